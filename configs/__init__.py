@@ -1,0 +1,1 @@
+"""YAML presets, one per thing a user runs (data only; read by ``mplicits.pipelines.config``)."""

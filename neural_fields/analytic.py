@@ -1,0 +1,164 @@
+"""Exact signed distance fields: ground truth for tests, examples and initialisation."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+
+import torch
+from torch import Tensor
+
+from .field import Field, Jet
+
+__all__ = ["Box", "Capsule", "Plane", "Sphere", "Torus", "Union"]
+
+
+class _Exact(Field):
+    """A closed-form field with one level; a subclass gives value and gradient at ``(..., 3)`` points."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.in_dim = 3
+        self.num_levels = 1
+        self.register_buffer("deltas", torch.empty(0), persistent=False)
+
+    @abstractmethod
+    def _evaluate(self, x: Tensor) -> tuple[Tensor, Tensor]: ...
+
+    def value(self, x: Tensor, *, level: int = -1) -> Tensor:
+        self.resolve_level(level)
+        return self._evaluate(self.check_points(x))[0]
+
+    def jet(self, x: Tensor, *, level: int = -1) -> Jet:
+        self.resolve_level(level)
+        value, gradient = self._evaluate(self.check_points(x))
+        return Jet(value, gradient, x.new_empty((*x.shape[:-1], 0)))
+
+
+def _vector(values: tuple[float, ...], like: Tensor) -> Tensor:
+    return torch.tensor(values, dtype=like.dtype, device=like.device)
+
+
+def _norm_and_direction(v: Tensor) -> tuple[Tensor, Tensor]:
+    """Length of ``v`` and ``v`` over it; zero vectors get direction zero instead of NaN."""
+    length = v.norm(dim=-1)
+    safe = torch.where(length > 0, length, torch.ones_like(length))
+    return length, v / safe[..., None]
+
+
+class Sphere(_Exact):
+    """``f(x) = |x − center| − radius``.
+
+    Example:
+        >>> import torch
+        >>> Sphere(radius=0.5).value(torch.tensor([[1.0, 0.0, 0.0]]))
+        tensor([0.5000])
+    """
+
+    def __init__(self, *, radius: float = 0.5, center: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> None:
+        super().__init__()
+        if not radius > 0:
+            raise ValueError(f"radius={radius}: expected > 0")
+        self.radius, self.center = radius, center
+
+    def _evaluate(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        length, direction = _norm_and_direction(x - _vector(self.center, x))
+        return length - self.radius, direction
+
+
+class Plane(_Exact):
+    """``f(x) = ⟨normal, x⟩ − offset`` with a unit normal; negative on the side the normal leaves."""
+
+    def __init__(self, *, normal: tuple[float, float, float] = (0.0, 0.0, 1.0), offset: float = 0.0) -> None:
+        super().__init__()
+        length = sum(c * c for c in normal) ** 0.5
+        if not length > 0:
+            raise ValueError(f"normal={normal}: expected a vector of non-zero length")
+        self.normal, self.offset = tuple(c / length for c in normal), offset
+
+    def _evaluate(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        normal = _vector(self.normal, x)
+        return x @ normal - self.offset, normal.expand(x.shape)
+
+
+class Torus(_Exact):
+    """``f(x) = √((√(x² + y²) − major)² + z²) − minor``, around the z axis."""
+
+    def __init__(self, *, major: float = 0.5, minor: float = 0.2) -> None:
+        super().__init__()
+        if not major > minor > 0:
+            raise ValueError(f"major={major}, minor={minor}: expected major > minor > 0")
+        self.major, self.minor = major, minor
+
+    def _evaluate(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        rho, radial = _norm_and_direction(x[..., :2])
+        length, q = _norm_and_direction(torch.stack((rho - self.major, x[..., 2]), -1))
+        return length - self.minor, torch.cat((q[..., :1] * radial, q[..., 1:]), -1)
+
+
+class Box(_Exact):
+    """Axis-aligned box with half-sizes ``half`` around ``center``.
+
+    Outside, the distance to the nearest point of the box; inside, minus the distance to the nearest face.
+    """
+
+    def __init__(
+        self,
+        *,
+        half: tuple[float, float, float] = (0.4, 0.4, 0.4),
+        center: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    ) -> None:
+        super().__init__()
+        if not min(half) > 0:
+            raise ValueError(f"half={half}: expected three numbers > 0")
+        self.half, self.center = half, center
+
+    def _evaluate(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        p = x - _vector(self.center, x)
+        sign = torch.where(p < 0, -1.0, 1.0).to(x.dtype)
+        q = p.abs() - _vector(self.half, x)
+        outside, direction = _norm_and_direction(q.clamp(min=0))
+        inside, axis = q.max(dim=-1)
+        facing = torch.nn.functional.one_hot(axis, 3).to(x.dtype)
+        gradient = torch.where((inside > 0)[..., None], direction, facing) * sign
+        return outside + inside.clamp(max=0), gradient
+
+
+class Capsule(_Exact):
+    """All points within ``radius`` of the segment from ``start`` to ``end``."""
+
+    def __init__(
+        self,
+        *,
+        start: tuple[float, float, float] = (0.0, 0.0, -0.4),
+        end: tuple[float, float, float] = (0.0, 0.0, 0.4),
+        radius: float = 0.2,
+    ) -> None:
+        super().__init__()
+        if not radius > 0 or start == end:
+            raise ValueError(f"start={start}, end={end}, radius={radius}: expected two different points and radius > 0")
+        self.start, self.end, self.radius = start, end, radius
+
+    def _evaluate(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        start = _vector(self.start, x)
+        axis = _vector(self.end, x) - start
+        along = (((x - start) @ axis) / (axis @ axis)).clamp(0, 1)
+        length, direction = _norm_and_direction(x - start - along[..., None] * axis)
+        return length - self.radius, direction
+
+
+class Union(_Exact):
+    """``min_i f_i(x)``: exact outside every part, a bound inside where parts overlap."""
+
+    def __init__(self, *parts: Field) -> None:
+        super().__init__()
+        if not parts:
+            raise ValueError("parts: expected at least one field")
+        self.parts = torch.nn.ModuleList(parts)
+
+    def _evaluate(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        jets = [part.jet(x) for part in self.parts]  # pyright: ignore[reportCallIssue]
+        values = torch.stack([jet.value for jet in jets])
+        value, nearest = values.min(dim=0)
+        gradients = torch.stack([jet.gradient for jet in jets])
+        index = nearest[None, ..., None].expand(1, *x.shape)
+        return value, gradients.gather(0, index)[0]

@@ -1,0 +1,94 @@
+"""``Field`` and ``Jet``: the one interface between geometry and everything that uses it."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+__all__ = ["Field", "Jet"]
+
+
+class Jet(NamedTuple):
+    """Value, gradient and features of a field at some points (its 1-jet).
+
+    Attributes:
+        value: ``(...,)`` signed distance, negative inside; ``(..., 3)`` for a colour field.
+        gradient: ``(..., d)``, or ``(..., 3, d)`` for a colour field. Not normalised: a gradient
+            is not a normal.
+        features: ``(..., F)`` extra outputs; F may be 0.
+    """
+
+    value: Tensor
+    gradient: Tensor
+    features: Tensor
+
+
+class Field(nn.Module, ABC):
+    """A function of space, known by its value and its analytic gradient, at one or more levels of detail.
+
+    Levels count from 0, coarse to fine (level i is the paper's f_{i+1}); ``level=-1`` is the finest.
+    Each level but the last has a band, ``|f_i(x)| < deltas[i]``, outside which the next level adds nothing.
+
+    Attributes:
+        in_dim: dimension d of the domain, 3, or 4 for (x, y, z, t).
+        num_levels: how many levels of detail the field has.
+        deltas: ``(num_levels - 1,)`` half-widths of the bands, in the field's own units.
+    """
+
+    in_dim: int
+    num_levels: int
+    deltas: Tensor
+
+    @abstractmethod
+    def value(self, x: Tensor, *, level: int = -1) -> Tensor:
+        """Evaluate the field at ``x`` ``(..., d)`` → ``(...,)``.
+
+        Raises:
+            ValueError: the last dimension of ``x`` is not ``in_dim``, or there is no such level.
+        """
+
+    @abstractmethod
+    def jet(self, x: Tensor, *, level: int = -1) -> Jet:
+        """Evaluate value and gradient together at ``x`` ``(..., d)``.
+
+        The gradient is analytic and itself differentiable with respect to parameters and ``x``.
+
+        Raises:
+            ValueError: the last dimension of ``x`` is not ``in_dim``, or there is no such level.
+        """
+
+    def in_band(self, x: Tensor, *, level: int) -> Tensor:
+        """Whether ``level`` may be evaluated at ``x`` ``(..., d)`` → bool ``(...,)``.
+
+        True where every coarser level says ``|f_i(x)| < deltas[i]``; level 0 is allowed everywhere.
+
+        Raises:
+            ValueError: the last dimension of ``x`` is not ``in_dim``, or there is no such level.
+        """
+        inside = torch.ones(self.check_points(x).shape[:-1], dtype=torch.bool, device=x.device)
+        for coarser in range(self.resolve_level(level)):
+            inside = inside & (self.value(x, level=coarser).abs() < self.deltas[coarser])
+        return inside
+
+    def resolve_level(self, level: int) -> int:
+        """Turn a level counted from either end into one counted from 0.
+
+        Raises:
+            ValueError: there is no such level.
+        """
+        if not -self.num_levels <= level < self.num_levels:
+            raise ValueError(f"level={level}: this field has levels 0 to {self.num_levels - 1} (or -1 for the finest)")
+        return level % self.num_levels
+
+    def check_points(self, x: Tensor) -> Tensor:
+        """Return ``x`` if its shape is ``(..., in_dim)``.
+
+        Raises:
+            ValueError: it is not.
+        """
+        if x.ndim == 0 or x.shape[-1] != self.in_dim:
+            raise ValueError(f"x has shape {tuple(x.shape)}; expected (..., {self.in_dim})")
+        return x

@@ -1,0 +1,58 @@
+"""The similarity between the user's coordinates and the unit sphere in which fields live."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["Similarity"]
+
+Float64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """``x_unit = (x_input - center) / scale``, kept in float64.
+
+    Map coordinates (UTM metres, say) have seven digits before the point; float32 has seven in all.
+    The shift is therefore always made in float64, before anything is rounded.
+
+    Attributes:
+        center: three numbers, in input units.
+        scale: input units per unit of the field.
+    """
+
+    center: tuple[float, float, float]
+    scale: float
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.center).all() and np.isfinite(self.scale) and self.scale > 0):
+            raise ValueError(f"center={self.center}, scale={self.scale}: expected finite numbers and scale > 0")
+
+    @classmethod
+    def identity(cls) -> Similarity:
+        """The similarity that changes nothing."""
+        return cls((0.0, 0.0, 0.0), 1.0)
+
+    @classmethod
+    def to_unit_sphere(cls, points: Float64) -> Similarity:
+        """Centre ``points`` ``(N, 3)`` on their bounding box and scale them into the unit sphere.
+
+        Raises:
+            ValueError: there are no points, or all of them coincide.
+        """
+        center = (points.min(axis=0) + points.max(axis=0)) / 2
+        radius = float(np.sqrt(((points - center) ** 2).sum(axis=1).max()))
+        if radius == 0:
+            raise ValueError("points: all of them coincide, so there is no scale")
+        return cls((float(center[0]), float(center[1]), float(center[2])), radius)
+
+    def to_unit(self, points: Float64) -> Float64:
+        """Map ``(..., 3)`` input coordinates into the unit sphere, in float64."""
+        return (np.asarray(points, np.float64) - np.asarray(self.center)) / self.scale
+
+    def to_input(self, points: NDArray[np.floating]) -> Float64:
+        """Map ``(..., 3)`` unit-sphere coordinates back to input coordinates, in float64."""
+        return np.asarray(points, np.float64) * self.scale + np.asarray(self.center)
