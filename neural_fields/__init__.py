@@ -1,9 +1,12 @@
 """Neural signed distance fields, and the mathematics that evaluates them."""
 
 from .analytic import Box, Capsule, Plane, Sphere, Torus, Union
+from .checkpoint import SavedField, load_field, save_field
 from .errors import InputError
 from .field import Field, Jet
+from .multiscale import MultiscaleSDF
 from .similarity import Similarity
+from .siren import Siren
 
 __all__ = [
     "Box",
@@ -11,9 +14,14 @@ __all__ = [
     "Field",
     "InputError",
     "Jet",
+    "MultiscaleSDF",
     "Plane",
+    "SavedField",
     "Similarity",
+    "Siren",
     "Sphere",
     "Torus",
     "Union",
+    "load_field",
+    "save_field",
 ]

@@ -96,7 +96,7 @@ class Torus(_Exact):
 
 
 class Box(_Exact):
-    """Axis-aligned box with half-sizes ``half`` around ``center``.
+    """Axis-aligned box with half-sizes ``half_size`` around ``center``.
 
     Outside, the distance to the nearest point of the box; inside, minus the distance to the nearest face.
     """
@@ -104,18 +104,18 @@ class Box(_Exact):
     def __init__(
         self,
         *,
-        half: tuple[float, float, float] = (0.4, 0.4, 0.4),
+        half_size: tuple[float, float, float] = (0.4, 0.4, 0.4),
         center: tuple[float, float, float] = (0.0, 0.0, 0.0),
     ) -> None:
         super().__init__()
-        if not min(half) > 0:
-            raise ValueError(f"half={half}: expected three numbers > 0")
-        self.half, self.center = half, center
+        if not min(half_size) > 0:
+            raise ValueError(f"half_size={half_size}: expected three numbers > 0")
+        self.half_size, self.center = half_size, center
 
     def _evaluate(self, x: Tensor) -> tuple[Tensor, Tensor]:
         p = x - _vector(self.center, x)
         sign = torch.where(p < 0, -1.0, 1.0).to(x.dtype)
-        q = p.abs() - _vector(self.half, x)
+        q = p.abs() - _vector(self.half_size, x)
         outside, direction = _norm_and_direction(q.clamp(min=0))
         inside, axis = q.max(dim=-1)
         facing = torch.nn.functional.one_hot(axis, 3).to(x.dtype)
