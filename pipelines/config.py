@@ -1,0 +1,224 @@
+"""Typed settings: a flat dataclass, filled from a YAML preset and then from command-line flags."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import difflib
+import math
+import types
+from collections.abc import Iterable, Mapping
+from importlib import resources
+from pathlib import Path
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+
+import yaml
+
+__all__ = ["add_config_flags", "closest", "given_flags", "load_config", "preset_names"]
+
+T = TypeVar("T")
+Pairs = Mapping[object, object]
+
+
+class _MismatchError(Exception):
+    """A value does not fit its annotation; the message says what would."""
+
+
+def load_config(
+    cls: type[T],
+    preset: str | Path | None = None,
+    overrides: Mapping[str, object] | None = None,
+    *,
+    thing: str = "fit",
+) -> T:
+    """Build a ``cls`` from its defaults, then a preset, then overrides.
+
+    Args:
+        cls: a flat dataclass: bool, int, float, str, Literal, ``tuple[X, ...]`` and ``X | None``.
+        preset: the name of a preset in ``mplicits.configs`` (``"fast"`` is ``<thing>_fast.yaml``), or
+            the path of a YAML file (a ``Path``, or a string that ends in .yaml or .yml).
+        overrides: field name → value or its text; given by flags, and named as flags in messages.
+        thing: what is configured; the first half of a preset's file name.
+
+    Raises:
+        InputError: no such preset or file, not YAML, an unknown key, or a value of the wrong kind. The
+            message names the file or flag, the key, what came and what is allowed.
+    """
+    hints = get_type_hints(cls)
+    fields = [field.name for field in dataclasses.fields(cls)]  # pyright: ignore[reportArgumentType]
+    source, pairs = _read_preset(preset, thing)
+    values: dict[str, Any] = {}
+    for key, value in pairs.items():
+        if key not in hints or not isinstance(key, str):
+            raise _input_error(f"{source}: unknown key {str(key)!r}{closest(str(key), fields)}")
+        values[key] = _checked(value, hints[key], f"{source}: {key}")
+    for key, value in (overrides or {}).items():
+        if key not in hints:
+            raise _input_error(f"unknown flag {_flag(key)}{closest(_flag(key), map(_flag, fields))}")
+        values[key] = _checked(value, hints[key], _flag(key))
+    try:
+        return cls(**values)
+    except ValueError as error:  # a range check of the dataclass itself
+        raise _input_error(f"{source}: {error}" if preset is not None else str(error)) from error
+
+
+def add_config_flags(parser: argparse.ArgumentParser, cls: type) -> None:
+    """Add one flag per field of ``cls`` (``learning_rates`` → ``--learning-rates 1e-3 5e-4``).
+
+    A flag that is not given leaves no trace in the namespace, so that only given ones override. Values
+    stay text: ``load_config`` checks them with the same rules as a file's.
+    """
+    group = parser.add_argument_group("settings", "each overrides the preset")
+    hints = get_type_hints(cls)
+    for field in dataclasses.fields(cls):
+        kind = hints[field.name]
+        text = str(field.metadata.get("help", "")).replace("%", "%%")
+        options: dict[str, Any] = {"default": argparse.SUPPRESS, "help": text, "dest": field.name}
+        if _without_none(kind) is bool:
+            group.add_argument(_flag(field.name), action=argparse.BooleanOptionalAction, **options)
+        else:
+            many = get_origin(_without_none(kind)) is tuple
+            options["metavar"] = _metavar(kind)
+            group.add_argument(_flag(field.name), nargs="+" if many else None, **options)
+
+
+def given_flags(arguments: argparse.Namespace, cls: type) -> dict[str, object]:
+    """The fields of ``cls`` that were given on the command line, ready for ``load_config``'s ``overrides``."""
+    return {field.name: getattr(arguments, field.name) for field in dataclasses.fields(cls) if field.name in arguments}
+
+
+def preset_names(thing: str) -> list[str]:
+    """Names of the bundled presets of ``thing``, sorted."""
+    files = (Path(file.name) for file in resources.files("mplicits.configs").iterdir())
+    return sorted(file.stem.removeprefix(f"{thing}_") for file in files if file.match(f"{thing}_*.yaml"))
+
+
+def closest(name: str, known: Iterable[str]) -> str:
+    """``"; did you mean 'widths'?"``, or the known names where none is near."""
+    known = sorted(known)
+    near = difflib.get_close_matches(name, known, n=1)
+    return f"; did you mean {near[0]!r}?" if near else f"; known: {', '.join(known)}"
+
+
+def _read_preset(preset: str | Path | None, thing: str) -> tuple[str, Pairs]:
+    """Name for messages, and the key-value pairs of a preset."""
+    if preset is None:
+        return thing, {}
+    if isinstance(preset, Path) or preset.endswith((".yaml", ".yml")):
+        source = str(preset)
+        try:
+            text = Path(preset).read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
+            raise _input_error(f"{source}: cannot read the configuration ({reason})") from error
+    else:
+        names = preset_names(thing)
+        if preset not in names:
+            raise _input_error(f"no preset {preset!r} for {thing}{closest(preset, names)} (a file: --config FILE)")
+        source = f"{thing}_{preset}.yaml"
+        text = (resources.files("mplicits.configs") / source).read_text(encoding="utf-8")
+    try:
+        pairs = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        place = f", line {mark.line + 1}, column {mark.column + 1}" if mark else ""
+        problem = getattr(error, "problem", None) or "unreadable"
+        raise _input_error(f"{source}{place}: not YAML ({problem})") from error
+    if pairs is None:
+        return source, {}
+    if not isinstance(pairs, dict):
+        raise _input_error(f"{source}: expected lines of 'key: value', got a {type(pairs).__name__}")
+    return source, pairs
+
+
+def _checked(value: object, kind: Any, place: str) -> Any:
+    try:
+        return _convert(value, kind)
+    except _MismatchError as error:
+        shown = " ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
+        raise _input_error(f"{place}: got {shown!r}, expected {error}") from error
+
+
+def _convert(value: object, kind: Any) -> Any:
+    """``value``, or the text of one, as an instance of the annotation ``kind``."""
+    origin, args = get_origin(kind), get_args(kind)
+    if origin is Literal:
+        if value in args:
+            return value
+        raise _MismatchError("one of " + ", ".join(map(str, args)))
+    if origin is tuple:
+        return _convert_tuple(value, args)
+    if origin is types.UnionType or origin is Union:
+        if value is None or value in ("none", ["none"]):
+            return None
+        try:
+            return _convert(value, _without_none(kind))
+        except _MismatchError as error:
+            raise _MismatchError(f"{error}, or none") from error
+    if kind is bool and isinstance(value, bool):
+        return value
+    if kind is str and isinstance(value, str):
+        return value
+    if kind is int or kind is float:
+        return _convert_number(value, kind)
+    raise _MismatchError({bool: "true or false", str: "text"}[kind])
+
+
+def _convert_number(value: object, kind: type[int] | type[float]) -> int | float:
+    """Numbers, and their text: YAML itself reads ``1e-3``, which has no point, as text."""
+    allowed = "a whole number" if kind is int else "a finite number"
+    if isinstance(value, bool) or not isinstance(value, int | float | str):
+        raise _MismatchError(allowed)
+    if kind is int and isinstance(value, int):
+        return value
+    try:
+        number = float(value)
+    except ValueError as error:
+        raise _MismatchError(allowed) from error
+    if not math.isfinite(number) or (kind is int and not number.is_integer()):
+        raise _MismatchError(allowed)
+    return kind(number)
+
+
+def _convert_tuple(value: object, args: tuple[Any, ...]) -> tuple[Any, ...]:
+    if args[-1] is Ellipsis:
+        count, allowed = None, f"a list of {_plural(args[0])}"
+    else:
+        count, allowed = len(args), f"a list of {len(args)} {_plural(args[0])}"
+    if not isinstance(value, list | tuple) or len(value) not in (count or len(value),):
+        raise _MismatchError(allowed)
+    try:
+        return tuple(_convert(item, args[0] if count is None else args[i]) for i, item in enumerate(value))
+    except _MismatchError as error:
+        raise _MismatchError(allowed) from error
+
+
+def _without_none(kind: Any) -> Any:
+    """The X of ``X | None``; any other annotation as it is."""
+    if get_origin(kind) is types.UnionType or get_origin(kind) is Union:
+        (kind,) = (arg for arg in get_args(kind) if arg is not types.NoneType)
+    return kind
+
+
+def _plural(kind: Any) -> str:
+    return {int: "whole numbers", float: "finite numbers", bool: "true or false"}.get(kind, "texts")
+
+
+def _metavar(kind: Any) -> str:
+    kind = _without_none(kind)
+    if get_origin(kind) is tuple:
+        kind = get_args(kind)[0]
+    if get_origin(kind) is Literal:
+        return "{" + ",".join(map(str, get_args(kind))) + "}"
+    return {int: "N", float: "X"}.get(kind, "TEXT")
+
+
+def _flag(name: str) -> str:
+    return "--" + name.replace("_", "-")
+
+
+def _input_error(message: str) -> Exception:
+    # Imported late: the package behind it loads torch, and `mplicits --help` must not wait for that.
+    from ..neural_fields.errors import InputError
+
+    return InputError(message)

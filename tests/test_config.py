@@ -1,0 +1,125 @@
+"""Typed settings: what a YAML file and flags may say, and what each mistake is answered with."""
+
+import argparse
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import pytest
+from mplicits.neural_fields import InputError
+from mplicits.pipelines.config import add_config_flags, given_flags, load_config, preset_names
+
+
+@dataclass(frozen=True)
+class Settings:
+    widths: tuple[int, ...] = field(default=(128, 256), metadata={"help": "width of each level"})
+    rates: tuple[float, ...] = (1e-3,)
+    normals: Literal["auto", "file"] = "auto"
+    origin: tuple[float, float, float] | None = None
+    budget: float | None = None
+    batch: int = 8192
+    device: str = "cpu"
+    verbose: bool = False
+
+    def __post_init__(self) -> None:
+        if self.batch < 1:
+            raise ValueError(f"batch={self.batch}: expected > 0")
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / "mine.yaml"
+    path.write_text(text)
+    return path
+
+
+def test_defaults_file_and_overrides_apply_in_this_order(tmp_path):
+    path = write(tmp_path, "widths: [64, 64, 64]\nrates: [1e-3, 5.0e-4, 1]\nbudget: 60\nverbose: true\nbatch: 1e4\n")
+    config = load_config(Settings, path, {"batch": "512", "origin": ["0", "-1e-3", "2"]})
+    assert config == Settings(
+        widths=(64, 64, 64),
+        rates=(1e-3, 5e-4, 1.0),
+        budget=60.0,
+        verbose=True,
+        batch=512,
+        origin=(0.0, -1e-3, 2.0),
+    )
+    assert isinstance(config.budget, float)
+    assert isinstance(config.rates[2], float)
+    assert load_config(Settings) == Settings()
+    assert load_config(Settings, str(path)) == load_config(Settings, path)
+
+
+def test_none_can_be_given_in_a_file_and_by_a_flag(tmp_path):
+    path = write(tmp_path, "budget: null\norigin: none\n")
+    assert load_config(Settings, path) == Settings()
+    assert load_config(Settings, write(tmp_path, "budget: 3"), {"budget": "none"}).budget is None
+    assert load_config(Settings, None, {"origin": ["none"]}).origin is None
+
+
+def test_an_empty_file_is_the_defaults(tmp_path):
+    assert load_config(Settings, write(tmp_path, "# nothing yet\n")) == Settings()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("widht: [1]", r"mine.yaml: unknown key 'widht'; did you mean 'widths'\?$"),
+        ("3: [1]", r"mine.yaml: unknown key '3'; known: batch, budget, device"),
+        ("widths: 128", r"mine.yaml: widths: got '128', expected a list of whole numbers$"),
+        ("widths: [1.5]", r"widths: got '1.5', expected a list of whole numbers$"),
+        ("batch: many", r"batch: got 'many', expected a whole number$"),
+        ("batch: true", r"batch: got 'True', expected a whole number$"),
+        ("budget: .nan", r"budget: got 'nan', expected a finite number, or none$"),
+        ("budget: [1]", r"budget: got '1', expected a finite number, or none$"),
+        ("origin: [1, 2]", r"origin: got '1 2', expected a list of 3 finite numbers, or none$"),
+        ("normals: sometimes", r"normals: got 'sometimes', expected one of auto, file$"),
+        ("verbose: 1", r"verbose: got '1', expected true or false$"),
+        ("device: 0", r"device: got '0', expected text$"),
+        ("batch: -1", r"mine.yaml: batch=-1: expected > 0$"),
+        ("- 1\n- 2", r"mine.yaml: expected lines of 'key: value', got a list$"),
+        ("a: b: c", r"mine.yaml, line 1, column 5: not YAML"),
+    ],
+)
+def test_each_mistake_in_a_file_is_one_line_that_names_it(tmp_path, text, message):
+    with pytest.raises(InputError, match=message) as caught:
+        load_config(Settings, write(tmp_path, text))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        ({"rates": ["fast"]}, r"^--rates: got 'fast', expected a list of finite numbers$"),
+        ({"batch": "0.5"}, r"^--batch: got '0.5', expected a whole number$"),
+        ({"bacht": "1"}, r"^unknown flag --bacht; did you mean '--batch'\?$"),
+    ],
+)
+def test_mistakes_in_flags_are_named_as_flags(overrides, message):
+    with pytest.raises(InputError, match=message):
+        load_config(Settings, None, overrides)
+
+
+def test_a_missing_file_and_an_unknown_preset_are_input_errors(tmp_path):
+    with pytest.raises(InputError, match=r"absent.yaml: cannot read the configuration"):
+        load_config(Settings, tmp_path / "absent.yaml")
+    with pytest.raises(InputError, match="no preset 'slow' for nothing"):
+        load_config(Settings, "slow", thing="nothing")
+    (tmp_path / "mine.yaml").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(InputError, match=r"mine.yaml: cannot read the configuration \(not UTF-8 text\)"):
+        load_config(Settings, tmp_path / "mine.yaml")
+
+
+def test_presets_are_found_by_the_name_of_their_thing():
+    assert preset_names("nothing") == []
+
+
+def test_flags_come_from_the_dataclass_and_only_given_ones_override():
+    parser = argparse.ArgumentParser()
+    add_config_flags(parser, Settings)
+    arguments = parser.parse_args(["--widths", "32", "64", "--verbose", "--normals", "file", "--batch", "100"])
+    given = given_flags(arguments, Settings)
+    assert given == {"widths": ["32", "64"], "verbose": True, "normals": "file", "batch": "100"}
+    assert load_config(Settings, None, given) == Settings(widths=(32, 64), verbose=True, normals="file", batch=100)
+    assert given_flags(parser.parse_args([]), Settings) == {}
+    assert "width of each level" in parser.format_help()
+    assert "{auto,file}" in parser.format_help()
