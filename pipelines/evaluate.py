@@ -1,0 +1,229 @@
+"""How far a mesh is from a reference: the figures of the paper's tables, and a true volumetric IoU.
+
+Protocol (paper, Sec. 5; DESIGN Sec. 4): both shapes are moved by the similarity that puts the REFERENCE
+into the unit sphere; distances are between area-weighted uniform samples of the two surfaces.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from ..neural_fields import InputError, Similarity
+from .surface import Surface, components, is_closed, read_surface, sample_surface
+from .volume_overlap import overlap
+
+__all__ = ["Metrics", "chamfer", "evaluate_files", "evaluate_surfaces", "format_metrics", "write_metrics"]
+
+Float64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Metrics:
+    """Figures of one mesh against one reference; lengths are in units of the reference's bounding sphere.
+
+    Attributes:
+        chamfer: mean squared distance mesh → reference plus mean squared distance reference → mesh.
+        chamfer_floor: the same between two independent samplings of the reference: what a perfect mesh
+            would score. None for a point cloud.
+        accuracy: the first half of ``chamfer``, mesh → reference.
+        completeness: its second half, reference → mesh.
+        hausdorff: the largest squared distance, either way.
+        f_score: harmonic mean of the shares of samples within ``threshold`` of the other surface.
+        threshold: distance (not squared) for ``f_score``.
+        normal_consistency: mean of |n·n'| between samples and their nearest neighbours, over both
+            directions. None for a reference without normals.
+        iou: volume of the intersection over volume of the union. None when the reference is a point
+            cloud, or when a surface has so many holes that inside cannot be told.
+        shell_iou: the paper's "IoU": overlap of the sets of voxels that hold samples.
+        voxel: size of the voxels of ``shell_iou``.
+        components: connected components of the mesh.
+        closed: whether every edge of the mesh has a face on both sides.
+        vertices: vertices of the mesh.
+        faces: faces of the mesh.
+        mean_distance: mean unsquared distance over both directions, in INPUT units.
+        scale: input units per unit.
+        samples: samples on each surface.
+        seed: seed of the samples.
+        notes: what the reader of the figures should know.
+    """
+
+    chamfer: float
+    chamfer_floor: float | None
+    accuracy: float
+    completeness: float
+    hausdorff: float
+    f_score: float
+    threshold: float
+    normal_consistency: float | None
+    iou: float | None
+    shell_iou: float
+    voxel: float
+    components: int
+    closed: bool
+    vertices: int
+    faces: int
+    mean_distance: float
+    scale: float
+    samples: int
+    seed: int
+    notes: tuple[str, ...]
+
+
+def evaluate_files(mesh: str | Path, reference: str | Path, *, samples: int = 500_000, seed: int = 0) -> Metrics:
+    """``evaluate_surfaces`` on two files; the reference may be a point cloud.
+
+    Raises:
+        InputError: a file cannot be read, or the first one holds no faces.
+    """
+    surface = read_surface(mesh)
+    if not len(surface.faces):
+        raise InputError(f"{mesh}: holds points but no faces, so it is no mesh to evaluate; give the mesh first")
+    return evaluate_surfaces(surface, read_surface(reference), samples=samples, seed=seed)
+
+
+def evaluate_surfaces(
+    mesh: Surface,
+    reference: Surface,
+    *,
+    samples: int = 500_000,
+    seed: int = 0,
+    threshold: float = 0.01,
+    voxel: float = 0.01,
+    columns: int = 512,
+) -> Metrics:
+    """Compare a mesh with a reference surface or cloud, both in the same coordinates.
+
+    Args:
+        mesh: the surface to judge.
+        reference: the truth. Without faces it is a cloud: distances are to its points.
+        samples: points drawn on each surface (500 K in the paper).
+        seed: of the samples.
+        threshold: for the F-score, in units of the reference's bounding sphere.
+        voxel: for the shell IoU (0.01 in the paper's code), same units.
+        columns: for the volumetric IoU, columns along the longest side.
+
+    Raises:
+        ValueError: ``samples`` is not positive.
+    """
+    if samples < 1:
+        raise ValueError(f"samples={samples}: expected > 0")
+    is_cloud = not len(reference.faces)
+    similarity = Similarity.to_unit_sphere(reference.used_vertices())
+    mesh, reference = mesh.moved(similarity), reference.moved(similarity)
+    of_mesh, of_reference, of_floor = np.random.default_rng(seed).spawn(3)
+    points, normals = sample_surface(mesh, samples, of_mesh)
+    target, target_normals = sample_surface(reference, samples, of_reference)
+
+    forward, nearest = KDTree(target, balanced_tree=False).query(points, workers=-1)
+    backward, nearest_back = KDTree(points, balanced_tree=False).query(target, workers=-1)
+    consistency = None
+    if normals is not None and target_normals is not None:
+        there = np.abs((normals * target_normals[nearest]).sum(axis=1)).mean()
+        back = np.abs((target_normals * normals[nearest_back]).sum(axis=1)).mean()
+        consistency = float(there + back) / 2
+
+    notes = []
+    floor = iou = None
+    if is_cloud:
+        notes.append("the reference is a point cloud: distances are to its points; no floor, no iou")
+    else:
+        floor = sum(chamfer(target, sample_surface(reference, samples, of_floor)[0]))
+        iou, iou_notes = _iou(mesh, reference, columns)
+        notes.extend(iou_notes)
+    precision, recall = float((forward < threshold).mean()), float((backward < threshold).mean())
+    accuracy, completeness = float((forward**2).mean()), float((backward**2).mean())
+    return Metrics(
+        chamfer=accuracy + completeness,
+        chamfer_floor=floor,
+        accuracy=accuracy,
+        completeness=completeness,
+        hausdorff=float(max(forward.max(), backward.max()) ** 2),
+        f_score=2 * precision * recall / (precision + recall) if precision + recall > 0 else 0.0,
+        threshold=threshold,
+        normal_consistency=consistency,
+        iou=iou,
+        shell_iou=shell_iou(points, target, voxel=voxel),
+        voxel=voxel,
+        components=components(mesh),
+        closed=is_closed(mesh),
+        vertices=len(mesh.vertices),
+        faces=len(mesh.faces),
+        mean_distance=float(forward.mean() + backward.mean()) / 2 * similarity.scale,
+        scale=similarity.scale,
+        samples=samples,
+        seed=seed,
+        notes=tuple(notes),
+    )
+
+
+def chamfer(a: Float64, b: Float64) -> tuple[float, float]:
+    """The two halves of the squared-L2 Chamfer distance of point sets ``(N, 3)`` and ``(M, 3)``.
+
+    ``mean_a min_b |a − b|²`` and ``mean_b min_a |a − b|²``; the tables give their sum.
+    """
+    forward, _ = KDTree(b, balanced_tree=False).query(a, workers=-1)
+    backward, _ = KDTree(a, balanced_tree=False).query(b, workers=-1)
+    return float((forward**2).mean()), float((backward**2).mean())
+
+
+def shell_iou(a: Float64, b: Float64, *, voxel: float = 0.01) -> float:
+    """Overlap of the voxels that hold points of ``a`` ``(N, 3)`` and of ``b`` ``(M, 3)``, on ONE grid.
+
+    The paper's code gives each set its own grid origin, so that equal shapes need not score 1.
+    """
+    low = np.minimum(a.min(axis=0), b.min(axis=0))
+    cells = [np.floor((points - low) / voxel).astype(np.int64) for points in (a, b)]
+    shape = np.maximum(cells[0].max(axis=0), cells[1].max(axis=0)) + 1
+    keys = [np.unique((c[:, 0] * shape[1] + c[:, 1]) * shape[2] + c[:, 2]) for c in cells]
+    common = len(np.intersect1d(*keys, assume_unique=True))
+    return common / (len(keys[0]) + len(keys[1]) - common)
+
+
+def _iou(mesh: Surface, reference: Surface, columns: int) -> tuple[float | None, list[str]]:
+    """Volumetric IoU, with a note where it is approximate or cannot be had."""
+    volumes = overlap(mesh, reference, columns=columns)
+    holes = [name for name, shape in (("the mesh", mesh), ("the reference", reference)) if not is_closed(shape)]
+    if not volumes.union > 0 or volumes.broken > 0.1:
+        share = f"{volumes.broken:.0%} of the columns enter and leave a different number of times"
+        return None, [f"no iou: {' and '.join(holes) or 'a surface'} is not closed ({share})"]
+    note = f"{' and '.join(holes)} not closed: iou leaves out {volumes.broken:.2%} of the columns"
+    return volumes.intersection / volumes.union, [note] if holes else []
+
+
+def format_metrics(metrics: Metrics) -> str:
+    """A table for people, one figure a line."""
+    m = metrics
+
+    def optional(value: float | None, form: str) -> str:
+        return "n/a" if value is None else format(value, form)
+
+    lines = [
+        ("chamfer (squared L2, both ways)", f"{m.chamfer:.3e}", f"sampling floor {optional(m.chamfer_floor, '.3e')}"),
+        ("  mesh → reference", f"{m.accuracy:.3e}", ""),
+        ("  reference → mesh", f"{m.completeness:.3e}", ""),
+        ("hausdorff (squared)", f"{m.hausdorff:.3e}", ""),
+        ("f_score", f"{m.f_score:.4f}", f"within {m.threshold:g}"),
+        ("normal_consistency", optional(m.normal_consistency, ".4f"), "mean |n·n'|"),
+        ("iou", optional(m.iou, ".4f"), "of volumes"),
+        ("shell_iou", f"{m.shell_iou:.4f}", f"of surface voxels of {m.voxel:g}"),
+        ("components", f"{m.components}", "closed" if m.closed else "with open edges"),
+        ("vertices, faces", f"{m.vertices:,}", f"{m.faces:,}"),
+        ("mean distance, input units", f"{m.mean_distance:.4g}", f"1 unit above = {m.scale:.6g} input units"),
+    ]
+    rows = [f"{name:<32} {value:>10}  {remark}".rstrip() for name, value, remark in lines]
+    return "\n".join([*rows, f"{m.samples:,} samples on each surface, seed {m.seed}", *(f"note: {n}" for n in m.notes)])
+
+
+def write_metrics(path: str | Path, metrics: Metrics) -> None:
+    """Write the figures as JSON, through a temporary file beside the target."""
+    path = Path(path)
+    partial = path.with_name(path.name + ".partial")
+    partial.write_text(json.dumps(dataclasses.asdict(metrics), indent=2) + "\n", encoding="utf-8")
+    partial.replace(path)

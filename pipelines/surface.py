@@ -1,0 +1,166 @@
+"""Triangle surfaces as arrays: reading, sampling, and what can be counted on them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from ..neural_fields import InputError, Similarity
+
+__all__ = [
+    "MESH_SUFFIXES",
+    "Surface",
+    "components",
+    "face_normals",
+    "is_closed",
+    "merged",
+    "read_surface",
+    "sample_surface",
+]
+
+Float64 = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+
+MESH_SUFFIXES = (".ply", ".obj", ".stl", ".off", ".glb")
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A triangle mesh, or with no faces a cloud of points.
+
+    Attributes:
+        vertices: ``(V, 3)``.
+        faces: ``(F, 3)``; F is 0 for a cloud.
+        normals: ``(V, 3)`` unit normals at the vertices, where the file gives them.
+        colors: ``(V, 3)`` in [0, 1], where the file gives them.
+    """
+
+    vertices: Float64
+    faces: Int64
+    normals: Float64 | None = None
+    colors: Float64 | None = None
+
+    def used_vertices(self) -> Float64:
+        """The vertices that a face uses; of a cloud, all."""
+        return self.vertices[np.unique(self.faces)] if len(self.faces) else self.vertices
+
+    def moved(self, similarity: Similarity) -> Surface:
+        """The same surface in unit-sphere coordinates."""
+        return Surface(similarity.to_unit(self.vertices), self.faces, self.normals, self.colors)
+
+
+def read_surface(path: str | Path) -> Surface:
+    """Read a mesh, or any cloud that ``datasets.read_cloud`` knows.
+
+    Raises:
+        InputError: the file is missing, damaged, empty or of a kind we do not read.
+    """
+    path = Path(path)
+    if path.suffix.lower() in MESH_SUFFIXES:
+        mesh = _load_mesh(path)
+        if mesh is not None:
+            return mesh
+    from ..datasets import read_cloud
+
+    cloud = read_cloud(path)
+    return Surface(cloud.points, np.empty((0, 3), np.int64), cloud.normals, cloud.colors)
+
+
+def _load_mesh(path: Path) -> Surface | None:
+    """The triangles of a file; None where it has no faces."""
+    if not path.is_file():
+        raise InputError(f"{path}: no such file")
+    try:
+        # process=False: trimesh would otherwise merge vertices and drop faces before we count them.
+        loaded: Any = trimesh.load_mesh(path, process=False)
+    except Exception as error:  # trimesh's readers raise whatever their parsing runs into
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise InputError(f"{path}: cannot be read as a {path.suffix[1:].upper()} mesh ({reason})") from error
+    faces = np.asarray(getattr(loaded, "faces", ()), np.int64).reshape(-1, 3)
+    if not len(faces):
+        return None
+    vertices = np.asarray(loaded.vertices, np.float64)
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise InputError(f"{path}: a face names vertex {faces.max()}, but there are only {len(vertices)}")
+    if not np.isfinite(vertices[np.unique(faces)]).all():
+        raise InputError(f"{path}: a vertex has a coordinate that is not a finite number")
+    if not np.ptp(vertices[np.unique(faces)], axis=0).any():
+        raise InputError(f"{path}: all vertices coincide")
+    colors = None
+    if loaded.visual.kind == "vertex":
+        colors = np.asarray(loaded.visual.vertex_colors, np.float64)[:, :3] / 255
+    # A property of trimesh computes normals that are not there; the cache says whether the file gave any.
+    normals = np.asarray(loaded.vertex_normals, np.float64) if "vertex_normals" in loaded._cache else None
+    return Surface(vertices, faces, normals, colors)
+
+
+def face_normals(surface: Surface) -> tuple[Float64, Float64]:
+    """Unit normals ``(F, 3)`` (zero for a face without area) and areas ``(F,)``."""
+    a, b, c = (surface.vertices[surface.faces[:, k]] for k in range(3))
+    cross = np.cross(b - a, c - a)
+    length = np.linalg.norm(cross, axis=1)
+    return np.divide(cross, length[:, None], out=np.zeros_like(cross), where=length[:, None] > 0), length / 2
+
+
+def sample_surface(surface: Surface, count: int, rng: np.random.Generator) -> tuple[Float64, Float64 | None]:
+    """Points uniform by area ``(count, 3)`` with the normals of their faces.
+
+    Of a cloud, its own points (at most ``count``, chosen at random) with their own normals.
+
+    Raises:
+        ValueError: the surface has no area.
+    """
+    if not len(surface.faces):
+        chosen = slice(None)
+        if len(surface.vertices) > count:
+            chosen = rng.permutation(len(surface.vertices))[:count]
+        return surface.vertices[chosen], None if surface.normals is None else surface.normals[chosen]
+    normals, areas = face_normals(surface)
+    total = np.cumsum(areas)
+    if not total[-1] > 0:
+        raise ValueError("surface: all of its faces have zero area")
+    face = np.searchsorted(total, rng.uniform(0, total[-1], count), side="right").clip(max=len(total) - 1)
+    face = np.sort(face)  # neighbours in memory are then neighbours in space, which k-d trees like
+    root, second = np.sqrt(rng.uniform(size=count)), rng.uniform(size=count)
+    weights = np.stack((1 - root, root * (1 - second), root * second), axis=1)  # (N, 3)
+    points = sum(weights[:, k, None] * surface.vertices[surface.faces[face, k]] for k in range(3))
+    return np.asarray(points), normals[face]
+
+
+def merged(surface: Surface) -> Surface:
+    """The surface with exactly equal vertices made one, and faces that collapse by it dropped."""
+    vertices, index = np.unique(surface.vertices, axis=0, return_inverse=True)
+    faces = index.reshape(-1)[surface.faces]
+    whole = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+    return Surface(vertices, faces[whole])
+
+
+def components(surface: Surface) -> int:
+    """Connected components of the faces, through shared vertices, equal vertices merged."""
+    whole = merged(surface)
+    if not len(whole.faces):
+        return 0
+    a, b = whole.faces[:, [0, 1]].reshape(-1), whole.faces[:, [1, 2]].reshape(-1)
+    size = len(whole.vertices)
+    graph = coo_array((np.ones(len(a), np.int8), (a, b)), shape=(size, size)).tocsr()
+    labels = connected_components(graph, directed=False)[1]
+    return len(np.unique(labels[whole.faces[:, 0]]))
+
+
+def is_closed(surface: Surface) -> bool:
+    """Whether each edge is run through as often in one direction as in the other, equal vertices merged."""
+    whole = merged(surface)
+    if not len(whole.faces):
+        return False
+    a = whole.faces.reshape(-1)
+    b = whole.faces[:, [1, 2, 0]].reshape(-1)
+    size = len(whole.vertices)
+    there, back = np.sort(a * size + b), np.sort(b * size + a)
+    return bool((there == back).all())

@@ -1,0 +1,271 @@
+"""Figures between surfaces, checked where the exact answer is known."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import trimesh
+from mplicits.neural_fields import InputError, Similarity
+from mplicits.pipelines.evaluate import (
+    chamfer,
+    evaluate_files,
+    evaluate_surfaces,
+    format_metrics,
+    shell_iou,
+    write_metrics,
+)
+from mplicits.pipelines.raster import cover
+from mplicits.pipelines.surface import Surface, components, is_closed, merged, read_surface, sample_surface
+from mplicits.pipelines.volume_overlap import overlap
+
+
+def surface(mesh: trimesh.Trimesh) -> Surface:
+    return Surface(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64))
+
+
+def sphere(radius: float = 1.0, subdivisions: int = 5) -> Surface:
+    return surface(trimesh.creation.icosphere(subdivisions, radius=radius))
+
+
+def box(
+    size: tuple[float, float, float] = (1.0, 1.0, 1.0), at: tuple[float, float, float] = (0.0, 0.0, 0.0)
+) -> Surface:
+    return surface(trimesh.creation.box(size).apply_translation(at))
+
+
+def joined(*parts: Surface) -> Surface:
+    starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    faces = [part.faces + start for part, start in zip(parts, starts, strict=False)]
+    return Surface(np.concatenate([part.vertices for part in parts]), np.concatenate(faces))
+
+
+def without_face(shape: Surface, index: int = 0) -> Surface:
+    return Surface(shape.vertices, np.delete(shape.faces, index, axis=0))
+
+
+# --- distances ---------------------------------------------------------------------------------------
+
+
+def test_concentric_spheres_have_the_exact_distances():
+    inner, outer = 0.9, 1.0
+    metrics = evaluate_surfaces(sphere(inner), sphere(outer), samples=20_000, columns=128)
+    gap = (outer - inner) ** 2
+    spacing = 4 * math.pi / 20_000  # mean squared distance to the nearest of 20 K samples is below this
+    assert metrics.accuracy == pytest.approx(gap, abs=spacing)
+    assert metrics.completeness == pytest.approx(gap, abs=spacing)
+    assert metrics.chamfer == metrics.accuracy + metrics.completeness
+    assert metrics.hausdorff == pytest.approx(gap, abs=25 * spacing)
+    assert metrics.hausdorff > metrics.accuracy
+    assert metrics.iou == pytest.approx((inner / outer) ** 3, abs=1e-3)
+    assert metrics.normal_consistency == pytest.approx(1, abs=2e-3)
+    assert metrics.f_score == 0
+    assert metrics.shell_iou == 0
+    assert (metrics.components, metrics.closed, metrics.notes) == (1, True, ())
+
+
+def test_a_mesh_against_itself_scores_the_floor_and_no_less():
+    shape = sphere(3.0)
+    metrics = evaluate_surfaces(shape, shape, samples=20_000, columns=128)
+    assert metrics.chamfer_floor is not None
+    assert metrics.chamfer == pytest.approx(metrics.chamfer_floor, rel=0.1)
+    # Of a uniform sampling with density ρ, the mean squared distance to the nearest sample is 1 / (π ρ), each way.
+    assert metrics.chamfer_floor == pytest.approx(2 * 4 * math.pi / (math.pi * 20_000), rel=0.1)
+    assert metrics.iou == 1
+    within = 1 - math.exp(-20_000 / (4 * math.pi) * math.pi * metrics.threshold**2)  # some sample that near
+    assert metrics.f_score == pytest.approx(within, abs=0.02)
+    assert metrics.scale == pytest.approx(3.0)
+
+
+def test_the_floor_does_not_depend_on_the_mesh():
+    a = evaluate_surfaces(sphere(0.9, 3), box(), samples=2_000, columns=32)
+    b = evaluate_surfaces(box(at=(0.3, 0, 0)), box(), samples=2_000, columns=32)
+    assert a.chamfer_floor == b.chamfer_floor
+    assert a.chamfer != b.chamfer
+
+
+def test_figures_do_not_change_with_the_units_and_the_place_of_the_input():
+    shapes = sphere(0.9, 3), sphere(1.0, 3)
+    far = Similarity((-4e5, -5.2e6, -120.0), 1 / 40)
+    here = evaluate_surfaces(*shapes, samples=2_000, columns=64)
+    there = evaluate_surfaces(*(shape.moved(far) for shape in shapes), samples=2_000, columns=64)
+    assert there.chamfer == pytest.approx(here.chamfer, rel=1e-6)
+    assert there.iou == pytest.approx(here.iou, rel=1e-6)
+    assert there.mean_distance == pytest.approx(40 * here.mean_distance, rel=1e-6)
+
+
+def test_parallel_squares_are_as_far_apart_as_their_gap():
+    square = Surface(
+        np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]), np.array([[0, 1, 2], [0, 2, 3]], np.int64)
+    )
+    lifted = Surface(square.vertices + np.array([0, 0, 0.5]), square.faces)
+    metrics = evaluate_surfaces(lifted, square, samples=20_000, columns=32)
+    radius = math.sqrt(0.5)
+    assert metrics.scale == pytest.approx(radius)
+    assert metrics.chamfer == pytest.approx(2 * (0.5 / radius) ** 2, rel=1e-3)
+    assert metrics.mean_distance == pytest.approx(0.5, rel=1e-3)
+    assert metrics.iou is None
+    assert "not closed" in metrics.notes[0]
+
+
+def test_chamfer_and_shell_iou_of_points_by_hand():
+    a, b = np.array([[0.0, 0, 0], [1, 0, 0]]), np.array([[0.0, 0, 2]])
+    assert chamfer(a, b) == ((4 + 5) / 2, 4.0)
+    cells = np.array([[0.5, 0.5, 0.5], [1.5, 0.5, 0.5], [1.6, 0.5, 0.5]])
+    assert shell_iou(cells, cells[:1], voxel=1.0) == 1 / 2
+    assert shell_iou(cells, cells, voxel=0.3) == 1
+
+
+def test_the_f_score_is_the_harmonic_mean_of_precision_and_recall():
+    far = box((0.1, 0.1, 0.1), (3, 0, 0))
+    metrics = evaluate_surfaces(joined(box(), far), box(), samples=20_000, threshold=0.05, columns=32)
+    precision = 6 / (6 + 6 * 0.01)  # share of the area that lies on the reference; recall is 1
+    assert metrics.f_score == pytest.approx(2 * precision / (precision + 1), abs=2e-3)
+    assert metrics.components == 2
+
+
+# --- volumes -----------------------------------------------------------------------------------------
+
+
+def test_volume_of_boxes_is_that_of_their_sides():
+    unit, shifted = box(), box(at=(0.5, 0.25, 0.0))
+    volumes = overlap(unit, shifted, columns=256)
+    assert volumes.first == pytest.approx(1, rel=0.01)
+    assert volumes.intersection == pytest.approx(0.5 * 0.75, rel=0.01)
+    assert volumes.union == pytest.approx(2 - 0.5 * 0.75, rel=0.01)
+    assert volumes.broken == 0
+
+
+@pytest.mark.parametrize("columns", [1, 7, 64, 300])
+def test_columns_through_edges_and_vertices_are_never_broken(columns):
+    fine = sphere(1.0, 4)
+    rounded = Surface(np.round(fine.vertices * 20) / 20, fine.faces)  # many faces edge-on to the axes, many ties
+    assert overlap(rounded, box((2, 2, 2)), columns=columns).broken == 0
+
+
+def test_overlapping_parts_of_one_mesh_and_bubbles_in_it_are_told_apart():
+    twice = joined(box(), box(at=(0.25, 0, 0)))  # wound twice in the middle: still inside
+    assert overlap(twice, twice, columns=128).first == pytest.approx(1.25, rel=0.01)
+    bubble = box((0.5, 0.5, 0.5))
+    hollow = joined(box(), Surface(bubble.vertices, bubble.faces[:, ::-1]))
+    assert overlap(hollow, hollow, columns=128).first == pytest.approx(1 - 0.125, rel=0.01)
+
+
+def test_a_small_hole_costs_columns_but_not_the_iou():
+    holed = without_face(sphere(1.0, 4))
+    metrics = evaluate_surfaces(holed, sphere(1.0, 4), samples=1_000, columns=256)
+    assert metrics.iou == pytest.approx(1, abs=1e-9)
+    assert not metrics.closed
+    assert "the mesh not closed" in metrics.notes[0]
+
+
+def test_columns_of_a_triangle_are_those_inside_it():
+    xy = np.array([[0.5, 0.5], [8.5, 0.5], [0.5, 8.5]])
+    (found,) = cover(xy, np.array([[0, 1, 2]]), (10, 10))
+    i, j = found.column // 10, found.column % 10
+    expected = {(a, b) for a in range(10) for b in range(10) if a > 0.5 and b > 0.5 and a + b < 9}
+    assert set(zip(i.tolist(), j.tolist(), strict=True)) == expected
+    np.testing.assert_allclose(found.weights @ xy, np.stack((i, j), axis=1), atol=1e-12)
+    assert (found.sign == 1).all()
+    (turned,) = cover(xy, np.array([[0, 2, 1]]), (10, 10))
+    assert (turned.sign == -1).all()
+    np.testing.assert_array_equal(np.sort(turned.column), np.sort(found.column))
+
+
+def test_small_chunks_cover_the_same_columns():
+    rng = np.random.default_rng(3)
+    xy, faces = rng.uniform(-5, 40, (60, 2)), rng.integers(0, 60, (50, 3))
+    whole = np.concatenate([np.stack((c.face, c.column)) for c in cover(xy, faces, (32, 40))], axis=1)
+    parts = [np.stack((c.face, c.column)) for c in cover(xy, faces, (32, 40), chunk=100)]
+    assert len(parts) > 10
+    np.testing.assert_array_equal(np.concatenate(parts, axis=1), whole)
+
+
+# --- counting ----------------------------------------------------------------------------------------
+
+
+def test_components_and_closedness():
+    two = joined(box(), box(at=(3, 0, 0)))
+    assert components(two) == 2
+    assert is_closed(two)
+    assert not is_closed(without_face(two))
+    soup = Surface(two.vertices[two.faces].reshape(-1, 3), np.arange(3 * len(two.faces)).reshape(-1, 3))
+    assert components(soup) == 2
+    assert is_closed(soup)
+    assert len(merged(soup).vertices) == 16
+    flipped = Surface(two.vertices, np.concatenate((two.faces[:1, ::-1], two.faces[1:])))
+    assert not is_closed(flipped)
+
+
+def test_samples_are_uniform_by_area():
+    square = np.array([[0.0, 0, 0], [4, 0, 0], [4, 1, 0], [0, 1, 0], [1, 0, 0]])
+    uneven = Surface(square, np.array([[0, 4, 3], [4, 1, 2], [4, 2, 3]], np.int64))
+    points, normals = sample_surface(uneven, 100_000, np.random.default_rng(0))
+    counts, _, _ = np.histogram2d(points[:, 0], points[:, 1], bins=(8, 4), range=((0, 4), (0, 1)))
+    assert abs(counts / 100_000 * 32 - 1).max() < 0.1
+    np.testing.assert_array_equal(normals, np.broadcast_to([0.0, 0, 1], normals.shape))
+
+
+# --- files -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("suffix", ["ply", "obj", "stl", "off", "glb"])
+def test_meshes_are_read_whole_from_every_kind_of_file(tmp_path, suffix):
+    shape = box()
+    trimesh.Trimesh(shape.vertices, shape.faces, process=False).export(tmp_path / f"box.{suffix}")
+    read = read_surface(tmp_path / f"box.{suffix}")
+    assert len(read.faces) == 12
+    assert components(read) == 1
+    assert is_closed(read)
+    assert overlap(read, shape, columns=64).intersection == pytest.approx(1, rel=0.02)
+
+
+def test_a_cloud_may_be_the_reference_but_not_the_mesh(tmp_path):
+    mesh, cloud = tmp_path / "mesh.ply", tmp_path / "cloud.xyz"
+    shape = sphere(1.0, 4)
+    trimesh.Trimesh(shape.vertices, shape.faces, process=False).export(mesh)
+    np.savetxt(cloud, sample_surface(shape, 5_000, np.random.default_rng(0))[0])
+    metrics = evaluate_files(mesh, cloud, samples=2_000)
+    assert metrics.chamfer_floor is None
+    assert metrics.iou is None
+    assert metrics.normal_consistency is None
+    assert metrics.chamfer < 0.01
+    with pytest.raises(InputError, match="holds points but no faces"):
+        evaluate_files(cloud, mesh)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("absent.ply", None, "no such file"),
+        ("broken.ply", b"ply\nformat nonsense", "cannot be read as a PLY mesh"),
+        ("broken.glb", b"not a glb at all", "cannot be read as a GLB mesh"),
+        ("index.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "index.obj"),
+        ("point.obj", b"v 1 1 1\nv 1 1 1\nv 1 1 1\nf 1 2 3\n", "all vertices coincide"),
+        ("nan.off", b"OFF\n3 1 0\n0 0 nan\n1 0 0\n0 1 0\n3 0 1 2\n", "not a finite number"),
+    ],
+)
+def test_unusable_files_are_one_line(tmp_path, name, content, message):
+    if content is not None:
+        (tmp_path / name).write_bytes(content)
+    with pytest.raises(InputError, match=message) as caught:
+        read_surface(tmp_path / name)
+    assert "\n" not in str(caught.value)
+    assert name in str(caught.value)
+
+
+def test_the_table_and_the_json_hold_the_figures(tmp_path):
+    metrics = evaluate_surfaces(sphere(0.9, 3), sphere(1.0, 3), samples=1_000, columns=32)
+    text = format_metrics(metrics)
+    assert f"{metrics.chamfer:.3e}" in text
+    assert f"{metrics.iou:.4f}" in text
+    write_metrics(tmp_path / "figures.json", metrics)
+    written = json.loads((tmp_path / "figures.json").read_text())
+    assert written["chamfer"] == metrics.chamfer
+    assert written["components"] == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["figures.json"]
+
+
+def test_samples_must_be_positive():
+    with pytest.raises(ValueError, match="samples=0"):
+        evaluate_surfaces(box(), box(), samples=0)
