@@ -1,0 +1,82 @@
+"""NPY ``(N, 3 | 6 | 9)`` and NPZ with ``points`` and, optionally, ``normals`` and ``colors``."""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..neural_fields import InputError
+from .point_cloud import PointCloud, colors_from, normals_from
+from .text import table_to_cloud
+
+__all__ = ["read_npy", "read_npz"]
+
+
+def read_npy(path: Path) -> PointCloud:
+    """Read one array with columns xyz, xyz + normal or xyz + normal + rgb.
+
+    Raises:
+        InputError: it is not a NumPy array of numbers with 3, 6 or 9 columns.
+    """
+    array = _load(path)
+    if not isinstance(array, np.ndarray):
+        raise InputError(f"{path}: an NPZ archive under another name; rename it to .npz")
+    return table_to_cloud(_numeric(array, "array", path), path, f"array of shape {array.shape}: ")
+
+
+def read_npz(path: Path) -> PointCloud:
+    """Read ``points`` (N, 3), ``normals`` (float, or int8/int16 over their largest value) and ``colors``.
+
+    Raises:
+        InputError: it is not such an archive, or an array has the wrong type or shape.
+    """
+    archive = _load(path)
+    if isinstance(archive, np.ndarray):
+        raise InputError(f"{path}: a single NumPy array under another name; rename it to .npy")
+    with archive:
+        if "points" not in archive.files:
+            raise InputError(f"{path}: points: no such array (there are: {', '.join(archive.files) or 'none'}); add it")
+        arrays = {
+            name: _member(archive, name, path) for name in ("points", "normals", "colors") if name in archive.files
+        }
+    points = arrays["points"]
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise InputError(f"{path}: points: shape {points.shape}; expected (N, 3)")
+    for name, array in arrays.items():
+        if array.shape != points.shape:
+            raise InputError(f"{path}: {name}: shape {array.shape}; expected {points.shape}, one row per point")
+    normals, colors = arrays.get("normals"), arrays.get("colors")
+    return PointCloud(
+        points.astype(np.float64),
+        None if normals is None else normals_from(normals),
+        None if colors is None else colors_from(colors),
+        str(path),
+    )
+
+
+def _load(path: Path) -> Any:
+    try:
+        return np.load(path, allow_pickle=False)
+    except (ValueError, EOFError, zipfile.BadZipFile, KeyError) as error:
+        reason = "holds Python objects" if "Object arrays" in str(error) else "damaged or not a NumPy file"
+        raise InputError(f"{path}: {reason}; save plain numbers with numpy.save or numpy.savez") from error
+
+
+def _member(archive: Any, name: str, path: Path) -> NDArray[Any]:
+    try:
+        return _numeric(archive[name], name, path)
+    except (ValueError, EOFError, zipfile.BadZipFile, zipfile.error) as error:
+        if isinstance(error, InputError):
+            raise
+        reason = "holds Python objects" if "Object arrays" in str(error) else "damaged"
+        raise InputError(f"{path}: {name}: {reason}; save plain numbers with numpy.savez") from error
+
+
+def _numeric(array: NDArray[Any], name: str, path: Path) -> NDArray[Any]:
+    if array.dtype.kind not in "fiu":
+        raise InputError(f"{path}: {name}: type {array.dtype}; expected numbers")
+    return array

@@ -1,0 +1,277 @@
+"""PLY point clouds, exactly: any vertex type and order, lists, elements before and after the vertices.
+
+Format: G. Turk, "The PLY Polygon File Format", 1994. An ASCII body is turned into the binary body of a
+file whose properties are all doubles, so that one decoder serves all three encodings.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..neural_fields import InputError
+from .meshes import triangulate, vertex_normals
+from .point_cloud import PointCloud, colors_from, normals_from
+
+__all__ = ["read_ply", "write_cloud_ply"]
+
+_KINDS = {
+    **dict.fromkeys(("char", "int8"), "i1"),
+    **dict.fromkeys(("uchar", "uint8"), "u1"),
+    **dict.fromkeys(("short", "int16"), "i2"),
+    **dict.fromkeys(("ushort", "uint16"), "u2"),
+    **dict.fromkeys(("int", "int32"), "i4"),
+    **dict.fromkeys(("uint", "uint32"), "u4"),
+    **dict.fromkeys(("float", "float32"), "f4"),
+    **dict.fromkeys(("double", "float64"), "f8"),
+}
+_ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
+_NORMALS = (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"))
+_COLORS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
+
+
+@dataclass(frozen=True)
+class _Property:
+    name: str
+    kind: str
+    length_kind: str | None  # of a list: the type of its length
+
+
+@dataclass(frozen=True)
+class _Element:
+    name: str
+    count: int
+    properties: tuple[_Property, ...]
+
+
+@dataclass(frozen=True)
+class _Lists:
+    """One list per row: ``lengths`` ``(n,)`` and all items in one array."""
+
+    lengths: NDArray[np.int64]
+    items: NDArray[Any]
+
+
+_Columns = dict[str, "NDArray[Any] | _Lists"]
+
+
+def read_ply(path: Path) -> PointCloud:
+    """Read the vertices of a PLY file; if they have no normals but the file has faces, take those of the mesh.
+
+    Raises:
+        InputError: the header is not PLY, x, y or z is missing, or the file ends too early.
+    """
+    data = path.read_bytes()
+    encoding, elements, body = _parse_header(data, path)
+    order = _ORDERS[encoding]
+    if encoding == "ascii":
+        data, body = _ascii_to_doubles(data[body:], path), 0
+    vertex: _Columns | None = None
+    faces: NDArray[np.int64] | None = None
+    for element in elements:
+        stored = _as_doubles(element) if encoding == "ascii" else element
+        columns, body = _decode(data, body, stored, order, path)
+        if element.name == "vertex":
+            vertex = {p.name: _restore(columns[p.name], p) for p in element.properties}
+            if _channels(vertex, _NORMALS) is not None:
+                break  # nothing that follows is needed
+        elif element.name == "face":
+            lists = columns.get("vertex_indices", columns.get("vertex_index"))
+            faces = triangulate(lists.lengths, lists.items.astype(np.int64)) if isinstance(lists, _Lists) else None
+    if vertex is None:
+        raise InputError(f"{path}: vertex: the header declares no such element; export it as a point cloud")
+    return _cloud(vertex, faces, path)
+
+
+def write_cloud_ply(path: str | Path, cloud: PointCloud) -> None:
+    """Write ``cloud`` as binary little-endian PLY with double coordinates; an existing file is replaced at the end."""
+    path = Path(path)
+    fields = [(name, "<f8") for name in "xyz"]
+    values = list(cloud.points.T)
+    if cloud.normals is not None:
+        fields += [(name, "<f4") for name in ("nx", "ny", "nz")]
+        values += list(cloud.normals.T)
+    if cloud.colors is not None:
+        fields += [(name, "u1") for name in ("red", "green", "blue")]
+        values += list(np.rint(cloud.colors * 255).astype(np.uint8).T)
+    rows = np.empty(len(cloud), np.dtype(fields))
+    for (name, _), column in zip(fields, values, strict=True):
+        rows[name] = column
+    types = {"<f8": "double", "<f4": "float", "u1": "uchar"}
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(cloud)}"]
+    header += [f"property {types[kind]} {name}" for name, kind in fields]
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        temporary.write_bytes("\n".join([*header, "end_header\n"]).encode() + rows.tobytes())
+        temporary.replace(path)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise InputError(f"{path}: cannot be written ({error.strerror}); choose another place") from error
+
+
+def _cloud(vertex: _Columns, faces: NDArray[np.int64] | None, path: Path) -> PointCloud:
+    points = _channels(vertex, (("x", "y", "z"),))
+    if points is None:
+        missing = ", ".join(name for name in "xyz" if name not in vertex)
+        raise InputError(f"{path}: vertex: property {missing} is missing; export it with x, y and z")
+    points = points.astype(np.float64)
+    normals, colors = _channels(vertex, _NORMALS), _channels(vertex, _COLORS)
+    if faces is not None and len(faces) and (faces.min() < 0 or faces.max() >= len(points)):
+        raise InputError(f"{path}: face: names a vertex beyond the {len(points)} there are; export it again")
+    from_faces = normals is None and faces is not None and len(faces) > 0
+    return PointCloud(
+        points,
+        vertex_normals(points, faces) if from_faces else None if normals is None else normals_from(normals),
+        None if colors is None else colors_from(colors),
+        str(path),
+        "mesh" if from_faces else "file",
+    )
+
+
+def _channels(columns: _Columns, names: tuple[tuple[str, str, str], ...]) -> NDArray[Any] | None:
+    """The first triple of scalar properties that is there, as ``(N, 3)``."""
+    for triple in names:
+        found = [columns.get(name) for name in triple]
+        arrays = [column for column in found if isinstance(column, np.ndarray)]
+        if len(arrays) == 3:
+            return np.stack(arrays, axis=1)
+    return None
+
+
+def _parse_header(data: bytes, path: Path) -> tuple[str, list[_Element], int]:
+    if not re.match(rb"ply[ \t]*\r?\n", data):
+        raise InputError(f"{path}: does not start with 'ply', so it is not a PLY file; check its extension")
+    end = re.search(rb"^end_header[ \t]*(\r\n|\n|\r)", data, re.MULTILINE)
+    if end is None:
+        raise InputError(f"{path}: end_header is missing, so the header is cut off; export it again")
+    encoding = ""
+    elements: list[_Element] = []
+    for number, line in enumerate(data[: end.start()].decode("ascii", "replace").splitlines()[1:], start=2):
+        words = line.split()
+        try:
+            match words:
+                case [] | ["comment" | "obj_info", *_]:
+                    continue
+                case ["format", name, *_] if name in _ORDERS:
+                    encoding = name
+                case ["element", name, count] if int(count) >= 0:
+                    elements.append(_Element(name, int(count), ()))
+                case ["property", "list", length_kind, kind, name]:
+                    elements[-1] = _with(elements[-1], _Property(name, _KINDS[kind], _KINDS[length_kind]))
+                case ["property", kind, name]:
+                    elements[-1] = _with(elements[-1], _Property(name, _KINDS[kind], None))
+                case _:
+                    raise ValueError(line)
+        except (ValueError, KeyError, IndexError) as error:
+            raise InputError(
+                f"{path}: header line {number}: {line.strip()!r} is not valid PLY; export it again"
+            ) from error
+    if not encoding:
+        raise InputError(f"{path}: format: missing from the header; expected one of {', '.join(_ORDERS)}")
+    return encoding, elements, end.end()
+
+
+def _with(element: _Element, added: _Property) -> _Element:
+    return _Element(element.name, element.count, (*element.properties, added))
+
+
+def _ascii_to_doubles(body: bytes, path: Path) -> bytes:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", DeprecationWarning)  # what numpy < 2.3 gives instead of a ValueError
+        try:
+            return np.fromstring(body.decode("ascii"), np.float64, sep=" ").astype("<f8").tobytes()
+        except (ValueError, DeprecationWarning) as error:
+            raise InputError(f"{path}: {_first_bad_word(body)} in an ascii PLY; export it again") from error
+
+
+def _first_bad_word(body: bytes) -> str:
+    for number, line in enumerate(body.splitlines(), start=1):
+        for word in line.split():
+            try:
+                float(word)
+            except ValueError:
+                return f"line {number} after the header: {word[:40].decode('ascii', 'replace')!r} is not a number"
+    return "something is not a number"
+
+
+def _as_doubles(element: _Element) -> _Element:
+    doubles = (_Property(p.name, "f8", "f8" if p.length_kind else None) for p in element.properties)
+    return _Element(element.name, element.count, tuple(doubles))
+
+
+def _restore(column: NDArray[Any] | _Lists, declared: _Property) -> NDArray[Any] | _Lists:
+    """Give a scalar column its declared type back (an ASCII body was read as doubles)."""
+    if isinstance(column, _Lists):
+        return column
+    # A double written into an ascii "float" property keeps its digits: people do write map coordinates so.
+    return column if declared.kind[0] == "f" else column.astype(declared.kind)
+
+
+def _decode(data: bytes, start: int, element: _Element, order: str, path: Path) -> tuple[_Columns, int]:
+    """Read all rows of ``element`` from ``data[start:]`` → columns by name, and where the rows end."""
+    if element.count == 0 or not element.properties:
+        return {p.name: np.empty(0, p.kind) for p in element.properties}, start
+    try:
+        uniform = _decode_uniform(data, start, element, order)
+        return uniform if uniform is not None else _decode_ragged(data, start, element, order)
+    except (ValueError, IndexError) as error:
+        raise InputError(
+            f"{path}: {element.name}: the file ends before its {element.count} rows do (truncated?); "
+            "copy or export it again"
+        ) from error
+
+
+def _decode_uniform(data: bytes, start: int, element: _Element, order: str) -> tuple[_Columns, int] | None:
+    """Decode rows that are all as long as the first one; None if they are not."""
+    fields: list[tuple[str, str] | tuple[str, str, tuple[int]]] = []
+    at = start
+    for number, p in enumerate(element.properties):
+        if p.length_kind is None:
+            fields.append((f"{number}", order + p.kind))
+            at += np.dtype(p.kind).itemsize
+            continue
+        length = int(np.frombuffer(data, order + p.length_kind, 1, at)[0])
+        fields += [(f"{number}#", order + p.length_kind), (f"{number}", order + p.kind, (length,))]
+        at += np.dtype(p.length_kind).itemsize + length * np.dtype(p.kind).itemsize
+    row = np.dtype(fields)
+    has_lists = any(p.length_kind for p in element.properties)
+    if has_lists and start + row.itemsize * element.count > len(data):
+        return None
+    rows = np.frombuffer(data, row, element.count, start)
+    columns: _Columns = {}
+    for number, p in enumerate(element.properties):
+        column = rows[f"{number}"]
+        if p.length_kind is None:
+            columns[p.name] = column.astype(p.kind)
+            continue
+        lengths = rows[f"{number}#"].astype(np.int64)
+        if bool((lengths != lengths[0]).any()):
+            return None
+        columns[p.name] = _Lists(lengths, column.reshape(-1).astype(p.kind))
+    return columns, start + row.itemsize * element.count
+
+
+def _decode_ragged(data: bytes, start: int, element: _Element, order: str) -> tuple[_Columns, int]:
+    """Decode row by row: where each row starts depends on all rows before it."""
+    values: list[list[NDArray[Any]]] = [[] for _ in element.properties]
+    at = start
+    for _ in range(element.count):
+        for column, p in zip(values, element.properties, strict=True):
+            length = 1
+            if p.length_kind is not None:
+                length = int(np.frombuffer(data, order + p.length_kind, 1, at)[0])
+                at += np.dtype(p.length_kind).itemsize
+            column.append(np.frombuffer(data, order + p.kind, length, at) if length else np.empty(0, p.kind))
+            at += length * np.dtype(p.kind).itemsize
+    columns: _Columns = {}
+    for column, p in zip(values, element.properties, strict=True):
+        items = np.concatenate(column).astype(p.kind)
+        columns[p.name] = items if p.length_kind is None else _Lists(np.array([len(c) for c in column]), items)
+    return columns, at

@@ -1,0 +1,219 @@
+"""``prepare_cloud``: a file's points → clean, oriented points in the unit sphere."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from ..neural_fields import InputError, Similarity
+from .orientation import estimate_normals, nearest, orient_normals, outwardness
+from .point_cloud import PointCloud
+from .reading import MIN_POINTS
+
+__all__ = ["CleaningReport", "OrientedCloud", "prepare_cloud"]
+
+Float64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class CleaningReport:
+    """What was done to a cloud.
+
+    Attributes:
+        read: points in the file.
+        kept: points left.
+        dropped_nan: points with a coordinate that is not finite.
+        dropped_duplicates: points at exactly the place of an earlier one.
+        repaired_normals: zero or NaN normals replaced by their neighbours' mean.
+        dropped_normals: points whose normal could not be repaired.
+        normals_source: "file", "mesh" (from the file's faces) or "estimated".
+        flipped: whether all normals pointed inward and were turned round.
+        pieces: connected pieces oriented one by one; 0 if normals were not estimated, or a sensor oriented them.
+    """
+
+    read: int
+    kept: int
+    dropped_nan: int
+    dropped_duplicates: int
+    repaired_normals: int
+    dropped_normals: int
+    normals_source: Literal["file", "mesh", "estimated"]
+    flipped: bool
+    pieces: int
+
+    def summary(self) -> str:
+        """One line for people."""
+        source = {"file": "from the file", "mesh": "of the mesh", "estimated": "estimated"}[self.normals_source]
+        parts = [f"{self.kept:,} of {self.read:,} points", f"normals {source}"]
+        if self.pieces > 1:
+            parts.append(f"oriented in {self.pieces:,} separate pieces")
+        if self.flipped:
+            parts.append("all normals pointed inward and were flipped (--normals file keeps them)")
+        counts = {
+            "not finite": self.dropped_nan,
+            "duplicate": self.dropped_duplicates,
+            "without a usable normal": self.dropped_normals,
+        }
+        dropped = ", ".join(f"{count:,} {what}" for what, count in counts.items() if count)
+        if self.repaired_normals:
+            parts.append(f"{self.repaired_normals:,} normals repaired")
+        return "; ".join([*parts, *([f"dropped {dropped}"] if dropped else [])])
+
+
+@dataclass(frozen=True)
+class OrientedCloud:
+    """A clean cloud in the unit sphere.
+
+    Attributes:
+        points: ``(N, 3)`` float32, in the unit sphere.
+        normals: ``(N, 3)`` float32, of unit length, outward.
+        colors: ``(N, 3)`` float32 in [0, 1], or None.
+        similarity: the way back to input coordinates.
+        report: what was dropped, repaired and estimated.
+    """
+
+    points: NDArray[np.float32]
+    normals: NDArray[np.float32]
+    colors: NDArray[np.float32] | None
+    similarity: Similarity
+    report: CleaningReport
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+def prepare_cloud(
+    cloud: PointCloud,
+    *,
+    normals: Literal["auto", "file", "estimate"] = "auto",
+    sensor_origin: tuple[float, float, float] | None = None,
+    neighbors: int = 16,
+) -> OrientedCloud:
+    """Clean a cloud, give it oriented unit normals and move it into the unit sphere.
+
+    Points that are not finite and exact duplicates (all but the first) are dropped, then the cloud is centred and
+    scaled in float64, and only then rounded to float32.
+
+    Args:
+        cloud: as read.
+        normals: "file" keeps the file's normals and their sign; "estimate" ignores them; "auto" takes the
+            file's if at least half are usable, and turns them all round when they plainly point inward.
+        sensor_origin: where the scanner stood, in input coordinates; estimated normals are turned towards it.
+        neighbors: size of the neighbourhoods normals are estimated and repaired from.
+
+    Raises:
+        InputError: too few points are left, or ``normals="file"`` and there are none.
+        ValueError: ``normals`` or ``neighbors`` is none of those allowed.
+    """
+    if normals not in ("auto", "file", "estimate"):
+        raise ValueError(f"normals={normals!r}: expected 'auto', 'file' or 'estimate'")
+    if neighbors < 3:
+        raise ValueError(f"neighbors={neighbors}: expected at least 3, to span a plane")
+    if sensor_origin is not None and not np.isfinite(np.asarray(sensor_origin, np.float64)).all():
+        raise InputError(f"sensor_origin={sensor_origin}: expected three finite numbers")
+
+    finite = np.flatnonzero(np.isfinite(cloud.points).all(axis=1))
+    kept = finite[_first_of_each(cloud.points[finite])]
+    _check_enough(len(kept), cloud, "are left after dropping NaN and duplicates")
+    similarity = Similarity.to_unit_sphere(cloud.points[kept])
+    points = similarity.to_unit(cloud.points[kept])
+
+    given = _unit_rows(cloud.normals[kept]) if cloud.normals is not None and normals != "estimate" else None
+    usable = np.zeros(len(points), bool) if given is None else given.any(axis=1)
+    if normals == "file" and not usable.any():
+        raise InputError(f"{cloud.source}: normals: the file has none; use --normals estimate")
+    source: Literal["file", "mesh", "estimated"] = cloud.normals_source
+    repaired = pieces = 0
+    flipped = False
+    if given is not None and (normals == "file" or 2 * usable.sum() >= len(points)):
+        unit, decided = _repair(points, given, usable, neighbors)
+        repaired = int(decided.sum() - usable.sum())
+        points, unit, kept = points[decided], unit[decided], kept[decided]
+        _check_enough(len(kept), cloud, "have a usable normal; use --normals estimate")
+        flipped = normals == "auto" and _plainly_inward(points, unit)
+        unit = -unit if flipped else unit
+        dropped_normals = int(len(decided) - decided.sum())
+    else:
+        source, dropped_normals = "estimated", 0
+        unit, pieces = _estimate(points, neighbors, similarity, sensor_origin)
+    report = CleaningReport(
+        read=len(cloud),
+        kept=len(kept),
+        dropped_nan=len(cloud) - len(finite),
+        dropped_duplicates=len(finite) - len(kept) - dropped_normals,
+        repaired_normals=repaired,
+        dropped_normals=dropped_normals,
+        normals_source=source,
+        flipped=flipped,
+        pieces=pieces,
+    )
+    colors = None if cloud.colors is None else cloud.colors[kept]
+    return OrientedCloud(points.astype(np.float32), unit.astype(np.float32), colors, similarity, report)
+
+
+def _check_enough(count: int, cloud: PointCloud, why: str) -> None:
+    if count < MIN_POINTS:
+        raise InputError(
+            f"{cloud.source}: points: only {count} of {len(cloud)} {why}; at least {MIN_POINTS} are needed"
+        )
+
+
+def _first_of_each(points: Float64) -> NDArray[np.int64]:
+    """Indices, in order, of the points that no earlier point equals."""
+    order = np.lexsort((points + 0.0).T)  # stable: among equals the first comes first; + 0.0: minus zero is zero
+    ordered = points[order]
+    first = np.ones(len(points), bool)
+    first[1:] = (ordered[1:] != ordered[:-1]).any(axis=1)
+    return np.sort(order[first])
+
+
+def _unit_rows(vectors: NDArray[np.float32]) -> Float64:
+    """Rows over their lengths; rows of no length, or with NaN, become zero."""
+    rows = vectors.astype(np.float64)
+    rows[~np.isfinite(rows).all(axis=1)] = 0
+    lengths = np.linalg.norm(rows, axis=1, keepdims=True)
+    return np.divide(rows, lengths, out=np.zeros_like(rows), where=lengths > 0)
+
+
+def _repair(
+    points: Float64, normals: Float64, usable: NDArray[np.bool_], neighbors: int, *, agreement: float = 0.5
+) -> tuple[Float64, NDArray[np.bool_]]:
+    """Replace unusable normals by the mean of the nearest usable ones.
+
+    A mean shorter than ``agreement`` (1: all equal, 0: they cancel) decides nothing.
+
+    Returns:
+        Normals ``(N, 3)``, and which of them are decided ``(N,)``.
+    """
+    missing = np.flatnonzero(~usable)
+    if len(missing) == 0:
+        return normals, usable
+    near = cKDTree(points[usable]).query(points[missing], k=min(neighbors, int(usable.sum())), workers=-1)[1]
+    mean = normals[usable][near.reshape(len(missing), -1)].mean(axis=1)
+    length = np.linalg.norm(mean, axis=1)
+    clear = length > agreement
+    repaired, decided = normals.copy(), usable.copy()
+    repaired[missing[clear]] = mean[clear] / length[clear, None]
+    decided[missing[clear]] = True
+    return repaired, decided
+
+
+def _plainly_inward(points: Float64, normals: Float64, *, score: float = -0.3, share: float = 0.9) -> bool:
+    """Whether the evidence is overwhelming: an open scan, seen from one side, must not be turned round."""
+    mean, negative = outwardness(points, normals)
+    return mean < score and negative >= share
+
+
+def _estimate(
+    points: Float64, neighbors: int, similarity: Similarity, sensor_origin: tuple[float, float, float] | None
+) -> tuple[Float64, int]:
+    near = nearest(points, neighbors)
+    normals, spread = estimate_normals(points, near)
+    if sensor_origin is None:
+        return orient_normals(points, normals, spread, near)
+    towards = similarity.to_unit(np.asarray(sensor_origin, np.float64)) - points
+    return np.where((normals * towards).sum(axis=1, keepdims=True) < 0, -normals, normals), 0

@@ -1,0 +1,89 @@
+"""``read_cloud``: any supported file → ``PointCloud``."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from types import MappingProxyType
+
+import numpy as np
+
+from ..neural_fields import InputError
+from .arrays import read_npy, read_npz
+from .las import read_las
+from .meshes import read_off, read_stl
+from .obj import read_obj
+from .ply import read_ply
+from .point_cloud import PointCloud
+from .text import read_text
+
+__all__ = ["MIN_POINTS", "READERS", "read_cloud"]
+
+MIN_POINTS = 10
+"""Fewer points than this are no surface."""
+
+READERS: Mapping[str, Callable[[Path], PointCloud]] = MappingProxyType(
+    {
+        ".ply": read_ply,
+        ".obj": read_obj,
+        ".stl": read_stl,
+        ".off": read_off,
+        ".xyz": read_text,
+        ".txt": read_text,
+        ".csv": read_text,
+        ".npy": read_npy,
+        ".npz": read_npz,
+        ".las": read_las,
+        ".laz": read_las,
+    }
+)
+"""What reads which extension."""
+
+
+def read_cloud(path: str | Path) -> PointCloud:
+    """Read a point cloud; of a mesh, its vertices with area-weighted vertex normals.
+
+    Args:
+        path: a PLY, OBJ, STL, OFF, XYZ, TXT, CSV, NPY, NPZ, LAS or LAZ file.
+
+    Raises:
+        InputError: the file is missing, damaged, foreign or of an unknown kind, or holds no usable cloud.
+
+    Example:
+        >>> read_cloud("scan.xyzz")
+        Traceback (most recent call last):
+        ...
+        mplicits.neural_fields.errors.InputError: scan.xyzz: no such file; check the path
+    """
+    path = Path(path)
+    if path.is_dir():
+        raise InputError(f"{path}: is a directory; name the point-cloud file in it")
+    if not path.exists():
+        raise InputError(f"{path}: no such file; check the path")
+    extension = path.suffix.lower()
+    if extension not in READERS:
+        known = ", ".join(READERS)
+        nearest = difflib.get_close_matches(extension, READERS, n=1, cutoff=0.5)
+        hint = f"did you mean {nearest[0]}? " if nearest else ""
+        raise InputError(f"{path}: unknown extension {extension!r}; {hint}known are {known}")
+    try:
+        if path.stat().st_size == 0:
+            raise InputError(f"{path}: the file is empty; export it again")
+        cloud = READERS[extension](path)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error}); check its permissions") from error
+    _check_cloud(cloud)
+    return cloud
+
+
+def _check_cloud(cloud: PointCloud) -> None:
+    finite = cloud.points[np.isfinite(cloud.points).all(axis=1)]
+    if len(finite) == 0:
+        raise InputError(f"{cloud.source}: points: none with finite coordinates among {len(cloud)}; export it again")
+    if bool((finite == finite[0]).all()) and len(finite) > 1:
+        raise InputError(f"{cloud.source}: points: all {len(finite)} coincide; export it with more digits")
+    if len(finite) < MIN_POINTS:
+        raise InputError(
+            f"{cloud.source}: points: {len(finite)} with finite coordinates; at least {MIN_POINTS} are needed"
+        )
