@@ -139,5 +139,5 @@ def _piece_signs(points: Float64, normals: Float64, pieces: int, piece: NDArray[
 
 def nearest(points: Float64, count: int) -> Index:
     """Indices ``(N, count)`` of each point's nearest points, itself first."""
-    tree = KDTree(points)
-    return tree.query(points, k=min(count, len(points)), workers=-1)[1].astype(np.int64)
+    _, index = KDTree(points).query(points, k=min(count, len(points)), workers=-1)
+    return np.asarray(index, np.int64)

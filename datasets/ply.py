@@ -125,14 +125,10 @@ def _cloud(vertex: _Columns, faces: NDArray[np.int64] | None, path: Path) -> Poi
     normals, colors = _channels(vertex, _NORMALS), _channels(vertex, _COLORS)
     if faces is not None and len(faces) and (faces.min() < 0 or faces.max() >= len(points)):
         raise InputError(f"{path}: face: names a vertex beyond the {len(points)} there are; export it again")
-    from_faces = normals is None and faces is not None and len(faces) > 0
-    return PointCloud(
-        points,
-        vertex_normals(points, faces) if from_faces else None if normals is None else normals_from(normals),
-        None if colors is None else colors_from(colors),
-        str(path),
-        "mesh" if from_faces else "file",
-    )
+    shades = None if colors is None else colors_from(colors)
+    if normals is None and faces is not None and len(faces):
+        return PointCloud(points, vertex_normals(points, faces), shades, str(path), "mesh")
+    return PointCloud(points, None if normals is None else normals_from(normals), shades, str(path))
 
 
 def _channels(columns: _Columns, names: tuple[tuple[str, str, str], ...]) -> NDArray[Any] | None:

@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from ..neural_fields import InputError, Similarity
 from .orientation import estimate_normals, nearest, orient_normals, outwardness
@@ -123,7 +123,9 @@ def prepare_cloud(
     points = similarity.to_unit(cloud.points[kept])
 
     given = _unit_rows(cloud.normals[kept]) if cloud.normals is not None and normals != "estimate" else None
-    usable = np.zeros(len(points), bool) if given is None else given.any(axis=1)
+    usable: NDArray[np.bool_] = np.zeros(len(points), bool)
+    if given is not None:
+        usable = (given != 0).any(axis=1)
     if normals == "file" and not usable.any():
         raise InputError(f"{cloud.source}: normals: the file has none; use --normals estimate")
     source: Literal["file", "mesh", "estimated"] = cloud.normals_source
@@ -192,7 +194,7 @@ def _repair(
     missing = np.flatnonzero(~usable)
     if len(missing) == 0:
         return normals, usable
-    near = cKDTree(points[usable]).query(points[missing], k=min(neighbors, int(usable.sum())), workers=-1)[1]
+    near = KDTree(points[usable]).query(points[missing], k=min(neighbors, int(usable.sum())), workers=-1)[1]
     mean = normals[usable][near.reshape(len(missing), -1)].mean(axis=1)
     length = np.linalg.norm(mean, axis=1)
     clear = length > agreement
