@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from ..datasets import PointCloud, read_cloud
 from ..neural_fields import InputError, Similarity
 
 __all__ = [
@@ -19,10 +20,12 @@ __all__ = [
     "Surface",
     "components",
     "face_normals",
+    "from_cloud",
     "is_closed",
     "merged",
     "read_surface",
     "sample_surface",
+    "vertex_normals",
 ]
 
 Float64 = NDArray[np.float64]
@@ -67,10 +70,20 @@ def read_surface(path: str | Path) -> Surface:
         mesh = _load_mesh(path)
         if mesh is not None:
             return mesh
-    from ..datasets import read_cloud
+    return from_cloud(read_cloud(path))
 
-    cloud = read_cloud(path)
-    return Surface(cloud.points, np.empty((0, 3), np.int64), cloud.normals, cloud.colors)
+
+def from_cloud(cloud: PointCloud) -> Surface:
+    """The finite points of a cloud, as a surface without faces; normals of unit length, or zero."""
+    finite = np.isfinite(cloud.points).all(axis=1)
+    normals = colors = None
+    if cloud.normals is not None:
+        normals = np.nan_to_num(cloud.normals[finite].astype(np.float64), posinf=0.0, neginf=0.0)
+        length = np.linalg.norm(normals, axis=1, keepdims=True)
+        normals = np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
+    if cloud.colors is not None:
+        colors = cloud.colors[finite].astype(np.float64)
+    return Surface(cloud.points[finite], np.empty((0, 3), np.int64), normals, colors)
 
 
 def _load_mesh(path: Path) -> Surface | None:
@@ -107,6 +120,17 @@ def face_normals(surface: Surface) -> tuple[Float64, Float64]:
     cross = np.cross(b - a, c - a)
     length = np.linalg.norm(cross, axis=1)
     return np.divide(cross, length[:, None], out=np.zeros_like(cross), where=length[:, None] > 0), length / 2
+
+
+def vertex_normals(surface: Surface) -> Float64:
+    """Normals at the vertices ``(V, 3)``, area-weighted over their faces, equal vertices taken as one; not unit."""
+    places, index = np.unique(surface.vertices, axis=0, return_inverse=True)
+    index = index.reshape(-1)
+    normals, areas = face_normals(surface)
+    total = np.zeros_like(places)
+    for k in range(3):
+        np.add.at(total, index[surface.faces[:, k]], normals * areas[:, None])
+    return total[index]
 
 
 def sample_surface(surface: Surface, count: int, rng: np.random.Generator) -> tuple[Float64, Float64 | None]:
