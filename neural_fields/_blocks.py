@@ -1,0 +1,281 @@
+"""Finding the few cells that a surface crosses: culled blocks first, then signs at the corners of what is left.
+
+All indices are lattice points (see `Lattice`). The search ends at blocks of 2³ cells, whose centre is itself a
+lattice point, so that no value of it is thrown away.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ._cube import CORNERS, cube_tables
+from ._lattice import Lattice, Sampler
+
+__all__ = ["ActiveCells", "NoSurfaceError", "active_cells", "cull_blocks"]
+
+Ints = NDArray[np.int64]
+Floats = NDArray[np.floating]
+
+_OFFSETS: Ints = np.stack(np.meshgrid(*[np.arange(3)] * 3, indexing="ij"), -1).reshape(27, 3)
+
+
+class NoSurfaceError(ValueError):
+    """The field does not change sign in the box; the message says what it does instead."""
+
+
+@dataclass(frozen=True)
+class ActiveCells:
+    """The cells that the surface crosses.
+
+    Attributes:
+        cases: ``(C,)`` uint8 case of each cell (see `cube_tables`).
+        corners: ``(C, 8)`` rows of ``points``.
+        points: ``(P, 3)`` lattice points.
+        values: ``(P,)`` their values; only those at the end of a crossed edge mean anything.
+    """
+
+    cases: NDArray[np.uint8]
+    corners: NDArray[np.int32]
+    points: Ints
+    values: Floats
+
+
+def cull_blocks(sampler: Sampler, *, level: int, lipschitz: float) -> tuple[Ints, Floats]:
+    """Halve blocks from about 1/32 of the box down to 2³ cells, dropping those that cannot hold a zero.
+
+    A stage with blocks of half diagonal r asks level j only at the block centres c and keeps those with
+
+        |f_j(c)| ≤ L r + δ_j,
+
+    because a zero p of the target has |f_j(p)| < δ_j (it is in level j's band) and |f_j(c) − f_j(p)| ≤ L r. The
+    level is the first one with 2 δ_j ≤ L r: a finer one would cull little more; for the target δ is 0. Two
+    neighbouring centres with opposite signs are both kept whatever they say, since there the bound is violated.
+
+    Returns:
+        Origins ``(B, 3)`` of the surviving blocks of 2³ cells, and ``(B,)`` target values at their centres.
+
+    Raises:
+        NoSurfaceError: nothing survives.
+    """
+    lattice = sampler.lattice
+    deltas = [float(delta) for delta in sampler.field.deltas[:level]]
+    size = 2 ** max(1, math.floor(math.log2(max(lattice.shape) / 32)))
+    axes = [np.arange(0, cells, size) for cells in lattice.shape]
+    blocks = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+    while True:
+        reach = lipschitz * lattice.step * size * math.sqrt(3) / 2
+        asked = next((j for j, delta in enumerate(deltas) if 2 * delta <= reach), level) if size > 2 else level
+        slack = deltas[asked] if asked < level else 0.0
+        values = sampler.values(blocks + size // 2, level=asked, stage=f"blocks of {size}³ cells")
+        kept = (np.abs(values) <= reach + slack) | _beside_other_sign(blocks // size, values < 0)
+        if not kept.any():
+            raise NoSurfaceError(_where_signs_are(values, blocks + size // 2, lattice, sampler))
+        blocks, values = blocks[kept], values[kept]
+        if size == 2:
+            return blocks, values
+        size //= 2
+        blocks = (blocks[:, None] + CORNERS * size).reshape(-1, 3)
+        blocks = blocks[(blocks < lattice.shape).all(axis=1)]
+
+
+def _beside_other_sign(cells: Ints, inside: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Which of the ``cells`` (N, 3) have one of their six neighbours in the list with the other sign."""
+    size = cells.max(axis=0) + 2
+    strides = np.array([size[1] * size[2], size[2], 1])
+    keys = cells @ strides
+    order = np.argsort(keys)
+    keys, sign = keys[order], inside[order]
+    found = np.zeros(len(cells), bool)
+    for stride in strides:
+        right = np.minimum(np.searchsorted(keys, keys + stride), len(keys) - 1)
+        differ = (keys[right] == keys + stride) & (sign[right] != sign)
+        found[order[differ]] = True
+        found[order[right[differ]]] = True
+    return found
+
+
+def _where_signs_are(values: Floats, points: Ints, lattice: Lattice, sampler: Sampler) -> str:
+    smallest = int(np.abs(values).argmin())
+    where = ", ".join(f"{c:.4g}" for c in lattice.positions(points[smallest]))
+    inside = int((values < 0).sum())
+    signs = {0: "all positive", len(values): "all negative"}.get(inside, f"{inside} of them negative")
+    return (
+        f"no surface in the box {lattice}: of {sum(sampler.counts)} points evaluated the last {len(values)} are "
+        f"{signs}, the smallest value {values[smallest]:.4g} at ({where}), cells of {lattice.step:.3g}"
+    )
+
+
+def active_cells(sampler: Sampler, blocks: Ints, centres: Floats, *, level: int, lipschitz: float) -> ActiveCells:
+    """Find the crossed cells of 2³-cell blocks, and exact values at both ends of every crossed edge.
+
+    The sign at a corner q follows from any centre c of a block around it with |f(c)| > L |q − c|; only the other
+    corners are evaluated, then the ends of the edges that turn out to be crossed, until nothing is new. Where
+    the surface leaves the blocks through a face, the neighbour there is added and the search goes on, so that
+    the surface is closed inside the box also where the field is steeper than L.
+
+    Raises:
+        NoSurfaceError: the blocks hold no sign change.
+    """
+    known: tuple[Ints, Floats] = (np.empty(0, np.int64), centres[:0])
+    while True:
+        corners = _Corners(sampler, blocks, centres, known, level=level, lipschitz=lipschitz)
+        missing = corners.open_neighbours()
+        if not len(missing):
+            return corners.cells()
+        known = corners.known_values()
+        blocks = np.concatenate((blocks, missing))
+        centres = np.concatenate((centres, sampler.values(missing + 1, level=level, stage="closing")))
+
+
+def _merged(first: Ints, second: Ints) -> Ints:
+    """The union of two sorted lists, sorted; a stable sort merges sorted runs in linear time."""
+    both = np.sort(np.concatenate((first, second)), kind="stable")
+    return both[np.append(True, both[1:] != both[:-1])]
+
+
+class _Corners:
+    """Signs and values at the corner points of a set of 2³-cell blocks.
+
+    Every point belongs to the block at its lower end: point ``(2 b + o)`` with ``o`` in {0, 1}³ is number ``o`` of
+    block b. The points on the upper sides belong to the neighbours there, which are listed as owners whether
+    they are blocks of the set or not, so that shared points have one number and no sorting of points is needed.
+    """
+
+    def __init__(
+        self,
+        sampler: Sampler,
+        blocks: Ints,
+        centres: Floats,
+        known: tuple[Ints, Floats],
+        *,
+        level: int,
+        lipschitz: float,
+    ) -> None:
+        self.sampler, self.level = sampler, level
+        self.lattice = sampler.lattice
+        # Two spare layers on each axis let the key of any neighbour be had by adding a stride.
+        self.size = tuple(cells // 2 + 3 for cells in self.lattice.shape)
+        self.strides = np.array([self.size[1] * self.size[2], self.size[2], 1])
+        keys = (blocks // 2 + 1) @ self.strides
+        order = np.argsort(keys)
+        self.blocks, self.keys = blocks[order], keys[order]
+        self.owners = self.keys
+        for stride in self.strides:
+            self.owners = _merged(self.owners, self.owners + stride)
+        self.owner_of = [
+            np.searchsorted(self.owners, self.keys + corner @ self.strides).astype(np.int32) for corner in CORNERS
+        ]
+        count = 8 * len(self.owners)
+        self.value = np.zeros(count, centres.dtype)
+        self.known = np.zeros(count, bool)
+        self._set(self.rows(_OFFSETS[13]), centres[order])
+        owner = np.searchsorted(self.owners, known[0] // 8)
+        self._set(owner * 8 + known[0] % 8, known[1])
+        self.inside = np.zeros(count, bool)
+        self._find_signs(centres[order], lipschitz * self.lattice.step)
+        self._verify_ends()
+
+    def rows(self, offset: Ints) -> NDArray[np.int32]:
+        """Point numbers of one of the 27 points, ``offset`` in {0, 1, 2}³, of every block."""
+        weights = np.array([1, 2, 4])
+        return self.owner_of[int(offset // 2 @ weights)] * 8 + np.int32(offset % 2 @ weights)
+
+    def points(self, rows: NDArray[np.integer]) -> Ints:
+        """Lattice points ``(N, 3)`` of point numbers."""
+        return self._origins(self.owners[rows // 8]) + CORNERS[rows % 8]
+
+    def _origins(self, keys: Ints) -> Ints:
+        return 2 * (np.stack(np.unravel_index(keys, self.size), axis=1) - 1)
+
+    def _set(self, rows: NDArray[np.integer], values: Floats) -> None:
+        self.value[rows], self.known[rows] = values, True
+
+    def _evaluate(self, rows: NDArray[np.integer], stage: str) -> None:
+        self._set(rows, self.sampler.values(self.points(rows), level=self.level, stage=stage))
+
+    def _find_signs(self, centres: Floats, slope: float) -> None:
+        low, high = np.full_like(self.value, -np.inf), np.full_like(self.value, np.inf)
+        touched = np.zeros(len(self.value), bool)
+        for offset in _OFFSETS:
+            rows, reach = self.rows(offset), slope * math.sqrt(((offset - 1) ** 2).sum())
+            low[rows], high[rows] = np.maximum(low[rows], centres - reach), np.minimum(high[rows], centres + reach)
+            touched[rows] = True
+        # Where two centres contradict each other the field is steeper than L: ask it.
+        unsure = touched & ~self.known & ((low > 0) == (high < 0))
+        self._evaluate(np.flatnonzero(unsure), "corners")
+        self.inside = np.where(self.known, self.value < 0, high < 0)
+
+    def _verify_ends(self) -> None:
+        """Evaluate both ends of every crossed edge until no sign changes any more."""
+        tables = cube_tables()
+        while True:
+            cases = self._cases()
+            needed = np.zeros(len(self.value), bool)
+            for cell, case in zip(CORNERS, cases, strict=True):
+                ends = tables.ends[case]
+                for number, corner in enumerate(CORNERS):
+                    needed[self.rows(cell + corner)[ends[:, number]]] = True
+            rows = np.flatnonzero(needed & ~self.known)
+            self._evaluate(rows, "crossings")
+            inside = self.value[rows] < 0
+            changed = (inside != self.inside[rows]).any()
+            self.inside[rows] = inside
+            if not changed:
+                return
+
+    def _cases(self) -> NDArray[np.uint8]:
+        """The case of each of the eight cells of each block, ``(8, B)``; cells beyond the box are empty."""
+        cases = np.zeros((8, len(self.blocks)), np.uint8)
+        for offset in _OFFSETS:
+            inside = self.inside[self.rows(offset)]
+            for cell in np.flatnonzero(((offset >= CORNERS) & (offset <= CORNERS + 1)).all(axis=1)):
+                cases[cell] |= inside.astype(np.uint8) << np.uint8((offset - CORNERS[cell]) @ np.array([1, 2, 4]))
+        for cell, beyond in enumerate((self.blocks + corner >= self.lattice.shape).any(axis=1) for corner in CORNERS):
+            cases[cell][beyond] = 0
+        return cases
+
+    def open_neighbours(self) -> Ints:
+        """Blocks outside the set, inside the box, that share a face whose points differ in sign."""
+        cells = (np.array(self.lattice.shape) + 1) // 2
+        found = [self.keys[:0]]
+        for axis in range(3):
+            for side, step in ((0, -1), (2, 1)):
+                face = [self.inside[self.rows(offset)] for offset in _OFFSETS[_OFFSETS[:, axis] == side]]
+                place = self.blocks[:, axis] // 2 + step
+                open_ = ~(np.logical_and.reduce(face) | ~np.logical_or.reduce(face))
+                keys = self.keys[open_ & (place >= 0) & (place < cells[axis])] + step * self.strides[axis]
+                near = np.minimum(np.searchsorted(self.keys, keys), len(self.keys) - 1)
+                found.append(keys[self.keys[near] != keys])
+        return self._origins(np.unique(np.concatenate(found)))
+
+    def known_values(self) -> tuple[Ints, Floats]:
+        """What has been evaluated: keys of points, and their values."""
+        rows = np.flatnonzero(self.known)
+        return self.owners[rows // 8] * 8 + rows % 8, self.value[rows]
+
+    def cells(self) -> ActiveCells:
+        """The crossed cells."""
+        cases = self._cases()
+        crossed = [np.flatnonzero((case != 0) & (case != 255)) for case in cases]
+        corners = np.concatenate(
+            [
+                np.stack([self.rows(cell + corner)[chosen] for corner in CORNERS], axis=1)
+                for cell, chosen in zip(CORNERS, crossed, strict=True)
+            ]
+        )
+        if not len(corners):
+            centres = self.rows(_OFFSETS[13])
+            raise NoSurfaceError(
+                _where_signs_are(self.value[centres], self.points(centres), self.lattice, self.sampler)
+            )
+        is_used = np.zeros(len(self.value), bool)
+        is_used[corners] = True
+        used = np.flatnonzero(is_used)
+        number = np.empty(len(self.value), np.int32)
+        number[used] = np.arange(len(used), dtype=np.int32)
+        chosen = np.concatenate([case[rows] for case, rows in zip(cases, crossed, strict=True)])
+        return ActiveCells(chosen, number[corners], self.points(used), self.value[used])
