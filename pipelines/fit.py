@@ -1,0 +1,353 @@
+"""``fit``: from an oriented point cloud to a multiscale SDF, level by level (paper Sec. 3.2)."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ..datasets import OrientedCloud, PointCloud, prepare_cloud, read_cloud
+from ..neural_fields import InputError, MultiscaleSDF, Similarity, Siren, save_field
+from .cloud_distance import CloudDistance
+from .config import load_config
+from .fit_config import FitConfig
+from .fit_state import (
+    FIELD_FILE,
+    STATE_FILE,
+    environment,
+    fingerprint,
+    load_state,
+    read_record,
+    save_state,
+    write_record,
+)
+from .sampling import (
+    Samples,
+    band_samples,
+    delta_of,
+    distance_samples,
+    free_lengths,
+    offset_samples,
+    with_previous,
+)
+from .training import LevelTrainer, Progress, Source, StopFlag, stop_on_signals
+
+__all__ = ["FitConfig", "Interrupted", "Run", "fit"]
+
+# A residual starts at a tenth of the usual output scale, close to the level before it.
+RESIDUAL_GAIN = 0.1
+
+Cloud = PointCloud | str | Path | NDArray[np.floating]
+
+
+class Interrupted(Exception):  # noqa: N818  what happened is no error
+    """Training was asked to stop, and a usable checkpoint was written.
+
+    Attributes:
+        directory: the run directory, for ``--resume``; None if the fit had none.
+    """
+
+    def __init__(self, directory: Path | None) -> None:
+        super().__init__("interrupted" if directory is None else f"interrupted; checkpoint in {directory}")
+        self.directory = directory
+
+
+@dataclass(frozen=True)
+class Run:
+    """A finished fit.
+
+    Attributes:
+        field: the trained field, in unit-sphere coordinates, on the CPU.
+        similarity: the way back to input coordinates.
+        directory: where it was written, or None.
+        record: what ``run.json`` holds.
+    """
+
+    field: MultiscaleSDF
+    similarity: Similarity
+    directory: Path | None
+    record: dict[str, Any]
+
+
+def fit(
+    cloud: Cloud,
+    config: FitConfig | None = None,
+    *,
+    out: str | Path | None = None,
+    resume: bool = False,
+    progress: Callable[[Progress], None] | None = None,
+) -> Run:
+    """Fit a multiscale SDF to a point cloud.
+
+    Args:
+        cloud: a file, a `PointCloud`, or an array ``(N, 3)`` or ``(N, 6)`` of points (and normals).
+        config: settings; the defaults are those of the ``default`` preset.
+        out: run directory for the field, the checkpoints and ``run.json``; None writes nothing.
+        resume: continue the interrupted run in ``out`` with its own settings; ``config`` is then ignored.
+        progress: called now and then with how far the training is.
+
+    Raises:
+        InputError: the cloud cannot be read or used, or there is nothing to resume.
+        Interrupted: Ctrl-C or SIGTERM; ``out`` then holds a checkpoint and a usable field.
+
+    Example:
+        >>> run = fit("scan.ply")  # doctest: +SKIP
+        >>> run.field.value(run.similarity.to_unit(points))  # doctest: +SKIP
+    """
+    directory = None if out is None else Path(out)
+    if resume:
+        if directory is None:
+            raise InputError("resume: needs the run directory (out=...)")
+        config = load_config(FitConfig, None, read_record(directory)["config"])
+    config = config or FitConfig()
+    device = choose_device(config.device)
+    raw = _as_cloud(cloud)
+    oriented = prepare_cloud(raw, normals=config.normals, sensor_origin=config.sensor_origin)
+    if directory is not None:
+        directory.mkdir(parents=True, exist_ok=True)
+    fitting = _Fitting(oriented, raw.source, config, device, directory, progress)
+    if resume:
+        fitting.restore()
+    with stop_on_signals() as flag:
+        return fitting.run(flag)
+
+
+def choose_device(name: str) -> torch.device:
+    """``auto`` is CUDA where there is a working GPU, the CPU elsewhere.
+
+    Raises:
+        InputError: no such device here.
+    """
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        device = torch.device(name)
+        torch.empty(1, device=device)
+    except (RuntimeError, AssertionError) as error:
+        reason = str(error).splitlines()[0]
+        raise InputError(f"--device {name}: not usable here ({reason}); use auto or cpu") from error
+    return device
+
+
+def _as_cloud(cloud: Cloud) -> PointCloud:
+    if isinstance(cloud, PointCloud):
+        return cloud
+    if isinstance(cloud, str | Path):
+        return read_cloud(cloud)
+    array = np.asarray(cloud)
+    if array.ndim != 2 or array.shape[1] not in (3, 6):
+        raise InputError(f"cloud: array of shape {array.shape}; expected (N, 3) points or (N, 6) points and normals")
+    normals = array[:, 3:].astype(np.float32) if array.shape[1] == 6 else None
+    return PointCloud(points=array[:, :3].astype(np.float64), normals=normals, source="array")
+
+
+class _Fitting:
+    """One fit under way: the frozen levels, and the records of their stages."""
+
+    def __init__(
+        self,
+        cloud: OrientedCloud,
+        source: str,
+        config: FitConfig,
+        device: torch.device,
+        directory: Path | None,
+        progress: Callable[[Progress], None] | None,
+    ) -> None:
+        self.cloud, self.source, self.config = cloud, source, config
+        self.device, self.directory = device, directory
+        self.progress = progress or (lambda _: None)
+        self.fingerprint = fingerprint(cloud)
+        self.frozen: MultiscaleSDF | None = None
+        self.stages: list[dict[str, Any]] = []
+        self.trainer_state: dict[str, Tensor] = {}
+
+    def run(self, flag: StopFlag) -> Run:
+        index = CloudDistance(torch.from_numpy(self.cloud.points), torch.from_numpy(self.cloud.normals))
+        if self.directory is not None:
+            write_record(self.directory, self.record(finished=False))
+        for level in range(len(self.stages), self.config.num_levels):
+            self.train_level(level, index, flag)
+        assert self.frozen is not None
+        record = self.record(finished=True)
+        if self.directory is not None:
+            save_field(
+                self.directory / FIELD_FILE, self.frozen, similarity=self.cloud.similarity, metadata={"run": record}
+            )
+            write_record(self.directory, record)
+            (self.directory / STATE_FILE).unlink(missing_ok=True)
+        return Run(self.frozen.cpu(), self.cloud.similarity, self.directory, record)
+
+    def train_level(self, level: int, index: CloudDistance, flag: StopFlag) -> None:
+        """Make the samples of one level, train it, freeze it."""
+        config, started = self.config, time.monotonic()
+        generator = torch.Generator().manual_seed(config.seed * 1009 + level)
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(config.seed * 1009 + level)
+            network = Siren(
+                config.widths[level],
+                config.depths[level],
+                omega=config.omegas[level],
+                output_gain=RESIDUAL_GAIN if level else 1.0,
+            ).to(self.device)
+        self.progress(Progress(f"level {level}: samples", 0, config.steps[level], 0.0, {}))
+        delta = None if self.frozen is None else self.next_delta()
+        sources = self.sources(index, delta, generator)
+        sampling_seconds = time.monotonic() - started
+        trainer = LevelTrainer(
+            network,
+            sources,
+            steps=config.steps[level],
+            learning_rate=config.learning_rates[level],
+            seconds=self.seconds_for(level, sampling_seconds),
+            generator=generator,
+        )
+        if self.trainer_state:
+            trainer.restore(self.trainer_state)
+            self.trainer_state = {}
+
+        def report(trainer: LevelTrainer) -> None:
+            self.progress(Progress(f"level {level}", trainer.step, trainer.steps, trainer.fraction, trainer.losses))
+
+        finished = trainer.run(flag, report=report, save=lambda trainer: self.save(trainer, delta))
+        if not finished:
+            self.save(trainer, delta)
+            raise Interrupted(self.directory)
+        self.frozen = self.grown(network, delta).requires_grad_(False)
+        self.stages.append(
+            {
+                "level": level,
+                "parameters": sum(p.numel() for p in network.parameters()),
+                "delta": delta,
+                "samples": {source.name: len(source.samples) for source in sources},
+                "sampling_seconds": round(sampling_seconds, 3),
+                "training_seconds": round(trainer.elapsed, 3),
+                "steps": trainer.step,
+                "ended_by_time_budget": trainer.ended_early,
+                "losses": trainer.losses,
+                **self.surface_errors(),
+            }
+        )
+        self.save(None, None)
+
+    def sources(self, index: CloudDistance, delta: float | None, generator: torch.Generator) -> list[Source]:
+        """What a level learns from: Ω for level 0, the band around the frozen surface for the others."""
+        config = self.config
+        weights = (config.data_weight, config.normal_weight, config.eikonal_weight)
+        points, normals = torch.from_numpy(index.points), torch.from_numpy(index.normals)
+        surface = Samples(points, distance=torch.zeros(len(points)), normal=normals)
+        if self.frozen is None or delta is None:
+            domain = distance_samples(index, config.samples, generator=generator)
+            far_weights = (config.data_weight * config.domain_weight, 0.0, config.eikonal_weight)
+            half = config.batch // 2
+            return [
+                Source("surface", surface.to(self.device), half, *weights),
+                Source("domain", domain.to(self.device), half, *far_weights),
+            ]
+        offset = offset_samples(index, free_lengths(index, delta), config.samples, generator=generator)
+        band = band_samples(index, delta, config.samples, generator=generator)
+        third, sources = config.batch // 3, []
+        for name, samples in (("surface", surface), ("offset", offset), ("band", band)):
+            kept = with_previous(samples, self.frozen, delta, device=self.device)
+            sources.append(Source(name, kept, third, *weights))
+        return sources
+
+    def next_delta(self) -> float:
+        """Half-width of the band around the last frozen level (Eq. 5)."""
+        errors = self.values_at_cloud()
+        delta = delta_of(errors, epsilon=self.config.epsilon, quantile=self.config.quantile)
+        # A level that met every point exactly would leave its successor no band at all.
+        return max(delta, 1e-6)
+
+    @torch.no_grad()
+    def values_at_cloud(self) -> Tensor:
+        """Values of the finest frozen level at the input points → ``(n,)`` on the CPU."""
+        assert self.frozen is not None
+        points = torch.from_numpy(self.cloud.points)
+        return torch.cat([self.frozen.value(part.to(self.device)).cpu() for part in points.split(1 << 18)])
+
+    def surface_errors(self) -> dict[str, float]:
+        """|f| at the input points, in input units: how closely the level passes by them."""
+        errors = self.values_at_cloud().abs() * self.cloud.similarity.scale
+        return {
+            "rms_at_points": float(errors.square().mean().sqrt()),
+            "max_at_points": float(errors.max()),
+        }
+
+    def seconds_for(self, level: int, sampling_seconds: float) -> float | None:
+        """How long this level may train within the time budget."""
+        if self.config.time_budget is None:
+            return None
+        spent = sum(stage["sampling_seconds"] + stage["training_seconds"] for stage in self.stages)
+        left = max(self.config.time_budget - spent - sampling_seconds, 1e-3)
+        return left * self.config.share_of_time(level)
+
+    def grown(self, network: Siren, delta: float | None) -> MultiscaleSDF:
+        """The frozen levels and one more."""
+        if self.frozen is None or delta is None:
+            return MultiscaleSDF(network, [], []).to(self.device)
+        return self.frozen.with_level(network, delta=delta).to(self.device)
+
+    def save(self, trainer: LevelTrainer | None, delta: float | None) -> None:
+        """Write a usable field and all that `restore` needs."""
+        if self.directory is None:
+            return
+        field = self.frozen if trainer is None else self.grown(trainer.network, delta)
+        assert field is not None
+        record = self.record(finished=False)
+        save_field(self.directory / FIELD_FILE, field, similarity=self.cloud.similarity, metadata={"run": record})
+        tensors = {} if trainer is None else {f"trainer.{k}": v for k, v in trainer.state().items()}
+        if self.frozen is not None:
+            tensors |= {f"frozen.{name}": tensor for name, tensor in self.frozen.state_dict().items()}
+        save_state(self.directory, tensors, {"fingerprint": self.fingerprint, "stages": self.stages})
+        write_record(self.directory, record)
+
+    def restore(self) -> None:
+        """Take up an interrupted run.
+
+        Raises:
+            InputError: nothing to resume, a damaged file, or another cloud than the run began with.
+        """
+        assert self.directory is not None
+        tensors, progress = load_state(self.directory)
+        if progress["fingerprint"] != self.fingerprint:
+            raise InputError(
+                f"{self.source}: not the cloud that {self.directory} was fitted to; "
+                "resume with that cloud, or leave out --resume and choose a new -o"
+            )
+        self.stages = progress["stages"]
+        levels = [
+            Siren(self.config.widths[i], self.config.depths[i], omega=self.config.omegas[i])
+            for i in range(len(self.stages))
+        ]
+        if levels:
+            self.frozen = MultiscaleSDF(levels[0], levels[1:], [1.0] * (len(levels) - 1)).to(self.device)
+            self.frozen.load_state_dict(_with_prefix(tensors, "frozen."))
+            self.frozen.requires_grad_(False)
+        self.trainer_state = _with_prefix(tensors, "trainer.")
+
+    def record(self, *, finished: bool) -> dict[str, Any]:
+        """What ``run.json`` holds."""
+        return {
+            "finished": finished,
+            "cloud": self.source,
+            "cleaning": dataclasses.asdict(self.cloud.report),
+            "similarity": dataclasses.asdict(self.cloud.similarity),
+            "config": dataclasses.asdict(self.config),
+            "stages": self.stages,
+            "parameters": sum(stage["parameters"] for stage in self.stages),
+            "deltas": [stage["delta"] for stage in self.stages if stage["delta"] is not None],
+            "training_seconds": round(sum(s["sampling_seconds"] + s["training_seconds"] for s in self.stages), 3),
+            "environment": environment(self.device),
+        }
+
+
+def _with_prefix(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    return {name.removeprefix(prefix): tensor for name, tensor in tensors.items() if name.startswith(prefix)}

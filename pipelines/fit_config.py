@@ -1,0 +1,80 @@
+"""Settings of ``fit``; every field is a key of the YAML presets and a flag of the command line."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+__all__ = ["FitConfig"]
+
+
+def _setting(default: Any, text: str) -> Any:
+    return field(default=default, metadata={"help": text})
+
+
+@dataclass(frozen=True)
+class FitConfig:
+    """Settings of ``fit``; the defaults are the ``default`` preset.
+
+    Raises:
+        ValueError: lists of different lengths, or a number out of range; the message names the field.
+    """
+
+    widths: tuple[int, ...] = _setting((128, 256, 400), "neurons per layer, one number per level")
+    depths: tuple[int, ...] = _setting((2, 2, 2), "sine layers, one number per level")
+    omegas: tuple[float, ...] = _setting((30.0, 45.0, 100.0), "SIREN frequency of each level (Eq. 2)")
+    steps: tuple[int, ...] = _setting((1500, 900, 700), "training steps, one number per level")
+    learning_rates: tuple[float, ...] = _setting((2e-3, 1e-3, 1e-3), "peak learning rate of each level")
+    batch: int = _setting(8192, "samples per training step")
+    levels: int | None = _setting(None, "train only this many levels, coarse to fine")
+    data_weight: float = _setting(3000.0, "weight of (f(x) - d)^2 where the distance d is known (Eq. 4)")
+    normal_weight: float = _setting(100.0, "weight of 1 - cos(grad f, N) where the normal N is known (Eq. 4)")
+    eikonal_weight: float = _setting(50.0, "weight of (|grad f| - 1)^2 (Eq. 4)")
+    domain_weight: float = _setting(0.1, "factor on data_weight for level 0's distances away from the cloud")
+    epsilon: float = _setting(0.3, "margin of the bands (Eq. 5)")
+    quantile: float = _setting(0.999, "quantile of |f(x_j)| that a band must hold; 1 is the maximum of Eq. 5")
+    samples: int = _setting(400_000, "samples made per level and kind, drawn from at every step")
+    normals: Literal["auto", "file", "estimate"] = _setting("auto", "where normals come from: auto, file or estimate")
+    sensor_origin: tuple[float, float, float] | None = _setting(
+        None, "x y z of the sensor, in input units: estimated normals face it"
+    )
+    time_budget: float | None = _setting(None, "end training after about this many seconds, all levels together")
+    seed: int = _setting(0, "random seed")
+    device: str = _setting("auto", "torch device: auto, cpu, cuda, ...")
+
+    def __post_init__(self) -> None:
+        count = len(self.widths)
+        if count == 0:
+            raise ValueError("widths: expected at least one level")
+        for name in ("depths", "omegas", "steps", "learning_rates"):
+            if len(getattr(self, name)) != count:
+                raise ValueError(
+                    f"{name}: {len(getattr(self, name))} entries for {count} widths; expected one for each"
+                )
+        for name in ("widths", "depths", "omegas", "steps", "learning_rates"):
+            if min(getattr(self, name)) <= 0:
+                raise ValueError(f"{name}: {getattr(self, name)}; expected numbers > 0")
+        for name in ("batch", "samples", "epsilon", "time_budget"):
+            number = getattr(self, name)
+            if number is not None and number <= 0:
+                raise ValueError(f"{name}: {number}; expected > 0")
+        for name in ("data_weight", "normal_weight", "eikonal_weight", "domain_weight"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"{name}: {getattr(self, name)}; expected ≥ 0")
+        if not 0 < self.quantile <= 1:
+            raise ValueError(f"quantile: {self.quantile}; expected a number in (0, 1]")
+        if self.levels is not None and not 1 <= self.levels <= count:
+            raise ValueError(f"levels: {self.levels}; expected 1 to {count}, the number of widths")
+
+    @property
+    def num_levels(self) -> int:
+        """How many levels are trained."""
+        return len(self.widths) if self.levels is None else self.levels
+
+    def share_of_time(self, level: int) -> float:
+        """The part of a time budget left before ``level`` that this level may use, by the cost of its steps."""
+        cost = [
+            steps * (width**2 * depth + 4096)
+            for steps, width, depth in zip(self.steps, self.widths, self.depths, strict=True)
+        ]
+        return cost[level] / sum(cost[level : self.num_levels])

@@ -1,0 +1,108 @@
+"""What a fit leaves in its run directory, and how an interrupted one finds its way back."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import json
+import os
+import platform
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from ..datasets import OrientedCloud
+from ..neural_fields import InputError
+
+__all__ = [
+    "FIELD_FILE",
+    "RECORD_FILE",
+    "STATE_FILE",
+    "environment",
+    "fingerprint",
+    "load_state",
+    "read_record",
+    "save_state",
+    "write_record",
+]
+
+FIELD_FILE = "field.safetensors"
+RECORD_FILE = "run.json"
+STATE_FILE = "resume.safetensors"
+
+
+def fingerprint(cloud: OrientedCloud) -> str:
+    """A digest of points and normals, to tell whether a resumed run sees the same cloud."""
+    digest = hashlib.sha256()
+    for array in (cloud.points, cloud.normals):
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
+
+
+def environment(device: torch.device) -> dict[str, Any]:
+    """What the figures of a run depend on: versions, threads, machine."""
+    names = ("mplicits", "torch", "numpy", "scipy", "scikit-image", "safetensors")
+    return {
+        "versions": {name: importlib.metadata.version(name) for name in names},
+        "python": platform.python_version(),
+        "machine": f"{platform.system()} {platform.machine()}",
+        "cpu_count": os.cpu_count(),
+        "threads": torch.get_num_threads(),
+        "device": torch.cuda.get_device_name(device) if device.type == "cuda" else str(device),
+    }
+
+
+def write_record(directory: Path, record: Mapping[str, Any]) -> None:
+    """Write ``run.json``, whole or not at all."""
+    partial = directory / f".{RECORD_FILE}.{os.getpid()}.partial"
+    partial.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
+    partial.replace(directory / RECORD_FILE)
+
+
+def read_record(directory: Path) -> dict[str, Any]:
+    """Read ``run.json``.
+
+    Raises:
+        InputError: there is none, or it is damaged.
+    """
+    path = directory / RECORD_FILE
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+        if not isinstance(record["config"], dict):
+            raise TypeError("config is not a mapping")
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; expected a run directory written by `mplicits fit`") from None
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{path}: damaged ({error}); fit again into a new directory") from error
+    return record
+
+
+def save_state(directory: Path, tensors: Mapping[str, Tensor], progress: Mapping[str, Any]) -> None:
+    """Write the resume file, whole or not at all; ``progress`` is JSON."""
+    partial = directory / f".{STATE_FILE}.{os.getpid()}.partial"
+    plain = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in tensors.items()}
+    save_file(plain, partial, metadata={"progress": json.dumps(dict(progress))})
+    partial.replace(directory / STATE_FILE)
+
+
+def load_state(directory: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Read what `save_state` wrote.
+
+    Raises:
+        InputError: there is no resume file, or it is damaged.
+    """
+    path = directory / STATE_FILE
+    if not path.is_file():
+        raise InputError(f"{path}: no such file, so there is nothing to resume; leave out --resume and choose a new -o")
+    try:
+        with safe_open(path, framework="pt") as file:
+            progress = json.loads(file.metadata()["progress"])
+            return {name: file.get_tensor(name) for name in file.keys()}, progress  # noqa: SIM118
+    except (SafetensorError, KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path}: damaged ({error}); fit again into a new directory") from error

@@ -1,0 +1,133 @@
+"""Training samples of one level (paper Sec. 3.2, "Sampling"), made once and drawn from at every step.
+
+Everything that a step would otherwise have to find out again is stored with a sample: the distance and the
+normal that the cloud gives it, and the value and the gradient of the frozen levels before. A step then
+evaluates the residual being trained and nothing else.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..neural_fields import Field, Jet
+from .cloud_distance import CloudDistance
+
+__all__ = ["Samples", "band_samples", "delta_of", "distance_samples", "free_lengths", "offset_samples", "with_previous"]
+
+# Half-edge of the cube in which level 0 learns distances: the mesher's box is [-1, 1]³, and a little more.
+DOMAIN = 1.05
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Points with what is known about them.
+
+    Attributes:
+        points: ``(N, 3)``.
+        distance: ``(N,)`` known signed distance, or None: only |∇f| = 1 is known.
+        normal: ``(N, 3)`` known unit gradient, or None.
+        value: ``(N,)`` what the levels before say here; None at level 0.
+        gradient: ``(N, 3)`` their gradient; None at level 0.
+    """
+
+    points: Tensor
+    distance: Tensor | None = None
+    normal: Tensor | None = None
+    value: Tensor | None = None
+    gradient: Tensor | None = None
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def take(self, index: Tensor) -> Samples:
+        """The samples at ``index``."""
+        parts = (self.points, self.distance, self.normal, self.value, self.gradient)
+        return Samples(*(None if part is None else part[index] for part in parts))  # pyright: ignore[reportArgumentType]
+
+    def to(self, device: torch.device) -> Samples:
+        """The same samples on another device."""
+        parts = (self.points, self.distance, self.normal, self.value, self.gradient)
+        return Samples(*(None if part is None else part.to(device) for part in parts))  # pyright: ignore[reportArgumentType]
+
+
+def delta_of(errors: Tensor, *, epsilon: float, quantile: float) -> float:
+    """The half-width of a band, ``δ = (1 + ε) · Q_q(|f(x_j)|)``; the paper's Eq. 5 at ``quantile = 1``.
+
+    Args:
+        errors: ``(n,)`` values f(x_j) at the input points.
+        epsilon: the ε of Eq. 5.
+        quantile: q in (0, 1]; below 1 a few stray points cannot widen the band.
+    """
+    ordered = errors.abs().flatten().sort().values
+    return (1 + epsilon) * float(ordered[max(0, math.ceil(quantile * len(ordered)) - 1)])
+
+
+def distance_samples(cloud: CloudDistance, count: int, *, generator: torch.Generator) -> Samples:
+    """Points with their signed distance to the cloud: half uniform in the domain, half near the surface.
+
+    The near half is Gaussian around cloud points, with deviations from twice the point spacing to 0.1, so that
+    the coarse level sees every scale that it can represent.
+    """
+    near_count = count // 2
+    uniform = (2 * torch.rand(count - near_count, 3, generator=generator) - 1) * DOMAIN
+    anchors = torch.from_numpy(cloud.points)[torch.randint(len(cloud.points), (near_count,), generator=generator)]
+    least = min(2 * cloud.spacing, 0.1)
+    deviation = least * (0.1 / least) ** torch.rand(near_count, 1, generator=generator)
+    near = (anchors + deviation * torch.randn(near_count, 3, generator=generator)).clamp(-DOMAIN, DOMAIN)
+    points = torch.cat((uniform, near))
+    return Samples(points, distance=cloud.signed(points))
+
+
+def free_lengths(cloud: CloudDistance, delta: float, *, steps: int = 8) -> Tensor:
+    """How far along ±normal each cloud point can be moved while it stays the closest: the paper's t_j ≤ δ.
+
+    For each point and side the first t of ``steps`` decreasing ones for which the distance from x_j ± t N_j to the
+    cloud is t, up to the spacing of the cloud; 0 where none is.
+
+    Returns:
+        ``(2, N)``: outward and inward lengths.
+    """
+    lengths = np.zeros((2, len(cloud.points)))
+    for side, sign in enumerate((1.0, -1.0)):
+        open_rows = np.arange(len(cloud.points))
+        for t in np.linspace(delta, delta / steps, steps):
+            moved = cloud.points[open_rows] + sign * t * cloud.normals[open_rows]
+            # A curved or noisy cloud has points a little nearer than t without another sheet being there.
+            clear = cloud.nearest(moved) >= 0.9 * t
+            lengths[side, open_rows[clear]] = t
+            open_rows = open_rows[~clear]
+    return torch.from_numpy(lengths.astype(np.float32))
+
+
+def offset_samples(cloud: CloudDistance, lengths: Tensor, count: int, *, generator: torch.Generator) -> Samples:
+    """Points x_j + t N_j with distance t and gradient N_j, t uniform in the free length on either side."""
+    index = torch.randint(len(cloud.points), (count,), generator=generator)
+    side = torch.randint(2, (count,), generator=generator)
+    t = lengths[side, index] * torch.rand(count, generator=generator) * (1 - 2.0 * side)
+    normal = torch.from_numpy(cloud.normals)[index]
+    return Samples(torch.from_numpy(cloud.points)[index] + t[:, None] * normal, distance=t, normal=normal)
+
+
+def band_samples(cloud: CloudDistance, delta: float, count: int, *, generator: torch.Generator) -> Samples:
+    """Cloud points with every coordinate moved by U(−2δ, 2δ); `with_previous` rejects those outside the band."""
+    index = torch.randint(len(cloud.points), (count,), generator=generator)
+    shift = (2 * torch.rand(count, 3, generator=generator) - 1) * 2 * delta
+    return Samples(torch.from_numpy(cloud.points)[index] + shift)
+
+
+@torch.no_grad()
+def with_previous(samples: Samples, field: Field, delta: float, *, device: torch.device) -> Samples:
+    """Add the frozen levels' value and gradient, and reject the samples outside ``|f| < delta`` or a coarser band."""
+    points = samples.points.to(device)
+    level = field.num_levels - 1
+    jets = [field.jet(part) for part in points.split(1 << 16)]
+    jet = Jet(*(torch.cat(parts) for parts in zip(*jets, strict=True)))
+    kept = (jet.value.abs() < delta) & (field.in_band(points, level=level) if level else True)
+    moved = samples.to(device)
+    full = Samples(points, moved.distance, moved.normal, jet.value, jet.gradient)
+    return full.take(kept.nonzero()[:, 0])
