@@ -1,0 +1,191 @@
+"""Meshes out: PLY, OBJ, STL and GLB, in input coordinates, complete or not at all."""
+
+from __future__ import annotations
+
+import json
+import os
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..neural_fields import InputError, Similarity
+from ..neural_fields.meshing import Mesh
+
+__all__ = ["check_mesh_path", "needs_doubles", "write_mesh"]
+
+# float32 rounds a coordinate c by up to 6e-8 |c|. Up to this many scales from the origin that is less than a
+# hundredth of a cell at 2048³.
+FLOAT32_REACH = 128.0
+TEXT_ROWS = 1 << 16
+_GLTF_UBYTE, _GLTF_UINT, _GLTF_FLOAT = 5121, 5125, 5126
+
+
+def check_mesh_path(path: str | Path, similarity: Similarity | None = None) -> Path:
+    """Whether a mesh can be written to ``path``, to be asked before any long work.
+
+    Args:
+        path: the file to be; an existing file would be replaced.
+        similarity: that of the field, where it is known already.
+
+    Raises:
+        InputError: the extension is unknown or cannot hold the coordinates, the folder does not exist or may not
+            be written, or ``path`` is a folder.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in _WRITERS:
+        known = ", ".join(_WRITERS)
+        raise InputError(f"{path}: unknown mesh format {path.suffix or '(no extension)'!r}; use one of {known}")
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder; give the name of a file in it")
+    if not path.absolute().parent.is_dir():
+        raise InputError(f"{path}: the folder {path.absolute().parent} does not exist; make it first")
+    if not os.access(path.absolute().parent, os.W_OK):
+        raise InputError(f"{path}: the folder {path.absolute().parent} may not be written; choose another")
+    if path.suffix.lower() == ".stl" and similarity is not None and needs_doubles(similarity):
+        center = ", ".join(f"{c:.0f}" for c in similarity.center)
+        raise InputError(f"{path}: STL keeps seven digits, too few so far from the origin ({center}); use .ply or .obj")
+    return path
+
+
+def needs_doubles(similarity: Similarity) -> bool:
+    """Whether the coordinates are so far from the origin, as map coordinates are, that float32 would spoil them."""
+    return max(abs(c) for c in similarity.center) > FLOAT32_REACH * similarity.scale
+
+
+def write_mesh(path: str | Path, mesh: Mesh, similarity: Similarity | None = None) -> None:
+    """Write ``mesh``, moved to input coordinates by ``similarity``; the extension chooses the format.
+
+    PLY is binary, with double coordinates where float would spoil them (see `needs_doubles`), normals and
+    colours; OBJ has normals and colours; STL (binary) neither. GLB is float32 by its standard: far from the
+    origin it holds coordinates relative to ``similarity.center``, which becomes the translation of its node
+    and is repeated in the node's ``extras``. The file appears under its name only when it is complete.
+
+    Raises:
+        InputError: see `check_mesh_path`; or the disk is full.
+    """
+    similarity = similarity or Similarity.identity()
+    path = check_mesh_path(path, similarity)
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        _WRITERS[path.suffix.lower()](partial, mesh, similarity)
+        partial.replace(path)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror}); choose another place") from error
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def _bytes(colors: NDArray[np.floating]) -> NDArray[np.uint8]:
+    return np.rint(np.clip(colors, 0, 1) * 255).astype(np.uint8)
+
+
+def _write_ply(path: Path, mesh: Mesh, similarity: Similarity) -> None:
+    kind = "<f8" if needs_doubles(similarity) else "<f4"
+    columns = [(name, kind, column) for name, column in zip("xyz", similarity.to_input(mesh.vertices).T, strict=True)]
+    if mesh.normals is not None:
+        columns += [(name, "<f4", n) for name, n in zip(("nx", "ny", "nz"), mesh.normals.T, strict=True)]
+    if mesh.colors is not None:
+        columns += [(name, "u1", c) for name, c in zip(("red", "green", "blue"), _bytes(mesh.colors).T, strict=True)]
+    vertices = np.empty(len(mesh.vertices), [(name, kind) for name, kind, _ in columns])
+    for name, _, column in columns:
+        vertices[name] = column
+    faces = np.empty(len(mesh.faces), [("count", "u1"), ("index", "<i4", 3)])
+    faces["count"], faces["index"] = 3, mesh.faces
+    names = {"<f8": "double", "<f4": "float", "u1": "uchar"}
+    header = ["ply", "format binary_little_endian 1.0", "comment mplicits", f"element vertex {len(vertices)}"]
+    header += [f"property {names[kind]} {name}" for name, kind, _ in columns]
+    header += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header\n"]
+    with path.open("wb") as file:
+        file.write("\n".join(header).encode())
+        file.write(vertices.data)
+        file.write(faces.data)
+
+
+def _write_obj(path: Path, mesh: Mesh, similarity: Similarity) -> None:
+    digits = "%.15g" if needs_doubles(similarity) else "%.9g"
+    vertices = similarity.to_input(mesh.vertices)
+    line = "v " + " ".join([digits] * 3)
+    if mesh.colors is not None:
+        vertices = np.concatenate((vertices, mesh.colors), axis=1)
+        line += " %.4g %.4g %.4g"
+    faces, face = mesh.faces.astype(np.int64) + 1, "f %d %d %d\n"
+    if mesh.normals is not None:
+        faces, face = np.repeat(faces, 2, axis=1), "f %d//%d %d//%d %d//%d\n"
+    with path.open("w", encoding="ascii") as file:
+        file.write("# mplicits\n")
+        blocks = [(line + "\n", vertices), (face, faces)]
+        if mesh.normals is not None:
+            blocks.insert(1, ("vn %.5f %.5f %.5f\n", mesh.normals))
+        for template, rows in blocks:
+            for start in range(0, len(rows), TEXT_ROWS):
+                part = rows[start : start + TEXT_ROWS]
+                file.write(template * len(part) % tuple(part.ravel().tolist()))
+
+
+def _write_stl(path: Path, mesh: Mesh, similarity: Similarity) -> None:
+    corners = similarity.to_input(mesh.vertices)[mesh.faces]  # (F, 3, 3)
+    facing = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    length = np.linalg.norm(facing, axis=1, keepdims=True)
+    faces = np.zeros(len(mesh.faces), [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+    faces["normal"] = np.divide(facing, length, out=np.zeros_like(facing), where=length > 0)
+    faces["corners"] = corners
+    with path.open("wb") as file:
+        file.write(b"mplicits".ljust(80) + len(faces).to_bytes(4, "little"))
+        file.write(faces.data)
+
+
+def _write_glb(path: Path, mesh: Mesh, similarity: Similarity) -> None:
+    """GlTF 2.0 in one binary file: a JSON chunk that describes the arrays of a second, binary chunk."""
+    origin = np.asarray(similarity.center if needs_doubles(similarity) else (0.0, 0.0, 0.0))
+    positions = (similarity.to_input(mesh.vertices) - origin).astype("<f4")
+    arrays: list[tuple[NDArray[np.generic], int, str, dict[str, Any]]] = [
+        (mesh.faces.astype("<u4").reshape(-1), _GLTF_UINT, "SCALAR", {}),
+        (positions, _GLTF_FLOAT, "VEC3", {"min": positions.min(0).tolist(), "max": positions.max(0).tolist()}),
+    ]
+    attributes = {"POSITION": 1}
+    if mesh.normals is not None:
+        attributes["NORMAL"] = len(arrays)
+        arrays.append((mesh.normals.astype("<f4"), _GLTF_FLOAT, "VEC3", {}))
+    if mesh.colors is not None:
+        attributes["COLOR_0"] = len(arrays)
+        opaque = np.full((len(mesh.colors), 4), 255, np.uint8)  # four channels keep rows aligned to four bytes
+        opaque[:, :3] = _bytes(mesh.colors)
+        arrays.append((opaque, _GLTF_UBYTE, "VEC4", {"normalized": True}))
+    starts = np.cumsum([0] + [array.nbytes for array, *_ in arrays]).tolist()
+    header = {
+        "asset": {"version": "2.0", "generator": "mplicits"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"name": "mesh", "mesh": 0, "translation": origin.tolist(), "extras": {"origin": origin.tolist()}}],
+        "meshes": [{"primitives": [{"attributes": attributes, "indices": 0, "material": 0}]}],
+        "materials": [{"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.8}}],
+        "buffers": [{"byteLength": starts[-1]}],
+        "bufferViews": [
+            {"buffer": 0, "byteOffset": start, "byteLength": array.nbytes, "target": 34962 if index else 34963}
+            for index, (start, (array, *_)) in enumerate(zip(starts, arrays, strict=False))
+        ],
+        "accessors": [
+            {"bufferView": index, "componentType": kind, "count": len(array), "type": shape, **more}
+            for index, (array, kind, shape, more) in enumerate(arrays)
+        ],
+    }
+    text = json.dumps(header, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    with path.open("wb") as file:
+        file.write(struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + starts[-1]))
+        file.write(struct.pack("<I4s", len(text), b"JSON") + text)
+        file.write(struct.pack("<I4s", starts[-1], b"BIN\0"))
+        for array, *_ in arrays:
+            file.write(np.ascontiguousarray(array).data)
+
+
+_WRITERS: dict[str, Callable[[Path, Mesh, Similarity], None]] = {
+    ".ply": _write_ply,
+    ".obj": _write_obj,
+    ".stl": _write_stl,
+    ".glb": _write_glb,
+}

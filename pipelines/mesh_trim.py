@@ -1,0 +1,67 @@
+"""Parts of a mesh: the largest component, or what lies near the input points."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
+
+from ..neural_fields import InputError
+from ..neural_fields.meshing import Mesh
+
+__all__ = ["face_areas", "keep_faces", "keep_largest", "trim_distance"]
+
+
+def face_areas(mesh: Mesh) -> NDArray[np.float64]:
+    """Areas ``(F,)``."""
+    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
+    return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+
+
+def keep_faces(mesh: Mesh, kept: NDArray[np.bool_]) -> Mesh:
+    """The mesh with only the faces where ``kept`` ``(F,)`` is true, and the vertices they use."""
+    faces = mesh.faces[kept]
+    used = np.zeros(len(mesh.vertices), bool)
+    used[faces] = True
+    number = np.cumsum(used, dtype=mesh.faces.dtype) - 1
+    return dataclasses.replace(
+        mesh,
+        vertices=mesh.vertices[used],
+        faces=number[faces].astype(mesh.faces.dtype),
+        normals=None if mesh.normals is None else mesh.normals[used],
+        colors=None if mesh.colors is None else mesh.colors[used],
+    )
+
+
+def keep_largest(mesh: Mesh) -> Mesh:
+    """Keep the connected component (through shared vertices) with the largest area."""
+    a, b = mesh.faces[:, [0, 1]].ravel(), mesh.faces[:, [1, 2]].ravel()
+    size = len(mesh.vertices)
+    graph = coo_array((np.ones(len(a), np.int8), (a, b)), shape=(size, size)).tocsr()
+    component = connected_components(graph, directed=False)[1][mesh.faces[:, 0]]
+    return keep_faces(mesh, component == np.bincount(component, weights=face_areas(mesh)).argmax())
+
+
+def trim_distance(mesh: Mesh, points: NDArray[np.floating], distance: float) -> Mesh:
+    """Keep the faces whose three corners are all within ``distance`` of some of ``points`` ``(N, 3)``.
+
+    Mesh, points and distance in the same coordinates.
+
+    Raises:
+        ValueError: ``distance`` is not positive.
+        InputError: no face is that close.
+    """
+    if not distance > 0:
+        raise ValueError(f"distance={distance}: expected > 0")
+    limit = np.nextafter(distance, np.inf)  # the tree's bound is exclusive
+    nearest = KDTree(points).query(mesh.vertices, distance_upper_bound=limit)[0]
+    kept = (nearest <= distance)[mesh.faces].all(axis=1)
+    if not kept.any():
+        raise InputError(
+            f"--trim-distance: none of {len(mesh.faces)} faces is within {distance:.4g} of the points; raise it"
+        )
+    return keep_faces(mesh, kept)

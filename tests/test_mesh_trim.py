@@ -1,0 +1,52 @@
+import numpy as np
+import pytest
+from mplicits.neural_fields import InputError, Sphere, Union
+from mplicits.neural_fields.meshing import Mesh, extract_mesh
+from mplicits.pipelines.mesh_trim import face_areas, keep_faces, keep_largest, trim_distance
+
+
+@pytest.fixture(scope="module")
+def two():
+    return extract_mesh(
+        Union(Sphere(radius=0.15, center=(-0.6, 0, 0)), Sphere(radius=0.4, center=(0.3, 0, 0))), resolution=40
+    )
+
+
+def test_keep_largest_keeps_the_larger_sphere_whole(two):
+    large = keep_largest(two)
+    alone = extract_mesh(Sphere(radius=0.4, center=(0.3, 0, 0)), resolution=40)
+    assert len(large.faces) == len(alone.faces)
+    assert face_areas(large).sum() == pytest.approx(4 * np.pi * 0.16, rel=0.02)
+    assert np.abs(np.linalg.norm(large.vertices - [0.3, 0, 0], axis=1) - 0.4).max() < 1e-4
+    assert np.abs(large.normals - (large.vertices - [0.3, 0, 0]) / 0.4).max() < 0.02
+    assert np.array_equal(np.unique(large.faces), np.arange(len(large.vertices)))
+
+
+def test_keep_largest_goes_by_area_not_by_count():
+    fan = np.array([[5 + 0.1 * np.cos(t), 0.1 * np.sin(t), 0] for t in np.linspace(0, 1, 9)])
+    vertices = np.concatenate(([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [5, 0, 0]], fan))
+    faces = np.array([[0, 1, 2], *[[3, 4 + k, 5 + k] for k in range(8)]], np.int32)
+    assert np.array_equal(keep_largest(Mesh(vertices, faces)).vertices, vertices[:3])
+
+
+def test_keep_faces_carries_normals_and_colors(two):
+    colored = Mesh(two.vertices, two.faces, two.normals, np.zeros_like(two.normals))
+    kept = keep_faces(colored, np.arange(len(two.faces)) < 5)
+    assert len(kept.faces) == 5
+    assert len(kept.vertices) == len(kept.normals) == len(kept.colors)
+    assert np.array_equal(kept.vertices[kept.faces], two.vertices[two.faces[:5]])
+
+
+def test_trim_distance_keeps_what_is_near(two):
+    trimmed = trim_distance(two, np.array([[0.7, 0.0, 0.0]]), 0.3)
+    away = np.linalg.norm(two.vertices - [0.7, 0, 0], axis=1)
+    assert len(trimmed.faces) == (away[two.faces] <= 0.3).all(axis=1).sum() > 0
+    assert np.linalg.norm(trimmed.vertices - [0.7, 0, 0], axis=1).max() <= 0.3
+    assert len(trim_distance(two, two.vertices, 1e-9).faces) == len(two.faces)
+
+
+def test_trim_distance_never_gives_an_empty_mesh(two):
+    with pytest.raises(InputError, match="--trim-distance: none of"):
+        trim_distance(two, np.array([[9.0, 9.0, 9.0]]), 0.1)
+    with pytest.raises(ValueError, match=r"distance=0\.0"):
+        trim_distance(two, two.vertices, 0.0)
