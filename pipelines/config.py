@@ -14,7 +14,7 @@ from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_
 
 import yaml
 
-__all__ = ["add_config_flags", "closest", "given_flags", "load_config", "preset_names"]
+__all__ = ["add_config_flags", "closest", "given_flags", "input_error", "load_config", "preset_names"]
 
 T = TypeVar("T")
 Pairs = Mapping[object, object]
@@ -50,16 +50,16 @@ def load_config(
     values: dict[str, Any] = {}
     for key, value in pairs.items():
         if key not in hints or not isinstance(key, str):
-            raise _input_error(f"{source}: unknown key {str(key)!r}{closest(str(key), fields)}")
+            raise input_error(f"{source}: unknown key {str(key)!r}{closest(str(key), fields)}")
         values[key] = _checked(value, hints[key], f"{source}: {key}")
     for key, value in (overrides or {}).items():
         if key not in hints:
-            raise _input_error(f"unknown flag {_flag(key)}{closest(_flag(key), map(_flag, fields))}")
+            raise input_error(f"unknown flag {_flag(key)}{closest(_flag(key), map(_flag, fields))}")
         values[key] = _checked(value, hints[key], _flag(key))
     try:
         return cls(**values)
     except ValueError as error:  # a range check of the dataclass itself
-        raise _input_error(f"{source}: {error}" if preset is not None else str(error)) from error
+        raise input_error(f"{source}: {error}" if preset is not None else str(error)) from error
 
 
 def add_config_flags(parser: argparse.ArgumentParser, cls: type) -> None:
@@ -110,11 +110,11 @@ def _read_preset(preset: str | Path | None, thing: str) -> tuple[str, Pairs]:
             text = Path(preset).read_text(encoding="utf-8")
         except (OSError, UnicodeDecodeError) as error:
             reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
-            raise _input_error(f"{source}: cannot read the configuration ({reason})") from error
+            raise input_error(f"{source}: cannot read the configuration ({reason})") from error
     else:
         names = preset_names(thing)
         if preset not in names:
-            raise _input_error(f"no preset {preset!r} for {thing}{closest(preset, names)} (a file: --config FILE)")
+            raise input_error(f"no preset {preset!r} for {thing}{closest(preset, names)} (a file: --config FILE)")
         source = f"{thing}_{preset}.yaml"
         text = (resources.files("mplicits.configs") / source).read_text(encoding="utf-8")
     try:
@@ -123,11 +123,11 @@ def _read_preset(preset: str | Path | None, thing: str) -> tuple[str, Pairs]:
         mark = getattr(error, "problem_mark", None)
         place = f", line {mark.line + 1}, column {mark.column + 1}" if mark else ""
         problem = getattr(error, "problem", None) or "unreadable"
-        raise _input_error(f"{source}{place}: not YAML ({problem})") from error
+        raise input_error(f"{source}{place}: not YAML ({problem})") from error
     if pairs is None:
         return source, {}
     if not isinstance(pairs, dict):
-        raise _input_error(f"{source}: expected lines of 'key: value', got a {type(pairs).__name__}")
+        raise input_error(f"{source}: expected lines of 'key: value', got a {type(pairs).__name__}")
     return source, pairs
 
 
@@ -136,7 +136,7 @@ def _checked(value: object, kind: Any, place: str) -> Any:
         return _convert(value, kind)
     except _MismatchError as error:
         shown = " ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
-        raise _input_error(f"{place}: got {shown!r}, expected {error}") from error
+        raise input_error(f"{place}: got {shown!r}, expected {error}") from error
 
 
 def _convert(value: object, kind: Any) -> Any:
@@ -217,8 +217,8 @@ def _flag(name: str) -> str:
     return "--" + name.replace("_", "-")
 
 
-def _input_error(message: str) -> Exception:
-    # Imported late: the package behind it loads torch, and `mplicits --help` must not wait for that.
+def input_error(message: str) -> Exception:
+    """An ``InputError``, imported late: its package loads torch, and ``mplicits --help`` must not wait for that."""
     from ..neural_fields.errors import InputError
 
     return InputError(message)

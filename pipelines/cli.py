@@ -1,0 +1,134 @@
+"""The command line: ``mplicits COMMAND …``.
+
+Bad input is one line on stderr and exit code 2; Ctrl-C is 130. torch is loaded by the command that needs
+it, never for help or for a mistake in the arguments.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.metadata
+import os
+import re
+import sys
+from collections.abc import Sequence
+from typing import NoReturn
+
+from .commands import COMMANDS, Command
+from .config import closest
+
+__all__ = ["main"]
+
+OVERVIEW = """usage: mplicits COMMAND [arguments]
+
+Fit a multiscale neural signed distance field to a point cloud, mesh it, and measure the result.
+
+commands:
+{commands}
+
+examples:
+  mplicits sample -o scan.ply                       write the bundled scan of a statue
+  mplicits fit scan.ply -o runs/statue              fit it (about three minutes on two cores)
+  mplicits mesh runs/statue -o statue.ply --resolution 512
+  mplicits evaluate statue.ply reference.ply
+
+`mplicits COMMAND --help` says more about each; `mplicits --version` prints the version."""
+
+
+class _UsageError(Exception):
+    """A mistake in the arguments."""
+
+
+class _Parser(argparse.ArgumentParser):
+    """An argument parser that raises instead of exiting, and knows what a mistyped flag should have been."""
+
+    def __init__(self, name: str, command: Command) -> None:
+        super().__init__(
+            prog=f"mplicits {name}",
+            description=command.description or command.summary,
+            epilog=f"examples:\n{command.examples}",
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+            allow_abbrev=False,
+        )
+        # argparse takes -1e-3 for a flag; coordinates and tolerances are written so.
+        self._negative_number_matcher = re.compile(r"^-(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$")
+        command.add_arguments(self)
+
+    def error(self, message: str) -> NoReturn:
+        raise _UsageError(f"{message} (see `{self.prog} --help`)")
+
+    def check_flags(self, arguments: Sequence[str]) -> None:
+        """Name the nearest flag of a mistyped one, before argparse complains of what is then missing."""
+        known = set(re.findall(r"--[a-z][\w-]*", self.format_help()))
+        for argument in arguments:
+            if argument == "--":
+                return
+            flag = argument.split("=", 1)[0]
+            if flag.startswith("--") and flag not in known:
+                self.error(f"unknown flag {flag}{closest(flag, known)}")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command.
+
+    Args:
+        argv: arguments without the program's name; those of the process by default.
+
+    Returns:
+        Exit code: 0, 1 (a check failed), 2 (bad input or arguments) or 130 (interrupted).
+    """
+    try:
+        return _run(list(sys.argv[1:] if argv is None else argv))
+    except SystemExit as stop:  # argparse's --help
+        return int(stop.code or 0)
+    except _UsageError as error:
+        return _fail(str(error))
+    except KeyboardInterrupt:
+        print("mplicits: interrupted", file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        # Whoever read our output has left, `head` say. Python would complain again when it flushes at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 141
+    except ValueError as error:
+        from ..neural_fields import InputError
+
+        if not isinstance(error, InputError):
+            raise
+        return _fail(str(error))
+
+
+def _run(arguments: list[str]) -> int:
+    if not arguments or arguments[0] in ("-h", "--help", "help"):
+        width = max(map(len, COMMANDS))
+        print(OVERVIEW.format(commands="\n".join(f"  {n:<{width}}  {c.summary}" for n, c in COMMANDS.items())))
+        return 0 if arguments else 2
+    if arguments[0] == "--version":
+        print(f"mplicits {importlib.metadata.version('mplicits')}")
+        return 0
+    name, command, rest = _choose(arguments)
+    parser = _Parser(name, command)
+    if not {"-h", "--help"} & set(rest):
+        parser.check_flags(rest)
+    code = command.run(parser.parse_args(rest))
+    sys.stdout.flush()
+    return code
+
+
+def _choose(arguments: list[str]) -> tuple[str, Command, list[str]]:
+    """The command that the first word names, or with ``bench`` the first two."""
+    for words in (2, 1):
+        name = " ".join(arguments[:words])
+        if name in COMMANDS:
+            return name, COMMANDS[name], arguments[words:]
+    first = {name.split()[0] for name in COMMANDS}
+    if arguments[0] in first:
+        known = [name.split()[1] for name in COMMANDS if name.startswith(f"{arguments[0]} ")]
+        given = arguments[1] if len(arguments) > 1 else ""
+        raise _UsageError(f"{arguments[0]}: unknown command {given!r}{closest(given, known)}")
+    raise _UsageError(f"unknown command {arguments[0]!r}{closest(arguments[0], first)}")
+
+
+def _fail(message: str) -> int:
+    print(f"mplicits: error: {' '.join(message.split())}", file=sys.stderr)
+    return 2

@@ -1,0 +1,223 @@
+"""The commands: their arguments, and the few lines each one runs.
+
+Whatever a command needs is imported when it runs; this module itself stays light, because
+``mplicits --help`` imports it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Mapping
+from contextlib import nullcontext
+from pathlib import Path
+from types import MappingProxyType
+
+from .bench_commands import BENCH_COMMANDS
+from .command import Command, add_json, check_output, positive, whole
+from .config import add_config_flags, given_flags, input_error, load_config, preset_names
+from .fit_config import FitConfig
+
+__all__ = ["COMMANDS", "Command"]
+
+MESH_FILES = (".ply", ".obj", ".stl", ".glb")
+SAMPLES = ("statue",)
+
+
+def _fit_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("cloud", metavar="CLOUD", help="PLY, OBJ, STL, OFF, XYZ, TXT, CSV, NPY, NPZ, LAS or LAZ file")
+    parser.add_argument("-o", "--out", required=True, type=Path, metavar="RUN", help="directory of the run")
+    source = parser.add_mutually_exclusive_group()
+    source.add_argument("--preset", metavar="NAME", help=f"one of {', '.join(preset_names('fit'))} (default: default)")
+    source.add_argument("--config", type=Path, metavar="FILE", help="a YAML file of settings")
+    begin = parser.add_mutually_exclusive_group()
+    begin.add_argument("--resume", action="store_true", help="continue the interrupted run in RUN, with its settings")
+    begin.add_argument("--force", action="store_true", help="overwrite the run in RUN")
+    parser.add_argument("--quiet", action="store_true", help="no progress bars")
+    add_config_flags(parser, FitConfig)
+
+
+def _fit(arguments: argparse.Namespace) -> int:
+    given = given_flags(arguments, FitConfig)
+    preset: str | Path = arguments.config or arguments.preset or "default"
+    if arguments.resume and (given or arguments.config or arguments.preset):
+        raise input_error("--resume: continues with the run's own settings; leave out --preset, --config and the rest")
+    config = None if arguments.resume else load_config(FitConfig, preset, given, thing="fit")
+    from .fit import Interrupted, fit
+    from .fit_state import STATE_FILE
+    from .info import describe
+    from .progress_bar import progress_bars
+    from .runs import check_new_run
+
+    directory = check_new_run(arguments.out, resume=arguments.resume, force=arguments.force)
+    if arguments.force:
+        (directory / STATE_FILE).unlink(missing_ok=True)  # a state of the old run must not be resumed into the new
+    try:
+        with nullcontext() if arguments.quiet else progress_bars() as report:
+            fit(arguments.cloud, config, out=directory, resume=arguments.resume, progress=report)
+    except Interrupted:
+        print(f"interrupted; to continue: mplicits fit {arguments.cloud} -o {directory} --resume", file=sys.stderr)
+        return 130
+    print(describe(directory))
+    print(f"next: mplicits mesh {directory} -o {directory / 'mesh.ply'}")
+    return 0
+
+
+def _mesh_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("run", metavar="RUN", help="run directory or .safetensors file")
+    parser.add_argument("-o", "--out", required=True, type=Path, metavar="FILE", help=", ".join(MESH_FILES))
+    parser.add_argument("--resolution", type=whole(8, 2048), default=256, metavar="N", help="cells per side (256)")
+    parser.add_argument("--level", type=whole(0), metavar="L", help="0 is the coarsest (default: the finest)")
+    parser.add_argument("--keep-largest", action="store_true", help="keep only the component of largest area")
+    parser.add_argument(
+        "--trim-distance",
+        type=positive,
+        metavar="D",
+        help="drop faces further than D (input units) from the points: holes stay holes",
+    )
+    parser.add_argument("--cloud", metavar="FILE", help="the points for --trim-distance (default: those of the fit)")
+
+
+def _mesh(arguments: argparse.Namespace) -> int:
+    from .mesh import MeshOptions, mesh_run
+
+    started = time.monotonic()
+    options = MeshOptions(
+        resolution=arguments.resolution,
+        level=arguments.level,
+        keep_largest=arguments.keep_largest,
+        trim_distance=arguments.trim_distance,
+        cloud=arguments.cloud,
+    )
+    mesh = mesh_run(arguments.run, arguments.out, options)
+    seconds = time.monotonic() - started
+    print(f"{arguments.out}: {len(mesh.vertices):,} vertices, {len(mesh.faces):,} faces, in {seconds:.1f} s")
+    return 0
+
+
+def _evaluate_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("mesh", metavar="MESH", help="the mesh to judge")
+    parser.add_argument("reference", metavar="REFERENCE", help="the true mesh, or a point cloud")
+    parser.add_argument("--samples", type=whole(1), default=500_000, metavar="N", help="on each surface (500000)")
+    parser.add_argument("--seed", type=whole(0), default=0, metavar="N", help="of the samples (0)")
+    add_json(parser)
+
+
+def _evaluate(arguments: argparse.Namespace) -> int:
+    check_output(arguments.json, (".json",))
+    from .evaluate import evaluate_files, format_metrics, write_metrics
+
+    metrics = evaluate_files(arguments.mesh, arguments.reference, samples=arguments.samples, seed=arguments.seed)
+    print(format_metrics(metrics))
+    if arguments.json:
+        write_metrics(arguments.json, metrics)
+    return 0
+
+
+def _info_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("path", metavar="RUN|FILE", help="a run, a .safetensors file, a mesh or a cloud")
+
+
+def _info(arguments: argparse.Namespace) -> int:
+    from .info import describe
+
+    print(describe(arguments.path))
+    return 0
+
+
+def _doctor(_arguments: argparse.Namespace) -> int:
+    from .doctor import examine, format_findings
+
+    findings = examine()
+    print(format_findings(findings))
+    return int(any(finding.level == "error" for finding in findings))
+
+
+def _sample_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("name", nargs="?", choices=SAMPLES, default=SAMPLES[0], help="which one (default: statue)")
+    parser.add_argument("-o", "--out", required=True, type=Path, metavar="FILE", help="a .ply file to write")
+    parser.add_argument("--seed", type=whole(0), default=0, metavar="N", help="of the scanners' noise (0)")
+
+
+def _sample(arguments: argparse.Namespace) -> int:
+    check_output(arguments.out, (".ply",))
+    from ..datasets import statue_scan, write_cloud_ply
+
+    cloud = statue_scan(seed=arguments.seed)
+    write_cloud_ply(arguments.out, cloud)
+    print(f"{arguments.out}: {len(cloud):,} points; fit it with: mplicits fit {arguments.out} -o RUN")
+    return 0
+
+
+def _demo_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("cloud", nargs="?", metavar="CLOUD", help="any cloud (default: the bundled statue scan)")
+    parser.add_argument("-o", "--out", type=Path, default=Path("demo"), metavar="DIR", help="directory (demo)")
+    parser.add_argument("--preset", metavar="NAME", help=f"of the fit: one of {', '.join(preset_names('fit'))}")
+    parser.add_argument("--up", choices=("y", "z"), help="the axis that points up in the picture")
+
+
+def _demo(arguments: argparse.Namespace) -> int:
+    config = None if arguments.preset is None else load_config(FitConfig, arguments.preset, thing="fit")
+    from .demo import demo
+
+    return demo(arguments.cloud, arguments.out, config=config, up=arguments.up)
+
+
+COMMANDS: Mapping[str, Command] = MappingProxyType(
+    {
+        "fit": Command(
+            "fit a multiscale SDF to a point cloud",
+            """  mplicits fit scan.ply -o runs/scan
+  mplicits fit scan.ply -o runs/quick --preset fast
+  mplicits fit scan.ply -o runs/scan --resume
+  mplicits fit scan.xyz -o runs/mine --normals estimate --time-budget 120 --steps 2000 1000 1000""",
+            _fit_arguments,
+            _fit,
+            "Fit a multiscale SDF to a point cloud. RUN will hold field.safetensors and run.json.",
+        ),
+        "mesh": Command(
+            "extract a mesh from a fit",
+            """  mplicits mesh runs/scan -o scan.ply --resolution 512
+  mplicits mesh runs/scan -o coarse.obj --level 0
+  mplicits mesh runs/scan -o scan.glb --keep-largest --trim-distance 0.01""",
+            _mesh_arguments,
+            _mesh,
+            "Extract a mesh from a fit, in the coordinates of its input.",
+        ),
+        "evaluate": Command(
+            "measure a mesh against a reference",
+            """  mplicits evaluate scan.ply truth.ply
+  mplicits evaluate scan.ply points.xyz --samples 100000 --json figures.json""",
+            _evaluate_arguments,
+            _evaluate,
+            "Measure a mesh against a mesh or a cloud. Lengths are in units of the reference's bounding sphere.",
+        ),
+        "info": Command(
+            "say what a run, a checkpoint, a mesh or a cloud is",
+            "  mplicits info runs/scan\n  mplicits info scan.ply",
+            _info_arguments,
+            _info,
+        ),
+        "doctor": Command(
+            "check this installation and measure this machine",
+            "  mplicits doctor",
+            lambda _parser: None,
+            _doctor,
+        ),
+        "sample": Command(
+            "write the bundled scan of a statue",
+            "  mplicits sample -o scan.ply",
+            _sample_arguments,
+            _sample,
+        ),
+        "demo": Command(
+            "fit, mesh and draw the bundled scan, or any cloud",
+            "  mplicits demo\n  mplicits demo scan.ply -o demo-scan --up z",
+            _demo_arguments,
+            _demo,
+            "Fit a cloud, write mesh.ply, mesh.glb and picture.png, and say how near the result is.",
+        ),
+        **BENCH_COMMANDS,
+    }
+)

@@ -1,0 +1,157 @@
+"""``mplicits doctor``: is everything here that a fit needs, and how fast is this machine?"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import platform
+import re
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import torch
+
+from .timing import sgemm_rate
+
+__all__ = ["Finding", "examine", "format_findings"]
+
+PACKAGE = "mplicits"
+OWN_CV2 = "opencv-contrib-python-headless"
+OTHER_CV2 = ("opencv-python", "opencv-python-headless", "opencv-contrib-python")
+SLOW_GFLOPS = 15.0  # below this, the three minutes of the default preset become more than ten
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the report.
+
+    Attributes:
+        level: "ok", "note" (works without), "warning" (works, badly) or "error" (does not work).
+        topic: what was looked at.
+        text: what was found and, where it is not "ok", what to do.
+    """
+
+    level: Literal["ok", "note", "warning", "error"]
+    topic: str
+    text: str
+
+
+def examine(folder: Path | None = None) -> list[Finding]:
+    """Look at Python, packages, threads, GPU, speed and disk.
+
+    Args:
+        folder: where runs will be written; the current directory by default.
+    """
+    return [
+        _python(),
+        *(_requirement(line) for line in importlib.metadata.requires(PACKAGE) or [] if "extra ==" not in line),
+        *(_extra(line) for line in importlib.metadata.requires(PACKAGE) or [] if re.search(r"extra == .(?!dev)", line)),
+        _cv2(),
+        _threads(),
+        _cuda(),
+        _speed(),
+        _disk(folder or Path()),
+    ]
+
+
+def format_findings(findings: list[Finding]) -> str:
+    """The report, and a verdict as its last line."""
+    width = max(len(finding.topic) for finding in findings)
+    lines = [f"{finding.level:<7}  {finding.topic:<{width}}  {finding.text}" for finding in findings]
+    errors = sum(finding.level == "error" for finding in findings)
+    warnings = sum(finding.level == "warning" for finding in findings)
+    verdict = "all that is needed is here" if not errors else f"{errors} error{'s' * (errors > 1)}: see above"
+    if warnings:
+        verdict += f"; {warnings} warning{'s' * (warnings > 1)}"
+    return "\n".join([*lines, verdict])
+
+
+def _python() -> Finding:
+    return Finding("ok", "Python", f"{platform.python_version()} on {platform.system()} {platform.machine()}")
+
+
+def _split(requirement: str) -> tuple[str, str]:
+    """Name and lowest version of ``name[extras]>=1.2; marker``."""
+    match = re.match(r"([A-Za-z0-9._-]+)(?:\[[^\]]*\])?(?:>=([0-9.]+))?", requirement)
+    assert match is not None, requirement
+    return match[1], match[2] or "0"
+
+
+def _installed(name: str) -> str | None:
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def _requirement(requirement: str) -> Finding:
+    name, lowest = _split(requirement)
+    version = _installed(name)
+    if version is None:
+        return Finding("error", name, f"not installed; pip install '{name}>={lowest}'")
+    if _numbers(version) < _numbers(lowest):
+        return Finding("error", name, f"{version} is too old; pip install '{name}>={lowest}'")
+    return Finding("ok", name, version)
+
+
+def _extra(requirement: str) -> Finding:
+    name, lowest = _split(requirement)
+    extra = re.search(r"""extra == ["']([\w-]+)["']""", requirement)
+    label = extra[1] if extra else "?"
+    version = _installed(name)
+    if version is None or _numbers(version) < _numbers(lowest):
+        return Finding("note", name, f"optional, not installed; pip install '{PACKAGE}[{label}]'")
+    return Finding("ok", name, f"{version} (optional: {label})")
+
+
+def _numbers(version: str) -> tuple[int, ...]:
+    """``"2.13.0+cpu"`` → (2, 13, 0)."""
+    return tuple(int(part) for part in re.match(r"[0-9.]*", version)[0].split(".") if part)  # pyright: ignore[reportOptionalSubscript]
+
+
+def _cv2() -> Finding:
+    others = [name for name in OTHER_CV2 if _installed(name)]
+    if others:
+        names = " ".join(others)
+        fix = f"pip uninstall {names} {OWN_CV2}, then pip install {OWN_CV2}"
+        return Finding("warning", "cv2", f"{names} and {OWN_CV2} overwrite each other's files; {fix}")
+    return Finding("ok", "cv2", "one wheel only")
+
+
+def _threads() -> Finding:
+    threads, cores = torch.get_num_threads(), os.cpu_count() or 1
+    text = f"{threads} of {cores} logical CPUs"
+    if threads < cores // 2:
+        return Finding("warning", "threads", f"{text}; unset OMP_NUM_THREADS to use more")
+    return Finding("ok", "threads", text)
+
+
+def _cuda() -> Finding:
+    if not torch.cuda.is_available():
+        return Finding("note", "CUDA", "none; fits run on the CPU")
+    try:
+        torch.ones(8, device="cuda").sum().item()
+    except RuntimeError as error:
+        return Finding("warning", "CUDA", f"present but unusable ({str(error).splitlines()[0]}); use --device cpu")
+    memory = torch.cuda.get_device_properties(0).total_memory / 2**30
+    return Finding("ok", "CUDA", f"{torch.cuda.get_device_name(0)}, {memory:.0f} GiB")
+
+
+def _speed() -> Finding:
+    rate = sgemm_rate(256, repeats=100) / 1e9
+    text = f"{rate:.0f} GFLOP/s in float32 matrix products of 2048 × 256 × 256"
+    if rate < SLOW_GFLOPS:
+        return Finding("warning", "speed", f"{text}: slow, so start with --preset fast; is the machine busy?")
+    return Finding("ok", "speed", text)
+
+
+def _disk(folder: Path) -> Finding:
+    try:
+        with tempfile.NamedTemporaryFile(dir=folder) as file:
+            file.write(bytes(1 << 20))
+            file.flush()
+    except OSError as error:
+        return Finding("error", "disk", f"cannot write to {folder.absolute()} ({error.strerror}); run elsewhere")
+    return Finding("ok", "disk", f"{folder.absolute()} can be written")

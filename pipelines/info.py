@@ -1,0 +1,105 @@
+"""``mplicits info``: what a run, a checkpoint, a mesh or a cloud is."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..neural_fields import MultiscaleSDF, Siren, load_field
+from .fit_state import RECORD_FILE
+from .runs import find_field, is_field
+from .surface import Surface, components, is_closed, read_surface
+
+__all__ = ["describe"]
+
+Rows = list[tuple[str, str]]
+
+
+def describe(path: str | Path) -> str:
+    """A few lines about ``path``.
+
+    Raises:
+        InputError: it is nothing that we can read.
+    """
+    rows = _describe_field(Path(path)) if is_field(path) else _describe_surface(read_surface(path))
+    width = max(len(name) for name, _ in rows)
+    return "\n".join([str(path), *(f"  {name:<{width}}  {text}".rstrip() for name, text in rows)])
+
+
+def _describe_field(path: Path) -> Rows:
+    file = find_field(path)
+    field, similarity, metadata = load_field(file)
+    record = metadata.get("run", {})
+    if path.is_dir() and (path / RECORD_FILE).is_file():
+        record = json.loads((path / RECORD_FILE).read_text(encoding="utf-8"))
+    count = sum(parameter.numel() for parameter in field.parameters())
+    rows: Rows = [
+        (
+            "kind",
+            f"{type(field).__name__}, {field.num_levels} level{'s' * (field.num_levels > 1)}, in {field.in_dim}-D",
+        ),
+        ("parameters", f"{count:,} ({file.stat().st_size / 1024:,.0f} KiB on disk)"),
+    ]
+    levels = [field.base, *field.residuals] if isinstance(field, MultiscaleSDF) else [field]
+    stages = {stage.get("level"): stage for stage in record.get("stages", [])}
+    for index, level in enumerate(levels):
+        rows.append((f"level {index}", _describe_level(level, stages.get(index, {}))))
+        if index < len(field.deltas):
+            delta = float(field.deltas[index])
+            rows.append((f"  band {index}", f"δ = {delta:.5g} ({delta * similarity.scale:.5g} input units)"))
+    center = ", ".join(f"{number:.9g}" for number in similarity.center)
+    rows.append(("input frame", f"center ({center}), 1 unit = {similarity.scale:.9g} input units"))
+    return rows + _describe_record(record)
+
+
+def _describe_level(level: Any, stage: dict[str, Any]) -> str:
+    text = type(level).__name__
+    if isinstance(level, Siren):
+        count = sum(parameter.numel() for parameter in level.parameters())
+        text = f"({level.width}, {level.depth}), ω₀ = {level.omega:g}, {count:,} parameters"
+    if "training_seconds" in stage:
+        text += f"; {stage['steps']:,} steps in {stage['training_seconds']:.1f} s"
+    if "rms_at_points" in stage:
+        text += f"; rms at the points {stage['rms_at_points']:.4g} input units"
+    return text
+
+
+def _describe_record(record: dict[str, Any]) -> Rows:
+    if not record:
+        return []
+    rows: Rows = [("fitted to", str(record.get("cloud", "?")))]
+    cleaning, environment = record.get("cleaning", {}), record.get("environment", {})
+    if cleaning:
+        rows.append(("points", f"{cleaning['kept']:,} of {cleaning['read']:,}, normals {cleaning['normals_source']}"))
+    rows.append(("state", "finished" if record.get("finished") else "unfinished: --resume continues it"))
+    if "training_seconds" in record:
+        rows.append(("time", f"{record['training_seconds']:.1f} s"))
+    if environment:
+        versions = ", ".join(f"{name} {version}" for name, version in environment.get("versions", {}).items())
+        rows.append(("made with", f"{versions}, Python {environment.get('python', '?')}"))
+        rows.append(("on", f"{environment.get('device', '?')}, {environment.get('threads', '?')} threads"))
+    if "seed" in record.get("config", {}):
+        rows.append(("seed", str(record["config"]["seed"])))
+    return rows
+
+
+def _describe_surface(surface: Surface) -> Rows:
+    points = surface.used_vertices()
+    low, high = points.min(axis=0), points.max(axis=0)
+    rows: Rows = []
+    if len(surface.faces):
+        rows.append(("kind", "mesh"))
+        rows.append(("vertices, faces", f"{len(surface.vertices):,}, {len(surface.faces):,}"))
+        rows.append(("closed", "yes" if is_closed(surface) else "no: it has open or badly oriented edges"))
+        rows.append(("components", f"{components(surface):,}"))
+    else:
+        rows.append(("kind", "point cloud"))
+        rows.append(("points", f"{len(surface.vertices):,}"))
+    rows.append(("bounds", "  ".join(f"{axis} {a:.9g} … {b:.9g}" for axis, a, b in zip("xyz", low, high, strict=True))))
+    rows.append(("diagonal", f"{float(np.linalg.norm(high - low)):.6g}"))
+    rows.append(("normals", "no" if surface.normals is None else "yes"))
+    rows.append(("colors", "no" if surface.colors is None else "yes"))
+    return rows

@@ -1,0 +1,83 @@
+"""From a run to a mesh file: extract, clean up, write."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..datasets import read_cloud
+from ..neural_fields import InputError, load_field
+from ..neural_fields.meshing import Mesh, NoSurfaceError, extract_mesh
+from .mesh_files import check_mesh_path, write_mesh
+from .mesh_trim import keep_largest, trim_distance
+from .runs import find_field
+
+__all__ = ["MeshOptions", "mesh_run"]
+
+
+@dataclass(frozen=True)
+class MeshOptions:
+    """How to mesh a run.
+
+    Attributes:
+        resolution: cells along each side of the cube around the unit sphere.
+        level: counted from 0, the coarsest; None is the finest.
+        keep_largest: whether to keep only the component of largest area.
+        trim_distance: drop faces further than this from the points, in input units.
+        cloud: the points for that; by default the file that was fitted.
+    """
+
+    resolution: int = 256
+    level: int | None = None
+    keep_largest: bool = False
+    trim_distance: float | None = None
+    cloud: str | Path | None = None
+
+
+def mesh_run(run: str | Path, out: str | Path, options: MeshOptions | None = None) -> Mesh:
+    """Extract the surface of a run and write it in the coordinates of its input.
+
+    Args:
+        run: run directory or .safetensors file.
+        out: the mesh file.
+        options: how.
+
+    Returns:
+        The mesh as written, in unit-sphere coordinates.
+
+    Raises:
+        InputError: there is no such run or level, it has no surface, or the file cannot be written.
+    """
+    options = options or MeshOptions()
+    check_mesh_path(out)
+    file = find_field(run)
+    field, similarity, metadata = load_field(file)
+    check_mesh_path(out, similarity)  # again: not every format can hold every place
+    level = field.num_levels - 1 if options.level is None else options.level
+    if not 0 <= level < field.num_levels:
+        raise InputError(f"--level {level}: {file} has levels 0 to {field.num_levels - 1}")
+    points = None
+    if options.trim_distance is not None:
+        cloud = read_cloud(options.cloud or _fitted_cloud(file, metadata))
+        points = similarity.to_unit(cloud.points[np.isfinite(cloud.points).all(axis=1)])
+    try:
+        mesh = extract_mesh(field, resolution=options.resolution, level=level)
+    except NoSurfaceError as error:
+        raise InputError(f"{file}: no surface to mesh ({error})") from error
+    if points is not None and options.trim_distance is not None:
+        mesh = trim_distance(mesh, points, options.trim_distance / similarity.scale)
+    if options.keep_largest:
+        mesh = keep_largest(mesh)
+    write_mesh(out, mesh, similarity)
+    return mesh
+
+
+def _fitted_cloud(file: Path, metadata: dict[str, Any]) -> Path:
+    """The file that a checkpoint was fitted to."""
+    source = metadata.get("run", {}).get("cloud")
+    if not source or not Path(source).is_file():
+        raise InputError(f"{file}: its cloud {source or ''!s} is not to be found; name it with --cloud FILE")
+    return Path(source)

@@ -1,0 +1,67 @@
+"""A progress bar per stage of a fit, with its loss terms and the time left."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Protocol
+
+from rich.console import Console
+from rich.progress import BarColumn, TaskID, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import Progress as Bars
+
+from .training import Progress
+
+__all__ = ["progress_bars"]
+
+
+class Report(Protocol):
+    """What `fit` calls."""
+
+    def __call__(self, progress: Progress, /) -> None: ...
+
+
+@contextmanager
+def progress_bars() -> Iterator[Report]:
+    """Show bars on stderr; where that is no terminal, one line per finished stage instead."""
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield _Lines()
+        return
+    bars = Bars(
+        TextColumn("{task.description:<18}"),
+        BarColumn(bar_width=24),
+        TaskProgressColumn(),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[losses]}"),
+        console=console,
+    )
+    with bars:
+        yield _Bars(bars)
+
+
+class _Bars:
+    def __init__(self, bars: Bars) -> None:
+        self.bars = bars
+        self.tasks: dict[str, TaskID] = {}
+
+    def __call__(self, progress: Progress, /) -> None:
+        if progress.stage not in self.tasks:
+            for task in self.tasks.values():
+                self.bars.update(task, completed=1.0)
+            self.tasks[progress.stage] = self.bars.add_task(progress.stage, total=1.0, losses="")
+        losses = _text(progress)
+        self.bars.update(self.tasks[progress.stage], completed=progress.fraction, losses=losses)
+
+
+class _Lines:
+    def __call__(self, progress: Progress, /) -> None:
+        if progress.fraction >= 1:
+            print(f"{progress.stage}: {progress.step:,} steps; {_text(progress)}", file=sys.stderr)
+
+
+def _text(progress: Progress) -> str:
+    return "  ".join(f"{name} {value:.1e}" for name, value in progress.losses.items())

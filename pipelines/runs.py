@@ -1,0 +1,62 @@
+"""Run directories: which file an argument ``RUN|FILE`` means, and where a new run may be written."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ..neural_fields import InputError
+from .fit_state import FIELD_FILE, RECORD_FILE, STATE_FILE
+
+__all__ = ["check_new_run", "find_field", "is_field"]
+
+
+def find_field(path: str | Path) -> Path:
+    """The checkpoint that ``RUN|FILE`` names.
+
+    Raises:
+        InputError: there is nothing there, or it is neither a run directory with a field nor a .safetensors file.
+    """
+    path = Path(path)
+    if path.is_dir():
+        field = path / FIELD_FILE
+        if field.is_file():
+            return field
+        if (path / RECORD_FILE).is_file():
+            raise InputError(
+                f"{path}: holds no {FIELD_FILE} yet; finish it with `mplicits fit CLOUD -o {path} --resume`"
+            )
+        raise InputError(f"{path}: not a run directory (no {FIELD_FILE}); make one with `mplicits fit CLOUD -o {path}`")
+    if not path.exists():
+        raise InputError(f"{path}: no such run directory or file")
+    if path.suffix.lower() != ".safetensors":
+        raise InputError(f"{path}: expected a run directory or a .safetensors file")
+    return path
+
+
+def is_field(path: str | Path) -> bool:
+    """Whether ``path`` is meant as a run or a checkpoint rather than as a mesh or a cloud."""
+    return Path(path).is_dir() or Path(path).suffix.lower() == ".safetensors"
+
+
+def check_new_run(path: str | Path, *, resume: bool, force: bool) -> Path:
+    """The directory of a run to be written, if nothing there would be lost.
+
+    Raises:
+        InputError: it cannot be made, holds something already, or with ``resume`` holds nothing to resume.
+    """
+    path = Path(path)
+    if path.exists() and not path.is_dir():
+        raise InputError(f"{path}: is a file; name a directory for the run")
+    parent = path.absolute().parent
+    if not path.exists() and not parent.is_dir():
+        raise InputError(f"{path}: the folder {parent} does not exist; make it first")
+    if resume:
+        if not (path / STATE_FILE).is_file():
+            finished = (path / FIELD_FILE).is_file()
+            reason = "is finished" if finished else "holds no interrupted run"
+            raise InputError(f"{path}: {reason}, so there is nothing to resume; leave out --resume")
+        return path
+    if path.is_dir() and not force and any(path.iterdir()):
+        hint = " --resume continues it," if (path / STATE_FILE).is_file() else ""
+        raise InputError(f"{path}: exists and is not empty;{hint} --force overwrites it, or choose another -o")
+    return path

@@ -1,0 +1,292 @@
+"""The command line as a user meets it: output, exit codes, and one line for each mistake."""
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from mplicits.neural_fields import MultiscaleSDF, Similarity, save_field
+from mplicits.pipelines import doctor
+from mplicits.pipelines.cli import main
+from mplicits.pipelines.commands import COMMANDS
+
+SMALL = ["--widths", "16", "16", "--depths", "1", "1", "--omegas", "5", "8", "--steps", "300", "100"]
+SMALL += ["--learning-rates", "5e-3", "1e-3", "--batch", "256", "--samples", "2000", "--quiet"]
+
+
+@pytest.fixture(scope="module")
+def cloud(tmp_path_factory) -> Path:
+    """A sphere of radius 3 around (100, 0, 0), as text with normals."""
+    normals = np.random.default_rng(0).normal(size=(3000, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    path = tmp_path_factory.mktemp("cloud") / "ball.xyz"
+    np.savetxt(path, np.concatenate((3 * normals + [100, 0, 0], normals), axis=1))
+    return path
+
+
+@pytest.fixture(scope="module")
+def run(cloud, tmp_path_factory) -> Path:
+    """A finished run, fitted through the command line."""
+    path = tmp_path_factory.mktemp("runs") / "ball"
+    assert main(["fit", str(cloud), "-o", str(path), *SMALL]) == 0
+    return path
+
+
+@pytest.fixture
+def box(tmp_path) -> Path:
+    path = tmp_path / "box.ply"
+    trimesh.creation.box((1, 2, 3)).export(path)
+    return path
+
+
+def fails(capsys, *arguments: object) -> str:
+    """Run a command that must fail as bad input does → its one line."""
+    capsys.readouterr()
+    assert main([str(argument) for argument in arguments]) == 2
+    output, error = capsys.readouterr()
+    assert output == ""
+    lines = error.splitlines()
+    assert len(lines) == 1, lines
+    assert lines[0].startswith("mplicits: error: ")
+    return lines[0]
+
+
+# --- help --------------------------------------------------------------------------------------------
+
+
+def test_help_names_every_command(capsys):
+    assert main(["--help"]) == 0
+    text = capsys.readouterr().out
+    assert all(f"  {name} " in text for name in COMMANDS)
+    assert main([]) == 2
+    assert main(["--version"]) == 0
+    assert re.search(r"^mplicits \d", capsys.readouterr().out, re.MULTILINE)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_of_each_command_has_examples_that_parse(capsys, name):
+    from mplicits.pipelines.cli import _Parser
+
+    assert main([*name.split(), "--help"]) == 0
+    assert "examples:" in capsys.readouterr().out
+    examples = [line.strip() for line in COMMANDS[name].examples.splitlines()]
+    assert examples
+    for example in examples:
+        words = example.split()
+        assert words[0] == "mplicits"
+        assert words[1 : 1 + len(name.split())] == name.split()
+        rest = words[1 + len(name.split()) :]
+        parser = _Parser(name, COMMANDS[name])
+        parser.check_flags(rest)
+        parser.parse_args(rest)
+
+
+def test_neither_help_nor_mistakes_wait_for_torch():
+    program = (
+        "import sys; from mplicits.pipelines.cli import main; "
+        "main(['--help']); main(['fit', '--help']); main(['fti']); main(['fit', 'a', '--ouput', 'b']); "
+        "sys.exit('torch' in sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True, capture_output=True, timeout=60)
+
+
+# --- mistakes ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("mseh", "unknown command 'mseh'; did you mean 'mesh'?"),
+        ("bench normls", "bench: unknown command 'normls'; did you mean 'normals'?"),
+        ("fit a.ply --ouput b", "unknown flag --ouput; did you mean '--out'?"),
+        ("fit a.ply", "the following arguments are required: -o/--out"),
+        ("fit a.ply -o b --preset fsat", "no preset 'fsat' for fit; did you mean 'fast'?"),
+        ("fit a.ply -o b --steps many", "--steps: got 'many', expected a list of whole numbers"),
+        ("fit a.ply -o b --normals maybe", "--normals: got 'maybe', expected one of auto, file, estimate"),
+        ("fit a.ply -o b --batch 1.5", "--batch: got '1.5', expected a whole number"),
+        ("fit a.ply -o b --batch 0", "batch: 0; expected > 0"),
+        ("fit a.ply -o b --resume --seed 3", "--resume: continues with the run's own settings"),
+        ("fit a.ply -o b --resume --force", "not allowed with"),
+        ("mesh run -o mesh.ply --resolution 9000", "got '9000', expected a whole number from 8 to 2048"),
+        ("mesh run -o mesh.xyz", "mesh.xyz: unknown mesh format '.xyz'"),
+        ("mesh run -o absent/mesh.ply", "absent does not exist"),
+        ("evaluate a.ply b.ply --json figures.txt", "figures.txt: unknown extension '.txt'"),
+        ("sample lion -o a.ply", "'lion'"),
+    ],
+)
+def test_mistakes_in_the_arguments(capsys, monkeypatch, tmp_path, arguments, message):
+    monkeypatch.chdir(tmp_path)
+    assert message in fails(capsys, *arguments.split())
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("absent.ply", None, "no such file"),
+        ("empty.ply", b"", "empty"),
+        ("cut.ply", b"ply\nformat binary_little_endian 1.0\nelement vertex 50\n", "cut.ply"),
+        ("scan.docx", b"PK", "unknown extension"),
+        ("words.xyz", b"one two three\n" * 20, "words.xyz"),
+        ("four.csv", b"1,2,3,4\n" * 20, "four.csv"),
+        ("nan.xyz", b"nan nan nan\n" * 20, "none with finite coordinates"),
+        ("point.xyz", b"1 2 3\n" * 20, "coincide"),
+        ("few.xyz", b"1 2 3\n4 5 6\n", "at least 10"),
+        ("flat.npy", b"not an array", "flat.npy"),
+        ("object.npz", b"nonsense", "object.npz"),
+    ],
+)
+def test_broken_clouds_are_one_line_and_leave_no_run_behind(capsys, tmp_path, name, content, message):
+    if content is not None:
+        (tmp_path / name).write_bytes(content)
+    line = fails(capsys, "fit", tmp_path / name, "-o", tmp_path / "run")
+    assert name in line
+    assert message in line
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_configuration_file_with_a_mistake_is_named(capsys, cloud, tmp_path):
+    (tmp_path / "mine.yaml").write_text("widht: [16]\n")
+    line = fails(capsys, "fit", cloud, "-o", tmp_path / "run", "--config", tmp_path / "mine.yaml")
+    assert "mine.yaml: unknown key 'widht'; did you mean 'widths'?" in line
+
+
+def test_foreign_and_damaged_fields_are_one_line(capsys, run, tmp_path):
+    (tmp_path / "cut.safetensors").write_bytes((run / "field.safetensors").read_bytes()[:500])
+    for arguments in (["info"], ["mesh", "-o", tmp_path / "mesh.ply"]):
+        assert "cut.safetensors" in fails(capsys, *arguments, tmp_path / "cut.safetensors")
+        assert "not a run directory" in fails(capsys, *arguments, tmp_path)
+        assert "no such run" in fails(capsys, *arguments, tmp_path / "absent.safetensors")
+    assert not (tmp_path / "mesh.ply").exists()
+
+
+# --- fit, mesh, evaluate, info -----------------------------------------------------------------------
+
+
+def test_a_run_holds_its_field_and_its_record(run):
+    record = json.loads((run / "run.json").read_text())
+    assert record["finished"]
+    assert record["config"]["widths"] == [16, 16]
+    assert record["config"]["steps"] == [300, 100]
+    assert (run / "field.safetensors").is_file()
+
+
+def test_a_run_is_not_overwritten_unless_told_to(capsys, cloud, run):
+    before = (run / "field.safetensors").read_bytes()
+    assert "--force overwrites it" in fails(capsys, "fit", cloud, "-o", run, *SMALL)
+    assert "nothing to resume" in fails(capsys, "fit", cloud, "-o", run, "--resume")
+    assert "is a file" in fails(capsys, "fit", cloud, "-o", run / "run.json", *SMALL)
+    assert (run / "field.safetensors").read_bytes() == before
+
+
+def test_mesh_is_in_input_coordinates_and_evaluate_measures_it(capsys, run, tmp_path):
+    out = tmp_path / "ball.ply"
+    assert main(["mesh", str(run), "-o", str(out), "--resolution", "48", "--keep-largest"]) == 0
+    assert "faces" in capsys.readouterr().out
+    truth = tmp_path / "truth.ply"
+    trimesh.creation.icosphere(4, radius=3.0).apply_translation((100, 0, 0)).export(truth)
+    figures = tmp_path / "figures.json"
+    assert main(["evaluate", str(out), str(truth), "--samples", "5000", "--json", str(figures)]) == 0
+    written = json.loads(figures.read_text())
+    assert written["iou"] > 0.8
+    assert written["components"] == 1
+    assert f"{written['chamfer']:.3e}" in capsys.readouterr().out
+
+
+def test_levels_are_meshed_by_number(capsys, run, tmp_path):
+    assert main(["mesh", str(run), "-o", str(tmp_path / "a.stl"), "--resolution", "32", "--level", "0"]) == 0
+    assert "has levels 0 to 1" in fails(capsys, "mesh", run, "-o", tmp_path / "b.stl", "--level", "2")
+
+
+def test_trimming_takes_the_points_from_the_fit_or_from_a_file(capsys, run, cloud, tmp_path):
+    out = str(tmp_path / "a.ply")
+    assert main(["mesh", str(run), "-o", out, "--resolution", "32", "--trim-distance", "1"]) == 0
+    half = tmp_path / "half.xyz"
+    points = np.loadtxt(cloud)
+    np.savetxt(half, points[points[:, 0] > 100])
+    whole = trimesh.load_mesh(out).area
+    arguments = ["mesh", str(run), "-o", out, "--resolution", "32", "--trim-distance", "0.6", "--cloud", str(half)]
+    assert main(arguments) == 0
+    assert trimesh.load_mesh(out).area == pytest.approx(whole * 0.6, rel=0.2)
+
+
+def test_a_field_without_a_surface_says_so(capsys, tmp_path):
+    field = MultiscaleSDF.from_widths([(8, 1)], omegas=[30])
+    state = {name: tensor * 0 for name, tensor in field.state_dict().items()}
+    last = [name for name in state if name.endswith("bias")][-1]
+    state[last] += 1
+    field.load_state_dict(state)
+    save_field(tmp_path / "one.safetensors", field, similarity=Similarity.identity())
+    line = fails(capsys, "mesh", tmp_path / "one.safetensors", "-o", tmp_path / "mesh.ply")
+    assert "no surface" in line
+    assert not (tmp_path / "mesh.ply").exists()
+
+
+def test_info_describes_runs_fields_meshes_and_clouds(capsys, run, cloud, box):
+    assert main(["info", str(run)]) == 0
+    text = capsys.readouterr().out
+    assert "MultiscaleSDF, 2 levels" in text
+    assert "(16, 1), ω₀ = 5" in text
+    assert "δ = " in text
+    assert "finished" in text
+    assert main(["info", str(run / "field.safetensors")]) == 0
+    assert "2 levels" in capsys.readouterr().out
+    assert main(["info", str(box)]) == 0
+    text = capsys.readouterr().out
+    assert re.search(r"vertices, faces +8, 12", text)
+    assert re.search(r"closed +yes", text)
+    assert main(["info", str(cloud)]) == 0
+    text = capsys.readouterr().out
+    assert re.search(r"points +3,000", text)
+    assert re.search(r"normals +yes", text)
+
+
+def test_ctrl_c_and_a_closed_pipe_end_quietly(monkeypatch, capsys):
+    def interrupt(_path: object) -> str:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("mplicits.pipelines.info.describe", interrupt)
+    assert main(["info", "x"]) == 130
+    assert capsys.readouterr().err == "mplicits: interrupted\n"
+
+
+def test_output_into_a_closed_pipe_is_no_traceback(box):
+    program = f"import sys; from mplicits.pipelines.cli import main; sys.exit(main(['info', {str(box)!r}]))"
+    process = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    assert process.stdout is not None
+    assert process.stderr is not None
+    process.stdout.close()
+    error = process.stderr.read()
+    process.stderr.close()
+    assert process.wait(timeout=60) == 141
+    assert error == b""
+
+
+# --- doctor ------------------------------------------------------------------------------------------
+
+
+def test_doctor_finds_nothing_wrong_here(capsys):
+    assert main(["doctor"]) == 0
+    text = capsys.readouterr().out
+    assert "GFLOP/s" in text
+    assert re.search(r"ok +torch +\d", text)
+    assert "error" not in text.replace("errors", "")
+
+
+def test_doctor_names_what_is_missing_and_what_clashes(monkeypatch, tmp_path):
+    versions = {"torch": "2.1.0", "opencv-contrib-python-headless": "5.0.0", "opencv-python": "4.9"}
+    monkeypatch.setattr(doctor, "_installed", versions.get)
+    findings = {finding.topic: finding for finding in doctor.examine(tmp_path / "absent")}
+    assert findings["torch"].level == "error"
+    assert "2.1.0 is too old; pip install 'torch>=2.6'" in findings["torch"].text
+    assert "not installed; pip install 'numpy>=" in findings["numpy"].text
+    assert findings["laspy"].level == "note"
+    assert "pip install 'mplicits[las]'" in findings["laspy"].text
+    assert findings["cv2"].level == "warning"
+    assert "opencv-python" in findings["cv2"].text
+    assert findings["disk"].level == "error"
+    assert "errors: see above" in doctor.format_findings(list(findings.values()))
