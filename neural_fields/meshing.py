@@ -18,9 +18,9 @@ __all__ = ["Mesh", "MeshStats", "NoSurfaceError", "extract_mesh"]
 # The unit sphere with a little room, so that a surface that touches it is still closed.
 DEFAULT_BOUNDS: Bounds = ((-1.02, -1.02, -1.02), (1.02, 1.02, 1.02))
 
-# Cells that a vertex may move before its normal is taken anew: a hundredth of a cell turns it by less than
-# 0.6 degrees even where the radius of curvature is one cell.
-RENEWED_NORMAL = 0.01
+# Cells that a vertex may move before its normal is taken anew: a twentieth of a cell turns the normal by 0.3 degrees
+# where the radius of curvature is ten cells.
+RENEWED_NORMAL = 0.05
 
 
 @dataclass(frozen=True)

@@ -156,7 +156,7 @@ def test_normals_are_the_gradient():
     radial = mesh.vertices - [0.1, 0.0, -0.1]
     assert mesh.normals is not None
     assert mesh.normals.dtype == np.float32
-    assert np.abs(mesh.normals - radial / 0.6).max() < 2e-3
+    assert np.abs(mesh.normals - radial / 0.6).max() < 5e-3
     assert np.abs(np.linalg.norm(mesh.normals, axis=1) - 1).max() < 1e-6
     p = mesh.vertices[mesh.faces]
     facing = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])

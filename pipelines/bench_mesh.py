@@ -1,0 +1,260 @@
+"""``mplicits bench mesh``: adaptive extraction beside the paper's scheme and a dense SIREN, in one run."""
+
+from __future__ import annotations
+
+import itertools
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+from skimage.measure import marching_cubes
+from torch import Tensor
+
+from ..neural_fields import Field, Jet, MultiscaleSDF, Siren, load_field, save_field
+from ..neural_fields.meshing import DEFAULT_BOUNDS, extract_mesh
+from .runs import find_field
+from .timing import format_table
+
+__all__ = ["MeshBench", "MeshRow", "bench_mesh", "format_bench_mesh"]
+
+PAPER, DENSE = "level 0 on every vertex (paper)", "dense SIREN (256,4)"
+SAMPLED_SHARE = 1 / 32
+
+
+@dataclass(frozen=True)
+class MeshRow:
+    """One extraction, in a process of its own.
+
+    Attributes:
+        method: what was run.
+        resolution: cells along each side of the box.
+        seconds: wall time of evaluation and triangles, without normals; extrapolated where ``share`` < 1.
+        normals: seconds more for analytic normals; None where there are none.
+        evaluations: rows that the network of each level evaluated, without normals.
+        vertices: of the mesh; 0 where only the evaluation was timed.
+        peak: most memory the process held at any time, Python and libraries included, in bytes.
+        share: fraction of the lattice that was really evaluated.
+    """
+
+    method: str
+    resolution: int
+    seconds: float
+    normals: float | None
+    evaluations: tuple[int, ...]
+    vertices: int
+    peak: int
+    share: float = 1.0
+
+
+@dataclass(frozen=True)
+class MeshBench:
+    """All rows, and how far our vertices are from the nearest ones of the paper's scheme, in cells.
+
+    Attributes:
+        rows: adaptive ones first, then the peers at the reference resolution.
+        reference: resolution at which methods are compared.
+        mean_distance: mean over our vertices and over the peer's, each to the nearest of the other.
+        max_distance: the largest of them.
+        limit: a line about the machine's limit, printed as it is.
+    """
+
+    rows: tuple[MeshRow, ...]
+    reference: int
+    mean_distance: float
+    max_distance: float
+    limit: str = ""
+
+
+def bench_mesh(
+    source: str | Path | Field,
+    *,
+    resolutions: Sequence[int] = (256, 512, 1024),
+    reference: int = 512,
+    full: bool = False,
+    limit: str = "",
+    report: Callable[[str], None] | None = None,
+) -> MeshBench:
+    """Time ours at each of ``resolutions``, and the peers at ``reference``, over the same box.
+
+    The paper's scheme evaluates level 0 at every lattice point and finer levels in their bands, then runs dense
+    marching cubes (scikit-image). The dense peer is one (256,4) SIREN with random weights, of which only the
+    evaluation is timed; unless ``full``, on every 32nd slab of the lattice, and extrapolated linearly.
+    Every row runs in a fresh process, so that its peak memory is its own.
+
+    Args:
+        source: a run, a .safetensors file or a field.
+        resolutions: where ours is timed.
+        reference: where ours is compared; added to ``resolutions`` if it is not among them.
+        full: whether the dense peer evaluates the whole lattice.
+        limit: text about the machine's limit to print with the table.
+        report: told what is being run.
+
+    Raises:
+        InputError: ``source`` is no run and no field's file.
+    """
+    say = report or (lambda _: None)
+    with tempfile.TemporaryDirectory() as scratch:
+        if isinstance(source, Field):
+            path = Path(scratch) / "field.safetensors"
+            save_field(path, source)
+        else:
+            path = find_field(source)
+        rows = []
+        for resolution in sorted({*resolutions, reference}):
+            say(f"adaptive at {resolution}³")
+            keep = Path(scratch) / "ours.npy" if resolution == reference else None
+            rows.append(_alone(_adaptive, path, resolution, keep))
+        say(f"{PAPER} at {reference}³")
+        rows.append(_alone(_paper, path, reference, Path(scratch) / "paper.npy"))
+        say(f"{DENSE} at {reference}³")
+        rows.append(_alone(_dense, reference, 1.0 if full else SAMPLED_SHARE))
+        mean, largest = _distances(np.load(Path(scratch) / "ours.npy"), np.load(Path(scratch) / "paper.npy"))
+    cell = _step(reference)
+    return MeshBench(tuple(rows), reference, mean / cell, largest / cell, limit)
+
+
+def format_bench_mesh(bench: MeshBench) -> str:
+    """The table, the growth per doubling, the ratios, and whether both found the same surface."""
+    table = [_cells(row) for row in bench.rows]
+    header = ("method", "cells", "seconds", "+ normals", "evaluations per level", "vertices", "peak memory")
+    lines = [format_table(header, table), ""]
+    adaptive = [row for row in bench.rows if row.method == "adaptive"]
+    for small, large in itertools.pairwise(adaptive):
+        growth = f"×{large.seconds / small.seconds:.2f} in time"
+        growth += f", ×{sum(large.evaluations) / sum(small.evaluations):.2f} in evaluations"
+        lines.append(f"{small.resolution}³ → {large.resolution}³: {growth}")
+    ours = next(row for row in adaptive if row.resolution == bench.reference)
+    for peer in bench.rows[len(adaptive) :]:
+        how = "" if peer.share == 1 else f" (timed on {peer.share:.1%} of the slabs, extrapolated linearly)"
+        lines.append(f"{peer.seconds / ours.seconds:.1f}× faster than {peer.method} at {bench.reference}³{how}")
+    lines.append(
+        f"vertices of ours and the paper's scheme, to the nearest of the other: mean {bench.mean_distance:.4f} cells, "
+        f"max {bench.max_distance:.3f} cells"
+    )
+    return "\n".join([*lines, bench.limit] if bench.limit else lines)
+
+
+def _cells(row: MeshRow) -> tuple[str, ...]:
+    return (
+        row.method,
+        f"{row.resolution}³",
+        f"{row.seconds:.2f}" if row.share == 1 else f"~{row.seconds:.0f}",
+        "" if row.normals is None else f"{row.normals:.2f}",
+        " + ".join(f"{count / 1e6:.2f} M" for count in row.evaluations),
+        f"{row.vertices:,}" if row.vertices else "",
+        f"{row.peak / 2**20:.0f} MiB",
+    )
+
+
+def _alone(work: Callable[..., MeshRow], *arguments: object) -> MeshRow:
+    """Run ``work`` in a fresh process with as many threads as here."""
+    with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+        return pool.submit(_with_threads, torch.get_num_threads(), work, *arguments).result()
+
+
+def _with_threads(threads: int, work: Callable[..., MeshRow], *arguments: object) -> MeshRow:
+    torch.set_num_threads(threads)
+    return work(*arguments)
+
+
+class _Counted(Field):
+    """A level that counts the rows it evaluates."""
+
+    def __init__(self, inner: Field) -> None:
+        super().__init__()
+        self.inner, self.in_dim, self.num_levels, self.rows = inner, inner.in_dim, inner.num_levels, 0
+        self.register_buffer("deltas", inner.deltas)
+
+    def value(self, x: Tensor, *, level: int = -1) -> Tensor:
+        self.rows += x.shape[:-1].numel()
+        return self.inner.value(x, level=level)
+
+    def jet(self, x: Tensor, *, level: int = -1) -> Jet:
+        return self.inner.jet(x, level=level)
+
+
+def _counted(field: Field) -> tuple[Field, list[_Counted]]:
+    """The field with counters in the place of its levels."""
+    if not isinstance(field, MultiscaleSDF):
+        whole = _Counted(field)
+        return whole, [whole]
+    levels = [_Counted(level) for level in (field.base, *field.residuals) if isinstance(level, Field)]
+    return MultiscaleSDF(levels[0], levels[1:], field.deltas, taper=field.taper), levels
+
+
+def _adaptive(path: Path, resolution: int, keep: Path | None) -> MeshRow:
+    field, levels = _counted(load_field(path).field)
+    start = time.perf_counter()
+    mesh = extract_mesh(field, resolution=resolution)
+    seconds = time.perf_counter() - start
+    assert mesh.stats is not None
+    normals = mesh.stats.seconds["normals"]
+    counts = tuple(level.rows for level in levels)
+    if keep is not None:
+        np.save(keep, mesh.vertices)
+    return MeshRow("adaptive", resolution, seconds - normals, normals, counts, len(mesh.vertices), _peak())
+
+
+def _paper(path: Path, resolution: int, keep: Path) -> MeshRow:
+    field, levels = _counted(load_field(path).field)
+    start = time.perf_counter()
+    values = np.empty((resolution + 1,) * 3, np.float32)
+    _evaluate_slabs(field, values, range(resolution + 1))
+    step = _step(resolution)
+    vertices = marching_cubes(values, 0.0, spacing=(step, step, step))[0] + np.asarray(DEFAULT_BOUNDS[0])
+    seconds = time.perf_counter() - start
+    np.save(keep, vertices)
+    return MeshRow(PAPER, resolution, seconds, None, tuple(level.rows for level in levels), len(vertices), _peak())
+
+
+def _dense(resolution: int, share: float) -> MeshRow:
+    torch.manual_seed(0)
+    field = Siren(256, 4).requires_grad_(False)
+    slabs = range(0, resolution + 1, round(1 / share))
+    start = time.perf_counter()
+    _evaluate_slabs(field, np.empty((1, resolution + 1, resolution + 1), np.float32), slabs)
+    done = len(slabs) / (resolution + 1)
+    seconds = (time.perf_counter() - start) / done
+    return MeshRow(DENSE, resolution, seconds, None, ((resolution + 1) ** 3,), 0, _peak(), done)
+
+
+@torch.inference_mode()
+def _evaluate_slabs(field: Field, values: NDArray[np.float32], slabs: Sequence[int]) -> None:
+    """Fill ``values`` with the field on some planes of constant x; with room for one plane only, overwrite it."""
+    count = values.shape[1]
+    axis = torch.arange(count) * _step(count - 1) + DEFAULT_BOUNDS[0][0]
+    plane = torch.stack(torch.meshgrid(axis, axis, axis[:1], indexing="ij"), -1).reshape(-1, 3)[:, [2, 0, 1]]
+    for slab in slabs:
+        plane[:, 0] = axis[slab]
+        values[slab % len(values)] = field.value(plane).numpy().reshape(count, count)
+
+
+def _step(resolution: int) -> float:
+    return (DEFAULT_BOUNDS[1][0] - DEFAULT_BOUNDS[0][0]) / resolution
+
+
+def _distances(ours: NDArray[np.float64], theirs: NDArray[np.float64]) -> tuple[float, float]:
+    """Mean and maximum over both sets of the distance to the nearest point of the other."""
+    distances = np.concatenate((KDTree(theirs).query(ours)[0], KDTree(ours).query(theirs)[0]))
+    return float(distances.mean()), float(distances.max())
+
+
+def _peak() -> int:
+    """The most memory this process has held, in bytes."""
+    status = Path("/proc/self/status")
+    if status.is_file():
+        # Not getrusage: on Linux its maximum survives exec, so a child would report its parent's memory.
+        line = next(line for line in status.read_text().splitlines() if line.startswith("VmHWM:"))
+        return 1024 * int(line.split()[1])
+    import resource
+
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
