@@ -103,7 +103,8 @@ def prepare_cloud(
         normals: "file" keeps the file's normals and their sign; "estimate" ignores them; "auto" takes the
             file's if at least half are usable, and turns them all round when they plainly point inward.
         sensor_origin: where the scanner stood, in input coordinates; estimated normals are turned towards it.
-        neighbors: size of the neighbourhoods normals are estimated and repaired from.
+        neighbors: size of the neighbourhoods normals are estimated and repaired from; doubled for estimation,
+            at most twice, while the cloud is too noisy for them to look flat.
 
     Raises:
         InputError: too few points are left, or ``normals="file"`` and there are none.
@@ -213,9 +214,20 @@ def _plainly_inward(points: Float64, normals: Float64, *, score: float = -0.3, s
 def _estimate(
     points: Float64, neighbors: int, similarity: Similarity, sensor_origin: tuple[float, float, float] | None
 ) -> tuple[Float64, int]:
-    near = nearest(points, neighbors)
-    normals, spread = estimate_normals(points, near)
+    near, normals, spread = _planes(points, neighbors)
     if sensor_origin is None:
         return orient_normals(points, normals, spread, near)
     towards = similarity.to_unit(np.asarray(sensor_origin, np.float64)) - points
     return np.where((normals * towards).sum(axis=1, keepdims=True) < 0, -normals, normals), 0
+
+
+def _planes(
+    points: Float64, neighbors: int, *, flat: float = 0.25, doublings: int = 2
+) -> tuple[NDArray[np.int64], Float64, Float64]:
+    """Neighbourhoods with a median thickness below ``flat`` times their radius, and the planes through them."""
+    near = nearest(points, neighbors)
+    normals, spread = estimate_normals(points, near)
+    radius = np.linalg.norm(points[near[:, -1]] - points, axis=1)
+    if doublings == 0 or np.median(spread / radius) < flat:
+        return near, normals, spread
+    return _planes(points, 2 * neighbors, flat=flat, doublings=doublings - 1)
