@@ -1,0 +1,81 @@
+"""Fields survive the disk; damaged and foreign files are one clear line."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from fields import small_multiscale
+from mplicits.neural_fields import Field, InputError, Similarity, Siren, Sphere, load_field, save_field
+from safetensors.torch import save_file
+
+
+@pytest.mark.parametrize("field", [Siren(8, 2, omega=3.0, in_dim=4, num_features=2), small_multiscale(0.2)])
+def test_round_trip(field: Field, dtype: torch.dtype, tmp_path: Path) -> None:
+    field = field.to(dtype)
+    similarity = Similarity((4.5e6, -3.0, 0.25), 12.5)
+    save_field(tmp_path / "f.safetensors", field, similarity=similarity, metadata={"seed": 3})
+    loaded = load_field(tmp_path / "f.safetensors")
+    x = torch.rand(20, field.in_dim, dtype=dtype)
+    for a, b in zip(loaded.field.jet(x), field.jet(x), strict=True):
+        assert torch.equal(a, b)
+    assert loaded.similarity == similarity
+    assert loaded.metadata == {"seed": 3}
+    assert [path.name for path in tmp_path.iterdir()] == ["f.safetensors"]
+
+
+def test_similarity_goes_there_and_back() -> None:
+    points = torch.rand(100, 3, dtype=torch.float64).numpy() * 0.5 + [5e5, 4.2e6, 80.0]
+    similarity = Similarity.to_unit_sphere(points)
+    unit = similarity.to_unit(points)
+    assert abs((unit**2).sum(axis=1).max() - 1) < 1e-9
+    assert abs(similarity.to_input(unit.astype("float32")) - points).max() < 1e-6
+    with pytest.raises(ValueError, match="scale"):
+        Similarity((0.0, 0.0, 0.0), 0.0)
+    with pytest.raises(ValueError, match="coincide"):
+        Similarity.to_unit_sphere(points[:1].repeat(5, axis=0))
+
+
+def test_a_field_that_cannot_be_described_leaves_nothing(tmp_path: Path) -> None:
+    with pytest.raises(TypeError, match="Sphere cannot be saved"):
+        save_field(tmp_path / "f.safetensors", Sphere())
+    assert not list(tmp_path.iterdir())
+
+
+def saved(path: Path) -> Path:
+    save_field(path, Siren(8, 2))
+    return path
+
+
+def test_missing_file(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such file"):
+        load_field(tmp_path / "none.safetensors")
+
+
+def test_truncated_file(tmp_path: Path) -> None:
+    path = saved(tmp_path / "f.safetensors")
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(InputError, match=r"f\.safetensors: damaged"):
+        load_field(path)
+
+
+def test_not_safetensors(tmp_path: Path) -> None:
+    path = tmp_path / "f.safetensors"
+    path.write_text("ply\nformat ascii 1.0\n")
+    with pytest.raises(InputError, match="damaged, or not a field"):
+        load_field(path)
+
+
+def test_foreign_safetensors(tmp_path: Path) -> None:
+    path = tmp_path / "f.safetensors"
+    save_file({"a": torch.zeros(3)}, path)
+    with pytest.raises(InputError, match="a safetensors file, but not a field"):
+        load_field(path)
+
+
+def test_not_finite(tmp_path: Path) -> None:
+    network = Siren(8, 2)
+    with torch.no_grad():
+        network.output.bias.fill_(float("nan"))
+    save_field(tmp_path / "f.safetensors", network)
+    with pytest.raises(InputError, match=r"'output\.bias' has NaN"):
+        load_field(tmp_path / "f.safetensors")

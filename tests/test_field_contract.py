@@ -1,0 +1,98 @@
+"""What every `Field` promises, over every field × level × dtype × batch shape."""
+
+import pytest
+import torch
+from fields import EXACT, FIELDS
+from mplicits.neural_fields import Field, Jet
+from torch import Tensor
+
+
+def points(field: Field, shape: tuple[int, ...], **options: object) -> Tensor:
+    return 2 * torch.rand(*shape, field.in_dim, **options) - 1
+
+
+@pytest.fixture(params=FIELDS)
+def field(request: pytest.FixtureRequest, dtype: torch.dtype, device: torch.device) -> Field:
+    return FIELDS[request.param]().to(device=device, dtype=dtype)
+
+
+@pytest.mark.parametrize("shape", [(), (1,), (0,), (7,), (2, 3), (3, 0, 2)])
+def test_shapes_and_types_follow_the_input(
+    field: Field, shape: tuple[int, ...], dtype: torch.dtype, device: torch.device
+) -> None:
+    x = points(field, shape, dtype=dtype, device=device)
+    for level in range(-field.num_levels, field.num_levels):
+        value, jet = field.value(x, level=level), field.jet(x, level=level)
+        assert isinstance(jet, Jet)
+        assert value.shape == jet.value.shape == shape
+        assert jet.gradient.shape == x.shape
+        assert jet.features.shape[:-1] == shape
+        inside = field.in_band(x, level=level)
+        assert inside.shape == shape
+        assert inside.dtype == torch.bool
+        for tensor in (value, *jet):
+            assert tensor.dtype == dtype
+            assert tensor.device.type == device.type
+
+
+def test_jet_agrees_with_value_and_autograd(field: Field, dtype: torch.dtype, device: torch.device) -> None:
+    x = points(field, (200,), dtype=dtype, device=device).requires_grad_()
+    tolerance = 1e-12 if dtype == torch.float64 else 2e-5
+    for level in range(field.num_levels):
+        value, jet = field.value(x, level=level), field.jet(x, level=level)
+        (gradient,) = torch.autograd.grad(value.sum(), x)
+        torch.testing.assert_close(jet.value, value, rtol=0, atol=tolerance)
+        torch.testing.assert_close(jet.gradient, gradient, rtol=0, atol=tolerance)
+
+
+def test_results_without_a_graph_are_the_same(field: Field, dtype: torch.dtype, device: torch.device) -> None:
+    x = points(field, (300,), dtype=dtype, device=device)
+    with_graph = field.jet(x.clone().requires_grad_())
+    with torch.inference_mode():
+        without, value = field.jet(x), field.value(x)
+    tolerance = 1e-12 if dtype == torch.float64 else 1e-5
+    for a, b in zip((*with_graph, with_graph.value), (*without, value), strict=True):
+        torch.testing.assert_close(a.detach(), b, rtol=0, atol=tolerance)
+
+
+def test_levels_count_from_both_ends_and_stop_there(field: Field, dtype: torch.dtype, device: torch.device) -> None:
+    x = points(field, (50,), dtype=dtype, device=device)
+    assert field.deltas.shape == (field.num_levels - 1,)
+    assert torch.equal(field.value(x), field.value(x, level=field.num_levels - 1))
+    for level in (field.num_levels, -field.num_levels - 1):
+        with pytest.raises(ValueError, match="this field has levels"):
+            field.value(x, level=level)
+        with pytest.raises(ValueError, match="this field has levels"):
+            field.jet(x, level=level)
+
+
+def test_levels_differ_only_inside_the_band(field: Field, dtype: torch.dtype, device: torch.device) -> None:
+    x = points(field, (2000,), dtype=dtype, device=device)
+    assert field.in_band(x, level=0).all()
+    for level in range(1, field.num_levels):
+        before, after = field.value(x, level=level - 1), field.value(x, level=level)
+        inside = field.in_band(x, level=level)
+        assert torch.equal(before[~inside], after[~inside])
+        expected = field.in_band(x, level=level - 1) & (before.abs() < field.deltas[level - 1])
+        assert torch.equal(inside, expected)
+        assert inside.any()
+        assert not inside.all()
+
+
+def test_wrong_dimension_is_refused(field: Field) -> None:
+    for method in (field.value, field.jet):
+        with pytest.raises(ValueError, match=rf"expected \(\.\.\., {field.in_dim}\)"):
+            method(torch.zeros(5, field.in_dim + 1))
+
+
+@pytest.mark.parametrize("name", EXACT)
+def test_exact_fields_are_distances(name: str) -> None:
+    """The step −f ∇f from any point lands on the zero set, and no surface point is nearer."""
+    field = EXACT[name]().double()
+    x = points(field, (4000,), dtype=torch.float64)
+    value, gradient, _ = field.jet(x)
+    torch.testing.assert_close(gradient.norm(dim=-1), torch.ones_like(value))
+    foot = x - value[:, None] * gradient
+    torch.testing.assert_close(field.value(foot), torch.zeros_like(value), rtol=0, atol=1e-9)
+    nearest = torch.cdist(x[:500], foot).min(dim=1).values
+    assert (nearest >= value[:500].abs() - 1e-9).all()

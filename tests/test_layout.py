@@ -1,0 +1,48 @@
+"""Imports run pipelines → datasets → neural_fields and never back."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+BELOW = {"neural_fields": set(), "datasets": {"neural_fields"}, "pipelines": {"neural_fields", "datasets"}}
+OUTSIDE = {"torch", "numpy", "skimage", "safetensors"}  # what neural_fields may import
+
+
+def imports(path: Path) -> list[tuple[int, str]]:
+    """(relative level, module) of every import statement, nested ones included."""
+    found = []
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom):
+            found.append((node.level, node.module or ""))
+        elif isinstance(node, ast.Import):
+            found += [(0, alias.name) for alias in node.names]
+    return found
+
+
+@pytest.mark.parametrize("package", BELOW)
+def test_import_direction(package: str) -> None:
+    files = sorted((ROOT / package).glob("*.py"))
+    assert files
+    for path in files:
+        for level, module in imports(path):
+            assert not (level == 0 and module.split(".")[0] == "mplicits"), f"{path}: import {module} relatively"
+            if level == 2:
+                assert module.split(".")[0] in BELOW[package], f"{path}: {package} must not import {module}"
+
+
+def test_neural_fields_is_light() -> None:
+    for path in (ROOT / "neural_fields").glob("*.py"):
+        for level, module in imports(path):
+            top = module.split(".")[0]
+            if level == 0:
+                assert top in OUTSIDE or top in sys.stdlib_module_names, f"{path} imports {top}"
+
+
+def test_no_top_level_name_is_taken() -> None:
+    """A user's own `datasets` folder, or Hugging Face's package, must never be shadowed."""
+    code = "import mplicits.datasets, sys; assert not {'datasets', 'pipelines', 'neural_fields'} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True, cwd="/")
