@@ -69,11 +69,11 @@ def test_taper_makes_value_and_gradient_continuous_at_the_edge() -> None:
     """Across |f| = δ the hard gate jumps by the residual; the tapered one by nothing."""
     residual = Siren(16, 2, omega=5.0).double()
     step = 1e-9
-    radii = torch.tensor([0.6 - step, 0.6 + step], dtype=torch.float64)
+    radii = torch.tensor([0.625 - step, 0.625 + step], dtype=torch.float64)
     direction = torch.nn.functional.normalize(torch.randn(200, 1, 3, dtype=torch.float64), dim=-1)
     x = direction * radii[:, None]
     for taper, continuous in ((0.0, False), (0.3, True)):
-        sdf = MultiscaleSDF(Sphere(radius=0.5), [residual], [0.1], taper=taper).double()
+        sdf = MultiscaleSDF(Sphere(radius=0.5), [residual], [0.125], taper=taper).double()
         jet = sdf.jet(x)
         value_jump = (jet.value[:, 1] - jet.value[:, 0]).abs().max()
         gradient_jump = (jet.gradient[:, 1] - jet.gradient[:, 0]).norm(dim=-1).max()
