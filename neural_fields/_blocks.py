@@ -7,6 +7,7 @@ lattice point, so that no value of it is thrown away.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,7 +18,7 @@ from ._lattice import Lattice, Sampler
 
 __all__ = ["ActiveCells", "NoSurfaceError", "active_cells", "cull_blocks"]
 
-Ints = NDArray[np.int64]
+Ints = NDArray[np.integer]
 Floats = NDArray[np.floating]
 
 _OFFSETS: Ints = np.stack(np.meshgrid(*[np.arange(3)] * 3, indexing="ij"), -1).reshape(27, 3)
@@ -33,7 +34,7 @@ class ActiveCells:
 
     Attributes:
         cases: ``(C,)`` uint8 case of each cell (see `cube_tables`).
-        corners: ``(C, 8)`` rows of ``points``.
+        corners: ``(8, C)`` rows of ``points``.
         points: ``(P, 3)`` lattice points.
         values: ``(P,)`` their values; only those at the end of a crossed edge mean anything.
     """
@@ -70,7 +71,8 @@ def cull_blocks(sampler: Sampler, *, level: int, lipschitz: float) -> tuple[Ints
         reach = lipschitz * lattice.step * size * math.sqrt(3) / 2
         asked = next((j for j, delta in enumerate(deltas) if 2 * delta <= reach), level) if size > 2 else level
         slack = deltas[asked] if asked < level else 0.0
-        values = sampler.values(blocks + size // 2, level=asked, stage=f"blocks of {size}³ cells")
+        stage = f"blocks of {size}³ cells"
+        values = sampler.values(len(blocks), lambda part: blocks[part] + size // 2, level=asked, stage=stage)  # noqa: B023
         kept = (np.abs(values) <= reach + slack) | _beside_other_sign(blocks // size, values < 0)
         if not kept.any():
             raise NoSurfaceError(_where_signs_are(values, blocks + size // 2, lattice, sampler))
@@ -128,7 +130,8 @@ def active_cells(sampler: Sampler, blocks: Ints, centres: Floats, *, level: int,
             return corners.cells()
         known = corners.known_values()
         blocks = np.concatenate((blocks, missing))
-        centres = np.concatenate((centres, sampler.values(missing + 1, level=level, stage="closing")))
+        added = sampler.values(len(missing), lambda part: missing[part] + 1, level=level, stage="closing")  # noqa: B023
+        centres = np.concatenate((centres, added))
 
 
 def _merged(first: Ints, second: Ints) -> Ints:
@@ -186,16 +189,21 @@ class _Corners:
 
     def points(self, rows: NDArray[np.integer]) -> Ints:
         """Lattice points ``(N, 3)`` of point numbers."""
-        return self._origins(self.owners[rows // 8]) + CORNERS[rows % 8]
+        return self._places(self.owners[rows // 8], [rows >> axis & 1 for axis in range(3)])
 
-    def _origins(self, keys: Ints) -> Ints:
-        return 2 * (np.stack(np.unravel_index(keys, self.size), axis=1) - 1)
+    def _places(self, keys: Ints, within: Sequence[Ints | int]) -> NDArray[np.int32]:
+        """Lattice points ``(N, 3)`` at some offsets from the origins of blocks given by their keys."""
+        places = np.empty((len(keys), 3), np.int32)
+        for axis, block in enumerate(np.unravel_index(keys, self.size)):
+            places[:, axis] = 2 * (block - 1) + within[axis]
+        return places
 
     def _set(self, rows: NDArray[np.integer], values: Floats) -> None:
         self.value[rows], self.known[rows] = values, True
 
     def _evaluate(self, rows: NDArray[np.integer], stage: str) -> None:
-        self._set(rows, self.sampler.values(self.points(rows), level=self.level, stage=stage))
+        values = self.sampler.values(len(rows), lambda part: self.points(rows[part]), level=self.level, stage=stage)
+        self._set(rows, values)
 
     def _find_signs(self, centres: Floats, slope: float) -> None:
         low, high = np.full_like(self.value, -np.inf), np.full_like(self.value, np.inf)
@@ -250,7 +258,7 @@ class _Corners:
                 keys = self.keys[open_ & (place >= 0) & (place < cells[axis])] + step * self.strides[axis]
                 near = np.minimum(np.searchsorted(self.keys, keys), len(self.keys) - 1)
                 found.append(keys[self.keys[near] != keys])
-        return self._origins(np.unique(np.concatenate(found)))
+        return self._places(np.unique(np.concatenate(found)), (0, 0, 0))
 
     def known_values(self) -> tuple[Ints, Floats]:
         """What has been evaluated: keys of points, and their values."""
@@ -261,21 +269,21 @@ class _Corners:
         """The crossed cells."""
         cases = self._cases()
         crossed = [np.flatnonzero((case != 0) & (case != 255)) for case in cases]
-        corners = np.concatenate(
-            [
-                np.stack([self.rows(cell + corner)[chosen] for corner in CORNERS], axis=1)
-                for cell, chosen in zip(CORNERS, crossed, strict=True)
-            ]
-        )
-        if not len(corners):
+        chosen = np.concatenate([case[rows] for case, rows in zip(cases, crossed, strict=True)])
+        if not len(chosen):
             centres = self.rows(_OFFSETS[13])
             raise NoSurfaceError(
                 _where_signs_are(self.value[centres], self.points(centres), self.lattice, self.sampler)
             )
+        corners = np.empty((8, len(chosen)), np.int32)
+        for number, corner in enumerate(CORNERS):
+            columns = [self.rows(cell + corner)[rows] for cell, rows in zip(CORNERS, crossed, strict=True)]
+            np.concatenate(columns, out=corners[number])
         is_used = np.zeros(len(self.value), bool)
         is_used[corners] = True
         used = np.flatnonzero(is_used)
         number = np.empty(len(self.value), np.int32)
         number[used] = np.arange(len(used), dtype=np.int32)
-        chosen = np.concatenate([case[rows] for case, rows in zip(cases, crossed, strict=True)])
-        return ActiveCells(chosen, number[corners], self.points(used), self.value[used])
+        for column in corners:
+            column[:] = number[column]
+        return ActiveCells(chosen, corners, self.points(used), self.value[used])

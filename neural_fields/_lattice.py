@@ -77,18 +77,22 @@ class Sampler:
         return torch.from_numpy(positions).to(device=self._like.device, dtype=self._like.dtype)
 
     @torch.inference_mode()
-    def values(self, index: NDArray[np.integer], *, level: int, stage: str) -> NDArray[np.floating]:
-        """Values at lattice points ``(N, 3)`` → ``(N,)``, in the field's dtype.
+    def values(
+        self, count: int, points: Callable[[slice], NDArray[np.integer]], *, level: int, stage: str
+    ) -> NDArray[np.floating]:
+        """Values at ``count`` lattice points → ``(count,)``, in the field's dtype.
+
+        ``points`` gives a part of them, ``(n, 3)``, when it is needed, so that they never exist all at once.
 
         Raises:
             ValueError: the field gave NaN or an infinity.
         """
         parts = [np.empty(0, np.float32)]
-        for start in range(0, len(index), self.batch):
-            positions = self.lattice.positions(index[start : start + self.batch])
+        for start in range(0, count, self.batch):
+            positions = self.lattice.positions(points(slice(start, start + self.batch)))
             part = self.field.value(self._points(positions), level=level).cpu().numpy()
             self._check(part, positions, level)
-            self._report(level, stage, start + len(part), len(index), len(part))
+            self._report(level, stage, start + len(part), count, len(part))
             parts.append(part)
         return np.concatenate(parts[1:] or parts)
 

@@ -21,6 +21,7 @@ DEFAULT_BOUNDS: Bounds = ((-1.02, -1.02, -1.02), (1.02, 1.02, 1.02))
 # Cells that a vertex may move before its normal is taken anew: a twentieth of a cell turns the normal by 0.3 degrees
 # where the radius of curvature is ten cells.
 RENEWED_NORMAL = 0.05
+CELLS_AT_ONCE = 1 << 18
 
 
 @dataclass(frozen=True)
@@ -170,23 +171,26 @@ def _triangles(cells: ActiveCells) -> tuple[NDArray[np.int32], NDArray[np.int32]
     """
     tables = cube_tables()
     number = np.zeros(3 * len(cells.points), np.int32)
-    edges = []
-    for edge, ((low, high), axis) in enumerate(zip(EDGE_ENDS, EDGE_AXIS, strict=True)):
-        rows = np.flatnonzero(tables.crossed[cells.cases, edge])
-        key = 3 * cells.corners[rows, low] + axis
-        edges.append((key, cells.corners[rows, high]))
-        number[key] = 1
+    for edge, (low, _) in enumerate(EDGE_ENDS):
+        crossed = tables.crossed[cells.cases, edge]
+        number[3 * cells.corners[low][crossed] + int(EDGE_AXIS[edge])] = 1
     used = np.flatnonzero(number)
     number[used] = np.arange(len(used), dtype=np.int32)
     ends = np.empty((len(used), 2), np.int32)
     ends[:, 0] = used // 3
-    for key, high in edges:
-        ends[number[key], 1] = high
+    for edge, (low, high) in enumerate(EDGE_ENDS):
+        crossed = tables.crossed[cells.cases, edge]
+        ends[number[3 * cells.corners[low][crossed] + int(EDGE_AXIS[edge])], 1] = cells.corners[high][crossed]
 
-    start = tables.start[cells.cases]
-    count = tables.start[cells.cases.astype(np.int64) + 1] - start
-    cell = np.repeat(np.arange(len(cells.cases)), count)
-    within = np.arange(len(cell)) - np.repeat(np.cumsum(count) - count, count)
-    triangles = tables.triangles[start[cell] + within]  # (F, 3) edges of the cube
-    faces = number[3 * cells.corners[cell[:, None], EDGE_ENDS[triangles, 0]] + EDGE_AXIS[triangles]]
+    first = tables.start[cells.cases]
+    last = np.cumsum(tables.start[cells.cases.astype(np.int64) + 1] - first)
+    faces = np.empty((last[-1], 3), np.int32)
+    for begin in range(0, len(first), CELLS_AT_ONCE):
+        part = slice(begin, begin + CELLS_AT_ONCE)
+        before = np.concatenate(([0] if begin == 0 else [last[begin - 1]], last[part][:-1]))
+        cell = np.repeat(np.arange(begin, begin + len(before)), last[part] - before)
+        within = np.arange(before[0], before[0] + len(cell)) - np.repeat(before, last[part] - before)
+        triangles = tables.triangles[first[cell] + within]  # (f, 3) edges of the cube
+        key = 3 * cells.corners[EDGE_ENDS[triangles, 0], cell[:, None]] + EDGE_AXIS[triangles]
+        faces[before[0] : before[0] + len(cell)] = number[key]
     return faces, ends
