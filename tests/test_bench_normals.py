@@ -1,0 +1,27 @@
+"""The peers of the jet benchmark compute the same thing; the table says what was measured."""
+
+import pytest
+import torch
+from mplicits.neural_fields import Siren
+from mplicits.pipelines.bench_normals import bench_normals, format_normals, tangent_jet
+
+
+@pytest.mark.parametrize("depth", [1, 2, 3])
+def test_algorithm_1_is_the_jet(depth: int) -> None:
+    network = Siren(48, depth, omega=6.0).double().requires_grad_(False)
+    x = torch.rand(6000, 3, dtype=torch.float64)
+    value, gradient = tangent_jet(network, x)
+    jet = network.jet(x)
+    torch.testing.assert_close(value, jet.value)
+    torch.testing.assert_close(gradient, jet.gradient)
+
+
+def test_rows_and_table() -> None:
+    rows = bench_normals(points=3000, sizes=((16, 2), (24, 3)), repeats=1)
+    assert [(row.width, row.depth) for row in rows] == [(16, 2), (24, 3)]
+    for row in rows:
+        assert min(row.value, row.jet, row.tangents, row.autograd, row.gemm) > 0
+        assert row.largest_difference < 1e-3
+    table = format_normals(rows)
+    assert "(24,3)" in table
+    assert f"{rows[0].jet / rows[0].value:.2f}" in table

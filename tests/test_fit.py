@@ -1,0 +1,162 @@
+"""The whole fit on small clouds: accuracy, bands, interruption, resumption, refusal."""
+
+import json
+import os
+import signal
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from mplicits.datasets import PointCloud
+from mplicits.neural_fields import InputError, load_field
+from mplicits.neural_fields.meshing import extract_mesh
+from mplicits.pipelines.fit import Interrupted, choose_device, fit
+from mplicits.pipelines.fit_config import FitConfig
+from mplicits.pipelines.training import Progress
+
+SMALL = FitConfig(
+    widths=(32, 48),
+    depths=(2, 2),
+    omegas=(10.0, 15.0),
+    steps=(150, 80),
+    learning_rates=(3e-3, 1e-3),
+    batch=1024,
+    samples=20_000,
+)
+
+
+def sphere_cloud(count: int = 3000, *, radius: float = 7.0) -> PointCloud:
+    """A sphere in the user's own coordinates."""
+    normals = np.random.default_rng(0).normal(size=(count, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    return PointCloud(radius * normals + [1000.0, -50.0, 5.0], normals=normals.astype(np.float32), source="ball")
+
+
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    directory = tmp_path_factory.mktemp("run")
+    fit(sphere_cloud(), SMALL, out=directory)
+    return directory
+
+
+def test_a_sphere_comes_out_as_a_sphere(fitted: Path) -> None:
+    field, similarity, metadata = load_field(fitted / "field.safetensors")
+    mesh = extract_mesh(field, resolution=48)
+    radii = np.linalg.norm(similarity.to_input(mesh.vertices) - [1000.0, -50.0, 5.0], axis=1)
+    assert abs(radii - 7.0).max() < 0.05
+    errors = [stage["rms_at_points"] for stage in metadata["run"]["stages"]]
+    assert errors[1] < errors[0]
+    x = torch.rand(2000, 3) * 2 - 1
+    x = x[(x.norm(dim=1) - 1).abs() > 0.05]
+    assert torch.equal(field.value(x) > 0, x.norm(dim=1) > 1)
+
+
+def test_bands_hold_the_points(fitted: Path) -> None:
+    field, similarity, metadata = load_field(fitted / "field.safetensors")
+    points = torch.from_numpy(similarity.to_unit(sphere_cloud().points)).float()
+    inside = field.in_band(points, level=1).float().mean()
+    assert inside >= SMALL.quantile - 0.001
+    assert field.deltas.tolist() == pytest.approx(metadata["run"]["deltas"])
+
+
+def test_the_run_directory(fitted: Path) -> None:
+    assert sorted(path.name for path in fitted.iterdir()) == ["field.safetensors", "run.json"]
+    record = json.loads((fitted / "run.json").read_text())
+    assert record["finished"] is True
+    assert record["cloud"] == "ball"
+    assert record["config"]["steps"] == [150, 80]
+    assert record["environment"]["versions"]["torch"] == torch.__version__
+    assert [stage["steps"] for stage in record["stages"]] == [150, 80]
+    assert record["parameters"] == sum(p.numel() for p in load_field(fitted / "field.safetensors").field.parameters())
+
+
+def test_the_same_seed_gives_the_same_field(fitted: Path) -> None:
+    run = fit(sphere_cloud(), SMALL)
+    saved = load_field(fitted / "field.safetensors").field.state_dict()
+    assert all(torch.equal(tensor, saved[name]) for name, tensor in run.field.state_dict().items())
+    other = fit(sphere_cloud(), replace(SMALL, seed=1, steps=(5, 5)))
+    assert not torch.equal(other.field.state_dict()["base.output.weight"], saved["base.output.weight"])
+
+
+@pytest.mark.parametrize(("level", "number"), [(0, signal.SIGINT), (1, signal.SIGTERM)])
+def test_an_interrupted_run_resumes_to_the_same_result(
+    fitted: Path, tmp_path: Path, level: int, number: signal.Signals
+) -> None:
+    def interrupt(progress: Progress) -> None:
+        if progress.stage == f"level {level}" and progress.step == 40:
+            os.kill(os.getpid(), number)
+
+    with pytest.raises(Interrupted, match="checkpoint"):
+        fit(sphere_cloud(), SMALL, out=tmp_path, progress=interrupt)
+    usable = load_field(tmp_path / "field.safetensors").field
+    assert usable.num_levels == level + 1
+    assert json.loads((tmp_path / "run.json").read_text())["finished"] is False
+    fit(sphere_cloud(), out=tmp_path, resume=True)
+    assert (tmp_path / "run.json").exists()
+    assert not (tmp_path / "resume.safetensors").exists()
+    resumed, whole = (load_field(d / "field.safetensors").field.state_dict() for d in (tmp_path, fitted))
+    assert all(torch.equal(resumed[name], whole[name]) for name in whole)
+
+
+def test_signal_handlers_are_put_back() -> None:
+    before = signal.getsignal(signal.SIGINT)
+    fit(sphere_cloud(200), replace(SMALL, steps=(2, 2), samples=100, batch=32))
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_resume_refuses_another_cloud_or_nothing(tmp_path: Path, fitted: Path) -> None:
+    with pytest.raises(InputError, match=r"run\.json: no such file"):
+        fit(sphere_cloud(), out=tmp_path / "none", resume=True)
+    with pytest.raises(InputError, match="nothing to resume"):
+        fit(sphere_cloud(), out=fitted, resume=True)
+
+    def interrupt(progress: Progress) -> None:
+        if progress.step == 20:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    with pytest.raises(Interrupted):
+        fit(sphere_cloud(), SMALL, out=tmp_path, progress=interrupt)
+    with pytest.raises(InputError, match="not the cloud"):
+        fit(sphere_cloud(2999), out=tmp_path, resume=True)
+    (tmp_path / "resume.safetensors").write_bytes(b"junk")
+    with pytest.raises(InputError, match="damaged"):
+        fit(sphere_cloud(), out=tmp_path, resume=True)
+
+
+def test_levels_and_time_budget() -> None:
+    assert fit(sphere_cloud(), replace(SMALL, levels=1, steps=(5, 5))).field.num_levels == 1
+    run = fit(sphere_cloud(), replace(SMALL, steps=(10**6, 10**6), time_budget=2.0))
+    assert [stage["ended_by_time_budget"] for stage in run.record["stages"]] == [True, True]
+    assert run.record["training_seconds"] < 4.0
+
+
+def test_arrays_and_devices() -> None:
+    cloud = sphere_cloud()
+    array = np.hstack((cloud.points, cloud.normals))  # type: ignore[arg-type]
+    tiny = replace(SMALL, steps=(3, 3), device="cpu")
+    a, b = fit(array, tiny).field.state_dict(), fit(cloud, tiny).field.state_dict()
+    assert all(torch.equal(a[name], b[name]) for name in a)
+    with pytest.raises(InputError, match="shape"):
+        fit(array[:, :5], tiny)
+    assert choose_device("cpu").type == "cpu"
+    with pytest.raises(InputError, match="--device nonsense"):
+        choose_device("nonsense")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"steps": (1,)}, "steps: 1 entries for 2 widths"),
+        ({"widths": ()}, "widths: expected at least one"),
+        ({"omegas": (10.0, 0.0)}, "omegas"),
+        ({"batch": 0}, "batch: 0"),
+        ({"quantile": 0.0}, "quantile"),
+        ({"levels": 3}, "levels: 3; expected 1 to 2"),
+        ({"normal_weight": -1.0}, "normal_weight"),
+    ],
+)
+def test_settings_are_checked(change: dict[str, object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        replace(SMALL, **change)  # type: ignore[arg-type]

@@ -1,0 +1,145 @@
+"""Samples of a sphere's cloud against what the sphere says."""
+
+import numpy as np
+import pytest
+import torch
+from mplicits.neural_fields import MultiscaleSDF, Siren, Sphere, Torus
+from mplicits.pipelines.cloud_distance import CloudDistance
+from mplicits.pipelines.sampling import (
+    Samples,
+    band_samples,
+    delta_of,
+    distance_samples,
+    free_lengths,
+    offset_samples,
+    with_previous,
+)
+from torch import Tensor
+
+RADIUS = 0.6
+CPU = torch.device("cpu")
+
+
+def sphere_points(count: int, radius: float = RADIUS) -> tuple[Tensor, Tensor]:
+    """Nearly uniform points on a sphere (a Fibonacci lattice) and their normals."""
+    i = torch.arange(count, dtype=torch.float64) + 0.5
+    z, turn = 1 - 2 * i / count, i * np.pi * (3 - 5**0.5)
+    flat = (1 - z**2).sqrt()
+    normals = torch.stack((flat * turn.cos(), flat * turn.sin(), z), 1)
+    return (radius * normals).float(), normals.float()
+
+
+@pytest.fixture(scope="module")
+def cloud() -> CloudDistance:
+    return CloudDistance(*sphere_points(20_000))
+
+
+def generator() -> torch.Generator:
+    return torch.Generator().manual_seed(0)
+
+
+def test_spacing_and_areas(cloud: CloudDistance) -> None:
+    area = 4 * np.pi * RADIUS**2
+    assert cloud.areas.sum() == pytest.approx(area, rel=0.1)
+    assert cloud.spacing == pytest.approx((area / 20_000) ** 0.5, rel=0.1)
+
+
+def test_signed_distance_of_a_sphere(cloud: CloudDistance) -> None:
+    x = 2 * torch.rand(20_000, 3, generator=generator()) - 1
+    expected = x.norm(dim=1) - RADIUS
+    found = cloud.signed(x)
+    clear = expected.abs() > 1e-4
+    assert torch.equal(found.sign()[clear], expected.sign()[clear])
+    assert (found - expected).abs().max() < 2e-3
+    # The distance to the nearest point alone is too long by up to the spacing of the cloud.
+    nearest = torch.from_numpy(cloud.nearest(x.numpy()))
+    assert (found - expected).abs().mean() < 0.3 * (nearest - expected.abs()).abs().mean()
+
+
+def test_winding_number_tells_inside_from_outside_through_a_hole() -> None:
+    points, normals = sphere_points(20_000)
+    open_below = points[:, 2] > -0.9 * RADIUS
+    cloud = CloudDistance(points[open_below], normals[open_below])
+    x = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, -0.4], [0.0, 0.0, -0.9], [0.7, 0.0, 0.0], [0.3, 0.3, 0.0]])
+    winding = cloud.winding_number(x.numpy())
+    assert (winding[[0, 1, 4]] > 0.5).all()
+    assert (winding[[2, 3]] < 0.5).all()
+    assert torch.equal(cloud.signed(x) < 0, torch.tensor([True, True, False, False, True]))
+
+
+def test_delta_is_equation_5() -> None:
+    errors = torch.tensor([0.01, -0.02, 0.005, 0.0])
+    assert delta_of(errors, epsilon=0.3, quantile=1.0) == pytest.approx(1.3 * 0.02)
+    assert delta_of(errors, epsilon=0.3, quantile=0.75) == pytest.approx(1.3 * 0.01)
+    stray = torch.cat((torch.full((9999,), 0.01), torch.tensor([1.0])))
+    assert delta_of(stray, epsilon=0.3, quantile=1.0) == pytest.approx(1.3)
+    assert delta_of(stray, epsilon=0.3, quantile=0.999) == pytest.approx(1.3 * 0.01)
+
+
+def test_distance_samples_cover_the_domain_and_the_surface(cloud: CloudDistance) -> None:
+    samples = distance_samples(cloud, 4000, generator=generator())
+    assert len(samples) == 4000
+    assert samples.points.abs().max() <= 1.05
+    assert samples.distance is not None
+    torch.testing.assert_close(samples.distance, samples.points.norm(dim=1) - RADIUS, rtol=0, atol=2e-3)
+    assert (samples.distance.abs() < 0.1).float().mean() > 0.4
+    assert (samples.points.abs() > 0.9).any(dim=1).float().mean() > 0.1
+
+
+def test_free_lengths_stop_halfway_to_the_next_sheet() -> None:
+    """Between two spheres 0.1 apart a point can move 0.05 towards the other sheet, and δ away from it."""
+    inner, inner_normals = sphere_points(20_000, 0.5)
+    outer, outer_normals = sphere_points(20_000, 0.6)
+    cloud = CloudDistance(torch.cat((inner, outer)), torch.cat((-inner_normals, outer_normals)))
+    outward, inward = free_lengths(cloud, 0.08, steps=16)
+    assert inward.min() >= 0.04
+    assert inward.max() <= 0.06  # the test of 0.9 t allows 0.0526
+    assert (outward[20_000:] == 0.08).all()
+
+
+def test_offset_samples_have_the_distance_and_normal_they_claim(cloud: CloudDistance) -> None:
+    samples = offset_samples(cloud, free_lengths(cloud, 0.05), 5000, generator=generator())
+    assert samples.distance is not None
+    assert samples.normal is not None
+    jet = Sphere(radius=RADIUS).jet(samples.points)
+    torch.testing.assert_close(samples.distance, jet.value, rtol=0, atol=1e-5)
+    torch.testing.assert_close(samples.normal, jet.gradient, rtol=0, atol=1e-4)
+    assert samples.distance.max() > 0.04
+    assert samples.distance.min() < -0.04
+
+
+def test_band_samples_are_rejected_outside_the_band(cloud: CloudDistance) -> None:
+    delta = 0.03
+    raw = band_samples(cloud, delta, 8000, generator=generator())
+    kept = with_previous(raw, Sphere(radius=RADIUS), delta, device=CPU)
+    assert raw.distance is None
+    assert kept.value is not None
+    assert kept.gradient is not None
+    assert 0.3 < len(kept) / len(raw) < 0.9
+    assert (kept.value.abs() < delta).all()
+    torch.testing.assert_close(kept.value, kept.points.norm(dim=1) - RADIUS)
+    torch.testing.assert_close(kept.gradient, torch.nn.functional.normalize(kept.points, dim=1))
+
+
+def test_previous_levels_reject_by_every_band() -> None:
+    field = MultiscaleSDF(Sphere(radius=RADIUS), [Siren(8, 1)], [0.05])
+    with torch.no_grad():
+        field.residuals[0].output.weight.zero_()  # type: ignore[union-attr]
+        field.residuals[0].output.bias.zero_()  # type: ignore[union-attr]
+    x = 2 * torch.rand(5000, 3, generator=generator()) - 1
+    kept = with_previous(Samples(x), field, 0.2, device=CPU)  # the second band is wider than the first
+    assert len(kept) == int(((x.norm(dim=1) - RADIUS).abs() < 0.05).sum())
+
+
+def test_signed_distance_of_a_torus_cloud() -> None:
+    torus = Torus(major=0.6, minor=0.25)
+    u, v = 2 * np.pi * torch.rand(2, 40_000, generator=generator())
+    rho = 0.6 + 0.25 * v.cos()
+    points = torch.stack((rho * u.cos(), rho * u.sin(), 0.25 * v.sin()), 1)
+    cloud = CloudDistance(points, torus.jet(points).gradient)
+    x = 2 * torch.rand(5000, 3, generator=generator()) - 1
+    expected = torus.value(x)
+    found = cloud.signed(x)
+    clear = expected.abs() > 0.01
+    assert torch.equal(found.sign()[clear], expected.sign()[clear])
+    assert (found - expected).abs().mean() < 1e-3
