@@ -161,7 +161,7 @@ _TINY = 1e-18  # keeps roots differentiable at zero; far below float32's resolut
 
 
 def _norm(v: Tensor) -> Tensor:
-    return torch.sqrt((v * v).sum(dim=1) + _TINY)
+    return torch.sqrt((v * v) @ v.new_ones(3) + _TINY)  # several times faster than a sum over a short dimension
 
 
 def _vector(values: Vector, like: Tensor) -> Tensor:

@@ -10,8 +10,9 @@ from torch import Tensor
 
 from ..neural_fields import Field, Jet
 from . import solids
+from .closest import distinct_starts, refine_closest
 from .solids import Solid, Vector
-from .synthetic import project_to_surface, sample_surface
+from .synthetic import sample_surface
 
 __all__ = ["Statue"]
 
@@ -39,7 +40,7 @@ class Statue(Field):
         self.in_dim = 3
         self.num_levels = 1
         self.register_buffer("deltas", torch.empty(0), persistent=False)
-        self._samples: tuple[Float64, KDTree] | None = None
+        self._samples: tuple[Float64, NDArray[np.floating], KDTree] | None = None
 
     def value(self, x: Tensor, *, level: int = -1) -> Tensor:
         """Implicit function at ``x`` ``(..., 3)`` → ``(...,)``."""
@@ -58,56 +59,35 @@ class Statue(Field):
         blocks = [_statue(block) for block in rows.split(_BLOCK)] if len(rows) else [Solid(rows[:, 0], rows)]
         return Solid(torch.cat([b.value for b in blocks]), torch.cat([b.gradient for b in blocks]))
 
-    def exact_distance(self, points: NDArray[np.floating], *, candidates: int = 4, steps: int = 30) -> Float64:
+    def exact_distance(self, points: NDArray[np.floating], *, candidates: int = 24) -> Float64:
         """Signed distance ``(N,)`` of ``points`` ``(N, 3)``, to 1e-6.
 
-        The nearest of 200,000 surface samples start an iteration to the closest point q: q moves along the
-        tangential part of x - q and back onto the surface; a step that does not shorten |x - q| is
-        undone and halved. The sign is that of the implicit function, which is exact.
+        From the nearest of 200,000 surface samples, taken on first use, :func:`.closest.refine_closest`
+        descends to the closest point. The sign is that of the implicit function, which is exact.
 
         Args:
             points: in the unit sphere's coordinates.
-            candidates: how many nearest samples are refined; the shortest result counts.
-            steps: of the iteration.
+            candidates: how many nearest samples are considered; the shortest result counts.
         """
         points = np.asarray(points, np.float64)
         if len(points) == 0:
             return np.empty(0)
-        samples, tree = self._surface()
-        _, index = tree.query(points, k=candidates, workers=-1)
-        targets = np.repeat(points, candidates, axis=0)
-        distance = self._closest(targets, samples[np.asarray(index).ravel()], steps)
-        sign = np.where(self.value(torch.from_numpy(points)).detach().numpy() < 0, -1.0, 1.0)
-        return sign * distance.reshape(-1, candidates).min(axis=1)
+        samples, normals, tree = self._surface()
+        near = np.asarray(tree.query(points, k=candidates, workers=-1)[1])
+        row, column = np.nonzero(distinct_starts(samples[near], normals[near], radius=0.02))
+        found = refine_closest(self, points[row], samples[near[row, column]])
+        distance = np.full(len(points), np.inf)
+        np.minimum.at(distance, row, found)
+        with torch.no_grad():
+            inside = self.value(torch.from_numpy(points)).numpy() < 0
+        return np.where(inside, -distance, distance)
 
-    def _surface(self) -> tuple[Float64, KDTree]:
+    def _surface(self) -> tuple[Float64, NDArray[np.floating], KDTree]:
         if self._samples is None:
-            points = sample_surface(self, 200_000, seed=0).points
-            self._samples = (points, KDTree(points))
+            cloud = sample_surface(self, 200_000, seed=0)
+            assert cloud.normals is not None
+            self._samples = (cloud.points, cloud.normals, KDTree(cloud.points))
         return self._samples
-
-    def _closest(self, targets: Float64, start: Float64, steps: int) -> Float64:
-        """Distance ``(M,)`` from each target to its closest surface point near ``start`` ``(M, 3)``."""
-        foot, normal, _ = project_to_surface(self, start)
-        best = np.linalg.norm(targets - foot, axis=1)
-        rate = np.ones(len(targets))
-        active = np.arange(len(targets))
-        for _ in range(steps):
-            offset = targets[active] - foot[active]
-            tangential = offset - (offset * normal[active]).sum(axis=1, keepdims=True) * normal[active]
-            # the distance still to be gained is of the order of |tangential|² / |offset|
-            gain = (tangential**2).sum(axis=1) / np.maximum(best[active], 1e-9)
-            open_ones = (gain > 1e-9) & (rate[active] > 1e-6)
-            active, tangential = active[open_ones], tangential[open_ones]
-            if len(active) == 0:
-                break
-            moved, turned, landed = project_to_surface(self, foot[active] + rate[active, None] * tangential)
-            length = np.linalg.norm(targets[active] - moved, axis=1)
-            better = landed & (length < best[active])
-            chosen = active[better]
-            foot[chosen], normal[chosen], best[chosen] = moved[better], turned[better], length[better]
-            rate[active] = np.where(better, np.minimum(1.0, 1.5 * rate[active]), 0.4 * rate[active])
-        return best
 
     def colors(self, points: NDArray[np.floating]) -> NDArray[np.float32]:
         """Procedural texture ``(N, 3)`` in [0, 1] at ``points`` ``(N, 3)``: plumage, gilt, amber and marble."""

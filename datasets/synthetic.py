@@ -174,8 +174,8 @@ def _occupied_cells(
 ) -> tuple[Float64, float]:
     """Lower corners ``(M, 3)`` of the cells of a regular grid that the shell may cross, and the cells' size."""
     size = 2 * extent / cells
-    axis = -extent + size * np.arange(cells)
-    corners = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+    axis = -extent + size * np.arange(cells, dtype=np.float64)
+    corners: Float64 = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
     value, _ = _evaluate(field, corners + size / 2)
     return corners[np.abs(value) < steepness * (np.sqrt(3) / 2 * size + shell)], size
 
