@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
+import sys
 from collections.abc import Mapping
+from pathlib import Path
 from types import MappingProxyType
 
-from .command import Command, add_json, check_output, whole
+from .command import Command, add_json, check_output, positive, whole, write_json
+from .fit_settings import add_fit_settings, fit_settings
 
 __all__ = ["BENCH_COMMANDS"]
 
@@ -29,8 +31,75 @@ def _normals(arguments: argparse.Namespace) -> int:
         points=arguments.points, repeats=arguments.repeats, device=arguments.device, seed=arguments.seed
     )
     print(format_normals(rows))
-    if arguments.json:
-        arguments.json.write_text(json.dumps([dataclasses.asdict(row) for row in rows], indent=2) + "\n")
+    write_json(arguments.json, [row.as_dict() for row in rows])
+    return 0
+
+
+def _mesh_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("run", metavar="RUN", help="run directory or .safetensors file")
+    parser.add_argument(
+        "--resolutions",
+        type=whole(8, 2048),
+        nargs="+",
+        default=(256, 512, 1024),
+        metavar="N",
+        help="where ours is timed (256 512 1024)",
+    )
+    parser.add_argument("--reference", type=whole(8, 1024), default=512, metavar="N", help="where all are (512)")
+    parser.add_argument("--full", action="store_true", help="evaluate the dense peer on the whole lattice: very slow")
+    add_json(parser)
+
+
+def _mesh(arguments: argparse.Namespace) -> int:
+    check_output(arguments.json, (".json",))
+    from .bench_mesh import bench_mesh, format_bench_mesh
+    from .timing import sgemm_rate
+
+    bench = bench_mesh(
+        arguments.run,
+        resolutions=arguments.resolutions,
+        reference=arguments.reference,
+        full=arguments.full,
+        limit=f"this machine multiplies float32 matrices at {sgemm_rate(256) / 1e9:.0f} GFLOP/s",
+        report=lambda text: print(f"{text} …", file=sys.stderr),
+    )
+    print(format_bench_mesh(bench))
+    write_json(arguments.json, dataclasses.asdict(bench))
+    return 0
+
+
+def _fit_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("shapes", nargs="+", metavar="SHAPE", help="mesh files")
+    parser.add_argument("--noise", type=positive, metavar="X", help="move points by up to X bounding-box diagonals")
+    parser.add_argument("--resolution", type=whole(8, 2048), default=512, metavar="N", help="of the meshes (512)")
+    parser.add_argument("--eval-samples", type=whole(1), default=500_000, metavar="N", help="per surface (500000)")
+    parser.add_argument("--poisson-depth", type=whole(4, 14), default=10, metavar="N", help="octree depth (10)")
+    parser.add_argument("--pictures", type=Path, metavar="DIR", help="write a picture of all methods per shape")
+    add_json(parser)
+    add_fit_settings(parser)
+
+
+def _fit(arguments: argparse.Namespace) -> int:
+    check_output(arguments.json, (".json",))
+    config = fit_settings(arguments)
+    from .bench_fit import bench_fit, format_fit
+    from .progress_bar import progress_bars
+
+    if arguments.pictures is not None:
+        arguments.pictures.mkdir(parents=True, exist_ok=True)
+    with progress_bars() as report:
+        rows = bench_fit(
+            arguments.shapes,
+            config,
+            noise=arguments.noise or 0.0,
+            resolution=arguments.resolution,
+            samples=arguments.eval_samples,
+            poisson_depth=arguments.poisson_depth,
+            pictures=arguments.pictures,
+            progress=lambda shape, step: report(dataclasses.replace(step, stage=f"{shape} {step.stage}")),
+        )
+    print(format_fit(rows))
+    write_json(arguments.json, [row.as_dict() for row in rows])
     return 0
 
 
@@ -41,6 +110,20 @@ BENCH_COMMANDS: Mapping[str, Command] = MappingProxyType(
             "  mplicits bench normals\n  mplicits bench normals --points 65536 --json normals.json",
             _normals_arguments,
             _normals,
+        ),
+        "bench mesh": Command(
+            "what extraction costs: adaptive, the paper's, dense",
+            "  mplicits bench mesh runs/scan\n  mplicits bench mesh runs/scan --resolutions 128 256 --reference 256",
+            _mesh_arguments,
+            _mesh,
+        ),
+        "bench fit": Command(
+            "how near fits come: ours per level, screened Poisson",
+            """  mplicits bench fit armadillo.ply --time-budget 180
+  mplicits bench fit armadillo.ply bunny.ply --noise 0.01 --preset fast --pictures pictures""",
+            _fit_arguments,
+            _fit,
+            "Fit the vertices of each mesh and measure the result against the mesh; Poisson needs mplicits[poisson].",
         ),
     }
 )

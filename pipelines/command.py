@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import argparse
+import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from .config import input_error
 
-__all__ = ["Command", "add_json", "check_output", "positive", "whole"]
+__all__ = ["Command", "add_json", "check_output", "positive", "whole", "write_json"]
 
 
 @dataclass(frozen=True)
@@ -77,3 +79,12 @@ def check_output(path: Path | None, suffixes: Sequence[str]) -> None:
         raise input_error(f"{path}: the folder {path.absolute().parent} does not exist; make it first")
     if path.is_dir():
         raise input_error(f"{path}: is a directory; name a file")
+
+
+def write_json(path: Path | None, data: Any) -> None:
+    """Write figures through a temporary file beside the target; nothing without a path."""
+    if path is None:
+        return
+    partial = path.with_name(f".{path.name}.partial")
+    partial.write_text(json.dumps(data, indent=2) + "\n", encoding="utf-8")
+    partial.replace(path)

@@ -16,8 +16,8 @@ from types import MappingProxyType
 
 from .bench_commands import BENCH_COMMANDS
 from .command import Command, add_json, check_output, positive, whole
-from .config import add_config_flags, given_flags, input_error, load_config, preset_names
-from .fit_config import FitConfig
+from .config import input_error
+from .fit_settings import add_fit_settings, fit_settings, were_given
 
 __all__ = ["COMMANDS", "Command"]
 
@@ -28,22 +28,17 @@ SAMPLES = ("statue",)
 def _fit_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("cloud", metavar="CLOUD", help="PLY, OBJ, STL, OFF, XYZ, TXT, CSV, NPY, NPZ, LAS or LAZ file")
     parser.add_argument("-o", "--out", required=True, type=Path, metavar="RUN", help="directory of the run")
-    source = parser.add_mutually_exclusive_group()
-    source.add_argument("--preset", metavar="NAME", help=f"one of {', '.join(preset_names('fit'))} (default: default)")
-    source.add_argument("--config", type=Path, metavar="FILE", help="a YAML file of settings")
     begin = parser.add_mutually_exclusive_group()
     begin.add_argument("--resume", action="store_true", help="continue the interrupted run in RUN, with its settings")
     begin.add_argument("--force", action="store_true", help="overwrite the run in RUN")
     parser.add_argument("--quiet", action="store_true", help="no progress bars")
-    add_config_flags(parser, FitConfig)
+    add_fit_settings(parser)
 
 
 def _fit(arguments: argparse.Namespace) -> int:
-    given = given_flags(arguments, FitConfig)
-    preset: str | Path = arguments.config or arguments.preset or "default"
-    if arguments.resume and (given or arguments.config or arguments.preset):
+    if arguments.resume and were_given(arguments):
         raise input_error("--resume: continues with the run's own settings; leave out --preset, --config and the rest")
-    config = None if arguments.resume else load_config(FitConfig, preset, given, thing="fit")
+    config = None if arguments.resume else fit_settings(arguments)
     from .fit import Interrupted, fit
     from .fit_state import STATE_FILE
     from .info import describe
@@ -153,12 +148,12 @@ def _sample(arguments: argparse.Namespace) -> int:
 def _demo_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("cloud", nargs="?", metavar="CLOUD", help="any cloud (default: the bundled statue scan)")
     parser.add_argument("-o", "--out", type=Path, default=Path("demo"), metavar="DIR", help="directory (demo)")
-    parser.add_argument("--preset", metavar="NAME", help=f"of the fit: one of {', '.join(preset_names('fit'))}")
     parser.add_argument("--up", choices=("y", "z"), help="the axis that points up in the picture")
+    add_fit_settings(parser)
 
 
 def _demo(arguments: argparse.Namespace) -> int:
-    config = None if arguments.preset is None else load_config(FitConfig, arguments.preset, thing="fit")
+    config = fit_settings(arguments) if were_given(arguments) else None
     from .demo import demo
 
     return demo(arguments.cloud, arguments.out, config=config, up=arguments.up)

@@ -115,7 +115,8 @@ def picture_of(
         normal = None if surface.normals is None else surface.normals[index]
         color = None if surface.colors is None else surface.colors[index]
     image = np.ones((width * height, 3), np.float32)
-    image[pixel] = _shade(position, normal, color, camera)
+    # A point of a cloud has no back: its normal may be anything, and seeing far ones between near ones is normal.
+    image[pixel] = _shade(position, normal, color, camera, back=BACK if len(surface.faces) else None)
     image = image.reshape(width, height, 3).swapaxes(0, 1)
     return cv2.resize((image * 255 + 0.5).astype(np.uint8), size, interpolation=cv2.INTER_AREA).astype(np.uint8)
 
@@ -173,7 +174,14 @@ def _cloud_pixels(xy: Float64, depth: Float64, size: tuple[int, int], diameter: 
     return pixel, (buffer[pixel] & np.uint64(0xFFFFFFFF)).astype(np.int64)
 
 
-def _shade(position: Float64, normal: Float64 | None, color: Float64 | None, camera: Camera) -> Float64:
+def _shade(
+    position: Float64,
+    normal: Float64 | None,
+    color: Float64 | None,
+    camera: Camera,
+    *,
+    back: tuple[float, float, float] | None,
+) -> Float64:
     """Headlight, a weaker lamp above left of the camera, and a little ambient light; ``(P, 3)`` in [0, 1]."""
     albedo = np.broadcast_to(CLAY, position.shape) if color is None else color
     to_eye = camera.eye - position
@@ -191,7 +199,8 @@ def _shade(position: Float64, normal: Float64 | None, color: Float64 | None, cam
     lamp /= np.linalg.norm(lamp)
     turned = normal * np.where(facing < 0, -1.0, 1.0)[:, None]
     light = 0.22 + 0.50 * np.abs(facing) + 0.34 * (turned @ lamp).clip(0)
-    albedo = np.where((facing < 0)[:, None], BACK, albedo)
+    if back is not None:
+        albedo = np.where((facing < 0)[:, None], back, albedo)
     return (albedo * light[:, None]).clip(0, 1)
 
 

@@ -14,6 +14,7 @@ from scipy.sparse.csgraph import connected_components
 
 from ..datasets import PointCloud, read_cloud
 from ..neural_fields import InputError, Similarity
+from ..neural_fields.meshing import Mesh
 
 __all__ = [
     "MESH_SUFFIXES",
@@ -21,6 +22,7 @@ __all__ = [
     "components",
     "face_normals",
     "from_cloud",
+    "from_mesh",
     "is_closed",
     "merged",
     "read_surface",
@@ -112,6 +114,13 @@ def _load_mesh(path: Path) -> Surface | None:
     # A property of trimesh computes normals that are not there; the cache says whether the file gave any.
     normals = np.asarray(loaded.vertex_normals, np.float64) if "vertex_normals" in loaded._cache else None
     return Surface(vertices, faces, normals, colors)
+
+
+def from_mesh(mesh: Mesh) -> Surface:
+    """A mesh that `extract_mesh` made, in its own coordinates."""
+    normals = None if mesh.normals is None else mesh.normals.astype(np.float64)
+    colors = None if mesh.colors is None else mesh.colors.astype(np.float64)
+    return Surface(mesh.vertices, mesh.faces.astype(np.int64), normals, colors)
 
 
 def face_normals(surface: Surface) -> tuple[Float64, Float64]:

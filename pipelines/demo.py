@@ -1,0 +1,160 @@
+"""``mplicits demo``: a scan in, a mesh and a picture of every level out, and how near the result is."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from ..datasets import STATUE_PLACEMENT, PointCloud, Statue, read_cloud, statue_scan, write_cloud_ply
+from ..neural_fields import Field, InputError, Similarity
+from ..neural_fields.meshing import Mesh, NoSurfaceError, extract_mesh
+from .config import load_config
+from .fit import Run, fit
+from .fit_config import FitConfig
+from .mesh_files import write_mesh
+from .picture import contact_sheet, look_at, picture_of, write_picture
+from .progress_bar import progress_bars
+from .surface import from_cloud, from_mesh
+from .timing import format_table
+
+__all__ = ["demo", "distances_to_surface", "draw_levels", "spread_colors"]
+
+Float64 = NDArray[np.float64]
+
+TRAINING_SECONDS = 150.0  # with what else the demo does, under four minutes on two cores
+RESOLUTION = 320
+CHECKED = 3_000  # vertices and points whose exact distance to the statue is worked out
+TILE = (480, 640)
+
+
+def demo(
+    cloud: str | Path | None,
+    out: str | Path,
+    *,
+    config: FitConfig | None = None,
+    up: str | None = None,
+    resolution: int = RESOLUTION,
+) -> int:
+    """Fit a cloud, write its meshes and a picture into ``out``, print figures.
+
+    Args:
+        cloud: a point-cloud file; None takes the bundled scan, whose exact distance is known.
+        out: directory for scan.ply (the bundled scan), run/, mesh.ply, mesh.glb and picture.png.
+        config: of the fit; by default the ``default`` preset within ``TRAINING_SECONDS``.
+        up: axis that points up in the picture, "y" or "z".
+        resolution: of the meshes.
+
+    Raises:
+        InputError: the cloud cannot be used, or ``out`` cannot be made.
+    """
+    started = time.monotonic()
+    config = config or load_config(FitConfig, "default", {"time_budget": TRAINING_SECONDS})
+    out = Path(out)
+    if out.exists() and not out.is_dir():
+        raise InputError(f"{out}: is a file; name a directory for the demo")
+    points = statue_scan() if cloud is None else read_cloud(cloud)  # before anything is made
+    out.mkdir(parents=True, exist_ok=True)
+    file = out / "scan.ply" if cloud is None else Path(cloud)
+    if cloud is None:
+        write_cloud_ply(file, points)
+    print(f"{file}: {len(points):,} points")
+    with progress_bars() as report:
+        run = fit(file, config, out=out / "run", progress=report)
+
+    meshes = [_extract(run.field, level, resolution) for level in range(run.field.num_levels)]
+    finest = spread_colors(meshes[-1], points, run.similarity)
+    for name in ("mesh.ply", "mesh.glb"):
+        write_mesh(out / name, finest, run.similarity)
+    picture = draw_levels(points, [*meshes[:-1], finest], run.similarity, up=up or ("z" if cloud is None else "y"))
+    write_picture(out / "picture.png", picture)
+    print(_figures(run, meshes, points))
+    if cloud is None:
+        print(_true_errors(points, meshes, run.similarity))
+    print(f"{out / 'mesh.ply'}, mesh.glb, picture.png, run/: {time.monotonic() - started:.0f} s in all")
+    return 0
+
+
+def _extract(field: Field, level: int, resolution: int) -> Mesh:
+    try:
+        return extract_mesh(field, level=level, resolution=resolution)
+    except NoSurfaceError as error:
+        raise InputError(f"level {level} has no surface ({error}); is the cloud a surface, are its normals?") from error
+
+
+def spread_colors(mesh: Mesh, cloud: PointCloud, similarity: Similarity, *, neighbors: int = 4) -> Mesh:
+    """The mesh with each vertex coloured by the nearest points; as it is, where the cloud has no colours.
+
+    Args:
+        mesh: in unit-sphere coordinates.
+        cloud: in input coordinates.
+        similarity: from one to the other.
+        neighbors: how many points share in a vertex (2 or more), by the inverse of their squared distances.
+    """
+    points = from_cloud(cloud).moved(similarity)
+    if points.colors is None:
+        return mesh
+    distance, index = KDTree(points.vertices).query(mesh.vertices, k=neighbors, workers=-1)
+    weights = 1 / np.maximum(distance, 1e-9) ** 2
+    weights /= weights.sum(axis=1, keepdims=True)
+    colors = np.einsum("vk,vkc->vc", weights, points.colors[index])
+    return dataclasses.replace(mesh, colors=colors.astype(np.float32))
+
+
+def draw_levels(cloud: PointCloud, meshes: Sequence[Mesh], similarity: Similarity, *, up: str) -> NDArray[np.uint8]:
+    """The cloud and the mesh of each level side by side, all from one camera."""
+    points = from_cloud(cloud).moved(similarity)
+    camera = look_at(points.vertices, up=up, aspect=TILE[0] / TILE[1])
+    pictures = [(f"input: {len(points.vertices):,} points", picture_of(points, camera, size=TILE))]
+    for level, mesh in enumerate(meshes):
+        label = f"level {level}: {len(mesh.faces):,} faces"
+        pictures.append((label, picture_of(from_mesh(mesh), camera, size=TILE)))
+    return contact_sheet(pictures)
+
+
+@torch.inference_mode()
+def distances_to_surface(field: Field, points: Float64, *, level: int, batch: int = 1 << 18) -> Float64:
+    """First-order distances |f| / |∇f| of ``points`` ``(N, 3)`` to the zero set of a level, in the field's units."""
+    parts = []
+    for part in torch.from_numpy(points.astype(np.float32)).split(batch):
+        jet = field.jet(part, level=level)
+        parts.append(jet.value.abs() / jet.gradient.norm(dim=-1).clamp(min=1e-6))
+    return torch.cat(parts).double().numpy()
+
+
+def _figures(run: Run, meshes: Sequence[Mesh], cloud: PointCloud) -> str:
+    """Per level: what it cost, and how far the input points are from its surface."""
+    scale = run.similarity.scale
+    points = run.similarity.to_unit(from_cloud(cloud).vertices)
+    rows = []
+    for stage, mesh in zip(run.record["stages"], meshes, strict=True):
+        level = stage["level"]
+        away = distances_to_surface(run.field, points, level=level) * scale
+        delta = f"{float(run.field.deltas[level]) * scale:.4g}" if level < len(run.field.deltas) else "-"
+        seconds = stage["sampling_seconds"] + stage["training_seconds"]
+        figures = [f"{np.sqrt((away**2).mean()):.4g}", f"{np.median(away):.4g}", f"{len(mesh.faces):,}"]
+        rows.append([f"level {level}", f"{stage['parameters']:,}", f"{seconds:.0f} s", delta, *figures])
+    header = ["", "parameters", "training", "band δ", "points off: rms", "median", "faces"]
+    return f"lengths in input units\n{format_table(header, rows)}"
+
+
+def _true_errors(cloud: PointCloud, meshes: Sequence[Mesh], similarity: Similarity) -> str:
+    """Exact distances to the statue, of the scan's points and of each level's vertices, in input units."""
+    statue = Statue()
+    random = np.random.default_rng(0)
+    shapes = [("scan points (noise)", cloud.points)]
+    shapes += [(f"level {level} mesh", similarity.to_input(mesh.vertices)) for level, mesh in enumerate(meshes)]
+    rows = []
+    for name, points in shapes:
+        chosen = points[random.permutation(len(points))[:CHECKED]]
+        error = np.abs(statue.exact_distance(STATUE_PLACEMENT.to_unit(chosen))) * STATUE_PLACEMENT.scale
+        figures = (error.mean(), np.sqrt((error**2).mean()), np.quantile(error, 0.95), error.max())
+        rows.append([name, *(f"{figure:.3f}" for figure in figures)])
+    header = ["true error, mm", "mean", "rms", "95 %", "max"]
+    return format_table(header, rows)
