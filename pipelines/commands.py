@@ -148,6 +148,7 @@ def _sample(arguments: argparse.Namespace) -> int:
 def _demo_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("cloud", nargs="?", metavar="CLOUD", help="any cloud (default: the bundled statue scan)")
     parser.add_argument("-o", "--out", type=Path, default=Path("demo"), metavar="DIR", help="directory (demo)")
+    parser.add_argument("--resolution", type=whole(8, 2048), default=320, metavar="N", help="of the meshes (320)")
     parser.add_argument("--up", choices=("y", "z"), help="the axis that points up in the picture")
     add_fit_settings(parser)
 
@@ -156,7 +157,7 @@ def _demo(arguments: argparse.Namespace) -> int:
     config = fit_settings(arguments) if were_given(arguments) else None
     from .demo import demo
 
-    return demo(arguments.cloud, arguments.out, config=config, up=arguments.up)
+    return demo(arguments.cloud, arguments.out, config=config, up=arguments.up, resolution=arguments.resolution)
 
 
 COMMANDS: Mapping[str, Command] = MappingProxyType(

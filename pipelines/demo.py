@@ -29,7 +29,6 @@ __all__ = ["demo", "distances_to_surface", "draw_levels", "spread_colors"]
 Float64 = NDArray[np.float64]
 
 TRAINING_SECONDS = 150.0  # with what else the demo does, under four minutes on two cores
-RESOLUTION = 320
 CHECKED = 3_000  # vertices and points whose exact distance to the statue is worked out
 TILE = (480, 640)
 
@@ -40,7 +39,7 @@ def demo(
     *,
     config: FitConfig | None = None,
     up: str | None = None,
-    resolution: int = RESOLUTION,
+    resolution: int = 320,
 ) -> int:
     """Fit a cloud, write its meshes and a picture into ``out``, print figures.
 

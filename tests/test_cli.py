@@ -2,13 +2,16 @@
 
 import json
 import re
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
+from mplicits.datasets import sample_sphere
 from mplicits.neural_fields import MultiscaleSDF, Similarity, save_field
 from mplicits.pipelines import doctor
 from mplicits.pipelines.cli import main
@@ -183,6 +186,29 @@ def test_a_run_is_not_overwritten_unless_told_to(capsys, cloud, run):
     assert (run / "field.safetensors").read_bytes() == before
 
 
+def test_ctrl_c_leaves_a_run_that_resume_finishes(cloud, tmp_path):
+    out = tmp_path / "run"
+    slow = [word for word in SMALL if word != "--quiet"]
+    slow[slow.index("300")] = "100000"
+    program = "import sys; from mplicits.pipelines.cli import main; sys.exit(main(sys.argv[1:]))"
+    arguments = [sys.executable, "-c", program, "fit", str(cloud), "-o", str(out)]
+    process = subprocess.Popen(
+        [*arguments, *slow, "--time-budget", "3"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    deadline = time.monotonic() + 60
+    while not (out / "run.json").is_file() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    time.sleep(0.5)
+    process.send_signal(signal.SIGINT)
+    _, error = process.communicate(timeout=60)
+    assert process.returncode == 130, error
+    assert f"to continue: mplicits fit {cloud} -o {out} --resume" in error
+    assert "Traceback" not in error
+    done = subprocess.run([*arguments, "--resume"], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    assert json.loads((out / "run.json").read_text())["finished"]
+
+
 def test_mesh_is_in_input_coordinates_and_evaluate_measures_it(capsys, run, tmp_path):
     out = tmp_path / "ball.ply"
     assert main(["mesh", str(run), "-o", str(out), "--resolution", "48", "--keep-largest"]) == 0
@@ -264,6 +290,36 @@ def test_output_into_a_closed_pipe_is_no_traceback(box):
     process.stderr.close()
     assert process.wait(timeout=60) == 141
     assert error == b""
+
+
+def test_the_sample_is_written_and_read_again(monkeypatch, tmp_path, capsys):
+    # Fewer rays than the real scan, which takes seconds: the command, not the scanner, is tested here.
+    monkeypatch.setattr("mplicits.datasets.statue_scan", lambda *, seed: sample_sphere(50, seed=seed))
+    assert main(["sample", "-o", str(tmp_path / "scan.ply")]) == 0
+    assert "50 points" in capsys.readouterr().out
+    assert main(["info", str(tmp_path / "scan.ply")]) == 0
+    assert "x -0." in capsys.readouterr().out
+
+
+def test_the_demo_writes_meshes_and_a_picture_of_any_cloud(cloud, tmp_path, capsys):
+    out = tmp_path / "demo"
+    small = [*(word for word in SMALL if word != "--quiet"), "--resolution", "48"]
+    assert main(["demo", str(cloud), "-o", str(out), *small]) == 0
+    assert sorted(path.name for path in out.iterdir()) == ["mesh.glb", "mesh.ply", "picture.png", "run"]
+    mesh = trimesh.load_mesh(out / "mesh.ply")
+    np.testing.assert_allclose(mesh.bounds.mean(axis=0), [100, 0, 0], atol=0.3)
+    np.testing.assert_allclose(trimesh.load_mesh(out / "mesh.glb").bounds, mesh.bounds, atol=1e-3)
+    text = capsys.readouterr().out
+    assert re.search(r"level 1 +\d", text)
+    assert "true error" not in text
+    assert "is a file" in fails(capsys, "demo", cloud, "-o", out / "mesh.ply")
+
+
+def test_bench_normals_prints_a_table_and_writes_json(tmp_path, capsys):
+    figures = tmp_path / "normals.json"
+    assert main(["bench", "normals", "--points", "256", "--repeats", "1", "--json", str(figures)]) == 0
+    assert len(json.loads(figures.read_text())) == 4
+    assert "autograd" in capsys.readouterr().out
 
 
 # --- doctor ------------------------------------------------------------------------------------------
