@@ -21,6 +21,7 @@ __all__ = ["ActiveCells", "NoSurfaceError", "active_cells", "cull_blocks"]
 Ints = NDArray[np.integer]
 Floats = NDArray[np.floating]
 
+_BITS = np.array([1, 2, 4])
 _OFFSETS: Ints = np.stack(np.meshgrid(*[np.arange(3)] * 3, indexing="ij"), -1).reshape(27, 3)
 
 
@@ -45,7 +46,7 @@ class ActiveCells:
     values: Floats
 
 
-def cull_blocks(sampler: Sampler, *, level: int, lipschitz: float) -> tuple[Ints, Floats]:
+def cull_blocks(sampler: Sampler, *, level: int, lipschitz: float) -> tuple[Ints, Floats, NDArray[np.bool_]]:
     """Halve blocks from about 1/32 of the box down to 2³ cells, dropping those that cannot hold a zero.
 
     A stage with blocks of half diagonal r asks level j only at the block centres c and keeps those with
@@ -53,11 +54,12 @@ def cull_blocks(sampler: Sampler, *, level: int, lipschitz: float) -> tuple[Ints
         |f_j(c)| ≤ L r + δ_j,
 
     because a zero p of the target has |f_j(p)| < δ_j (it is in level j's band) and |f_j(c) − f_j(p)| ≤ L r. The
-    level is the first one with 2 δ_j ≤ L r: a finer one would cull little more; for the target δ is 0. Two
+    level is the first one with 4 δ_j ≤ L r: a finer one would cull little more; for the target δ is 0. Two
     neighbouring centres with opposite signs are both kept whatever they say, since there the bound is violated.
 
     Returns:
-        Origins ``(B, 3)`` of the surviving blocks of 2³ cells, and ``(B,)`` target values at their centres.
+        Of the blocks of 2³ cells that were looked at: origins ``(B, 3)``, target values at the centres ``(B,)``, and
+        which survived ``(B,)``. The others still bound the field around them.
 
     Raises:
         NoSurfaceError: nothing survives.
@@ -69,18 +71,17 @@ def cull_blocks(sampler: Sampler, *, level: int, lipschitz: float) -> tuple[Ints
     blocks = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
     while True:
         reach = lipschitz * lattice.step * size * math.sqrt(3) / 2
-        asked = next((j for j, delta in enumerate(deltas) if 2 * delta <= reach), level) if size > 2 else level
+        asked = next((j for j, delta in enumerate(deltas) if 4 * delta <= reach), level) if size > 2 else level
         slack = deltas[asked] if asked < level else 0.0
         stage = f"blocks of {size}³ cells"
         values = sampler.values(len(blocks), lambda part: blocks[part] + size // 2, level=asked, stage=stage)  # noqa: B023
         kept = (np.abs(values) <= reach + slack) | _beside_other_sign(blocks // size, values < 0)
         if not kept.any():
             raise NoSurfaceError(_where_signs_are(values, blocks + size // 2, lattice, sampler))
-        blocks, values = blocks[kept], values[kept]
         if size == 2:
-            return blocks, values
+            return blocks, values, kept
         size //= 2
-        blocks = (blocks[:, None] + CORNERS * size).reshape(-1, 3)
+        blocks = (blocks[kept, None] + CORNERS * size).reshape(-1, 3)
         blocks = blocks[(blocks < lattice.shape).all(axis=1)]
 
 
@@ -111,10 +112,12 @@ def _where_signs_are(values: Floats, points: Ints, lattice: Lattice, sampler: Sa
     )
 
 
-def active_cells(sampler: Sampler, blocks: Ints, centres: Floats, *, level: int, lipschitz: float) -> ActiveCells:
+def active_cells(
+    sampler: Sampler, blocks: Ints, centres: Floats, kept: NDArray[np.bool_], *, level: int, lipschitz: float
+) -> ActiveCells:
     """Find the crossed cells of 2³-cell blocks, and exact values at both ends of every crossed edge.
 
-    The sign at a corner q follows from any centre c of a block around it with |f(c)| > L |q − c|; only the other
+    The sign at a corner q follows from any known centre c of a block around it with |f(c)| > L |q − c|; only the other
     corners are evaluated, then the ends of the edges that turn out to be crossed, until nothing is new. Where
     the surface leaves the blocks through a face, the neighbour there is added and the search goes on, so that
     the surface is closed inside the box also where the field is steeper than L.
@@ -124,7 +127,7 @@ def active_cells(sampler: Sampler, blocks: Ints, centres: Floats, *, level: int,
     """
     known: tuple[Ints, Floats] = (np.empty(0, np.int64), centres[:0])
     while True:
-        corners = _Corners(sampler, blocks, centres, known, level=level, lipschitz=lipschitz)
+        corners = _Corners(sampler, blocks, centres, kept, known, level=level, lipschitz=lipschitz)
         missing = corners.open_neighbours()
         if not len(missing):
             return corners.cells()
@@ -132,6 +135,7 @@ def active_cells(sampler: Sampler, blocks: Ints, centres: Floats, *, level: int,
         blocks = np.concatenate((blocks, missing))
         added = sampler.values(len(missing), lambda part: missing[part] + 1, level=level, stage="closing")  # noqa: B023
         centres = np.concatenate((centres, added))
+        kept = np.concatenate((kept, np.ones(len(missing), bool)))
 
 
 def _merged(first: Ints, second: Ints) -> Ints:
@@ -153,6 +157,7 @@ class _Corners:
         sampler: Sampler,
         blocks: Ints,
         centres: Floats,
+        kept: NDArray[np.bool_],
         known: tuple[Ints, Floats],
         *,
         level: int,
@@ -163,9 +168,10 @@ class _Corners:
         # Two spare layers on each axis let the key of any neighbour be had by adding a stride.
         self.size = tuple(cells // 2 + 3 for cells in self.lattice.shape)
         self.strides = np.array([self.size[1] * self.size[2], self.size[2], 1])
-        keys = (blocks // 2 + 1) @ self.strides
-        order = np.argsort(keys)
-        self.blocks, self.keys = blocks[order], keys[order]
+        seen = (blocks // 2 + 1) @ self.strides
+        order = np.flatnonzero(kept)
+        order = order[np.argsort(seen[order])]
+        self.blocks, self.keys = blocks[order], seen[order]
         self.owners = self.keys
         for stride in self.strides:
             self.owners = _merged(self.owners, self.owners + stride)
@@ -179,13 +185,16 @@ class _Corners:
         owner = np.searchsorted(self.owners, known[0] // 8)
         self._set(owner * 8 + known[0] % 8, known[1])
         self.inside = np.zeros(count, bool)
-        self._find_signs(centres[order], lipschitz * self.lattice.step)
+        self._find_signs(seen, centres, lipschitz * self.lattice.step)
         self._verify_ends()
 
     def rows(self, offset: Ints) -> NDArray[np.int32]:
         """Point numbers of one of the 27 points, ``offset`` in {0, 1, 2}³, of every block."""
-        weights = np.array([1, 2, 4])
-        return self.owner_of[int(offset // 2 @ weights)] * 8 + np.int32(offset % 2 @ weights)
+        return self._row(self.owner_of[int(offset // 2 @ _BITS)], offset)
+
+    @staticmethod
+    def _row(owner: NDArray[np.int32], offset: Ints) -> NDArray[np.int32]:
+        return owner * 8 + np.int32(offset % 2 @ _BITS)
 
     def points(self, rows: NDArray[np.integer]) -> Ints:
         """Lattice points ``(N, 3)`` of point numbers."""
@@ -205,13 +214,23 @@ class _Corners:
         values = self.sampler.values(len(rows), lambda part: self.points(rows[part]), level=self.level, stage=stage)
         self._set(rows, values)
 
-    def _find_signs(self, centres: Floats, slope: float) -> None:
+    def _find_signs(self, seen: Ints, centres: Floats, slope: float) -> None:
+        """Bound the field at every point by ``centres ± slope · distance``, and evaluate where that leaves both signs.
+
+        ``seen`` are the keys of all blocks whose centre is known, those outside the set among them.
+        """
         low, high = np.full_like(self.value, -np.inf), np.full_like(self.value, np.inf)
+        for corner in CORNERS:
+            keys = seen + corner @ self.strides
+            owner = np.minimum(np.searchsorted(self.owners, keys), len(self.owners) - 1).astype(np.int32)
+            listed = self.owners[owner] == keys
+            owner, values = owner[listed], centres[listed]
+            for offset in _OFFSETS[np.all(corner == _OFFSETS // 2, axis=1)]:
+                rows, reach = self._row(owner, offset), slope * math.sqrt(((offset - 1) ** 2).sum())
+                low[rows], high[rows] = np.maximum(low[rows], values - reach), np.minimum(high[rows], values + reach)
         touched = np.zeros(len(self.value), bool)
         for offset in _OFFSETS:
-            rows, reach = self.rows(offset), slope * math.sqrt(((offset - 1) ** 2).sum())
-            low[rows], high[rows] = np.maximum(low[rows], centres - reach), np.minimum(high[rows], centres + reach)
-            touched[rows] = True
+            touched[self.rows(offset)] = True
         # Where two centres contradict each other the field is steeper than L: ask it.
         unsure = touched & ~self.known & ((low > 0) == (high < 0))
         self._evaluate(np.flatnonzero(unsure), "corners")
@@ -241,7 +260,7 @@ class _Corners:
         for offset in _OFFSETS:
             inside = self.inside[self.rows(offset)]
             for cell in np.flatnonzero(((offset >= CORNERS) & (offset <= CORNERS + 1)).all(axis=1)):
-                cases[cell] |= inside.astype(np.uint8) << np.uint8((offset - CORNERS[cell]) @ np.array([1, 2, 4]))
+                cases[cell] |= inside.astype(np.uint8) << np.uint8((offset - CORNERS[cell]) @ _BITS)
         for cell, beyond in enumerate((self.blocks + corner >= self.lattice.shape).any(axis=1) for corner in CORNERS):
             cases[cell][beyond] = 0
         return cases

@@ -117,9 +117,9 @@ def extract_mesh(
     level = field.resolve_level(level)
     sampler = Sampler(field, Lattice.over(bounds, resolution), batch, progress)
     times = [time.perf_counter()]
-    blocks, centres = cull_blocks(sampler, level=level, lipschitz=lipschitz)
+    blocks, centres, kept = cull_blocks(sampler, level=level, lipschitz=lipschitz)
     times.append(time.perf_counter())
-    cells = active_cells(sampler, blocks, centres, level=level, lipschitz=lipschitz)
+    cells = active_cells(sampler, blocks, centres, kept, level=level, lipschitz=lipschitz)
     times.append(time.perf_counter())
     faces, ends = _triangles(cells)
     fractions = _crossing(cells.values[ends[:, 0]], cells.values[ends[:, 1]]).clip(clearance, 1 - clearance)
@@ -143,7 +143,7 @@ def extract_mesh(
     times.append(time.perf_counter())
     stages = ("cull", "corners", "triangles", "normals")
     seconds = {stage: after - before for stage, before, after in zip(stages, times, times[1:], strict=False)}
-    stats = MeshStats(tuple(sampler.counts), len(blocks), len(cells.cases), seconds)
+    stats = MeshStats(tuple(sampler.counts), int(kept.sum()), len(cells.cases), seconds)
     return Mesh(vertices, faces, unit, stats=stats)
 
 
