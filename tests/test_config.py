@@ -8,6 +8,7 @@ from typing import Literal
 import pytest
 from mplicits.neural_fields import InputError
 from mplicits.pipelines.config import add_config_flags, given_flags, load_config, preset_names
+from mplicits.pipelines.fit_config import FitConfig
 
 
 @dataclass(frozen=True)
@@ -111,6 +112,15 @@ def test_a_missing_file_and_an_unknown_preset_are_input_errors(tmp_path):
 
 def test_presets_are_found_by_the_name_of_their_thing():
     assert preset_names("nothing") == []
+
+
+@pytest.mark.parametrize("name", preset_names("fit"))
+def test_the_bundled_presets_are_valid(name):
+    assert load_config(FitConfig, name).steps
+
+
+def test_the_presets_that_the_documentation_names_exist():
+    assert {"fast", "default", "paper"} <= set(preset_names("fit"))
 
 
 def test_flags_come_from_the_dataclass_and_only_given_ones_override():
