@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import zipfile
+import zlib
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,8 @@ from .text import table_to_cloud
 
 __all__ = ["read_npy", "read_npz"]
 
+_DAMAGE = (ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error)  # what numpy.load raises on bad files
+
 
 def read_npy(path: Path) -> PointCloud:
     """Read one array with columns xyz, xyz + normal or xyz + normal + rgb.
@@ -22,7 +25,8 @@ def read_npy(path: Path) -> PointCloud:
     Raises:
         InputError: it is not a NumPy array of numbers with 3, 6 or 9 columns.
     """
-    array = _load(path)
+    with path.open("rb") as file:
+        array = _load(file, path)
     if not isinstance(array, np.ndarray):
         raise InputError(f"{path}: an NPZ archive under another name; rename it to .npz")
     return table_to_cloud(_numeric(array, "array", path), path, f"array of shape {array.shape}: ")
@@ -34,15 +38,15 @@ def read_npz(path: Path) -> PointCloud:
     Raises:
         InputError: it is not such an archive, or an array has the wrong type or shape.
     """
-    archive = _load(path)
-    if isinstance(archive, np.ndarray):
-        raise InputError(f"{path}: a single NumPy array under another name; rename it to .npy")
-    with archive:
-        if "points" not in archive.files:
-            raise InputError(f"{path}: points: no such array (there are: {', '.join(archive.files) or 'none'}); add it")
-        arrays = {
-            name: _member(archive, name, path) for name in ("points", "normals", "colors") if name in archive.files
-        }
+    with path.open("rb") as file:
+        archive = _load(file, path)
+        if isinstance(archive, np.ndarray):
+            raise InputError(f"{path}: a single NumPy array under another name; rename it to .npy")
+        names = archive.files
+        if "points" not in names:
+            raise InputError(f"{path}: points: no such array (there are: {', '.join(names) or 'none'}); add it")
+        wanted = [name for name in ("points", "normals", "colors") if name in names]
+        arrays = {name: _member(archive, name, path) for name in wanted}
     points = arrays["points"]
     if points.ndim != 2 or points.shape[1] != 3:
         raise InputError(f"{path}: points: shape {points.shape}; expected (N, 3)")
@@ -58,22 +62,21 @@ def read_npz(path: Path) -> PointCloud:
     )
 
 
-def _load(path: Path) -> Any:
+def _load(file: BinaryIO, path: Path) -> Any:
     try:
-        return np.load(path, allow_pickle=False)
-    except (ValueError, EOFError, zipfile.BadZipFile, KeyError) as error:
+        return np.load(file, allow_pickle=False)
+    except _DAMAGE as error:
         reason = "holds Python objects" if "Object arrays" in str(error) else "damaged or not a NumPy file"
         raise InputError(f"{path}: {reason}; save plain numbers with numpy.save or numpy.savez") from error
 
 
 def _member(archive: Any, name: str, path: Path) -> NDArray[Any]:
     try:
-        return _numeric(archive[name], name, path)
-    except (ValueError, EOFError, zipfile.BadZipFile, zipfile.error) as error:
-        if isinstance(error, InputError):
-            raise
+        array = archive[name]
+    except _DAMAGE as error:
         reason = "holds Python objects" if "Object arrays" in str(error) else "damaged"
         raise InputError(f"{path}: {name}: {reason}; save plain numbers with numpy.savez") from error
+    return _numeric(array, name, path)
 
 
 def _numeric(array: NDArray[Any], name: str, path: Path) -> NDArray[Any]:

@@ -13,7 +13,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 from scipy.spatial import KDTree
 
-__all__ = ["estimate_normals", "fibonacci_directions", "nearest", "orient_normals", "outwardness"]
+__all__ = ["estimate_normals", "fibonacci_directions", "nearest", "openness", "orient_normals", "outwardness"]
 
 Float64 = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -93,6 +93,22 @@ def outwardness(points: Float64, normals: Float64, *, directions: int = 64, cap:
         facing = normals[beyond] @ direction
         scores[index] = facing.sum() / max(np.abs(facing).sum(), 1e-300)
     return float(scores.mean()), float((scores < 0).mean())
+
+
+def openness(points: Float64, normals: Float64, *, neighbors: int = 9) -> float:
+    """``|Σ a n| / Σ a``: 0 for a closed surface, 1 for a flat sheet; a hole counts with its area.
+
+    The area a of a point is that of the disc out to its last neighbour, up to a factor.
+
+    Args:
+        points: ``(N, 3)``; of more than 50,000 an even selection is used.
+        normals: ``(N, 3)``, of unit length.
+        neighbors: of each point, itself included.
+    """
+    points, normals = points[:: 1 + len(points) // 50_000], normals[:: 1 + len(normals) // 50_000]
+    last = nearest(points, neighbors)[:, -1]
+    area = ((points[last] - points) ** 2).sum(axis=1)
+    return float(np.linalg.norm(area @ normals) / area.sum())
 
 
 def fibonacci_directions(count: int) -> Float64:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from ..neural_fields import InputError, Similarity
-from .orientation import estimate_normals, nearest, orient_normals, outwardness
+from .orientation import estimate_normals, nearest, openness, orient_normals, outwardness
 from .point_cloud import PointCloud
 from .reading import MIN_POINTS
 
@@ -205,10 +205,16 @@ def _repair(
     return repaired, decided
 
 
-def _plainly_inward(points: Float64, normals: Float64, *, score: float = -0.3, share: float = 0.9) -> bool:
-    """Whether the evidence is overwhelming: an open scan, seen from one side, must not be turned round."""
+def _plainly_inward(
+    points: Float64, normals: Float64, *, score: float = -0.3, share: float = 0.9, opening: float = 0.15
+) -> bool:
+    """Whether the evidence is overwhelming: an open scan, seen from one side, must not be turned round.
+
+    A hollow seen from its open side has inward normals, rightly; it is told from a closed body turned inside out
+    by the sum of its area-weighted normals, which over a closed surface is zero (see :func:`openness`).
+    """
     mean, negative = outwardness(points, normals)
-    return mean < score and negative >= share
+    return mean < score and negative >= share and openness(points, normals) < opening
 
 
 def _estimate(

@@ -62,7 +62,7 @@ class Statue(Field):
     def exact_distance(self, points: NDArray[np.floating], *, candidates: int = 24) -> Float64:
         """Signed distance ``(N,)`` of ``points`` ``(N, 3)``, to 1e-6.
 
-        From the nearest of 200,000 surface samples, taken on first use, :func:`.closest.refine_closest`
+        From the nearest of 100,000 surface samples, taken on first use, :func:`.closest.refine_closest`
         descends to the closest point. The sign is that of the implicit function, which is exact.
 
         Args:
@@ -84,7 +84,7 @@ class Statue(Field):
 
     def _surface(self) -> tuple[Float64, NDArray[np.floating], KDTree]:
         if self._samples is None:
-            cloud = sample_surface(self, 200_000, seed=0)
+            cloud = sample_surface(self, 100_000, seed=0)
             assert cloud.normals is not None
             self._samples = (cloud.points, cloud.normals, KDTree(cloud.points))
         return self._samples

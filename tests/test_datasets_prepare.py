@@ -1,0 +1,144 @@
+"""``prepare_cloud``: what is dropped, repaired, estimated and turned round."""
+
+import numpy as np
+import pytest
+from mplicits.datasets import PointCloud, add_noise, prepare_cloud, sample_sphere, sample_surface, sample_torus
+from mplicits.neural_fields import Box, InputError, Similarity
+
+
+def agreement(prepared, normals):
+    """Share of the prepared normals on the right side, and the mean cosine."""
+    cosines = (prepared.normals * normals).sum(axis=1)
+    return float((cosines > 0).mean()), float(cosines.mean())
+
+
+def test_nan_and_duplicates_are_dropped_and_counted():
+    torus = sample_torus(1000)
+    points = np.concatenate((torus.points, torus.points[:7], np.full((3, 3), np.nan), [[np.inf, 0, 0]]))
+    normals = np.concatenate((torus.normals, -torus.normals[:7], np.zeros((4, 3))))
+    colors = np.linspace(0, 1, 3 * len(points)).reshape(-1, 3)
+    cloud = prepare_cloud(PointCloud(points, normals, colors))
+    assert len(cloud) == cloud.report.kept == 1000
+    assert (cloud.report.read, cloud.report.dropped_nan, cloud.report.dropped_duplicates) == (1011, 4, 7)
+    assert np.abs(cloud.normals - torus.normals).max() < 1e-6  # the first of equal points stays
+    assert np.array_equal(cloud.colors, colors[:1000].astype(np.float32))
+    assert "dropped 4 not finite, 7 duplicate" in cloud.report.summary()
+    assert "\n" not in cloud.report.summary()
+
+
+def test_map_coordinates_keep_their_digits():
+    """UTM metres with tenths of millimetres: shifted in float64 before they are rounded."""
+    torus = sample_torus(500)
+    placed = Similarity((431234.5678, 5412345.6789, 250.0), 0.35).to_input(torus.points)
+    cloud = prepare_cloud(PointCloud(placed, torus.normals))
+    assert cloud.points.dtype == np.float32
+    assert np.linalg.norm(cloud.points, axis=1).max() <= 1 + 1e-6
+    assert np.abs(cloud.similarity.to_input(cloud.points) - placed).max() < 1e-7
+
+
+def test_normals_are_normalised_and_repaired():
+    torus = sample_torus(4000)
+    normals = torus.normals * np.random.default_rng(0).uniform(0.1, 9, (4000, 1)).astype(np.float32)
+    normals[::10] = 0
+    normals[5::100] = np.nan
+    cloud = prepare_cloud(PointCloud(torus.points, normals))
+    assert cloud.report.repaired_normals == 440
+    assert np.abs(np.linalg.norm(cloud.normals, axis=1) - 1).max() < 1e-6
+    assert (cloud.normals * torus.normals).sum(axis=1).min() > 0.98
+
+
+def test_undecidable_normals_are_dropped():
+    """Between two coincident sheets with opposite normals, no neighbourhood has a majority."""
+    side = np.stack(np.meshgrid(np.arange(20.0), np.arange(20.0)), axis=-1).reshape(-1, 2)
+    sheets = np.concatenate([np.column_stack((side, np.full(400, z))) for z in (0.0, 0.01)])
+    normals = np.repeat([[0.0, 0, -1], [0, 0, 1]], 400, axis=0)
+    points = np.concatenate((sheets, [[9.5, 9.5, 0.005]]))
+    cloud = prepare_cloud(PointCloud(points, np.concatenate((normals, [[0.0, 0, 0]]))), normals="file")
+    assert cloud.report.dropped_normals == 1
+    assert len(cloud) == 800
+
+
+@pytest.mark.parametrize("shape", ["sphere", "torus", "box"])
+@pytest.mark.parametrize("noise", [0.0, 0.003])
+def test_estimated_normals_agree_with_exact_ones(shape, noise):
+    clouds = {
+        "sphere": sample_sphere,
+        "torus": sample_torus,
+        "box": lambda n: sample_surface(Box(half_size=(0.5, 0.3, 0.2)), n),
+    }
+    exact = clouds[shape](6000)
+    cloud = prepare_cloud(PointCloud(add_noise(exact, noise).points))
+    assert cloud.report.normals_source == "estimated"
+    right, cosine = agreement(cloud, exact.normals)
+    assert right == 1.0 if shape != "box" else right > 0.999
+    assert cosine > 0.95
+
+
+def test_thin_sheet_keeps_its_two_sides():
+    """A plate ten times as wide as thick; plain propagation by |⟨n, n'⟩| cannot tell the sides at its rim."""
+    exact = sample_surface(Box(half_size=(0.6, 0.6, 0.03)), 12000, shell=0.005)
+    right, _ = agreement(prepare_cloud(PointCloud(exact.points)), exact.normals)
+    assert right > 0.99
+
+
+def test_separate_pieces_are_each_turned_outward():
+    spheres = [sample_sphere(1500, radius=0.2, seed=i) for i in range(3)]
+    points = np.concatenate([s.points + np.array((i, 0, 0)) for i, s in enumerate(spheres)])
+    cloud = prepare_cloud(PointCloud(points))
+    assert cloud.report.pieces == 3
+    assert "3 separate pieces" in cloud.report.summary()
+    assert agreement(cloud, np.concatenate([s.normals for s in spheres]))[0] == 1.0
+
+
+def test_sensor_origin_orients():
+    """Seen from within, a room's walls face inward."""
+    exact = sample_sphere(3000)
+    placed = exact.points * 10 + (100.0, 50.0, 0.0)
+    cloud = prepare_cloud(PointCloud(placed), sensor_origin=(100.0, 51.0, 0.0))
+    assert agreement(cloud, -exact.normals)[0] == 1.0
+
+
+@pytest.mark.parametrize("shape", [sample_sphere, sample_torus])
+def test_inward_files_are_turned_round_only_by_auto(shape):
+    exact = shape(3000)
+    inward = PointCloud(exact.points, -exact.normals)
+    auto, kept = prepare_cloud(inward), prepare_cloud(inward, normals="file")
+    assert auto.report.flipped
+    assert "flipped" in auto.report.summary()
+    assert agreement(auto, exact.normals)[0] == 1.0
+    assert not kept.report.flipped
+    assert agreement(kept, -exact.normals)[0] == 1.0
+
+
+def test_open_scan_of_a_hollow_is_not_turned_round():
+    """A bowl seen from above has normals that face its middle: no evidence that they are wrong."""
+    sphere = sample_sphere(6000)
+    low = sphere.points[:, 2] < -0.2
+    bowl = PointCloud(sphere.points[low], -sphere.normals[low])
+    cloud = prepare_cloud(bowl)
+    assert not cloud.report.flipped
+
+
+def test_auto_estimates_when_most_normals_are_unusable():
+    exact = sample_torus(2000)
+    normals = exact.normals.copy()
+    normals[:1100] = 0  # as in files of Gaussian splats
+    assert prepare_cloud(PointCloud(exact.points, normals)).report.normals_source == "estimated"
+    cloud = prepare_cloud(PointCloud(exact.points, normals), normals="file")
+    assert (cloud.report.normals_source, cloud.report.repaired_normals) == ("file", 1100 - cloud.report.dropped_normals)
+
+
+def test_errors():
+    torus = sample_torus(100)
+    with pytest.raises(InputError, match="torus: normals: the file has none; use --normals estimate"):
+        prepare_cloud(PointCloud(torus.points, source="torus"), normals="file")
+    with pytest.raises(InputError, match="points: only 9 of 100 are left"):
+        prepare_cloud(PointCloud(np.where(np.arange(100)[:, None] < 9, torus.points, np.nan)))
+    with pytest.raises(ValueError, match="normals='none'"):
+        prepare_cloud(torus, normals="none")
+    with pytest.raises(ValueError, match="neighbors=2"):
+        prepare_cloud(torus, neighbors=2)
+
+
+def test_fewer_points_than_neighbors():
+    assert len(prepare_cloud(PointCloud(sample_sphere(12).points))) == 12

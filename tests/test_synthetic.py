@@ -1,0 +1,156 @@
+"""Exact clouds are exact and even; the statue is one solid with a true distance; the scan is a scan."""
+
+import numpy as np
+import pytest
+import torch
+from mplicits.datasets import (
+    STATUE_PLACEMENT,
+    Statue,
+    add_noise,
+    add_outliers,
+    prepare_cloud,
+    sample_sphere,
+    sample_surface,
+    sample_torus,
+    simulate_scan,
+    statue_scan,
+)
+from mplicits.datasets.closest import refine_closest
+from mplicits.neural_fields import Box, Capsule, Sphere, Torus
+from scipy.spatial import KDTree
+from skimage import measure
+
+
+@pytest.mark.parametrize("field", [Sphere(radius=0.6), Torus(), Capsule(), Box()])
+def test_samples_lie_on_the_surface_with_its_normals(field):
+    cloud = sample_surface(field, 2000, seed=5)
+    jet = field.jet(torch.from_numpy(cloud.points))
+    assert len(cloud) == 2000
+    assert jet.value.abs().max() < 1e-9
+    assert np.abs(cloud.normals - jet.gradient.numpy()).max() < 1e-6
+    assert np.array_equal(cloud.points, sample_surface(field, 2000, seed=5).points)
+    assert not np.array_equal(cloud.points, sample_surface(field, 2000, seed=6).points)
+
+
+@pytest.mark.parametrize("cloud", [sample_surface(Torus(), 40000, seed=2), sample_torus(40000, seed=2)])
+def test_torus_is_sampled_evenly_by_area(cloud):
+    """The outer half of a torus has the share 1/2 + minor/(π major) of the area (Pappus)."""
+    outer = (np.hypot(*cloud.points[:, :2].T) > 0.5).mean()
+    assert abs(outer - (0.5 + 0.2 / (0.5 * np.pi))) < 4 * 0.5 / 200
+    assert Torus().value(torch.from_numpy(cloud.points)).abs().max() < 1e-9
+
+
+def test_no_surface_is_an_error():
+    with pytest.raises(ValueError, match="no zero set"):
+        sample_surface(Sphere(center=(9.0, 0.0, 0.0)), 10)
+
+
+def test_noise_moves_points_along_their_normals():
+    cloud = sample_sphere(20000, radius=1.0)
+    noisy = add_noise(cloud, 0.01, seed=1)
+    shift = ((noisy.points - cloud.points) * cloud.normals).sum(axis=1)
+    bound = 0.01 * np.linalg.norm(np.ptp(cloud.points, axis=0))
+    assert np.abs(noisy.points - cloud.points - shift[:, None] * cloud.normals).max() < 1e-7
+    assert 0.99 * bound < np.abs(shift).max() <= bound * (1 + 1e-6)
+    assert abs(shift.std() - bound / 3**0.5) < 0.02 * bound
+    assert noisy.normals is cloud.normals
+
+
+def test_outliers_fill_the_ball():
+    cloud = sample_sphere(20000, radius=2.0)
+    dirty = add_outliers(cloud, 0.5, seed=1)
+    assert len(dirty) == 30000
+    assert np.array_equal(dirty.points[:20000], cloud.points)
+    radii = np.linalg.norm(dirty.points[20000:], axis=1) / 2
+    assert radii.max() < 1.01
+    assert abs((radii < 0.5).mean() - 1 / 8) < 0.015
+    assert np.abs(np.linalg.norm(dirty.normals, axis=1) - 1).max() < 1e-6
+    assert np.abs(dirty.normals[20000:].mean(axis=0)).max() < 0.03
+
+
+def test_closest_points_of_a_torus():
+    """Started up to a fifth of a turn away, the descent finds the exact distance."""
+    random = np.random.default_rng(0)
+    targets = random.uniform(-1, 1, (500, 3))
+    exact = Torus().value(torch.from_numpy(targets)).abs().numpy()
+    samples = sample_torus(300).points
+    starts = samples[KDTree(samples).query(targets)[1]]
+    assert np.abs(refine_closest(Torus(), targets, starts) - exact).max() < 1e-8
+
+
+@pytest.fixture(scope="module")
+def statue():
+    return Statue()
+
+
+def test_statue_gradient_is_that_of_its_value(statue):
+    x = (torch.rand(3000, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) * 2 - 1).requires_grad_()
+    (expected,) = torch.autograd.grad(statue.value(x).sum(), x)
+    jet = statue.jet(x)
+    assert (jet.gradient - expected).abs().max() < 1e-6
+    assert torch.equal(jet.value, statue.value(x))
+    assert statue.jet(torch.empty(0, 2, 3)).gradient.shape == (0, 2, 3)
+
+
+def test_statue_is_one_solid_inside_the_unit_sphere(statue):
+    n = 112
+    axis = torch.linspace(-1, 1, n)
+    grid = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1)
+    inside = (statue.value(grid) < 0).numpy()
+    assert measure.label(inside, connectivity=1).max() == 1
+    assert measure.label(~inside, connectivity=1).max() == 1  # no bubbles
+    assert float(grid.norm(dim=-1)[torch.from_numpy(inside)].max()) < 1
+
+
+def test_statue_distance_is_exact(statue):
+    random = np.random.default_rng(0)
+    surface = sample_surface(statue, 20000, seed=9)
+    points = np.concatenate((random.uniform(-1, 1, (200, 3)), surface.points[:200] + random.normal(0, 0.02, (200, 3))))
+    distance = statue.exact_distance(points)
+    brute, _ = KDTree(surface.points).query(points)
+    # no sample is nearer than the distance, and with a spacing s one is nearer than √(d² + s²(1 + d/ρ))
+    assert (brute - np.abs(distance)).min() > -1e-6
+    assert ((brute**2 - distance**2) / (1 + np.abs(distance) / 0.2)).max() < 0.05**2
+    assert np.array_equal(distance < 0, statue.value(torch.from_numpy(points)).numpy() < 0)
+    more = statue.exact_distance(points, candidates=64)
+    assert np.quantile(np.abs(distance - more), 0.99) < 1e-6
+    assert np.abs(statue.exact_distance(surface.points[:200])).max() < 1e-6
+    assert statue.exact_distance(np.empty((0, 3))).shape == (0,)
+
+
+def test_statue_distance_has_unit_slope(statue):
+    points = np.random.default_rng(1).uniform(-0.8, 0.8, (200, 3))
+    h = 1e-4
+    ahead, behind = (np.stack([statue.exact_distance(points + s * h * e) for e in np.eye(3)], 1) for s in (1, -1))
+    slope = np.linalg.norm((ahead - behind) / (2 * h), axis=1)
+    assert np.median(np.abs(slope - 1)) < 1e-4
+    assert (np.abs(slope - 1) < 1e-2).mean() > 0.95  # all but those astride the medial axis
+
+
+def test_scan_of_a_sphere_is_complete_and_noisy_along_the_rays():
+    scan = simulate_scan(Sphere(radius=0.8), scanners=8, resolution=64, noise=0.002, seed=3)
+    radii = np.linalg.norm(scan.points, axis=1)
+    assert abs(radii.mean() - 0.8) < 5e-4
+    assert 0.001 < radii.std() < 0.003
+    exact = scan.points / radii[:, None]
+    known = scan.normals.any(axis=1)
+    assert 0.9 < known.mean() < 1
+    assert (exact * scan.normals).sum(axis=1)[known].mean() > 0.97
+    assert scan.colors is None
+
+
+def test_statue_scan(statue):
+    scan = statue_scan(seed=0)
+    assert 60_000 < len(scan) < 120_000
+    assert scan.colors is not None
+    assert scan.points.max() > 1000  # millimetres in a hall, not the unit sphere
+    some = STATUE_PLACEMENT.to_unit(scan.points[::40])
+    distance = statue.exact_distance(some)
+    assert np.abs(distance).max() < 0.01
+    assert 0.0003 < distance.std() < 0.001
+    cloud = prepare_cloud(scan)
+    assert cloud.report.repaired_normals > 100
+    assert cloud.report.kept > 0.995 * len(scan)
+    assert not cloud.report.flipped
+    spacing, _ = KDTree(scan.points).query(scan.points, k=2)
+    assert np.quantile(spacing[:, 1], 0.95) > 3 * np.quantile(spacing[:, 1], 0.05)  # uneven density
