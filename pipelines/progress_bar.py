@@ -7,9 +7,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Protocol
 
-from rich.console import Console
+from rich.console import Console, RenderableType
 from rich.progress import BarColumn, TaskID, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.progress import Progress as Bars
+from rich.text import Text
 
 from .training import Progress
 
@@ -29,22 +30,31 @@ def progress_bars() -> Iterator[Report]:
     if not console.is_terminal:
         yield _Lines()
         return
-    bars = Bars(
-        TextColumn("{task.description:<18}"),
+    bars = _BarsAndLosses(
+        TextColumn("{task.description}"),
         BarColumn(bar_width=24),
         TaskProgressColumn(),
         TimeElapsedColumn(),
         TextColumn("left"),
         TimeRemainingColumn(),
-        TextColumn("{task.fields[losses]}"),
         console=console,
     )
     with bars:
         yield _Bars(bars)
 
 
+class _BarsAndLosses(Bars):
+    """Bars with a line of loss terms below, which is too long to stand beside them."""
+
+    losses = ""
+
+    def get_renderables(self) -> Iterator[RenderableType]:
+        yield from super().get_renderables()
+        yield Text(self.losses, style="dim")
+
+
 class _Bars:
-    def __init__(self, bars: Bars) -> None:
+    def __init__(self, bars: _BarsAndLosses) -> None:
         self.bars = bars
         self.tasks: dict[str, TaskID] = {}
 
@@ -52,9 +62,9 @@ class _Bars:
         if progress.stage not in self.tasks:
             for task in self.tasks.values():
                 self.bars.update(task, completed=1.0)
-            self.tasks[progress.stage] = self.bars.add_task(progress.stage, total=1.0, losses="")
-        losses = _text(progress)
-        self.bars.update(self.tasks[progress.stage], completed=progress.fraction, losses=losses)
+            self.tasks[progress.stage] = self.bars.add_task(progress.stage, total=1.0)
+        self.bars.losses = _text(progress)
+        self.bars.update(self.tasks[progress.stage], completed=progress.fraction)
 
 
 class _Lines:
