@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -64,8 +65,12 @@ def simulate_scan(
     if scanners < 1 or resolution < 8:
         raise ValueError(f"scanners={scanners}, resolution={resolution}: expected at least 1 and 8")
     random = np.random.default_rng(seed)
-    empty = _EmptySpace(field)
-    parts = [_scan(field, empty, index, scanners, resolution, noise, random) for index in range(scanners)]
+    views = [_view(index, scanners, resolution, random) for index in range(scanners)]
+    # all rays at once: late steps, with few rays left, cost as much as early ones
+    origins = np.concatenate([np.broadcast_to(view.position, view.rays.shape).reshape(-1, 3) for view in views])
+    ranges = _trace(field, origins, np.concatenate([view.rays.reshape(-1, 3) for view in views]))
+    split = np.split(ranges, np.cumsum([view.rays[..., 0].size for view in views])[:-1])
+    parts = [_measure(field, view, each, noise, random) for view, each in zip(views, split, strict=True)]
     points, normals, exact = (np.concatenate([part[k] for part in parts]) for k in range(3))
     if len(points) == 0:
         raise ValueError("field: no ray of any scanner hits its surface; expected one in the unit sphere")
@@ -78,24 +83,26 @@ def simulate_scan(
     return PointCloud(placed, normals.astype(np.float32), shades, f"simulated scan of {type(field).__name__}")
 
 
-def _scan(
-    field: Field,
-    empty: _EmptySpace,
-    index: int,
-    scanners: int,
-    resolution: int,
-    noise: float,
-    random: np.random.Generator,
-) -> tuple[Float64, Float64, Float64]:
-    """One scanner's noisy points, their normals, and the points without noise; each ``(M, 3)``."""
+class _View(NamedTuple):
+    position: Float64  # (3,)
+    rays: Float64  # (side, side, 3), unit
+
+
+def _view(index: int, scanners: int, resolution: int, random: np.random.Generator) -> _View:
     azimuth = 2 * np.pi * (index + random.uniform(-0.2, 0.2)) / scanners
     elevation = np.radians(_ELEVATIONS[index % len(_ELEVATIONS)] + random.uniform(-4, 4))
     position = random.uniform(2.2, 3.0) * np.array(
         [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)]
     )
-    side = int(resolution * random.uniform(0.75, 1.25))
-    rays = _grid_of_rays(position, side)  # (side, side, 3)
-    ranges = _trace(field, empty, position, rays.reshape(-1, 3)).reshape(side, side)  # NaN: nothing hit
+    return _View(position, _grid_of_rays(position, int(resolution * random.uniform(0.75, 1.25))))
+
+
+def _measure(
+    field: Field, view: _View, ranges: Float64, noise: float, random: np.random.Generator
+) -> tuple[Float64, Float64, Float64]:
+    """One scanner's noisy points, their normals, and the points without noise; each ``(M, 3)``."""
+    position, rays = view
+    ranges = ranges.reshape(rays.shape[:2])  # NaN: nothing hit
     exact = position + ranges[..., None] * rays
     hit = np.isfinite(ranges)
     facing = np.zeros_like(ranges)
@@ -135,21 +142,20 @@ class _EmptySpace:
         return self._clearance[(index[:, 0] * self._cells + index[:, 1]) * self._cells + index[:, 2]]
 
 
-def _trace(
-    field: Field, empty: _EmptySpace, origin: Float64, rays: Float64, *, steps: int = 128, tolerance: float = 2e-4
-) -> Float64:
+def _trace(field: Field, origins: Float64, rays: Float64, *, steps: int = 96, tolerance: float = 2e-4) -> Float64:
     """Sphere tracing inside the unit sphere: range ``(R,)`` along each unit ray ``(R, 3)``, NaN for a miss.
 
-    The field is evaluated only where ``empty`` cannot promise a step; two Newton steps along the ray then
+    The field is evaluated only where :class:`_EmptySpace` cannot promise a step; two Newton steps along the ray then
     take the hit from ``tolerance`` down to rounding.
     """
-    middle = -rays @ origin
-    half_chord = np.sqrt((middle**2 - (origin @ origin - 1)).clip(min=0))
+    empty = _EmptySpace(field)
+    middle = -(rays * origins).sum(axis=1)
+    half_chord = np.sqrt((middle**2 - (origins**2).sum(axis=1) + 1).clip(min=0))
     ranges, last = middle - half_chord, middle + half_chord
     active = np.flatnonzero(half_chord > 0)
     hits: list[NDArray[np.int64]] = []
     for _ in range(steps):
-        points = origin + ranges[active, None] * rays[active]
+        points = origins[active] + ranges[active, None] * rays[active]
         step = empty.clearance(points)
         near = step <= 0
         value = _value(field, points[near])
@@ -162,7 +168,7 @@ def _trace(
         active = active[ranges[active] < last[active]]
     found = np.concatenate(hits)
     for _ in range(2):
-        value, gradient = _jet(field, origin + ranges[found, None] * rays[found])
+        value, gradient = _jet(field, origins[found] + ranges[found, None] * rays[found])
         slope = np.minimum((gradient * rays[found]).sum(axis=1), -0.1)
         ranges[found] -= (value / slope).clip(-4 * tolerance, 4 * tolerance)
     result = np.full(len(rays), np.nan)
