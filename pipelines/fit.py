@@ -240,24 +240,36 @@ class _Fitting:
     def sources(self, index: CloudDistance, delta: float | None, generator: torch.Generator) -> list[Source]:
         """What a level learns from: Ω for level 0, the band around the frozen surface for the others."""
         config = self.config
-        weights = (config.data_weight, config.normal_weight, config.eikonal_weight)
         points, normals = torch.from_numpy(index.points), torch.from_numpy(index.normals)
         surface = Samples(points, distance=torch.zeros(len(points)), normal=normals)
         if self.frozen is None or delta is None:
-            domain = distance_samples(index, config.samples, generator=generator)
-            far_weights = (config.data_weight * config.domain_weight, 0.0, config.eikonal_weight)
+            domain = distance_samples(index, config.samples, generator=generator).to(self.device)
+            near, far = config.data_weight, config.data_weight * config.domain_weight
             half = config.batch // 2
             return [
-                Source("surface", surface.to(self.device), half, *weights),
-                Source("domain", domain.to(self.device), half, *far_weights),
+                Source("surface", surface.to(self.device), half, near, config.normal_weight, config.eikonal_weight),
+                Source("domain", domain, half, far, 0.0, config.eikonal_weight),
             ]
         offset = offset_samples(index, free_lengths(index, delta), config.samples, generator=generator)
         band = band_samples(index, delta, config.samples, generator=generator)
-        third, sources = config.batch // 3, []
-        for name, samples in (("surface", surface), ("offset", offset), ("band", band)):
-            kept = with_previous(samples, self.frozen, delta, device=self.device)
-            sources.append(Source(name, kept, third, *weights))
-        return sources
+        kept = {
+            name: with_previous(samples, self.frozen, delta, device=self.device)
+            for name, samples in (("surface", surface), ("offset", offset), ("band", band))
+        }
+        for name, samples in kept.items():
+            if not len(samples):
+                raise InputError(
+                    f"{self.source}: no {name} samples within {delta:.2g} of the level before; train it longer "
+                    "(--steps) or widen the band (--epsilon)"
+                )
+        # Errors shrink from level to level, their squares twice as fast, and angles hardly: a fixed weight would
+        # leave the finest level to its normals alone, and noise to the distances. In units of the error before
+        # the balance stays what it was, on clean clouds and on noisy ones.
+        before = kept["surface"].value
+        assert before is not None
+        data = config.residual_data_weight / max(float(before.square().mean()), 1e-10)
+        third, weights = config.batch // 3, (data, config.normal_weight, config.eikonal_weight)
+        return [Source(name, samples, third, *weights) for name, samples in kept.items()]
 
     def next_delta(self) -> float:
         """Half-width of the band around the last frozen level (Eq. 5)."""

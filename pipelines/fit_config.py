@@ -22,17 +22,22 @@ class FitConfig:
 
     widths: tuple[int, ...] = _setting((128, 256, 400), "neurons per layer, one number per level")
     depths: tuple[int, ...] = _setting((2, 2, 2), "sine layers, one number per level")
-    omegas: tuple[float, ...] = _setting((30.0, 45.0, 100.0), "SIREN frequency of each level (Eq. 2)")
-    steps: tuple[int, ...] = _setting((1500, 900, 700), "training steps, one number per level")
-    learning_rates: tuple[float, ...] = _setting((2e-3, 1e-3, 1e-3), "peak learning rate of each level")
+    omegas: tuple[float, ...] = _setting((30.0, 80.0, 160.0), "SIREN frequency of each level (Eq. 2)")
+    steps: tuple[int, ...] = _setting((1200, 800, 600), "training steps, one number per level")
+    learning_rates: tuple[float, ...] = _setting((4e-3, 5e-4, 3e-4), "peak learning rate of each level")
     batch: int = _setting(8192, "samples per training step")
     levels: int | None = _setting(None, "train only this many levels, coarse to fine")
-    data_weight: float = _setting(3000.0, "weight of (f(x) - d)^2 where the distance d is known (Eq. 4)")
-    normal_weight: float = _setting(100.0, "weight of 1 - cos(grad f, N) where the normal N is known (Eq. 4)")
+    data_weight: float = _setting(1e4, "level 0's weight of (f(x) - d)^2 where the distance d is known (Eq. 4)")
+    residual_data_weight: float = _setting(
+        1.0, "the other levels' weight of (f(x) - d)^2, in units of the mean square error of the level before"
+    )
+    normal_weight: float = _setting(300.0, "weight of 1 - cos(grad f, N) where the normal N is known (Eq. 4)")
     eikonal_weight: float = _setting(50.0, "weight of (|grad f| - 1)^2 (Eq. 4)")
-    domain_weight: float = _setting(0.1, "factor on data_weight for level 0's distances away from the cloud")
+    domain_weight: float = _setting(0.03, "factor on data_weight for level 0's distances away from the cloud")
     epsilon: float = _setting(0.3, "margin of the bands (Eq. 5)")
-    quantile: float = _setting(0.999, "quantile of |f(x_j)| that a band must hold; 1 is the maximum of Eq. 5")
+    quantile: float | None = _setting(
+        None, "quantile of |f(x_j)| that a band must hold; 1 is the maximum of Eq. 5, none the maximum but for strays"
+    )
     samples: int = _setting(400_000, "samples made per level and kind, drawn from at every step")
     normals: Literal["auto", "file", "estimate"] = _setting("auto", "where normals come from: auto, file or estimate")
     sensor_origin: tuple[float, float, float] | None = _setting(
@@ -58,10 +63,10 @@ class FitConfig:
             number = getattr(self, name)
             if number is not None and number <= 0:
                 raise ValueError(f"{name}: {number}; expected > 0")
-        for name in ("data_weight", "normal_weight", "eikonal_weight", "domain_weight"):
+        for name in ("data_weight", "residual_data_weight", "normal_weight", "eikonal_weight", "domain_weight"):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name}: {getattr(self, name)}; expected ≥ 0")
-        if not 0 < self.quantile <= 1:
+        if self.quantile is not None and not 0 < self.quantile <= 1:
             raise ValueError(f"quantile: {self.quantile}; expected a number in (0, 1]")
         if self.levels is not None and not 1 <= self.levels <= count:
             raise ValueError(f"levels: {self.levels}; expected 1 to {count}, the number of widths")

@@ -21,6 +21,9 @@ __all__ = ["Samples", "band_samples", "delta_of", "distance_samples", "free_leng
 
 # Half-edge of the cube in which level 0 learns distances: the mesher's box is [-1, 1]³, and a little more.
 DOMAIN = 1.05
+# Largest error over its 99th percentile: 1.0 for uniform noise, 1.6 for Gaussian, 2 to 3 for what a coarse level
+# misses of the fine parts of a clean cloud.
+STRAY = 4.0
 
 
 @dataclass(frozen=True)
@@ -55,15 +58,22 @@ class Samples:
         return Samples(*(None if part is None else part.to(device) for part in parts))  # pyright: ignore[reportArgumentType]
 
 
-def delta_of(errors: Tensor, *, epsilon: float, quantile: float) -> float:
+def delta_of(errors: Tensor, *, epsilon: float, quantile: float | None) -> float:
     """The half-width of a band, ``δ = (1 + ε) · Q_q(|f(x_j)|)``; the paper's Eq. 5 at ``quantile = 1``.
+
+    The maximum of Eq. 5 is fragile: one stray point far from the surface widens the band to half the domain. With
+    ``quantile=None`` it is taken over the points with no more than ``STRAY`` times the 99th percentile, which all
+    points of a sound cloud are: their errors have a bounded distribution, strays do not.
 
     Args:
         errors: ``(n,)`` values f(x_j) at the input points.
         epsilon: the ε of Eq. 5.
-        quantile: q in (0, 1]; below 1 a few stray points cannot widen the band.
+        quantile: q in (0, 1], or None.
     """
     ordered = errors.abs().flatten().sort().values
+    if quantile is None:
+        usual = STRAY * ordered[math.ceil(0.99 * len(ordered)) - 1]
+        return (1 + epsilon) * float(ordered[ordered <= usual][-1])
     return (1 + epsilon) * float(ordered[max(0, math.ceil(quantile * len(ordered)) - 1)])
 
 

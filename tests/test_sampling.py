@@ -73,7 +73,10 @@ def test_delta_is_equation_5() -> None:
     assert delta_of(errors, epsilon=0.3, quantile=0.75) == pytest.approx(1.3 * 0.01)
     stray = torch.cat((torch.full((9999,), 0.01), torch.tensor([1.0])))
     assert delta_of(stray, epsilon=0.3, quantile=1.0) == pytest.approx(1.3)
-    assert delta_of(stray, epsilon=0.3, quantile=0.999) == pytest.approx(1.3 * 0.01)
+    for quantile in (0.999, None):
+        assert delta_of(stray, epsilon=0.3, quantile=quantile) == pytest.approx(1.3 * 0.01)
+    normal = torch.randn(50_000, generator=generator())
+    assert delta_of(normal, epsilon=0.3, quantile=None) == pytest.approx(1.3 * float(normal.abs().max()))
 
 
 def test_distance_samples_cover_the_domain_and_the_surface(cloud: CloudDistance) -> None:
