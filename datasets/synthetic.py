@@ -136,7 +136,9 @@ def add_noise(cloud: PointCloud, amplitude: float, *, seed: int = 0) -> PointClo
         raise ValueError(f"amplitude={amplitude}: expected a fraction of the diagonal, 0 or more")
     diagonal = float(np.linalg.norm(np.ptp(cloud.points, axis=0)))
     shift = np.random.default_rng(seed).uniform(-1, 1, (len(cloud), 1)) * amplitude * diagonal
-    return replace(cloud, points=cloud.points + shift * cloud.normals)
+    length = np.linalg.norm(cloud.normals, axis=1, keepdims=True)
+    unit = np.divide(cloud.normals, length, out=np.zeros(cloud.points.shape), where=length > 0)
+    return replace(cloud, points=cloud.points + shift * unit)
 
 
 def add_outliers(cloud: PointCloud, fraction: float, *, seed: int = 0) -> PointCloud:

@@ -4,6 +4,7 @@ from .analytic import Box, Capsule, Plane, Sphere, Torus, Union
 from .checkpoint import SavedField, load_field, save_field
 from .errors import InputError
 from .field import Field, Jet
+from .meshing import Mesh, NoSurfaceError, extract_mesh
 from .multiscale import MultiscaleSDF
 from .similarity import Similarity
 from .siren import Siren
@@ -14,7 +15,9 @@ __all__ = [
     "Field",
     "InputError",
     "Jet",
+    "Mesh",
     "MultiscaleSDF",
+    "NoSurfaceError",
     "Plane",
     "SavedField",
     "Similarity",
@@ -22,6 +25,7 @@ __all__ = [
     "Sphere",
     "Torus",
     "Union",
+    "extract_mesh",
     "load_field",
     "save_field",
 ]

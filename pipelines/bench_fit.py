@@ -8,9 +8,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from ..datasets import PointCloud, add_noise, prepare_cloud
+from ..datasets import PointCloud, add_noise, prepare_cloud, read_cloud
 from ..neural_fields import InputError, Similarity
 from ..neural_fields.meshing import NoSurfaceError, extract_mesh
 from .evaluate import Metrics, evaluate_surfaces
@@ -18,11 +16,11 @@ from .fit import fit
 from .fit_config import FitConfig
 from .picture import contact_sheet, look_at, picture_of, write_picture
 from .poisson import has_poisson, screened_poisson
-from .surface import Surface, from_cloud, from_mesh, read_surface, vertex_normals
+from .surface import Surface, from_cloud, from_mesh, read_surface
 from .timing import format_table
 from .training import Progress
 
-__all__ = ["FitRow", "bench_fit", "format_fit", "vertex_cloud"]
+__all__ = ["FitRow", "bench_fit", "format_fit"]
 
 
 @dataclass(frozen=True)
@@ -84,7 +82,7 @@ def bench_fit(
     references = [_reference(Path(shape)) for shape in shapes]
     rows: list[FitRow] = []
     for path, reference in zip(map(Path, shapes), references, strict=True):
-        cloud = vertex_cloud(reference, source=path.name)
+        cloud = read_cloud(path)
         if noise:
             cloud = add_noise(cloud, noise, seed=config.seed)
         drawn: list[tuple[str, Surface]] = [("input", from_cloud(cloud))]
@@ -103,17 +101,6 @@ def bench_fit(
             tiles = [(label, picture_of(surface, camera)) for label, surface in [*drawn, ("reference", reference)]]
             write_picture(pictures / f"{path.stem}{f'-noise-{noise:g}' if noise else ''}.png", contact_sheet(tiles))
     return rows
-
-
-def vertex_cloud(surface: Surface, *, source: str) -> PointCloud:
-    """The vertices of a mesh that a face uses, with area-weighted normals."""
-    used = np.unique(surface.faces)
-    return PointCloud(
-        surface.vertices[used],
-        normals=vertex_normals(surface)[used].astype(np.float32),
-        source=source,
-        normals_source="mesh",
-    )
 
 
 def format_fit(rows: Sequence[FitRow]) -> str:

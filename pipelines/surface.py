@@ -43,7 +43,7 @@ class Surface:
     Attributes:
         vertices: ``(V, 3)``.
         faces: ``(F, 3)``; F is 0 for a cloud.
-        normals: ``(V, 3)`` unit normals at the vertices, where the file gives them.
+        normals: ``(V, 3)`` unit normals at the vertices, where known; those of a mesh file are worked out anew.
         colors: ``(V, 3)`` in [0, 1], where the file gives them.
     """
 
@@ -111,9 +111,7 @@ def _load_mesh(path: Path) -> Surface | None:
     colors = None
     if loaded.visual.kind == "vertex":
         colors = np.asarray(loaded.visual.vertex_colors, np.float64)[:, :3] / 255
-    # A property of trimesh computes normals that are not there; the cache says whether the file gave any.
-    normals = np.asarray(loaded.vertex_normals, np.float64) if "vertex_normals" in loaded._cache else None
-    return Surface(vertices, faces, normals, colors)
+    return Surface(vertices, faces, None, colors)
 
 
 def from_mesh(mesh: Mesh) -> Surface:

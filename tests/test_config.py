@@ -133,3 +133,14 @@ def test_flags_come_from_the_dataclass_and_only_given_ones_override():
     assert given_flags(parser.parse_args([]), Settings) == {}
     assert "width of each level" in parser.format_help()
     assert "{auto,file}" in parser.format_help()
+
+
+def test_the_defaults_are_the_default_preset() -> None:
+    assert load_config(FitConfig, "default", thing="fit") == FitConfig()
+
+
+def test_the_paper_preset_is_the_paper() -> None:
+    """(128,2) ▷ (256,2) ▷ (400,2), ω₀ = 30 / 45 / 100, ε = 0.3 and the maximum of Eq. 5."""
+    paper = load_config(FitConfig, "paper", thing="fit")
+    assert (paper.widths, paper.depths, paper.omegas) == ((128, 256, 400), (2, 2, 2), (30.0, 45.0, 100.0))
+    assert (paper.epsilon, paper.quantile) == (0.3, 1.0)

@@ -1,5 +1,7 @@
 """Exact clouds are exact and even; the statue is one solid with a true distance; the scan is a scan."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -154,3 +156,11 @@ def test_statue_scan(statue):
     assert not cloud.report.flipped
     spacing, _ = KDTree(scan.points).query(scan.points, k=2)
     assert np.quantile(spacing[:, 1], 0.95) > 3 * np.quantile(spacing[:, 1], 0.05)  # uneven density
+
+
+def test_noise_moves_along_the_direction_of_a_normal_not_by_its_length():
+    """Normals as meshes sum them up, area-weighted, have any length."""
+    cloud = sample_sphere(500, radius=2.0)
+    assert cloud.normals is not None
+    short = replace(cloud, normals=cloud.normals * np.float32(1e-4))
+    np.testing.assert_allclose(add_noise(short, 0.01).points, add_noise(cloud, 0.01).points, atol=1e-6)

@@ -1,0 +1,80 @@
+"""The fit benchmark on a small shape: every level has a row, noise is applied, Poisson joins when it is there."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mplicits.neural_fields import InputError, Similarity, Sphere, extract_mesh
+from mplicits.pipelines import bench_fit as module
+from mplicits.pipelines.bench_fit import bench_fit, format_fit
+from mplicits.pipelines.fit_config import FitConfig
+from mplicits.pipelines.mesh_files import write_mesh
+
+SMALL = FitConfig(
+    widths=(32, 32),
+    depths=(2, 2),
+    omegas=(10.0, 15.0),
+    steps=(120, 40),
+    learning_rates=(4e-3, 1e-3),
+    batch=1024,
+    samples=10_000,
+)
+
+
+@pytest.fixture(scope="module")
+def ball(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("shapes") / "ball.ply"
+    write_mesh(path, extract_mesh(Sphere(radius=0.7), resolution=40), Similarity((5.0, 0.0, -1.0), 20.0))
+    return path
+
+
+def test_rows_picture_and_table(ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "has_poisson", lambda: False)
+    rows = bench_fit([ball], SMALL, resolution=32, samples=5000, pictures=tmp_path)
+    assert [row.method for row in rows] == ["level 0", "level 1"]
+    assert rows[1].seconds > rows[0].seconds > 0
+    for row in rows:
+        assert row.metrics is not None
+        assert row.metrics.iou is not None
+        assert row.metrics.iou > 0.95
+        assert row.metrics.components == 1
+        assert row.metrics.chamfer < 2 * row.metrics.chamfer_floor
+    assert (tmp_path / "ball.png").stat().st_size > 1000
+    table = format_fit(rows)
+    assert f"{rows[1].metrics.chamfer:.2e}" in table  # type: ignore[union-attr]
+
+
+def test_noise_reaches_the_fit(ball: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = []
+
+    def reconstruct(cloud, *_):
+        radii = np.linalg.norm(cloud.points - [5.0, 0.0, -1.0], axis=1)
+        seen.append(abs(radii - 14.0).max())
+        return []
+
+    monkeypatch.setattr(module, "_reconstructions", reconstruct)
+    bench_fit([ball], SMALL)
+    bench_fit([ball], SMALL, noise=0.01)
+    diagonal = 28.0 * 3**0.5
+    assert seen[0] < 0.02
+    assert 0.9 * 0.01 * diagonal < seen[1] < 1.01 * 0.01 * diagonal + 0.02
+
+
+def test_screened_poisson_when_installed(ball: Path) -> None:
+    pytest.importorskip("pymeshlab", reason="the extra mplicits[poisson] is not installed")
+    rows = bench_fit([ball], SMALL, resolution=32, samples=5000, poisson_depth=6)
+    assert rows[-1].method == "screened Poisson"
+    assert rows[-1].metrics is not None
+    assert rows[-1].metrics.iou is not None
+    assert rows[-1].metrics.iou > 0.95
+
+
+def test_a_level_without_a_surface_is_a_row(monkeypatch: pytest.MonkeyPatch, ball: Path) -> None:
+    monkeypatch.setattr(module, "_reconstructions", lambda *_: [("level 0", 1.0, 0.1, None)])
+    assert "no surface" in format_fit(bench_fit([ball], SMALL))
+
+
+def test_a_cloud_is_no_reference(tmp_path: Path) -> None:
+    np.savetxt(tmp_path / "cloud.xyz", np.random.default_rng(0).random((50, 3)))
+    with pytest.raises(InputError, match="has no faces"):
+        bench_fit([tmp_path / "cloud.xyz"], SMALL)

@@ -1,0 +1,76 @@
+"""Every example that a reader may copy runs: docstrings, the README's Python, and its command lines."""
+
+import doctest
+import importlib
+import pkgutil
+import re
+import shlex
+from pathlib import Path
+
+import mplicits.datasets
+import mplicits.neural_fields
+import mplicits.pipelines
+import pytest
+from mplicits.pipelines import cli
+from mplicits.pipelines.commands import COMMANDS
+
+ROOT = Path(__file__).parent.parent
+DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+MODULES = [
+    module.name
+    for package in (mplicits.neural_fields, mplicits.datasets, mplicits.pipelines)
+    for module in pkgutil.iter_modules(package.__path__, f"{package.__name__}.")
+]
+
+
+def blocks(language: str) -> list[str]:
+    return [
+        block
+        for path in DOCUMENTS
+        for block in re.findall(
+            rf"^```{language}\n(.*?)^```", path.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL
+        )
+    ]
+
+
+def commands() -> list[str]:
+    """Every ``mplicits …`` line of the documents' shell blocks, without its comment."""
+    lines = [line for block in blocks("sh") for line in block.splitlines()]
+    return [line.partition("#")[0].strip() for line in lines if line.startswith("mplicits ")]
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_docstring_examples(name: str) -> None:
+    assert doctest.testmod(importlib.import_module(name)).failed == 0
+
+
+def test_there_are_docstring_examples() -> None:
+    finder = doctest.DocTestFinder()
+    found = [test for name in MODULES for test in finder.find(importlib.import_module(name)) if test.examples]
+    assert len(found) > 5
+
+
+@pytest.mark.parametrize("block", blocks("python"))
+def test_python_of_the_documents(block: str) -> None:
+    exec(compile(block, "README.md", "exec"), {})
+
+
+def test_the_documents_have_python_and_commands() -> None:
+    assert len(blocks("python")) >= 2
+    assert len(commands()) >= 5
+
+
+@pytest.mark.parametrize("line", commands())
+def test_commands_of_the_documents_parse(line: str) -> None:
+    words = shlex.split(line)[1:]
+    name = " ".join(words[:2]) if words[0] == "bench" else words[0]
+    parser = cli._Parser(name, COMMANDS[name])
+    arguments = words[len(name.split()) :]
+    parser.check_flags(arguments)
+    parser.parse_args(arguments)
+
+
+def test_links_of_the_documents_lead_somewhere() -> None:
+    for path in DOCUMENTS:
+        for target in re.findall(r"\]\((?!http)([^)#]+)", path.read_text(encoding="utf-8")):
+            assert (path.parent / target).exists(), f"{path.name} links to {target}"
