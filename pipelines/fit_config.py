@@ -33,7 +33,7 @@ class FitConfig:
     )
     normal_weight: float = _setting(300.0, "weight of 1 - cos(grad f, N) where the normal N is known (Eq. 4)")
     eikonal_weight: float = _setting(50.0, "weight of (|grad f| - 1)^2 (Eq. 4)")
-    domain_weight: float = _setting(0.03, "factor on data_weight for level 0's distances away from the cloud")
+    domain_weight: float = _setting(0.1, "factor on data_weight for level 0's distances away from the cloud")
     epsilon: float = _setting(0.3, "margin of the bands (Eq. 5)")
     quantile: float | None = _setting(
         None, "quantile of |f(x_j)| that a band must hold; 1 is the maximum of Eq. 5, none the maximum but for strays"
