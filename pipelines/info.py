@@ -98,8 +98,8 @@ def _describe_surface(surface: Surface) -> Rows:
     else:
         rows.append(("kind", "point cloud"))
         rows.append(("points", f"{len(surface.vertices):,}"))
+        rows.append(("normals", "no" if surface.normals is None else "yes"))
     rows.append(("bounds", "  ".join(f"{axis} {a:.9g} … {b:.9g}" for axis, a, b in zip("xyz", low, high, strict=True))))
     rows.append(("diagonal", f"{float(np.linalg.norm(high - low)):.6g}"))
-    rows.append(("normals", "no" if surface.normals is None else "yes"))
     rows.append(("colors", "no" if surface.colors is None else "yes"))
     return rows
