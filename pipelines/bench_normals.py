@@ -101,7 +101,7 @@ def format_normals(rows: list[NormalsRow]) -> str:
     ]
     notes = (
         f"{rows[0].points:,} points, {torch.get_num_threads()} threads, float32; value, jet and both tangent methods "
-        "in the same blocks.\nAlg. 1: the paper's, as printed: three passes, each with its own activations. shared: the "
+        "in the same blocks.\nAlg. 1: as the paper prints it: three passes with their own activations. shared: the "
         "three tangents on one set of activations.\nautograd: torch.autograd.grad on all points at once. of GEMM "
         "peak: the jet's matrix products at the measured SGEMM rate, over its time.\n"
         f"largest difference between the gradients: {max(r.largest_difference for r in rows):.1e}"
