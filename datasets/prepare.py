@@ -28,6 +28,7 @@ class CleaningReport:
         kept: points left.
         dropped_nan: points with a coordinate that is not finite.
         dropped_duplicates: points at exactly the place of an earlier one.
+        dropped_isolated: points far from all others.
         repaired_normals: zero or NaN normals replaced by their neighbours' mean.
         dropped_normals: points whose normal could not be repaired.
         normals_source: "file", "mesh" (from the file's faces) or "estimated".
@@ -39,6 +40,7 @@ class CleaningReport:
     kept: int
     dropped_nan: int
     dropped_duplicates: int
+    dropped_isolated: int
     repaired_normals: int
     dropped_normals: int
     normals_source: Literal["file", "mesh", "estimated"]
@@ -56,6 +58,7 @@ class CleaningReport:
         counts = {
             "not finite": self.dropped_nan,
             "duplicate": self.dropped_duplicates,
+            "isolated": self.dropped_isolated,
             "without a usable normal": self.dropped_normals,
         }
         dropped = ", ".join(f"{count:,} {what}" for what, count in counts.items() if count)
@@ -92,6 +95,7 @@ def prepare_cloud(
     normals: Literal["auto", "file", "estimate"] = "auto",
     sensor_origin: tuple[float, float, float] | None = None,
     neighbors: int = 16,
+    isolation: float | None = 30.0,
 ) -> OrientedCloud:
     """Clean a cloud, give it oriented unit normals and move it into the unit sphere.
 
@@ -105,6 +109,8 @@ def prepare_cloud(
         sensor_origin: where the scanner stood, in input coordinates; estimated normals are turned towards it.
         neighbors: size of the neighbourhoods normals are estimated and repaired from; doubled for estimation,
             at most twice, while the cloud is too noisy for them to look flat.
+        isolation: points whose eighth neighbour is this many times further away than the median point's are dropped:
+            a single stray point of a scan would get a bubble of surface to itself, and set the scale. None keeps them.
 
     Raises:
         InputError: too few points are left, or ``normals="file"`` and there are none.
@@ -114,12 +120,16 @@ def prepare_cloud(
         raise ValueError(f"normals={normals!r}: expected 'auto', 'file' or 'estimate'")
     if neighbors < 3:
         raise ValueError(f"neighbors={neighbors}: expected at least 3, to span a plane")
+    if isolation is not None and not isolation > 1:
+        raise ValueError(f"isolation={isolation}: expected a factor > 1, or None")
     if sensor_origin is not None and not np.isfinite(np.asarray(sensor_origin, np.float64)).all():
         raise InputError(f"sensor_origin={sensor_origin}: expected three finite numbers")
 
     finite = np.flatnonzero(np.isfinite(cloud.points).all(axis=1))
-    kept = finite[_first_of_each(cloud.points[finite])]
-    _check_enough(len(kept), cloud, "are left after dropping NaN and duplicates")
+    distinct = finite[_first_of_each(cloud.points[finite])]
+    _check_enough(len(distinct), cloud, "are left after dropping NaN and duplicates")
+    kept = distinct if isolation is None else distinct[~_isolated(cloud.points[distinct], isolation)]
+    dropped_isolated = len(distinct) - len(kept)
     similarity = Similarity.to_unit_sphere(cloud.points[kept])
     points = similarity.to_unit(cloud.points[kept])
 
@@ -147,7 +157,8 @@ def prepare_cloud(
         read=len(cloud),
         kept=len(kept),
         dropped_nan=len(cloud) - len(finite),
-        dropped_duplicates=len(finite) - len(kept) - dropped_normals,
+        dropped_duplicates=len(finite) - len(distinct),
+        dropped_isolated=dropped_isolated,
         repaired_normals=repaired,
         dropped_normals=dropped_normals,
         normals_source=source,
@@ -172,6 +183,13 @@ def _first_of_each(points: Float64) -> NDArray[np.int64]:
     first = np.ones(len(points), bool)
     first[1:] = (ordered[1:] != ordered[:-1]).any(axis=1)
     return np.sort(order[first])
+
+
+def _isolated(points: Float64, factor: float, *, neighbors: int = 8) -> NDArray[np.bool_]:
+    """Which points have their ``neighbors``-th neighbour more than ``factor`` times the median further away."""
+    shifted = points - points.mean(axis=0)  # a tree over map coordinates would lose digits
+    found = KDTree(shifted).query(shifted, k=[min(neighbors, len(points) - 1) + 1], workers=-1)[0][:, 0]
+    return found > factor * np.median(found)
 
 
 def _unit_rows(vectors: NDArray[np.float32]) -> Float64:

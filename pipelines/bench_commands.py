@@ -17,7 +17,7 @@ __all__ = ["BENCH_COMMANDS"]
 
 def _normals_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--points", type=whole(1), default=262_144, metavar="N", help="how many (262144)")
-    parser.add_argument("--repeats", type=whole(1), default=5, metavar="N", help="the best of how many (5)")
+    parser.add_argument("--repeats", type=whole(1), default=3, metavar="N", help="the best of how many (3)")
     parser.add_argument("--device", default="cpu", help="torch device (cpu)")
     parser.add_argument("--seed", type=whole(0), default=0, metavar="N", help="of points and weights (0)")
     add_json(parser)

@@ -40,7 +40,7 @@ def bench_normals(
     *,
     points: int = 262_144,
     sizes: tuple[tuple[int, int], ...] = SIZES,
-    repeats: int = 5,
+    repeats: int = 3,
     device: str = "cpu",
     seed: int = 0,
 ) -> list[NormalsRow]:

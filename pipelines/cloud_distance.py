@@ -20,6 +20,9 @@ __all__ = ["CloudDistance"]
 
 Float32 = NDArray[np.float32]
 
+# Area of a point's disc over the median one: scans are this much sparser where they graze the surface, hardly more.
+LARGEST_AREA = 100.0
+
 
 class CloudDistance:
     """Nearest distances to, and signed distances from, an oriented cloud in the unit sphere.
@@ -40,7 +43,9 @@ class CloudDistance:
         count = min(8, len(points) - 1)
         reach = np.asarray(self.tree.query(self.points, k=count + 1, workers=-1)[0])[:, -1]
         # `count` neighbours share the disc of radius `reach`: each of them has this much area to itself.
-        self.areas: Float32 = (math.pi * reach**2 / count).astype(np.float32)
+        areas = math.pi * reach**2 / count
+        # A few points on their own have nobody near, but no surface of that size either.
+        self.areas: Float32 = np.minimum(areas, LARGEST_AREA * np.median(areas)).astype(np.float32)
         self.radii: Float32 = np.sqrt(self.areas / math.pi)
         self.spacing = float(np.median(np.sqrt(self.areas)))
 

@@ -110,7 +110,9 @@ def fit(
     config = config or FitConfig()
     device = choose_device(config.device)
     raw = _as_cloud(cloud)
-    oriented = prepare_cloud(raw, normals=config.normals, sensor_origin=config.sensor_origin)
+    oriented = prepare_cloud(
+        raw, normals=config.normals, sensor_origin=config.sensor_origin, isolation=config.isolation
+    )
     if directory is not None:
         directory.mkdir(parents=True, exist_ok=True)
     fitting = _Fitting(oriented, raw.source, config, device, directory, progress)

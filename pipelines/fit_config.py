@@ -43,6 +43,9 @@ class FitConfig:
     sensor_origin: tuple[float, float, float] | None = _setting(
         None, "x y z of the sensor, in input units: estimated normals face it"
     )
+    isolation: float | None = _setting(
+        30.0, "drop points whose 8th neighbour is this many times further away than is usual; none keeps them"
+    )
     time_budget: float | None = _setting(None, "end training after about this many seconds, all levels together")
     seed: int = _setting(0, "random seed")
     device: str = _setting("auto", "torch device: auto, cpu, cuda, ...")
@@ -66,6 +69,8 @@ class FitConfig:
         for name in ("data_weight", "residual_data_weight", "normal_weight", "eikonal_weight", "domain_weight"):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name}: {getattr(self, name)}; expected ≥ 0")
+        if self.isolation is not None and not self.isolation > 1:
+            raise ValueError(f"isolation: {self.isolation}; expected a factor > 1, or none")
         if self.quantile is not None and not 0 < self.quantile <= 1:
             raise ValueError(f"quantile: {self.quantile}; expected a number in (0, 1]")
         if self.levels is not None and not 1 <= self.levels <= count:

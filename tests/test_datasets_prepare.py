@@ -142,3 +142,27 @@ def test_errors():
 
 def test_fewer_points_than_neighbors():
     assert len(prepare_cloud(PointCloud(sample_sphere(12).points))) == 12
+
+
+def test_isolated_points_are_dropped_before_the_scale_is_set():
+    cloud = sample_sphere(2000, radius=2.0)
+    stray = PointCloud(
+        np.concatenate((cloud.points, [[40.0, 0.0, 0.0]])),
+        normals=np.concatenate((cloud.normals, [[1.0, 0.0, 0.0]])),
+    )
+    prepared = prepare_cloud(stray)
+    assert prepared.report.dropped_isolated == 1
+    assert "1 isolated" in prepared.report.summary()
+    assert prepared.similarity.scale == pytest.approx(2.0, rel=0.01)
+    kept = prepare_cloud(stray, isolation=None)
+    assert kept.report.dropped_isolated == 0
+    assert len(kept) == 2001
+    with pytest.raises(ValueError, match="isolation"):
+        prepare_cloud(stray, isolation=0.5)
+
+
+def test_uneven_density_is_not_isolation():
+    dense, sparse = sample_sphere(20_000, seed=1), sample_sphere(100, seed=2)
+    half = dense.points[:, 2] > 0
+    points = np.concatenate((dense.points[half], sparse.points[sparse.points[:, 2] <= 0]))
+    assert prepare_cloud(PointCloud(points, normals=points.astype(np.float32))).report.dropped_isolated == 0
