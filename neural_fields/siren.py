@@ -144,6 +144,8 @@ class Siren(Field):
         parameters: list[Tensor] = []
         for layer in self._sine_layers():
             parameters += [layer.weight * self.omega, layer.bias * self.omega]
+        # The sweep back ends in a product with three columns; BLAS does it three times faster if they are contiguous.
+        parameters[0] = parameters[0].t().contiguous().t()
         return [*parameters, self.output.weight, self.output.bias]
 
     def _sine_layers(self) -> Iterator[nn.Linear]:
