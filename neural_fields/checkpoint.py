@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 
 from .errors import InputError
 from .field import Field
@@ -68,7 +68,8 @@ def save_field(
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in field.state_dict().items()}
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
-        save_file(tensors, partial, metadata={FORMAT: json.dumps(header)})
+        # Bytes, not save_file: that makes files nobody else may read, whatever the umask.
+        partial.write_bytes(save(tensors, metadata={FORMAT: json.dumps(header)}))
         partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor
 
 from ..datasets import OrientedCloud
@@ -87,7 +87,7 @@ def save_state(directory: Path, tensors: Mapping[str, Tensor], progress: Mapping
     """Write the resume file, whole or not at all; ``progress`` is JSON."""
     partial = directory / f".{STATE_FILE}.{os.getpid()}.partial"
     plain = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in tensors.items()}
-    save_file(plain, partial, metadata={"progress": json.dumps(dict(progress))})
+    partial.write_bytes(save(plain, metadata={"progress": json.dumps(dict(progress))}))
     partial.replace(directory / STATE_FILE)
 
 
