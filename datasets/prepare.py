@@ -188,7 +188,7 @@ def _first_of_each(points: Float64) -> NDArray[np.int64]:
 def _isolated(points: Float64, factor: float, *, neighbors: int = 8) -> NDArray[np.bool_]:
     """Which points have their ``neighbors``-th neighbour more than ``factor`` times the median further away."""
     shifted = points - points.mean(axis=0)  # a tree over map coordinates would lose digits
-    found = KDTree(shifted).query(shifted, k=[min(neighbors, len(points) - 1) + 1], workers=-1)[0][:, 0]
+    found = np.asarray(KDTree(shifted).query(shifted, k=min(neighbors, len(points) - 1) + 1, workers=-1)[0])[:, -1]
     return found > factor * np.median(found)
 
 

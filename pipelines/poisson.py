@@ -26,7 +26,7 @@ def screened_poisson(cloud: OrientedCloud, *, depth: int = 10) -> Surface:
     Raises:
         ModuleNotFoundError: the extra is not installed (see `has_poisson`).
     """
-    import pymeshlab
+    import pymeshlab  # pyright: ignore[reportMissingImports]  an extra
 
     meshes = pymeshlab.MeshSet()  # pyright: ignore[reportAttributeAccessIssue]  its names come from a C++ module
     points, normals = cloud.points.astype(np.float64), cloud.normals.astype(np.float64)
