@@ -10,7 +10,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from ..neural_fields import InputError
-from .point_cloud import PointCloud
+from .point_cloud import PointCloud, unit_rows
 
 __all__ = ["read_off", "read_stl", "triangulate", "vertex_normals", "weld"]
 
@@ -94,5 +94,4 @@ def vertex_normals(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> N
     sums = np.stack(
         [np.bincount(index[faces].T.ravel(), np.tile(weighted[:, k], 3), len(points)) for k in range(3)], axis=1
     )
-    lengths = np.linalg.norm(sums, axis=1, keepdims=True)
-    return np.divide(sums, lengths, out=np.zeros_like(sums), where=lengths > 0)[index].astype(np.float32)
+    return unit_rows(sums)[index].astype(np.float32)

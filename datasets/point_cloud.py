@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["PointCloud", "colors_from", "normals_from"]
+__all__ = ["PointCloud", "colors_from", "normals_from", "unit_rows"]
 
 
 @dataclass(frozen=True)
@@ -71,3 +71,11 @@ def colors_from(values: NDArray[Any]) -> NDArray[np.float32]:
     integral = np.issubdtype(values.dtype, np.integer)
     scale = 1.0 if largest <= 1 and not integral else 255.0 if largest <= 255 else 65535.0
     return (finite / scale).clip(0, 1).astype(np.float32)
+
+
+def unit_rows(vectors: NDArray[np.floating] | NDArray[np.integer]) -> NDArray[np.float64]:
+    """Rows ``(..., 3)`` over their lengths; rows of no length, or with NaN, become zero."""
+    rows = vectors.astype(np.float64)
+    rows[~np.isfinite(rows).all(axis=-1)] = 0
+    lengths = np.linalg.norm(rows, axis=-1, keepdims=True)
+    return np.divide(rows, lengths, out=np.zeros_like(rows), where=lengths > 0)

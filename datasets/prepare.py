@@ -11,7 +11,7 @@ from scipy.spatial import KDTree
 
 from ..neural_fields import InputError, Similarity
 from .orientation import estimate_normals, nearest, openness, orient_normals, outwardness
-from .point_cloud import PointCloud
+from .point_cloud import PointCloud, unit_rows
 from .reading import MIN_POINTS
 
 __all__ = ["CleaningReport", "OrientedCloud", "prepare_cloud"]
@@ -133,7 +133,7 @@ def prepare_cloud(
     similarity = Similarity.to_unit_sphere(cloud.points[kept])
     points = similarity.to_unit(cloud.points[kept])
 
-    given = _unit_rows(cloud.normals[kept]) if cloud.normals is not None and normals != "estimate" else None
+    given = unit_rows(cloud.normals[kept]) if cloud.normals is not None and normals != "estimate" else None
     usable: NDArray[np.bool_] = np.zeros(len(points), bool)
     if given is not None:
         usable = (given != 0).any(axis=1)
@@ -190,14 +190,6 @@ def _isolated(points: Float64, factor: float, *, neighbors: int = 8) -> NDArray[
     shifted = points - points.mean(axis=0)  # a tree over map coordinates would lose digits
     found = np.asarray(KDTree(shifted).query(shifted, k=min(neighbors, len(points) - 1) + 1, workers=-1)[0])[:, -1]
     return found > factor * np.median(found)
-
-
-def _unit_rows(vectors: NDArray[np.float32]) -> Float64:
-    """Rows over their lengths; rows of no length, or with NaN, become zero."""
-    rows = vectors.astype(np.float64)
-    rows[~np.isfinite(rows).all(axis=1)] = 0
-    lengths = np.linalg.norm(rows, axis=1, keepdims=True)
-    return np.divide(rows, lengths, out=np.zeros_like(rows), where=lengths > 0)
 
 
 def _repair(

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from ..neural_fields import Field, Similarity
-from .point_cloud import PointCloud
+from .point_cloud import PointCloud, unit_rows
 from .statue import Statue
 
 __all__ = ["STATUE_PLACEMENT", "simulate_scan", "statue_scan"]
@@ -193,8 +193,7 @@ def _grid_normals(points: Float64, rays: Float64, *, jump: float = 3.0) -> Float
         tangents.append(np.pad(step, before) + np.pad(step, after))  # central, or one-sided at an edge
     normals = np.cross(tangents[0], tangents[1])
     normals *= -np.sign((normals * rays).sum(axis=2, keepdims=True))
-    length = np.linalg.norm(normals, axis=2, keepdims=True)
-    return np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
+    return unit_rows(normals)
 
 
 def _value(field: Field, points: Float64) -> Float64:

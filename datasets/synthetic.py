@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from ..neural_fields import Field, Similarity
-from .point_cloud import PointCloud
+from .point_cloud import PointCloud, unit_rows
 
 __all__ = ["add_noise", "add_outliers", "project_to_surface", "sample_sphere", "sample_surface", "sample_torus"]
 
@@ -136,9 +136,7 @@ def add_noise(cloud: PointCloud, amplitude: float, *, seed: int = 0) -> PointClo
         raise ValueError(f"amplitude={amplitude}: expected a fraction of the diagonal, 0 or more")
     diagonal = float(np.linalg.norm(np.ptp(cloud.points, axis=0)))
     shift = np.random.default_rng(seed).uniform(-1, 1, (len(cloud), 1)) * amplitude * diagonal
-    length = np.linalg.norm(cloud.normals, axis=1, keepdims=True)
-    unit = np.divide(cloud.normals, length, out=np.zeros(cloud.points.shape), where=length > 0)
-    return replace(cloud, points=cloud.points + shift * unit)
+    return replace(cloud, points=cloud.points + shift * unit_rows(cloud.normals))
 
 
 def add_outliers(cloud: PointCloud, fraction: float, *, seed: int = 0) -> PointCloud:

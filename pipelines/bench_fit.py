@@ -8,11 +8,11 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from ..datasets import PointCloud, add_noise, prepare_cloud, read_cloud
+from ..datasets import PointCloud, add_noise, read_cloud
 from ..neural_fields import InputError, Similarity
 from ..neural_fields.meshing import NoSurfaceError, extract_mesh
 from .evaluate import Metrics, evaluate_surfaces
-from .fit import fit
+from .fit import fit, prepare
 from .fit_config import FitConfig
 from .picture import contact_sheet, look_at, picture_of, write_picture
 from .poisson import has_poisson, screened_poisson
@@ -58,7 +58,6 @@ def bench_fit(
     poisson_depth: int = 10,
     pictures: Path | None = None,
     progress: Callable[[str, Progress], None] | None = None,
-    done: Callable[[FitRow], None] | None = None,
 ) -> list[FitRow]:
     """Fit the vertices of each mesh with their area-weighted normals, and compare with the mesh itself.
 
@@ -74,7 +73,6 @@ def bench_fit(
         poisson_depth: octree depth of screened Poisson, which runs if its extra is installed.
         pictures: folder for one contact sheet per shape.
         progress: called with the shape's name and the fit's progress.
-        done: called with each row as it is finished.
 
     Raises:
         InputError: a file cannot be read, or holds no faces to compare with.
@@ -94,8 +92,6 @@ def bench_fit(
                 metrics = evaluate_surfaces(mesh, reference, samples=samples, seed=config.seed)
                 drawn.append((method, mesh))
             rows.append(FitRow(path.stem, noise, method, seconds, mesh_seconds, metrics))
-            if done is not None:
-                done(rows[-1])
         if pictures is not None:
             camera = look_at(reference.vertices)
             tiles = [(label, picture_of(surface, camera)) for label, surface in [*drawn, ("reference", reference)]]
@@ -162,7 +158,7 @@ def _reconstructions(
             mesh = None
         results.append((f"level {level}", seconds, time.perf_counter() - started, mesh))
     if has_poisson():
-        oriented = prepare_cloud(cloud, normals=config.normals)
+        oriented = prepare(cloud, config)
         started = time.perf_counter()
         mesh = screened_poisson(oriented, depth=poisson_depth)
         results.append(("screened Poisson", time.perf_counter() - started, 0.0, _in_input(mesh, oriented.similarity)))

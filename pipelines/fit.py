@@ -40,7 +40,7 @@ from .sampling import (
 )
 from .training import LevelTrainer, Progress, Source, StopFlag, stop_on_signals
 
-__all__ = ["FitConfig", "Interrupted", "Run", "fit"]
+__all__ = ["FitConfig", "Interrupted", "Run", "fit", "prepare"]
 
 # A residual starts at a tenth of the usual output scale, close to the level before it.
 RESIDUAL_GAIN = 0.1
@@ -110,9 +110,7 @@ def fit(
     config = config or FitConfig()
     device = choose_device(config.device)
     raw = _as_cloud(cloud)
-    oriented = prepare_cloud(
-        raw, normals=config.normals, sensor_origin=config.sensor_origin, isolation=config.isolation
-    )
+    oriented = prepare(raw, config)
     if directory is not None:
         directory.mkdir(parents=True, exist_ok=True)
     fitting = _Fitting(oriented, raw.source, config, device, directory, progress)
@@ -120,6 +118,15 @@ def fit(
         fitting.restore()
     with stop_on_signals() as flag:
         return fitting.run(flag)
+
+
+def prepare(cloud: PointCloud, config: FitConfig) -> OrientedCloud:
+    """`prepare_cloud` as the settings of a fit ask for it.
+
+    Raises:
+        InputError: see `prepare_cloud`.
+    """
+    return prepare_cloud(cloud, normals=config.normals, sensor_origin=config.sensor_origin, isolation=config.isolation)
 
 
 def choose_device(name: str) -> torch.device:
@@ -168,6 +175,7 @@ class _Fitting:
         self.progress = progress or (lambda _: None)
         self.fingerprint = fingerprint(cloud)
         self.frozen: MultiscaleSDF | None = None
+        self.errors = torch.empty(0)  # of the last frozen level, at the input points
         self.stages: list[dict[str, Any]] = []
         self.trainer_state: dict[str, Tensor] = {}
 
@@ -223,6 +231,7 @@ class _Fitting:
             self.save(trainer, delta)
             raise Interrupted(self.directory)
         self.frozen = self.grown(network, delta).requires_grad_(False)
+        self.errors = self.values_at_cloud()
         self.stages.append(
             {
                 "level": level,
@@ -275,8 +284,7 @@ class _Fitting:
 
     def next_delta(self) -> float:
         """Half-width of the band around the last frozen level (Eq. 5)."""
-        errors = self.values_at_cloud()
-        delta = delta_of(errors, epsilon=self.config.epsilon, quantile=self.config.quantile)
+        delta = delta_of(self.errors, epsilon=self.config.epsilon, quantile=self.config.quantile)
         # A level that met every point exactly would leave its successor no band at all.
         return max(delta, 1e-6)
 
@@ -289,7 +297,7 @@ class _Fitting:
 
     def surface_errors(self) -> dict[str, float]:
         """|f| at the input points, in input units: how closely the level passes by them."""
-        errors = self.values_at_cloud().abs() * self.cloud.similarity.scale
+        errors = self.errors.abs() * self.cloud.similarity.scale
         return {
             "rms_at_points": float(errors.square().mean().sqrt()),
             "max_at_points": float(errors.max()),
@@ -345,6 +353,7 @@ class _Fitting:
             self.frozen = MultiscaleSDF(levels[0], levels[1:], [1.0] * (len(levels) - 1)).to(self.device)
             self.frozen.load_state_dict(_with_prefix(tensors, "frozen."))
             self.frozen.requires_grad_(False)
+            self.errors = self.values_at_cloud()
         self.trainer_state = _with_prefix(tensors, "trainer.")
 
     def record(self, *, finished: bool) -> dict[str, Any]:

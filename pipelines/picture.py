@@ -14,9 +14,10 @@ import imageio.v3 as iio
 import numpy as np
 from numpy.typing import NDArray
 
+from ..datasets.meshes import vertex_normals
 from ..neural_fields import InputError
 from .raster import cover
-from .surface import Surface, vertex_normals
+from .surface import Surface
 
 __all__ = ["Camera", "contact_sheet", "look_at", "picture_of", "write_picture"]
 
@@ -143,7 +144,9 @@ def _mesh_pixels(
     def interpolate(values: Float64) -> Float64:
         return np.einsum("pk,pkc->pc", weights, values[corners])
 
-    normals = vertex_normals(surface) if surface.normals is None else surface.normals
+    normals = surface.normals
+    if normals is None:
+        normals = vertex_normals(surface.vertices, surface.faces).astype(np.float64)
     colors = None if surface.colors is None else interpolate(surface.colors)
     return pixel, interpolate(surface.vertices), interpolate(normals), colors
 

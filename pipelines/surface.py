@@ -13,6 +13,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from ..datasets import PointCloud, read_cloud
+from ..datasets.point_cloud import unit_rows
 from ..neural_fields import InputError, Similarity
 from ..neural_fields.meshing import Mesh
 
@@ -27,7 +28,6 @@ __all__ = [
     "merged",
     "read_surface",
     "sample_surface",
-    "vertex_normals",
 ]
 
 Float64 = NDArray[np.float64]
@@ -81,8 +81,7 @@ def from_cloud(cloud: PointCloud) -> Surface:
     normals = colors = None
     if cloud.normals is not None:
         normals = np.nan_to_num(cloud.normals[finite].astype(np.float64), posinf=0.0, neginf=0.0)
-        length = np.linalg.norm(normals, axis=1, keepdims=True)
-        normals = np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
+        normals = unit_rows(normals)
     if cloud.colors is not None:
         colors = cloud.colors[finite].astype(np.float64)
     return Surface(cloud.points[finite], np.empty((0, 3), np.int64), normals, colors)
@@ -127,17 +126,6 @@ def face_normals(surface: Surface) -> tuple[Float64, Float64]:
     cross = np.cross(b - a, c - a)
     length = np.linalg.norm(cross, axis=1)
     return np.divide(cross, length[:, None], out=np.zeros_like(cross), where=length[:, None] > 0), length / 2
-
-
-def vertex_normals(surface: Surface) -> Float64:
-    """Normals at the vertices ``(V, 3)``, area-weighted over their faces, equal vertices taken as one; not unit."""
-    places, index = np.unique(surface.vertices, axis=0, return_inverse=True)
-    index = index.reshape(-1)
-    normals, areas = face_normals(surface)
-    total = np.zeros_like(places)
-    for k in range(3):
-        np.add.at(total, index[surface.faces[:, k]], normals * areas[:, None])
-    return total[index]
 
 
 def sample_surface(surface: Surface, count: int, rng: np.random.Generator) -> tuple[Float64, Float64 | None]:
