@@ -1,5 +1,6 @@
-"""Files and sensors → tensors: point clouds, and synthetic ones whose exact surface is known."""
+"""Files and sensors → tensors: point clouds, synthetic ones whose exact surface is known, and cameras."""
 
+from .cameras import Camera, look_at, orbit, turntable
 from .ply import write_cloud_ply
 from .point_cloud import PointCloud
 from .prepare import CleaningReport, OrientedCloud, prepare_cloud
@@ -10,12 +11,15 @@ from .synthetic import add_noise, add_outliers, sample_sphere, sample_surface, s
 
 __all__ = [
     "STATUE_PLACEMENT",
+    "Camera",
     "CleaningReport",
     "OrientedCloud",
     "PointCloud",
     "Statue",
     "add_noise",
     "add_outliers",
+    "look_at",
+    "orbit",
     "prepare_cloud",
     "read_cloud",
     "sample_sphere",
@@ -23,5 +27,6 @@ __all__ = [
     "sample_torus",
     "simulate_scan",
     "statue_scan",
+    "turntable",
     "write_cloud_ply",
 ]

@@ -1,0 +1,330 @@
+"""Pinhole cameras: from pixels to rays and back, and where to stand to see all of a shape.
+
+OpenCV's convention: x right, y down, z forward, and the centre of pixel (0, 0) at (0, 0), so that the image runs
+from −0.5 to width − 0.5. Everything is float64: at map coordinates (millions of metres) float32 has no centimetres.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ..neural_fields import Similarity
+
+__all__ = ["UP_AXES", "Camera", "look_at", "orbit", "pinhole_intrinsics", "turntable"]
+
+UP_AXES: Mapping[str, tuple[float, float, float]] = MappingProxyType({"y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)})
+"""The names of the axes that may point up, and their directions."""
+
+RIGID = 1e-6  # how far a pose's axes may be from orthonormal
+STRAIGHT = 1e-9  # sine of the angle below which a view runs along the up direction
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A pinhole camera without lens distortion.
+
+    Attributes:
+        intrinsics: ``(3, 3)`` float64, in pixels: ``[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]``.
+        world_from_camera: ``(4, 4)`` float64 rigid pose; its columns are right, down, forward and the eye.
+        width: of the image, in pixels.
+        height: of the image, in pixels.
+
+    Raises:
+        ValueError: a matrix has another shape, type or form, or the image has no pixels.
+
+    Example:
+        >>> camera = look_at((0, 0, 4), (0, 0, 0), width=3, height=3)
+        >>> pixel, z = camera.project(torch.zeros(3))
+        >>> pixel.tolist(), z.item()
+        ([1.0, 1.0], 4.0)
+    """
+
+    intrinsics: Tensor
+    world_from_camera: Tensor
+    width: int
+    height: int
+
+    def __post_init__(self) -> None:
+        for name, shape in (("intrinsics", (3, 3)), ("world_from_camera", (4, 4))):
+            matrix = getattr(self, name)
+            if tuple(matrix.shape) != shape or matrix.dtype != torch.float64:
+                raise ValueError(f"{name}: {tuple(matrix.shape)} of {matrix.dtype}; expected {shape} of torch.float64")
+            if not bool(matrix.isfinite().all()):
+                raise ValueError(f"{name}: holds a number that is not finite")
+        for name in ("width", "height"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name}={getattr(self, name)}: expected at least one pixel")
+        (fx, skew, _), (low, fy, _), last = self.intrinsics.tolist()
+        if fx <= 0 or fy <= 0 or skew or low or last != [0, 0, 1]:
+            expected = "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0"
+            raise ValueError(f"intrinsics: {self.intrinsics.tolist()}; expected {expected}")
+        axes = self.world_from_camera[:3, :3]
+        off = float((axes.T @ axes - torch.eye(3, dtype=torch.float64, device=axes.device)).abs().max())
+        if off > RIGID or float(torch.linalg.det(axes)) < 0 or self.world_from_camera[3].tolist() != [0, 0, 0, 1]:
+            raise ValueError(
+                f"world_from_camera: {self.world_from_camera.tolist()}; expected a rigid pose (right-handed unit axes)"
+            )
+
+    @property
+    def eye(self) -> Tensor:
+        """``(3,)`` where the camera stands, in world coordinates."""
+        return self.world_from_camera[:3, 3]
+
+    @property
+    def right(self) -> Tensor:
+        """``(3,)`` unit direction of growing x, in world coordinates."""
+        return self.world_from_camera[:3, 0]
+
+    @property
+    def down(self) -> Tensor:
+        """``(3,)`` unit direction of growing y, in world coordinates."""
+        return self.world_from_camera[:3, 1]
+
+    @property
+    def forward(self) -> Tensor:
+        """``(3,)`` unit direction of view, in world coordinates."""
+        return self.world_from_camera[:3, 2]
+
+    def rays(self, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> tuple[Tensor, Tensor]:
+        """The eye ``(3,)`` and unit directions ``(H, W, 3)`` through the pixels' centres, in world coordinates.
+
+        Args:
+            dtype: of both; they are worked out in float64 and rounded once.
+            device: where to.
+        """
+        from kornia.geometry.camera import unproject_points  # imported here: it takes a fifth of a second
+
+        # Metal has no float64: there, the work is done on the CPU.
+        place = "cpu" if torch.device(device).type == "mps" else device
+        pose = self.world_from_camera.to(place)
+        x = torch.arange(self.width, dtype=torch.float64, device=place)
+        y = torch.arange(self.height, dtype=torch.float64, device=place)
+        pixels = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)  # (H, W, 2)
+        ones = pixels.new_ones(()).expand(*pixels.shape[:2], 1)
+        seen = unproject_points(pixels, ones, self.intrinsics.to(place), normalize=True)
+        directions = seen @ pose[:3, :3].T
+        return pose[:3, 3].to(dtype).to(device), directions.to(dtype).to(device)
+
+    def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Where points ``(..., 3)`` fall in the image: pixels ``(..., 2)`` and depths z ``(...,)`` along the axis.
+
+        Both are float64, on the points' device. A pixel means something only where z > 0: what lies behind the
+        camera is not in the picture.
+
+        Raises:
+            ValueError: the points are not ``(..., 3)``.
+        """
+        from kornia.geometry.camera import project_points
+
+        if points.ndim == 0 or points.shape[-1] != 3:
+            raise ValueError(f"points: shape {tuple(points.shape)}; expected (..., 3)")
+        pose = self.world_from_camera.to(points.device)
+        # The eye is taken off first, while map coordinates still have all their digits.
+        seen = (points.double() - pose[:3, 3]) @ pose[:3, :3]
+        pixels = project_points(seen.reshape(-1, 3), self.intrinsics.to(points.device))
+        return pixels.reshape(*points.shape[:-1], 2), seen[..., 2]
+
+    def moved(self, similarity: Similarity) -> Camera:
+        """The same camera in unit-sphere coordinates: it sees the moved world in the same pixels."""
+        pose = self.world_from_camera.clone()
+        pose[:3, 3] = torch.from_numpy(similarity.to_unit(self.eye.cpu().numpy()))
+        return replace(self, world_from_camera=pose)
+
+    def resized(self, width: int, height: int) -> Camera:
+        """The same view in other pixels; where the aspect ratio changes, they are no longer square.
+
+        Corners, not pixel centres, stay where they are: x becomes ``(x + 0.5) · width / self.width − 0.5``.
+
+        Raises:
+            ValueError: ``width`` or ``height`` is less than one pixel.
+        """
+        sx, sy = width / self.width, height / self.height
+        scale = self.intrinsics.new_tensor([[sx, 0, (sx - 1) / 2], [0, sy, (sy - 1) / 2], [0, 0, 1]])
+        return replace(self, intrinsics=scale @ self.intrinsics, width=width, height=height)
+
+
+def pinhole_intrinsics(fov: float, width: int, height: int) -> Tensor:
+    """The ``(3, 3)`` matrix of square pixels and an axis through the middle of the image.
+
+    Args:
+        fov: full vertical angle of view, degrees.
+        width: of the image, in pixels.
+        height: of the image, in pixels.
+
+    Raises:
+        ValueError: ``fov`` is not between 0 and 180.
+    """
+    if not 0 < fov < 180:
+        raise ValueError(f"fov={fov}: expected degrees between 0 and 180")
+    focal = height / 2 / math.tan(math.radians(fov) / 2)
+    matrix = [[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]]
+    return torch.tensor(matrix, dtype=torch.float64)
+
+
+def look_at(
+    eye: Sequence[float] | Tensor,
+    target: Sequence[float] | Tensor,
+    *,
+    up: Sequence[float] | Tensor = UP_AXES["y"],
+    fov: float = 25.0,
+    width: int,
+    height: int,
+) -> Camera:
+    """A camera at ``eye`` with ``target`` in the middle of its image.
+
+    Args:
+        eye: ``(3,)`` where it stands.
+        target: ``(3,)`` what it looks at.
+        up: ``(3,)`` what is up in the image. Looking straight along it, the image's right is +x (or +y, if that is
+            the direction of view).
+        fov: full vertical angle of view, degrees.
+        width: of the image, in pixels.
+        height: of the image, in pixels.
+
+    Raises:
+        ValueError: ``eye`` and ``target`` coincide, ``up`` is zero, or one of them is not three finite numbers.
+    """
+    eye, target, up = _vector("eye", eye), _vector("target", target), _vector("up", up)
+    forward = target - eye
+    if not float(forward.norm()):
+        raise ValueError(f"target={target.tolist()}: is where the eye is, so there is no direction of view")
+    if not float(up.norm()):
+        raise ValueError("up: is zero; expected a direction")
+    forward = forward / forward.norm()
+    right = torch.linalg.cross(forward, up / up.norm())
+    if float(right.norm()) < STRAIGHT:
+        axis = torch.eye(3, dtype=torch.float64)[1 if abs(float(forward[0])) > 0.9 else 0]
+        right = axis - (axis @ forward) * forward
+    return _camera(eye, right / right.norm(), forward, pinhole_intrinsics(fov, width, height), width, height)
+
+
+def orbit(
+    points: NDArray[np.floating] | Tensor,
+    *,
+    azimuth: float = 30.0,
+    elevation: float = 15.0,
+    up: str = "y",
+    fov: float = 25.0,
+    width: int = 640,
+    height: int = 640,
+    margin: float = 0.94,
+    zoom: float = 1.0,
+) -> Camera:
+    """A camera on a sphere around the middle of ``points``, as near as it can be with all of them in view.
+
+    Args:
+        points: ``(N, 3)`` what to look at; the corners of a box will do.
+        azimuth: degrees around the up axis, counter-clockwise from the front (+z for ``up="y"``, −y for ``up="z"``).
+        elevation: degrees above the horizon, from −90 (from below) to 90 (from above).
+        up: "y" or "z", the axis that points up.
+        fov: full vertical angle of view, degrees.
+        width: of the image, in pixels.
+        height: of the image, in pixels.
+        margin: share of the image that the points may fill.
+        zoom: how much larger than that the middle of the image is drawn, from the same place.
+
+    Raises:
+        ValueError: an argument is out of its range, or the points are not ``(N, 3)``, not finite or all the same.
+    """
+    poses = [(azimuth, elevation)]
+    return _around(points, poses, up=up, fov=fov, width=width, height=height, margin=margin, zoom=zoom)[0]
+
+
+def turntable(
+    points: NDArray[np.floating] | Tensor,
+    frames: int,
+    *,
+    azimuth: float = 30.0,
+    elevation: float = 15.0,
+    up: str = "y",
+    fov: float = 25.0,
+    width: int = 640,
+    height: int = 640,
+    margin: float = 0.94,
+    zoom: float = 1.0,
+) -> list[Camera]:
+    """Cameras once around ``points``, evenly spaced, all at the distance of the one that must stand furthest.
+
+    The first stands at ``azimuth``; the next after the last would stand there again. Other arguments as for `orbit`.
+
+    Raises:
+        ValueError: ``frames`` is not positive, or as for `orbit`.
+    """
+    if frames < 1:
+        raise ValueError(f"frames={frames}: expected at least one")
+    poses = [(azimuth + 360 * frame / frames, elevation) for frame in range(frames)]
+    return _around(points, poses, up=up, fov=fov, width=width, height=height, margin=margin, zoom=zoom)
+
+
+def _around(
+    points: NDArray[np.floating] | Tensor,
+    poses: Sequence[tuple[float, float]],
+    *,
+    up: str,
+    fov: float,
+    width: int,
+    height: int,
+    margin: float,
+    zoom: float,
+) -> list[Camera]:
+    """Cameras at (azimuth, elevation), all at the distance from which each has all the points in view."""
+    if not 0 < margin <= 1:
+        raise ValueError(f"margin={margin}: expected more than 0 and at most 1")
+    if not (zoom > 0 and math.isfinite(zoom)):
+        raise ValueError(f"zoom={zoom}: expected a positive number")
+    points = torch.as_tensor(points, dtype=torch.float64, device="cpu")
+    if points.ndim != 2 or points.shape[1] != 3 or not len(points) or not bool(points.isfinite().all()):
+        raise ValueError(f"points: shape {tuple(points.shape)}; expected (N, 3) finite numbers, N > 0")
+    center = (points.amin(dim=0) + points.amax(dim=0)) / 2
+    offset = points - center
+    if not bool(offset.any()):
+        raise ValueError("points: all of them coincide, so there is no distance to look from")
+    axes = [_orbit_axes(azimuth, elevation, up) for azimuth, elevation in poses]
+    intrinsics = pinhole_intrinsics(fov, width, height)
+    slopes = margin * torch.tensor([width, height]) / 2 / intrinsics.diagonal()[:2]
+    distance = 0.0
+    for right, forward in axes:
+        seen = offset @ torch.stack((right, torch.linalg.cross(forward, right), forward), dim=1)  # (N, 3)
+        # From distance d, a point at camera offset (x, y, z) is in view if |x| ≤ slope (d + z), and so for y.
+        needed = (seen[:, :2].abs() / slopes).amax(dim=1) - seen[:, 2]
+        distance = max(distance, float(needed.max()))
+    intrinsics[:2, :2] *= zoom
+    return [_camera(center - distance * forward, right, forward, intrinsics, width, height) for right, forward in axes]
+
+
+def _orbit_axes(azimuth: float, elevation: float, up: str) -> tuple[Tensor, Tensor]:
+    """Right and forward of a camera that looks at the middle of its orbit; at the poles too."""
+    if up not in UP_AXES:
+        raise ValueError(f"up={up!r}: expected 'y' or 'z'")
+    if not -90 <= elevation <= 90:
+        raise ValueError(f"elevation={elevation}: expected degrees from -90 to 90")
+    if not math.isfinite(azimuth):
+        raise ValueError(f"azimuth={azimuth}: expected degrees")
+    a, e = math.radians(azimuth), math.radians(elevation)
+    side, front, high = math.sin(a) * math.cos(e), math.cos(a) * math.cos(e), math.sin(e)
+    if up == "y":
+        right, forward = (math.cos(a), 0.0, -math.sin(a)), (-side, -high, -front)
+    else:
+        right, forward = (math.cos(a), math.sin(a), 0.0), (-side, front, -high)
+    return torch.tensor(right, dtype=torch.float64), torch.tensor(forward, dtype=torch.float64)
+
+
+def _camera(eye: Tensor, right: Tensor, forward: Tensor, intrinsics: Tensor, width: int, height: int) -> Camera:
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3] = torch.stack((right, torch.linalg.cross(forward, right), forward, eye), dim=1)
+    return Camera(intrinsics, pose, width, height)
+
+
+def _vector(name: str, numbers: Sequence[float] | Tensor) -> Tensor:
+    vector = torch.as_tensor(numbers, dtype=torch.float64, device="cpu")
+    if tuple(vector.shape) != (3,) or not bool(vector.isfinite().all()):
+        raise ValueError(f"{name}={numbers}: expected three finite numbers")
+    return vector

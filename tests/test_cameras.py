@@ -1,0 +1,244 @@
+"""Cameras: rays and projection undo each other, views are where they say, and nothing is lost far from the origin."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from mplicits.datasets import Camera, look_at, orbit, turntable
+from mplicits.datasets.cameras import pinhole_intrinsics
+from mplicits.neural_fields import Similarity
+
+
+def some_camera() -> Camera:
+    """Pixels that are not square, an axis that is not in the middle, a pose that is nobody's axis."""
+    camera = look_at((1.0, 2.0, 3.0), (-0.3, 0.1, 0.2), up=(0.1, 0.9, -0.2), width=31, height=17)
+    intrinsics = torch.tensor([[25.0, 0, 14.2], [0, 22.0, 9.1], [0, 0, 1]], dtype=torch.float64)
+    return Camera(intrinsics, camera.world_from_camera, 31, 17)
+
+
+def pixel_grid(camera: Camera) -> torch.Tensor:
+    x, y = torch.arange(camera.width).double(), torch.arange(camera.height).double()
+    return torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
+
+
+def test_project_undoes_rays():
+    camera = some_camera()
+    eye, directions = camera.rays(dtype=torch.float64)
+    torch.testing.assert_close(directions.norm(dim=-1), torch.ones(17, 31).double(), rtol=0, atol=1e-14)
+    depth = torch.rand(17, 31).double() * 5 + 0.1
+    pixels, z = camera.project(eye + depth[..., None] * directions)
+    torch.testing.assert_close(pixels, pixel_grid(camera), rtol=0, atol=1e-12)
+    torch.testing.assert_close(z, depth * (directions @ camera.forward), rtol=0, atol=1e-12)
+
+
+def test_the_middle_pixel_and_the_corners_look_where_trigonometry_says():
+    camera = look_at((0, 0, 2), (0, 0, 0), fov=90, width=5, height=3)
+    _, directions = camera.rays(dtype=torch.float64)
+    torch.testing.assert_close(directions[1, 2], torch.tensor([0.0, 0, -1]).double())
+    # The top edge is half a pixel above the centre of the first row, at 45°: one row is tan 45° / 1.5.
+    expected = torch.tensor([-2 / 1.5, 1 / 1.5, -1]).double()
+    torch.testing.assert_close(directions[0, 0], expected / expected.norm())
+
+
+def test_projection_agrees_with_the_matrices_written_out():
+    camera = some_camera()
+    points = torch.randn(40, 3).double()
+    world = torch.cat((points, torch.ones(40, 1).double()), dim=1)
+    image = world @ torch.linalg.inv(camera.world_from_camera).T[:, :3] @ camera.intrinsics.T
+    pixels, z = camera.project(points)
+    torch.testing.assert_close(pixels, image[:, :2] / image[:, 2:], rtol=1e-10, atol=1e-10)
+    torch.testing.assert_close(z, image[:, 2])
+
+
+@pytest.mark.parametrize("shape", [(3,), (0, 3), (1, 3), (2, 4, 3)])
+def test_points_of_any_leading_shape_and_dtype(shape, dtype):
+    pixels, z = some_camera().project(torch.zeros(shape, dtype=dtype))
+    assert pixels.shape == (*shape[:-1], 2)
+    assert z.shape == shape[:-1]
+    assert pixels.dtype == z.dtype == torch.float64
+
+
+def test_rays_go_to_the_device_and_dtype_asked_for(device, dtype):
+    camera = some_camera()
+    eye, directions = camera.rays(dtype=dtype, device=device)
+    assert eye.dtype == directions.dtype == dtype
+    assert eye.device.type == directions.device.type == device.type
+    torch.testing.assert_close(directions.cpu().double(), camera.rays(dtype=torch.float64)[1], rtol=0, atol=1e-7)
+    pixels, _ = camera.project(eye.double() + directions.double())
+    torch.testing.assert_close(pixels.cpu(), pixel_grid(camera), rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("up", [(0, 1, 0), (0, 0, 1), (1.0, 2.0, -0.5)])
+def test_look_at_has_right_down_forward_axes_and_its_target_in_the_middle(up):
+    eye, target = torch.tensor([3.0, -1, 2]).double(), torch.tensor([0.5, 0.2, -0.3]).double()
+    camera = look_at(eye, target, up=up, width=21, height=11)
+    axes = camera.world_from_camera[:3, :3]
+    torch.testing.assert_close(axes.T @ axes, torch.eye(3).double(), rtol=0, atol=1e-14)
+    torch.testing.assert_close(torch.linalg.cross(camera.right, camera.down), camera.forward)
+    torch.testing.assert_close(camera.eye, eye)
+    torch.testing.assert_close(camera.forward, (target - eye) / (target - eye).norm())
+    above = torch.tensor(up).double()
+    assert float(camera.right @ above) == pytest.approx(0, abs=1e-14)
+    assert float(camera.down @ above) < 0
+    pixel, z = camera.project(target)
+    torch.testing.assert_close(pixel, torch.tensor([10.0, 5.0]).double())
+    assert float(z) == pytest.approx(float((target - eye).norm()))
+
+
+@pytest.mark.parametrize("up", [(0, 1, 0), (0, 0, -2.0), (1, 0, 0)])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("tilt", [0.0, 1e-12, 1e-7])
+def test_looking_along_the_up_direction_is_no_accident(up, sign, tilt):
+    eye = sign * torch.tensor(up).double() + tilt
+    camera = look_at(eye, (0, 0, 0), up=up, width=8, height=8)
+    axes = camera.world_from_camera[:3, :3]
+    torch.testing.assert_close(axes.T @ axes, torch.eye(3).double(), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("up", ["y", "z"])
+@pytest.mark.parametrize("size", [(320, 640), (500, 500), (640, 320)])
+@pytest.mark.parametrize("elevation", [-90, -25, 90])
+def test_orbit_keeps_all_points_in_view_and_touches_the_margin(up, size, elevation):
+    points = np.random.default_rng(1).uniform(-1, 1, (500, 3)) * [3, 1, 2] + [100, -50, 7]
+    width, height = size
+    view = {"azimuth": 40, "elevation": elevation, "up": up, "fov": 40, "width": width, "height": height}
+    camera = orbit(points, **view, margin=0.9)
+    pixels, z = camera.project(torch.from_numpy(points))
+    assert bool((z > 0).all())
+    off = (pixels - torch.tensor([width - 1, height - 1]) / 2).abs() / (torch.tensor([width, height]) / 2)
+    assert float(off.max()) == pytest.approx(0.9)
+    if abs(elevation) < 90:
+        assert float(camera.down["xyz".index(up)]) < 0
+    closer, z_closer = orbit(points, **view, margin=0.9, zoom=2.0).project(torch.from_numpy(points))
+    middle = torch.tensor([width - 1, height - 1]) / 2
+    torch.testing.assert_close(closer - middle, 2 * (pixels - middle))
+    torch.testing.assert_close(z_closer, z)
+
+
+def test_azimuth_and_elevation_are_where_they_say():
+    box = torch.tensor([[-1.0, -1, -1], [1, 1, 1]])
+
+    def forward(**view: object) -> list[float]:
+        return orbit(box, **view).forward.tolist()
+
+    assert forward(azimuth=0, elevation=0) == pytest.approx([0, 0, -1])
+    assert forward(azimuth=90, elevation=0) == pytest.approx([-1, 0, 0])
+    assert forward(azimuth=0, elevation=0, up="z") == pytest.approx([0, 1, 0])
+    assert forward(azimuth=90, elevation=0, up="z") == pytest.approx([-1, 0, 0])
+    assert forward(azimuth=77, elevation=90) == pytest.approx([0, -1, 0])
+    assert forward(azimuth=77, elevation=-90, up="z") == pytest.approx([0, 0, 1])
+    assert orbit(box, azimuth=0, elevation=90).right.tolist() == pytest.approx([1, 0, 0])
+
+
+def test_a_turntable_goes_once_around_at_one_distance_and_crops_nothing():
+    points = torch.rand(300, 3).double() * torch.tensor([4.0, 1.0, 0.5]) + torch.tensor([0.0, 5.0, 9.0])
+    cameras = turntable(points, 12, azimuth=10, elevation=20, width=64, height=48)
+    middle = (points.amin(dim=0) + points.amax(dim=0)) / 2
+    distances = [float((camera.eye - middle).norm()) for camera in cameras]
+    assert distances == pytest.approx([distances[0]] * 12)
+    alone = [orbit(points, azimuth=10 + 30 * k, elevation=20, width=64, height=48) for k in range(12)]
+    assert distances[0] == pytest.approx(max(float((camera.eye - middle).norm()) for camera in alone))
+    for camera, other in zip(cameras, alone, strict=True):
+        torch.testing.assert_close(camera.world_from_camera[:3, :3], other.world_from_camera[:3, :3])
+        pixels, _ = camera.project(points)
+        assert bool(((pixels >= -0.5) & (pixels <= torch.tensor([63.5, 47.5]))).all())
+
+
+def test_a_moved_camera_sees_the_same_pixels():
+    similarity = Similarity((3.0, -20.0, 700.0), 42.0)
+    camera = look_at((30, 10, 600), similarity.center, up=(0, 0, 1), width=64, height=48)
+    points = torch.randn(50, 3).double() * 10 + torch.tensor(similarity.center)
+    pixels, z = camera.project(points)
+    unit = torch.from_numpy(similarity.to_unit(points.numpy()))
+    moved, z_moved = camera.moved(similarity).project(unit)
+    torch.testing.assert_close(moved, pixels, rtol=0, atol=1e-10)
+    torch.testing.assert_close(z_moved * similarity.scale, z)
+
+
+def test_a_resized_camera_keeps_the_view_to_its_corners():
+    camera = some_camera()
+    larger = camera.resized(93, 34)
+    points = torch.randn(50, 3).double()
+    pixels, z = camera.project(points)
+    resized, z_resized = larger.project(points)
+    torch.testing.assert_close(resized, (pixels + 0.5) * torch.tensor([3.0, 2.0]) - 0.5)
+    torch.testing.assert_close(z_resized, z)
+    back = larger.resized(31, 17)
+    torch.testing.assert_close(back.intrinsics, camera.intrinsics)
+    # Three times as large, every pixel is the middle one of nine.
+    _, small = camera.rays(dtype=torch.float64)
+    _, tripled = camera.resized(93, 51).rays(dtype=torch.float64)
+    torch.testing.assert_close(tripled[1::3, 1::3], small)
+
+
+def test_map_coordinates_keep_their_precision():
+    home = torch.tensor([500_000.0, 5_400_000.0, 300.0]).double()
+    points = torch.rand(20, 3).double()
+    near = look_at((3.0, 4.0, 2.0), (0.5, 0.5, 0.5), up=(0, 0, 1), width=640, height=480)
+    far = look_at(home + torch.tensor([3.0, 4.0, 2.0]), home + 0.5, up=(0, 0, 1), width=640, height=480)
+    torch.testing.assert_close(far.project(points + home)[0], near.project(points)[0], rtol=0, atol=1e-5)
+    moved = far.moved(Similarity(tuple(home.tolist()), 1.0))
+    torch.testing.assert_close(moved.rays()[0], near.rays()[0], rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"intrinsics": torch.eye(4).double()}, r"intrinsics: \(4, 4\)"),
+        ({"intrinsics": torch.eye(3)}, r"intrinsics: .*torch.float32; expected"),
+        ({"intrinsics": torch.tensor([[1.0, 0.1, 0], [0, 1, 0], [0, 0, 1]]).double()}, "intrinsics: .*fx, 0, cx"),
+        ({"intrinsics": torch.tensor([[1.0, 0, 0], [0, -1, 0], [0, 0, 1]]).double()}, "intrinsics: .*fx, fy > 0"),
+        ({"intrinsics": torch.full((3, 3), math.nan).double()}, "intrinsics: .*not finite"),
+        ({"world_from_camera": torch.diag(torch.tensor([1.0, 1, -1, 1])).double()}, "world_from_camera: .*rigid"),
+        ({"world_from_camera": torch.diag(torch.tensor([2.0, 2, 2, 1])).double()}, "world_from_camera: .*rigid"),
+        ({"world_from_camera": torch.diag(torch.tensor([1.0, 1, 1, 2])).double()}, "world_from_camera: .*rigid"),
+        ({"width": 0}, "width=0"),
+        ({"height": -3}, "height=-3"),
+    ],
+)
+def test_a_camera_that_cannot_be_says_why(change, message):
+    whole = {
+        "intrinsics": torch.eye(3).double(),
+        "world_from_camera": torch.eye(4).double(),
+        "width": 4,
+        "height": 4,
+    }
+    Camera(**whole)
+    with pytest.raises(ValueError, match=message):
+        Camera(**{**whole, **change})
+
+
+def test_views_that_cannot_be_say_why():
+    box = torch.tensor([[-1.0, -1, -1], [1, 1, 1]])
+    for arguments, message in [
+        ({"up": "x"}, "up='x'"),
+        ({"elevation": 91}, "elevation=91"),
+        ({"azimuth": math.inf}, "azimuth=inf"),
+        ({"fov": 180}, "fov=180"),
+        ({"margin": 0}, "margin=0"),
+        ({"zoom": -1}, "zoom=-1"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            orbit(box, **arguments)
+    for points in (box[:, :2], box[:0], box * math.nan):
+        with pytest.raises(ValueError, match="points: shape"):
+            orbit(points)
+    with pytest.raises(ValueError, match="coincide"):
+        orbit(box[:1])
+    with pytest.raises(ValueError, match="frames=0"):
+        turntable(box, 0)
+    for arguments, message in [
+        (((0, 0, 0), (0, 0, 0), (0, 1, 0)), "target"),
+        (((0, 0, 1), (0, 0, 0), (0, 0, 0)), "up"),
+        (((0, 0), (0, 0, 0), (0, 1, 0)), "eye"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            look_at(*arguments[:2], up=arguments[2], width=4, height=4)
+    with pytest.raises(ValueError, match="shape"):
+        some_camera().project(torch.zeros(4, 2))
+
+
+def test_intrinsics_of_a_vertical_angle_of_view():
+    matrix = pinhole_intrinsics(90, 6, 4)
+    torch.testing.assert_close(matrix, torch.tensor([[2.0, 0, 2.5], [0, 2.0, 1.5], [0, 0, 1]]).double())
