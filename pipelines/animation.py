@@ -1,0 +1,152 @@
+"""Frames to an MP4 or a looping GIF, one at a time, so that a long animation takes no more memory than a short one."""
+
+from __future__ import annotations
+
+import itertools
+import subprocess
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import IO
+
+import imageio_ffmpeg
+import numpy as np
+from numpy.typing import NDArray
+
+from ..neural_fields import InputError
+
+__all__ = ["ANIMATIONS", "write_animation"]
+
+Image = NDArray[np.uint8]
+
+ANIMATIONS = (".mp4", ".gif")
+CRF = 16  # x264's constant rate factor: flat colours and thin lines stay clean, and files are still small
+# Without these, players guess the matrix from the frame's size, and colours shift a little.
+BT709 = ["-colorspace", "bt709", "-color_primaries", "bt709", "-color_trc", "bt709", "-color_range", "tv"]
+
+
+def write_animation(
+    path: str | Path, frames: Iterable[Image], *, fps: float = 30, progress: Callable[[int], None] | None = None
+) -> None:
+    """Write an H.264 MP4 that every player takes, or a GIF that loops.
+
+    Frames are asked for one by one and written into a temporary file beside the target, which takes its place only
+    when it is whole: an interruption leaves an older file as it was. An odd width or height of an MP4 is padded by
+    repeating the last column or row, since its colour is stored at half resolution. A GIF gets one palette for
+    all of its frames, so that what rests does not flicker.
+
+    Args:
+        path: an .mp4 or .gif file.
+        frames: ``(H, W, 3)`` uint8 RGB, all of one size.
+        fps: frames per second. A GIF counts in hundredths of a second and shows at most 50.
+        progress: called with the number of frames so far after each one.
+
+    Raises:
+        InputError: another extension, or the folder does not exist.
+        ValueError: there are no frames, one is no RGB image or of another size than the first, or ``fps`` is not > 0.
+        OSError: ffmpeg could not write the file.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix not in ANIMATIONS:
+        raise InputError(f"{path}: animations are written as {' or '.join(ANIMATIONS)}")
+    if not path.absolute().parent.is_dir():
+        raise InputError(f"{path}: the folder {path.absolute().parent} does not exist; make it first")
+    if not 0 < fps < float("inf"):
+        raise ValueError(f"{path}: fps={fps}; expected a number > 0")
+    partial = path.with_name(f".{path.stem}.partial{suffix}")
+    checked = _checked(path, frames, progress)
+    try:
+        if suffix == ".mp4":
+            _write_mp4(partial, checked, fps)
+        else:
+            _write_gif(partial, checked, fps)
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def _checked(path: Path, frames: Iterable[Image], progress: Callable[[int], None] | None) -> Iterator[Image]:
+    """The frames as they come, or an error that says what is wrong with one."""
+    first: tuple[int, ...] | None = None
+    count = 0
+    for count, frame in enumerate(frames, start=1):
+        if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3 or not frame.size:
+            raise ValueError(f"{path}: frame {count} is {frame.dtype} {frame.shape}; expected uint8 (H, W, 3)")
+        first = first or frame.shape
+        if frame.shape != first:
+            raise ValueError(
+                f"{path}: frame {count} is {frame.shape[1]}×{frame.shape[0]} after frames of {first[1]}×{first[0]}; "
+                "draw all of them in one size"
+            )
+        yield frame
+        if progress is not None:
+            progress(count)
+    if not count:
+        raise ValueError(f"{path}: no frames to write; expected at least one")
+
+
+def _write_mp4(path: Path, frames: Iterator[Image], fps: float) -> None:
+    matrix = ["-vf", "scale=out_color_matrix=bt709:out_range=tv", "-pix_fmt", "yuv420p", *BT709]
+    settings = ["-vcodec", "libx264", "-crf", str(CRF), "-movflags", "+faststart"]
+    _encode(map(_even, frames), fps, [*matrix, *settings, path])
+
+
+def _write_gif(path: Path, frames: Iterator[Image], fps: float) -> None:
+    """Two passes over a lossless copy: the best 256 colours of all frames, then the frames in these colours.
+
+    Ordered dithering, unlike error diffusion, gives a resting pixel the same colour in every frame.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        clip, palette = Path(folder) / "clip.mkv", Path(folder) / "palette.png"
+        _encode(frames, fps, ["-vcodec", "ffv1", "-pix_fmt", "bgr0", clip])
+        with _ffmpeg(["-i", clip, "-vf", "palettegen", "-update", "1", palette]):
+            pass
+        dither = "paletteuse=dither=bayer:bayer_scale=4:diff_mode=rectangle"
+        with _ffmpeg(["-i", clip, "-i", palette, "-lavfi", dither, "-loop", "0", path]):
+            pass
+
+
+def _encode(frames: Iterator[Image], fps: float, output: Sequence[str | Path]) -> None:
+    """Send frames to ffmpeg; nothing is started before the first one, whose size ffmpeg must be told, is there."""
+    first = next(frames)
+    size = f"{first.shape[1]}x{first.shape[0]}"
+    with _ffmpeg(["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-r", str(fps), "-i", "-", *output]) as stdin:
+        for frame in itertools.chain([first], frames):
+            stdin.write(np.ascontiguousarray(frame).data)
+
+
+@contextmanager
+def _ffmpeg(arguments: Sequence[str | Path]) -> Iterator[IO[bytes]]:
+    """Run ffmpeg around a block that may write to its input; an error in the block kills it.
+
+    imageio's own writer leaves ffmpeg running when a frame cannot be made, and does not look at its exit code.
+
+    Raises:
+        OSError: ffmpeg failed; the message names the file and gives its reason.
+    """
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-v", "error", *map(str, arguments)]
+    with tempfile.TemporaryFile() as log:
+        # In a session of its own ffmpeg does not see Ctrl-C: it is for us to stop it.
+        process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=log, start_new_session=True
+        )
+        assert process.stdin is not None
+        try:
+            with suppress(BrokenPipeError), process.stdin:  # ffmpeg is gone: its log says why
+                yield process.stdin
+            code = process.wait()
+        except BaseException:
+            process.kill()
+            process.wait()
+            raise
+        if code:
+            log.seek(0)
+            reason = " ".join(log.read().decode(errors="replace").split())[:200]
+            raise OSError(f"{arguments[-1]}: ffmpeg failed ({reason or code})")
+
+
+def _even(frame: Image) -> Image:
+    """The frame with its last row and column repeated where their number is odd."""
+    return np.pad(frame, ((0, frame.shape[0] % 2), (0, frame.shape[1] % 2), (0, 0)), mode="edge")
