@@ -8,13 +8,13 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from ..datasets import PointCloud, add_noise, read_cloud
+from ..datasets import PointCloud, add_noise, orbit, read_cloud
 from ..neural_fields import InputError, Similarity
 from ..neural_fields.meshing import NoSurfaceError, extract_mesh
 from .evaluate import Metrics, evaluate_surfaces
 from .fit import fit, prepare
 from .fit_config import FitConfig
-from .picture import contact_sheet, look_at, picture_of, write_picture
+from .picture import contact_sheet, picture_of, write_picture
 from .poisson import has_poisson, screened_poisson
 from .surface import Surface, from_cloud, from_mesh, read_surface
 from .timing import format_table
@@ -93,7 +93,7 @@ def bench_fit(
                 drawn.append((method, mesh))
             rows.append(FitRow(path.stem, noise, method, seconds, mesh_seconds, metrics))
         if pictures is not None:
-            camera = look_at(reference.vertices)
+            camera = orbit(reference.vertices)
             tiles = [(label, picture_of(surface, camera)) for label, surface in [*drawn, ("reference", reference)]]
             write_picture(pictures / f"{path.stem}{f'-noise-{noise:g}' if noise else ''}.png", contact_sheet(tiles))
     return rows

@@ -12,14 +12,14 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from ..datasets import STATUE_PLACEMENT, PointCloud, Statue, read_cloud, statue_scan, write_cloud_ply
+from ..datasets import STATUE_PLACEMENT, PointCloud, Statue, orbit, read_cloud, statue_scan, write_cloud_ply
 from ..neural_fields import Field, InputError, Similarity
 from ..neural_fields.meshing import Mesh, NoSurfaceError, extract_mesh
 from .config import load_config
 from .fit import Run, fit
 from .fit_config import FitConfig
 from .mesh_files import write_mesh
-from .picture import contact_sheet, look_at, picture_of, write_picture
+from .picture import contact_sheet, picture_of, write_picture
 from .progress_bar import progress_bars
 from .surface import from_cloud, from_mesh
 from .timing import format_table
@@ -109,14 +109,14 @@ def spread_colors(mesh: Mesh, cloud: PointCloud, similarity: Similarity, *, neig
 def draw_levels(cloud: PointCloud, meshes: Sequence[Mesh], similarity: Similarity, *, up: str) -> NDArray[np.uint8]:
     """The cloud and the mesh of each level side by side, all from one camera."""
     points = from_cloud(cloud).moved(similarity)
-    camera = look_at(points.vertices, up=up, aspect=TILE[0] / TILE[1])
-    pictures = [(f"input: {len(points.vertices):,} points", picture_of(points, camera, size=TILE))]
+    camera = orbit(points.vertices, up=up, width=TILE[0], height=TILE[1])
+    pictures = [(f"input: {len(points.vertices):,} points", picture_of(points, camera))]
     for level, mesh in enumerate(meshes):
         label = f"level {level}: {len(mesh.faces):,} faces"
-        pictures.append((label, picture_of(from_mesh(mesh), camera, size=TILE)))
+        pictures.append((label, picture_of(from_mesh(mesh), camera)))
     if points.colors is not None:
         colored = spread_colors(meshes[-1], cloud, similarity)
-        pictures.append(("its colours from the nearest points", picture_of(from_mesh(colored), camera, size=TILE)))
+        pictures.append(("its colours from the nearest points", picture_of(from_mesh(colored), camera)))
     return contact_sheet(pictures)
 
 

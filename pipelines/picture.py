@@ -1,25 +1,28 @@
 """Pictures of meshes and clouds without a GPU or a window: a z-buffer in numpy.
 
-Image coordinates are OpenCV's: x right, y down, z forward. Images are ``(H, W, 3)`` uint8 RGB.
+Images are ``(H, W, 3)`` uint8 RGB, or with an alpha channel ``(H, W, 4)``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import imageio.v3 as iio
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
+from ..datasets.cameras import Camera
 from ..datasets.meshes import vertex_normals
 from ..neural_fields import InputError
-from .raster import cover
+from .raster import clip, cover
+from .seen import Seen
 from .surface import Surface
 
-__all__ = ["Camera", "contact_sheet", "look_at", "picture_of", "write_picture"]
+__all__ = ["check_picture_path", "cloud_view", "contact_sheet", "mesh_view", "picture_of", "write_picture"]
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
@@ -27,184 +30,184 @@ Image = NDArray[np.uint8]
 
 CLAY = (0.80, 0.78, 0.74)
 BACK = (0.62, 0.36, 0.33)  # faces seen from inside, so that holes and wrong normals show
+LAMP = (-0.6, -0.7, -0.4)  # towards the lamp, along the camera's right, down and forward
 SUPERSAMPLING = 2
+NEAR = 1e-4  # what is nearer than this share of the furthest depth is not drawn: it would fill the image
 
 
-@dataclass(frozen=True)
-class Camera:
-    """A pinhole camera.
+def mesh_view(surface: Surface, camera: Camera) -> Seen:
+    """What the pixels see of a mesh; the part of it behind the camera is cut away.
 
-    Attributes:
-        eye: ``(3,)`` where it stands.
-        axes: ``(3, 3)`` rows right, down, forward, in world coordinates.
-        fov: full vertical angle of view, degrees.
-    """
-
-    eye: Float64
-    axes: Float64
-    fov: float
-
-
-def look_at(
-    points: Float64,
-    *,
-    azimuth: float = 30.0,
-    elevation: float = 15.0,
-    up: str = "y",
-    fov: float = 25.0,
-    aspect: float = 1.0,
-    margin: float = 0.94,
-) -> Camera:
-    """A camera on an orbit around ``points`` ``(N, 3)``, as near as it can be with all of them in view.
+    Normals and colours are those of the vertices, interpolated in space (not on the screen). Normals are unit
+    again after that, and point where the mesh has them point: away from the camera, on faces seen from inside.
 
     Args:
-        points: what to look at.
-        azimuth: degrees around the up axis, counter-clockwise from the front (+z for ``up="y"``, −y for ``up="z"``).
-        elevation: degrees above the horizon, less than 90 either way.
-        up: "y" or "z", the axis that points up.
-        fov: full vertical angle of view, degrees.
-        aspect: width over height of the image.
-        margin: share of the image that the points may fill.
+        surface: a mesh; without normals, those of its faces are averaged at the vertices.
+        camera: in the mesh's coordinates.
 
-    Raises:
-        ValueError: ``up`` is neither axis.
+    Returns:
+        One row per pixel that sees the mesh, in float32.
     """
-    if up not in ("y", "z"):
-        raise ValueError(f"up={up!r}: expected 'y' or 'z'")
-    a, e = np.radians(azimuth), np.radians(elevation)
-    side, front, high = np.sin(a) * np.cos(e), np.cos(a) * np.cos(e), np.sin(e)
-    towards_eye = np.array([side, high, front]) if up == "y" else np.array([side, -front, high])
-    forward = -towards_eye
-    right = np.cross(forward, [0.0, 1.0, 0.0] if up == "y" else [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    axes = np.stack((right, np.cross(forward, right), forward))
-    center = (points.min(axis=0) + points.max(axis=0)) / 2
-    x, y, z = ((points - center) @ axes.T).T
-    slope = np.tan(np.radians(fov) / 2) * margin
-    # From distance d, a point at camera offset (x, y, z) is in view if |y| ≤ slope (d + z), and so for x.
-    needed = np.maximum(np.abs(x) / (slope * aspect), np.abs(y) / slope) - z
-    return Camera(center - float(needed.max()) * forward, axes, fov)
+    normals = surface.normals
+    if normals is None:
+        normals = vertex_normals(surface.vertices, surface.faces)
+    attributes = [surface.vertices, normals] + ([] if surface.colors is None else [surface.colors])
+    values = np.concatenate(attributes, axis=1)  # (V, 6 | 9): what is interpolated
+    z = camera.project(torch.from_numpy(surface.vertices))[1].numpy()
+    clipped = clip(z - _near(z), surface.faces)
+    share = clipped.share[:, None]
+    values = np.concatenate((values, (1 - share) * values[clipped.kept] + share * values[clipped.dropped]))
+    pixel, corners, weights = _nearest_faces(values[:, :3], clipped.faces, camera)
+    rows = np.zeros((len(pixel), values.shape[1]))
+    for k in range(3):
+        rows += weights[:, k, None] * values[corners[:, k]]
+    return _seen(camera, pixel, rows[:, :3], rows[:, 3:6], None if surface.colors is None else rows[:, 6:])
 
 
-def picture_of(
-    surface: Surface,
-    camera: Camera,
-    *,
-    size: tuple[int, int] = (640, 640),
-    point_size: float | None = None,
-    supersampling: int = SUPERSAMPLING,
-) -> Image:
-    """Draw a mesh (smooth-shaded, its back faces reddish), or a cloud as discs, on white.
+def cloud_view(surface: Surface, camera: Camera, *, point_size: float | None = None) -> Seen:
+    """What the pixels see of a cloud whose points are discs of one size on the screen.
+
+    All pixels of a disc see its point. Where there is no normal, the surface is taken to face the camera.
 
     Args:
-        surface: what to draw; with no faces it is a cloud. Colours and normals are used where there are any.
-        camera: from where; every vertex must be in front of it.
-        size: width and height of the image.
-        point_size: diameter of a cloud's discs in pixels; by default such that they touch.
-        supersampling: pixels drawn per pixel and direction.
+        surface: its vertices, with their normals and colours, are drawn; faces are not.
+        camera: in the cloud's coordinates.
+        point_size: diameter of the discs in pixels; by default such that they touch.
+
+    Returns:
+        One row per pixel that sees a point, in float32.
     """
-    width, height = size[0] * supersampling, size[1] * supersampling
-    seen = (surface.vertices - camera.eye) @ camera.axes.T  # (V, 3)
-    focal = height / 2 / np.tan(np.radians(camera.fov) / 2)
-    xy = focal * seen[:, :2] / seen[:, 2:] + (np.array([width, height]) - 1) / 2
-    if len(surface.faces):
-        pixel, position, normal, color = _mesh_pixels(surface, seen[:, 2], xy, (width, height))
-    else:
-        diameter = supersampling * point_size if point_size else _touching(xy, (width, height))
-        pixel, index = _cloud_pixels(xy, seen[:, 2], (width, height), diameter)
-        position = surface.vertices[index]
-        normal = None if surface.normals is None else surface.normals[index]
-        color = None if surface.colors is None else surface.colors[index]
-    image = np.ones((width * height, 3), np.float32)
-    # A point of a cloud has no back: its normal may be anything, and seeing far ones between near ones is normal.
-    image[pixel] = _shade(position, normal, color, camera, back=BACK if len(surface.faces) else None)
-    image = image.reshape(width, height, 3).swapaxes(0, 1)
-    return cv2.resize((image * 255 + 0.5).astype(np.uint8), size, interpolation=cv2.INTER_AREA).astype(np.uint8)
+    xy, z = (array.numpy() for array in camera.project(torch.from_numpy(surface.vertices)))
+    front = np.flatnonzero(z > _near(z))
+    xy, z, size = xy[front], z[front], (camera.width, camera.height)
+    diameter = _touching(xy, size) if point_size is None else point_size
+    pixel, index = _nearest_points(xy, z, size, diameter)
+    index = front[index]
+    normal = np.zeros((len(pixel), 3)) if surface.normals is None else surface.normals[index]
+    return _seen(
+        camera, pixel, surface.vertices[index], normal, None if surface.colors is None else surface.colors[index]
+    )
 
 
-def _mesh_pixels(
-    surface: Surface, depth: Float64, xy: Float64, size: tuple[int, int]
-) -> tuple[Int64, Float64, Float64, Float64 | None]:
-    """Pixels that see the mesh, with what they see: positions, normals and colours ``(P, 3)``."""
-    count = size[0] * size[1]
+def _near(z: Float64) -> float:
+    return NEAR * max(float(z.max(initial=0.0)), 0.0)
+
+
+def _seen(camera: Camera, pixel: Int64, position: Float64, normal: Float64, color: Float64 | None) -> Seen:
+    """Round to float32, after the eye has been taken off; a normal of length zero becomes one that faces the eye."""
+    offset = torch.from_numpy(position) - camera.eye
+    depth = offset.norm(dim=1, keepdim=True)
+    direction = offset / depth
+    towards = torch.from_numpy(normal).double()
+    length = towards.norm(dim=1, keepdim=True)
+    towards = torch.where(length > 0, towards / length, -direction)
+    return Seen(
+        size=(camera.width, camera.height),
+        pixel=torch.from_numpy(pixel),
+        depth=depth[:, 0].float(),
+        position=torch.from_numpy(position).float(),
+        normal=towards.float(),
+        direction=direction.float(),
+        color=None if color is None else torch.from_numpy(color).float(),
+    )
+
+
+def _nearest_faces(vertices: Float64, faces: Int64, camera: Camera) -> tuple[Int64, Int64, Float64]:
+    """Pixels ``(P,)`` that see a face, the vertices ``(P, 3)`` of the nearest and their weights ``(P, 3)`` in space."""
+    xy, z = (array.numpy() for array in camera.project(torch.from_numpy(vertices)))
+    count = camera.width * camera.height
     nearest = np.full(count, np.inf, np.float32)
     face = np.full(count, -1, np.int64)
     weights = np.zeros((count, 3))
-    for found in cover(xy, surface.faces, size):
-        inverse = found.weights / depth[surface.faces[found.face]]  # 1/z, not z, is linear on the screen
-        z = (1 / inverse.sum(axis=1)).astype(np.float32)
-        np.minimum.at(nearest, found.column, z)
-        won = nearest[found.column] == z
+    # With x and y exchanged, the columns of the raster are pixels in row-major order.
+    for found in cover(xy[:, ::-1], faces, (camera.height, camera.width)):
+        inverse = found.weights / z[faces[found.face]]  # 1/z, not z, is linear on the screen
+        depth = (1 / inverse.sum(axis=1)).astype(np.float32)
+        np.minimum.at(nearest, found.column, depth)
+        won = nearest[found.column] == depth
         pixel = found.column[won]
         face[pixel] = found.face[won]
         weights[pixel] = (inverse / inverse.sum(axis=1, keepdims=True))[won]
     pixel = np.flatnonzero(face >= 0)
-    corners, weights = surface.faces[face[pixel]], weights[pixel]
-
-    def interpolate(values: Float64) -> Float64:
-        return np.einsum("pk,pkc->pc", weights, values[corners])
-
-    normals = surface.normals
-    if normals is None:
-        normals = vertex_normals(surface.vertices, surface.faces).astype(np.float64)
-    colors = None if surface.colors is None else interpolate(surface.colors)
-    return pixel, interpolate(surface.vertices), interpolate(normals), colors
+    return pixel, faces[face[pixel]], weights[pixel]
 
 
 def _touching(xy: Float64, size: tuple[int, int]) -> float:
     """A diameter at which discs spread over the box of the cloud cover it."""
+    if not len(xy):
+        return 2.0
     extent = np.ptp(xy.clip(0, size), axis=0)
     return float(np.clip(2.0 * np.sqrt(extent[0] * extent[1] / len(xy)), 2.0, 12.0))
 
 
-def _cloud_pixels(xy: Float64, depth: Float64, size: tuple[int, int], diameter: float) -> tuple[Int64, Int64]:
+def _nearest_points(xy: Float64, z: Float64, size: tuple[int, int], diameter: float) -> tuple[Int64, Int64]:
     """Pixels that see a point, and the index of the point each one sees."""
-    middle = np.rint(xy).astype(np.int64)
     reach = int(np.ceil(diameter / 2))
+    # Far outside, where a point is does not matter, and it need not fit an integer.
+    middle = np.rint(xy.clip(-2 * reach - 2, np.array(size) + 2 * reach + 2)).astype(np.int64)
     i, j = np.meshgrid(np.arange(-reach, reach + 1), np.arange(-reach, reach + 1), indexing="ij")
     disc = i**2 + j**2 <= (diameter / 2) ** 2
     # Bits of positive float32 are ordered as the numbers are, so depth and index compare as one integer.
-    key = (depth.astype(np.float32).view(np.uint32).astype(np.uint64) << np.uint64(32)) | np.arange(
-        len(depth), dtype=np.uint64
-    )
+    key = (z.astype(np.float32).view(np.uint32).astype(np.uint64) << np.uint64(32)) | np.arange(len(z), dtype=np.uint64)
     empty = np.iinfo(np.uint64).max
     buffer = np.full(size[0] * size[1], empty, np.uint64)
     for step in np.stack((i[disc], j[disc]), axis=1):  # a few dozen pixels of a disc
         x, y = (middle + step).T
         inside = (x >= 0) & (x < size[0]) & (y >= 0) & (y < size[1])
-        np.minimum.at(buffer, x[inside] * size[1] + y[inside], key[inside])
+        np.minimum.at(buffer, y[inside] * size[0] + x[inside], key[inside])
     pixel = np.flatnonzero(buffer != empty)
     return pixel, (buffer[pixel] & np.uint64(0xFFFFFFFF)).astype(np.int64)
 
 
-def _shade(
-    position: Float64,
-    normal: Float64 | None,
-    color: Float64 | None,
-    camera: Camera,
-    *,
-    back: tuple[float, float, float] | None,
-) -> Float64:
+def picture_of(
+    surface: Surface, camera: Camera, *, point_size: float | None = None, supersampling: int = SUPERSAMPLING
+) -> Image:
+    """Draw a mesh (smooth-shaded, its back faces reddish), or a cloud as discs, on white.
+
+    Args:
+        surface: what to draw; with no faces it is a cloud. Colours and normals are used where there are any.
+        camera: from where, and how large; in the surface's coordinates.
+        point_size: diameter of a cloud's discs in pixels; by default such that they touch.
+        supersampling: pixels drawn per pixel and direction.
+    """
+    fine = camera.resized(camera.width * supersampling, camera.height * supersampling)
+    if len(surface.faces):
+        seen = mesh_view(surface, fine)
+        shade = _lit(seen, camera, back=BACK)
+    else:
+        seen = cloud_view(surface, fine, point_size=supersampling * point_size if point_size else None)
+        # A point of a cloud has no back: its normal may be anything, and seeing far ones between near ones is normal.
+        shade = _fading(seen, camera) if surface.normals is None else _lit(seen, camera, back=None)
+    image = torch.ones(fine.height * fine.width, 3)
+    image[seen.pixel] = shade
+    image = (image * 255 + 0.5).byte().reshape(fine.height, fine.width, 3).numpy()
+    size = (camera.width, camera.height)
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.uint8)
+
+
+def _albedo(seen: Seen) -> Tensor:
+    return torch.tensor(CLAY).expand_as(seen.position) if seen.color is None else seen.color
+
+
+def _lit(seen: Seen, camera: Camera, *, back: tuple[float, float, float] | None) -> Tensor:
     """Headlight, a weaker lamp above left of the camera, and a little ambient light; ``(P, 3)`` in [0, 1]."""
-    albedo = np.broadcast_to(CLAY, position.shape) if color is None else color
-    to_eye = camera.eye - position
-    to_eye /= np.linalg.norm(to_eye, axis=1, keepdims=True)
-    if normal is None:
-        # Without normals, only depth gives shape: the far side is darker.
-        depth = (position - camera.eye) @ camera.axes[2]
-        span = float(np.ptp(depth)) if len(depth) else 0.0
-        far = (depth - depth.min()) / span if span > 0 else np.zeros(len(depth))
-        return albedo * (1 - 0.55 * far)[:, None]
-    length = np.linalg.norm(normal, axis=1, keepdims=True)
-    normal = np.divide(normal, length, out=to_eye.copy(), where=length > 0)
-    facing = (normal * to_eye).sum(axis=1)
-    lamp = np.array([-0.6, -0.7, -0.4]) @ camera.axes
-    lamp /= np.linalg.norm(lamp)
-    turned = normal * np.where(facing < 0, -1.0, 1.0)[:, None]
-    light = 0.22 + 0.50 * np.abs(facing) + 0.34 * (turned @ lamp).clip(0)
+    lamp = (camera.world_from_camera[:3, :3] @ torch.tensor(LAMP).double()).float()
+    facing = -(seen.normal * seen.direction).sum(dim=1, keepdim=True)
+    turned = torch.where(facing < 0, -seen.normal, seen.normal)
+    light = 0.22 + 0.50 * facing.abs() + 0.34 * (turned @ (lamp / lamp.norm())[:, None]).clamp(min=0)
+    albedo = _albedo(seen)
     if back is not None:
-        albedo = np.where((facing < 0)[:, None], back, albedo)
-    return (albedo * light[:, None]).clip(0, 1)
+        albedo = torch.where(facing < 0, torch.tensor(back), albedo)
+    return (albedo * light).clamp(0, 1)
+
+
+def _fading(seen: Seen, camera: Camera) -> Tensor:
+    """Without normals, only depth gives shape: the far side is darker; ``(P, 3)`` in [0, 1]."""
+    depth = seen.depth * (seen.direction @ camera.forward.float())
+    if not len(depth):
+        return _albedo(seen)
+    far = (depth - depth.min()) / (depth.max() - depth.min()).clamp(min=torch.finfo(depth.dtype).tiny)
+    return _albedo(seen) * (1 - 0.55 * far)[:, None]
 
 
 def contact_sheet(pictures: Sequence[tuple[str, Image]], *, gap: int = 12, strip: int = 40) -> Image:
@@ -229,17 +232,36 @@ def contact_sheet(pictures: Sequence[tuple[str, Image]], *, gap: int = 12, strip
     return np.concatenate(tiles, axis=1)
 
 
-def write_picture(path: str | Path, image: Image) -> None:
-    """Write a PNG or JPEG, through a temporary file beside the target.
+def check_picture_path(path: str | Path, *, transparent: bool = False) -> None:
+    """Check, before any work is done, that `write_picture` will be able to write there.
+
+    Args:
+        path: of the picture.
+        transparent: whether it has an alpha channel.
 
     Raises:
-        InputError: the extension is another one, or the folder does not exist.
+        InputError: the extension is not one of ours or holds no transparency, or the folder does not exist.
     """
     path = Path(path)
     if path.suffix.lower() not in (".png", ".jpg", ".jpeg"):
         raise InputError(f"{path}: pictures are written as .png or .jpg")
+    if transparent and path.suffix.lower() != ".png":
+        raise InputError(f"{path}: JPEG knows no transparency; write a .png, or give a background")
     if not path.parent.is_dir():
         raise InputError(f"{path}: the folder {path.parent} does not exist")
+
+
+def write_picture(path: str | Path, image: Image) -> None:
+    """Write a PNG ``(H, W, 3 | 4)`` or a JPEG ``(H, W, 3)``, through a temporary file beside the target.
+
+    Raises:
+        InputError: as for `check_picture_path`.
+    """
+    path = Path(path)
+    check_picture_path(path, transparent=image.shape[2] == 4)
     partial = path.with_name(f".{path.stem}.partial{path.suffix}")
-    iio.imwrite(partial, image)
-    partial.replace(path)
+    try:
+        iio.imwrite(partial, image)
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Coverage", "cover"]
+__all__ = ["Clipped", "Coverage", "clip", "cover"]
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
@@ -33,6 +33,50 @@ class Coverage(NamedTuple):
     column: Int64
     weights: Float64
     sign: NDArray[np.int8]
+
+
+class Clipped(NamedTuple):
+    """What is left of triangles cut at a plane; vertex V + k is ``(1 − share[k]) kept[k] + share[k] dropped[k]``.
+
+    Attributes:
+        faces: ``(F', 3)`` indices of old vertices, and of new ones from V on.
+        kept: ``(K,)`` old vertex on the near side of the edge that new vertex k cuts.
+        dropped: ``(K,)`` the one on the far side.
+        share: ``(K,)`` how far from the first to the second the plane is.
+    """
+
+    faces: Int64
+    kept: Int64
+    dropped: Int64
+    share: Float64
+
+
+def clip(height: Float64, faces: Int64) -> Clipped:
+    """Cut triangles where ``height`` ``(V,)``, linear over each, is zero, and keep where it is positive.
+
+    A corner cut off leaves a quadrilateral, which becomes two triangles; two corners cut off leave one.
+    Neighbours cut their common edge at exactly the same place.
+    """
+    positive = height > 0
+    count = positive[faces].sum(axis=1)
+    parts, ends = [faces[count == 3]], []
+    new = len(height)
+    for corners in (1, 2):
+        cut = faces[count == corners]
+        # Turn the corner that is alone on its side to the front; the order of the other two stays.
+        alone = (positive[cut] == (corners == 1)).argmax(axis=1)
+        a, b, c = cut[np.arange(len(cut))[:, None], (alone[:, None] + np.arange(3)) % 3].T
+        ab, ac = new + np.arange(len(cut)), new + len(cut) + np.arange(len(cut))
+        new += 2 * len(cut)
+        if corners == 1:
+            parts.append(np.stack((a, ab, ac), axis=1))
+            ends.append((np.concatenate((a, a)), np.concatenate((b, c))))
+        else:
+            parts.extend((np.stack((ab, b, c), axis=1), np.stack((ab, c, ac), axis=1)))
+            ends.append((np.concatenate((b, c)), np.concatenate((a, a))))
+    kept, dropped = (np.concatenate(side) for side in zip(*ends, strict=True))
+    share = height[kept] / (height[kept] - height[dropped])
+    return Clipped(np.concatenate(parts), kept, dropped, share)
 
 
 def cover(xy: Float64, faces: Int64, shape: tuple[int, int], *, chunk: int = CHUNK) -> Iterator[Coverage]:

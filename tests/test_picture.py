@@ -3,12 +3,26 @@
 import imageio.v3 as iio
 import numpy as np
 import pytest
+import torch
 import trimesh
+from mplicits.datasets import Camera, look_at, orbit
 from mplicits.neural_fields import InputError
-from mplicits.pipelines.picture import BACK, CLAY, Camera, contact_sheet, look_at, picture_of, write_picture
+from mplicits.pipelines.picture import (
+    BACK,
+    CLAY,
+    check_picture_path,
+    cloud_view,
+    contact_sheet,
+    mesh_view,
+    picture_of,
+    write_picture,
+)
+from mplicits.pipelines.raster import clip
 from mplicits.pipelines.surface import Surface
 
 NO_FACES = np.empty((0, 3), np.int64)
+SQUARE = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+TWO_FACES = np.array([[0, 1, 2], [0, 2, 3]], np.int64)
 
 
 def sphere(radius: float = 1.0) -> Surface:
@@ -16,13 +30,16 @@ def sphere(radius: float = 1.0) -> Surface:
     return Surface(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64))
 
 
+def from_front(distance: float, *, fov: float, size: tuple[int, int]) -> Camera:
+    return look_at((0, 0, distance), (0, 0, 0), fov=fov, width=size[0], height=size[1])
+
+
 def drawn(image: np.ndarray) -> np.ndarray:
     return (image < 250).any(axis=2)
 
 
 def test_a_sphere_is_a_disc_of_the_right_size_without_holes():
-    camera = Camera(np.array([0.0, 0, 4]), np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]]), fov=60)
-    seen = drawn(picture_of(sphere(), camera, size=(200, 200)))
+    seen = drawn(picture_of(sphere(), from_front(4, fov=60, size=(200, 200))))
     # The outline of a unit sphere from distance 4 is at slope 1 / √(4² − 1); the image's edge is at slope tan 30°.
     radius = 100 * (1 / np.sqrt(15)) / np.tan(np.radians(30))
     assert seen.sum() == pytest.approx(np.pi * radius**2, rel=0.02)
@@ -31,39 +48,42 @@ def test_a_sphere_is_a_disc_of_the_right_size_without_holes():
     assert not seen[np.hypot(rows, columns) > radius + 1.5].any()
 
 
-@pytest.mark.parametrize("up", ["y", "z"])
-@pytest.mark.parametrize("aspect", [0.5, 1.0, 2.0])
-def test_look_at_fits_the_points_into_the_picture_and_touches_its_margin(up, aspect):
-    points = np.random.default_rng(1).uniform(-1, 1, (500, 3)) * [3, 1, 2] + [100, -50, 7]
-    camera = look_at(points, azimuth=40, elevation=-25, up=up, fov=40, aspect=aspect, margin=0.9)
-    np.testing.assert_allclose(camera.axes @ camera.axes.T, np.eye(3), atol=1e-12)
-    assert np.linalg.det(camera.axes) == pytest.approx(1)
-    assert camera.axes[1, "xyz".index(up)] < 0  # down in the picture is down in the world
-    x, y, z = ((points - camera.eye) @ camera.axes.T).T
-    assert (z > 0).all()
-    slope = np.tan(np.radians(20))
-    filled = max(abs(x / z).max() / (slope * aspect), abs(y / z).max() / slope)
-    assert filled == pytest.approx(0.9)
+def test_pixels_see_a_tilted_square_where_their_rays_meet_it():
+    normal = np.array([0.6, 0.0, 0.8])
+    vertices = SQUARE @ np.array([[0.8, 0, -0.6], [0, 1, 0], [0.6, 0, 0.8]])
+    mesh = Surface(vertices, TWO_FACES, colors=SQUARE / 2 + 0.5)
+    camera = look_at((0.3, 0.4, 3), (0, 0, 0), up=(0.1, 1, 0), fov=50, width=60, height=40)
+    seen = mesh_view(mesh, camera)
+    eye, rays = camera.rays(dtype=torch.float64)
+    depth = -(eye @ torch.from_numpy(normal)) / (rays @ torch.from_numpy(normal))  # (H, W)
+    points = (eye + depth[..., None] * rays).reshape(-1, 3)
+    on_square = points @ torch.from_numpy(np.array([[0.8, 0, -0.6], [0, 1, 0]]).T)  # (H·W, 2)
+    assert seen.size == (60, 40)
+    assert seen.pixel.tolist() == torch.nonzero((on_square.abs() < 1).all(dim=1))[:, 0].tolist()
+    torch.testing.assert_close(seen.depth, depth.reshape(-1)[seen.pixel].float())
+    torch.testing.assert_close(seen.position, points[seen.pixel].float(), rtol=0, atol=1e-6)
+    torch.testing.assert_close(seen.direction, rays.reshape(-1, 3)[seen.pixel].float(), rtol=0, atol=1e-6)
+    torch.testing.assert_close(seen.normal, torch.from_numpy(normal).float().expand_as(seen.normal))
+    assert seen.color is not None
+    torch.testing.assert_close(seen.color[:, :2], (on_square[seen.pixel] / 2 + 0.5).float(), rtol=0, atol=1e-6)
 
 
-def test_azimuth_and_elevation_are_where_they_say():
-    points = sphere().vertices
-    np.testing.assert_allclose(look_at(points, azimuth=0, elevation=0).axes[2], [0, 0, -1], atol=1e-12)
-    np.testing.assert_allclose(look_at(points, azimuth=90, elevation=0).axes[2], [-1, 0, 0], atol=1e-12)
-    np.testing.assert_allclose(look_at(points, azimuth=0, elevation=0, up="z").axes[2], [0, 1, 0], atol=1e-12)
-    assert look_at(points, elevation=60).eye[1] > 1
-    with pytest.raises(ValueError, match="up='x'"):
-        look_at(points, up="x")
+def test_normals_are_interpolated_to_unit_length_and_do_not_turn_to_the_camera():
+    ball, camera = sphere(), from_front(4, fov=40, size=(64, 64))
+    seen = mesh_view(ball, camera)
+    torch.testing.assert_close(seen.normal.norm(dim=1), torch.ones(len(seen.pixel)))
+    assert float((seen.normal * seen.position).sum(dim=1).min()) > 0.998
+    inside_out = mesh_view(Surface(ball.vertices, ball.faces[:, ::-1]), camera)
+    torch.testing.assert_close(inside_out.normal, -seen.normal)
 
 
 def test_the_nearer_of_two_squares_hides_the_other():
-    corners = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
-    vertices = np.concatenate((corners - [0, 0, 1], corners * 0.5 + [0, 0, 1]))
-    faces = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]], np.int64)
+    vertices = np.concatenate((SQUARE - [0, 0, 1], SQUARE * 0.5 + [0, 0, 1]))
+    faces = np.concatenate((TWO_FACES, TWO_FACES + 4))
     colors = np.repeat([[1.0, 0, 0], [0, 0, 1]], 4, axis=0)
-    camera = Camera(np.array([0.0, 0, 5]), np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]]), fov=40)
+    camera = from_front(5, fov=40, size=(100, 100))
     for order in (faces, faces[::-1]):
-        image = picture_of(Surface(vertices, order, colors=colors), camera, size=(100, 100)).astype(int)
+        image = picture_of(Surface(vertices, order, colors=colors), camera).astype(int)
         assert image[50, 50, 2] > image[50, 50, 0] + 100
         assert image[70, 70, 0] > image[70, 70, 2] + 100
         assert (image[2, 2] == 255).all()
@@ -71,27 +91,108 @@ def test_the_nearer_of_two_squares_hides_the_other():
 
 def test_back_faces_show_as_such():
     ball = sphere()
-    camera = look_at(ball.vertices)
-    front = picture_of(ball, camera, size=(64, 64))[32, 32].astype(float)
-    back = picture_of(Surface(ball.vertices, ball.faces[:, ::-1]), camera, size=(64, 64))[32, 32].astype(float)
+    camera = orbit(ball.vertices, width=64, height=64)
+    front = picture_of(ball, camera)[32, 32].astype(float)
+    back = picture_of(Surface(ball.vertices, ball.faces[:, ::-1]), camera)[32, 32].astype(float)
     np.testing.assert_allclose(front / front[0], np.array(CLAY) / CLAY[0], atol=0.02)
     np.testing.assert_allclose(back / back[0], np.array(BACK) / BACK[0], atol=0.02)
 
 
+def test_cutting_triangles_keeps_their_area_in_front_and_closes_up():
+    generator = np.random.default_rng(2)
+    vertices = generator.uniform(-1, 1, (90, 3))
+    faces = np.arange(90).reshape(30, 3)
+    height = vertices[:, 2] - 0.1
+    cut = clip(height, faces)
+    share = cut.share[:, None]
+    every = np.concatenate((vertices, (1 - share) * vertices[cut.kept] + share * vertices[cut.dropped]))
+    assert len(cut.share)
+    assert (height[cut.kept] > 0).all()
+    assert (height[cut.dropped] <= 0).all()
+    np.testing.assert_allclose(every[90:, 2], 0.1, atol=1e-12)
+
+    def cross(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+        a, b, c = (points[triangles[:, k]] for k in range(3))
+        return np.cross(b - a, c - a)
+
+    # What is in front and what is behind are together the whole, orientation included.
+    behind = clip(-height, faces)
+    share = behind.share[:, None]
+    others = np.concatenate((vertices, (1 - share) * vertices[behind.kept] + share * vertices[behind.dropped]))
+    both = cross(every, cut.faces).sum(axis=0) + cross(others, behind.faces).sum(axis=0)
+    np.testing.assert_allclose(both, cross(vertices, faces).sum(axis=0), atol=1e-12)
+    areas = [np.linalg.norm(cross(*part), axis=1).sum() for part in ((every, cut.faces), (others, behind.faces))]
+    assert sum(areas) == pytest.approx(np.linalg.norm(cross(vertices, faces), axis=1).sum())
+
+
+@pytest.mark.parametrize("turned", [0, 1, 2])
+def test_a_floor_under_the_camera_is_drawn_up_to_the_horizon(turned):
+    """Two triangles that reach far behind the camera fill exactly the lower half of the picture."""
+    corners = np.array([[-1e4, 0, -1e4], [-1e4, 0, 1e4], [1e4, 0, 1e4], [1e4, 0, -1e4]])
+    floor = Surface(corners, np.roll(TWO_FACES, turned, axis=1), colors=np.ones((4, 3)))
+    camera = look_at((0.1, 2, 0.2), (0.1, 2, -5), fov=60, width=40, height=40)
+    seen = mesh_view(floor, camera)
+    assert seen.pixel.tolist() == list(range(20 * 40, 40 * 40))
+    _, rays = camera.rays()
+    torch.testing.assert_close(seen.depth, -2 / rays.reshape(-1, 3)[seen.pixel, 1], rtol=1e-4, atol=0)
+    torch.testing.assert_close(seen.normal, torch.tensor([[0.0, 1, 0]]).expand_as(seen.normal))
+
+
+@pytest.mark.parametrize("faces", [TWO_FACES, NO_FACES])
+def test_what_is_behind_the_camera_is_not_drawn(faces):
+    camera = look_at((0, 0, 5), (0, 0, 10), fov=60, width=20, height=20)
+    behind = Surface(SQUARE, faces)
+    assert (picture_of(behind, camera) == 255).all()
+    ahead = Surface(np.concatenate((SQUARE, SQUARE + np.array([0, 0, 8]))), np.concatenate((faces, faces + 4)))
+    view = mesh_view if len(faces) else cloud_view
+    assert set(view(ahead, camera).position[:, 2].tolist()) == {8.0}
+
+
+def test_a_view_from_inside_a_closed_mesh_sees_it_everywhere():
+    camera = look_at((0.2, 0.1, 0), (1, 0.3, -2), fov=100, width=40, height=30)
+    seen = mesh_view(sphere(), camera)
+    assert seen.pixel.tolist() == list(range(40 * 30))
+    assert float(abs(seen.position.norm(dim=1) - 1).max()) < 0.01
+    assert float((seen.normal * seen.direction).sum(dim=1).min()) > 0  # outward, so away from the eye
+
+
 def test_a_cloud_is_discs_of_the_size_asked_for():
     point = Surface(np.array([[0.0, 0, 0]]), NO_FACES, colors=np.array([[0.0, 0, 0]]))
-    camera = Camera(np.array([0.0, 0, 4]), np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]]), fov=40)
-    image = picture_of(point, camera, size=(65, 65), point_size=11)
+    image = picture_of(point, from_front(4, fov=40, size=(65, 65)), point_size=11)
     ink = (255 - image[..., 0].astype(float)).sum() / 255
     assert ink == pytest.approx(np.pi * 5.5**2, rel=0.1)
     assert not drawn(image)[:20].any()
 
 
+def test_the_pixels_of_a_disc_see_its_point():
+    points = np.array([[0.5, 0.25, 0.0], [0.5, 0.25, 1.0], [-0.5, 0, 0]])
+    normals = np.array([[0.0, 0, 1], [0, 1, 0], [0, 0, 0]])
+    colors = np.array([[0.1, 0.2, 0.3], [0.4, 0.5, 0.6], [0.7, 0.8, 0.9]])
+    camera = from_front(4, fov=40, size=(81, 61))
+    seen = cloud_view(Surface(points, NO_FACES, normals, colors), camera, point_size=3)
+    pixels, _ = camera.project(torch.from_numpy(points))
+    x, y = (pixels[:, k].round().long() for k in (0, 1))
+    rows = dict(zip(seen.pixel.tolist(), range(len(seen.pixel)), strict=True))
+    assert len(rows) == 27  # three discs apart from each other: i² + j² ≤ 1.5² holds for 9 pixels
+    assert seen.color is not None
+    for index in range(3):
+        row = rows[int(y[index] * 81 + x[index])]
+        torch.testing.assert_close(seen.position[row], torch.from_numpy(points[index]).float())
+        torch.testing.assert_close(seen.color[row], torch.from_numpy(colors[index]).float())
+        offset = torch.from_numpy(points[index]) - camera.eye
+        torch.testing.assert_close(seen.depth[row], offset.norm().float())
+        torch.testing.assert_close(seen.direction[row], (offset / offset.norm()).float())
+        expected = torch.from_numpy(normals[index]) if normals[index].any() else -offset / offset.norm()
+        torch.testing.assert_close(seen.normal[row], expected.float())
+    without = cloud_view(Surface(points, NO_FACES), camera, point_size=3)
+    torch.testing.assert_close(without.normal, -without.direction)
+
+
 def test_a_dense_cloud_looks_like_its_surface():
     ball = sphere()
     cloud = Surface(ball.vertices, NO_FACES, ball.vertices)
-    camera = look_at(ball.vertices)
-    mesh, points = (picture_of(shape, camera, size=(96, 96)).astype(float) for shape in (ball, cloud))
+    camera = orbit(ball.vertices, width=96, height=96)
+    mesh, points = (picture_of(shape, camera).astype(float) for shape in (ball, cloud))
     both = drawn(mesh) & drawn(points)
     assert both.sum() > 0.95 * drawn(mesh).sum()
     assert np.median(abs(mesh - points)[both]) < 8
@@ -99,9 +200,19 @@ def test_a_dense_cloud_looks_like_its_surface():
 
 def test_a_cloud_without_normals_is_darker_where_it_is_further():
     points = np.array([[-1.0, 0, 1], [1.0, 0, -1]])
-    camera = Camera(np.array([0.0, 0, 6]), np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]]), fov=40)
-    image = picture_of(Surface(points, NO_FACES), camera, size=(100, 100), point_size=8)
+    image = picture_of(Surface(points, NO_FACES), from_front(6, fov=40, size=(100, 100)), point_size=8)
     assert image[:, :50].min() > image[:, 50:].min() + 30
+
+
+def test_pictures_of_the_same_thing_far_from_the_origin_are_the_same():
+    ball, home = sphere(), np.array([5e5, 5.4e6, 300])
+    camera = orbit(ball.vertices, width=48, height=48)
+    far = Surface(ball.vertices + home, ball.faces)
+    np.testing.assert_allclose(
+        picture_of(far, orbit(far.vertices, width=48, height=48)).astype(int),
+        picture_of(ball, camera).astype(int),
+        atol=1,
+    )
 
 
 def test_a_sheet_holds_every_picture_under_its_label():
@@ -116,8 +227,9 @@ def test_a_sheet_holds_every_picture_under_its_label():
         contact_sheet([("a", red), ("b", np.zeros((60, 40, 3), np.uint8))])
 
 
-def test_pictures_are_written_whole_or_not_at_all(tmp_path):
-    image = np.random.default_rng(0).integers(0, 255, (8, 9, 3)).astype(np.uint8)
+@pytest.mark.parametrize("channels", [3, 4])
+def test_pictures_are_written_whole_or_not_at_all(channels, tmp_path):
+    image = np.random.default_rng(0).integers(0, 255, (8, 9, channels)).astype(np.uint8)
     write_picture(tmp_path / "picture.png", image)
     np.testing.assert_array_equal(iio.imread(tmp_path / "picture.png"), image)
     assert len(list(tmp_path.iterdir())) == 1
@@ -125,3 +237,11 @@ def test_pictures_are_written_whole_or_not_at_all(tmp_path):
         write_picture(tmp_path / "picture.bmp", image)
     with pytest.raises(InputError, match="does not exist"):
         write_picture(tmp_path / "absent" / "picture.png", image)
+
+
+def test_transparency_and_jpeg_do_not_go_together(tmp_path):
+    with pytest.raises(InputError, match=r"picture\.jpg: JPEG knows no transparency; write a \.png"):
+        write_picture(tmp_path / "picture.jpg", np.zeros((4, 4, 4), np.uint8))
+    assert not list(tmp_path.iterdir())
+    check_picture_path(tmp_path / "picture.jpg")
+    check_picture_path(tmp_path / "picture.png", transparent=True)
