@@ -1,0 +1,251 @@
+"""A plane through a field: its values there, and the picture of them (paper Fig. 4).
+
+A plane is given by a point ``origin`` and two orthogonal unit vectors: ``u`` points right in the picture and ``v``
+up, so that it is seen from the side to which ``u × v`` points. Everything is in the field's own coordinates.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ..neural_fields import Field
+
+__all__ = [
+    "Slice",
+    "draw_slice",
+    "level_color",
+    "plane_axes",
+    "round_step",
+    "slice_field",
+    "slice_points",
+    "take_slice",
+]
+
+Image = NDArray[np.uint8]
+Array = NDArray[np.floating]
+Floats = NDArray[np.float32]
+Color = tuple[float, float, float]
+Vector = Sequence[float] | NDArray[np.float64]
+
+# Near the surface and far from it; blue outside, orange inside.
+OUTSIDE: tuple[Color, Color] = ((0.91, 0.95, 0.98), (0.42, 0.60, 0.79))
+INSIDE: tuple[Color, Color] = ((1.00, 0.93, 0.84), (0.87, 0.53, 0.27))
+FINEST: Color = (0.11, 0.13, 0.19)
+COARSER: tuple[Color, ...] = ((0.05, 0.53, 0.42), (0.63, 0.20, 0.58), (0.78, 0.14, 0.20), (0.35, 0.35, 0.70))
+TINT = 0.34  # how much of its colour a band lays over what is below
+FADE = 0.35  # distance, as a share of the picture's half height, at which 1 − 1/e of the far colour is reached
+LINE, ZERO_LINE, OUTLINE = 0.9, 2.2, 1.0  # widths in pixels of a picture 640 pixels high
+EVERY_FIFTH = 5  # iso-lines that are drawn stronger
+
+
+def plane_axes(normal: Vector, *, up: str = "y") -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The axes (u, v) of a plane seen from the side to which ``normal`` points, with ``up`` upwards in the picture.
+
+    A plane across the up axis itself has up another axis: −z for ``up="y"``, y for ``up="z"``, as on a map.
+
+    Raises:
+        ValueError: the normal has no direction, or ``up`` is neither "y" nor "z".
+    """
+    n = np.asarray(normal, np.float64)
+    length = float(np.linalg.norm(n))
+    if n.shape != (3,) or not 0 < length < np.inf:
+        raise ValueError(f"normal={normal}: expected three numbers, not all zero")
+    if up not in ("y", "z"):
+        raise ValueError(f"up={up!r}: expected 'y' or 'z'")
+    n = n / length
+    upwards = np.array([0.0, 1, 0] if up == "y" else [0.0, 0, 1])
+    if abs(n @ upwards) > 0.999:
+        upwards = np.array([0.0, 0, -1] if up == "y" else [0.0, 1, 0])
+    v = upwards - (n @ upwards) * n
+    v /= np.linalg.norm(v)
+    return np.cross(v, n), v
+
+
+def slice_points(*, origin: Vector, u: Vector, v: Vector, half_size: float, size: tuple[int, int]) -> Tensor:
+    """The points ``(H, W, 3)`` at the centres of a picture's pixels, in float64.
+
+    Args:
+        origin: the point in the middle of the picture.
+        u: unit vector to the right.
+        v: unit vector upwards.
+        half_size: half the height of the picture; pixels are square.
+        size: width and height in pixels.
+
+    Raises:
+        ValueError: ``half_size`` or ``size`` is not > 0.
+    """
+    width, height = size
+    if not (0 < half_size < math.inf and width > 0 and height > 0):
+        raise ValueError(f"half_size={half_size}, size={size}: expected numbers > 0")
+    step = 2 * half_size / height
+    right = (np.arange(width) - (width - 1) / 2) * step
+    upward = ((height - 1) / 2 - np.arange(height)) * step
+    points = np.asarray(origin, np.float64) + right[:, None] * np.asarray(u) + upward[:, None, None] * np.asarray(v)
+    return torch.from_numpy(points)
+
+
+def slice_field(
+    field: Field,
+    *,
+    origin: Vector,
+    u: Vector,
+    v: Vector,
+    half_size: float,
+    size: tuple[int, int],
+    level: int = -1,
+) -> Tensor:
+    """Values ``(H, W)`` of one level at the centres of a picture's pixels, in one inference; see `slice_points`.
+
+    Example:
+        >>> from mplicits.neural_fields import Sphere
+        >>> from mplicits.pipelines.slice import slice_field
+        >>> slice_field(Sphere(radius=1), origin=(0, 0, 0), u=(1, 0, 0), v=(0, 1, 0), half_size=2, size=(4, 1))
+        tensor([[ 5.,  1.,  1.,  5.]])
+    """
+    points = slice_points(origin=origin, u=u, v=v, half_size=half_size, size=size)
+    with torch.inference_mode():
+        return field.value(points.to(field.deltas), level=level)
+
+
+@dataclass(frozen=True)
+class Slice:
+    """The values of all levels on a plane.
+
+    Attributes:
+        levels: ``(H, W)`` float32 for each level from the coarsest on; outside the band of a level, the next is equal.
+        bands: ``(H, W)`` bool for each level with a band: where it and every coarser level are in theirs.
+        deltas: half-width of each band, in the field's units.
+        pixel: side of a pixel, in the field's units.
+        finest: whether the last of ``levels`` is the field's finest.
+    """
+
+    levels: tuple[Floats, ...]
+    bands: tuple[NDArray[np.bool_], ...]
+    deltas: tuple[float, ...]
+    pixel: float
+    finest: bool
+
+
+def take_slice(
+    field: Field,
+    *,
+    origin: Vector,
+    u: Vector,
+    v: Vector,
+    half_size: float,
+    size: tuple[int, int],
+    level: int = -1,
+) -> Slice:
+    """Evaluate every level up to ``level``, each one only in the band of the one before; see `slice_points`."""
+    level = field.resolve_level(level)
+    points = slice_points(origin=origin, u=u, v=v, half_size=half_size, size=size).to(field.deltas)
+    deltas = tuple(float(delta) for delta in field.deltas[: level + 1])
+    with torch.inference_mode():
+        value = field.value(points, level=0)
+        inside = torch.ones_like(value, dtype=torch.bool)
+        levels, bands = [value], []
+        for index, delta in enumerate(deltas):
+            inside = inside & (value.abs() < delta)
+            bands.append(inside)
+            if index < level:
+                value = value.clone()
+                value[inside] = field.value(points[inside], level=index + 1)
+                levels.append(value)
+    return Slice(
+        tuple(values.float().cpu().numpy() for values in levels),
+        tuple(band.cpu().numpy() for band in bands),
+        deltas,
+        2 * half_size / size[1],
+        level == field.num_levels - 1,
+    )
+
+
+def draw_slice(taken: Slice, *, iso_step: float, bands: bool = True) -> Image:
+    """The picture ``(H, W, 3)`` of a slice.
+
+    Sign and distance of the finest level as colour, its iso-lines (every fifth stronger), each band
+    ``|f_i| < δ_i`` tinted and outlined, and the zero set of each level. Lines are as wide at any gradient:
+    their distance from a pixel is ``|f − c| / |∇f|``, with the gradient of the image.
+
+    Args:
+        taken: the values.
+        iso_step: distance between iso-lines, in the field's units.
+        bands: whether to draw the bands.
+
+    Raises:
+        ValueError: ``iso_step`` is not > 0.
+    """
+    if not 0 < iso_step < math.inf:
+        raise ValueError(f"iso_step={iso_step}: expected a number > 0")
+    values = taken.levels[-1]
+    height = values.shape[0]
+    stroke = max(height / 640, 0.75)
+    slope = _slope(values, taken.pixel)
+    image = distance_color(values, reach=FADE * taken.pixel * height / 2, slope=slope)
+
+    nearest = np.rint(values / iso_step)
+    far = np.abs(values - nearest * iso_step) / slope
+    strong = nearest % EVERY_FIFTH == 0
+    lines = _stroke(far, LINE * stroke * np.where(strong, 1.25, 1.0)) * np.where(strong, 0.50, 0.26)
+    lines[nearest == 0] = 0
+    ink = np.where((values < 0)[..., None], np.multiply(INSIDE[1], 0.45), np.multiply(OUTSIDE[1], 0.45))
+    image += lines[..., None] * (ink - image)
+
+    if bands:
+        for index, (band, delta) in enumerate(zip(taken.bands, taken.deltas, strict=True)):
+            _lay(image, level_color(index), TINT * band)
+            level = taken.levels[index]
+            edge = np.abs(np.abs(level) - delta) / _slope(level, taken.pixel)
+            # A band ends where its own level leaves it; where a coarser band ends first, so does the line.
+            allowed = taken.bands[index - 1] if index else np.ones_like(band)
+            _lay(image, level_color(index), 0.8 * _stroke(edge, OUTLINE * stroke) * allowed)
+    for index, level in enumerate(taken.levels):
+        last = index == len(taken.levels) - 1
+        color = FINEST if last and taken.finest else level_color(index)
+        width = ZERO_LINE * stroke * (1.0 if last else 0.75)
+        _lay(image, color, _stroke(np.abs(level) / _slope(level, taken.pixel), width))
+    return (image.clip(0, 1) * 255 + 0.5).astype(np.uint8)
+
+
+def distance_color(values: Floats, *, reach: float, slope: Floats | float) -> Floats:
+    """Blue outside and orange inside, deeper with distance, ``(..., 3)``; ``slope`` per pixel smooths the edge."""
+    share = (1 - np.exp(-np.abs(values) / reach))[..., None]
+    outside = np.multiply(1 - share, OUTSIDE[0]) + np.multiply(share, OUTSIDE[1])
+    inside = np.multiply(1 - share, INSIDE[0]) + np.multiply(share, INSIDE[1])
+    return inside + (outside - inside) * (0.5 + values / slope).clip(0, 1)[..., None]
+
+
+def level_color(index: int) -> Color:
+    """The colour of a level that is not the finest: of its zero set and its band."""
+    return COARSER[index % len(COARSER)]
+
+
+def round_step(length: float) -> float:
+    """The number 1, 2 or 5 times a power of ten that is nearest to ``length`` > 0 in ratio."""
+    power = 10.0 ** math.floor(math.log10(length))
+    return min((1 * power, 2 * power, 5 * power, 10 * power), key=lambda step: abs(math.log(step / length)))
+
+
+def _slope(values: Floats, pixel: float) -> Floats:
+    """|∇f| per pixel ``(H, W)``; on ridges, where it vanishes, a tenth of a distance's, so that lines end there."""
+    padded = np.pad(values, 1, mode="reflect", reflect_type="odd")  # central differences up to the border
+    across = (padded[1:-1, 2:] - padded[1:-1, :-2]) / 2
+    down = (padded[2:, 1:-1] - padded[:-2, 1:-1]) / 2
+    return np.maximum(np.hypot(across, down), 0.1 * pixel).astype(np.float32)
+
+
+def _stroke(distance: Array, width: float | Array) -> Floats:
+    """The share of each pixel that a line ``width`` pixels wide covers, ``distance`` pixels from its middle."""
+    return np.clip(np.asarray(width) / 2 + 0.5 - distance, 0, np.minimum(width, 1)).astype(np.float32)
+
+
+def _lay(image: Floats, color: Color, cover: Floats) -> None:
+    """Paint ``color`` over the image, in place."""
+    image += cover[..., None] * (np.asarray(color, np.float32) - image)

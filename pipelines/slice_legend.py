@@ -1,0 +1,128 @@
+"""What stands under the picture of a slice: where it is, its scale, and what its colours and lines mean."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from .slice import FADE, FINEST, LINE, TINT, Color, Slice, distance_color, level_color, round_step
+
+__all__ = ["with_legend"]
+
+Image = NDArray[np.uint8]
+
+TEXT: Color = (0.20, 0.22, 0.27)
+SUBSCRIPTS = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
+CAPTION_WIDTH = 9.5  # in text heights: a place wide enough for any number, so that nothing moves in an animation
+
+
+@dataclass(frozen=True)
+class _Entry:
+    """A drawing and the words after it; ``draw`` paints on ``(rows, width, 3)`` float RGB, ``rows`` high."""
+
+    width: int
+    words: str
+    draw: Callable[[NDArray[np.float32]], None]
+    least: int = 0  # room it takes at least
+
+
+def with_legend(
+    picture: Image, taken: Slice, *, caption: str, iso_step: float, unit: float = 1.0, bands: bool = True
+) -> Image:
+    """The picture with a strip under it.
+
+    Args:
+        picture: what `draw_slice` drew.
+        taken: the values it was drawn from.
+        caption: which plane this is.
+        iso_step: distance between iso-lines, in the field's units.
+        unit: what one unit of the field is in the units of the input; all numbers are shown in those.
+        bands: whether the bands were drawn.
+    """
+    width = picture.shape[1]
+    text = round(float(np.clip(width / 48, 9, 40)))
+    font = cv2.FontFace("uni")
+    entries = _entries(taken, text, width, caption=caption, iso_step=iso_step, unit=unit, bands=bands)
+    margin, gap, row = text, round(1.6 * text), round(1.9 * text)
+    room = [max(entry.least, entry.width + text // 2 + _text_width(entry.words, font, text)) for entry in entries]
+    places, x, line = [], margin, 0
+    for needed in room:
+        if x > margin and x + needed > width - margin:
+            x, line = margin, line + 1
+        places.append((x, line))
+        x += needed + gap
+    strip = np.ones((row * (line + 1) + text, width, 3), np.float32)
+    for entry, (left, line) in zip(entries, places, strict=True):
+        top = text // 2 + line * row
+        entry.draw(strip[top : top + row, left : left + entry.width])
+        start = left + (entry.width + text // 2 if entry.width else 0)
+        _write(strip, entry.words, (start, top + row // 2), font, text)
+    return np.concatenate((picture, (strip.clip(0, 1) * 255 + 0.5).astype(np.uint8)))
+
+
+def _entries(
+    taken: Slice, text: int, width: int, *, caption: str, iso_step: float, unit: float, bands: bool
+) -> list[_Entry]:
+    height = taken.levels[-1].shape[0]
+    bar = round_step(0.12 * width * taken.pixel * unit)
+    pixels = max(1, round(bar / (taken.pixel * unit)))
+    reach = FADE * taken.pixel * height / 2
+    entries = [
+        _Entry(0, caption, lambda _area: None, least=round(CAPTION_WIDTH * text)),
+        _Entry(pixels, f"{bar:g}", _scale_bar),
+        _Entry(5 * text, "inside, outside", lambda area: _ramp(area, reach)),
+        _Entry(2 * text, f"iso-lines every {iso_step * unit:.6g}", lambda area: _line(area, (0.45, 0.45, 0.45), LINE)),
+    ]
+    count = len(taken.levels)
+    for index in range(count):
+        finest = index == count - 1 and taken.finest
+        color = FINEST if finest else level_color(index)
+        name = f"f{index}".translate(SUBSCRIPTS)
+        entries.append(_Entry(2 * text, f"{name} = 0", lambda area, color=color: _line(area, color, 2.5)))
+        if bands and index < len(taken.deltas):
+            words = f"|{name}| < {f'δ{index}'.translate(SUBSCRIPTS)} = {taken.deltas[index] * unit:.3g}"
+            entries.append(_Entry(2 * text, words, lambda area, index=index: _swatch(area, level_color(index))))
+    return entries
+
+
+def _scale_bar(area: NDArray[np.float32]) -> None:
+    middle, tick = area.shape[0] // 2, area.shape[0] // 6
+    area[middle - 1 : middle + 1] = TEXT
+    area[middle - tick : middle + tick, [0, 1, -2, -1]] = TEXT
+
+
+def _ramp(area: NDArray[np.float32], reach: float) -> None:
+    third = area.shape[0] // 3
+    distance = np.linspace(-2.5 * reach, 2.5 * reach, area.shape[1]).astype(np.float32)
+    area[third:-third] = distance_color(distance, reach=reach, slope=5 * reach / area.shape[1])
+
+
+def _line(area: NDArray[np.float32], color: Color, width: float) -> None:
+    middle = area.shape[0] // 2
+    rows = round(max(1, width * area.shape[0] / 32))
+    area[middle - rows // 2 : middle - rows // 2 + rows] = color
+
+
+def _swatch(area: NDArray[np.float32], color: Color) -> None:
+    """A band as it looks: its tint over both sides of the surface, with its outline."""
+    third = area.shape[0] // 4
+    box = area[third:-third]
+    box[:] = color
+    inner = box[1:-1, 1:-1]
+    distance = np.linspace(-1, 1, inner.shape[1]).astype(np.float32)
+    inner[:] = (1 - TINT) * distance_color(distance, reach=20.0, slope=0.1) + np.multiply(TINT, color)
+
+
+def _text_width(words: str, font: cv2.FontFace, text: int) -> int:
+    return int(cv2.getTextSize((0, 0), words, (0, 0), font, text)[2])
+
+
+def _write(strip: NDArray[np.float32], words: str, place: tuple[int, int], font: cv2.FontFace, text: int) -> None:
+    """Words from ``place``, the middle of their left side; cv2 draws them on bytes, which serve as a mask."""
+    mask = np.zeros(strip.shape, np.uint8)
+    cv2.putText(mask, words, (place[0], place[1] + round(0.36 * text)), (255, 255, 255), font, text)
+    strip += mask.astype(np.float32) / 255 * (np.asarray(TEXT, np.float32) - strip)

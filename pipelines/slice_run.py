@@ -1,0 +1,205 @@
+"""From a run to the picture of a plane through its field, or to a film of the plane passing through the shape."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..neural_fields import Field, InputError, Similarity, load_field
+from ..neural_fields.meshing import NoSurfaceError, extract_mesh
+from .animation import ANIMATIONS, write_animation
+from .picture import write_picture
+from .runs import find_field
+from .slice import draw_slice, plane_axes, round_step, take_slice
+from .slice_legend import with_legend
+
+__all__ = ["SliceOptions", "slice_run"]
+
+Float64 = NDArray[np.float64]
+Image = NDArray[np.uint8]
+Triple = tuple[float, float, float]
+
+MARGIN = 1.16  # the picture is this much larger than the shape
+BOX_RESOLUTION = 64  # of the mesh that says where the shape is
+
+
+@dataclass(frozen=True)
+class SliceOptions:
+    """Which plane, and how it is drawn. Places are in input coordinates.
+
+    Attributes:
+        level: counted from 0, the coarsest; None is the finest.
+        axis: the plane is across this one, "x", "y" or "z".
+        at: where on that axis; None is the middle of the shape.
+        percent: where on that axis instead, 0 where the shape begins and 100 where it ends.
+        normal: of a plane across no axis, instead; the side it points to is the one seen.
+        point: a point of that plane; None is the middle of the shape.
+        up: "y" or "z", the axis that points up in the picture.
+        size: width and height of the picture, without its legend.
+        lines: about how many iso-lines there are room for from the bottom of the picture to its top.
+        zoom: how much larger than to show the whole shape.
+        center: what is in the middle of the picture (its nearest point on the plane); None is the middle of the shape.
+        bands: whether to draw the bands.
+        frames: of a film.
+        fps: of a film.
+    """
+
+    level: int | None = None
+    axis: str = "z"
+    at: float | None = None
+    percent: float | None = None
+    normal: Triple | None = None
+    point: Triple | None = None
+    up: str = "y"
+    size: tuple[int, int] = (800, 800)
+    lines: int = 40
+    zoom: float = 1.0
+    center: Triple | None = None
+    bands: bool = True
+    frames: int = 96
+    fps: float = 24.0
+
+
+def slice_run(
+    run: str | Path,
+    out: str | Path,
+    options: SliceOptions | None = None,
+    *,
+    progress: Callable[[int], None] | None = None,
+) -> str:
+    """Draw a plane through the field of a run.
+
+    A film's plane starts in the middle of the shape, goes through to both its ends and comes back, so that it
+    can be repeated.
+
+    Args:
+        run: run directory or .safetensors file.
+        out: a .png or .jpg picture, or an .mp4 or .gif film.
+        options: which plane, and how.
+        progress: called with the number of frames of a film so far.
+
+    Returns:
+        What was drawn, in a few words.
+
+    Raises:
+        InputError: there is no such run or level, the plane misses the unit sphere, or the file cannot be written.
+    """
+    options, out = options or SliceOptions(), Path(out)
+    file = find_field(run)
+    field, similarity, _ = load_field(file)
+    if field.in_dim != 3:
+        raise InputError(f"{file}: a field of {field.in_dim} coordinates; slices are drawn of fields of 3")
+    level = field.num_levels - 1 if options.level is None else options.level
+    if not 0 <= level < field.num_levels:
+        raise InputError(f"--level {level}: {file} has levels 0 to {field.num_levels - 1}")
+    view = _View(file, field, similarity, level, options)
+    if out.suffix.lower() not in ANIMATIONS:
+        offset = view.offset()
+        write_picture(out, view.draw(offset))
+        return f"{view.caption(offset)}, iso-lines every {view.iso_step * similarity.scale:.6g}"
+    turn = 2 * np.pi * np.arange(options.frames) / options.frames
+    offsets = view.middle + 0.5 * (view.end - view.begin) * np.sin(turn)
+    write_animation(out, _each_once(view.draw, offsets), fps=options.fps, progress=progress)
+    return f"{options.frames} slices, from {view.caption(view.begin)} to {view.caption(view.end)}"
+
+
+class _View:
+    """A family of parallel planes through a shape, all seen in one frame; an offset is a place along the normal."""
+
+    def __init__(self, file: Path, field: Field, similarity: Similarity, level: int, options: SliceOptions) -> None:
+        self.field, self.similarity, self.level, self.options = field, similarity, level, options
+        self.normal = np.eye(3)["xyz".index(options.axis)] if options.normal is None else np.array(options.normal)
+        self.u, self.v = plane_axes(self.normal, up=options.up)
+        self.normal = self.normal / np.linalg.norm(self.normal)
+        try:
+            shape = extract_mesh(field, resolution=BOX_RESOLUTION, level=level).vertices.astype(np.float64)
+        except NoSurfaceError as error:
+            raise InputError(f"{file}: no surface to slice ({error})") from error
+        axes = np.stack((self.u, self.v, self.normal), axis=1)
+        low, high = (shape @ axes).min(axis=0), (shape @ axes).max(axis=0)  # (3,) right, up, towards the viewer
+        self.begin, self.end = float(low[2]), float(high[2])
+        self.middle = (self.begin + self.end) / 2
+        half = (high - low) / 2
+        width, height = options.size
+        self.half_size = float(max(half[0] * height / width, half[1])) * MARGIN / options.zoom
+        self.iso_step = round_step(2 * self.half_size * similarity.scale / options.lines) / similarity.scale
+        center = (low + high)[:2] / 2
+        if options.center is not None:
+            center = similarity.to_unit(np.array(options.center)) @ axes[:, :2]
+        self.center = center @ axes[:, :2].T  # on the plane of offset 0
+
+    def offset(self) -> float:
+        """Where the plane that was asked for is.
+
+        Raises:
+            InputError: it does not pass through the unit sphere, outside which the field knows nothing.
+        """
+        options = self.options
+        offset, flag = self.middle, "--at"
+        if options.normal is not None and options.point is not None:
+            offset, flag = float(self.similarity.to_unit(np.array(options.point)) @ self.normal), "--point"
+        elif options.normal is None and options.percent is not None:
+            offset = self.begin + (self.end - self.begin) * options.percent / 100
+        elif options.normal is None and options.at is not None:
+            offset = float((self.similarity.to_unit(np.full(3, options.at)) * self.normal).sum())
+        if not abs(offset) <= 1:
+            along = f"along {options.axis}" if options.normal is None else "along the normal"
+            begin, end = (self.position(place) for place in (self.begin, self.end))
+            raise InputError(
+                f"{flag}: the plane misses the shape, which reaches from {begin:.6g} to {end:.6g} {along} "
+                "(coordinates of the input)"
+            )
+        return offset
+
+    def position(self, offset: float) -> float:
+        """The input coordinate along the normal of the plane at ``offset``."""
+        return float(self.similarity.to_input(offset * self.normal) @ self.normal)
+
+    def caption(self, offset: float) -> str:
+        """Which plane, in words."""
+        extent = (self.end - self.begin) * self.similarity.scale
+        digits = max(0, 3 - math.floor(math.log10(extent))) if extent > 0 else 3
+        place = f"{self.position(offset):.{digits}f}".replace("-", "−")
+        return f"{self.options.axis if self.options.normal is None else 'n·x'} = {place}"
+
+    def draw(self, offset: float) -> Image:
+        """The picture of the plane at ``offset``, with its legend."""
+        options = self.options
+        taken = take_slice(
+            self.field,
+            origin=self.center + offset * self.normal,
+            u=self.u,
+            v=self.v,
+            half_size=self.half_size,
+            size=options.size,
+            level=self.level,
+        )
+        picture = draw_slice(taken, iso_step=self.iso_step, bands=options.bands)
+        return with_legend(
+            picture,
+            taken,
+            caption=self.caption(offset),
+            iso_step=self.iso_step,
+            unit=self.similarity.scale,
+            bands=options.bands,
+        )
+
+
+def _each_once(draw: Callable[[float], Image], offsets: Float64) -> Iterator[Image]:
+    """The picture at each offset; one that comes back is kept, packed, until then instead of drawn again."""
+    keys = np.round(offsets, 9).tolist()
+    packed: dict[float, NDArray[np.uint8]] = {}
+    for place, key in enumerate(keys):
+        if key in packed:
+            yield np.asarray(cv2.imdecode(packed[key], cv2.IMREAD_COLOR), np.uint8)
+        else:
+            image = draw(key)
+            if key in keys[place + 1 :]:
+                packed[key] = np.asarray(cv2.imencode(".png", image)[1], np.uint8)
+            yield image
