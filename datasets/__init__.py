@@ -3,6 +3,7 @@
 from .cameras import Camera, look_at, orbit, turntable
 from .ply import write_cloud_ply
 from .point_cloud import PointCloud
+from .posed_cameras import read_cameras
 from .prepare import CleaningReport, OrientedCloud, prepare_cloud
 from .reading import read_cloud
 from .scanner import STATUE_PLACEMENT, simulate_scan, statue_scan
@@ -21,6 +22,7 @@ __all__ = [
     "look_at",
     "orbit",
     "prepare_cloud",
+    "read_cameras",
     "read_cloud",
     "sample_sphere",
     "sample_surface",

@@ -1,0 +1,225 @@
+"""Cameras from files: every dialect gives the camera that was written, and what cannot be read says why."""
+
+import json
+import math
+from pathlib import Path
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+import torch
+from mplicits.datasets import Camera, look_at, read_cameras
+from mplicits.neural_fields import InputError
+
+WIDTH, HEIGHT = 40, 30
+
+
+def cameras(count: int = 3) -> list[Camera]:
+    """Cameras around the origin whose pixels are not square and whose axis is not in the middle."""
+    intrinsics = torch.tensor([[55.0, 0, 18.5], [0, 53.0, 16.25], [0, 0, 1]], dtype=torch.float64)
+    views = [look_at((3 - k, 0.5 * k, 2 + k), (0, 0.1, 0), width=WIDTH, height=HEIGHT) for k in range(count)]
+    return [Camera(intrinsics, view.world_from_camera, WIDTH, HEIGHT) for view in views]
+
+
+def write_image(path: Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    iio.imwrite(path, np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+
+
+def opengl(camera: Camera) -> list[list[float]]:
+    """Columns right, up, backward and the eye."""
+    columns = (camera.right, -camera.down, -camera.forward, camera.eye)
+    return [*torch.stack(columns, dim=1).tolist(), [0.0, 0.0, 0.0, 1.0]]
+
+
+def transforms(**shared: object) -> dict:
+    frames = [{"file_path": f"images/{k}.png", "transform_matrix": opengl(c)} for k, c in enumerate(cameras())]
+    return {**shared, "frames": frames}
+
+
+FOCAL = {"fl_x": 55.0, "fl_y": 53.0, "cx": 19.0, "cy": 16.75}  # counted from the corner, half a pixel before the centre
+SIZE = {"w": float(WIDTH), "h": HEIGHT}
+
+
+def write_json(folder: Path, content: object) -> Path:
+    path = folder / "transforms.json"
+    path.write_text(json.dumps(content))
+    return path
+
+
+def write_neus(folder: Path, **changes: np.ndarray | None) -> Path:
+    arrays: dict[str, np.ndarray | None] = {}
+    for index, camera in enumerate(cameras()):
+        projection = torch.eye(4, dtype=torch.float64)
+        projection[:3] = camera.intrinsics @ torch.linalg.inv(camera.world_from_camera)[:3]
+        arrays[f"world_mat_{index}"] = projection.numpy()
+        arrays[f"scale_mat_{index}"] = np.diag([2.0, 2, 2, 1])
+        write_image(folder / "image" / f"{index:03d}.png")
+    path = folder / "cameras_sphere.npz"
+    np.savez(path, **{name: array for name, array in {**arrays, **changes}.items() if array is not None})
+    return path
+
+
+def assert_same(read: list[tuple[str, Camera]], names: list[str]) -> None:
+    assert [name for name, _ in read] == names
+    for (_, camera), expected in zip(read, cameras(), strict=True):
+        assert (camera.width, camera.height) == (WIDTH, HEIGHT)
+        torch.testing.assert_close(camera.intrinsics, expected.intrinsics, rtol=1e-9, atol=1e-9)
+        torch.testing.assert_close(camera.world_from_camera, expected.world_from_camera, rtol=1e-9, atol=1e-9)
+
+
+NAMES = [f"images/{k}.png" for k in range(3)]
+
+
+def test_intrinsics_at_the_top_of_the_file(tmp_path):
+    assert_same(read_cameras(write_json(tmp_path, transforms(**FOCAL, **SIZE, k1=0.1, p2=-0.2))), NAMES)
+
+
+def test_intrinsics_in_each_frame_go_before_those_at_the_top(tmp_path):
+    content = transforms(fl_x=1.0, fl_y=1.0, cx=1.0, cy=1.0, w=1, h=1)
+    for frame in content["frames"]:
+        frame.update(FOCAL, **SIZE)
+    assert_same(read_cameras(write_json(tmp_path, content)), NAMES)
+
+
+@pytest.mark.parametrize("file", ["images/{}.png", "images/{}.png.png"])
+def test_without_a_size_the_image_is_asked_with_or_without_its_extension(file, tmp_path):
+    for k in range(3):
+        write_image(tmp_path / file.format(k))
+    assert_same(read_cameras(write_json(tmp_path, transforms(**FOCAL))), NAMES)
+
+
+def test_an_angle_of_view_takes_the_place_of_the_focal_length(tmp_path):
+    [(_, first), *_] = read_cameras(write_json(tmp_path, transforms(camera_angle_x=math.pi / 2, **SIZE)))
+    expected = torch.tensor([[20.0, 0, 19.5], [0, 20.0, 14.5], [0, 0, 1]]).double()
+    torch.testing.assert_close(first.intrinsics, expected)
+    both = transforms(camera_angle_x=math.pi / 2, camera_angle_y=2 * math.atan(0.5), **SIZE)
+    [(_, first), *_] = read_cameras(write_json(tmp_path, both))
+    assert first.intrinsics.diagonal().tolist() == pytest.approx([20, 30, 1])
+    [(_, first), *_] = read_cameras(write_json(tmp_path, transforms(camera_angle_x=1.0, fl_x=55.0, **SIZE)))
+    assert first.intrinsics.diagonal().tolist() == pytest.approx([55, 55, 1])
+
+
+def test_poses_are_made_rigid_from_few_digits_three_rows_or_a_scale(tmp_path):
+    content = transforms(**FOCAL, **SIZE)
+    matrices = [np.array(frame["transform_matrix"]) for frame in content["frames"]]
+    matrices[1][:3, :3] *= 1.7
+    for frame, matrix in zip(content["frames"], (matrices[0].round(5), matrices[1], matrices[2][:3]), strict=True):
+        frame["transform_matrix"] = matrix.tolist()
+    for (_, camera), expected in zip(read_cameras(write_json(tmp_path, content)), cameras(), strict=True):
+        torch.testing.assert_close(camera.world_from_camera, expected.world_from_camera, rtol=0, atol=2e-5)
+
+
+def test_neus_projections_are_taken_apart(tmp_path):
+    assert_same(read_cameras(write_neus(tmp_path)), [f"image/{k:03d}.png" for k in range(3)])
+
+
+@pytest.mark.parametrize("factor", [-1.0, 0.01])
+def test_a_projection_has_no_sign_and_no_scale(factor, tmp_path):
+    with np.load(write_neus(tmp_path)) as archive:
+        changed = {name: archive[name] * factor for name in archive.files if name.startswith("world")}
+    assert_same(read_cameras(write_neus(tmp_path, **changed)), [f"image/{k:03d}.png" for k in range(3)])
+
+
+def frame_change(**change: object) -> dict:
+    content = transforms(**FOCAL, **SIZE)
+    content["frames"][1].update(change)
+    return content
+
+
+def without(key: str) -> dict:
+    content = transforms(**FOCAL, **SIZE)
+    for part in (content, content["frames"][1]):
+        part.pop(key, None)
+    return content
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ([1, 2], r"transforms\.json: frames: expected a list"),
+        ({"cameras": []}, "frames: expected a list"),
+        ({"frames": []}, "frames: expected a list of at least one"),
+        ({"frames": ["a"]}, r"frames\[0\]: expected an object"),
+        (without("file_path"), r"frames\[1\]\.file_path: None; expected the name"),
+        (without("fl_x"), r"frames\[0\]\.fl_x: missing, and so is camera_angle_x"),
+        (without("w"), r"frames\[0\]\.file_path: no image .*images/0\.png to take the size from; add it, or w and h"),
+        (without("transform_matrix"), r"frames\[1\]\.transform_matrix: missing"),
+        (frame_change(transform_matrix=[[1, 0], [0, 1]]), r"frames\[1\]\.transform_matrix: shape \(2, 2\)"),
+        (frame_change(transform_matrix=[[1, 0], [0]]), r"frames\[1\]\.transform_matrix: expected four rows"),
+        (frame_change(transform_matrix=np.zeros((4, 4)).tolist()), r"frames\[1\]\.transform_matrix: is singular"),
+        (frame_change(transform_matrix=np.diag([1, 1, -1, 1]).tolist()), "transform_matrix: is singular, mirrored"),
+        (frame_change(transform_matrix=np.diag([1, 1.1, 1, 1]).tolist()), "transform_matrix: .* oblique"),
+        (frame_change(transform_matrix=np.full((4, 4), math.nan).tolist()), "transform_matrix: .* not finite"),
+        (frame_change(fl_x=-3), r"frames\[1\]\.fl_x: -3; expected more than 0"),
+        (frame_change(cx="middle"), r"frames\[1\]\.cx: 'middle'; expected a finite number"),
+        (frame_change(camera_angle_x=4), r"frames\[1\]\.camera_angle_x: 4; expected radians"),
+        (frame_change(w=40.5), r"frames\[1\]\.w: 40\.5; expected whole pixels"),
+        (
+            transforms(**FOCAL, **SIZE, camera_model="OPENCV_FISHEYE"),
+            "json: camera_model: 'OPENCV_FISHEYE': no",
+        ),
+        (transforms(**FOCAL, **SIZE, is_fisheye=True), "is_fisheye: True: no pinhole; undistort"),
+    ],
+)
+def test_what_is_wrong_with_a_transforms_json_is_said_in_one_line(content, message, tmp_path):
+    path = write_json(tmp_path, content)
+    with pytest.raises(InputError, match=message) as caught:
+        read_cameras(path)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("text", ["{", "", "\x00\x01"])
+def test_what_is_not_json_says_so(text, tmp_path):
+    path = tmp_path / "transforms.json"
+    path.write_text(text)
+    with pytest.raises(InputError, match=r"transforms\.json: is not JSON"):
+        read_cameras(path)
+    path.write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(InputError, match=r"transforms\.json: is not JSON"):
+        read_cameras(path)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({f"world_mat_{k}": None for k in range(3)}, "world_mat_0: no such array"),
+        ({"world_mat_2": None}, "2 world_mat_i, but 3 images in .*image; make them match"),
+        ({"world_mat_2": None, "world_mat_3": np.eye(4)}, "world_mat_2: no such array; number them"),
+        ({"world_mat_1": np.eye(3)}, r"world_mat_1: float64 of shape \(3, 3\)"),
+        ({"world_mat_1": np.full((4, 4), "a")}, "world_mat_1: <U1 of shape"),
+        ({"world_mat_1": np.full((4, 4), math.nan)}, "world_mat_1: .* not finite"),
+        ({"world_mat_1": np.diag([1.0, 1, 0, 1])}, "world_mat_1: .* singular"),
+        ({"world_mat_1": np.array([[9.0, 1, 0, 0], [0, 9, 0, 0], [0, 0, 1, 0]])}, "world_mat_1: .* skewed by 1.7"),
+    ],
+)
+def test_what_is_wrong_with_a_neus_file_is_said_in_one_line(changes, message, tmp_path):
+    path = write_neus(tmp_path, **changes)
+    with pytest.raises(InputError, match=message) as caught:
+        read_cameras(path)
+    assert str(caught.value).startswith(f"{path}: ")
+
+
+def test_files_that_cannot_be_read_say_so(tmp_path):
+    for name, message in [
+        ("absent.json", "no such file"),
+        ("", "is a directory"),
+        ("cameras.txt", "unknown extension '.txt'; cameras are read from"),
+        ("cameras.npz", "damaged or not an NPZ"),
+    ]:
+        if name.startswith("cameras"):
+            (tmp_path / name).write_text("1 2 3")
+        with pytest.raises(InputError, match=message):
+            read_cameras(tmp_path / name)
+
+
+def test_images_that_are_missing_or_damaged_are_named(tmp_path):
+    path = write_neus(tmp_path)
+    (tmp_path / "image" / "001.png").write_bytes(b"\x89PNG\r\n\x1a\n damaged")
+    with pytest.raises(InputError, match=r"001\.png: cannot be read as an image"):
+        read_cameras(path)
+    for image in (tmp_path / "image").iterdir():
+        image.unlink()
+    with pytest.raises(InputError, match=r"cameras_sphere\.npz: no images in .*image to take names and sizes from"):
+        read_cameras(path)
