@@ -8,11 +8,13 @@ from .meshing import Mesh, NoSurfaceError, extract_mesh
 from .multiscale import MultiscaleSDF
 from .similarity import Similarity
 from .siren import Siren
+from .tracing import Hits, cone_starts, sphere_trace
 
 __all__ = [
     "Box",
     "Capsule",
     "Field",
+    "Hits",
     "InputError",
     "Jet",
     "Mesh",
@@ -25,7 +27,9 @@ __all__ = [
     "Sphere",
     "Torus",
     "Union",
+    "cone_starts",
     "extract_mesh",
     "load_field",
     "save_field",
+    "sphere_trace",
 ]

@@ -1,0 +1,316 @@
+"""Traced depths against closed forms, against a dense search along the rays, and against the field itself."""
+
+import numpy as np
+import pytest
+import torch
+from fields import FIELDS, small_multiscale
+from mplicits.neural_fields import (
+    Box,
+    Field,
+    Jet,
+    MultiscaleSDF,
+    Plane,
+    Siren,
+    Sphere,
+    Torus,
+    cone_starts,
+    sphere_trace,
+)
+from torch import Tensor
+
+THREE_D = {name: make for name, make in FIELDS.items() if make().in_dim == 3}
+
+
+def unit(x: Tensor) -> Tensor:
+    return torch.nn.functional.normalize(x, dim=-1)
+
+
+def random_rays(count: int, *, spread: float, dtype: torch.dtype = torch.float64) -> tuple[Tensor, Tensor]:
+    """Rays from a sphere of radius 2.5 towards random points in a cube."""
+    origins = 2.5 * unit(torch.randn(count, 3, dtype=dtype))
+    return origins, unit(spread * (2 * torch.rand(count, 3, dtype=dtype) - 1) - origins)
+
+
+def sphere_depth(origins: Tensor, directions: Tensor, radius: float) -> Tensor:
+    along = (origins * directions).sum(-1)
+    squared = radius**2 - (origins - along[:, None] * directions).square().sum(-1)
+    return torch.where(squared > 0, -along - squared.clamp(min=0).sqrt(), torch.inf)
+
+
+def box_depth(origins: Tensor, directions: Tensor, half: Tensor) -> Tensor:
+    a, b = (-half - origins) / directions, (half - origins) / directions
+    enter, leave = torch.minimum(a, b).amax(-1), torch.maximum(a, b).amin(-1)
+    return torch.where(enter < leave, enter, torch.inf)
+
+
+def torus_depth(origins: Tensor, directions: Tensor, major: float, minor: float) -> Tensor:
+    """First positive root of the quartic (|p|² + R² − r²)² = 4 R² (p_x² + p_y²)."""
+    depths = []
+    for o, d in zip(origins.numpy(), directions.numpy(), strict=True):
+        square = np.array([d @ d, 2 * o @ d, o @ o])
+        around = np.array([d[:2] @ d[:2], 2 * o[:2] @ d[:2], o[:2] @ o[:2]])
+        left = square + np.array([0, 0, major**2 - minor**2])
+        roots = np.roots(np.polysub(np.polymul(left, left), 4 * major**2 * around))
+        real = roots[np.abs(roots.imag) < 1e-7].real
+        depths.append(min(real[real > 0], default=np.inf))
+    return torch.tensor(np.array(depths))
+
+
+EXACT_SHAPES = {
+    "sphere": (lambda: Sphere(radius=0.6), lambda o, d: sphere_depth(o, d, 0.6)),
+    "box": (lambda: Box(half_size=(0.5, 0.3, 0.4)), lambda o, d: box_depth(o, d, o.new_tensor([0.5, 0.3, 0.4]))),
+    "torus": (lambda: Torus(major=0.5, minor=0.2), lambda o, d: torus_depth(o, d, 0.5, 0.2)),
+}
+
+
+@pytest.mark.parametrize("name", EXACT_SHAPES)
+@pytest.mark.parametrize("tolerance", [1e-5, 1e-9])
+def test_depth_of_a_thousand_random_rays(name, tolerance):
+    make, exact = EXACT_SHAPES[name]
+    origins, directions = random_rays(1000, spread=0.75)
+    expected = exact(origins, directions)
+    hits = sphere_trace(make().double(), origins, directions, tolerance=tolerance)
+    assert torch.equal(hits.mask, expected.isfinite())
+    assert 200 < int(hits.mask.sum()) < 1000
+    assert float((hits.depth - expected)[hits.mask].abs().max()) < tolerance
+    torch.testing.assert_close(hits.position, origins + hits.depth[:, None] * directions)
+
+
+@pytest.mark.parametrize("name", EXACT_SHAPES)
+def test_single_precision_keeps_to_its_tolerance(name):
+    make, exact = EXACT_SHAPES[name]
+    origins, directions = random_rays(1000, spread=0.75)
+    expected = exact(origins, directions)
+    hits = sphere_trace(make(), origins.float(), directions.float())
+    assert torch.equal(hits.mask, expected.isfinite())
+    error = (hits.depth.double() - expected)[hits.mask].abs()
+    assert float(error.median()) < 1e-6
+    assert float(error.max()) < 1e-4  # a rounding error across the ray moves a grazing one by more than 1e-5
+
+
+@pytest.mark.parametrize("miss", [False, True])
+def test_grazing_rays_of_a_sphere(miss):
+    """Rays that pass the silhouette by 1e-1 to 1e-8, inside or outside."""
+    count = 1000
+    directions = unit(torch.randn(count, 3, dtype=torch.float64))
+    aside = unit(torch.linalg.cross(directions, torch.randn(count, 3, dtype=torch.float64)))
+    by = 10 ** torch.linspace(-8, -1, count, dtype=torch.float64)
+    origins = -2 * directions + aside * (0.6 + (by if miss else -by))[:, None]
+    hits = sphere_trace(Sphere(radius=0.6).double(), origins, directions)
+    expected = sphere_depth(origins, directions, 0.6)
+    assert torch.equal(hits.mask, expected.isfinite())
+    assert bool(hits.mask.any()) != miss
+    if not miss:
+        assert float((hits.depth - expected).abs().max()) < 1e-5
+    assert float(hits.steps.double().mean()) < 150  # plain sphere tracing needs up to 10⁴ for the nearest
+
+
+def test_rays_along_a_face_end():
+    """Parallel to a face at 1e-5 above it, plain sphere tracing would need 10⁵ steps."""
+    heights = 0.3 + torch.tensor([1e-5, 1e-3, -1e-5, -1e-3], dtype=torch.float64)
+    origins = torch.stack((torch.full_like(heights, -2), torch.zeros_like(heights), heights), dim=1)
+    hits = sphere_trace(Box(half_size=(0.5, 0.5, 0.3)).double(), origins, origins.new_tensor([1.0, 0.0, 0.0]))
+    assert hits.mask.tolist() == [False, False, True, True]
+    assert float((hits.depth[2:] - 1.5).abs().max()) < 1e-5
+    assert int(hits.steps.max()) < 400
+
+
+def test_nothing_thin_is_lost():
+    """A plate of 1e-3, from every side."""
+    half = torch.tensor([0.5, 0.0005, 0.5], dtype=torch.float64)
+    origins, directions = random_rays(4000, spread=0.5)
+    hits = sphere_trace(Box(half_size=tuple(half.tolist())).double(), origins, directions)
+    expected = box_depth(origins, directions, half)
+    assert torch.equal(hits.mask, expected.isfinite())
+    assert float((hits.depth - expected)[hits.mask].abs().max()) < 1e-5
+
+
+def nested(field: Field) -> Field:
+    """Residuals small enough to keep each surface within the band before it, as training leaves them."""
+    if isinstance(field, MultiscaleSDF):
+        with torch.no_grad():
+            for residual in field.residuals:
+                assert isinstance(residual, Siren)
+                residual.output.weight.mul_(0.1)
+                residual.output.bias.mul_(0.1)
+    return field
+
+
+@pytest.mark.parametrize("name", THREE_D)
+def test_every_field_against_a_dense_search(name):
+    field = nested(THREE_D[name]()).double().requires_grad_(False)
+    origins, directions = random_rays(300, spread=0.6)
+    step = 5e-4
+    ladder = torch.arange(1.4, 3.6, step, dtype=torch.float64)
+    hits = sphere_trace(field, origins, directions, near=1.4, far=3.6, radius=None, lipschitz=2.0)
+    values = field.value(origins[:, None] + ladder[:, None] * directions[:, None])
+    flips = (values[:, :-1] < 0) != (values[:, 1:] < 0)
+    first = torch.where(flips.any(1), ladder[flips.int().argmax(1)], torch.inf)
+    agree = (hits.mask == first.isfinite()) & (~hits.mask | ((hits.depth - first - step / 2).abs() < step))
+    # A ray may touch the surface between two rungs of the ladder; the trace is then the better of the two.
+    touched = hits.mask & (hits.depth < first) & (field.value(hits.position).abs() < 1e-5)
+    assert bool((agree | touched).all())
+    assert float((touched & ~agree).double().mean()) < 0.02
+
+
+@pytest.mark.parametrize("level", [0, 1, 2])
+def test_hits_lie_on_the_level_that_was_asked_for(level):
+    residuals = list(small_multiscale().residuals)
+    field = MultiscaleSDF(Sphere(radius=0.5), residuals, [0.3, 0.2], taper=0.5).double().requires_grad_(False)
+    origins, directions = random_rays(300, spread=0.3)
+    hits = sphere_trace(field, origins, directions, level=level, lipschitz=2.0)
+    assert float(hits.mask.double().mean()) > 0.5
+    assert float(field.value(hits.position[hits.mask], level=level).abs().max()) < 5e-5  # 1e-5 in depth
+    assert set(hits.level[hits.mask].tolist()) == {level}
+
+
+class Watched(Field):
+    """A residual that remembers the points it was asked at."""
+
+    def __init__(self, amplitude: float) -> None:
+        super().__init__()
+        self.in_dim, self.num_levels, self.amplitude = 3, 1, amplitude
+        self.register_buffer("deltas", torch.empty(0))
+        self.asked: list[Tensor] = []
+
+    def value(self, x: Tensor, *, level: int = -1) -> Tensor:
+        self.asked.append(x)
+        return self.amplitude * torch.sin(20 * x[..., 0])
+
+    def jet(self, x: Tensor, *, level: int = -1) -> Jet:
+        raise NotImplementedError
+
+
+def test_residuals_are_evaluated_only_in_their_band():
+    base, residual = Sphere(radius=0.5).double(), Watched(0.02)
+    field = MultiscaleSDF(base, [residual], [0.05]).double()
+    origins, directions = random_rays(500, spread=0.5)
+    hits = sphere_trace(field, origins, directions, lipschitz=1.4)
+    asked = torch.cat(residual.asked)
+    assert 0 < len(asked) < 0.7 * int(hits.steps.sum())
+    assert float(base.value(asked).abs().max()) < 0.05
+
+
+def test_a_ray_from_inside_finds_the_way_out():
+    origins = torch.zeros(50, 3, dtype=torch.float64)
+    hits = sphere_trace(Sphere(radius=0.5).double(), origins, unit(torch.randn(50, 3, dtype=torch.float64)))
+    assert bool(hits.mask.all())
+    assert float((hits.depth - 0.5).abs().max()) < 1e-5
+
+
+def test_near_and_far_bound_the_search():
+    field = Sphere(radius=0.5).double()
+    origin = torch.tensor([0.0, 0.0, -2.0], dtype=torch.float64)
+    direction = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    assert not sphere_trace(field, origin, direction, far=1.49).mask
+    assert sphere_trace(field, origin, direction, far=1.51).mask
+    behind = sphere_trace(field, origin, direction, near=2.6)
+    assert not behind.mask
+    assert sphere_trace(field, origin, direction, near=torch.tensor(1.2)).depth == pytest.approx(1.5, abs=1e-5)
+    assert not sphere_trace(field, origin, -direction).mask
+
+
+def test_steep_fields_need_their_lipschitz_constant():
+    class Steep(Field):
+        in_dim, num_levels = 3, 1
+
+        def __init__(self) -> None:
+            super().__init__()
+            self.register_buffer("deltas", torch.empty(0))
+            self.inner = Torus(major=0.5, minor=0.05)
+
+        def value(self, x: Tensor, *, level: int = -1) -> Tensor:
+            return 3 * self.inner.value(x)
+
+        def jet(self, x: Tensor, *, level: int = -1) -> Jet:
+            raise NotImplementedError
+
+    origins, directions = random_rays(2000, spread=0.6)
+    expected = torus_depth(origins, directions, 0.5, 0.05)
+    hits = sphere_trace(Steep().double(), origins, directions, lipschitz=3.0)
+    assert torch.equal(hits.mask, expected.isfinite())
+    assert float((hits.depth - expected)[hits.mask].abs().max()) < 1e-5
+
+
+def test_without_a_bounding_ball():
+    plane = Plane(normal=(0.0, 0.0, 1.0), offset=-3.0).double()
+    origin = torch.zeros(3, dtype=torch.float64)
+    direction = unit(torch.tensor([0.6, 0.0, -0.8], dtype=torch.float64))
+    assert not sphere_trace(plane, origin, direction).mask
+    assert sphere_trace(plane, origin, direction, radius=None, far=10.0).depth == pytest.approx(3 / 0.8, abs=1e-5)
+
+
+def test_the_papers_budget_converges_head_on_and_counts():
+    field = MultiscaleSDF(Sphere(radius=0.5), [Watched(0.0), Watched(0.0)], [0.05, 0.02]).double()
+    origins = torch.tensor([[0.0, 0.0, -2.0], [0.0, 0.9, -2.0], [0.0, 3.0, -2.0]], dtype=torch.float64)
+    hits = sphere_trace(field, origins, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), budget=(20, 5, 5))
+    assert hits.mask.tolist() == [True, False, False]
+    assert float(hits.depth[0]) == pytest.approx(1.5, abs=1e-9)
+    assert int(hits.steps[0]) <= 6
+    assert int(hits.steps.max()) <= 30
+    assert int(hits.steps[2]) == 0
+
+
+def test_a_small_budget_leaves_holes_that_the_default_does_not():
+    origins, directions = random_rays(1000, spread=0.75)
+    expected = torus_depth(origins, directions, 0.5, 0.2).isfinite()
+    field = Torus(major=0.5, minor=0.2).double()
+    few = sphere_trace(field, origins, directions, budget=(4,))
+    assert int((expected & ~few.mask).sum()) > 20
+    enough = sphere_trace(field, origins, directions, budget=(60,), capture=1e-4)
+    assert int((expected != enough.mask).sum()) < 5
+
+
+@pytest.mark.parametrize("level", [0, -1])
+@pytest.mark.parametrize("name", ["sphere", "torus", "box", "multiscale-over-sphere"])
+def test_cones_stop_before_the_surface(name, level):
+    field = THREE_D[name]().double().requires_grad_(False)
+    origin = torch.tensor([0.4, 0.3, -3.0], dtype=torch.float64)
+    across = torch.linspace(-0.4, 0.4, 75, dtype=torch.float64)
+    rows, columns = torch.meshgrid(across[:60], across, indexing="ij")
+    directions = unit(torch.stack((columns, rows, torch.ones_like(rows)), dim=-1))
+    near = cone_starts(field, origin, directions, level=level, lipschitz=1.3)
+    hits = sphere_trace(field, origin, directions, level=level, lipschitz=1.3)
+    assert near.shape == (60, 75)
+    assert bool((near <= hits.depth)[hits.mask].all())
+    assert not bool(hits.mask[near.isinf()].any())
+    assert bool(near.isinf().any())
+    assert float((hits.depth - near)[hits.mask].median()) < 0.35
+    again = sphere_trace(field, origin, directions, level=level, near=near, lipschitz=1.3)
+    assert torch.equal(again.mask, hits.mask)
+    assert float((again.depth - hits.depth)[hits.mask].abs().max()) < 2e-5
+    assert int(again.steps.sum()) < int(hits.steps.sum())
+
+
+@pytest.mark.parametrize("shape", [(), (0,), (1,), (4, 3)])
+def test_shapes(shape, device, dtype):
+    field = Sphere(radius=0.5).to(device, dtype)
+    origins = torch.tensor([0.0, 0.0, -2.0], device=device, dtype=dtype)
+    directions = torch.tensor([0.0, 0.0, 1.0], device=device, dtype=dtype).expand(*shape, 3)
+    hits = sphere_trace(field, origins, directions)
+    assert hits.mask.shape == hits.depth.shape == hits.level.shape == hits.steps.shape == shape
+    assert hits.position.shape == (*shape, 3)
+    assert bool(hits.mask.all())
+    assert hits.depth.dtype == dtype
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"origins": torch.zeros(4)}, r"origins has shape \(4,\)"),
+        ({"directions": torch.zeros(5, 2)}, r"directions has shape \(5, 2\)"),
+        ({"tolerance": 0.0}, "tolerance=0.0"),
+        ({"lipschitz": -1.0}, "lipschitz=-1.0"),
+        ({"level": 3}, "level=3"),
+        ({"budget": (20, 5)}, r"budget=\[20, 5\]: expected 1 number"),
+    ],
+)
+def test_bad_arguments(change, message):
+    given = {"origins": torch.zeros(3), "directions": torch.tensor([0.0, 0.0, 1.0])} | change
+    with pytest.raises(ValueError, match=message):
+        sphere_trace(Sphere(radius=0.5), given.pop("origins"), given.pop("directions"), **given)
+
+
+def test_four_dimensional_fields_are_refused():
+    with pytest.raises(ValueError, match="in_dim=4"):
+        sphere_trace(FIELDS["siren-one-layer-4d"](), torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
