@@ -103,7 +103,7 @@ def _write_gif(path: Path, frames: Iterator[Image], fps: float) -> None:
         _encode(frames, fps, ["-vcodec", "ffv1", "-pix_fmt", "bgr0", clip])
         with _ffmpeg(["-i", clip, "-vf", "palettegen", "-update", "1", palette]):
             pass
-        dither = "paletteuse=dither=bayer:bayer_scale=4:diff_mode=rectangle"
+        dither = "paletteuse=dither=bayer:bayer_scale=5:diff_mode=rectangle"
         with _ffmpeg(["-i", clip, "-i", palette, "-lavfi", dither, "-loop", "0", path]):
             pass
 

@@ -107,7 +107,7 @@ def slice_field(
         >>> from mplicits.neural_fields import Sphere
         >>> from mplicits.pipelines.slice import slice_field
         >>> slice_field(Sphere(radius=1), origin=(0, 0, 0), u=(1, 0, 0), v=(0, 1, 0), half_size=2, size=(4, 1))
-        tensor([[ 5.,  1.,  1.,  5.]])
+        tensor([[5., 1., 1., 5.]])
     """
     points = slice_points(origin=origin, u=u, v=v, half_size=half_size, size=size)
     with torch.inference_mode():
