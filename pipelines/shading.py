@@ -1,0 +1,251 @@
+"""Colours for what an image sees: pure functions of `Seen`, on its device, for the pixels that see something."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from ..datasets.cameras import Camera
+from ..neural_fields import Field
+from .colormap import COLOR_MAPS, map_colors
+from .curvature import mean_curvature
+from .matcap import load_matcap, sample_matcap
+from .seen import Seen
+from .shading_names import SHADINGS, ShadeOptions
+from .visibility import ambient_occlusion, soft_shadow
+
+__all__ = ["SHADINGS", "ShadeOptions", "compose", "downsample", "measure", "shade", "value_limits"]
+
+Image = NDArray[np.uint8]
+
+GAMMA = 2.2  # between display values, in which images are stored, and light, which adds up
+
+# Directions to the lamps in the camera's axes: right, up, towards the eye.
+KEY_LAMP = (-0.55, 0.70, 0.60)
+FILL_LAMP = (0.75, 0.05, 0.65)
+# Their light, and that of sky and ground, on a surface that faces them; a little warm against a little cool.
+KEY_LIGHT = (0.96, 0.93, 0.88)
+FILL_LIGHT = (0.17, 0.18, 0.20)
+SKY_LIGHT = (0.34, 0.36, 0.39)
+GROUND_LIGHT = (0.15, 0.14, 0.13)
+BACK_TINT = (0.62, 0.36, 0.33)
+# Cosine of the view with a normal beyond which it is the back that is seen, not a rim with a finer level's normal.
+SEEN_FROM_BEHIND = 0.2
+
+_MAPS = {"depth": "viridis", "curvature": "diverging", "error": "magma"}
+
+
+def shade(
+    seen: Seen,
+    shading: str,
+    *,
+    camera: Camera,
+    field: Field | None = None,
+    level: int = -1,
+    options: ShadeOptions | None = None,
+    matcap: Tensor | None = None,
+    reference: KDTree | None = None,
+    values: Tensor | None = None,
+) -> Tensor:
+    """Colour the pixels that see something.
+
+    Args:
+        seen: what they see.
+        shading: one of `SHADINGS`.
+        camera: in the coordinates of ``seen``; lamps and matcaps turn with it.
+        field: for shadows, occlusion and curvature.
+        level: the level that is seen.
+        options: settings.
+        matcap: ``(H, W, 3)`` from `load_matcap`; by default ``options.matcap`` is loaded.
+        reference: the cloud from which the error is measured.
+        values: ``(P,)`` numbers to map to colours, where they are known and need not be measured.
+
+    Returns:
+        ``(P, 3)`` display RGB in [0, 1].
+
+    Raises:
+        ValueError: no such shading, or it needs a field, colours or a reference that is not there.
+        InputError: the matcap of the options cannot be read.
+    """
+    options = options or ShadeOptions()
+    if shading not in SHADINGS:
+        raise ValueError(f"shading={shading!r}: expected one of {', '.join(SHADINGS)}")
+    if shading == "lambert":
+        return _lambert(seen, camera, field, level, options)
+    if shading == "headlight":
+        light = 0.08 + 0.92 * _facing(seen)
+        return _to_display(_albedo(seen, options) * light[:, None])
+    if shading == "normals":
+        return (seen.normal + 1) / 2
+    if shading == "color":
+        if seen.color is None:
+            raise ValueError("shading='color': the surface has no colours; shade it 'lambert'")
+        return seen.color
+    if shading == "matcap":
+        return sample_matcap(load_matcap(options.matcap) if matcap is None else matcap, _view_normals(seen, camera))
+    if values is None:
+        values = measure(seen, shading, field=field, level=level, reference=reference, detail=options.detail)
+    low, high = value_limits(values, shading, options)
+    # What is near is light, what is far from the reference dark: of those two maps the light end is the high one.
+    colors = map_colors(values, (low, high) if shading == "curvature" else (high, low), COLOR_MAPS[_MAPS[shading]])
+    if shading == "depth":
+        return colors
+    return colors * (1 - options.relief * (1 - _facing(seen)))[:, None]
+
+
+def measure(
+    seen: Seen,
+    shading: str,
+    *,
+    field: Field | None = None,
+    level: int = -1,
+    reference: KDTree | None = None,
+    detail: float = 4e-3,
+) -> Tensor:
+    """The numbers ``(P,)`` that "depth", "curvature" and "error" show, in the units of ``seen``.
+
+    Args:
+        seen: what the pixels see.
+        shading: one of the three.
+        field: whose curvature.
+        level: of the field.
+        reference: the cloud from which the error is measured.
+        detail: step of the differences of which the curvature is made, see `mean_curvature`.
+
+    Raises:
+        ValueError: another shading, or it needs a field or a reference that is not there.
+    """
+    if shading == "depth":
+        return seen.depth
+    if shading == "curvature":
+        if field is None:
+            raise ValueError("shading='curvature': needs a field; a mesh has none")
+        return mean_curvature(field, seen.position, level=level, step=detail)
+    if shading == "error":
+        if reference is None:
+            raise ValueError("shading='error': needs a reference cloud to measure from")
+        distances = reference.query(seen.position.detach().cpu().double().numpy())[0]
+        return torch.as_tensor(np.asarray(distances)).to(seen.position)
+    raise ValueError(f"shading={shading!r}: expected one of {', '.join(_MAPS)}")
+
+
+def value_limits(values: Tensor, shading: str, options: ShadeOptions) -> tuple[float, float]:
+    """The values at the two ends of the colour map, for a legend, or for all frames of a turntable.
+
+    They are ``options.limits`` if given. Otherwise "depth" spans all ``values``; "error" starts at 0 and holds
+    ``options.quantile`` of them; "curvature" does so too, and is symmetric.
+    """
+    if options.limits is not None:
+        return options.limits
+    if not len(values):
+        return (0.0, 1.0)
+    if shading == "depth":
+        return float(values.min()), float(values.max())
+    magnitude = values.abs()
+    # kthvalue, not quantile: that refuses more than 16 million values.
+    rank = max(1, round(options.quantile * len(magnitude)))
+    high = float(magnitude.kthvalue(rank).values)
+    return (-high if shading == "curvature" else 0.0), high
+
+
+def compose(seen: Seen, rgb: Tensor, *, background: Sequence[float] | None = (1.0, 1.0, 1.0)) -> Image:
+    """Put colours ``(P, 3)`` into an image: ``(H, W, 3)`` on a background; without one ``(H, W, 4)``, transparent."""
+    width, height = seen.size
+    bytes_seen = (rgb.clamp(0, 1) * 255 + 0.5).to(torch.uint8)
+    if background is None:
+        canvas = rgb.new_zeros((height * width, 4), dtype=torch.uint8)
+        bytes_seen = torch.cat((bytes_seen, torch.full_like(bytes_seen[:, :1], 255)), 1)
+    else:
+        paper = (torch.tensor(background, device=rgb.device).clamp(0, 1) * 255 + 0.5).to(torch.uint8)
+        canvas = paper.repeat(height * width, 1)
+    canvas[seen.pixel] = bytes_seen
+    return canvas.reshape(height, width, -1).cpu().numpy()
+
+
+def downsample(image: Image, factor: int) -> Image:
+    """Average blocks of ``factor`` × ``factor`` pixels; of RGBA the colours by their alpha, so that rims keep theirs.
+
+    Raises:
+        ValueError: the factor is below 1, or does not divide the sides of the image.
+    """
+    height, width, channels = image.shape
+    if factor < 1 or height % factor or width % factor:
+        raise ValueError(f"factor={factor}: expected a divisor of both sides of a {width} × {height} image")
+    if factor == 1:
+        return image
+    blocks = image.reshape(height // factor, factor, width // factor, factor, channels)
+    if channels == 3:
+        return (blocks.sum((1, 3), dtype=np.float32) / factor**2 + 0.5).astype(np.uint8)
+    alpha = blocks[..., 3:].astype(np.float32)
+    total = alpha.sum((1, 3))
+    color = (blocks[..., :3] * alpha).sum((1, 3)) / np.maximum(total, 1)
+    return (np.concatenate((color, total / factor**2), -1) + 0.5).astype(np.uint8)
+
+
+def _lambert(seen: Seen, camera: Camera, field: Field | None, level: int, options: ShadeOptions) -> Tensor:
+    """Albedo times the light of two lamps and of sky and ground, the lamps a little off the camera's axis.
+
+    The key lamp is cut off by shadows, and everything else by occlusion; half of it dims the key lamp as well, which
+    keeps narrow creases readable in full light.
+    """
+    if field is None and (options.shadows or options.occlusion):
+        raise ValueError("shading='lambert': shadows and occlusion are traced in a field, and there is none")
+    normal = seen.normal * torch.where(_cosine(seen) > 0, -1, 1)[:, None]
+    axes = torch.stack((camera.right, -camera.down, -camera.forward)).to(normal)
+    lamps = torch.nn.functional.normalize(normal.new_tensor((KEY_LAMP, FILL_LAMP)), dim=1) @ axes
+    key, fill = (normal @ lamps.T).clamp(min=0).unbind(1)
+    lower = 0.5 - 0.5 * (normal @ axes[1])  # 0 for what faces the sky, 1 for what faces the ground
+    open_ = None
+    if field is not None:
+        where = options.light_level if options.light_level is not None else level
+        if options.shadows:
+            key = key * soft_shadow(field, seen.position, normal, lamps[0], level=where, softness=options.softness)
+        if options.occlusion:
+            open_ = ambient_occlusion(field, seen.position, normal, level=where, reach=options.reach)
+            key = key * (0.5 + 0.5 * open_)
+    ambient = torch.lerp(_light(SKY_LIGHT, normal), _light(GROUND_LIGHT, normal), lower[:, None])
+    rest = torch.addcmul(ambient, fill[:, None], _light(FILL_LIGHT, normal))
+    if open_ is not None:
+        rest = rest * open_[:, None]
+    light = torch.addcmul(rest, key[:, None], _light(KEY_LIGHT, normal))
+    return _to_display(_albedo(seen, options) * light)
+
+
+def _albedo(seen: Seen, options: ShadeOptions) -> Tensor:
+    """What the surface reflects, in linear light: ``(P, 3)``, or ``(3,)`` where it is the same everywhere."""
+    albedo = _light(options.clay, seen.normal) if seen.color is None else seen.color
+    if options.back_faces:
+        behind = _cosine(seen) > SEEN_FROM_BEHIND
+        albedo = torch.where(behind[:, None], _light(BACK_TINT, seen.normal), albedo)
+    return albedo**GAMMA
+
+
+def _to_display(light: Tensor) -> Tensor:
+    return light.clamp(0, 1) ** (1 / GAMMA)
+
+
+def _light(color: tuple[float, float, float], like: Tensor) -> Tensor:
+    return torch.tensor(color, dtype=like.dtype, device=like.device)
+
+
+def _cosine(seen: Seen) -> Tensor:
+    """Cosine of the normal with the view: negative where the front is seen."""
+    return (seen.normal * seen.direction).sum(-1)
+
+
+def _facing(seen: Seen) -> Tensor:
+    return _cosine(seen).abs()
+
+
+def _view_normals(seen: Seen, camera: Camera) -> Tensor:
+    """Normals ``(P, 3)`` with z towards the eye and x right: of each pixel's own view, so that rims are rims."""
+    towards = -seen.direction
+    right = torch.linalg.cross((-camera.down).to(towards).expand_as(towards), towards)
+    right = torch.nn.functional.normalize(right, dim=-1)
+    up = torch.linalg.cross(towards, right)
+    return torch.stack([(seen.normal * axis).sum(-1) for axis in (right, up, towards)], -1)

@@ -1,0 +1,344 @@
+"""Shadings, on points of a sphere whose colours can be worked out by hand."""
+
+import dataclasses
+import subprocess
+import sys
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+import torch
+from fields import FIELDS
+from mplicits.datasets.cameras import Camera, look_at
+from mplicits.neural_fields import Field, InputError, Plane, Sphere, Union
+from mplicits.pipelines.colormap import COLOR_MAPS, map_colors
+from mplicits.pipelines.matcap import MATCAPS, load_matcap, sample_matcap
+from mplicits.pipelines.seen import Seen
+from mplicits.pipelines.shading import (
+    SHADINGS,
+    ShadeOptions,
+    compose,
+    downsample,
+    measure,
+    shade,
+    value_limits,
+)
+from scipy.spatial import KDTree
+
+RADIUS, SIZE = 0.5, 48
+EYE = (0.0, 0.0, 4.0)
+
+
+def camera_at(eye: tuple[float, float, float] = EYE) -> Camera:
+    return look_at(eye, (0, 0, 0), fov=16, width=SIZE, height=SIZE)
+
+
+def ball(camera: Camera, *, device: torch.device | str = "cpu", color: torch.Tensor | None = None) -> Seen:
+    """The exact view of a sphere around the origin."""
+    eye, rays = camera.rays(device=device)
+    rays = rays.reshape(-1, 3)
+    along = -(rays @ eye)
+    gap = along**2 - eye @ eye + RADIUS**2
+    pixel = (gap > 0).nonzero()[:, 0]
+    rays, depth = rays[pixel], (along - gap.clamp(min=0).sqrt())[pixel]
+    position = eye + depth[:, None] * rays
+    colors = None if color is None else color.expand_as(position)
+    return Seen((SIZE, SIZE), pixel, depth, position, position / RADIUS, rays, colors)
+
+
+def nearest_row(seen: Seen, x: int, y: int) -> int:
+    return int((seen.pixel == y * SIZE + x).nonzero()[0, 0])
+
+
+@pytest.mark.parametrize("name", [name for name, make in FIELDS.items() if make().in_dim == 3])
+def test_every_shading_of_every_field_is_a_colour(name):
+    field = FIELDS[name]()
+    camera = camera_at()
+    seen = ball(camera, color=torch.tensor([0.2, 0.5, 0.9]))
+    options = ShadeOptions(shadows=True, occlusion=True)
+    tree = KDTree(seen.position.numpy()[::7])
+    for shading in SHADINGS:
+        for level in range(field.num_levels):
+            rgb = shade(seen, shading, camera=camera, field=field, level=level, options=options, reference=tree)
+            assert rgb.shape == (len(seen.pixel), 3)
+            assert rgb.dtype == torch.float32
+            assert ((rgb >= 0) & (rgb <= 1)).all()
+
+
+@pytest.mark.parametrize("shading", SHADINGS)
+def test_images_in_which_nothing_is_seen(shading):
+    seen = ball(camera_at(), color=torch.ones(3))
+    empty = Seen((3, 2), *(part[:0] for part in (seen.pixel, seen.depth, seen.position, seen.normal, seen.direction)))
+    empty = dataclasses.replace(empty, color=torch.empty(0, 3))
+    options = ShadeOptions(shadows=True, occlusion=True)
+    rgb = shade(empty, shading, camera=camera_at(), field=Sphere(), options=options, reference=KDTree(np.zeros((1, 3))))
+    assert (compose(empty, rgb) == 255).all()
+
+
+def test_shading_runs_where_the_view_is(device):
+    seen = ball(camera_at(), device=device, color=torch.ones(3, device=device))
+    field = Sphere(radius=RADIUS).to(device)
+    for shading in SHADINGS:
+        rgb = shade(seen, shading, camera=camera_at(), field=field, reference=KDTree(np.zeros((1, 3))))
+        assert rgb.device.type == device.type
+        assert compose(seen, rgb).shape == (SIZE, SIZE, 3)
+
+
+def test_normals_and_own_colours_are_shown_as_they_are():
+    camera = camera_at()
+    seen = ball(camera, color=torch.tensor([0.25, 0.5, 0.75]))
+    torch.testing.assert_close(shade(seen, "normals", camera=camera), (seen.normal + 1) / 2)
+    assert torch.equal(shade(seen, "color", camera=camera), seen.color)
+
+
+def test_the_headlight_is_brightest_in_the_middle_and_the_key_lamp_above_left():
+    camera = camera_at()
+    seen = ball(camera)
+    middle = (SIZE - 1) / 2
+    for shading, low, high in (("headlight", -1.0, 1.0), ("lambert", -0.8 * middle, -0.2 * middle)):
+        light = shade(seen, shading, camera=camera).sum(1)
+        brightest = int(seen.pixel[light.argmax()])
+        x, y = brightest % SIZE - middle, brightest // SIZE - middle
+        assert low <= x <= high
+        assert low <= y <= high
+        assert light.min() > 0.3  # nothing is black on the page
+        assert light.max() < 3
+
+
+@pytest.mark.parametrize("shading", ["lambert", "headlight", "matcap", "depth"])
+def test_lamps_and_matcaps_turn_with_the_camera(shading):
+    """A sphere looks the same from everywhere."""
+    pictures = []
+    for eye in (EYE, (4.0, 0.0, 0.0), (1.2, 3.0, -2.2)):
+        camera = camera_at(tuple(np.asarray(eye) / np.linalg.norm(eye) * 4))
+        seen = ball(camera)
+        pictures.append(compose(seen, shade(seen, shading, camera=camera)).astype(int))
+    for other in pictures[1:]:
+        off = np.abs(other - pictures[0]).max(axis=2)
+        assert np.quantile(off, 0.98) <= 2  # pixels of the outline may come and go
+
+
+def test_colours_of_the_surface_are_what_the_light_falls_on():
+    camera = camera_at()
+    clay = shade(ball(camera), "lambert", camera=camera, options=ShadeOptions(clay=(0.3, 0.6, 0.1)))
+    colored = shade(ball(camera, color=torch.tensor([0.3, 0.6, 0.1])), "lambert", camera=camera)
+    torch.testing.assert_close(clay, colored)
+    assert (clay[:, 1] > clay[:, 0]).all()
+
+
+def plate_under_ball() -> tuple[Field, Seen, Camera]:
+    """Points of the plane y = −0.3 below a ball, seen from the front and above."""
+    field = Union(Plane(normal=(0, 1, 0), offset=-0.3), Sphere(radius=0.2))
+    camera = camera_at((0, 2, 4))
+    x, z = (0.4 * (2 * torch.rand(2, 500) - 1)).unbind()
+    points = torch.stack((x, torch.full_like(x, -0.3), z), -1)
+    away = points - camera.eye.float()
+    depth = away.norm(dim=1)
+    normal = torch.tensor([0.0, 1.0, 0.0]).expand_as(points)
+    return field, Seen((SIZE, SIZE), torch.arange(500), depth, points, normal, away / depth[:, None]), camera
+
+
+def test_shadows_and_occlusion_only_take_light_away_and_only_near_the_ball():
+    field, seen, camera = plate_under_ball()
+    plain = shade(seen, "lambert", camera=camera, field=field)
+    assert plain.std(0).max() < 0.01  # a plane under a distant lamp
+    away = seen.position[:, [0, 2]].norm(dim=1)  # from the point below the ball's centre
+
+    def share(options: ShadeOptions) -> torch.Tensor:
+        return (shade(seen, "lambert", camera=camera, field=field, options=options) / plain).mean(1)
+
+    shadow = share(ShadeOptions(shadows=True, softness=1e-3))
+    assert shadow.max() <= 1 + 1e-6
+    dark = shadow < 0.9
+    assert torch.equal(dark, shadow < 0.99)  # sharp
+    # A disc of radius 0.2 seen slantwise, which the lamp above left of the camera throws to the right and behind.
+    assert 0.1 < dark.float().mean() < 0.4
+    assert (seen.position[dark].mean(0)[[0, 2]] * torch.tensor([1.0, -1.0]) > 0.05).all()
+    occlusion = share(ShadeOptions(occlusion=True, reach=0.2))
+    assert occlusion.max() <= 1 + 1e-6
+    assert (occlusion[away > 0.39] > 0.999).all()
+    assert occlusion[away < 0.1].max() < 0.9 < occlusion[away > 0.3].min()
+
+
+def test_depth_is_light_near_and_dark_far_between_the_ends_of_its_map():
+    camera = camera_at()
+    seen = ball(camera)
+    rgb = shade(seen, "depth", camera=camera)
+    order = seen.depth.argsort()
+    light = (rgb @ torch.tensor([0.2126, 0.7152, 0.0722]))[order]
+    assert (light.diff() <= 1e-5).all()
+    table = torch.from_numpy(COLOR_MAPS["viridis"])
+    torch.testing.assert_close(rgb[order[0]], table[-1])
+    torch.testing.assert_close(rgb[order[-1]], table[0])
+    fixed = shade(seen, "depth", camera=camera, options=ShadeOptions(limits=(0.0, 100.0)))
+    assert (fixed - table[-10]).abs().max() < 0.1  # every depth is near 4
+
+
+def test_error_is_the_distance_to_the_cloud_and_given_values_are_taken_as_they_are():
+    camera = camera_at()
+    seen = ball(camera)
+    tree = KDTree(np.array([[0.0, 0.0, 0.0]]))  # everything is a radius away
+    values = measure(seen, "error", reference=tree)
+    torch.testing.assert_close(values, torch.full_like(values, RADIUS))
+    options = ShadeOptions(limits=(0.0, 2 * RADIUS), relief=0.0)
+    half = torch.from_numpy(COLOR_MAPS["magma"][127:129]).mean(0)
+    rgb = shade(seen, "error", camera=camera, reference=tree, options=options)
+    torch.testing.assert_close(rgb, half.expand_as(rgb), atol=1e-3, rtol=0)
+    given = shade(seen, "error", camera=camera, values=torch.zeros_like(values), options=options)
+    torch.testing.assert_close(given, torch.from_numpy(COLOR_MAPS["magma"][-1]).expand_as(given))
+    assert value_limits(values, "error", ShadeOptions()) == pytest.approx((0, RADIUS), abs=1e-5)
+
+
+def test_curvature_is_white_on_a_plane_red_on_a_ball_and_blue_in_a_bowl():
+    camera = camera_at()
+    seen = ball(camera)
+    limits = ShadeOptions(limits=(-4.0, 4.0), relief=0.0)
+    table = torch.from_numpy(COLOR_MAPS["diverging"])
+    for field, expected in ((Sphere(radius=RADIUS), table[192]), (Plane(), table[128])):
+        rgb = shade(seen, "curvature", camera=camera, field=field, options=limits)
+        torch.testing.assert_close(rgb, expected.expand_as(rgb), atol=0.02, rtol=0)
+    low, high = value_limits(torch.tensor([-1.0, 3.0, 0.5]), "curvature", ShadeOptions(quantile=1.0))
+    assert (low, high) == (-3, 3)
+    assert table[0, 2] > table[0, 0]  # hollows are blue
+    assert table[-1, 0] > table[-1, 2]
+
+
+def test_limits_hold_the_share_of_the_values_that_they_should():
+    values = torch.arange(1000.0)
+    assert value_limits(values, "error", ShadeOptions(quantile=0.9)) == (0, 899)
+    assert value_limits(values, "curvature", ShadeOptions(quantile=0.5)) == (-499, 499)
+    assert value_limits(values, "depth", ShadeOptions()) == (0, 999)
+    assert value_limits(values, "depth", ShadeOptions(limits=(2, 5))) == (2, 5)
+
+
+def test_maps_are_linear_between_their_entries_and_clamped():
+    table = np.array([[0, 0, 0], [1, 0, 0.5], [1, 1, 1]], np.float32)
+    found = map_colors(torch.tensor([-5.0, 1.0, 1.5, 2.0, 2.5, 3.0, 9.0]), (1.0, 3.0), table)
+    expected = [[0, 0, 0], [0, 0, 0], [0.5, 0, 0.25], [1, 0, 0.5], [1, 0.5, 0.75], [1, 1, 1], [1, 1, 1]]
+    torch.testing.assert_close(found, torch.tensor(expected))
+    backwards = map_colors(torch.tensor([3.0, 1.0]), (3.0, 1.0), table)
+    torch.testing.assert_close(backwards, torch.tensor([[0.0, 0, 0], [1, 1, 1]]))
+    assert map_colors(torch.ones(4), (1.0, 1.0), table).isfinite().all()
+
+
+def test_a_matcap_gives_every_normal_its_own_texel(tmp_path):
+    size = 200
+    at = (np.arange(size) + 0.5) / size
+    image = np.zeros((size, size, 3))
+    image[..., 0], image[..., 1] = at[None, :], at[:, None]  # red grows to the right, green downwards
+    path = tmp_path / "ramp.png"
+    iio.imwrite(path, (image * 255).round().astype(np.uint8))
+    camera = camera_at()
+    seen = ball(camera)
+    rgb = shade(seen, "matcap", camera=camera, options=ShadeOptions(matcap=str(path)))
+    middle = nearest_row(seen, SIZE // 2, SIZE // 2)
+    torch.testing.assert_close(rgb[middle, :2], torch.tensor([0.5, 0.5]), atol=0.05, rtol=0)
+    torch.testing.assert_close(rgb[:, 0], 0.5 + 0.5 * seen.normal[:, 0], atol=0.08, rtol=0)
+    torch.testing.assert_close(rgb[:, 1], 0.5 - 0.5 * seen.normal[:, 1], atol=0.08, rtol=0)
+    normals = torch.tensor([[0.6, 0.0, 0.8], [0.0, -0.28, 0.96], [1.0, 0.0, 0.0], [0.6, 0.0, -0.8]])
+    found = sample_matcap(load_matcap(path), normals)[:, :2]
+    expected = torch.tensor([[0.8, 0.5], [0.5, 0.64], [0.995, 0.5], [0.995, 0.5]])
+    torch.testing.assert_close(found, expected, atol=0.004, rtol=0)
+
+
+def test_built_in_matcaps_are_lit_from_above_left():
+    for name in MATCAPS:
+        matcap = load_matcap(name)
+        assert matcap.shape[2] == 3
+        assert ((matcap >= 0) & (matcap <= 1)).all()
+        n = 0.55
+        upper, lower = sample_matcap(matcap, torch.tensor([[-n, n, 0.63], [n, -n, 0.63]])).mean(1)
+        assert upper > lower + 0.15
+
+
+def test_matcaps_that_cannot_be_read(tmp_path):
+    with pytest.raises(InputError, match=r"nowhere\.png: no such file; .*chrome"):
+        load_matcap(tmp_path / "nowhere.png")
+    for content in (b"", b"not an image"):
+        (tmp_path / "bad.png").write_bytes(content)
+        with pytest.raises(InputError, match=r"bad\.png: cannot be read"):
+            load_matcap(tmp_path / "bad.png")
+
+
+def test_what_a_shading_lacks_is_named():
+    camera = camera_at()
+    seen = ball(camera)
+    for shading, lacks in (("curvature", "field"), ("error", "reference"), ("color", "no colours")):
+        with pytest.raises(ValueError, match=lacks):
+            shade(seen, shading, camera=camera)
+    for options in (ShadeOptions(shadows=True), ShadeOptions(occlusion=True)):
+        with pytest.raises(ValueError, match="field"):
+            shade(seen, "lambert", camera=camera, options=options)
+    with pytest.raises(ValueError, match=r"'toon'.*lambert"):
+        shade(seen, "toon", camera=camera)
+    with pytest.raises(ValueError, match="depth"):
+        measure(seen, "lambert")
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"softness": 0.0},
+        {"reach": -1.0},
+        {"detail": 0.0},
+        {"clay": (0.5, 2.0, 0.0)},
+        {"limits": (1.0, 1.0)},
+        {"quantile": 0.0},
+        {"relief": 1.5},
+    ],
+)
+def test_options_out_of_range_are_refused(wrong):
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        ShadeOptions(**wrong)
+
+
+def test_backs_are_tinted_only_where_asked():
+    camera = camera_at()
+    seen = ball(camera)
+    turned = dataclasses.replace(seen, normal=-seen.normal)
+    front = shade(seen, "lambert", camera=camera)
+    torch.testing.assert_close(shade(turned, "lambert", camera=camera), front)
+    tinted = ShadeOptions(back_faces=True)
+    torch.testing.assert_close(shade(seen, "lambert", camera=camera, options=tinted), front)
+    back = shade(turned, "lambert", camera=camera, options=tinted)
+    assert ((back[:, 0] - back[:, 2]) > (front[:, 0] - front[:, 2]) + 0.05).float().mean() > 0.9
+
+
+def test_compose_puts_each_colour_at_its_pixel():
+    seen = ball(camera_at())
+    seen = dataclasses.replace(seen, size=(5, 3), pixel=torch.tensor([0, 7, 14]))
+    rgb = torch.tensor([[1.0, 0, 0], [0, 1, 0], [0, 0, 0.5]])
+    image = compose(seen, rgb, background=(1.0, 0.5, 0.0))
+    assert image.shape == (3, 5, 3)
+    assert image.dtype == np.uint8
+    assert image[0, 0].tolist() == [255, 0, 0]
+    assert image[1, 2].tolist() == [0, 255, 0]
+    assert image[2, 4].tolist() == [0, 0, 128]
+    assert (image.reshape(-1, 3)[[1, 6, 13]] == [255, 128, 0]).all()
+    clear = compose(seen, rgb, background=None)
+    assert clear.shape == (3, 5, 4)
+    assert clear[..., 3].sum() == 3 * 255
+    assert clear[1, 2].tolist() == [0, 255, 0, 255]
+
+
+def test_downsampling_a_transparent_image_and_pasting_it_is_the_other_way_round_too():
+    rng = np.random.default_rng(0)
+    color = rng.integers(0, 256, (24, 36, 3), dtype=np.uint8)
+    alpha = np.where(rng.random((24, 36, 1)) < 0.5, 255, 0).astype(np.uint8)
+    paper = np.array([255, 128, 0], np.uint8)
+    small = downsample(np.concatenate((color, alpha), -1), 4).astype(float)
+    assert small.shape == (6, 9, 4)
+    share = small[..., 3:] / 255
+    pasted = small[..., :3] * share + paper * (1 - share)
+    expected = downsample(np.where(alpha > 0, color, paper), 4)
+    assert np.abs(pasted - expected).max() <= 1.5
+    hidden = np.concatenate((color, np.zeros_like(alpha)), -1)
+    assert not downsample(hidden, 2)[..., 3].any()
+    assert downsample(color, 1) is color
+    with pytest.raises(ValueError, match="factor=5"):
+        downsample(color, 5)
+
+
+def test_the_names_are_known_without_torch():
+    code = "import sys, mplicits.pipelines.shading_names; assert not {'torch', 'numpy', 'cv2'} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True)
