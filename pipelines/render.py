@@ -1,0 +1,94 @@
+"""From a field and a camera to what every pixel sees: the coarse-to-fine trace, then one jet for each pixel."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from ..datasets.cameras import Camera
+from ..neural_fields import Field, Hits, cone_starts, sphere_trace
+from ..neural_fields.tracing import BOUNDING_RADIUS
+from .seen import Seen
+
+__all__ = ["pixel_size", "trace_hits", "trace_view"]
+
+# A trace ends within this share of a pixel; the jet's Newton step, which costs nothing, then leaves about its square.
+TOLERANCE = 0.1
+# Two crossings within this share of a pixel may be overlooked.
+RESOLUTION = 0.75
+# Below this slope along the ray a Newton step is not to be trusted: the surface may turn away before it arrives.
+SHALLOW = 0.05
+# A camera in the shape looks at things at least this far away, in the field's units.
+NEAREST = 0.05
+
+
+@torch.inference_mode()
+def trace_view(
+    field: Field,
+    camera: Camera,
+    *,
+    level: int = -1,
+    normal_level: int | None = None,
+    budget: Sequence[int] | None = None,
+    device: torch.device | str = "cpu",
+) -> Seen:
+    """What the pixels of a camera see of a level of a field.
+
+    The jet that gives the normal also gives the value at the hit, so the position takes one more Newton step along the
+    ray. With a finer ``normal_level`` the gradient is that level's instead (neural normal mapping, paper Sec. 3):
+    details of the fine level for the price of one evaluation, on the silhouette of the coarse one.
+
+    Args:
+        field: three-dimensional, on ``device``.
+        camera: in the field's coordinates.
+        level: whose surface is seen.
+        normal_level: whose gradient is the normal; by default ``level``.
+        budget: steps on each level, for the paper's fixed mode; by default the adaptive one (see `sphere_trace`).
+        device: where to work, and where the result is.
+
+    Raises:
+        ValueError: there is no such level, or the field is not three-dimensional.
+    """
+    level = field.resolve_level(level)
+    normal_level = level if normal_level is None else field.resolve_level(normal_level)
+    eye, directions = camera.rays(device=device)
+    hits = trace_hits(field, camera, eye, directions, level=level, budget=budget)
+    pixel = hits.mask.flatten().nonzero()[:, 0]
+    depth, direction = hits.depth.flatten()[pixel], directions.reshape(-1, 3)[pixel]
+    position = hits.position.reshape(-1, 3)[pixel]
+    jet = field.jet(position, level=normal_level)
+    if normal_level == level:
+        slope = (jet.gradient * direction).sum(dim=-1)
+        trusted = slope.abs() > SHALLOW * jet.gradient.norm(dim=-1)
+        reach = pixel_size(camera)
+        step = torch.where(trusted, -jet.value / slope, 0).clamp(-reach, reach)
+        depth, position = depth + step, torch.addcmul(position, step[:, None], direction)
+    return Seen((camera.width, camera.height), pixel, depth, position, normalize(jet.gradient, dim=-1), direction)
+
+
+def trace_hits(
+    field: Field,
+    camera: Camera,
+    eye: Tensor,
+    directions: Tensor,
+    *,
+    level: int,
+    budget: Sequence[int] | None = None,
+) -> Hits:
+    """Trace the rays ``(H, W, 3)`` of a camera to a tenth of a pixel, tiles of them first."""
+    if budget is not None:
+        return sphere_trace(field, eye, directions, level=level, budget=budget)
+    size = pixel_size(camera)
+    near = cone_starts(field, eye, directions, level=level)
+    return sphere_trace(
+        field, eye, directions, level=level, near=near, tolerance=TOLERANCE * size, resolution=RESOLUTION * size
+    )
+
+
+def pixel_size(camera: Camera) -> float:
+    """Width of a pixel at the near side of the ball that holds the surface, in the field's units."""
+    distance = max(float(camera.eye.norm()) - BOUNDING_RADIUS, NEAREST)
+    return distance / max(float(camera.intrinsics[0, 0]), float(camera.intrinsics[1, 1]))
