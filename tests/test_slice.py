@@ -25,7 +25,9 @@ from mplicits.neural_fields import (
 from mplicits.pipelines.slice import (
     FINEST,
     INSIDE,
+    LINE,
     OUTSIDE,
+    TINT,
     ZERO_LINE,
     draw_slice,
     level_color,
@@ -148,6 +150,11 @@ def test_lines_are_as_wide_at_any_gradient(tilt):
     paper = 255 * np.where(np.arange(640)[:, None] < 320, INSIDE[0], OUTSIDE[0])
     cover = ((paper - row) / (paper - INK)).mean(axis=1)[316:324]
     assert cover.sum() == pytest.approx(ZERO_LINE, abs=0.2)  # as wide as it says, in a picture 640 pixels high
+    # So is the first iso-line outside, 128 pixels from the middle, whatever the gradient.
+    at = round(319.5 + 128)
+    cover = ((row[at - 6] + row[at + 6]) / 2 - row[at - 5 : at + 6]).sum(axis=0)
+    strength = 0.26 * (row[at - 6] - 255 * 0.45 * np.array(OUTSIDE[1]))
+    np.testing.assert_allclose(cover / strength, LINE, atol=0.15)
     # Iso-lines stand at multiples of the step: 0.2 is 128 pixels from the middle of 640 pixels for 1.
     notch = np.convolve(row.sum(axis=1), [0.5, -1, 0.5], mode="same")
     lines = np.flatnonzero(notch[2:-2] > 6) + 2
@@ -186,9 +193,24 @@ def test_each_level_has_its_own_line_and_an_inner_band_ends_with_the_outer_one()
     # Level 1 is f_0 + 0.04 within 0.2 of the sphere, so its band is |r − 0.46| < 0.1.
     inner = taken.bands[1][200, 200:].nonzero()[0] * 0.005
     assert (inner[0], inner[-1]) == pytest.approx((0.36, 0.56), abs=0.006)
+    plain = draw_slice(taken, iso_step=0.5, bands=False)[200, 200:].astype(float)
+    for radius, colors in ((0.33, [0]), (0.42, [0, 1]), (0.65, [0]), (0.75, []), (0.2, [])):
+        tinted = plain[round(radius / 0.005)]
+        for index in colors:
+            tinted = tinted + TINT * (255 * np.array(level_color(index)) - tinted)
+        np.testing.assert_allclose(at(radius), tinted, atol=1.5)
     coarse = draw_slice(take_slice(field, **view, level=0), iso_step=0.5)
     assert not is_ink(coarse).any()  # the finest level's colour is kept for it
     assert is_ink(coarse, level_color(0)).any()
+
+
+def test_a_band_wider_than_the_one_before_it_ends_with_that_one():
+    field = MultiscaleSDF(Sphere(radius=0.5), [_Constant(0.0), _Constant(0.0)], [0.1, 0.3])
+    taken = take_slice(field, **ACROSS_Z, half_size=1.0, size=(200, 200))
+    np.testing.assert_array_equal(taken.bands[1], taken.bands[0])
+    with_bands, without = (draw_slice(taken, iso_step=0.5, bands=bands) for bands in (True, False))
+    changed = (with_bands != without).any(axis=2)
+    assert not changed[np.abs(taken.levels[0]) > 0.12].any()
 
 
 class _Constant(Sphere):
@@ -293,7 +315,9 @@ def differing(picture: np.ndarray, expected: np.ndarray) -> int:
 def test_a_plane_in_input_coordinates_is_the_right_one(run, options, axis, height):
     size = 128
     options = SliceOptions(**{**vars(options), "size": (size, size), "bands": False})
-    slice_run(run, run / "slice.png", options)
+    done = slice_run(run, run / "slice.png", options)
+    place = float(done.split(" = ")[1].split(",")[0].replace("−", "-"))
+    assert place == pytest.approx(SIMILARITY.center[axis] + 7 * (CENTER[axis] + height), abs=0.01)
     picture = iio.imread(run / "slice.png")[:size]
     normal = np.eye(3)[axis]
     u, v = plane_axes(normal)
@@ -303,7 +327,7 @@ def test_a_plane_in_input_coordinates_is_the_right_one(run, options, axis, heigh
 
 
 def test_an_oblique_plane_and_a_zoom_show_the_place_that_was_named(run):
-    normal, point = np.array((1.0, 1.0, 0.5)), CENTER + np.array((0.1, 0.2, 0.1))
+    normal, point = np.array((1.0, 1.0, 0.5)), CENTER + np.array((0.5, 0.3, 0.2))
     slice_run(
         run,
         run / "slice.png",
@@ -322,6 +346,7 @@ def test_an_oblique_plane_and_a_zoom_show_the_place_that_was_named(run):
     half = max(np.ptp(shape @ u), np.ptp(shape @ v)) / 2
     picture = iio.imread(run / "slice.png")[:128]
     expected = expected_inside(1.16 * half / 4, 128, u=u, v=v, origin=point)
+    assert 0.2 < expected.mean() < 0.8
     assert differing(picture, expected) <= 20  # the half size is known to a hundredth
 
 
