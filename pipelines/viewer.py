@@ -1,0 +1,184 @@
+"""``mplicits view``: a field in the browser, traced while one looks at it."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import io
+import math
+import socket
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from ..datasets.cameras import UP_AXES
+from ..neural_fields import Field, InputError, Similarity, load_field
+from .runs import find_field
+from .viewer_camera import first_eye
+from .viewer_client import Client, Shown
+from .viewer_draw import Painter
+from .viewer_frames import Frame, FrameScheduler
+from .viewer_shapes import Shapes
+
+__all__ = ["FIRST_PORT", "Viewer", "open_run"]
+
+FIRST_PORT = 8080
+PORTS = 100
+FOV = math.radians(30)
+
+
+class Viewer:
+    """A running viewer; `close` it, or use it as a context manager.
+
+    Args:
+        shown: what to show.
+        host: the address to listen on.
+        port: the port, or None for the first free one from 8080 upwards.
+        up: the axis that points up, "y" or "z".
+
+    Raises:
+        InputError: viser is not installed, or the address or the port cannot be had.
+    """
+
+    def __init__(self, shown: Shown, *, host: str = "127.0.0.1", port: int | None = None, up: str = "y") -> None:
+        viser = _import_viser()
+        port = _free_port(host, port)
+        self._clients: dict[int, Client] = {}
+        self._lock = threading.Lock()
+        self._shapes = shown.shapes
+        self._scheduler = FrameScheduler(shown.painter, self._deliver, self._fail)
+        with _silent():
+            self._server: Any = viser.ViserServer(host=host, port=port, label=shown.name, verbose=False)
+        self._server.gui.configure_theme(show_logo=False, show_share_button=False)
+        self._server.scene.set_up_direction(UP_AXES[up])
+        camera = self._server.initial_camera
+        camera.position, camera.look_at, camera.fov = first_eye(up, FOV), (0.0, 0.0, 0.0), FOV
+        camera.up = UP_AXES[up]
+        self.url = f"http://{_in_url(host)}:{self._server.get_port()}"
+
+        @self._server.on_client_connect
+        def _(handle: Any) -> None:
+            client = Client(handle, shown, self._scheduler)
+            with self._lock:
+                self._clients[handle.client_id] = client
+            if handle.client_id not in self._server.get_clients():
+                self._leave(handle.client_id)  # gone before it was here
+
+        @self._server.on_client_disconnect
+        def _(handle: Any) -> None:
+            self._leave(handle.client_id)
+
+    def close(self) -> None:
+        """Stop drawing and serving."""
+        for client in list(self._clients):
+            self._leave(client)
+        self._shapes.close()
+        self._scheduler.close()
+        with _silent():
+            self._server.stop()
+
+    def __enter__(self) -> Viewer:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _leave(self, name: int) -> None:
+        with self._lock:
+            client = self._clients.pop(name, None)
+        if client is not None:
+            client.leave()
+
+    def _deliver(self, name: int, frame: Frame) -> None:
+        client = self._clients.get(name)
+        if client is not None:
+            client.show(frame)
+
+    def _fail(self, name: int, error: Exception) -> None:
+        client = self._clients.get(name)
+        if client is not None:
+            client.fail(error)
+
+
+def open_run(run: str | Path, *, side: int = 512, device: torch.device | str = "cpu") -> Shown:
+    """Load what is to be shown.
+
+    Args:
+        run: run directory or .safetensors file.
+        side: images have about ``side``² pixels.
+        device: where to evaluate the field.
+
+    Raises:
+        InputError: there is no such run, or its field is not three-dimensional.
+    """
+    path = find_field(run)
+    field, similarity, metadata = load_field(path, device=device)
+    if field.in_dim != 3:
+        raise InputError(f"{path}: a field in {field.in_dim} dimensions; the viewer shows fields in 3")
+    source = metadata.get("run", {}).get("cloud")
+    cloud = Path(source) if source and Path(source).is_file() else None
+    name = Path(run).resolve().stem if Path(run).is_dir() else path.stem
+    return show_field(field, name=name, similarity=similarity, cloud=cloud, side=side)
+
+
+def show_field(
+    field: Field,
+    *,
+    name: str = "field",
+    similarity: Similarity | None = None,
+    cloud: Path | None = None,
+    side: int = 512,
+) -> Shown:
+    """What a `Viewer` needs to show any three-dimensional field, such as one in a script."""
+    similarity = similarity or Similarity.identity()
+    shapes = Shapes(field, similarity, cloud=cloud)
+    return Shown(name, field, similarity, shapes, Painter(field, shapes.cloud), side)
+
+
+def _import_viser() -> Any:
+    try:
+        import viser
+    except ModuleNotFoundError as error:
+        raise InputError("the viewer needs viser; pip install mplicits[view]") from error
+    return viser
+
+
+def _free_port(host: str, port: int | None) -> int:
+    """A port that can be listened on; viser itself would silently take another one, or wait for ever."""
+    for candidate in range(FIRST_PORT, FIRST_PORT + PORTS) if port is None else (port,):
+        try:
+            family, kind, protocol, _, address = socket.getaddrinfo(
+                host, candidate, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+            )[0]
+            with socket.socket(family, kind, protocol) as attempt:
+                attempt.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                attempt.bind(address)
+        except OSError as error:
+            if error.errno == errno.EADDRINUSE and port is None:
+                continue
+            if error.errno == errno.EADDRINUSE:
+                raise InputError(f"--port {port}: is in use; leave out --port to take a free one") from error
+            if error.errno == errno.EACCES:
+                raise InputError(f"--port {port}: may not be used; take one above 1023") from error
+            raise InputError(
+                f"--host {host}: cannot listen there ({error.strerror or error}); try 127.0.0.1"
+            ) from error
+        return candidate
+    raise InputError(f"no port from {FIRST_PORT} to {FIRST_PORT + PORTS - 1} is free; name one with --port")
+
+
+def _in_url(host: str) -> str:
+    """An address that a browser on this machine can open."""
+    if host in ("0.0.0.0", "::", ""):
+        return "127.0.0.1"
+    return f"[{host}]" if ":" in host else host
+
+
+@contextlib.contextmanager
+def _silent() -> Iterator[None]:
+    """Keep viser's own banner off the terminal; ours names the address."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        yield

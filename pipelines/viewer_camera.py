@@ -1,0 +1,98 @@
+"""What the viewer computes about cameras and images, apart from any browser."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ..datasets.cameras import Camera, orbit, pinhole_intrinsics
+from .seen import Seen
+
+__all__ = ["first_eye", "image_size", "merge_strips", "strips", "viser_camera", "z_buffer"]
+
+
+def viser_camera(
+    wxyz: Sequence[float] | NDArray[np.floating],
+    position: Sequence[float] | NDArray[np.floating],
+    fov: float,
+    size: tuple[int, int],
+) -> Camera:
+    """The camera that viser describes; both sides look along +z with y down.
+
+    Args:
+        wxyz: ``(4,)`` quaternion of the rotation from camera to world, of any length but 0.
+        position: ``(3,)`` of the eye.
+        fov: full vertical angle of view, radians.
+        size: width and height of the image.
+    """
+    width, height = size
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3] = torch.from_numpy(_rotation(np.asarray(wxyz, np.float64)))
+    pose[:3, 3] = torch.from_numpy(np.array(position, np.float64))
+    return Camera(pinhole_intrinsics(math.degrees(fov), width, height), pose, width, height)
+
+
+def _rotation(wxyz: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The matrix ``(3, 3)`` of a quaternion: (w² − |v|²) 1 + 2 v vᵀ + 2 w [v]ₓ."""
+    w, *v = wxyz / np.linalg.norm(wxyz)
+    x, y, z = v
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return (w * w - np.dot(v, v)) * np.eye(3) + 2 * np.outer(v, v) + 2 * w * cross
+
+
+def image_size(side: int, canvas: tuple[int, int]) -> tuple[int, int]:
+    """An image of about ``side``² pixels in the shape of the canvas, and no larger than it.
+
+    viser interpolates depths when it enlarges an image, but averages their bytes one by one when it has to
+    make one smaller, which gives wrong depths; hence never larger than the canvas.
+    """
+    width, height = (max(number, 1) for number in canvas)
+    factor = min(1.0, side / math.sqrt(width * height))
+    return max(1, round(width * factor)), max(1, round(height * factor))
+
+
+def strips(camera: Camera, pixels: int) -> Iterator[tuple[int, Camera]]:
+    """Cut a camera into strips of whole rows, of about ``pixels`` pixels each: first row, camera of the strip."""
+    rows = max(1, pixels // camera.width)
+    for first in range(0, camera.height, rows):
+        intrinsics = camera.intrinsics.clone()
+        intrinsics[1, 2] -= first
+        yield first, Camera(intrinsics, camera.world_from_camera, camera.width, min(rows, camera.height - first))
+
+
+def merge_strips(size: tuple[int, int], parts: Sequence[tuple[int, Seen]]) -> Seen:
+    """What the whole image sees, from what its strips see and the row that each begins at."""
+    colors = [part.color for _, part in parts if part.color is not None]
+    return Seen(
+        size=size,
+        pixel=torch.cat([part.pixel + first * size[0] for first, part in parts]),
+        depth=torch.cat([part.depth for _, part in parts]),
+        position=torch.cat([part.position for _, part in parts]),
+        normal=torch.cat([part.normal for _, part in parts]),
+        direction=torch.cat([part.direction for _, part in parts]),
+        color=torch.cat(colors) if len(colors) == len(parts) else None,
+    )
+
+
+def z_buffer(seen: Seen, camera: Camera) -> NDArray[np.float32]:
+    """Distance from the plane of the eye ``(H, W)``, which is not the distance along the ray; ∞ where nothing is."""
+    forward = camera.forward.to(seen.direction)
+    z = torch.full((seen.size[0] * seen.size[1],), torch.inf, dtype=torch.float32, device=seen.depth.device)
+    z[seen.pixel] = (seen.depth * (seen.direction @ forward)).to(z.dtype)
+    return z.reshape(seen.size[1], seen.size[0]).cpu().numpy()
+
+
+def first_eye(up: str, fov: float) -> tuple[float, float, float]:
+    """Where a camera stands that has all of the unit sphere in view, a little to the right of its front and above.
+
+    Args:
+        up: "y" or "z".
+        fov: full angle of view, radians.
+    """
+    towards = orbit(torch.eye(3, dtype=torch.float64), up=up).forward
+    x, y, z = (-towards / math.sin(fov / 2)).tolist()
+    return x, y, z

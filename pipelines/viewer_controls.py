@@ -1,0 +1,127 @@
+"""The viewer's panel: which controls there are, and what they say now."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from .viewer_frames import Look
+
+__all__ = ["SURFACES", "Controls"]
+
+TRACED, MESH, BOTH, NOTHING = SURFACES = ("traced", "mesh", "traced and wires", "hidden")
+NO_BAND = "none"
+SAME = "same level"
+AXES = ("x", "y", "z")
+NOTHING_READ = "Click on the surface, or on the slice plane."
+
+
+class Controls:
+    """The controls of one browser; every property says what its control shows now.
+
+    Args:
+        gui: viser's interface to the panel of that browser.
+        levels: number of levels of the field.
+        shadings: the names to choose from, the first one first shown.
+        has_cloud: whether there is a cloud to be shown.
+    """
+
+    def __init__(self, gui: Any, *, levels: int, shadings: Sequence[str], has_cloud: bool) -> None:
+        self._levels = levels
+        names = [str(level) for level in range(levels)]
+        with gui.add_folder("Surface"):
+            self._surface = gui.add_dropdown("Show", SURFACES, hint="wires and meshes are extracted once per level")
+            self._shading = gui.add_dropdown("Shading", tuple(shadings))
+            self._shadows = gui.add_checkbox("Shadows", False, hint="for lambert; traced in the coarsest level")
+            self._occlusion = gui.add_checkbox("Occlusion", False, hint="for lambert; darker hollows")
+            self._level = gui.add_dropdown(
+                "Level", names, initial_value=names[-1], hint="0 is the coarsest", visible=levels > 1
+            )
+            self._normals = gui.add_dropdown(
+                "Normals of",
+                (SAME, *names[1:]),
+                hint="neural normal mapping: normals of a finer level on a coarser surface",
+                visible=levels > 1,
+            )
+        with gui.add_folder("Beside it"):
+            self._cloud = gui.add_checkbox("Input cloud", False, visible=has_cloud)
+            self._band = gui.add_dropdown(
+                "Band", (NO_BAND, *names[:-1]), hint="shells |f| = δ of a level", visible=levels > 1
+            )
+            self._slice = gui.add_checkbox("Slice plane", False, hint="choose Show: hidden to see all of it")
+            self._axis = gui.add_dropdown("Slice across", AXES)
+            self._position = gui.add_slider("Slice at", min=-1.0, max=1.0, step=0.01, initial_value=0.0)
+        with gui.add_folder("Under the pointer"):
+            self._reading = gui.add_markdown(NOTHING_READ)
+        with gui.add_folder("Picture"):
+            self._width = gui.add_number(
+                "Width", 1600, min=16, max=8192, step=1, hint="pixels; the view's shape is kept"
+            )
+            self._transparent = gui.add_checkbox("Transparent", False)
+            self._save = gui.add_button("Save picture", hint="the traced surface as a PNG, at this width")
+            self._screenshot = gui.add_button(
+                "Save screenshot", hint="all that is in the scene, as it is on the screen"
+            )
+        self._status = gui.add_markdown("")
+
+    def on_change(self, look: Callable[[], None], scene: Callable[[], None]) -> None:
+        """Call ``look`` when the traced image has to be drawn anew, ``scene`` when what stands beside it changes."""
+        for control in (self._surface, self._shading, self._shadows, self._occlusion, self._level, self._normals):
+            control.on_update(lambda _event: look())
+        for control in (self._surface, self._level, self._cloud, self._band, self._slice, self._axis, self._position):
+            control.on_update(lambda _event: scene())
+
+    def on_save(self, picture: Callable[[], None], screenshot: Callable[[], None]) -> None:
+        """Call these when their buttons are pressed."""
+        self._save.on_click(lambda _event: picture())
+        self._screenshot.on_click(lambda _event: screenshot())
+
+    @property
+    def look(self) -> Look:
+        """How the field is drawn; normals come from no coarser level than the surface."""
+        normals = self.level if self._normals.value == SAME else max(self.level, int(self._normals.value))
+        return Look(self.level, normals, self._shading.value, self._shadows.value, self._occlusion.value)
+
+    @property
+    def level(self) -> int:
+        """The level shown."""
+        return int(self._level.value)
+
+    @property
+    def is_traced(self) -> bool:
+        """Whether the traced image is shown."""
+        return self._surface.value in (TRACED, BOTH)
+
+    @property
+    def mesh(self) -> tuple[int, bool] | None:
+        """The level whose mesh is shown and whether as wires; None where none is."""
+        return (self.level, self._surface.value == BOTH) if self._surface.value in (MESH, BOTH) else None
+
+    @property
+    def cloud(self) -> bool:
+        """Whether the input is shown."""
+        return bool(self._cloud.value)
+
+    @property
+    def band(self) -> int | None:
+        """The level whose band is shown, if one is."""
+        return None if self._band.value == NO_BAND else int(self._band.value)
+
+    @property
+    def slice(self) -> tuple[int, float] | None:
+        """Axis (0, 1, 2) and position of the slice plane, if it is shown."""
+        return (AXES.index(self._axis.value), float(self._position.value)) if self._slice.value else None
+
+    @property
+    def picture(self) -> tuple[int, bool]:
+        """Width of the picture to be saved, and whether without a background."""
+        return int(self._width.value), bool(self._transparent.value)
+
+    def read(self, text: str) -> None:
+        """Show what is under the pointer, in Markdown."""
+        self._reading.content = text
+
+    def say(self, text: str) -> None:
+        """Show a line at the end of the panel."""
+        if self._status.content != text:
+            self._status.content = text

@@ -1,0 +1,101 @@
+"""The traced image of a field, in pieces small enough to stop between them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import cached_property
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from ..datasets.cameras import Camera
+from ..neural_fields import Field
+from .matcap import load_matcap
+from .render import trace_view
+from .seen import Seen
+from .shading import ShadeOptions, compose, measure, shade
+from .viewer_camera import merge_strips, strips, z_buffer
+from .viewer_frames import Look
+
+__all__ = ["Painter"]
+
+WHITE = (1.0, 1.0, 1.0)
+# Pixels between two looks at whether anybody still waits: tens of milliseconds of work.
+BLOCK = 1 << 15
+# Shadings that map numbers to colours, whose limits depend on all pixels together.
+MEASURED = ("depth", "curvature", "error")
+
+
+class Painter:
+    """Draws a field.
+
+    Args:
+        field: what to draw.
+        reference: loads the cloud ``(N, 3)`` that "error" measures from, when it is first needed.
+    """
+
+    def __init__(self, field: Field, reference: Callable[[], NDArray[np.float32]]) -> None:
+        self._field, self._load_reference = field, reference
+
+    def __call__(
+        self, camera: Camera, look: Look, check: Callable[[], None]
+    ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+        """An image on white ``(H, W, 3)``, and the distance of what it shows from the plane of the eye ``(H, W)``."""
+        seen, rgb = self._paint(camera, look, check)
+        return compose(seen, rgb, background=WHITE), z_buffer(seen, camera)
+
+    def picture(self, camera: Camera, look: Look, check: Callable[[], None], *, transparent: bool) -> NDArray[np.uint8]:
+        """An image to keep ``(H, W, 3 or 4)``."""
+        return compose(*self._paint(camera, look, check), background=None if transparent else WHITE)
+
+    @torch.no_grad()
+    def _paint(self, camera: Camera, look: Look, check: Callable[[], None]) -> tuple[Seen, Tensor]:
+        parts = []
+        for first, strip in strips(camera, BLOCK):
+            check()
+            parts.append((first, trace_view(self._field, strip, level=look.level, normal_level=look.normal_level)))
+        seen = merge_strips((camera.width, camera.height), parts)
+        if look.shading in MEASURED:
+            numbers = [
+                measure(part, look.shading, field=self._field, level=look.normal_level, reference=self._reference(look))
+                for part in _pieces(seen, check)
+            ]
+            return seen, shade(seen, look.shading, camera=camera, values=torch.cat(numbers))
+        # Shadows and occlusion look further than a band is wide, and a coarse level answers that as well and sooner.
+        options = ShadeOptions(shadows=look.shadows, occlusion=look.occlusion, light_level=0)
+        colors = [
+            shade(part, look.shading, camera=camera, field=self._field, options=options, matcap=self._matcap)
+            for part in _pieces(seen, check)
+        ]
+        return seen, torch.cat(colors)
+
+    def _reference(self, look: Look) -> KDTree | None:
+        return self._tree if look.shading == "error" else None
+
+    @cached_property
+    def _tree(self) -> KDTree:
+        return KDTree(self._load_reference())
+
+    @cached_property
+    def _matcap(self) -> Tensor:
+        return load_matcap(ShadeOptions().matcap)
+
+
+def _pieces(seen: Seen, check: Callable[[], None]) -> Iterator[Seen]:
+    """Rows of what is seen, a block at a time; at least one, which may be empty."""
+    for first in range(0, max(1, len(seen.pixel)), BLOCK):
+        check()
+        part = slice(first, first + BLOCK)
+        yield replace(
+            seen,
+            pixel=seen.pixel[part],
+            depth=seen.depth[part],
+            position=seen.position[part],
+            normal=seen.normal[part],
+            direction=seen.direction[part],
+            color=None if seen.color is None else seen.color[part],
+        )

@@ -1,0 +1,159 @@
+"""The meshes and points that the viewer shows beside the traced image, made when they are first asked for."""
+
+from __future__ import annotations
+
+import math
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from ..datasets import read_cloud
+from ..neural_fields import Field, InputError, Jet, Similarity
+from ..neural_fields.meshing import Mesh, NoSurfaceError, extract_mesh
+from .slice import draw_slice, plane_axes, round_step, take_slice
+from .viewer_frames import Superseded
+
+__all__ = ["OffsetField", "Placement", "Shapes", "slice_image"]
+
+# Cells along the cube: an offset surface has no detail to lose, and this takes a second or two on two cores.
+MESH_RESOLUTION = 160
+SHELL_RESOLUTION = 96
+# More points than this make browsers slow, and cover the screen all the same.
+MOST_POINTS = 200_000
+ISO_STEP = 0.05
+
+
+class OffsetField(Field):
+    """One level of a field, less a constant: its zero set is where that level has the value ``offset``."""
+
+    def __init__(self, field: Field, *, level: int, offset: float) -> None:
+        super().__init__()
+        self.in_dim, self.num_levels = field.in_dim, 1
+        self.field, self.level, self.offset = field, field.resolve_level(level), float(offset)
+        self.register_buffer("deltas", torch.empty(0), persistent=False)
+
+    def value(self, x: Tensor, *, level: int = -1) -> Tensor:
+        """See `Field.value`."""
+        self.resolve_level(level)
+        return self.field.value(x, level=self.level) - self.offset
+
+    def jet(self, x: Tensor, *, level: int = -1) -> Jet:
+        """See `Field.jet`."""
+        self.resolve_level(level)
+        value, gradient, features = self.field.jet(x, level=self.level)
+        return Jet(value - self.offset, gradient, features)
+
+
+class Shapes:
+    """Meshes of a field's levels and bands, and the cloud it was fitted to, in unit-sphere coordinates.
+
+    Each is made once, in the thread that asks first; whoever asks meanwhile waits for it.
+
+    Args:
+        field: the field.
+        similarity: from input to unit-sphere coordinates.
+        cloud: the file that the field was fitted to, if it is known and still there.
+    """
+
+    def __init__(self, field: Field, similarity: Similarity, *, cloud: Path | None = None) -> None:
+        self._field, self._similarity = field, similarity
+        self._closed = threading.Event()
+        self.cloud_file = cloud
+        self._meshes: dict[tuple[int, float], Mesh | None] = {}
+        self._points: NDArray[np.float32] | None = None
+        self._lock = threading.Lock()
+
+    def surface(self, level: int) -> Mesh | None:
+        """The zero set of a level; None where it has none."""
+        return self._mesh(level, 0.0, MESH_RESOLUTION)
+
+    def shells(self, level: int) -> tuple[Mesh | None, Mesh | None]:
+        """The surfaces f_i = −δ_i and f_i = δ_i of a level but the last; where all is thin there is no inner one."""
+        delta = float(self._field.deltas[level])
+        return self._mesh(level, -delta, SHELL_RESOLUTION), self._mesh(level, delta, SHELL_RESOLUTION)
+
+    def cloud(self) -> NDArray[np.float32]:
+        """Points of the input ``(N, 3)``, at most `MOST_POINTS` of them, evenly taken.
+
+        Raises:
+            InputError: the file is not known, or cannot be read any more.
+        """
+        with self._lock:
+            if self._points is None:
+                if self.cloud_file is None:
+                    raise InputError("the cloud that the field was fitted to is not to be found")
+                points = read_cloud(self.cloud_file).points
+                points = points[np.isfinite(points).all(axis=1)]
+                step = max(1, math.ceil(len(points) / MOST_POINTS))
+                self._points = self._similarity.to_unit(points[::step]).astype(np.float32)
+            return self._points
+
+    def close(self) -> None:
+        """Give up what is being made; whoever waits for it gets a `Superseded`."""
+        self._closed.set()
+
+    def _go_on(self, *_progress: object) -> None:
+        if self._closed.is_set():
+            raise Superseded
+
+    def _mesh(self, level: int, offset: float, resolution: int) -> Mesh | None:
+        with self._lock:
+            key = (level, offset)
+            if key not in self._meshes:
+                reach = 1.02 + abs(offset)
+                try:
+                    self._meshes[key] = extract_mesh(
+                        OffsetField(self._field, level=level, offset=offset) if offset else self._field,
+                        resolution=resolution,
+                        level=0 if offset else level,
+                        bounds=((-reach, -reach, -reach), (reach, reach, reach)),
+                        normals=False,
+                        batch=1 << 15,
+                        progress=self._go_on,
+                    )
+                except NoSurfaceError:
+                    self._meshes[key] = None
+            return self._meshes[key]
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Where an image stands in the scene: its columns run along its own x axis, its rows along its own y axis.
+
+    Attributes:
+        size: width and height in the scene.
+        wxyz: ``(4,)`` quaternion of its rotation.
+        center: ``(3,)`` its middle.
+    """
+
+    size: tuple[float, float]
+    wxyz: NDArray[np.float64]
+    center: NDArray[np.float64]
+
+
+def slice_image(
+    field: Field, axis: int, position: float, *, level: int, scale: float, pixels: int = 384
+) -> tuple[NDArray[np.uint8], Placement]:
+    """The picture of a plane across an axis, and its place in the cube [−1, 1]³.
+
+    Args:
+        field: what to cut.
+        axis: 0, 1 or 2.
+        position: where on it.
+        level: the finest level drawn.
+        scale: input units per unit of the field; iso-lines are a round number of input units apart.
+        pixels: along each side.
+    """
+    normal, center = np.zeros(3), np.zeros(3)
+    normal[axis], center[axis] = 1.0, position
+    u, v = plane_axes(normal)
+    taken = take_slice(field, origin=center, u=u, v=v, half_size=1.0, size=(pixels, pixels), level=level)
+    image = draw_slice(taken, iso_step=round_step(ISO_STEP * scale) / scale)
+    quaternion = Rotation.from_matrix(np.stack((u, -v, -np.cross(u, v)), axis=1)).as_quat()
+    return image, Placement((2.0, 2.0), np.roll(quaternion, 1), center)
