@@ -88,13 +88,13 @@ def _clay(normals: Float32) -> Float32:
 
 
 def _chrome(normals: Float32) -> Float32:
-    """A mirror in a studio: bright sky, a dark horizon, a pale floor and one soft window."""
+    """A mirror in a studio: a sky that pales towards the horizon, a dark floor and one soft window."""
     mirrored = 2 * normals[..., 2:] * normals - np.array([0, 0, 1], np.float32)
     height = mirrored[..., 1:2]
-    sky = 0.30 + 0.60 * np.clip(height, 0, 1) ** 0.6
-    floor = 0.03 + 0.42 * np.clip(-height, 0, 1) ** 0.8
-    above = 1 / (1 + np.exp(-height * 24))
-    window = 1 / (1 + np.exp((0.90 - _toward(mirrored, (-0.5, 0.6, 0.62))) * 90))
+    sky = 0.22 + 0.60 * (1 - np.clip(height, 0, 1)) ** 1.5
+    floor = 0.04 + 0.40 * np.clip(-height, 0, 1) ** 1.2
+    above = 1 / (1 + np.exp(-height * 14))
+    window = 1 / (1 + np.exp((0.90 - _toward(mirrored, (-0.5, 0.6, 0.62))) * 60))
     tint = np.array([0.95, 0.98, 1.04]) * above + np.array([1.02, 1.0, 0.96]) * (1 - above)
     return _display((sky * above + floor * (1 - above)) * tint + 0.7 * window)
 

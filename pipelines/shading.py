@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -78,7 +79,7 @@ def shade(
     if shading == "lambert":
         return _lambert(seen, camera, field, level, options)
     if shading == "headlight":
-        light = 0.08 + 0.92 * _facing(seen)
+        light = 0.05 + 0.95 * _facing(seen) ** 2  # the square, because cosines alone leave shapes flat
         return _to_display(_albedo(seen, options) * light[:, None])
     if shading == "normals":
         return (seen.normal + 1) / 2
@@ -178,13 +179,14 @@ def downsample(image: Image, factor: int) -> Image:
         raise ValueError(f"factor={factor}: expected a divisor of both sides of a {width} × {height} image")
     if factor == 1:
         return image
-    blocks = image.reshape(height // factor, factor, width // factor, factor, channels)
+    size = (width // factor, height // factor)
     if channels == 3:
-        return (blocks.sum((1, 3), dtype=np.float32) / factor**2 + 0.5).astype(np.uint8)
-    alpha = blocks[..., 3:].astype(np.float32)
-    total = alpha.sum((1, 3))
-    color = (blocks[..., :3] * alpha).sum((1, 3)) / np.maximum(total, 1)
-    return (np.concatenate((color, total / factor**2), -1) + 0.5).astype(np.uint8)
+        return cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)
+    weighted = image.astype(np.float32)
+    weighted[..., :3] *= weighted[..., 3:] / 255
+    mean = cv2.resize(weighted, size, interpolation=cv2.INTER_AREA)
+    mean[..., :3] *= 255 / np.maximum(mean[..., 3:], 1e-3)
+    return (mean + 0.5).astype(np.uint8)
 
 
 def _lambert(seen: Seen, camera: Camera, field: Field | None, level: int, options: ShadeOptions) -> Tensor:

@@ -13,7 +13,7 @@ from ..neural_fields.tracing import BOUNDING_RADIUS
 
 __all__ = ["ambient_occlusion", "soft_shadow"]
 
-# Steps inside the penumbra, in radii of the cone: with 0.5 streaks show on curved surfaces, with 0.1 time is lost.
+# Steps inside the penumbra, in radii of the cone: with 0.5 streaks show on curved surfaces.
 STRIDE = 0.2
 # u below which a ray is given up as dark: v is 0.001 there, and steps only get smaller.
 DARK = 0.02
@@ -42,9 +42,9 @@ def soft_shadow(
     with s = ``softness``, or the sine of the lamp's height over the tangent plane if that is less: what lies below the
     horizon gives no light in any case, so that planes and convex shapes are never shadowed by themselves.
 
-    Steps are those of a cone of slope s that must not touch the surface, (f − s t) / (1 + s); once it does, a part of
-    its radius, so that little of the minimum is missed, but never more than f. Where a coarse level stands for finer
-    ones (f ≥ δ), the surface may be nearer by δ, so that is taken off.
+    Steps are those of a cone of slope s that must not touch the surface, (f − s t) / (1 + s); once it does, half of
+    f or a part of the cone's radius, so that little of the minimum is missed, but never more than f. Where a coarse
+    level stands for finer ones (f ≥ δ), the surface may be nearer by δ, so that is taken off.
 
     Args:
         field: a 3-D field.
@@ -81,7 +81,8 @@ def soft_shadow(
         least = torch.minimum(least, f / (slope * t))
         near = f - torch.where(f[:, None] >= slack, slack, 0).amax(1)
         step = torch.maximum((near - slope * t) / (1 + slope), STRIDE * softness * t)
-        t = t + torch.minimum(step, near).clamp(min=offset / 4)
+        step = torch.minimum(torch.maximum(step, near / 2), near)
+        t = t + step.clamp(min=offset / 4)
         going = (least > DARK) & (t < left)
         lit[rows[~going]] = _light_through(least[~going])
         kept = going.nonzero()[:, 0]
