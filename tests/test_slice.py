@@ -346,7 +346,7 @@ def test_an_oblique_plane_and_a_zoom_show_the_place_that_was_named(run):
     half = max(np.ptp(shape @ u), np.ptp(shape @ v)) / 2
     picture = iio.imread(run / "slice.png")[:128]
     expected = expected_inside(1.16 * half / 4, 128, u=u, v=v, origin=point)
-    assert 0.2 < expected.mean() < 0.8
+    assert 0.2 < expected.mean() < 0.9
     assert differing(picture, expected) <= 20  # the half size is known to a hundredth
 
 
