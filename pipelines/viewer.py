@@ -23,7 +23,7 @@ from .viewer_draw import Painter
 from .viewer_frames import Frame, FrameScheduler
 from .viewer_shapes import Shapes
 
-__all__ = ["FIRST_PORT", "Viewer", "open_run"]
+__all__ = ["FIRST_PORT", "Viewer", "free_port", "open_run", "show_field"]
 
 FIRST_PORT = 8080
 PORTS = 100
@@ -45,7 +45,8 @@ class Viewer:
 
     def __init__(self, shown: Shown, *, host: str = "127.0.0.1", port: int | None = None, up: str = "y") -> None:
         viser = _import_viser()
-        port = _free_port(host, port)
+        port = free_port(host, port)
+        shown.painter.warm_up()
         self._clients: dict[int, Client] = {}
         self._lock = threading.Lock()
         self._shapes = shown.shapes
@@ -70,6 +71,11 @@ class Viewer:
         @self._server.on_client_disconnect
         def _(handle: Any) -> None:
             self._leave(handle.client_id)
+
+    @property
+    def num_clients(self) -> int:
+        """How many browsers are connected."""
+        return len(self._clients)
 
     def close(self) -> None:
         """Stop drawing and serving."""
@@ -146,7 +152,7 @@ def _import_viser() -> Any:
     return viser
 
 
-def _free_port(host: str, port: int | None) -> int:
+def free_port(host: str, port: int | None) -> int:
     """A port that can be listened on; viser itself would silently take another one, or wait for ever."""
     for candidate in range(FIRST_PORT, FIRST_PORT + PORTS) if port is None else (port,):
         try:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from ..datasets.cameras import Camera
+from ..datasets.cameras import Camera, look_at
 from ..neural_fields import Field
 from .matcap import load_matcap
 from .render import trace_view
@@ -41,6 +41,11 @@ class Painter:
     def __init__(self, field: Field, reference: Callable[[], NDArray[np.float32]]) -> None:
         self._field, self._load_reference = field, reference
 
+    def warm_up(self) -> None:
+        """Draw a few pixels, so that the first image does not wait for what is loaded when it is first needed."""
+        camera = look_at((0.0, 0.0, 3.0), (0.0, 0.0, 0.0), width=8, height=8)
+        self(camera, Look(level=0, normal_level=0, shading="lambert"), lambda: None)
+
     def __call__(
         self, camera: Camera, look: Look, check: Callable[[], None]
     ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
@@ -52,12 +57,13 @@ class Painter:
         """An image to keep ``(H, W, 3 or 4)``."""
         return compose(*self._paint(camera, look, check), background=None if transparent else WHITE)
 
-    @torch.no_grad()
+    @torch.inference_mode()
     def _paint(self, camera: Camera, look: Look, check: Callable[[], None]) -> tuple[Seen, Tensor]:
-        parts = []
+        parts, device = [], self._field.deltas.device
         for first, strip in strips(camera, BLOCK):
             check()
-            parts.append((first, trace_view(self._field, strip, level=look.level, normal_level=look.normal_level)))
+            seen = trace_view(self._field, strip, level=look.level, normal_level=look.normal_level, device=device)
+            parts.append((first, seen))
         seen = merge_strips((camera.width, camera.height), parts)
         if look.shading in MEASURED:
             numbers = [

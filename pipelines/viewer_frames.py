@@ -113,6 +113,11 @@ class _Job:
     first: bool = True  # whether no image of it has been shown
     key: tuple[Look, int, int] = field(init=False)
 
+    @property
+    def urgency(self) -> tuple[bool, int, int]:
+        """The least comes first."""
+        return not self.first, -self.halvings, self.order
+
     def __post_init__(self) -> None:
         self.key = (self.view.look, self.view.camera.width, self.view.camera.height)
 
@@ -168,13 +173,12 @@ class FrameScheduler:
         self._thread.join(timeout)
 
     def _next(self) -> tuple[int, _Job] | None:
-        """The job to do now: first images before finer ones, then whoever has waited longest; None after the end."""
+        """The job to do now: first images, then coarse ones, then whoever has waited longest; None after the end."""
         with self._changed:
             self._changed.wait_for(lambda: self._jobs or self._closed)
             if self._closed:
                 return None
-            client = min(self._jobs, key=lambda name: (not self._jobs[name].first, self._jobs[name].order))
-            return client, self._jobs[client]
+            return min(self._jobs.items(), key=lambda item: item[1].urgency)
 
     def _is_wanted(self, client: int, job: _Job) -> bool:
         if self._closed or client not in self._jobs:
