@@ -46,8 +46,8 @@ def sample_matcap(matcap: Tensor, normals: Tensor) -> Tensor:
     """
     across = normals[:, :2]
     length = across.norm(dim=1, keepdim=True)
-    # One texel inside the rim, so that no colour of the background is mixed in.
-    rim = 1 - 2 / min(matcap.shape[:2])
+    # So far inside the rim that no texel of the background is mixed in: √2 texels, and a little.
+    rim = 1 - 3 / min(matcap.shape[:2])
     kept = torch.where(normals[:, 2:] > 0, length.clamp(max=rim), rim)
     across = across * (kept / length.clamp(min=1e-6))
     grid = torch.stack((across[:, 0], -across[:, 1]), -1)[None, :, None]  # (1, P, 1, 2)

@@ -36,7 +36,7 @@ class ShadeOptions:
     light_level: int | None = _setting(
         0, "level in which shadows and occlusion are traced: a coarse one is fast; none is the one shown"
     )
-    softness: float = _setting(0.15, "tangent of the lamp's angular radius: 0.001 throws sharp shadows")
+    softness: float = _setting(0.15, "how fast shadows blur with the distance they fall; 0.001 is sharp")
     reach: float = _setting(0.12, "how far around a point occlusion looks, in units of the field")
     clay: tuple[float, float, float] = _setting((0.80, 0.78, 0.74), "r g b of a surface without colours, in [0, 1]")
     back_faces: bool = _setting(False, "tint what is seen from behind, so that holes and wrong normals show")

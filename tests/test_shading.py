@@ -10,7 +10,7 @@ import pytest
 import torch
 from fields import FIELDS
 from mplicits.datasets.cameras import Camera, look_at
-from mplicits.neural_fields import Field, InputError, Plane, Sphere, Union
+from mplicits.neural_fields import Field, InputError, Plane, Siren, Sphere, Union
 from mplicits.pipelines.colormap import COLOR_MAPS, map_colors
 from mplicits.pipelines.matcap import MATCAPS, load_matcap, sample_matcap
 from mplicits.pipelines.seen import Seen
@@ -160,6 +160,21 @@ def test_shadows_and_occlusion_only_take_light_away_and_only_near_the_ball():
     assert occlusion[away < 0.1].max() < 0.9 < occlusion[away > 0.3].min()
 
 
+def test_where_nothing_is_open_only_the_key_lamp_is_left():
+    class Closed(Siren):
+        def value(self, x: torch.Tensor, *, level: int = -1) -> torch.Tensor:
+            return torch.zeros_like(x[..., 0])
+
+    camera = camera_at()
+    seen = ball(camera)
+    rgb = shade(seen, "lambert", camera=camera, field=Closed(4, 1), options=ShadeOptions(occlusion=True))
+    lower_right = (seen.normal[:, 0] > 0.5) & (seen.normal[:, 1] < -0.5)
+    assert lower_right.any()
+    assert (rgb[lower_right] == 0).all()
+    upper_left = (seen.normal[:, 0] < -0.4) & (seen.normal[:, 1] > 0.4)
+    assert (rgb[upper_left] > 0.4).all()
+
+
 def test_depth_is_light_near_and_dark_far_between_the_ends_of_its_map():
     camera = camera_at()
     seen = ball(camera)
@@ -237,8 +252,17 @@ def test_a_matcap_gives_every_normal_its_own_texel(tmp_path):
     torch.testing.assert_close(rgb[:, 1], 0.5 - 0.5 * seen.normal[:, 1], atol=0.08, rtol=0)
     normals = torch.tensor([[0.6, 0.0, 0.8], [0.0, -0.28, 0.96], [1.0, 0.0, 0.0], [0.6, 0.0, -0.8]])
     found = sample_matcap(load_matcap(path), normals)[:, :2]
-    expected = torch.tensor([[0.8, 0.5], [0.5, 0.64], [0.995, 0.5], [0.995, 0.5]])
+    expected = torch.tensor([[0.8, 0.5], [0.5, 0.64], [0.9925, 0.5], [0.9925, 0.5]])
     torch.testing.assert_close(found, expected, atol=0.004, rtol=0)
+
+
+def test_nothing_of_a_matcaps_background_is_mixed_in():
+    size = 64
+    at = torch.arange(size) - (size - 1) / 2
+    inside = torch.hypot(at[:, None], at[None]) < size / 2
+    angle = torch.linspace(0, 2 * torch.pi, 1000)
+    rim = torch.stack((angle.cos(), angle.sin(), torch.zeros_like(angle)), -1)
+    assert (sample_matcap(inside[..., None].expand(-1, -1, 3).float(), rim) > 1 - 1e-5).all()
 
 
 def test_built_in_matcaps_are_lit_from_above_left():

@@ -85,15 +85,33 @@ def test_a_coarse_level_shadows_the_finer_surface_but_not_itself():
     assert soft_shadow(coarse, points, normals, UP, softness=0.05).tolist() == [0, 0, 1, 1]
 
 
-def test_rays_through_the_bands_of_a_multiscale_field_meet_the_fine_surface():
-    class Shift(Siren):  # a residual that moves the surface up by 0.05
-        def value(self, x, *, level=-1):
-            return torch.full_like(x[..., 0], -0.05)
+class Raise(Siren):
+    """A residual that moves the surface outward by a constant."""
 
-    field = MultiscaleSDF(ball_over_plane(), [Shift(4, 1)], [0.08])
+    def __init__(self, height: float) -> None:
+        super().__init__(4, 1)
+        self.height = height
+
+    def value(self, x: torch.Tensor, *, level: int = -1) -> torch.Tensor:
+        return torch.full_like(x[..., 0], -self.height)
+
+
+def test_rays_through_the_bands_of_a_multiscale_field_meet_the_fine_surface():
+    field = MultiscaleSDF(ball_over_plane(), [Raise(0.05)], [0.08])
     points = torch.tensor([[0.0, 0, 0.05], [0.225, 0, 0.05], [0.28, 0, 0.05]])  # the ball's radius is 0.25 now
     lit = soft_shadow(field, points, UP.expand_as(points), UP, softness=1e-3)
     assert lit.tolist() == [0, 0, 1]
+    # A coarse ball of next to no size grows to 0.06: steps of the coarse value jump over what its rim shadows.
+    field = MultiscaleSDF(Sphere(radius=1e-3), [Raise(0.059)], [0.08])
+    points = torch.stack((torch.full((200,), 0.058), torch.zeros(200), -torch.linspace(0.06, 0.3, 200)), -1)
+    assert (soft_shadow(field, points, UP.expand_as(points), UP, softness=1e-3) == 0).all()
+
+
+def test_the_middle_of_a_thin_plates_shadow_is_dark_however_soft():
+    plate = Box(half_size=(0.6, 0.6, 1e-3), center=(0, 0, 0.3))
+    points = torch.stack((torch.zeros(50), torch.zeros(50), torch.linspace(-0.6, 0.2, 50)), -1)
+    for softness in (0.15, 0.5, 0.9):
+        assert (soft_shadow(plate, points, UP.expand_as(points), UP, softness=softness) == 0).all()
 
 
 @pytest.mark.parametrize("reach", [0.05, 0.2, 0.5])
@@ -103,6 +121,12 @@ def test_planes_and_convex_shapes_are_open(reach):
     normals = torch.nn.functional.normalize(torch.randn(50, 3), dim=1)
     openness = ambient_occlusion(Sphere(radius=0.6), 0.6 * normals, normals, reach=reach)
     torch.testing.assert_close(openness, torch.ones(50))
+
+
+@pytest.mark.parametrize("height", [-0.01, 0.01])
+def test_a_level_that_lies_elsewhere_is_open_too(height):
+    points, normals = on_plane((0, 0), (0.4, 0.1))
+    torch.testing.assert_close(ambient_occlusion(Plane(offset=height), points, normals), torch.ones(2))
 
 
 def test_a_corner_darkens_with_nearness_and_with_reach():
