@@ -17,22 +17,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from ._march import Found, Rays, Rule, march, march_budget
 from .field import Field
 
 __all__ = ["BOUNDING_RADIUS", "Hits", "cone_starts", "sphere_trace"]
 
 # Fields live in the unit sphere; their surfaces may pass it by a little.
 BOUNDING_RADIUS = 1.05
-# Steps at a gap of one `resolution`, before it doubles: few rays need as many, and none may need thousands.
-PATIENCE = 32
-# How far a step may reach into a band unseen, in δ: stepping to its edge and no further would never arrive.
-BAND_ENTRY = 0.5
-# Share of the widest step that two tangent balls on a plane allow; less than 1 lets surfaces bend towards the ray.
-BOLDNESS = 0.9
-# A ray that leaves the surface faster than this may not stride out any further for it.
-STEEPEST_RISE = 0.6
-# Values this many rounding errors from zero are zero: no step would bring them nearer.
-FLOOR = 8
 
 
 class Hits(NamedTuple):
@@ -77,7 +68,7 @@ def sphere_trace(
     2018, from the last two values); where a gap opens after all, the step is taken back. Two crossings closer
     to each other than ``resolution`` may be overlooked, which is what lets a ray go on along a surface that it
     nearly touches; rays that need more than 32 steps are given twice the resolution, and again after every 32.
-    A change of sign is closed in on by the Illinois variant of the secant rule. Rays are dropped as they end.
+    A change of sign is closed in on by the secant rule and bisection in turn. Rays are dropped as they end.
 
     With a ``budget``, the paper's mode: so many steps ``t ← t + f_j − δ_j`` on each level (20, 5, 5 in its Tab. 4),
     after which |f| < ``capture`` is a hit.
@@ -120,13 +111,13 @@ def sphere_trace(
     if radius is not None:
         entry, leave = _ball_crossing(origins, directions, radius)
         starts, ends = torch.maximum(starts, entry), torch.minimum(ends, leave)
-    rays = _Rays.begin(origins, directions, starts.clamp(min=0), ends)
-    found = _Found(starts)
+    rays = Rays.begin(origins, directions, starts.clamp(min=0), ends)
+    found = Found(starts)
     if budget is None:
-        rule = _Rule(field.deltas[:level].to(directions), tolerance, resolution, lipschitz)
-        _march(field, level, rays, found, rule, max_steps)
+        rule = Rule(field.deltas[:level].to(directions), tolerance, resolution, lipschitz)
+        march(field, level, rays, found, rule, max_steps)
     else:
-        _march_budget(field, rays, found, budget, tolerance, capture)
+        march_budget(field, rays, found, budget, tolerance, capture)
     position = origins + found.depth[:, None] * directions
     return Hits(
         found.mask.reshape(shape),
@@ -214,16 +205,20 @@ def _march_cones(
     depth = torch.maximum(starts, entry).clamp(min=0)
     depth[depth >= leave] = torch.inf
     active = depth.isfinite().nonzero()[:, 0]
+    before, value_before = depth.clone(), torch.full_like(depth, torch.nan)
     for _ in range(max_steps):
         if not len(active):
             break
-        t, sigma = depth[active], spread[active]
-        value = field.value(origin + t[:, None] * axis[active], level=0).abs()
-        step = ((value - delta) / lipschitz - t * sigma) / (1 + sigma)
-        t = t + step.clamp(min=0)
-        depth[active] = torch.where(t >= leave[active], torch.inf, t)
+        t, sigma, old = depth[active], spread[active], before[active]
+        value = field.value(origin + t[:, None] * axis[active], level=0)
+        # Behind the surface? Then the field is steeper than it was said to be: back, and leave it to the rays.
+        passed = value * value_before[active] < 0
+        step = ((value.abs() - delta) / lipschitz - t * sigma) / (1 + sigma)
+        ahead = torch.where(passed, old, t + step.clamp(min=0))
+        before[active], value_before[active] = t, value
+        depth[active] = torch.where(ahead >= leave[active], torch.inf, ahead)
         # Once a step is shorter than the cone is wide, smaller cones get on better.
-        active = active[(step > t * sigma) & (t < leave[active])]
+        active = active[(step > t * sigma) & (ahead < leave[active]) & ~passed]
     return depth
 
 
@@ -246,200 +241,3 @@ def _ball_crossing(origins: Tensor, directions: Tensor, radius: float | Tensor) 
     half = squared.clamp(min=0).sqrt()
     missed = squared <= 0
     return torch.where(missed, torch.inf, closest - half), torch.where(missed, -torch.inf, closest + half)
-
-
-class _Found:
-    """Results for every ray of a call, filled in as rays end."""
-
-    def __init__(self, depth: Tensor) -> None:
-        self.depth = depth.clone()
-        self.mask = torch.zeros_like(depth, dtype=torch.bool)
-        self.level = torch.zeros_like(depth, dtype=torch.int64)
-        self.steps = torch.zeros_like(self.level)
-
-    def record(self, index: Tensor, *, mask: Tensor, depth: Tensor, level: Tensor | int, steps: Tensor | int) -> None:
-        self.mask[index], self.depth[index], self.level[index], self.steps[index] = mask, depth, level, steps
-
-
-class _Rays(NamedTuple):
-    """The rays still under way, one row each.
-
-    Attributes:
-        ray: ``(K,)`` which ray of the call it is.
-        origin: ``(K, 3)``.
-        direction: ``(K, 3)``.
-        depth: ``(K,)`` where to look next.
-        far: ``(K,)`` where to give up.
-        sign: ``(K,)`` −1 for a ray that began inside, else 1; values are multiplied by it.
-        low: ``(K,)`` the last depth known to be in front of the surface.
-        low_value: ``(K,)`` the value there, infinite before the first.
-        free: ``(K,)`` radius of the empty ball there.
-        gap: ``(K,)`` how much of the step from there may lie outside both its balls.
-        high: ``(K,)`` a depth known to be behind the surface, infinite if there is none yet.
-        high_value: ``(K,)`` the value there, negative.
-        boldness: ``(K,)`` share of the widest step that is taken.
-    """
-
-    ray: Tensor
-    origin: Tensor
-    direction: Tensor
-    depth: Tensor
-    far: Tensor
-    sign: Tensor
-    low: Tensor
-    low_value: Tensor
-    free: Tensor
-    gap: Tensor
-    high: Tensor
-    high_value: Tensor
-    boldness: Tensor
-
-    @classmethod
-    def begin(cls, origins: Tensor, directions: Tensor, starts: Tensor, ends: Tensor) -> _Rays:
-        index = (starts < ends).nonzero()[:, 0]
-        depth, far = starts[index], ends[index]
-        zero, infinite = torch.zeros_like(depth), torch.full_like(depth, torch.inf)
-        return cls(
-            ray=index,
-            origin=origins[index],
-            direction=directions[index],
-            depth=depth,
-            far=far,
-            sign=zero + 1,
-            low=depth,
-            low_value=infinite,
-            free=zero,
-            gap=infinite,
-            high=infinite,
-            high_value=zero,
-            boldness=zero + BOLDNESS,
-        )
-
-    def only(self, rows: Tensor) -> _Rays:
-        return _Rays(*(column[rows] for column in self))
-
-    def points(self) -> Tensor:
-        return torch.addcmul(self.origin, self.depth[:, None], self.direction)
-
-
-class _Rule(NamedTuple):
-    """The numbers that say what a value allows."""
-
-    deltas: Tensor
-    tolerance: float
-    resolution: float
-    lipschitz: float
-
-    def band(self, size: Tensor) -> tuple[Tensor, Tensor]:
-        """How many bands |f| = ``size`` is inside of, and the δ of the first that it is not, 0 after the last."""
-        if not len(self.deltas):
-            return torch.zeros_like(size, dtype=torch.int64), torch.zeros_like(size)
-        inside = (size[:, None] < self.deltas).cumprod(dim=1).sum(dim=1)
-        return inside, torch.cat((self.deltas, self.deltas.new_zeros(1)))[inside]
-
-
-def _march(field: Field, level: int, rays: _Rays, found: _Found, rule: _Rule, max_steps: int) -> None:
-    """The adaptive mode: one evaluation of every ray under way, then see where each one stands."""
-    for count in range(1, max_steps + 1):
-        if not len(rays.ray):
-            return
-        value = field.value(rays.points(), level=level)
-        if count == 1:
-            rays = rays._replace(sign=torch.where(value < 0, -1.0, 1.0).to(value))
-        gap = rule.resolution * 2.0 ** ((count - 1) // PATIENCE)
-        rays, stand = _look(rays, value * rays.sign, rule, gap)
-        ended = stand.hit | stand.passed if count < max_steps else torch.ones_like(stand.hit)
-        rows = ended.nonzero()[:, 0]
-        found.record(
-            rays.ray[rows], mask=stand.hit[rows], depth=stand.depth[rows], level=stand.level[rows], steps=count
-        )
-        rays = rays.only((~ended).nonzero()[:, 0])
-
-
-class _Stand(NamedTuple):
-    """Where rays stand after a look at their values, ``(K,)`` each."""
-
-    hit: Tensor
-    passed: Tensor
-    depth: Tensor
-    level: Tensor
-
-
-def _look(rays: _Rays, value: Tensor, rule: _Rule, resolution: float) -> tuple[_Rays, _Stand]:
-    """Take in the ``value`` at ``rays.depth``, and say where to look next."""
-    level, delta = rule.band(value.abs())
-    free = ((value.abs() - delta) / rule.lipschitz).clamp(min=0)
-    slope = torch.where(rays.low_value.isfinite(), (value - rays.low_value) / (rays.depth - rays.low), -1.0)
-    enclosed = rays.high.isfinite()
-    sound = enclosed | (rays.depth - rays.low - rays.free - free <= rays.gap)
-    before, behind = sound & (value > 0), sound & (value <= 0)
-    low, high = torch.where(before, rays.depth, rays.low), torch.where(behind, rays.depth, rays.high)
-    low_value, high_value = torch.where(before, value, rays.low_value), torch.where(behind, value, rays.high_value)
-
-    # Before a change of sign: as far as two tangent balls on a plane reach, or over a gap that may be left.
-    gap = torch.maximum(BAND_ENTRY * delta, torch.full_like(delta, resolution))
-    s = slope.clamp(-1, STEEPEST_RISE)
-    widest = rays.boldness * free * (1 + s) / (1 - s)
-    zero = torch.where(s < 0, value / -s, torch.inf)
-    ahead = rays.depth + free + torch.maximum(widest, torch.minimum(gap, zero - free))
-    # A step that left too wide a gap is taken back, and the next ones are less bold.
-    ahead = torch.where(before, ahead, rays.low + rays.free)
-    # After it: the secant, or the middle where the secant did not halve the interval.
-    width = high - low
-    chord = low + width * low_value / (low_value - high_value)
-    halved = ~enclosed | (2 * width <= rays.high - rays.low)
-    closing = torch.where(halved, chord, low + width / 2)
-
-    closed = high.isfinite()
-    steep = slope.abs().clamp(max=1)
-    floor = FLOOR * torch.finfo(value.dtype).eps
-    near = sound & (delta == 0) & (value.abs() <= (rule.tolerance * steep).clamp(min=floor))
-    pinned = closed & (width <= rule.tolerance)
-    landing = rays.depth + (value / steep).clamp(-rule.tolerance, rule.tolerance)
-    passed = before & ~closed & (rays.depth + free + gap >= rays.far)
-    stand = _Stand(
-        hit=near | pinned,
-        passed=passed & ~near,
-        depth=torch.where(near, landing, torch.where(pinned, chord, rays.depth)),
-        level=level,
-    )
-    rays = rays._replace(
-        depth=torch.minimum(torch.where(closed, closing, ahead), rays.far),
-        low=low,
-        low_value=low_value,
-        free=torch.where(before, free, rays.free),
-        gap=gap,
-        high=high,
-        high_value=high_value,
-        boldness=torch.where(sound, rays.boldness, rays.boldness / 2),
-    )
-    return rays, stand
-
-
-def _march_budget(
-    field: Field, rays: _Rays, found: _Found, budget: Sequence[int], tolerance: float, capture: float
-) -> None:
-    """The paper's mode: a number of steps towards the edge of each band, then towards the surface."""
-    level = len(budget) - 1
-    edges = [*field.deltas[:level].tolist(), 0.0]
-    value, steps = torch.full_like(rays.depth, torch.inf), torch.zeros_like(rays.ray)
-    for current, (count, edge) in enumerate(zip(budget, edges, strict=True)):
-        moving = torch.arange(len(rays.ray), device=rays.ray.device)
-        for _ in range(count):
-            here = rays.only(moving)
-            value[moving] = field.value(here.points(), level=current)
-            step = value[moving] - edge
-            rays.depth[moving] += step
-            steps[moving] += 1
-            moving = moving[(step.abs() > tolerance) & (rays.depth[moving] < rays.far[moving])]
-        inside = (rays.depth < rays.far).nonzero()[:, 0]
-        gone = (rays.depth >= rays.far).nonzero()[:, 0]
-        found.record(
-            rays.ray[gone],
-            mask=torch.zeros_like(gone, dtype=torch.bool),
-            depth=rays.depth[gone],
-            level=current,
-            steps=steps[gone],
-        )
-        rays, value, steps = rays.only(inside), value[inside], steps[inside]
-    found.record(rays.ray, mask=value.abs() < capture, depth=rays.depth, level=level, steps=steps)

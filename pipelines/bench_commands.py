@@ -103,6 +103,49 @@ def _fit(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def _render_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("shapes", nargs="+", metavar="SHAPE", help="meshes or clouds")
+    parser.add_argument(
+        "-o", "--out", required=True, type=Path, metavar="DIR", help="keeps the fits; those that are there are used"
+    )
+    parser.add_argument("--size", type=whole(16, 4096), default=512, metavar="N", help="of the images (512)")
+    parser.add_argument("--views", type=whole(1), default=3, metavar="N", help="cameras around the shape (3)")
+    parser.add_argument("--repeats", type=whole(1), default=2, metavar="N", help="the best of how many (2)")
+    parser.add_argument("--no-naive", action="store_true", help="leave out the naive tracer, which takes minutes")
+    add_json(parser)
+    add_fit_settings(parser)
+
+
+def _render(arguments: argparse.Namespace) -> int:
+    check_output(arguments.json, (".json",))
+    config = fit_settings(arguments)
+    from .bench_render import bench_render, format_render
+    from .fit import choose_device
+    from .progress_bar import progress_bars
+    from .timing import sgemm_rate
+
+    device = choose_device(config.device)
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    with progress_bars() as report:
+        rows = bench_render(
+            arguments.shapes,
+            arguments.out,
+            config,
+            size=arguments.size,
+            views=arguments.views,
+            repeats=arguments.repeats,
+            naive=not arguments.no_naive,
+            device=str(device),
+            progress=lambda name, step: report(dataclasses.replace(step, stage=f"{name} {step.stage}")),
+            report=lambda text: print(f"{text} …", file=sys.stderr),
+        )
+    rate = sgemm_rate(256, device=device)
+    print(format_render(rows, sgemm=rate))
+    print(f"this machine multiplies float32 matrices at {rate / 1e9:.0f} GFLOP/s on {device}")
+    write_json(arguments.json, [row.as_dict() for row in rows])
+    return 0
+
+
 BENCH_COMMANDS: Mapping[str, Command] = MappingProxyType(
     {
         "bench normals": Command(
@@ -124,6 +167,15 @@ BENCH_COMMANDS: Mapping[str, Command] = MappingProxyType(
             _fit_arguments,
             _fit,
             "Fit the vertices of each mesh and measure the result against the mesh; Poisson needs mplicits[poisson].",
+        ),
+        "bench render": Command(
+            "what a picture costs: the rows of the paper's Tab. 4",
+            """  mplicits bench render armadillo.ply -o bench_render
+  mplicits bench render armadillo.ply eiffel.ply -o bench_render --views 1 --no-naive --json render.json""",
+            _render_arguments,
+            _render,
+            "Fit the networks of the paper's Tab. 4 to each shape, trace pictures of them in several ways, and judge "
+            "the pictures by converged traces and by a raycast of fine meshes.",
         ),
     }
 )

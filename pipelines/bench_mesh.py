@@ -17,10 +17,10 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from skimage.measure import marching_cubes
-from torch import Tensor
 
-from ..neural_fields import Field, Jet, MultiscaleSDF, Siren, load_field, save_field
+from ..neural_fields import Field, Siren, load_field, save_field
 from ..neural_fields.meshing import DEFAULT_BOUNDS, extract_mesh
+from .counting import counted
 from .runs import find_field
 from .timing import format_table
 
@@ -166,46 +166,21 @@ def _with_threads(threads: int, work: Callable[..., MeshRow], *arguments: object
     return work(*arguments)
 
 
-class _Counted(Field):
-    """A level that counts the rows it evaluates."""
-
-    def __init__(self, inner: Field) -> None:
-        super().__init__()
-        self.inner, self.in_dim, self.num_levels, self.rows = inner, inner.in_dim, inner.num_levels, 0
-        self.register_buffer("deltas", inner.deltas)
-
-    def value(self, x: Tensor, *, level: int = -1) -> Tensor:
-        self.rows += x.shape[:-1].numel()
-        return self.inner.value(x, level=level)
-
-    def jet(self, x: Tensor, *, level: int = -1) -> Jet:
-        return self.inner.jet(x, level=level)
-
-
-def _counted(field: Field) -> tuple[Field, list[_Counted]]:
-    """The field with counters in the place of its levels."""
-    if not isinstance(field, MultiscaleSDF):
-        whole = _Counted(field)
-        return whole, [whole]
-    levels = [_Counted(level) for level in (field.base, *field.residuals) if isinstance(level, Field)]
-    return MultiscaleSDF(levels[0], levels[1:], field.deltas, taper=field.taper), levels
-
-
 def _adaptive(path: Path, resolution: int, keep: Path | None) -> MeshRow:
-    field, levels = _counted(load_field(path).field)
+    field, levels = counted(load_field(path).field)
     start = time.perf_counter()
     mesh = extract_mesh(field, resolution=resolution)
     seconds = time.perf_counter() - start
     assert mesh.stats is not None
     normals = mesh.stats.seconds["normals"]
-    counts = tuple(level.rows for level in levels)
+    counts = tuple(level.values for level in levels)
     if keep is not None:
         np.save(keep, mesh.vertices)
     return MeshRow("adaptive", resolution, seconds - normals, normals, counts, len(mesh.vertices), _peak())
 
 
 def _paper(path: Path, resolution: int, keep: Path) -> MeshRow:
-    field, levels = _counted(load_field(path).field)
+    field, levels = counted(load_field(path).field)
     start = time.perf_counter()
     values = np.empty((resolution + 1,) * 3, np.float32)
     _evaluate_slabs(field, values, range(resolution + 1))
@@ -213,7 +188,7 @@ def _paper(path: Path, resolution: int, keep: Path) -> MeshRow:
     vertices = marching_cubes(values, 0.0, spacing=(step, step, step))[0] + np.asarray(DEFAULT_BOUNDS[0])
     seconds = time.perf_counter() - start
     np.save(keep, vertices)
-    return MeshRow(PAPER, resolution, seconds, None, tuple(level.rows for level in levels), len(vertices), _peak())
+    return MeshRow(PAPER, resolution, seconds, None, tuple(level.values for level in levels), len(vertices), _peak())
 
 
 def _dense(resolution: int, share: float) -> MeshRow:

@@ -1,7 +1,7 @@
 import pytest
 import torch
 from mplicits.neural_fields import InputError, MultiscaleSDF, Siren
-from mplicits.pipelines.bench_mesh import MeshBench, MeshRow, _counted, bench_mesh, format_bench_mesh
+from mplicits.pipelines.bench_mesh import MeshBench, MeshRow, bench_mesh, format_bench_mesh
 
 
 def sphere_like():
@@ -50,15 +50,6 @@ def test_format_prints_growth_ratios_and_limit():
     assert "10.0× faster than peer at 512³" in text
     assert "4.00 M + 2.00 M" in text
     assert text.endswith("limit: this machine")
-
-
-def test_counters_do_not_change_the_field():
-    field = sphere_like()
-    counted, levels = _counted(field)
-    x = torch.randn(100, 3)
-    assert torch.equal(counted.value(x), field.value(x))
-    assert levels[0].rows == 100
-    assert levels[1].rows == int(field.in_band(x, level=1).sum())
 
 
 def test_missing_run_is_an_input_error(tmp_path):

@@ -210,26 +210,40 @@ def test_near_and_far_bound_the_search():
     assert not sphere_trace(field, origin, -direction).mask
 
 
+class Steep(Field):
+    """Distances that are too large by a factor."""
+
+    in_dim, num_levels = 3, 1
+
+    def __init__(self, inner: Field, factor: float) -> None:
+        super().__init__()
+        self.register_buffer("deltas", torch.empty(0))
+        self.inner, self.factor = inner, factor
+
+    def value(self, x: Tensor, *, level: int = -1) -> Tensor:
+        return self.factor * self.inner.value(x)
+
+    def jet(self, x: Tensor, *, level: int = -1) -> Jet:
+        raise NotImplementedError
+
+
 def test_steep_fields_need_their_lipschitz_constant():
-    class Steep(Field):
-        in_dim, num_levels = 3, 1
-
-        def __init__(self) -> None:
-            super().__init__()
-            self.register_buffer("deltas", torch.empty(0))
-            self.inner = Torus(major=0.5, minor=0.05)
-
-        def value(self, x: Tensor, *, level: int = -1) -> Tensor:
-            return 3 * self.inner.value(x)
-
-        def jet(self, x: Tensor, *, level: int = -1) -> Jet:
-            raise NotImplementedError
-
     origins, directions = random_rays(2000, spread=0.6)
     expected = torus_depth(origins, directions, 0.5, 0.05)
-    hits = sphere_trace(Steep().double(), origins, directions, lipschitz=3.0)
+    hits = sphere_trace(Steep(Torus(major=0.5, minor=0.05), 3.0).double(), origins, directions, lipschitz=3.0)
     assert torch.equal(hits.mask, expected.isfinite())
     assert float((hits.depth - expected)[hits.mask].abs().max()) < 1e-5
+
+
+def test_cones_that_find_themselves_behind_the_surface_go_back():
+    across = torch.linspace(-0.1, 0.1, 64, dtype=torch.float64)
+    rows, columns = torch.meshgrid(across, across, indexing="ij")
+    directions = unit(torch.stack((columns, rows, torch.ones_like(rows)), dim=-1))
+    origin = torch.tensor([0.0, 0.0, -2.5], dtype=torch.float64)
+    near = cone_starts(Steep(Sphere(radius=0.6), 1.3).double(), origin, directions)
+    expected = sphere_depth(origin.expand(64 * 64, 3), directions.reshape(-1, 3), 0.6).reshape(64, 64)
+    assert bool(expected.isfinite().all())
+    assert bool((near < expected).all())
 
 
 def test_without_a_bounding_ball():

@@ -1,0 +1,225 @@
+"""The loops behind `sphere_trace`: rays that march together, and are dropped one by one as they end.
+
+Every pass evaluates the field once for each ray still under way, whether it is striding out, stepping back or closing
+in on a change of sign, so that passes are few and batches large.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from .field import Field
+
+__all__ = ["Found", "Rays", "Rule", "march", "march_budget"]
+
+# Steps at a gap of one `resolution`, before it doubles: few rays need as many, and none may need thousands.
+PATIENCE = 32
+# How far a step may reach into a band unseen, in δ: stepping to its edge and no further would never arrive.
+BAND_ENTRY = 0.5
+# Share of the widest step that two tangent balls on a plane allow; less than 1 lets surfaces bend towards the ray.
+BOLDNESS = 0.9
+# A ray that leaves the surface faster than this may not stride out any further for it.
+STEEPEST_RISE = 0.6
+# Values this many rounding errors from zero are zero: no step would bring them nearer.
+FLOOR = 8
+
+
+class Found:
+    """Results for every ray of a call, filled in as rays end."""
+
+    def __init__(self, depth: Tensor) -> None:
+        self.depth = depth.clone()
+        self.mask = torch.zeros_like(depth, dtype=torch.bool)
+        self.level = torch.zeros_like(depth, dtype=torch.int64)
+        self.steps = torch.zeros_like(self.level)
+
+    def record(self, index: Tensor, *, mask: Tensor, depth: Tensor, level: Tensor | int, steps: Tensor | int) -> None:
+        self.mask[index], self.depth[index], self.level[index], self.steps[index] = mask, depth, level, steps
+
+
+class Rays(NamedTuple):
+    """The rays still under way, one row each.
+
+    Attributes:
+        ray: ``(K,)`` which ray of the call it is.
+        origin: ``(K, 3)``.
+        direction: ``(K, 3)``.
+        depth: ``(K,)`` where to look next.
+        far: ``(K,)`` where to give up.
+        sign: ``(K,)`` −1 for a ray that began inside, else 1; values are multiplied by it.
+        low: ``(K,)`` the last depth known to be in front of the surface.
+        low_value: ``(K,)`` the value there, infinite before the first.
+        free: ``(K,)`` radius of the empty ball there.
+        gap: ``(K,)`` how much of the step from there may lie outside both its balls.
+        high: ``(K,)`` a depth known to be behind the surface, infinite if there is none yet.
+        high_value: ``(K,)`` the value there, negative.
+        boldness: ``(K,)`` share of the widest step that is taken.
+    """
+
+    ray: Tensor
+    origin: Tensor
+    direction: Tensor
+    depth: Tensor
+    far: Tensor
+    sign: Tensor
+    low: Tensor
+    low_value: Tensor
+    free: Tensor
+    gap: Tensor
+    high: Tensor
+    high_value: Tensor
+    boldness: Tensor
+
+    @classmethod
+    def begin(cls, origins: Tensor, directions: Tensor, starts: Tensor, ends: Tensor) -> Rays:
+        index = (starts < ends).nonzero()[:, 0]
+        depth, far = starts[index], ends[index]
+        zero, infinite = torch.zeros_like(depth), torch.full_like(depth, torch.inf)
+        return cls(
+            ray=index,
+            origin=origins[index],
+            direction=directions[index],
+            depth=depth,
+            far=far,
+            sign=zero + 1,
+            low=depth,
+            low_value=infinite,
+            free=zero,
+            gap=infinite,
+            high=infinite,
+            high_value=zero,
+            boldness=zero + BOLDNESS,
+        )
+
+    def only(self, rows: Tensor) -> Rays:
+        return Rays(*(column[rows] for column in self))
+
+    def points(self) -> Tensor:
+        return torch.addcmul(self.origin, self.depth[:, None], self.direction)
+
+
+class Rule(NamedTuple):
+    """The numbers that say what a value allows."""
+
+    deltas: Tensor
+    tolerance: float
+    resolution: float
+    lipschitz: float
+
+    def band(self, size: Tensor) -> tuple[Tensor, Tensor]:
+        """How many bands |f| = ``size`` is inside of, and the δ of the first that it is not, 0 after the last."""
+        if not len(self.deltas):
+            return torch.zeros_like(size, dtype=torch.int64), torch.zeros_like(size)
+        inside = (size[:, None] < self.deltas).cumprod(dim=1).sum(dim=1)
+        return inside, torch.cat((self.deltas, self.deltas.new_zeros(1)))[inside]
+
+
+def march(field: Field, level: int, rays: Rays, found: Found, rule: Rule, max_steps: int) -> None:
+    """The adaptive mode: one evaluation of every ray under way, then see where each one stands."""
+    for count in range(1, max_steps + 1):
+        if not len(rays.ray):
+            return
+        value = field.value(rays.points(), level=level)
+        if count == 1:
+            rays = rays._replace(sign=torch.where(value < 0, -1.0, 1.0).to(value))
+        gap = rule.resolution * 2.0 ** ((count - 1) // PATIENCE)
+        rays, stand = _look(rays, value * rays.sign, rule, gap)
+        ended = stand.hit | stand.passed if count < max_steps else torch.ones_like(stand.hit)
+        rows = ended.nonzero()[:, 0]
+        found.record(
+            rays.ray[rows], mask=stand.hit[rows], depth=stand.depth[rows], level=stand.level[rows], steps=count
+        )
+        rays = rays.only((~ended).nonzero()[:, 0])
+
+
+class Stand(NamedTuple):
+    """Where rays stand after a look at their values, ``(K,)`` each."""
+
+    hit: Tensor
+    passed: Tensor
+    depth: Tensor
+    level: Tensor
+
+
+def _look(rays: Rays, value: Tensor, rule: Rule, resolution: float) -> tuple[Rays, Stand]:
+    """Take in the ``value`` at ``rays.depth``, and say where to look next."""
+    level, delta = rule.band(value.abs())
+    free = ((value.abs() - delta) / rule.lipschitz).clamp(min=0)
+    slope = torch.where(rays.low_value.isfinite(), (value - rays.low_value) / (rays.depth - rays.low), -1.0)
+    enclosed = rays.high.isfinite()
+    sound = enclosed | (rays.depth - rays.low - rays.free - free <= rays.gap)
+    before, behind = sound & (value > 0), sound & (value <= 0)
+    low, high = torch.where(before, rays.depth, rays.low), torch.where(behind, rays.depth, rays.high)
+    low_value, high_value = torch.where(before, value, rays.low_value), torch.where(behind, value, rays.high_value)
+
+    # Before a change of sign: as far as two tangent balls on a plane reach, or over a gap that may be left.
+    gap = torch.maximum(BAND_ENTRY * delta, torch.full_like(delta, resolution))
+    s = slope.clamp(-1, STEEPEST_RISE)
+    widest = rays.boldness * free * (1 + s) / (1 - s)
+    zero = torch.where(s < 0, value / -s, torch.inf)
+    ahead = rays.depth + free + torch.maximum(widest, torch.minimum(gap, zero - free))
+    # A step that left too wide a gap is taken back, and the next ones are less bold.
+    ahead = torch.where(before, ahead, rays.low + rays.free)
+    # After it: the secant, or the middle where the secant did not halve the interval.
+    width = high - low
+    chord = low + width * low_value / (low_value - high_value)
+    halved = ~enclosed | (2 * width <= rays.high - rays.low)
+    closing = torch.where(halved, chord, low + width / 2)
+
+    closed = high.isfinite()
+    steep = slope.abs().clamp(max=1)
+    floor = FLOOR * torch.finfo(value.dtype).eps
+    near = sound & (delta == 0) & (value.abs() <= (rule.tolerance * steep).clamp(min=floor))
+    pinned = closed & (width <= rule.tolerance)
+    landing = rays.depth + (value / steep).clamp(-rule.tolerance, rule.tolerance)
+    passed = before & ~closed & (rays.depth + free + gap >= rays.far)
+    stand = Stand(
+        hit=near | pinned,
+        passed=passed & ~near,
+        depth=torch.where(near, landing, torch.where(pinned, chord, rays.depth)),
+        level=level,
+    )
+    rays = rays._replace(
+        depth=torch.minimum(torch.where(closed, closing, ahead), rays.far),
+        low=low,
+        low_value=low_value,
+        free=torch.where(before, free, rays.free),
+        gap=gap,
+        high=high,
+        high_value=high_value,
+        boldness=torch.where(sound, rays.boldness, rays.boldness / 2),
+    )
+    return rays, stand
+
+
+def march_budget(
+    field: Field, rays: Rays, found: Found, budget: Sequence[int], tolerance: float, capture: float
+) -> None:
+    """The paper's mode: a number of steps towards the edge of each band, then towards the surface."""
+    level = len(budget) - 1
+    edges = [*field.deltas[:level].tolist(), 0.0]
+    value, steps = torch.full_like(rays.depth, torch.inf), torch.zeros_like(rays.ray)
+    for current, (count, edge) in enumerate(zip(budget, edges, strict=True)):
+        moving = torch.arange(len(rays.ray), device=rays.ray.device)
+        for _ in range(count):
+            here = rays.only(moving)
+            value[moving] = field.value(here.points(), level=current)
+            step = value[moving] - edge
+            rays.depth[moving] += step
+            steps[moving] += 1
+            moving = moving[(step.abs() > tolerance) & (rays.depth[moving] < rays.far[moving])]
+        inside = (rays.depth < rays.far).nonzero()[:, 0]
+        gone = (rays.depth >= rays.far).nonzero()[:, 0]
+        found.record(
+            rays.ray[gone],
+            mask=torch.zeros_like(gone, dtype=torch.bool),
+            depth=rays.depth[gone],
+            level=current,
+            steps=steps[gone],
+        )
+        rays, value, steps = rays.only(inside), value[inside], steps[inside]
+    found.record(rays.ray, mask=value.abs() < capture, depth=rays.depth, level=level, steps=steps)
