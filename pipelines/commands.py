@@ -18,6 +18,8 @@ from .bench_commands import BENCH_COMMANDS
 from .command import Command, add_json, check_output, positive, whole
 from .config import input_error
 from .fit_settings import add_fit_settings, fit_settings, were_given
+from .render_command import COMMAND as RENDER
+from .slice_command import COMMAND as SLICE
 
 __all__ = ["COMMANDS", "Command"]
 
@@ -64,6 +66,9 @@ def _mesh_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--out", required=True, type=Path, metavar="FILE", help=", ".join(MESH_FILES))
     parser.add_argument("--resolution", type=whole(8, 2048), default=256, metavar="N", help="cells per side (256)")
     parser.add_argument("--level", type=whole(0), metavar="L", help="0 is the coarsest (default: the finest)")
+    parser.add_argument(
+        "--normal-level", type=whole(0), metavar="L", help="normals of this level on the mesh (default: of its own)"
+    )
     parser.add_argument("--keep-largest", action="store_true", help="keep only the component of largest area")
     parser.add_argument(
         "--trim-distance",
@@ -81,6 +86,7 @@ def _mesh(arguments: argparse.Namespace) -> int:
     options = MeshOptions(
         resolution=arguments.resolution,
         level=arguments.level,
+        normal_level=arguments.normal_level,
         keep_largest=arguments.keep_largest,
         trim_distance=arguments.trim_distance,
         cloud=arguments.cloud,
@@ -181,6 +187,8 @@ COMMANDS: Mapping[str, Command] = MappingProxyType(
             _mesh,
             "Extract a mesh from a fit, in the coordinates of its input.",
         ),
+        "render": RENDER,
+        "slice": SLICE,
         "evaluate": Command(
             "measure a mesh against a reference",
             """  mplicits evaluate scan.ply truth.ply

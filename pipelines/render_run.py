@@ -1,0 +1,277 @@
+"""From a run, a mesh or a cloud to a picture of it, or to a film around it."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ..datasets.cameras import Camera
+from ..neural_fields import InputError
+from .animation import ANIMATIONS, write_animation
+from .fit import choose_device
+from .legend import with_color_bar
+from .matcap import load_matcap
+from .picture import check_picture_path, contact_sheet, write_picture
+from .render_cameras import Orbit, orbit_cameras, posed_cameras
+from .render_scene import Look, Scene, open_scene, reference_distance
+from .seen import Seen
+from .shading import ShadeOptions, compose, downsample, measure, shade, value_limits
+
+__all__ = ["RenderOptions", "render_run"]
+
+Image = NDArray[np.uint8]
+Color = tuple[float, float, float]
+
+STRIP = 1 << 19  # pixels that are worked on at a time: about a third of a gigabyte
+PREVIEW = 160  # pixels on the longer side of the pictures from which colour maps take their limits
+PREVIEWS = 12  # of a film
+# What colours show, as the legend calls it, and the power of the input's unit it is measured in.
+MEASURES = {
+    "depth": ("distance from the camera", 1),
+    "curvature": ("mean curvature, 1 / unit", -1),
+    "error": ("distance to the reference", 1),
+}
+
+
+@dataclass(frozen=True)
+class RenderOptions:
+    """What is drawn, and how. Lengths and places are the input's.
+
+    Attributes:
+        size: width and height; of posed cameras only the width, the height follows. None is (640, 640), or that of
+            the posed images.
+        level: of a field; None is the finest.
+        normal_level: whose normals (neural normal mapping); None is ``level``.
+        levels: all levels side by side, and the coarsest with the normals of the finest.
+        shading: one of `SHADINGS`; None is "lambert", or what a cloud without normals can show.
+        shade: settings of the shading; ``limits`` in input units (curvature: in their inverse). Of a mesh or a cloud,
+            shadows and occlusion are left out, as they are traced in a field.
+        reference: cloud or mesh for the "error"; None is what the field was fitted to.
+        orbit: where the camera stands.
+        cameras: file of posed cameras instead, in input coordinates.
+        frame: which of them, by name or index; of a film None, all.
+        background: display RGB in [0, 1]; None is transparent.
+        legend: whether a picture in a colour map's colours has a legend under it.
+        samples: per pixel and direction.
+        frames: of a turntable.
+        fps: of a film.
+        device: where to evaluate a field, "auto" is CUDA where there is one.
+    """
+
+    size: tuple[int, ...] | None = None
+    level: int | None = None
+    normal_level: int | None = None
+    levels: bool = False
+    shading: str | None = None
+    shade: ShadeOptions = dataclasses.field(default_factory=lambda: ShadeOptions(shadows=True, occlusion=True))
+    reference: str | Path | None = None
+    orbit: Orbit = dataclasses.field(default_factory=Orbit)
+    cameras: str | Path | None = None
+    frame: str | None = None
+    background: Color | None = (1.0, 1.0, 1.0)
+    legend: bool = True
+    samples: int = 2
+    frames: int = 96
+    fps: float = 24.0
+    device: str = "auto"
+
+
+def render_run(
+    source: str | Path,
+    out: str | Path,
+    options: RenderOptions | None = None,
+    *,
+    progress: Callable[[int, int], None] | None = None,
+) -> str:
+    """Draw a run, a mesh or a cloud.
+
+    A film goes once around the shape, or through the posed cameras in their order.
+
+    Args:
+        source: run directory, .safetensors file, mesh or cloud.
+        out: a .png or .jpg picture, or an .mp4 or .gif film.
+        options: what, and how.
+        progress: called with how many parts are drawn, and of how many.
+
+    Returns:
+        What was drawn, in a few words.
+
+    Raises:
+        InputError: something cannot be read, is not there, or does not go together; or ``out`` cannot be written.
+    """
+    options, out = options or RenderOptions(), Path(out)
+    film = out.suffix.lower() in ANIMATIONS
+    if not film:
+        check_picture_path(out, transparent=options.background is None)
+    elif options.background is None:
+        raise InputError(f"{out}: films know no transparency; write a .png, or give a background")
+    scene = open_scene(
+        source,
+        level=options.level,
+        normal_level=options.normal_level,
+        levels=options.levels,
+        device=choose_device(options.device),
+    )
+    artist = _Artist(scene, options)
+    cameras = _cameras(scene, options, film=film)
+    artist.fit_limits(cameras)
+    if film:
+        write_animation(out, artist.pictures(cameras, progress), fps=options.fps)
+    else:
+        write_picture(out, next(artist.pictures(cameras, progress)))
+    return artist.caption(cameras)
+
+
+def _cameras(scene: Scene, options: RenderOptions, *, film: bool) -> list[Camera]:
+    if options.cameras is not None:
+        if options.size is not None and len(options.size) != 1:
+            raise InputError("--size: with --cameras give the width alone; the height follows from the images")
+        width = None if options.size is None else options.size[0]
+        return posed_cameras(options.cameras, options.frame, scene.similarity, width=width, film=film)
+    if options.frame is not None:
+        raise InputError(f"--frame {options.frame}: goes with --cameras FILE")
+    size = (640,) if options.size is None else options.size
+    return orbit_cameras(scene.outline(), options.orbit, size=(size[0], size[-1]), frames=options.frames if film else 1)
+
+
+class _Artist:
+    """Draws a scene in one manner, with one scale of colours for all pictures."""
+
+    def __init__(self, scene: Scene, options: RenderOptions) -> None:
+        """Check that the scene can be drawn so, and read what that needs.
+
+        Raises:
+            InputError: it cannot.
+        """
+        self.scene, self.options = scene, options
+        self.shading = options.shading or _default_shading(scene)
+        self.unit = scene.similarity.scale ** MEASURES.get(self.shading, ("", 0))[1]
+        if self.shading == "color" and not scene.colored:
+            raise InputError(f"{scene.name}: has no colours for --shading color; leave it out")
+        if self.shading == "curvature" and scene.field is None:
+            raise InputError(f"{scene.name}: --shading curvature needs a field; render the run, not its mesh")
+        shading_options = options.shade
+        if scene.field is None:
+            back = scene.looks[0].label == "mesh"
+            shading_options = dataclasses.replace(shading_options, shadows=False, occlusion=False, back_faces=back)
+        if options.shade.limits is not None:
+            low, high = options.shade.limits
+            shading_options = dataclasses.replace(shading_options, limits=(low / self.unit, high / self.unit))
+        self.shade_options = shading_options
+        self.matcap = load_matcap(options.shade.matcap) if self.shading == "matcap" else None
+        self.reference = reference_distance(scene, options.reference) if self.shading == "error" else None
+        self.anything = False
+
+    def fit_limits(self, cameras: Sequence[Camera]) -> None:
+        """Set the limits of the colour map, the same for all pictures, from small ones of some of them."""
+        if self.shading not in MEASURES or self.shade_options.limits is not None:
+            return
+        values = []
+        for camera in cameras[:: math.ceil(len(cameras) / PREVIEWS)]:
+            share = min(1.0, PREVIEW / max(camera.width, camera.height))
+            small = camera.resized(math.ceil(share * camera.width), math.ceil(share * camera.height))
+            values += [self._measure(self.scene.view(small, look), look) for look in self.scene.looks]
+        limits = value_limits(torch.cat(values), self.shading, self.shade_options)
+        if limits[0] < limits[1]:  # else all pixels show one number, and any limits will do
+            self.shade_options = dataclasses.replace(self.shade_options, limits=limits)
+
+    def pictures(self, cameras: Sequence[Camera], progress: Callable[[int, int], None] | None) -> Iterator[Image]:
+        """The picture from each camera."""
+        per_picture = len(self.scene.looks) * len(list(self._strips(cameras[0])))
+        total = per_picture * len(cameras)
+        for index, camera in enumerate(cameras):
+            done = index * per_picture
+            tiles = []
+            for look in self.scene.looks:
+                parts = []
+                for strip in self._strips(camera):
+                    parts.append(self._draw(strip, look))
+                    done += 1
+                    if progress is not None:
+                        progress(done, total)
+                tiles.append((look.label, np.concatenate(parts)))
+            yield self._with_legend(tiles[0][1] if len(tiles) == 1 else contact_sheet(tiles), camera)
+
+    def caption(self, cameras: Sequence[Camera]) -> str:
+        """What was drawn, in a few words."""
+        first, count = cameras[0], len(cameras)
+        what = ", ".join(look.label for look in self.scene.looks)
+        words = [what, self.shading, f"{first.width}×{first.height}" + (f", {count} frames" if count > 1 else "")]
+        if self.shading in MEASURES and self.shade_options.limits is not None:
+            low, high = (limit * self.unit for limit in self.shade_options.limits)
+            words[1] += f" from {low:.4g} to {high:.4g}"
+        return ", ".join(words) + ("" if self.anything else "; nothing of it is in view")
+
+    def _strips(self, camera: Camera) -> Iterator[Camera]:
+        """The camera, cut into strips of rows that are worked on one after the other."""
+        samples = self.options.samples
+        rows = max(1, STRIP // samples**2 // camera.width)
+        for first in range(0, camera.height, rows):
+            intrinsics = camera.intrinsics.clone()
+            intrinsics[1, 2] -= first
+            height = min(rows, camera.height - first)
+            strip = dataclasses.replace(camera, intrinsics=intrinsics, height=height)
+            yield strip.resized(camera.width * samples, height * samples)
+
+    def _draw(self, camera: Camera, look: Look) -> Image:
+        seen = self.scene.view(camera, look)
+        rgb = seen.position
+        if len(seen.pixel):
+            self.anything = True
+            rgb = self._colors(seen, camera, look)
+        return downsample(compose(seen, rgb, background=self.options.background), self.options.samples)
+
+    def _colors(self, seen: Seen, camera: Camera, look: Look) -> Tensor:
+        return shade(
+            seen,
+            self.shading,
+            camera=camera,
+            field=self.scene.field,
+            level=look.level,
+            options=self.shade_options,
+            matcap=self.matcap,
+            values=self._measure(seen, look) if self.shading in MEASURES else None,
+        )
+
+    def _measure(self, seen: Seen, look: Look) -> Tensor:
+        if not len(seen.pixel):
+            return seen.depth
+        if self.reference is not None:
+            return self.reference(seen.position)
+        return measure(
+            seen,
+            self.shading,
+            field=self.scene.field,
+            level=look.normal_level,  # a curvature is how the normals turn
+            detail=self.shade_options.detail,
+        )
+
+    def _with_legend(self, picture: Image, camera: Camera) -> Image:
+        limits = self.shade_options.limits
+        if not self.options.legend or self.shading not in MEASURES or limits is None:
+            return picture
+        title = MEASURES[self.shading][0]
+        shown = (limits[0] * self.unit, limits[1] * self.unit)
+        paper = self.options.background if len(self.scene.looks) == 1 else (1.0, 1.0, 1.0)
+        return with_color_bar(picture, self._scale(camera, limits), shown, title=title, background=paper)
+
+    def _scale(self, camera: Camera, limits: tuple[float, float]) -> NDArray[np.float32]:
+        """The colours ``(256, 3)`` of the map, as a surface that faces the eye shows them."""
+        values = torch.linspace(*limits, 256)
+        forward = camera.forward.float().expand(256, 3)
+        facing = Seen((256, 1), torch.arange(256), values, forward, -forward, forward)
+        return shade(facing, self.shading, camera=camera, options=self.shade_options, values=values).numpy()
+
+
+def _default_shading(scene: Scene) -> str:
+    if scene.oriented:
+        return "lambert"
+    return "color" if scene.colored else "depth"

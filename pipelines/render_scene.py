@@ -1,0 +1,226 @@
+"""What ``mplicits render`` draws, a fitted field or the mesh or cloud of a file, behind one interface."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from ..datasets.cameras import Camera
+from ..neural_fields import Field, InputError, Similarity, load_field
+from ..neural_fields.meshing import NoSurfaceError, extract_mesh
+from ..neural_fields.tracing import BOUNDING_RADIUS
+from .cloud_distance import CloudDistance
+from .picture import cloud_view, mesh_view
+from .render import trace_view
+from .runs import find_field, is_field
+from .seen import Seen
+from .surface import read_surface, sample_surface
+
+__all__ = ["Look", "Scene", "open_scene", "reference_distance"]
+
+Float64 = NDArray[np.float64]
+
+FRAME_RESOLUTION = 128  # of the mesh that says what the camera has to look at
+SAMPLES = 500_000  # on a reference that is a mesh
+DISC = 2.2  # diameter of a cloud's discs, in distances between neighbouring points
+
+
+@dataclass(frozen=True)
+class Look:
+    """One of several pictures side by side.
+
+    Attributes:
+        label: over it.
+        level: whose surface is seen.
+        normal_level: whose normals.
+    """
+
+    label: str
+    level: int = 0
+    normal_level: int = 0
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Something to draw, in unit-sphere coordinates.
+
+    Attributes:
+        name: of the file, for messages.
+        similarity: from input coordinates to those.
+        looks: what to draw of it, at least one.
+        field: what is traced; None for a mesh or a cloud.
+        colored: whether it has colours of its own.
+        oriented: whether it has normals.
+        fitted_to: name of the file that the field was fitted to, if it is known.
+        outline: points ``(N, 3)`` that a camera has to have in view.
+        view: what the pixels of a camera see.
+    """
+
+    name: Path
+    similarity: Similarity
+    looks: tuple[Look, ...]
+    field: Field | None
+    colored: bool
+    oriented: bool
+    fitted_to: str | None
+    outline: Callable[[], Float64]
+    view: Callable[[Camera, Look], Seen]
+
+
+def open_scene(
+    source: str | Path,
+    *,
+    level: int | None = None,
+    normal_level: int | None = None,
+    levels: bool = False,
+    device: torch.device | str = "cpu",
+) -> Scene:
+    """Open a run, a .safetensors file, a mesh or a cloud.
+
+    Args:
+        source: which.
+        level: to draw; by default the finest.
+        normal_level: whose normals; by default ``level``.
+        levels: whether to draw all levels side by side, and the coarsest with the normals of the finest.
+        device: where to evaluate a field.
+
+    Raises:
+        InputError: it cannot be read, or there is no such level.
+    """
+    if is_field(source):
+        return _field_scene(find_field(source), level, normal_level, levels, device)
+    for flag, given in (("--level", level), ("--normal-level", normal_level), ("--levels", levels or None)):
+        if given is not None:
+            raise InputError(f"{flag}: {source} has no levels; render the run that it was made from")
+    return _surface_scene(Path(source))
+
+
+def _field_scene(
+    file: Path, level: int | None, normal_level: int | None, levels: bool, device: torch.device | str
+) -> Scene:
+    field, similarity, metadata = load_field(file, device=device)
+    if field.in_dim != 3:
+        raise InputError(f"{file}: a field of {field.in_dim} coordinates; pictures are made of fields of 3")
+    finest = field.num_levels - 1
+    for flag, given in (("--level", level), ("--normal-level", normal_level)):
+        if given is not None and not 0 <= given <= finest:
+            raise InputError(f"{flag} {given}: {file} has levels 0 to {finest}")
+    level = finest if level is None else level
+    normal_level = level if normal_level is None else normal_level
+    looks = [_look(level, normal_level)]
+    if levels:
+        looks = [_look(index, index) for index in range(finest + 1)] + ([_look(0, finest)] if finest else [])
+
+    def view(camera: Camera, look: Look) -> Seen:
+        return trace_view(field, camera, level=look.level, normal_level=look.normal_level, device=device)
+
+    return Scene(
+        name=file,
+        similarity=similarity,
+        looks=tuple(looks),
+        field=field,
+        colored=False,
+        oriented=True,
+        fitted_to=_fitted_to(metadata),
+        outline=lambda: _outline(file, field),
+        view=view,
+    )
+
+
+def _look(level: int, normal_level: int) -> Look:
+    mapped = "" if normal_level == level else f" + normals of level {normal_level}"
+    return Look(f"level {level}{mapped}", level, normal_level)
+
+
+def _fitted_to(metadata: dict[str, Any]) -> str | None:
+    source = metadata.get("run", {}).get("cloud")
+    return str(source) if source else None
+
+
+def _outline(file: Path, field: Field) -> Float64:
+    """Points of the finest level, whichever is drawn, so that one camera serves all levels and a mesh of them."""
+    try:
+        vertices = extract_mesh(field, resolution=FRAME_RESOLUTION).vertices.astype(np.float64)
+    except NoSurfaceError as error:
+        raise InputError(f"{file}: no surface to render ({error})") from error
+    # An open surface may go on to the corners of the mesher's cube, but is not traced there.
+    inside = np.linalg.norm(vertices, axis=1) <= BOUNDING_RADIUS
+    return vertices[inside] if inside.any() else vertices
+
+
+def _surface_scene(file: Path) -> Scene:
+    surface = read_surface(file)
+    used = surface.used_vertices()
+    try:
+        similarity = Similarity.to_unit_sphere(used)
+    except ValueError as error:
+        raise InputError(f"{file}: {error}") from error
+    moved = surface.moved(similarity)
+    solid = bool(len(surface.faces))
+    spacing = 0.0 if solid else _spacing(moved.vertices)
+
+    def view(camera: Camera, _look: Look) -> Seen:
+        if solid:
+            return mesh_view(moved, camera)
+        distance = max(float(camera.eye.norm()), 1e-3)
+        size = DISC * spacing * float(camera.intrinsics[1, 1]) / distance
+        return cloud_view(moved, camera, point_size=max(size, 1.0))
+
+    return Scene(
+        name=file,
+        similarity=similarity,
+        looks=(Look("mesh" if solid else "cloud"),),
+        field=None,
+        colored=surface.colors is not None,
+        oriented=solid or surface.normals is not None,
+        fitted_to=None,
+        outline=lambda: similarity.to_unit(used),
+        view=view,
+    )
+
+
+def _spacing(points: Float64) -> float:
+    """A distance within which most points have a neighbour."""
+    chosen = points[:: max(1, len(points) // 20_000)]
+    return float(np.quantile(KDTree(points).query(chosen, k=2)[0][:, 1], 0.9))
+
+
+def reference_distance(scene: Scene, reference: str | Path | None) -> Callable[[Tensor], Tensor]:
+    """What measures how far points ``(P, 3)`` of a scene are from a reference, ``(P,)``, in the scene's coordinates.
+
+    Where the reference has normals, its points stand for discs that fill the gaps between them (`CloudDistance`), and
+    a surface through them has no error; the distance to bare points is never less than their spacing allows.
+
+    Args:
+        scene: what is drawn.
+        reference: a cloud, or a mesh, of which points are sampled; by default what the field was fitted to.
+
+    Raises:
+        InputError: there is none, or it cannot be read.
+    """
+    file = scene.fitted_to if reference is None else reference
+    if file is None:
+        raise InputError(f"{scene.name}: --shading error needs a cloud to measure from; name it with --reference FILE")
+    if reference is None and not Path(file).is_file():
+        raise InputError(f"{scene.name}: its cloud {file} is not to be found; name it with --reference FILE")
+    surface = read_surface(file)
+    points, normals = surface.vertices, surface.normals
+    if len(surface.faces):
+        points, normals = sample_surface(surface, SAMPLES, np.random.default_rng(0))
+    points = scene.similarity.to_unit(points)
+    if normals is None:
+        tree = KDTree(points)
+        return lambda places: torch.as_tensor(tree.query(places.cpu().double().numpy(), workers=-1)[0]).to(places)
+    known = np.linalg.norm(normals, axis=1) > 0.5
+    if known.sum() < 2:
+        raise InputError(f"{file}: fewer than two points with normals; nothing can be measured from it")
+    cloud = CloudDistance(torch.from_numpy(points[known]), torch.from_numpy(normals[known]))
+    return lambda places: cloud.signed(places).abs().to(places)
