@@ -4,7 +4,7 @@ from .analytic import Box, Capsule, Plane, Sphere, Torus, Union
 from .checkpoint import SavedField, load_field, save_field
 from .errors import InputError
 from .field import Field, Jet
-from .meshing import Mesh, NoSurfaceError, extract_mesh
+from .meshing import Mesh, NoSurfaceError, extract_mesh, map_normals
 from .multiscale import MultiscaleSDF
 from .similarity import Similarity
 from .siren import Siren
@@ -30,6 +30,7 @@ __all__ = [
     "cone_starts",
     "extract_mesh",
     "load_field",
+    "map_normals",
     "save_field",
     "sphere_trace",
 ]

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch.nn.functional import normalize
 
 from ._blocks import ActiveCells, NoSurfaceError, active_cells, cull_blocks
 from ._cube import EDGE_AXIS, EDGE_ENDS, cube_tables
 from ._lattice import Bounds, Lattice, Progress, Sampler
 from .field import Field
 
-__all__ = ["Mesh", "MeshStats", "NoSurfaceError", "extract_mesh"]
+__all__ = ["Mesh", "MeshStats", "NoSurfaceError", "extract_mesh", "map_normals"]
 
 # The unit sphere with a little room, so that a surface that touches it is still closed.
 DEFAULT_BOUNDS: Bounds = ((-1.02, -1.02, -1.02), (1.02, 1.02, 1.02))
@@ -145,6 +147,28 @@ def extract_mesh(
     seconds = {stage: after - before for stage, before, after in zip(stages, times, times[1:], strict=False)}
     stats = MeshStats(tuple(sampler.counts), int(kept.sum()), len(cells.cases), seconds)
     return Mesh(vertices, faces, unit, stats=stats)
+
+
+@torch.no_grad()
+def map_normals(mesh: Mesh, field: Field, *, level: int = -1, batch: int = 1 << 18) -> Mesh:
+    """Neural normal mapping: the mesh with a field's normals at its vertices (paper Sec. 3).
+
+    Each vertex p gets ∇f_j(p) / |∇f_j(p)|. For an f_j that is a distance this is the normal of its surface at the point
+    nearest to p, so a coarse mesh shades like a fine one as long as it stays within the bands of the level.
+
+    Args:
+        mesh: in the field's own coordinates; of a coarse level, say.
+        field: on the device of its parameters.
+        level: whose gradient to take.
+        batch: points per call of the field.
+
+    Raises:
+        ValueError: there is no such level.
+    """
+    like = next(field.parameters(), field.deltas)
+    points = torch.from_numpy(mesh.vertices).to(device=like.device, dtype=like.dtype)
+    gradients = [field.jet(part, level=level).gradient for part in points.split(batch)]
+    return replace(mesh, normals=normalize(torch.cat(gradients), dim=-1).float().cpu().numpy())
 
 
 def _crossing(low: NDArray[np.floating], high: NDArray[np.floating]) -> NDArray[np.float64]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..datasets import read_cloud
 from ..neural_fields import InputError, load_field
-from ..neural_fields.meshing import Mesh, NoSurfaceError, extract_mesh
+from ..neural_fields.meshing import Mesh, NoSurfaceError, extract_mesh, map_normals
 from .mesh_files import check_mesh_path, write_mesh
 from .mesh_trim import keep_largest, trim_distance
 from .runs import find_field
@@ -25,6 +25,7 @@ class MeshOptions:
     Attributes:
         resolution: cells along each side of the cube around the unit sphere.
         level: counted from 0, the coarsest; None is the finest.
+        normal_level: the level whose gradients are the normals (neural normal mapping); None is ``level``.
         keep_largest: whether to keep only the component of largest area.
         trim_distance: drop faces further than this from the points, in input units.
         cloud: the points for that; by default the file that was fitted.
@@ -32,6 +33,7 @@ class MeshOptions:
 
     resolution: int = 256
     level: int | None = None
+    normal_level: int | None = None
     keep_largest: bool = False
     trim_distance: float | None = None
     cloud: str | Path | None = None
@@ -57,8 +59,10 @@ def mesh_run(run: str | Path, out: str | Path, options: MeshOptions | None = Non
     field, similarity, metadata = load_field(file)
     check_mesh_path(out, similarity)  # again: not every format can hold every place
     level = field.num_levels - 1 if options.level is None else options.level
-    if not 0 <= level < field.num_levels:
-        raise InputError(f"--level {level}: {file} has levels 0 to {field.num_levels - 1}")
+    normal_level = level if options.normal_level is None else options.normal_level
+    for flag, number in (("--level", level), ("--normal-level", normal_level)):
+        if not 0 <= number < field.num_levels:
+            raise InputError(f"{flag} {number}: {file} has levels 0 to {field.num_levels - 1}")
     points = None
     if options.trim_distance is not None:
         cloud = read_cloud(options.cloud or _fitted_cloud(file, metadata))
@@ -67,6 +71,8 @@ def mesh_run(run: str | Path, out: str | Path, options: MeshOptions | None = Non
         mesh = extract_mesh(field, resolution=options.resolution, level=level)
     except NoSurfaceError as error:
         raise InputError(f"{file}: no surface to mesh ({error})") from error
+    if normal_level != level:
+        mesh = map_normals(mesh, field, level=normal_level)
     if points is not None and options.trim_distance is not None:
         mesh = trim_distance(mesh, points, options.trim_distance / similarity.scale)
     if options.keep_largest:

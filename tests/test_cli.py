@@ -226,6 +226,15 @@ def test_mesh_is_in_input_coordinates_and_evaluate_measures_it(capsys, run, tmp_
 def test_levels_are_meshed_by_number(capsys, run, tmp_path):
     assert main(["mesh", str(run), "-o", str(tmp_path / "a.stl"), "--resolution", "32", "--level", "0"]) == 0
     assert "has levels 0 to 1" in fails(capsys, "mesh", run, "-o", tmp_path / "b.stl", "--level", "2")
+    plain, mapped = str(tmp_path / "c.ply"), str(tmp_path / "d.ply")
+    assert main(["mesh", str(run), "-o", plain, "--resolution", "24", "--level", "0"]) == 0
+    assert main(["mesh", str(run), "-o", mapped, "--resolution", "24", "--level", "0", "--normal-level", "1"]) == 0
+    plain, mapped = (
+        trimesh.load_mesh(path, process=False).metadata["_ply_raw"]["vertex"]["data"] for path in (plain, mapped)
+    )
+    np.testing.assert_array_equal(plain["x"], mapped["x"])
+    assert 1e-4 < np.abs(plain["nx"] - mapped["nx"]).max() < 1
+    assert "--normal-level 2" in fails(capsys, "mesh", run, "-o", tmp_path / "b.stl", "--normal-level", "2")
 
 
 def test_trimming_takes_the_points_from_the_fit_or_from_a_file(capsys, run, cloud, tmp_path):

@@ -7,7 +7,7 @@ import torch
 from mplicits.neural_fields import Box, Capsule, Field, Jet, MultiscaleSDF, Plane, Siren, Sphere, Torus, Union
 from mplicits.neural_fields._cube import CORNERS, cube_tables
 from mplicits.neural_fields._lattice import Lattice
-from mplicits.neural_fields.meshing import Mesh, NoSurfaceError, extract_mesh
+from mplicits.neural_fields.meshing import Mesh, NoSurfaceError, extract_mesh, map_normals
 
 UNIT = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
 
@@ -161,6 +161,20 @@ def test_normals_are_the_gradient():
     p = mesh.vertices[mesh.faces]
     facing = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
     assert ((facing * mesh.normals[mesh.faces[:, 0]]).sum(axis=1) > 0).all()
+
+
+def test_normals_of_a_finer_level_on_a_coarse_mesh():
+    torch.manual_seed(0)
+    field = MultiscaleSDF(Sphere(radius=0.5), [Siren(16, 2, omega=5.0, output_gain=0.1)], [0.2]).double()
+    coarse = extract_mesh(field, resolution=24, level=0)
+    mapped = map_normals(coarse, field, level=1, batch=100)
+    assert mapped.vertices is coarse.vertices
+    assert mapped.normals.dtype == np.float32
+    gradient = field.jet(torch.from_numpy(coarse.vertices), level=1).gradient
+    expected = torch.nn.functional.normalize(gradient, dim=-1).detach().numpy()
+    np.testing.assert_allclose(mapped.normals, expected, atol=1e-6)
+    assert np.abs(mapped.normals - coarse.normals).max() > 0.01
+    np.testing.assert_allclose(map_normals(coarse, field, level=0).normals, coarse.normals, atol=2e-3)
 
 
 def test_without_normals_vertices_are_interpolated():
