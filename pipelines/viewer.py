@@ -54,6 +54,7 @@ class Viewer:
         with _silent():
             self._server: Any = viser.ViserServer(host=host, port=port, label=shown.name, verbose=False)
         self._server.gui.configure_theme(show_logo=False, show_share_button=False)
+        self._server.gui.main_panel.dock_right()  # beside the image, not on it
         self._server.scene.set_up_direction(UP_AXES[up])
         camera = self._server.initial_camera
         camera.position, camera.look_at, camera.fov = first_eye(up, FOV), (0.0, 0.0, 0.0), FOV

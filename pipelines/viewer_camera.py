@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 import torch
@@ -55,13 +55,20 @@ def image_size(side: int, canvas: tuple[int, int]) -> tuple[int, int]:
     return max(1, round(width * factor)), max(1, round(height * factor))
 
 
-def strips(camera: Camera, pixels: int) -> Iterator[tuple[int, Camera]]:
-    """Cut a camera into strips of whole rows, of about ``pixels`` pixels each: first row, camera of the strip."""
-    rows = max(1, pixels // camera.width)
-    for first in range(0, camera.height, rows):
+def strips(camera: Camera, pixels: Callable[[], int]) -> Iterator[tuple[int, Camera]]:
+    """Cut a camera into strips of whole rows: the first row and the camera of each.
+
+    Args:
+        camera: of the whole image.
+        pixels: asked before each strip for about how many pixels it is to have.
+    """
+    first = 0
+    while first < camera.height:
+        rows = min(max(1, pixels() // camera.width), camera.height - first)
         intrinsics = camera.intrinsics.clone()
         intrinsics[1, 2] -= first
-        yield first, Camera(intrinsics, camera.world_from_camera, camera.width, min(rows, camera.height - first))
+        yield first, Camera(intrinsics, camera.world_from_camera, camera.width, rows)
+        first += rows
 
 
 def merge_strips(size: tuple[int, int], parts: Sequence[tuple[int, Seen]]) -> Seen:

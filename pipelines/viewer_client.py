@@ -98,12 +98,20 @@ class Client:
             return
         self._last = frame
         self._send(frame)
-        size = f"{frame.camera.width} × {frame.camera.height}"
-        self._controls.say(f"{size} in {frame.seconds:.2f} s" if frame.final else f"{size} …")
+        self._say_size()
 
     def fail(self, error: Exception) -> None:
         """Say that an image could not be drawn; called by the scheduler."""
         self._controls.say(f"**Cannot be drawn:** {' '.join(str(error).split())}")
+
+    def _say_size(self) -> None:
+        """Say how large the image on the screen is, and whether a finer one follows."""
+        frame = self._last
+        if frame is None:
+            self._controls.say("")
+            return
+        size = f"{frame.camera.width} × {frame.camera.height}"
+        self._controls.say(f"{size} in {frame.seconds:.2f} s" if frame.final else f"{size} …")
 
     def _send(self, frame: Frame) -> None:
         # Depths are a third as much work again, and only needed where something else may be in front or behind.
@@ -126,13 +134,14 @@ class Client:
             self._scheduler.forget(self._handle.client_id)
             self._last = None
             self._handle.scene.set_background_image(None)
+            self._say_size()
 
     def _rearrange(self) -> None:
         """What stands beside the traced image has changed."""
         had_depth = self._scene.is_filled
         try:
             self._scene.arrange(busy=lambda: self._controls.say("Extracting a mesh …"))
-            self._controls.say("")
+            self._say_size()
         except InputError as error:
             self._controls.say(f"**{error}**")
         except Superseded:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cached_property
@@ -24,8 +26,10 @@ from .viewer_frames import Look
 __all__ = ["Painter"]
 
 WHITE = (1.0, 1.0, 1.0)
-# Pixels between two looks at whether anybody still waits: tens of milliseconds of work.
-BLOCK = 1 << 15
+# Seconds between two looks at whether anybody still waits, and pixels drawn between them: at first, and at most and
+# at least, because rows of empty pixels say nothing about those that follow.
+ATTENTION = 0.25
+BLOCK, SMALLEST_BLOCK, LARGEST_BLOCK = 1 << 13, 1 << 12, 1 << 15
 # Shadings that map numbers to colours, whose limits depend on all pixels together.
 MEASURED = ("depth", "curvature", "error")
 
@@ -60,22 +64,21 @@ class Painter:
     @torch.inference_mode()
     def _paint(self, camera: Camera, look: Look, check: Callable[[], None]) -> tuple[Seen, Tensor]:
         parts, device = [], self._field.deltas.device
-        for first, strip in strips(camera, BLOCK):
-            check()
+        for first, strip in strips(camera, _Pace(check).next_block):
             seen = trace_view(self._field, strip, level=look.level, normal_level=look.normal_level, device=device)
             parts.append((first, seen))
         seen = merge_strips((camera.width, camera.height), parts)
         if look.shading in MEASURED:
             numbers = [
                 measure(part, look.shading, field=self._field, level=look.normal_level, reference=self._reference(look))
-                for part in _pieces(seen, check)
+                for part in _pieces(seen, _Pace(check).next_block)
             ]
             return seen, shade(seen, look.shading, camera=camera, values=torch.cat(numbers))
         # Shadows and occlusion look further than a band is wide, and a coarse level answers that as well and sooner.
         options = ShadeOptions(shadows=look.shadows, occlusion=look.occlusion, light_level=0)
         colors = [
             shade(part, look.shading, camera=camera, field=self._field, options=options, matcap=self._matcap)
-            for part in _pieces(seen, check)
+            for part in _pieces(seen, _Pace(check).next_block)
         ]
         return seen, torch.cat(colors)
 
@@ -91,11 +94,29 @@ class Painter:
         return load_matcap(ShadeOptions().matcap)
 
 
-def _pieces(seen: Seen, check: Callable[[], None]) -> Iterator[Seen]:
+class _Pace:
+    """How many pixels to draw at once, from how long the last ones took."""
+
+    def __init__(self, check: Callable[[], None]) -> None:
+        self._check, self._block, self._begun = check, BLOCK, math.nan
+
+    def next_block(self) -> int:
+        """The number of pixels to draw now; looks first whether anybody still waits for them."""
+        self._check()
+        now = time.perf_counter()
+        if now - self._begun < ATTENTION / 2:
+            self._block = min(2 * self._block, LARGEST_BLOCK)
+        elif now - self._begun > ATTENTION:
+            self._block = max(self._block // 2, SMALLEST_BLOCK)
+        self._begun = now
+        return self._block
+
+
+def _pieces(seen: Seen, next_block: Callable[[], int]) -> Iterator[Seen]:
     """Rows of what is seen, a block at a time; at least one, which may be empty."""
-    for first in range(0, max(1, len(seen.pixel)), BLOCK):
-        check()
-        part = slice(first, first + BLOCK)
+    first = 0
+    while first < max(1, len(seen.pixel)):
+        part = slice(first, first + next_block())
         yield replace(
             seen,
             pixel=seen.pixel[part],
@@ -105,3 +126,4 @@ def _pieces(seen: Seen, check: Callable[[], None]) -> Iterator[Seen]:
             direction=seen.direction[part],
             color=None if seen.color is None else seen.color[part],
         )
+        first = part.stop

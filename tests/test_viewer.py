@@ -62,7 +62,7 @@ def test_image_has_the_shape_of_the_canvas_and_is_never_larger(canvas):
 
 def test_strips_see_together_what_the_camera_sees():
     camera, field = some_camera(), Sphere(radius=0.5)
-    parts = list(strips(camera, 64 * 7))
+    parts = list(strips(camera, lambda: 64 * 7))
     assert [first for first, _ in parts] == list(range(0, 48, 7))
     directions = torch.cat([strip.rays(dtype=torch.float64)[1] for _, strip in parts])
     torch.testing.assert_close(directions, camera.rays(dtype=torch.float64)[1], rtol=0, atol=1e-12)
