@@ -173,8 +173,8 @@ def test_normals_of_a_finer_level_on_a_coarse_mesh():
     gradient = field.jet(torch.from_numpy(coarse.vertices), level=1).gradient
     expected = torch.nn.functional.normalize(gradient, dim=-1).detach().numpy()
     np.testing.assert_allclose(mapped.normals, expected, atol=1e-6)
-    assert np.abs(mapped.normals - coarse.normals).max() > 0.01
-    np.testing.assert_allclose(map_normals(coarse, field, level=0).normals, coarse.normals, atol=2e-3)
+    assert np.abs(mapped.normals - coarse.normals).max() > 0.03
+    np.testing.assert_allclose(map_normals(coarse, field, level=0).normals, coarse.normals, atol=0.01)
 
 
 def test_without_normals_vertices_are_interpolated():
