@@ -22,7 +22,8 @@ WIRE_COLOR = (40, 60, 90)
 CLOUD_COLOR = (40, 90, 170)
 SHELL_COLORS = ((225, 120, 60), (70, 130, 220))  # f = −δ, f = δ
 SHELL_OPACITY = 0.3
-POINT_SIZE = 0.004
+# Points are half as wide as they would be apart, spread over a sphere of half the unit's radius; within these limits.
+POINT_SIZES = (0.002, 0.02)
 MARK_COLOR = (220, 40, 40)
 MARK_LENGTH = 0.15
 MARK_RADIUS = 0.012
@@ -106,8 +107,9 @@ class Scene:
 
     def _add_cloud(self, _wanted: bool) -> list[Any]:
         points = self._shapes.cloud()
+        size = float(np.clip(np.sqrt(np.pi / len(points)) / 2, *POINT_SIZES))
         self._check()
-        look: dict[str, Any] = {"point_size": POINT_SIZE, "point_shape": "circle", "precision": "float32"}
+        look: dict[str, Any] = {"point_size": size, "point_shape": "circle", "precision": "float32"}
         return [self._scene.add_point_cloud("/cloud", points, CLOUD_COLOR, **look)]
 
     def _add_shells(self, band: int) -> list[Any]:

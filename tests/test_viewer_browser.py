@@ -198,7 +198,7 @@ def test_what_stands_beside_the_image_is_shown_and_taken_away(page, browser):
     page.choose("Band", "none")
     page.changes(banded)
     page.tick("Input cloud")
-    page.changes(traced, share=0.003)
+    page.changes(traced)
     assert complaints(browser) == []
 
 
