@@ -20,6 +20,7 @@ from .config import input_error
 from .fit_settings import add_fit_settings, fit_settings, were_given
 from .render_command import COMMAND as RENDER
 from .slice_command import COMMAND as SLICE
+from .view_command import COMMAND as VIEW
 
 __all__ = ["COMMANDS", "Command"]
 
@@ -189,6 +190,7 @@ COMMANDS: Mapping[str, Command] = MappingProxyType(
         ),
         "render": RENDER,
         "slice": SLICE,
+        "view": VIEW,
         "evaluate": Command(
             "measure a mesh against a reference",
             """  mplicits evaluate scan.ply truth.ply
