@@ -38,8 +38,8 @@ def with_color_bar(
         title: what the numbers are.
         background: of the strip, in [0, 1]; None is transparent, for a picture with an alpha channel.
     """
-    width = picture.shape[1]
-    text = round(float(np.clip(width / 48, 9, 64)))
+    height, width = picture.shape[:2]
+    text = round(float(np.clip(min(width, 2 * height) / 48, 9, 64)))
     margin = text
     length = max(2, min(width - 2 * margin, LONGEST * text))
     paper = (1.0, 1.0, 1.0) if background is None else background

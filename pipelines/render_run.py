@@ -153,6 +153,9 @@ class _Artist:
         """
         self.scene, self.options = scene, options
         self.shading = options.shading or _default_shading(scene)
+        # Normals do not show in depths and errors: another level's would only repeat a picture.
+        mapped = self.shading not in ("depth", "error")
+        self.looks = [look for look in scene.looks if mapped or look.level == look.normal_level] or scene.looks[:1]
         self.unit = scene.similarity.scale ** MEASURES.get(self.shading, ("", 0))[1]
         if self.shading == "color" and not scene.colored:
             raise InputError(f"{scene.name}: has no colours for --shading color; leave it out")
@@ -178,19 +181,19 @@ class _Artist:
         for camera in cameras[:: math.ceil(len(cameras) / PREVIEWS)]:
             share = min(1.0, PREVIEW / max(camera.width, camera.height))
             small = camera.resized(math.ceil(share * camera.width), math.ceil(share * camera.height))
-            values += [self._measure(self.scene.view(small, look), look) for look in self.scene.looks]
+            values += [self._measure(self.scene.view(small, look), look) for look in self.looks]
         limits = value_limits(torch.cat(values), self.shading, self.shade_options)
         if limits[0] < limits[1]:  # else all pixels show one number, and any limits will do
             self.shade_options = dataclasses.replace(self.shade_options, limits=limits)
 
     def pictures(self, cameras: Sequence[Camera], progress: Callable[[int, int], None] | None) -> Iterator[Image]:
         """The picture from each camera."""
-        per_picture = len(self.scene.looks) * len(list(self._strips(cameras[0])))
+        per_picture = len(self.looks) * len(list(self._strips(cameras[0])))
         total = per_picture * len(cameras)
         for index, camera in enumerate(cameras):
             done = index * per_picture
             tiles = []
-            for look in self.scene.looks:
+            for look in self.looks:
                 parts = []
                 for strip in self._strips(camera):
                     parts.append(self._draw(strip, look))
@@ -203,7 +206,7 @@ class _Artist:
     def caption(self, cameras: Sequence[Camera]) -> str:
         """What was drawn, in a few words."""
         first, count = cameras[0], len(cameras)
-        what = ", ".join(look.label for look in self.scene.looks)
+        what = ", ".join(look.label for look in self.looks)
         words = [what, self.shading, f"{first.width}×{first.height}" + (f", {count} frames" if count > 1 else "")]
         if self.shading in MEASURES and self.shade_options.limits is not None:
             low, high = (limit * self.unit for limit in self.shade_options.limits)
@@ -260,7 +263,7 @@ class _Artist:
             return picture
         title = MEASURES[self.shading][0]
         shown = (limits[0] * self.unit, limits[1] * self.unit)
-        paper = self.options.background if len(self.scene.looks) == 1 else (1.0, 1.0, 1.0)
+        paper = self.options.background if len(self.looks) == 1 else (1.0, 1.0, 1.0)
         return with_color_bar(picture, self._scale(camera, limits), shown, title=title, background=paper)
 
     def _scale(self, camera: Camera, limits: tuple[float, float]) -> NDArray[np.float32]:

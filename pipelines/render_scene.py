@@ -30,6 +30,7 @@ Float64 = NDArray[np.float64]
 
 FRAME_RESOLUTION = 128  # of the mesh that says what the camera has to look at
 SAMPLES = 500_000  # on a reference that is a mesh
+WIDER = 2.0  # discs of a reference, so that they leave no gaps between points that are spread at random
 DISC = 2.2  # diameter of a cloud's discs, in distances between neighbouring points
 
 
@@ -223,4 +224,5 @@ def reference_distance(scene: Scene, reference: str | Path | None) -> Callable[[
     if known.sum() < 2:
         raise InputError(f"{file}: fewer than two points with normals; nothing can be measured from it")
     cloud = CloudDistance(torch.from_numpy(points[known]), torch.from_numpy(normals[known]))
+    cloud.radii *= WIDER
     return lambda places: cloud.signed(places).abs().to(places)
