@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from ..datasets import STATUE_PLACEMENT, PointCloud, Statue, orbit, read_cloud, statue_scan, write_cloud_ply
+from ..datasets import STATUE_PLACEMENT, Camera, PointCloud, Statue, orbit, read_cloud, statue_scan, write_cloud_ply
 from ..neural_fields import Field, InputError, Similarity
 from ..neural_fields.meshing import Mesh, NoSurfaceError, extract_mesh
 from .config import load_config
@@ -21,6 +21,8 @@ from .fit_config import FitConfig
 from .mesh_files import write_mesh
 from .picture import contact_sheet, picture_of, write_picture
 from .progress_bar import progress_bars
+from .render import trace_view
+from .shading import ShadeOptions, compose, shade
 from .surface import from_cloud, from_mesh
 from .timing import format_table
 
@@ -71,7 +73,7 @@ def demo(
     finest = spread_colors(meshes[-1], points, run.similarity)
     for name in ("mesh.ply", "mesh.glb"):
         write_mesh(out / name, finest, run.similarity)
-    picture = draw_levels(points, meshes, run.similarity, up=up or ("z" if cloud is None else "y"))
+    picture = draw_levels(points, run.field, finest, run.similarity, up=up or ("z" if cloud is None else "y"))
     write_picture(out / "picture.png", picture)
     print(_figures(run, meshes, points))
     if cloud is None:
@@ -106,18 +108,30 @@ def spread_colors(mesh: Mesh, cloud: PointCloud, similarity: Similarity, *, neig
     return dataclasses.replace(mesh, colors=colors.astype(np.float32))
 
 
-def draw_levels(cloud: PointCloud, meshes: Sequence[Mesh], similarity: Similarity, *, up: str) -> NDArray[np.uint8]:
-    """The cloud and the mesh of each level side by side, all from one camera."""
+def draw_levels(cloud: PointCloud, field: Field, mesh: Mesh, similarity: Similarity, *, up: str) -> NDArray[np.uint8]:
+    """The cloud and each level side by side, all from one camera; with the mesh, where that has colours.
+
+    Args:
+        cloud: in input coordinates.
+        field: whose levels are traced.
+        mesh: of the finest, in unit-sphere coordinates.
+        similarity: from input to unit-sphere coordinates.
+        up: "y" or "z".
+    """
     points = from_cloud(cloud).moved(similarity)
     camera = orbit(points.vertices, up=up, width=TILE[0], height=TILE[1])
     pictures = [(f"input: {len(points.vertices):,} points", picture_of(points, camera))]
-    for level, mesh in enumerate(meshes):
-        label = f"level {level}: {len(mesh.faces):,} faces"
-        pictures.append((label, picture_of(from_mesh(mesh), camera)))
-    if points.colors is not None:
-        colored = spread_colors(meshes[-1], cloud, similarity)
-        pictures.append(("its colours from the nearest points", picture_of(from_mesh(colored), camera)))
+    pictures += [(f"level {level}, traced", _traced(field, camera, level)) for level in range(field.num_levels)]
+    if mesh.colors is not None:
+        pictures.append((f"mesh: {len(mesh.faces):,} faces", picture_of(from_mesh(mesh), camera)))
     return contact_sheet(pictures)
+
+
+def _traced(field: Field, camera: Camera, level: int) -> NDArray[np.uint8]:
+    """One ray per pixel: four would take half a minute, and the sheet is seen smaller than it is."""
+    seen = trace_view(field, camera, level=level, device=field.deltas.device)
+    light = ShadeOptions(shadows=True, occlusion=True)
+    return compose(seen, shade(seen, "lambert", camera=camera, field=field, level=level, options=light))
 
 
 @torch.inference_mode()
