@@ -21,7 +21,7 @@ __all__ = ["main"]
 
 OVERVIEW = """usage: mplicits COMMAND [arguments]
 
-Fit a multiscale neural signed distance field to a point cloud, mesh it, and measure the result.
+Fit a multiscale neural signed distance field to a point cloud, draw it, mesh it, and measure the result.
 
 commands:
 {commands}
@@ -29,6 +29,7 @@ commands:
 examples:
   mplicits sample -o scan.ply                       write the bundled scan of a statue
   mplicits fit scan.ply -o runs/statue              fit it (about three minutes on two cores)
+  mplicits render runs/statue -o statue.png --up z  draw it; turntable.mp4 goes around it
   mplicits mesh runs/statue -o statue.ply --resolution 512
   mplicits evaluate statue.ply reference.ply
 
