@@ -2,25 +2,30 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
+from torch import Tensor, nn
 
+from .color import ColorSiren, TextureField
 from .errors import InputError
 from .field import Field
 from .multiscale import MultiscaleSDF
 from .similarity import Similarity
 from .siren import Siren
 
-__all__ = ["SavedField", "load_field", "save_field"]
+__all__ = ["SavedField", "load_field", "load_texture", "save_field", "save_texture"]
 
 FORMAT = "mplicits-field"
+TEXTURE_FORMAT = "mplicits-texture"
 VERSION = 1
 
 
@@ -64,15 +69,7 @@ def save_field(
         "similarity": {"center": list(similarity.center), "scale": similarity.scale},
         "metadata": dict(metadata or {}),
     }
-    path = Path(path)
-    tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in field.state_dict().items()}
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        # Bytes, not save_file: that makes files nobody else may read, whatever the umask.
-        partial.write_bytes(save(tensors, metadata={FORMAT: json.dumps(header)}))
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
+    _write(Path(path), dict(field.state_dict()), FORMAT, header)
 
 
 def load_field(path: str | os.PathLike[str], *, device: torch.device | str = "cpu") -> SavedField:
@@ -82,36 +79,124 @@ def load_field(path: str | os.PathLike[str], *, device: torch.device | str = "cp
         InputError: there is no such file, it is damaged, or it is not a field of this package.
     """
     path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; expected a field written by `mplicits fit` (field.safetensors)")
-    try:
-        with safe_open(path, framework="pt", device=str(device)) as file:
-            header_text = (file.metadata() or {}).get(FORMAT)
-            if header_text is None:
-                raise InputError(f"{path}: a safetensors file, but not a field; expected one written by `mplicits fit`")
-            header = json.loads(header_text)
-            if header["version"] != VERSION:
-                raise InputError(
-                    f"{path}: field format version {header['version']}; this mplicits reads version {VERSION}, "
-                    "so write it again with `mplicits fit` or install the version that wrote it"
-                )
-            field = _build(header["field"])
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        for tensor in tensors.values():
-            if tensor.is_floating_point():
-                field = field.to(dtype=tensor.dtype)
-        field.load_state_dict(tensors)
-        for name, tensor in tensors.items():
-            if not bool(torch.isfinite(tensor).all()):
-                raise InputError(f"{path}: tensor {name!r} has NaN or infinite entries; fit the field again")
+    with _reading(path, FORMAT, "a field", "mplicits fit", device) as (header, tensors):
+        field = _build(header["field"])
+        _restore(path, field, tensors, "fit the field again")
         center, scale = header["similarity"]["center"], header["similarity"]["scale"]
         similarity = Similarity((float(center[0]), float(center[1]), float(center[2])), float(scale))
         return SavedField(field.to(device).requires_grad_(False), similarity, header["metadata"])
+
+
+def save_texture(
+    path: str | os.PathLike[str], texture: TextureField, *, metadata: Mapping[str, Any] | None = None
+) -> None:
+    """Write a texture, without its geometry, to a safetensors file, whole or not at all.
+
+    Args:
+        path: where to write.
+        texture: its geometry is not stored; a digest of it is, so that no other geometry gets these colours.
+        metadata: JSON values to keep with it.
+    """
+    siren = texture.network.siren
+    header = {
+        "format": TEXTURE_FORMAT,
+        "version": VERSION,
+        "network": {"width": siren.width, "depth": siren.depth, "omega": siren.omega, "in_dim": siren.in_dim},
+        "geometry": {"level": texture.geometry_level, "digest": _digest(texture.geometry)},
+        "metadata": dict(metadata or {}),
+    }
+    tensors = {name: tensor for name, tensor in texture.state_dict().items() if not name.startswith("geometry.")}
+    _write(Path(path), tensors, TEXTURE_FORMAT, header)
+
+
+def load_texture(path: str | os.PathLike[str], geometry: Field) -> TextureField:
+    """Read what `save_texture` wrote, and put it around its geometry.
+
+    Args:
+        path: a file written by `save_texture`.
+        geometry: the field that the texture was trained on; left as it is. The texture is put on its device.
+
+    Raises:
+        InputError: there is no such file, it is damaged, no texture, or one of another geometry.
+    """
+    path = Path(path)
+    device = next(geometry.parameters(), geometry.deltas).device
+    with _reading(path, TEXTURE_FORMAT, "a texture", "mplicits texture", device) as (header, tensors):
+        if header["geometry"]["digest"] != _digest(geometry):
+            raise InputError(f"{path}: the texture of another field than this one; run `mplicits texture` again")
+        sizes = dict(header["network"])
+        network = ColorSiren(sizes.pop("width"), sizes.pop("depth"), **sizes)
+        prefix = "network."
+        own = {name.removeprefix(prefix): tensor for name, tensor in tensors.items() if name.startswith(prefix)}
+        _restore(path, network, own, "run `mplicits texture` again")
+        texture = TextureField(
+            geometry,
+            network.to(device).requires_grad_(False),
+            delta=float(tensors["delta"]),
+            geometry_level=header["geometry"]["level"],
+            outside=tensors["outside"].tolist(),
+        )
+        texture.delta, texture.outside = tensors["delta"], tensors["outside"]  # in the precision they were saved in
+        return texture
+
+
+def _digest(field: Field) -> str:
+    """SHA-256 of a field's tensors in float32, the same on every device and in every precision above it."""
+    digest = hashlib.sha256()
+    for name, tensor in sorted(field.state_dict().items()):
+        digest.update(name.encode())
+        digest.update(tensor.detach().cpu().float().contiguous().numpy().tobytes())
+    return digest.hexdigest()
+
+
+def _write(path: Path, state: Mapping[str, Tensor], form: str, header: Mapping[str, Any]) -> None:
+    tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in state.items()}
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        # Bytes, not save_file: that makes files nobody else may read, whatever the umask.
+        partial.write_bytes(save(tensors, metadata={form: json.dumps(header)}))
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+@contextmanager
+def _reading(
+    path: Path, form: str, thing: str, command: str, device: torch.device | str
+) -> Iterator[tuple[dict[str, Any], dict[str, Tensor]]]:
+    """Header and tensors of a file; whatever goes wrong with them becomes an `InputError`."""
+    if not path.is_file():
+        name = "texture.safetensors" if form == TEXTURE_FORMAT else "field.safetensors"
+        raise InputError(f"{path}: no such file; expected {thing} written by `{command}` ({name})")
+    try:
+        with safe_open(path, framework="pt", device=str(device)) as file:
+            header_text = (file.metadata() or {}).get(form)
+            if header_text is None:
+                raise InputError(f"{path}: a safetensors file, but not {thing}; expected one written by `{command}`")
+            header = json.loads(header_text)
+            if header["version"] != VERSION:
+                raise InputError(
+                    f"{path}: {thing.split()[-1]} format version {header['version']}; this mplicits reads version "
+                    f"{VERSION}, so write it again with `{command}` or install the version that wrote it"
+                )
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        yield header, tensors
     except InputError:
         raise
     except (SafetensorError, KeyError, IndexError, TypeError, ValueError, RuntimeError) as error:
         reason = " ".join(str(error).split())[:160]
-        raise InputError(f"{path}: damaged, or not a field written by `mplicits fit` ({reason})") from error
+        raise InputError(f"{path}: damaged, or not {thing} written by `{command}` ({reason})") from error
+
+
+def _restore(path: Path, module: nn.Module, tensors: Mapping[str, Tensor], remedy: str) -> None:
+    """Load the tensors in their own precision, and refuse those that are not finite."""
+    for tensor in tensors.values():
+        if tensor.is_floating_point():
+            module.to(dtype=tensor.dtype)
+    module.load_state_dict(tensors)
+    for name, tensor in tensors.items():
+        if not bool(torch.isfinite(tensor).all()):
+            raise InputError(f"{path}: tensor {name!r} has NaN or infinite entries; {remedy}")
 
 
 def _describe(field: Field) -> dict[str, Any]:

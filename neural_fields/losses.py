@@ -1,11 +1,11 @@
-"""The terms of the paper's Eqs. 1 and 4, per point: callers choose the mean and the weights."""
+"""The terms of the paper's Eqs. 1 and 4 and of its texture loss, per point: callers choose the mean and the weights."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-__all__ = ["data_loss", "eikonal_loss", "normal_loss"]
+__all__ = ["color_loss", "data_loss", "eikonal_loss", "normal_loss", "tangential_loss"]
 
 
 def data_loss(value: Tensor, target: Tensor | float = 0.0) -> Tensor:
@@ -28,3 +28,21 @@ def eikonal_loss(gradient: Tensor, *, eps: float = 1e-12) -> Tensor:
     ``eps`` keeps the derivative of the length finite where the gradient vanishes.
     """
     return ((gradient.square().sum(dim=-1) + eps).sqrt() - 1) ** 2
+
+
+def color_loss(color: Tensor, target: Tensor) -> Tensor:
+    """``|g(x) − c|² / 3``, the first term of the texture loss 𝒯 (Sec. 3). ``(..., 3)`` twice → ``(...,)``."""
+    return (color - target).square().mean(dim=-1)
+
+
+def tangential_loss(derivative: Tensor, delta: Tensor | float) -> Tensor:
+    """``δ² |∇g ∇f|² / 3``, the second term of 𝒯: the colour shall not change along the normals, only across them.
+
+    The paper has no δ there; with it the term is a squared difference of colours, that between the middle of
+    the band and its rim, so one weight serves bands of any width and shapes of any scale.
+
+    Args:
+        derivative: ``(..., 3)``, ∇g along ∇f.
+        delta: half-width of the band, in units of the field.
+    """
+    return delta**2 * derivative.square().mean(dim=-1)
