@@ -1,0 +1,258 @@
+"""``texture``: from colours on points or meshes to a texture field around a fitted surface (paper Sec. 3)."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from ..datasets import PointCloud
+from ..neural_fields import (
+    ColorSiren,
+    Field,
+    InputError,
+    Similarity,
+    TextureField,
+    load_field,
+    load_texture,
+    save_texture,
+)
+from ..neural_fields.losses import color_loss, tangential_loss
+from .fit import choose_device
+from .fit_state import RECORD_FILE, environment, read_record, write_record
+from .runs import find_field
+from .texture_config import TextureConfig
+from .texture_samples import BandSamples, ColorSamples, band_directions, match_colors, read_colors
+from .training import Progress, StopFlag, stop_on_signals
+
+__all__ = ["TEXTURE_FILE", "FittedTexture", "default_delta", "fit_texture", "texture_of", "texture_run"]
+
+TEXTURE_FILE = "texture.safetensors"
+# A band at least this wide (in units of the field) holds decimated meshes, and the surfaces of small networks.
+LEAST_DELTA = 0.02
+# The default for a field of one level, which has no band of its own that says how near it is to its points.
+SINGLE_LEVEL_DELTA = 0.05
+# Points of the pool at which the final error is measured.
+JUDGED = 100_000
+
+
+@dataclass(frozen=True)
+class FittedTexture:
+    """A trained texture.
+
+    Attributes:
+        texture: on the CPU, around its geometry.
+        record: what ``run.json`` holds under ``texture``; ``finished`` is False after Ctrl-C.
+    """
+
+    texture: TextureField
+    record: dict[str, Any]
+
+
+def fit_texture(
+    geometry: Field,
+    cloud: PointCloud,
+    config: TextureConfig | None = None,
+    *,
+    similarity: Similarity | None = None,
+    level: int = -1,
+    progress: Callable[[Progress], None] | None = None,
+) -> FittedTexture:
+    """Train a texture field by the paper's 𝒯(φ): the colours at points, and none of their change along ∇f.
+
+    The geometry is frozen, so ∇f is evaluated once for a pool of points of the band; a step evaluates the texture
+    network only. Ctrl-C ends the training early and leaves what has been learnt.
+
+    Args:
+        geometry: f.
+        cloud: points with colours, in input coordinates; of meshes see `texture_samples.read_colors`.
+        config: settings; the defaults are those of the ``default`` preset.
+        similarity: from input to the geometry's coordinates; the identity if there is none.
+        level: the level of the geometry that the colours belong to.
+        progress: called now and then with how far the training is.
+
+    Raises:
+        InputError: the cloud has no colours, or lies somewhere else than the surface.
+        ValueError: there is no such level.
+
+    Example:
+        >>> from mplicits.datasets import read_cloud
+        >>> from mplicits.pipelines.fit import fit
+        >>> run = fit("scan.ply")  # doctest: +SKIP
+        >>> fit_texture(run.field, read_cloud("scan.ply"), similarity=run.similarity)  # doctest: +SKIP
+    """
+    config, similarity = config or TextureConfig(), similarity or Similarity.identity()
+    device, started = choose_device(config.device), time.monotonic()
+    level = geometry.resolve_level(level)
+    delta = config.delta or default_delta(geometry)
+    report = progress or (lambda _: None)
+    report(Progress("texture: samples", 0, config.steps, 0.0, {}))
+    generator = torch.Generator().manual_seed(config.seed)
+    home = next(geometry.parameters(), geometry.deltas).device
+    geometry = geometry.to(device)
+    samples = match_colors(cloud, geometry, similarity, level=level, delta=delta, device=device)
+    band = band_directions(samples, geometry, config.samples // 2, level=level, delta=delta, generator=generator)
+    mean = samples.colors.mean(dim=0).tolist()
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(config.seed)
+        network = ColorSiren(config.width, config.depth, omega=config.omega, mean=mean).to(device)
+    sampling_seconds = time.monotonic() - started
+    trainer = _Trainer(network, samples, band, config, delta=delta, generator=generator, spent=sampling_seconds)
+    with stop_on_signals() as flag:
+        finished = trainer.run(flag, report)
+    record = {
+        "finished": finished,
+        "source": cloud.source,
+        "level": level,
+        "delta": delta,
+        "points": len(samples.points),
+        "left_out": samples.left_out,
+        "parameters": sum(parameter.numel() for parameter in network.parameters()),
+        "steps": trainer.step,
+        "sampling_seconds": round(sampling_seconds, 3),
+        "training_seconds": round(trainer.elapsed, 3),
+        "losses": trainer.losses,
+        "psnr_at_points": _psnr(network, samples, generator),
+        "config": dataclasses.asdict(config),
+        "environment": environment(device),
+    }
+    network.requires_grad_(False)
+    texture = TextureField(geometry.to(home), network.to(home), delta=delta, geometry_level=level, outside=mean)
+    return FittedTexture(texture.to(home), record)
+
+
+def texture_run(
+    run: str | Path,
+    source: str | Path,
+    config: TextureConfig | None = None,
+    *,
+    out: str | Path | None = None,
+    level: int | None = None,
+    progress: Callable[[Progress], None] | None = None,
+) -> FittedTexture:
+    """Train a texture for a run and write it, by default beside its field, where ``run.json`` records it.
+
+    Args:
+        run: run directory or .safetensors file.
+        source: a cloud with colours or a mesh with a texture or vertex colours, in the coordinates of the fit.
+        config: settings.
+        out: another place for the texture.
+        level: of the run, counted from 0; None is the finest.
+        progress: see `fit_texture`.
+
+    Raises:
+        InputError: there is no such run or level, or the source cannot be used.
+    """
+    config = config or TextureConfig()
+    file = find_field(run)
+    geometry, similarity, _ = load_field(file)
+    if level is not None and not 0 <= level < geometry.num_levels:
+        raise InputError(f"--level {level}: {file} has levels 0 to {geometry.num_levels - 1}")
+    cloud = read_colors(source, samples=config.samples, seed=config.seed)
+    fitted = fit_texture(
+        geometry, cloud, config, similarity=similarity, level=-1 if level is None else level, progress=progress
+    )
+    target = file.with_name(TEXTURE_FILE) if out is None else Path(out)
+    save_texture(target, fitted.texture, metadata={"texture": fitted.record})
+    if target == file.with_name(TEXTURE_FILE) and file.with_name(RECORD_FILE).is_file():
+        write_record(file.parent, read_record(file.parent) | {"texture": fitted.record})
+    return fitted
+
+
+def texture_of(run: str | Path, geometry: Field) -> TextureField | None:
+    """The texture that lies beside the field of a run, or None.
+
+    Args:
+        run: run directory or .safetensors file.
+        geometry: its field, loaded.
+
+    Raises:
+        InputError: there is no such run, or its texture is damaged or belongs to another field.
+    """
+    path = find_field(run).with_name(TEXTURE_FILE)
+    return load_texture(path, geometry) if path.is_file() else None
+
+
+def default_delta(geometry: Field) -> float:
+    """The band that holds the surfaces of all levels, in units of the field."""
+    if geometry.num_levels == 1:
+        return SINGLE_LEVEL_DELTA
+    return max(LEAST_DELTA, float(geometry.deltas.max()))
+
+
+class _Trainer:
+    """Trains a colour network with Adam, a warm-up and a cosine schedule."""
+
+    def __init__(
+        self,
+        network: ColorSiren,
+        samples: ColorSamples,
+        band: BandSamples,
+        config: TextureConfig,
+        *,
+        delta: float,
+        generator: torch.Generator,
+        spent: float,
+    ) -> None:
+        self.network, self.samples, self.band, self.config = network, samples, band, config
+        self.delta, self.generator = delta, generator
+        self.seconds = None if config.time_budget is None else max(config.time_budget - spent, 1e-3)
+        self.adam = torch.optim.Adam(network.parameters(), lr=config.learning_rate, betas=(0.9, 0.99), fused=True)
+        self.step, self.elapsed = 0, 0.0
+        self.losses: dict[str, float] = {}
+
+    @property
+    def fraction(self) -> float:
+        """How much of the schedule is done, by steps or by time, whichever is further."""
+        by_time = self.elapsed / self.seconds if self.seconds else 0.0
+        return min(1.0, max(self.step / self.config.steps, by_time))
+
+    def run(self, flag: StopFlag, report: Callable[[Progress], None], *, report_every: int = 20) -> bool:
+        """Train until the schedule ends → True, or until somebody asks to stop → False."""
+        start = time.monotonic()
+        while self.fraction < 1:
+            if flag.requested:
+                return False
+            terms = self._step()
+            self.elapsed = time.monotonic() - start
+            if self.step % report_every == 0 or self.fraction >= 1:
+                self.losses = {name: float(term) for name, term in terms.items()}
+                report(Progress("texture", self.step, self.config.steps, self.fraction, self.losses))
+        return True
+
+    def _step(self) -> dict[str, torch.Tensor]:
+        progress = self.fraction
+        rate = (
+            self.config.learning_rate * min(1.0, (progress + 0.001) / 0.02) * 0.5 * (1 + math.cos(math.pi * progress))
+        )
+        for group in self.adam.param_groups:
+            group["lr"] = rate
+        here, there = (
+            self._draw(self.samples.points, self.config.batch),
+            self._draw(self.band.points, self.config.band_batch),
+        )
+        color = color_loss(self.network.value(self.samples.points[here]), self.samples.colors[here]).mean()
+        _, along = self.network.derivative_along(self.band.points[there], self.band.gradients[there])
+        tangential = tangential_loss(along, self.delta).mean()
+        self.adam.zero_grad(set_to_none=True)
+        (color + self.config.tangential_weight * tangential).backward()
+        self.adam.step()
+        self.step += 1
+        return {"color": color.detach(), "tangential": tangential.detach()}
+
+    def _draw(self, pool: torch.Tensor, count: int) -> torch.Tensor:
+        return torch.randint(len(pool), (count,), generator=self.generator).to(pool.device)
+
+
+@torch.no_grad()
+def _psnr(network: ColorSiren, samples: ColorSamples, generator: torch.Generator) -> float:
+    """Peak signal-to-noise ratio of the colours at points that were trained on, in dB."""
+    index = torch.randperm(len(samples.points), generator=generator)[:JUDGED].to(samples.points.device)
+    error = color_loss(network.value(samples.points[index]).clamp(0, 1), samples.colors[index]).mean()
+    return round(-10 * math.log10(max(float(error), 1e-12)), 3)

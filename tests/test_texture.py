@@ -1,0 +1,326 @@
+"""Training textures: exact colours on exact surfaces, the term along the normals, bad input, runs and the command."""
+
+import argparse
+import json
+import math
+import os
+import signal
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from mplicits.datasets import PointCloud, write_cloud_ply
+from mplicits.neural_fields import (
+    InputError,
+    MultiscaleSDF,
+    Similarity,
+    Siren,
+    Sphere,
+    load_field,
+    load_texture,
+    map_colors,
+    save_field,
+)
+from mplicits.pipelines.config import load_config
+from mplicits.pipelines.texture import TEXTURE_FILE, default_delta, fit_texture, texture_of, texture_run
+from mplicits.pipelines.texture_command import COMMAND
+from mplicits.pipelines.texture_config import TextureConfig
+from mplicits.pipelines.texture_samples import read_colors
+from numpy.typing import NDArray
+
+SMALL = TextureConfig(
+    width=48, depth=2, omega=15.0, steps=250, learning_rate=3e-3, batch=1024, band_batch=512, samples=4000, delta=0.1
+)
+BRIEF = replace(SMALL, steps=3)
+
+
+def directions(count: int) -> NDArray[np.float64]:
+    points = np.random.default_rng(0).normal(size=(count, 3))
+    return points / np.linalg.norm(points, axis=1, keepdims=True)
+
+
+def painted(unit: NDArray[np.float64]) -> NDArray[np.float32]:
+    """A colour for every direction."""
+    return (0.5 + 0.4 * np.sin(4 * unit + np.array([0.0, 1.0, 2.0]))).astype(np.float32)
+
+
+def sphere_cloud(count: int = 4000) -> PointCloud:
+    unit = directions(count)
+    return PointCloud(0.5 * unit, colors=painted(unit), source="ball.ply")
+
+
+def psnr(found: torch.Tensor, expected: NDArray[np.float32]) -> float:
+    return -10 * math.log10(float(((found.numpy() - expected) ** 2).mean()))
+
+
+def test_colors_of_a_sphere_on_it_and_on_shifted_surfaces() -> None:
+    fitted = fit_texture(Sphere(radius=0.5), sphere_cloud(), SMALL)
+    unit = directions(3000)[::-1].copy()
+    for radius in (0.42, 0.5, 0.58):  # in the band, with half-width 0.1
+        x = torch.from_numpy((radius * unit).astype(np.float32))
+        assert fitted.texture.in_band(x).all()
+        assert psnr(fitted.texture.value(x), painted(unit)) > 32
+    for radius in (0.3, 0.9):  # outside
+        colors, reached = map_colors(fitted.texture, torch.from_numpy((radius * unit).astype(np.float32)))
+        assert reached.all()
+        assert psnr(colors, painted(unit)) > 32
+    assert fitted.record["finished"]
+    assert fitted.record["steps"] == 250
+    assert fitted.record["left_out"] == 0
+    at_points = fitted.texture.value(torch.from_numpy(sphere_cloud().points.astype(np.float32)))
+    assert fitted.record["psnr_at_points"] == pytest.approx(psnr(at_points, painted(directions(4000))), abs=0.01)
+
+
+def test_the_second_term_makes_colors_constant_along_normals() -> None:
+    unit = directions(2000)
+    x = torch.from_numpy((0.57 * unit).astype(np.float32))
+    slopes = []
+    for weight in (0.0, 1.0):
+        texture = fit_texture(Sphere(radius=0.5), sphere_cloud(), replace(SMALL, tangential_weight=weight)).texture
+        slopes.append(float(texture.derivative_along(x, x / x.norm(dim=-1, keepdim=True))[1].square().mean().sqrt()))
+    assert slopes[1] < 0.2 * slopes[0]
+
+
+def test_points_are_in_input_coordinates() -> None:
+    similarity = Similarity((400_000.0, 5_600_000.0, 100.0), 25.0)
+    cloud = sphere_cloud()
+    moved = replace(cloud, points=similarity.to_input(cloud.points))
+    fitted = fit_texture(Sphere(radius=0.5), moved, BRIEF, similarity=similarity)
+    assert fitted.record["left_out"] == 0
+    x = torch.from_numpy(cloud.points[:100].astype(np.float32))
+    # Rounding moves the samples a little.
+    torch.testing.assert_close(
+        fitted.texture.value(x), fit_texture(Sphere(radius=0.5), cloud, BRIEF).texture.value(x), rtol=0, atol=1e-3
+    )
+
+
+def test_the_same_seed_gives_the_same_texture() -> None:
+    x = torch.from_numpy((0.5 * directions(50)).astype(np.float32))
+    values = [
+        fit_texture(Sphere(radius=0.5), sphere_cloud(), replace(BRIEF, seed=s)).texture.value(x) for s in (1, 1, 2)
+    ]
+    assert torch.equal(values[0], values[1])
+    assert not torch.equal(values[0], values[2])
+
+
+def test_the_callers_random_state_and_geometry_are_left_alone() -> None:
+    geometry = Siren(8, 1, omega=1.0)
+    with torch.no_grad():
+        geometry.output.weight.zero_()
+        geometry.output.bias.zero_()
+    before = torch.random.get_rng_state()
+    fitted = fit_texture(geometry, sphere_cloud(), BRIEF)
+    assert torch.equal(torch.random.get_rng_state(), before)
+    assert fitted.texture.geometry is geometry
+    assert all(parameter.grad is None and parameter.requires_grad for parameter in geometry.parameters())
+    assert not any(parameter.requires_grad for parameter in fitted.texture.network.parameters())
+
+
+@pytest.mark.parametrize(
+    ("points", "distance"),
+    [
+        (lambda p: 3 * p, "1"),  # three times as large: on the sphere of radius 1.5
+        (lambda p: p + 100.0, "173"),  # elsewhere
+        (lambda p: 0.02 * p, "0.49"),  # metres for millimetres
+    ],
+)
+def test_another_shape_or_scale_is_refused(points: object, distance: str) -> None:
+    cloud = replace(sphere_cloud(), points=points(sphere_cloud().points))  # type: ignore[operator]
+    with pytest.raises(InputError, match=r"ball\.ply: points: 0% of them lie within 0\.1 of the surface") as error:
+        fit_texture(Sphere(radius=0.5), cloud, BRIEF)
+    assert f"half are further off than {distance}" in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_a_part_outside_the_band_is_left_out_and_counted() -> None:
+    cloud = sphere_cloud(1000)
+    points = cloud.points.copy()
+    points[:100] *= 1.5
+    points[100] = np.nan
+    assert fit_texture(Sphere(radius=0.5), replace(cloud, points=points), BRIEF).record["left_out"] == 101
+
+
+def test_points_without_colors_are_refused() -> None:
+    with pytest.raises(InputError, match=r"ball\.ply: colors: there are none"):
+        fit_texture(Sphere(radius=0.5), replace(sphere_cloud(), colors=None), BRIEF)
+
+
+def test_ctrl_c_leaves_what_was_learnt() -> None:
+    steps: list[int] = []
+
+    def stop(progress: object) -> None:
+        steps.append(progress.step)  # type: ignore[attr-defined]
+        if len(steps) == 3:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    fitted = fit_texture(Sphere(radius=0.5), sphere_cloud(), replace(SMALL, steps=10_000), progress=stop)
+    assert not fitted.record["finished"]
+    assert steps == [0, 20, 40]
+    assert fitted.record["steps"] == 40
+    assert fitted.texture.value(torch.tensor([[0.5, 0.0, 0.0]])).isfinite().all()
+
+
+def test_a_time_budget_ends_the_training() -> None:
+    fitted = fit_texture(Sphere(radius=0.5), sphere_cloud(), replace(SMALL, steps=1_000_000, time_budget=0.3))
+    assert fitted.record["finished"]
+    assert 0 < fitted.record["steps"] < 1_000_000
+    assert fitted.record["training_seconds"] < 2
+
+
+def test_the_band_that_is_chosen() -> None:
+    levels = [Siren(4, 1), Siren(4, 1)]
+    assert default_delta(Sphere()) == 0.05
+    assert default_delta(MultiscaleSDF(Sphere(), levels, [0.06, 0.01])) == pytest.approx(0.06)
+    assert default_delta(MultiscaleSDF(Sphere(), levels, [0.006, 0.001])) == 0.02
+
+
+def test_the_default_preset_is_the_default() -> None:
+    assert load_config(TextureConfig, "default", thing="texture") == TextureConfig()
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [({"width": 0}, "width: 0"), ({"delta": -1.0}, "delta: -1"), ({"tangential_weight": -0.5}, "tangential_weight")],
+)
+def test_bad_settings(setting: dict[str, float], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        TextureConfig(**setting)  # type: ignore[arg-type]
+
+
+# Runs: the field is the plane z = 0, as a network, so that it can be saved.
+
+
+def plane_field() -> MultiscaleSDF:
+    """Nearly ``f(x) = z``: ten times the sine of z / 10."""
+    network = Siren(4, 1, omega=1.0)
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter.zero_()
+        network.layers[0].weight[0, 2] = 0.1
+        network.output.weight[0, 0] = 10.0
+    return MultiscaleSDF(network, [], [])
+
+
+def plane_cloud(count: int = 2000, *, colors: bool = True) -> PointCloud:
+    points = np.random.default_rng(1).uniform(-0.7, 0.7, (count, 3)) * np.array([1, 1, 0])
+    return PointCloud(points + np.array([5.0, 0.0, 0.0]), colors=painted(points) if colors else None)
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    directory = tmp_path / "run"
+    directory.mkdir()
+    save_field(directory / "field.safetensors", plane_field(), similarity=Similarity((5.0, 0.0, 0.0), 1.0))
+    (directory / "run.json").write_text(json.dumps({"config": {}, "cloud": "plane.ply"}))
+    return directory
+
+
+@pytest.fixture
+def cloud(tmp_path: Path) -> Path:
+    write_cloud_ply(tmp_path / "plane.ply", plane_cloud())
+    return tmp_path / "plane.ply"
+
+
+def test_a_run_gets_its_texture(run: Path, cloud: Path) -> None:
+    geometry = load_field(run / "field.safetensors").field
+    assert texture_of(run, geometry) is None
+    fitted = texture_run(run, cloud, SMALL)
+    texture = texture_of(run, geometry)
+    assert texture is not None
+    points = plane_cloud().points - np.array([5.0, 0.0, 0.0])
+    found = texture.value(torch.from_numpy(points.astype(np.float32)))
+    assert torch.equal(found, fitted.texture.value(torch.from_numpy(points.astype(np.float32))))
+    assert psnr(found, painted(points)) > 30
+    record = json.loads((run / "run.json").read_text())
+    assert record["cloud"] == "plane.ply"
+    assert record["texture"] == json.loads(json.dumps(fitted.record))
+    assert sorted(path.name for path in run.iterdir()) == ["field.safetensors", "run.json", TEXTURE_FILE]
+
+
+def test_another_place_leaves_the_run_as_it_is(run: Path, cloud: Path, tmp_path: Path) -> None:
+    before = (run / "run.json").read_text()
+    texture_run(run, cloud, BRIEF, out=tmp_path / "other.safetensors")
+    assert (run / "run.json").read_text() == before
+    assert not (run / TEXTURE_FILE).exists()
+    assert load_texture(tmp_path / "other.safetensors", load_field(run / "field.safetensors").field).num_levels == 1
+
+
+def test_levels_that_are_not_there(run: Path, cloud: Path) -> None:
+    with pytest.raises(InputError, match=r"--level 1: .*field\.safetensors has levels 0 to 0"):
+        texture_run(run, cloud, BRIEF, level=1)
+
+
+def square(path: Path, *, colors: bool = True) -> Path:
+    """A PLY mesh of two triangles, red at x = 4.5 and black at x = 5.5."""
+    kinds = "property uchar red\nproperty uchar green\nproperty uchar blue\n" if colors else ""
+    rows = [(4.5, -0.5, 255), (5.5, -0.5, 0), (5.5, 0.5, 0), (4.5, 0.5, 255)]
+    vertices = "".join(f"{x} {y} 0{f' {red} 0 0' if colors else ''}\n" for x, y, red in rows)
+    path.write_text(
+        "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
+        f"{kinds}element face 2\nproperty list uchar int vertex_indices\nend_header\n{vertices}3 0 1 2\n3 0 2 3\n"
+    )
+    return path
+
+
+def test_meshes_are_sampled_and_clouds_are_not(tmp_path: Path, cloud: Path) -> None:
+    assert len(read_colors(cloud, samples=123, seed=0)) == 2000
+    mesh = read_colors(square(tmp_path / "square.ply"), samples=123, seed=0)
+    assert len(mesh) == 123
+    assert mesh.colors is not None
+    np.testing.assert_allclose(mesh.colors[:, 1:], 0, atol=1e-6)
+    assert np.corrcoef(mesh.colors[:, 0], mesh.points[:, 0])[0, 1] < -0.9
+    points = tmp_path / "points.obj"
+    points.write_text("".join(f"v {5 + i / 20} {i * i / 400} 0 1 0.5 0\n" for i in range(12)))
+    assert len(read_colors(points, samples=123, seed=0)) == 12
+    with pytest.raises(InputError, match=r"bare\.ply: neither a texture nor vertex colours"):
+        read_colors(square(tmp_path / "bare.ply", colors=False), samples=10, seed=0)
+    write_cloud_ply(tmp_path / "grey.ply", plane_cloud(colors=False))
+    with pytest.raises(InputError, match=r"grey\.ply: colors: there are none"):
+        read_colors(tmp_path / "grey.ply", samples=10, seed=0)
+    with pytest.raises(InputError, match=r"none\.obj: no such file"):
+        read_colors(tmp_path / "none.obj", samples=10, seed=0)
+
+
+def command(*words: object) -> int:
+    parser = argparse.ArgumentParser()
+    COMMAND.add_arguments(parser)
+    return COMMAND.run(parser.parse_args([str(word) for word in words]))
+
+
+QUICK = ("--quiet", "--steps", "2", "--width", "16", "--depth", "1", "--samples", "1000")
+
+
+def test_the_command(run: Path, cloud: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert command(run, cloud, *QUICK) == 0
+    printed = capsys.readouterr()
+    assert f"{run / TEXTURE_FILE}: (16, 1), 115 parameters, 2 steps" in printed.out
+    assert printed.err == ""
+    before = (run / TEXTURE_FILE).read_bytes()
+    with pytest.raises(InputError, match=r"texture\.safetensors: exists; --force replaces it"):
+        command(run, cloud, *QUICK)
+    assert (run / TEXTURE_FILE).read_bytes() == before
+    assert command(run, cloud, *QUICK, "--force", "--seed", 5) == 0
+    assert (run / TEXTURE_FILE).read_bytes() != before
+
+
+def test_the_command_warns_of_points_left_out(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    points = plane_cloud().points
+    points[:37, 2] = 0.3
+    write_cloud_ply(tmp_path / "raised.ply", replace(plane_cloud(), points=points))
+    assert command(run, tmp_path / "raised.ply", *QUICK) == 0
+    assert "warning: 37 of 2,000 points" in capsys.readouterr().err
+
+
+def test_the_command_refuses_bad_words_before_any_work(run: Path, cloud: Path, tmp_path: Path) -> None:
+    for words, message in (
+        ((run, cloud, "--preset", "fsat"), "no preset 'fsat' for texture"),
+        ((run, cloud, "--steps", "many"), "--steps: got 'many', expected a whole number"),
+        ((run, cloud, "-o", tmp_path / "texture.png"), "unknown extension"),
+        ((run, cloud, "-o", run / "field.safetensors", "--force"), "is the field itself"),
+        ((tmp_path / "none", cloud), "no such run"),
+    ):
+        with pytest.raises(InputError, match=message):
+            command(*words)
+    assert sorted(path.name for path in run.iterdir()) == ["field.safetensors", "run.json"]
