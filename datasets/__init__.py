@@ -1,34 +1,64 @@
 """Files and sensors → tensors: point clouds, synthetic ones whose exact surface is known, and cameras."""
 
 from .cameras import Camera, look_at, orbit, turntable
+from .color_space import linear_to_srgb, srgb_to_linear
+from .depth_camera import DepthCamera, read_intrinsics
+from .depth_cloud import DepthReport, DepthSettings, frame_cloud
+from .depth_fusion import fuse_frames
+from .depth_images import is_depth_file, read_color, read_depth
+from .depth_poses import read_poses, read_trajectory
 from .ply import write_cloud_ply
 from .point_cloud import PointCloud
 from .posed_cameras import read_cameras
 from .prepare import CleaningReport, OrientedCloud, prepare_cloud
 from .reading import read_cloud
+from .rgbd import RgbdFrame, read_frame
 from .scanner import STATUE_PLACEMENT, simulate_scan, statue_scan
 from .statue import Statue
 from .synthetic import add_noise, add_outliers, sample_sphere, sample_surface, sample_torus
+from .textured import TexturedMesh, colors_at, read_textured, sample_textured
+from .voxels import spacing_of, thin
 
 __all__ = [
     "STATUE_PLACEMENT",
     "Camera",
     "CleaningReport",
+    "DepthCamera",
+    "DepthReport",
+    "DepthSettings",
     "OrientedCloud",
     "PointCloud",
+    "RgbdFrame",
     "Statue",
+    "TexturedMesh",
     "add_noise",
     "add_outliers",
+    "colors_at",
+    "frame_cloud",
+    "fuse_frames",
+    "is_depth_file",
+    "linear_to_srgb",
     "look_at",
     "orbit",
     "prepare_cloud",
     "read_cameras",
     "read_cloud",
+    "read_color",
+    "read_depth",
+    "read_frame",
+    "read_intrinsics",
+    "read_poses",
+    "read_textured",
+    "read_trajectory",
     "sample_sphere",
     "sample_surface",
+    "sample_textured",
     "sample_torus",
     "simulate_scan",
+    "spacing_of",
+    "srgb_to_linear",
     "statue_scan",
+    "thin",
     "turntable",
     "write_cloud_ply",
 ]

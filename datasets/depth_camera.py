@@ -1,0 +1,210 @@
+"""``DepthCamera``: the lens of a depth sensor, from JSON files of two kinds, four numbers, or an angle of view."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ..neural_fields import InputError
+from .cameras import Camera, pinhole_intrinsics
+
+__all__ = ["DepthCamera", "read_intrinsics"]
+
+Float64 = NDArray[np.float64]
+
+COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")  # OpenCV's order
+OTHER_COEFFICIENTS = ("k4", "k5", "k6")  # of lenses that we do not model
+UNDISTORTION = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 200, 1e-13)  # OpenCV's own five steps leave 1e-3
+
+
+@dataclass(frozen=True)
+class DepthCamera:
+    """A pinhole with radial and tangential distortion, in OpenCV's convention (see `Camera`).
+
+    Attributes:
+        width: of the depth image, in pixels.
+        height: of the depth image, in pixels.
+        fx: focal length in widths of a pixel.
+        fy: focal length in heights of a pixel.
+        cx: where the axis meets the image, in pixels; the centre of the first pixel is at 0.
+        cy: the same along the height.
+        distortion: k1, k2, p1, p2, k3 of OpenCV's model; all zero for undistorted images.
+        depth_scale: how many steps of an integer depth image are one unit, or None if that is not known.
+
+    Raises:
+        ValueError: a size, focal length or scale is not positive, or a number is not finite.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    depth_scale: float | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("width", "height", "fx", "fy", "depth_scale"):
+            value = getattr(self, name)
+            if value is not None and not 0 < value < math.inf:
+                raise ValueError(f"{name}={value}: expected a finite number > 0")
+        for name, value in (("cx", self.cx), ("cy", self.cy), *zip(COEFFICIENTS, self.distortion, strict=True)):
+            if not math.isfinite(value):
+                raise ValueError(f"{name}={value}: expected a finite number")
+
+    @classmethod
+    def from_fov(cls, fov: float, width: int, height: int) -> DepthCamera:
+        """Square pixels, the axis through the middle of the image.
+
+        Args:
+            fov: full vertical angle of view, degrees.
+            width: of the image, in pixels.
+            height: of the image, in pixels.
+
+        Raises:
+            ValueError: ``fov`` is not between 0 and 180.
+        """
+        (fx, _, cx), (_, fy, cy), _ = pinhole_intrinsics(fov, width, height).tolist()
+        return cls(width, height, fx, fy, cx, cy)
+
+    @classmethod
+    def from_camera(cls, camera: Camera) -> DepthCamera:
+        """The lens of a `Camera`."""
+        (fx, _, cx), (_, fy, cy), _ = camera.intrinsics.tolist()
+        return cls(camera.width, camera.height, fx, fy, cx, cy)
+
+    @property
+    def matrix(self) -> Float64:
+        """``(3, 3)``: ``[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]``."""
+        return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], np.float64)
+
+    @property
+    def pixel_angle(self) -> float:
+        """The slope from the middle of a pixel to that of the next: a pixel at depth z is this times z wide."""
+        return 1 / math.sqrt(self.fx * self.fy)
+
+    def rays(self) -> Tensor:
+        """``(H, W, 3)`` float64: the points at depth 1 that the pixels see, in camera coordinates."""
+        from kornia.geometry.depth import unproject_meshgrid  # here: it takes a fifth of a second
+
+        if not any(self.distortion):
+            matrix = torch.from_numpy(self.matrix)[None]
+            return unproject_meshgrid(self.height, self.width, matrix, dtype=torch.float64)[0]
+        pixels = np.stack(np.meshgrid(np.arange(self.width), np.arange(self.height)), axis=-1).astype(np.float64)
+        flat = cv2.undistortPoints(
+            pixels.reshape(-1, 1, 2), self.matrix, np.array(self.distortion), criteria=UNDISTORTION
+        )
+        rays = np.ones((self.height, self.width, 3))
+        rays[..., :2] = flat.reshape(self.height, self.width, 2)
+        return torch.from_numpy(rays)
+
+    def unproject(self, depth: Float64) -> Float64:
+        """The points ``(H, W, 3)`` in camera coordinates that pixels with these depths z ``(H, W)`` see."""
+        from kornia.geometry.depth import depth_to_3d_v2
+
+        matrix = torch.from_numpy(self.matrix)[None]
+        grid = self.rays()[None]
+        return depth_to_3d_v2(torch.from_numpy(depth)[None], matrix, xyz_grid=grid)[0].numpy()
+
+    def project(self, points: Float64) -> tuple[Float64, NDArray[np.bool_]]:
+        """Pixels ``(N, 2)`` where points ``(N, 3)`` in camera coordinates fall, and which of them are in the image.
+
+        Far outside the image the polynomials of a distorted lens turn back, and would bring points of its
+        surroundings into it; so a point counts as inside only if its ray is among those of the image.
+        """
+        front = points[:, 2] > 0
+        slopes = points[:, :2] / np.where(front, points[:, 2], 1.0)[:, None]
+        if any(self.distortion):
+            border = self.rays().numpy()[..., :2]
+            low, high = border.min(axis=(0, 1)) - self.pixel_angle, border.max(axis=(0, 1)) + self.pixel_angle
+            front &= ((slopes >= low) & (slopes <= high)).all(axis=1)
+        slopes = np.where(front[:, None], slopes, 0.0)
+        pixels = _distort(slopes, self.distortion) * (self.fx, self.fy) + (self.cx, self.cy)
+        inside = front & (pixels >= -0.5).all(axis=1) & (pixels < (self.width - 0.5, self.height - 0.5)).all(axis=1)
+        return pixels, inside
+
+
+def _distort(slopes: Float64, coefficients: tuple[float, float, float, float, float]) -> Float64:
+    """OpenCV's model: ``x (1 + k1 r² + k2 r⁴ + k3 r⁶) + 2 p1 x y + p2 (r² + 2x²)``, and y with p1, p2 exchanged."""
+    k1, k2, p1, p2, k3 = coefficients
+    x, y = slopes.T
+    square = x**2 + y**2
+    radial = 1 + square * (k1 + square * (k2 + square * k3))
+    across = x * radial + 2 * p1 * x * y + p2 * (square + 2 * x**2)
+    down = y * radial + p1 * (square + 2 * y**2) + 2 * p2 * x * y
+    return np.stack((across, down), axis=1)
+
+
+def read_intrinsics(path: str | Path) -> DepthCamera:
+    """Read the intrinsics of a depth camera from JSON.
+
+    - ours: ``width``, ``height``, ``fx``, ``fy``, ``cx``, ``cy``, and if known ``depth_scale`` and the distortion
+      ``k1``, ``k2``, ``p1``, ``p2``, ``k3``;
+    - Open3D's: ``width``, ``height`` and ``intrinsic_matrix``, nine numbers column by column.
+
+    Raises:
+        InputError: the file is missing or no such JSON, or a field is missing or not a number that it can be.
+    """
+    path = Path(path)
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; check the path, or give --intrinsics FX FY CX CY") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error}); check the path") from error
+    except ValueError as error:  # both of JSON and of UTF-8
+        raise InputError(f"{path}: is not JSON ({error}); export the intrinsics again") from error
+    if not isinstance(content, dict):
+        raise InputError(f"{path}: expected an object with width, height, fx, fy, cx and cy")
+    if "intrinsic_matrix" in content:
+        content = {**content, **_open3d(content["intrinsic_matrix"], path)}
+    missing = [name for name in ("width", "height", "fx", "fy", "cx", "cy") if name not in content]
+    if missing:
+        raise InputError(f"{path}: {', '.join(missing)}: missing; add {'it' if len(missing) == 1 else 'them'}")
+    numbers = {
+        name: _number(content[name], name, path)
+        for name in ("width", "height", "fx", "fy", "cx", "cy", "depth_scale", *COEFFICIENTS, *OTHER_COEFFICIENTS)
+        if content.get(name) is not None
+    }
+    for name in OTHER_COEFFICIENTS:
+        if numbers.get(name):
+            raise InputError(f"{path}: {name}: lenses with k4 to k6 are not supported; undistort the images first")
+    for name in ("width", "height"):
+        if not numbers[name].is_integer():
+            raise InputError(f"{path}: {name}: {numbers[name]:g}; expected a whole number of pixels")
+    k1, k2, p1, p2, k3 = (numbers.get(name, 0.0) for name in COEFFICIENTS)
+    try:
+        return DepthCamera(
+            int(numbers["width"]),
+            int(numbers["height"]),
+            *(numbers[name] for name in ("fx", "fy", "cx", "cy")),
+            distortion=(k1, k2, p1, p2, k3),
+            depth_scale=numbers.get("depth_scale"),
+        )
+    except ValueError as error:
+        raise InputError(f"{path}: {error}") from error
+
+
+def _open3d(matrix: Any, path: Path) -> dict[str, Any]:
+    if not isinstance(matrix, list) or len(matrix) != 9:
+        raise InputError(f"{path}: intrinsic_matrix: expected nine numbers, column by column")
+    fx, low, a, skew, fy, b, cx, cy, one = (_number(value, "intrinsic_matrix", path) for value in matrix)
+    if any((low, a, skew, b)) or one != 1:
+        raise InputError(f"{path}: intrinsic_matrix: {matrix}; expected [fx, 0, 0, 0, fy, 0, cx, cy, 1]")
+    return {"fx": fx, "fy": fy, "cx": cx, "cy": cy}
+
+
+def _number(value: Any, name: str, path: Path) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise InputError(f"{path}: {name}: {value!r}; expected a finite number")
+    return float(value)

@@ -1,0 +1,178 @@
+"""Depth maps and their colour pictures, from files: 16-bit PNG, TIFF, NPY and NPZ."""
+
+from __future__ import annotations
+
+import zipfile
+import zlib
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..neural_fields import InputError
+from .color_space import linear_to_srgb, srgb_to_linear
+
+__all__ = ["DEPTH_SCALE", "DEPTH_SUFFIXES", "fit_color", "is_depth_file", "read_color", "read_depth"]
+
+Float64 = NDArray[np.float64]
+Bytes = NDArray[np.uint8]
+
+DEPTH_SUFFIXES = (".png", ".tif", ".tiff", ".npy", ".npz")
+COLOR_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
+DEPTH_SCALE = 1000.0
+"""Steps of an integer depth image in one unit where nobody says how many: millimetres in a metre."""
+
+CLOUD_COLUMNS = (3, 6, 9)  # of a table of points; see `read_cloud`
+ASPECT = 0.01  # how far two aspect ratios may be apart and still show the same picture
+
+
+def is_depth_file(path: str | Path) -> bool:
+    """Whether a file is a depth map by its name, or, of NPY and NPZ, by the shape of what is in it.
+
+    A two-dimensional array with 3, 6 or 9 columns is a table of points, and no depth map.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix not in (".npy", ".npz") or not path.is_file():
+        return suffix in DEPTH_SUFFIXES[:3]
+    try:
+        array = np.load(path, mmap_mode="r", allow_pickle=False)
+        if suffix == ".npy":
+            return array.ndim == 3 or (array.ndim == 2 and array.shape[1] not in CLOUD_COLUMNS)
+        with array:
+            return "points" not in array and len(array.files) > 0
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile):
+        return False  # whoever reads it will say what is wrong
+
+
+def read_depth(
+    path: str | Path, *, scale: float | None = None, integer_scale: float | None = None, inverse: bool = False
+) -> Float64:
+    """Read a depth map.
+
+    Args:
+        path: PNG (16 bits), TIFF (16 bits or float), NPY, or NPZ with an array ``depth`` or a single array.
+        scale: numbers in the file per unit: 1000 for millimetres, 5000 for the TUM benchmark. None is
+            ``integer_scale`` for integers and 1 for floating-point numbers.
+        integer_scale: what the camera says of its integer images; None is `DEPTH_SCALE`.
+        inverse: whether the numbers are inverse depths (disparities), ``z = scale / number``; then None is 1.
+
+    Returns:
+        ``(H, W)`` depth z along the camera's axis, in the unit that ``scale`` makes; NaN where there is no
+        reading (zero, negative, NaN or infinite in the file).
+
+    Raises:
+        InputError: the file is missing or damaged, has 8 bits or several channels, or no reading at all.
+        ValueError: ``scale`` is not positive.
+    """
+    path = Path(path)
+    if scale is not None and not 0 < scale < np.inf:
+        raise ValueError(f"scale={scale}: expected a finite number > 0")
+    if path.suffix.lower() not in DEPTH_SUFFIXES:
+        raise InputError(
+            f"{path}: unknown extension {path.suffix!r}; depth maps are read from {', '.join(DEPTH_SUFFIXES)}"
+        )
+    numbers = _read_array(path) if path.suffix.lower() in (".npy", ".npz") else _decode(path)
+    if numbers.ndim == 3 and 1 in (numbers.shape[0], numbers.shape[2]):
+        numbers = numbers[0] if numbers.shape[0] == 1 else numbers[..., 0]
+    if numbers.ndim != 2:
+        raise InputError(f"{path}: shape {numbers.shape}; expected a depth map of one channel, not a colour picture")
+    if numbers.dtype.kind not in "fiu":
+        raise InputError(f"{path}: holds {numbers.dtype}; expected numbers")
+    if numbers.dtype.itemsize == 1:
+        raise InputError(
+            f"{path}: 8 bits per pixel cannot hold depths; export 16-bit PNG, TIFF or NPY (is it a picture of them?)"
+        )
+    values = numbers.astype(np.float64)
+    values[~((values > 0) & (values < np.inf))] = np.nan
+    if np.isnan(values).all():
+        raise InputError(f"{path}: no pixel has a positive depth; export it again")
+    if inverse:
+        return (scale or 1.0) / values
+    return values / (scale or (1.0 if numbers.dtype.kind == "f" else integer_scale or DEPTH_SCALE))
+
+
+def read_color(path: str | Path) -> Bytes:
+    """Read a colour picture → ``(H, W, 3)`` display RGB; grey becomes RGB, and transparency is left out.
+
+    Raises:
+        InputError: the file is missing, damaged or no picture.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in COLOR_SUFFIXES:
+        raise InputError(
+            f"{path}: unknown extension {path.suffix!r}; colour pictures are read from {', '.join(COLOR_SUFFIXES)}"
+        )
+    image = _decode(path)
+    if image.dtype == np.uint16:
+        image = (image / np.float32(257) + 0.5).astype(np.uint8)
+    if image.dtype != np.uint8 or image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] not in (3, 4)):
+        raise InputError(f"{path}: {image.dtype} of shape {image.shape}; expected a picture with 8 or 16 bits")
+    if image.ndim == 2:
+        return np.repeat(image[..., None], 3, axis=2)
+    return np.ascontiguousarray(image[..., 2::-1])  # OpenCV's channels are blue, green, red
+
+
+def fit_color(color: Bytes, size: tuple[int, int], *, source: str, resize: bool = False) -> Bytes:
+    """Check that a picture ``(H, W, 3)`` has the size of the depth map, or bring it to that size.
+
+    Args:
+        color: display RGB.
+        size: width and height of the depth map.
+        source: what messages call the picture.
+        resize: whether to scale a picture of the same aspect ratio, in linear light.
+
+    Raises:
+        InputError: the sizes differ, and ``resize`` is off or the aspect ratios differ too.
+    """
+    height, width = color.shape[:2]
+    if (width, height) == size:
+        return color
+    differs = f"{source}: {width} × {height} pixels, but the depth map has {size[0]} × {size[1]}"
+    if abs(width * size[1] / (height * size[0]) - 1) > ASPECT:
+        raise InputError(f"{differs}; export the picture as the depth camera sees it (registered)")
+    if not resize:
+        raise InputError(f"{differs}; if both show the same view, add --resize-color")
+    linear = srgb_to_linear((color / np.float32(255)).astype(np.float32))
+    method = cv2.INTER_AREA if width > size[0] else cv2.INTER_LINEAR
+    resized = np.asarray(cv2.resize(linear, size, interpolation=method), np.float32).clip(0, 1)
+    return (linear_to_srgb(resized) * 255 + 0.5).astype(np.uint8)
+
+
+def _decode(path: Path) -> NDArray[Any]:
+    """Any image as it is, channels and bits as stored (blue first)."""
+    try:
+        data = np.fromfile(path, np.uint8)
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; check the path") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error}); check the path") from error
+    # imread would not say why it fails, and has trouble with names that are not ASCII
+    try:
+        image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if len(data) else None
+    except cv2.error:
+        image = None
+    if image is None:
+        raise InputError(f"{path}: cannot be decoded as an image; export it again")
+    return np.asarray(image)
+
+
+def _read_array(path: Path) -> NDArray[Any]:
+    try:
+        loaded = np.load(path, allow_pickle=False)
+        if isinstance(loaded, np.ndarray):
+            return loaded
+        with loaded:
+            if "depth" in loaded:
+                return loaded["depth"]
+            if len(loaded.files) == 1:
+                return loaded[loaded.files[0]]
+            raise InputError(f"{path}: arrays {', '.join(loaded.files)}; expected one, or one called depth")
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; check the path") from None
+    except InputError:
+        raise
+    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error) as error:
+        raise InputError(f"{path}: cannot be read as NumPy arrays ({error}); export it again") from error

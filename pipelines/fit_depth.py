@@ -1,0 +1,214 @@
+"""``mplicits fit`` of depth maps: which files belong together, and the cloud that they make."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from ..datasets import (
+    DepthCamera,
+    DepthReport,
+    DepthSettings,
+    PointCloud,
+    RgbdFrame,
+    fuse_frames,
+    read_cloud,
+    read_depth,
+    read_frame,
+    read_intrinsics,
+    read_poses,
+    spacing_of,
+    write_cloud_ply,
+)
+from ..datasets.depth_images import COLOR_SUFFIXES, DEPTH_SUFFIXES
+from ..datasets.depth_poses import PosedFrame
+from ..neural_fields import InputError
+from .fit import FitConfig, Run, choose_device, fit
+from .training import Progress
+
+__all__ = ["CLOUD_FILE", "DepthInput", "depth_cloud", "fit_depth", "read_frames", "trim_suggestion"]
+
+CLOUD_FILE = "cloud.ply"
+"""The cloud of a run that was fitted to depth maps; `mesh --trim-distance` and `texture` read it."""
+
+
+@dataclass(frozen=True)
+class DepthInput:
+    """Depth maps, and what is known about them.
+
+    Attributes:
+        depth: one depth map, or a folder of them, taken in order of their names.
+        intrinsics: a JSON file, or four numbers fx, fy, cx, cy; () if there are none.
+        fov: full vertical angle of view in degrees, where nothing better is known.
+        color: a picture, or a folder of as many as there are depth maps.
+        poses: trajectory.log or transforms.json.
+        scale: numbers in the depth files per unit.
+        inverse: whether they hold inverse depths.
+        resize_color: whether pictures of another size are scaled.
+        settings: of the cleaning.
+    """
+
+    depth: Path
+    intrinsics: tuple[str, ...] = ()
+    fov: float | None = None
+    color: Path | None = None
+    poses: Path | None = None
+    scale: float | None = None
+    inverse: bool = False
+    resize_color: bool = False
+    settings: DepthSettings = field(default_factory=DepthSettings)
+
+
+def depth_cloud(source: DepthInput) -> tuple[PointCloud, DepthReport]:
+    """Read, clean and join depth maps.
+
+    Raises:
+        InputError: a file cannot be read, or they do not fit together.
+    """
+    return fuse_frames(read_frames(source), source.settings)
+
+
+def read_frames(source: DepthInput) -> list[RgbdFrame]:
+    """Read the depth maps with their pictures and poses.
+
+    Raises:
+        InputError: a file cannot be read, or they do not fit together.
+    """
+    files = _files(source.depth, DEPTH_SUFFIXES, "depth maps")
+    own: list[PosedFrame] = [(None, np.eye(4), None)]
+    poses = own if source.poses is None else read_poses(source.poses)
+    if source.poses is None and len(files) > 1:
+        raise InputError(
+            f"{source.depth}: {len(files)} depth maps, but no poses to join them by; give --poses trajectory.log or "
+            "transforms.json, or name one depth map"
+        )
+    posed = _in_order_of(files, poses, source)
+    colors = _colors(files, source.color)
+    cameras = _cameras(files, posed, source)
+    return [
+        read_frame(
+            file,
+            camera,
+            color=color,
+            world_from_camera=pose,
+            scale=source.scale,
+            inverse=source.inverse,
+            resize_color=source.resize_color,
+        )
+        for file, camera, color, (_, pose, _) in zip(files, cameras, colors, posed, strict=True)
+    ]
+
+
+def fit_depth(
+    source: DepthInput,
+    config: FitConfig | None,
+    *,
+    out: Path,
+    resume: bool = False,
+    progress: Callable[[Progress], None] | None = None,
+    say: Callable[[str], None] | None = None,
+) -> Run:
+    """Fit depth maps: make their cloud, keep it as ``cloud.ply`` in the run's directory, and fit that.
+
+    Normals are those of the depth maps, which face the camera: none is turned round, not even in a room seen from
+    inside, unless the configuration asks for other normals.
+
+    Args:
+        source: the depth maps; not read again where a run is resumed.
+        config: settings; the defaults are those of the ``default`` preset.
+        out: run directory.
+        resume: continue the interrupted run in ``out``.
+        progress: called now and then with how far the training is.
+        say: called with a few lines about the cloud, before the training.
+
+    Raises:
+        InputError: the depth maps cannot be used, or there is nothing to resume.
+        Interrupted: see `fit`.
+    """
+    kept = out / CLOUD_FILE
+    if resume:
+        if not kept.is_file():
+            raise InputError(f"{out}: holds no {CLOUD_FILE}, so it was not fitted to depth maps; name its own cloud")
+        return fit(kept, config, out=out, resume=True, progress=progress)
+    config = config or FitConfig()
+    choose_device(config.device)  # or it would fail after the directory has been made
+    cloud, report = depth_cloud(source)
+    if say is not None:
+        say(report.summary())
+    if config.normals == "auto":
+        config = dataclasses.replace(config, normals="file")
+    out.mkdir(parents=True, exist_ok=True)
+    write_cloud_ply(kept, cloud)
+    return fit(kept, config, out=out, progress=progress)
+
+
+def trim_suggestion(run: Path) -> float:
+    """A distance for ``mplicits mesh --trim-distance`` that cuts off what closes an open surface behind.
+
+    Three times the distance to the nearest neighbour (of 95 % of the points): no holes between points, and only a
+    narrow rim beyond the last of them.
+    """
+    return 3 * spacing_of(read_cloud(run / CLOUD_FILE).points)
+
+
+def _files(path: Path, suffixes: tuple[str, ...], what: str) -> list[Path]:
+    if not path.exists():
+        raise InputError(f"{path}: no such file or folder; check the path")
+    if not path.is_dir():
+        return [path]
+    files = sorted(file for file in path.iterdir() if file.suffix.lower() in suffixes and file.name[0] != ".")
+    if not files:
+        raise InputError(f"{path}: no {what} in it; they end in {', '.join(suffixes)}")
+    return files
+
+
+def _in_order_of(files: list[Path], poses: list[PosedFrame], source: DepthInput) -> list[PosedFrame]:
+    """The pose of each file: by name where the poses have names that fit, else by order."""
+    named = {Path(name).stem: pose for pose in poses if (name := pose[0]) is not None}
+    if all(file.stem in named for file in files):
+        return [named[file.stem] for file in files]
+    if len(poses) != len(files):
+        raise InputError(f"{source.poses}: {len(poses)} poses, but {len(files)} depth maps in {source.depth}")
+    return poses
+
+
+def _colors(files: list[Path], color: Path | None) -> list[Path | None]:
+    """The picture of each depth map: by name where all names fit, else by order."""
+    if color is None:
+        return [None] * len(files)
+    pictures = _files(color, COLOR_SUFFIXES, "pictures")
+    named = {picture.stem: picture for picture in pictures}
+    if all(file.stem in named for file in files):
+        return [named[file.stem] for file in files]
+    if len(pictures) != len(files):
+        raise InputError(f"{color}: {len(pictures)} pictures, but {len(files)} depth maps; make their names match")
+    return list(pictures)
+
+
+def _cameras(files: list[Path], posed: list[PosedFrame], source: DepthInput) -> list[DepthCamera]:
+    """The lens of each depth map; what the user says comes before what the poses' file says."""
+    if len(source.intrinsics) == 1:
+        return [read_intrinsics(source.intrinsics[0])] * len(files)
+    lenses = [lens for _, _, lens in posed if lens is not None]
+    if not source.intrinsics and source.fov is None and len(lenses) == len(files):
+        return lenses
+    height, width = read_depth(files[0], inverse=source.inverse).shape
+    if source.fov is not None:
+        if not 0 < source.fov < 180:
+            raise InputError(f"--fov {source.fov:g}: expected degrees between 0 and 180")
+        return [DepthCamera.from_fov(source.fov, width, height)] * len(files)
+    if not source.intrinsics:
+        raise InputError(
+            f"{source.depth}: a depth map needs its camera; give --intrinsics camera.json, --intrinsics FX FY CX CY, "
+            "or roughly --fov DEGREES"
+        )
+    try:
+        fx, fy, cx, cy = (float(number) for number in source.intrinsics)
+        return [DepthCamera(width, height, fx, fy, cx, cy)] * len(files)
+    except ValueError as error:
+        given = " ".join(source.intrinsics)
+        raise InputError(f"--intrinsics {given}: expected a JSON file, or FX FY CX CY in pixels ({error})") from error

@@ -1,0 +1,301 @@
+"""Depth maps, pictures, lenses and poses from files: what was written comes back, and mistakes give one line."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+from mplicits.datasets import (
+    DepthCamera,
+    is_depth_file,
+    look_at,
+    read_color,
+    read_depth,
+    read_intrinsics,
+    read_poses,
+    read_trajectory,
+)
+from mplicits.datasets.depth_images import fit_color
+from mplicits.neural_fields import InputError
+
+OURS = {"width": 8, "height": 6, "fx": 10.0, "fy": 11.0, "cx": 3.5, "cy": 2.25}
+LENS = DepthCamera(160, 120, 130.0, 128.0, 81.5, 57.0, (-0.28, 0.09, 1e-3, -7e-4, -0.01))
+
+
+@pytest.fixture
+def steps():
+    """Millimetres; the first two pixels have no reading."""
+    values = np.random.default_rng(1).integers(400, 9000, (6, 8)).astype(np.uint16)
+    values[0, :2] = 0
+    return values
+
+
+def write(path, values):
+    if path.suffix == ".npy":
+        np.save(path, values)
+    else:
+        assert cv2.imwrite(str(path), values)
+    return path
+
+
+def same(read, expected):
+    assert read.dtype == np.float64
+    assert np.array_equal(np.isnan(read), np.isnan(expected))
+    assert np.nanmax(np.abs(read / expected - 1)) < 1e-12
+
+
+def with_holes(values):
+    return np.where(values > 0, values.astype(np.float64), np.nan)
+
+
+# --- depth -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["depth.png", "depth.tif", "depth.tiff", "depth.npy", "DEPTH.PNG"])
+@pytest.mark.parametrize(("scale", "camera", "divisor"), [(None, None, 1000), (None, 5000, 5000), (250, 5000, 250)])
+def test_integers_are_steps_of_a_unit(tmp_path, steps, name, scale, camera, divisor):
+    path = write(tmp_path / name, steps)
+    same(read_depth(path, scale=scale, integer_scale=camera), with_holes(steps) / divisor)
+
+
+@pytest.mark.parametrize("name", ["depth.tif", "depth.npy"])
+def test_floats_are_units(tmp_path, steps, name):
+    values = (steps / 1000).astype(np.float32)
+    values[1, 1], values[2, 2], values[3, 3], values[4, 4] = np.nan, np.inf, -1, -np.inf
+    expected = with_holes(values)
+    expected[2, 2] = np.nan
+    path = write(tmp_path / name, values)
+    same(read_depth(path, integer_scale=5000), expected)
+    same(read_depth(path, scale=2), expected / 2)
+
+
+def test_disparities_are_inverse_depths(tmp_path, steps):
+    path = write(tmp_path / "disparity.npy", steps.astype(np.float32))
+    same(read_depth(path, inverse=True), 1 / with_holes(steps))
+    same(read_depth(path, inverse=True, scale=500, integer_scale=7), 500 / with_holes(steps))
+
+
+def test_archives_and_single_channels(tmp_path, steps):
+    np.savez(tmp_path / "a.npz", depth=steps[None] / 1000.0, confidence=steps)
+    np.savez(tmp_path / "b.npz", steps[..., None] / 1000.0)
+    for name in ("a.npz", "b.npz"):
+        same(read_depth(tmp_path / name), with_holes(steps) / 1000)
+    np.savez(tmp_path / "c.npz", near=steps, far=steps)
+    with pytest.raises(InputError, match="near, far; expected one, or one called depth"):
+        read_depth(tmp_path / "c.npz")
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "message"),
+    [
+        ("a.png", np.full((6, 8), 200, np.uint8), "8 bits per pixel cannot hold depths"),
+        ("a.png", np.full((6, 8, 3), 200, np.uint16), "of one channel, not a colour picture"),
+        ("a.png", np.zeros((6, 8), np.uint16), "no pixel has a positive depth"),
+        ("a.npy", np.zeros(5), "of one channel"),
+        ("a.npy", np.full((6, 8), "x"), "expected numbers"),
+        ("a.npy", np.full((6, 8), np.nan), "no pixel has a positive depth"),
+    ],
+)
+def test_what_is_no_depth_map(tmp_path, name, values, message):
+    with pytest.raises(InputError, match=message) as error:
+        read_depth(write(tmp_path / name, values))
+    assert str(error.value).startswith(str(tmp_path / name))
+
+
+def test_missing_damaged_and_foreign_files(tmp_path, steps):
+    for name in ("none.png", "none.npy"):
+        with pytest.raises(InputError, match="no such file"):
+            read_depth(tmp_path / name)
+    for name in ("damaged.png", "damaged.npy", "empty.tif", "damaged.npz"):
+        (tmp_path / name).write_bytes(b"" if "empty" in name else b"no image at all")
+        with pytest.raises(InputError, match="export it again"):
+            read_depth(tmp_path / name)
+    with pytest.raises(InputError, match=r"unknown extension '.exr'"):
+        read_depth(tmp_path / "a.exr")
+    with pytest.raises(ValueError, match="scale=0"):
+        read_depth(write(tmp_path / "a.png", steps), scale=0)
+
+
+def test_tables_of_points_are_no_depth_maps(tmp_path):
+    for name, shape, expected in (
+        ("a", (9, 4), True),
+        ("b", (9, 3), False),
+        ("c", (9, 6), False),
+        ("d", (1, 6, 8), True),
+    ):
+        np.save(tmp_path / f"{name}.npy", np.ones(shape))
+        assert is_depth_file(tmp_path / f"{name}.npy") == expected
+    np.savez(tmp_path / "cloud.npz", points=np.ones((9, 3)))
+    np.savez(tmp_path / "depth.npz", depth=np.ones((9, 3)))
+    assert not is_depth_file(tmp_path / "cloud.npz")
+    assert is_depth_file(tmp_path / "depth.npz")
+    (tmp_path / "damaged.npy").write_bytes(b"?")
+    assert not is_depth_file(tmp_path / "damaged.npy")
+    assert is_depth_file("scan.TIFF")
+    assert not is_depth_file("scan.ply")
+
+
+# --- colour ------------------------------------------------------------------------------------------
+
+
+def test_pictures_are_rgb(tmp_path):
+    rgb = np.random.default_rng(2).integers(0, 256, (4, 5, 3)).astype(np.uint8)
+    alpha = np.full((4, 5, 1), 9, np.uint8)
+    files = {
+        "rgb.png": rgb[..., ::-1],
+        "rgba.png": np.concatenate((rgb[..., ::-1], alpha), axis=2),
+        "deep.png": rgb[..., ::-1].astype(np.uint16) * 257,
+    }
+    for name, stored in files.items():
+        assert np.array_equal(read_color(write(tmp_path / name, stored)), rgb), name
+    grey = read_color(write(tmp_path / "grey.png", rgb[..., 0]))
+    assert np.array_equal(grey, np.repeat(rgb[..., :1], 3, axis=2))
+    with pytest.raises(InputError, match="float32 of shape"):
+        read_color(write(tmp_path / "float.tif", np.ones((4, 5), np.float32)))
+    with pytest.raises(InputError, match="unknown extension"):
+        read_color(tmp_path / "a.npy")
+
+
+def test_pictures_of_another_size(tmp_path):
+    # Half of the light of white is 188 on the display, not 128: the mean of black and white, in linear light.
+    checker = np.zeros((8, 12, 3), np.uint8)
+    checker[::2, ::2] = checker[1::2, 1::2] = 255
+    assert fit_color(checker, (12, 8), source="c.png") is checker
+    with pytest.raises(InputError, match=r"c.png: 12 × 8 pixels, but the depth map has 6 × 4; .*--resize-color"):
+        fit_color(checker, (6, 4), source="c.png")
+    assert np.unique(fit_color(checker, (6, 4), source="c.png", resize=True)).tolist() == [188]
+    with pytest.raises(InputError, match="registered"):
+        fit_color(checker, (8, 8), source="c.png", resize=True)
+
+
+# --- lenses ------------------------------------------------------------------------------------------
+
+
+def test_intrinsics_of_both_kinds(tmp_path):
+    path = tmp_path / "camera.json"
+    path.write_text(json.dumps(OURS | {"depth_scale": 5000, "k1": 0.1, "p2": -0.2, "k4": 0, "note": "x"}))
+    expected = DepthCamera(8, 6, 10.0, 11.0, 3.5, 2.25, (0.1, 0.0, 0.0, -0.2, 0.0), 5000.0)
+    assert read_intrinsics(path) == expected
+    path.write_text(json.dumps({"width": 8, "height": 6, "intrinsic_matrix": [10, 0, 0, 0, 11, 0, 3.5, 2.25, 1]}))
+    assert read_intrinsics(path) == DepthCamera(8, 6, 10.0, 11.0, 3.5, 2.25)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ({k: v for k, v in OURS.items() if k not in ("fx", "cy")}, "fx, cy: missing; add them"),
+        (OURS | {"fx": "10"}, "fx: '10'; expected a finite number"),
+        (OURS | {"fx": -10}, "fx=-10.0: expected a finite number > 0"),
+        (OURS | {"width": 8.5}, "width: 8.5; expected a whole number"),
+        (OURS | {"k5": 0.1}, "k5: lenses with k4 to k6 are not supported"),
+        (OURS | {"depth_scale": 0}, "depth_scale=0.0: expected"),
+        (
+            {"width": 8, "height": 6, "intrinsic_matrix": [10, 0, 3.5, 0, 11, 2.25, 0, 0, 1]},
+            "intrinsic_matrix: .*expected",
+        ),
+        ({"width": 8, "height": 6, "intrinsic_matrix": [[10, 0, 3.5]]}, "nine numbers"),
+        ([1, 2], "expected an object"),
+    ],
+)
+def test_bad_intrinsics(tmp_path, content, message):
+    path = tmp_path / "camera.json"
+    path.write_text(json.dumps(content))
+    with pytest.raises(InputError, match=message) as error:
+        read_intrinsics(path)
+    assert str(error.value).startswith(str(path))
+
+
+def test_intrinsics_that_are_no_file_or_no_json(tmp_path):
+    with pytest.raises(InputError, match="no such file"):
+        read_intrinsics(tmp_path / "camera.json")
+    (tmp_path / "camera.json").write_text("fx = 1")
+    with pytest.raises(InputError, match="is not JSON"):
+        read_intrinsics(tmp_path / "camera.json")
+
+
+def test_lenses_from_an_angle_or_a_camera():
+    lens = DepthCamera.from_fov(90.0, 9, 5)
+    assert (lens.fx, lens.fy, lens.cx, lens.cy) == pytest.approx((2.5, 2.5, 4, 2))
+    assert DepthCamera.from_camera(look_at((0, 0, 4), (0, 0, 0), fov=90.0, width=9, height=5)) == lens
+
+
+def test_pixels_without_distortion_are_those_of_a_camera():
+    camera = look_at((1.0, 2, 4), (0, 0, 0), fov=50.0, width=9, height=5)
+    origin, directions = camera.rays(dtype=camera.eye.dtype)
+    lens = DepthCamera.from_camera(camera)
+    assert bool((origin == camera.eye).all())
+    world = lens.rays() @ camera.world_from_camera[:3, :3].T
+    assert float((world / world.norm(dim=2, keepdim=True) - directions).abs().max()) < 1e-14
+
+
+def test_distortion_is_undone_and_is_that_of_opencv():
+    depth = np.random.default_rng(3).uniform(1, 3, (120, 160))
+    points = LENS.unproject(depth).reshape(-1, 3)
+    pixels, inside = LENS.project(points)
+    u, v = np.meshgrid(np.arange(160.0), np.arange(120.0))
+    assert inside.all()
+    assert np.abs(pixels - np.stack((u, v), axis=-1).reshape(-1, 2)).max() < 1e-8
+    theirs, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), LENS.matrix, np.array(LENS.distortion))
+    assert np.abs(pixels - theirs[:, 0]).max() < 1e-8
+    straight = DepthCamera(160, 120, LENS.fx, LENS.fy, LENS.cx, LENS.cy).unproject(depth).reshape(-1, 3)
+    assert np.abs(points - straight).max() > 0.05  # so that the test would notice a lens left out
+
+
+def test_points_outside_or_behind_are_not_in_the_image():
+    # Far to the side, the polynomial of this lens turns back to the middle of the image.
+    slope = np.sqrt(1 / 0.28)
+    points = np.array([[0, 0, 1], [0, 0, -1], [0, 0, 0], [slope, 0, 1], [0.0, 5, 1]])
+    _, inside = DepthCamera(160, 120, 130, 130, 80, 60, (-0.28, 0.0, 0.0, 0.0, 0.0)).project(points)
+    assert inside.tolist() == [True, False, False, False, False]
+
+
+# --- poses -------------------------------------------------------------------------------------------
+
+
+def test_trajectory_is_camera_to_world(tmp_path):
+    angle = 0.3
+    pose = np.eye(4)
+    pose[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    pose[:3, 3] = 1.5, -2, 1e4
+    path = tmp_path / "trajectory.log"
+    rows = "\n".join(" ".join(f"{x:.6g}" for x in row) for row in pose)
+    path.write_text(f"0 0 2\n{rows}\n\n1 1 2\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n")
+    poses = read_trajectory(path)
+    assert poses.shape == (2, 4, 4)
+    assert np.abs(poses[0] - pose).max() < 1e-6
+    assert np.abs(poses[0, :3, :3].T @ poses[0, :3, :3] - np.eye(3)).max() < 1e-14
+    named = read_poses(path)
+    assert named[1][0] is None
+    assert named[1][2] is None
+    assert np.array_equal(named[1][1], np.eye(4))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("0 0 1\n1 0 0 0\n0 1 0 0\n", "3 lines; expected five per frame"),
+        ("0 0 1\n1 0 0 0\n0 1 0 0\n0 0 1 x\n0 0 0 1\n", "could not convert"),
+        ("0 0 1\n1 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n", "expected five lines per frame"),
+        ("0 1\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n", "has not three numbers"),
+        ("0 0 1\n2 0 0 0\n0 2 0 0\n0 0 2 0\n0 0 0 1\n", "frame 0: .*expected a rigid pose"),
+        ("0 0 1\n1 0 0 0\n0 1 0 0\n0 0 -1 0\n0 0 0 1\n", "frame 0: .*expected a rigid pose"),
+        ("0 0 1\n1 0 0 nan\n0 1 0 0\n0 0 1 0\n0 0 0 1\n", "frame 0: .*expected a rigid pose"),
+    ],
+)
+def test_bad_trajectories(tmp_path, text, message):
+    path = tmp_path / "trajectory.log"
+    path.write_text(text)
+    with pytest.raises(InputError, match=message):
+        read_trajectory(path)
+
+
+def test_poses_with_names_and_lenses(tmp_path):
+    frame = {"file_path": "images/b.png", "transform_matrix": np.diag([1.0, -1, -1, 1]).tolist()}
+    path = tmp_path / "transforms.json"
+    path.write_text(json.dumps({"w": 8, "h": 6, "fl_x": 10, "cx": 4, "cy": 3, "frames": [frame]}))
+    ((name, pose, lens),) = read_poses(path)
+    assert name == "images/b.png"
+    assert np.abs(pose - np.eye(4)).max() < 1e-12  # OpenGL's axes became OpenCV's
+    assert lens == DepthCamera(8, 6, 10.0, 10.0, 3.5, 2.5)
+    with pytest.raises(InputError, match="no such file"):
+        read_poses(tmp_path / "none.log")

@@ -1,0 +1,405 @@
+"""Depth maps of closed forms → clouds on them, with their normals and colours, and without curtains."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+from mplicits.datasets import (
+    DepthCamera,
+    DepthSettings,
+    PointCloud,
+    RgbdFrame,
+    frame_cloud,
+    fuse_frames,
+    look_at,
+    read_cloud,
+    read_frame,
+    thin,
+)
+from mplicits.neural_fields import InputError
+from mplicits.pipelines.cli import main
+
+LENS = DepthCamera(96, 72, 90.0, 92.0, 46.5, 36.5)
+EXACT = DepthSettings(smoothing=0)
+
+
+def plane_depth(normal, offset, lens=LENS):
+    """z of the plane ⟨normal, p⟩ = offset along the pixels' rays."""
+    return offset / (lens.rays().numpy() @ np.asarray(normal, float))
+
+
+def sphere_depth(center, radius, lens=LENS):
+    """z of the near side of a sphere in camera coordinates; NaN where the rays miss it."""
+    rays = lens.rays().numpy()
+    a, b = (rays**2).sum(axis=2), rays @ np.asarray(center, float)
+    inside = b**2 - a * (np.dot(center, center) - radius**2)
+    return np.where(inside > 0, (b - np.sqrt(inside.clip(min=0))) / a, np.nan)
+
+
+def pose_looking(eye, target):
+    return look_at(eye, target, up=(0, 0, 1), width=4, height=4).world_from_camera.numpy()
+
+
+def degrees_between(a, b):
+    return np.degrees(np.arccos((a * b).sum(axis=1).clip(-1, 1)))
+
+
+# --- one frame ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("incidence", [0, 45, 80])
+@pytest.mark.parametrize("distortion", [(0.0,) * 5, (-0.2, 0.05, 1e-3, -1e-3, 0.0)])
+def test_plane_is_met_exactly_however_steep(incidence, distortion):
+    """The steepest is seen at up to 83 degrees from its normal, and is no edge."""
+    lens = DepthCamera(96, 72, 900.0, 920.0, 46.5, 36.5, distortion)
+    normal = np.array([np.sin(np.radians(incidence)), 0, np.cos(np.radians(incidence))])
+    depth = plane_depth(normal, 2 * normal[2], lens)
+    cloud, report = frame_cloud(RgbdFrame(depth, lens), DepthSettings())
+    assert report.kept == len(cloud) == depth.size
+    assert report.smoothing == 0
+    assert np.abs(cloud.points @ normal - 2 * normal[2]).max() < 1e-12
+    assert degrees_between(cloud.normals, -normal[None]).max() < 0.05
+
+
+def test_sphere_points_normals_and_colours():
+    lens = DepthCamera(240, 180, 225.0, 230.0, 118.0, 92.0)
+    center, radius = np.array([0.1, -0.05, 3.0]), 0.8
+    depth = sphere_depth(center, radius, lens)
+    v, u = np.mgrid[:180, :240]
+    color = np.stack((u, v, np.full_like(u, 7)), axis=-1).astype(np.uint8)
+    cloud, report = frame_cloud(RgbdFrame(depth, lens, color), EXACT)
+    out = (cloud.points - center) / radius
+    assert np.abs(np.linalg.norm(out, axis=1) - 1).max() < 1e-6
+    angles = degrees_between(cloud.normals, out)
+    facing = -(out * cloud.points).sum(axis=1) / np.linalg.norm(cloud.points, axis=1)
+    assert angles[facing > 0.35].max() < 1  # seen at less than 70 degrees from the normal
+    assert angles.max() < 20  # at the rim, where the neighbours on one side are missing
+    assert ((cloud.normals * cloud.points).sum(axis=1) < 0).all()
+    pixels, _ = lens.project(cloud.points)
+    assert np.abs(cloud.colors[:, :2] * 255 - pixels).max() < 1e-4
+    assert report.without_reading == int(np.isnan(depth).sum())
+    assert report.pixels == report.without_reading + report.edges + report.grazing + report.specks + report.kept
+    assert report.kept > 0.95 * (report.pixels - report.without_reading)
+
+
+@pytest.mark.parametrize("ramp", [0, 1, 2, 3, 6])
+@pytest.mark.parametrize("axis", [0, 1])
+def test_step_grows_no_curtain(ramp, axis):
+    """Near and far planes, with ``ramp`` pixels between them that mix both."""
+    lens = DepthCamera(96, 72, 500.0, 500.0, 46.5, 36.5)
+    length = lens.width if axis else lens.height
+    profile = np.full(length, 1.0)
+    middle = length // 2
+    profile[middle:] = 2.0
+    profile[middle : middle + ramp] = 1 + (1 + np.arange(ramp)) / (ramp + 1)
+    depth = np.broadcast_to(profile[None] if axis else profile[:, None], (72, 96)).copy()
+    cloud, report = frame_cloud(RgbdFrame(depth, lens), EXACT)
+    assert np.isin(cloud.points[:, 2], (1.0, 2.0)).all()
+    assert degrees_between(cloud.normals, np.array([[0, 0, -1.0]])).max() < 1e-3
+    across = depth.size // length
+    assert report.kept == across * (length - ramp - 2)  # a pixel on each side goes, and nothing else
+    assert report.edges + report.grazing + report.specks == across * (ramp + 2)
+
+
+def test_step_in_front_of_a_steep_floor_is_found():
+    """A post before a floor that itself climbs: the floor stays, the post's rims go."""
+    floor = plane_depth((0, -1.0, 0.12), -1.0)
+    floor = np.where((floor > 0) & (floor < 6), floor, np.nan)
+    depth = floor.copy()
+    depth[:, 40:50] = np.fmin(depth[:, 40:50], 1.5)
+    cloud, _ = frame_cloud(RgbdFrame(depth, LENS), EXACT)
+    on_post = cloud.points[:, 2] == 1.5
+    on_floor = np.abs(cloud.points @ (0, -1.0, 0.12) + 1) < 1e-9
+    assert (on_post | on_floor).all()
+    assert on_post.sum() > 200
+    assert on_floor.sum() > 0.6 * np.isfinite(floor).sum()
+
+
+def test_noise_is_measured_and_smoothed_away_but_not_over_the_edge():
+    random = np.random.default_rng(0)
+    lens = DepthCamera(96, 72, 500.0, 500.0, 47.5, 35.5)
+    normal = np.array([0.5, 0.2, 0.8])
+    normal /= np.linalg.norm(normal)
+    depth = plane_depth(normal, 2 * normal[2], lens)
+    depth[:, 48:] += 1
+    noisy = depth * (1 + 0.002 * random.normal(size=depth.shape))
+    raw, _ = frame_cloud(RgbdFrame(noisy, lens), EXACT)
+    cloud, report = frame_cloud(RgbdFrame(noisy, lens))
+    assert report.noise == pytest.approx(0.002, rel=0.1)
+    assert 2 <= report.smoothing <= 8
+    left = cloud.points[:, 2] < 2.5
+    off = np.abs(cloud.points[left] @ normal - 2 * normal[2])
+    assert off.mean() < 0.4 * 0.002 * 2
+    assert np.median(degrees_between(raw.normals, -normal[None])) > 20
+    assert np.median(degrees_between(cloud.normals[left], -normal[None])) < 6
+    assert np.abs(cloud.points[:, 2] - lens_depth(cloud.points, depth, lens)).max() < 0.05
+
+
+def lens_depth(points, depth, lens):
+    u, v = np.rint(lens.project(points)[0]).astype(int).T
+    return depth[v, u]
+
+
+def test_colours_guide_the_smoothing():
+    """Two planes that meet in a step no higher than the noise, but of different colours, stay apart."""
+    random = np.random.default_rng(0)
+    depth = np.full((72, 96), 1.0)
+    depth[:, 48:] = 1.004
+    noisy = depth * (1 + 0.002 * random.normal(size=depth.shape))
+    color = np.zeros((72, 96, 3), np.uint8)
+    color[:, 48:] = 255
+    settings = DepthSettings(smoothing=6)
+    beside = {}
+    for name, picture in (("without", None), ("with", color)):
+        cloud, _ = frame_cloud(RgbdFrame(noisy, LENS, picture), settings)
+        pixels = np.rint(LENS.project(cloud.points)[0][:, 0])
+        beside[name] = cloud.points[pixels == 48, 2].mean() - cloud.points[pixels == 47, 2].mean()
+    assert beside["with"] == pytest.approx(0.004, abs=0.0008)
+    assert beside["without"] < 0.75 * beside["with"]
+
+
+def test_range_specks_and_nothing_left():
+    depth = np.full((72, 96), np.nan)
+    depth[10:40, 10:40] = 1.0
+    depth[50:53, 50:53] = 1.0
+    depth[50:70, 70:90] = 5.0
+    settings = DepthSettings(max_depth=4.0, smallest_piece=0.01, smoothing=0)
+    cloud, report = frame_cloud(RgbdFrame(depth, LENS), settings)
+    assert (report.kept, report.specks, report.out_of_range) == (900, 9, 400)
+    assert len(cloud) == 900
+    with pytest.raises(InputError, match="only 0 of 1309 readings lie on a surface"):
+        frame_cloud(RgbdFrame(depth, LENS), DepthSettings(max_depth=0.5))
+    assert "400 beyond the largest depth" in report.summary()
+
+
+@pytest.mark.parametrize(
+    "setting", [{"max_depth": 0}, {"jump": 0}, {"max_incidence": 91}, {"smoothing": -1}, {"max_points": 0}]
+)
+def test_settings_out_of_range(setting):
+    with pytest.raises(ValueError, match=next(iter(setting))):
+        DepthSettings(**setting)
+
+
+def test_frames_say_what_does_not_fit():
+    depth = np.ones((72, 96))
+    with pytest.raises(ValueError, match="depth: float64 of shape"):
+        RgbdFrame(np.ones((70, 96)), LENS)
+    with pytest.raises(ValueError, match="color: float64"):
+        RgbdFrame(depth, LENS, np.ones((72, 96, 3)))
+    with pytest.raises(ValueError, match="world_from_camera"):
+        RgbdFrame(depth, LENS, None, 2 * np.eye(4))
+
+
+# --- poses and fusion --------------------------------------------------------------------------------
+
+
+def test_pose_is_camera_to_world():
+    eye, target = np.array([5.0, 1, 2]), np.array([1.0, 2, 0.5])
+    pose = pose_looking(eye, target)
+    distance = np.linalg.norm(target - eye)
+    frame = RgbdFrame(sphere_depth((0, 0, distance), 1.0), LENS, None, pose)
+    cloud, _ = frame_cloud(frame, EXACT)
+    out = cloud.points - target
+    assert np.abs(np.linalg.norm(out, axis=1) - 1).max() < 1e-9
+    assert (out @ (eye - target) > 0).all()  # the side that the camera sees
+    assert np.median(degrees_between(cloud.normals, out)) < 1
+
+
+def sphere_frames(eyes, *, lens=LENS):
+    """Unit sphere around the origin, seen from there."""
+    frames = []
+    for eye in eyes:
+        pose = pose_looking(eye, (0, 0, 0))
+        frames.append(RgbdFrame(sphere_depth((0, 0, np.linalg.norm(eye)), 1.0, lens), lens, None, pose))
+    return frames
+
+
+def test_two_views_of_a_sphere_keep_both_sides_and_drop_what_flies():
+    frames = sphere_frames([(4.0, 0, 0), (-4.0, 0, 0), (0, 4.0, 0)])
+    clean, clean_report = fuse_frames(frames, EXACT)
+    assert clean_report.seen_through == 0
+    # A patch of air beside the sphere, 16 pixels wide, that the first camera alone believes in.
+    depth = frames[0].depth.copy()
+    patch = np.zeros(depth.shape, bool)
+    patch[28:44, 4:20] = True
+    assert np.isnan(depth[patch]).all()
+    depth[patch] = 4.0
+    walls = [np.where(np.isnan(frame.depth), 9.0, frame.depth) for frame in frames[1:]]  # free space all around it
+    flown = [
+        RgbdFrame(depth, LENS, None, frames[0].world_from_camera),
+        *(RgbdFrame(wall, LENS, None, f.world_from_camera) for wall, f in zip(walls, frames[1:], strict=True)),
+    ]
+    alone, _ = frame_cloud(flown[0], EXACT)
+    flying = np.abs(np.linalg.norm(alone.points, axis=1) - 1) > 0.01
+    assert flying.sum() > 100
+    cloud, report = fuse_frames(flown, EXACT)
+    radius = np.linalg.norm(cloud.points, axis=1)
+    assert ((np.abs(radius - 1) < 1e-9) | (radius > 4)).all()
+    assert report.seen_through == flying.sum()
+    on_sphere = cloud.points[radius < 2]
+    assert 0.9 * len(clean) < len(on_sphere) < len(clean)  # before walls, the rims of the sphere are edges
+    assert (on_sphere[:, 0] > 0.9).sum() > 50
+    assert (on_sphere[:, 0] < -0.9).sum() > 50
+    assert report.frames == 3
+    accounted = report.without_reading + report.edges + report.grazing + report.specks
+    assert report.pixels == accounted + report.seen_through + report.thinned + report.kept
+
+
+def test_fusion_thins_what_several_frames_saw():
+    frames = sphere_frames([(4.0, 0, 0.1 * k) for k in range(5)])
+    every, _ = fuse_frames(frames, EXACT)
+    few, report = fuse_frames(frames, DepthSettings(smoothing=0, max_points=1500))
+    assert 1200 <= len(few) <= 1500
+    assert report.thinned == len(every) - len(few)
+    assert np.isin(few.points, every.points).all()
+    assert fuse_frames(frames, EXACT, witnesses=2)[1].seen_through == 0
+
+
+def test_fusion_refuses_what_does_not_fit():
+    bare, other = sphere_frames([(4.0, 0, 0), (0, 4.0, 0)])
+    colored = RgbdFrame(bare.depth, LENS, np.zeros((72, 96, 3), np.uint8), bare.world_from_camera, "a.png")
+    with pytest.raises(InputError, match="has no colour picture, but other frames have one"):
+        fuse_frames([colored, other])
+    with pytest.raises(InputError, match="none given"):
+        fuse_frames([])
+    with pytest.raises(ValueError, match="tolerance=0"):
+        fuse_frames([bare], tolerance=0)
+
+
+def test_thinning_keeps_points_and_spreads_them():
+    random = np.random.default_rng(0)
+    points = np.concatenate((random.random((9000, 3)) * (1, 1, 0), random.random((1000, 3)) * (1, 1, 0) + (1, 0, 0)))
+    cloud = PointCloud(points + 1e6, points, points.clip(0, 1))
+    few = thin(cloud, 500)
+    assert 450 <= len(few) <= 500
+    assert np.isin(few.points, cloud.points).all()
+    assert np.abs(few.points - 1e6 - few.normals).max() < 1e-6  # rows stay together
+    dense = (few.points[:, 0] < 1e6 + 1).mean()
+    assert 0.4 < dense < 0.6  # of the points, 90 % lie there
+    assert thin(cloud, 10_000) is cloud
+    assert len(thin(cloud, 1)) == 1
+
+
+# --- files and the command line ----------------------------------------------------------------------
+
+
+def write_scene(folder, frames, *, scale=5000.0):
+    """Frames as a user has them: folders of PNG, a trajectory and intrinsics; pictures say where pixels are."""
+    (folder / "depth").mkdir()
+    (folder / "color").mkdir()
+    lines = []
+    for index, frame in enumerate(frames):
+        steps = np.rint(np.nan_to_num(frame.depth) * scale).astype(np.uint16)
+        cv2.imwrite(str(folder / "depth" / f"{index:03d}.png"), steps)
+        picture = np.full((*frame.depth.shape, 3), (40 * index, 100, 200), np.uint8)
+        cv2.imwrite(str(folder / "color" / f"{index:03d}.png"), picture[..., ::-1])
+        lines += [
+            f"{index} {index} {index + 1}",
+            *(" ".join(map(repr, map(float, r))) for r in frame.world_from_camera),
+        ]
+    (folder / "trajectory.log").write_text("\n".join(lines))
+    lens = {name: getattr(LENS, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
+    (folder / "camera.json").write_text(json.dumps(lens | {"depth_scale": scale}))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("scene")
+    return write_scene(folder, sphere_frames([(3.0, 0, 0), (-1.5, 2.6, 0), (-1.5, -2.6, 0.3)]))
+
+
+SMALL = ["--widths", "16", "--depths", "1", "--omegas", "5", "--steps", "200", "--learning-rates", "5e-3"]
+SMALL += ["--batch", "256", "--samples", "2000", "--quiet"]
+
+
+def run_fit(*arguments):
+    return main(["fit", *map(str, arguments), *SMALL])
+
+
+def fails(capsys, *arguments):
+    capsys.readouterr()
+    assert run_fit(*arguments) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1
+    return lines[0]
+
+
+def test_fit_of_one_depth_map(scene, tmp_path, capsys):
+    run = tmp_path / "run"
+    given = ["--intrinsics", scene / "camera.json", "--color", scene / "color" / "000.png"]
+    assert run_fit(scene / "depth" / "000.png", *given, "-o", run) == 0
+    output = capsys.readouterr().out
+    assert "1 depth map: " in output
+    trim = output.rsplit("--trim-distance ", 1)[1].split()[0]
+    cloud = read_cloud(run / "cloud.ply")
+    assert np.abs(np.linalg.norm(cloud.points - (0, 0, 3), axis=1) - 1).max() < 1e-3  # in the camera's own axes
+    assert np.abs(cloud.colors * 255 - (0, 100, 200)).max() < 1e-3
+    record = json.loads((run / "run.json").read_text())
+    assert record["cleaning"]["normals_source"] == "file"
+    assert record["config"]["normals"] == "file"
+    assert main(["mesh", str(run), "-o", str(tmp_path / "m.ply"), "--resolution", "48", "--trim-distance", trim]) == 0
+
+
+def test_fit_of_several_posed_depth_maps(scene, tmp_path, capsys):
+    run = tmp_path / "run"
+    given = ["--intrinsics", scene / "camera.json", "--color", scene / "color", "--poses", scene / "trajectory.log"]
+    assert run_fit(scene / "depth", *given, "-o", run) == 0
+    assert "3 depth maps: " in capsys.readouterr().out
+    cloud = read_cloud(run / "cloud.ply")
+    assert np.abs(np.linalg.norm(cloud.points, axis=1) - 1).max() < 1e-3
+    from_first = cloud.points[:, 0] > 0.95
+    assert np.abs(cloud.colors[from_first] * 255 - (0, 100, 200)).max() < 1e-3
+    assert len(np.unique(np.rint(cloud.colors[:, 0] * 255))) == 3
+
+
+def test_intrinsics_as_numbers_or_an_angle(scene, tmp_path):
+    depth = scene / "depth" / "000.png"
+    numbers = [LENS.fx, LENS.fy, LENS.cx, LENS.cy]
+    assert run_fit(depth, "--intrinsics", *numbers, "--depth-scale", 5000, "-o", tmp_path / "a") == 0
+    exact = read_cloud(tmp_path / "a" / "cloud.ply").points
+    assert np.abs(np.linalg.norm(exact - (0, 0, 3), axis=1) - 1).max() < 1e-3
+    assert run_fit(depth, "--fov", 40, "--max-points", 300, "-o", tmp_path / "b") == 0
+    rough = read_cloud(tmp_path / "b" / "cloud.ply").points
+    assert len(rough) <= 300
+    assert rough[:, 2].min() == pytest.approx(10, rel=0.01)  # millimetres were assumed
+
+
+def test_mistakes_of_the_command_line(scene, tmp_path, capsys):
+    depth, camera, out = scene / "depth" / "000.png", scene / "camera.json", ["-o", tmp_path / "run"]
+    assert "a depth map needs its camera" in fails(capsys, depth, *out)
+    assert "no such file or folder" in fails(capsys, "none.png", "--fov", 40, *out)
+    assert "3 depth maps, but no poses" in fails(capsys, scene / "depth", "--intrinsics", camera, *out)
+    assert "expected a JSON file, or FX FY CX CY" in fails(capsys, depth, "--intrinsics", 1, 2, 3, *out)
+    assert "--fov: does not go with --intrinsics" in fails(capsys, depth, "--intrinsics", camera, "--fov", 40, *out)
+    assert "3 poses, but 1 depth maps" in fails(
+        capsys, depth, "--intrinsics", camera, "--poses", scene / "trajectory.log", *out
+    )
+    small = tmp_path / "small.png"
+    cv2.imwrite(str(small), np.zeros((36, 48, 3), np.uint8))
+    assert "--resize-color" in fails(capsys, depth, "--intrinsics", camera, "--color", small, *out)
+    assert "3 pictures, but 1 depth maps" in fails(
+        capsys, small, "--intrinsics", camera, "--color", scene / "color", *out
+    )
+    assert "the intrinsics are for 96 × 72" in fails(
+        capsys, depth_of(tmp_path / "d.npy", 10, 20), "--intrinsics", camera, *out
+    )
+    (tmp_path / "ball.xyz").write_text("0 0 0\n")
+    assert "--max-depth is for depth maps" in fails(capsys, tmp_path / "ball.xyz", "--max-depth", 3, *out)
+    assert not (tmp_path / "run").exists()
+
+
+def depth_of(path, height, width):
+    np.save(path, np.ones((height, width)))
+    return path
+
+
+def test_read_frame_resizes_pictures_and_takes_the_scale_of_the_camera(tmp_path):
+    cv2.imwrite(str(tmp_path / "d.png"), np.full((6, 8), 5000, np.uint16))
+    cv2.imwrite(str(tmp_path / "c.png"), np.full((12, 16, 3), (10, 20, 30), np.uint8))
+    lens = DepthCamera(8, 6, 10.0, 10.0, 4.0, 3.0, depth_scale=2500.0)
+    frame = read_frame(tmp_path / "d.png", lens, color=tmp_path / "c.png", resize_color=True)
+    assert (frame.depth == 2).all()
+    assert frame.color is not None
+    assert (frame.color == (30, 20, 10)).all()
