@@ -41,27 +41,31 @@ def thin(cloud: PointCloud, max_points: int, *, steps: int = 12) -> PointCloud:
         raise ValueError(f"max_points={max_points}: expected at least one")
     if len(cloud) <= max_points:
         return cloud
-    extent = float(np.ptp(cloud.points, axis=0).max())
+    cells = _Cells(cloud.points)
     # One voxel holds all at the top; at the bottom a million of them stand along a side.
     low, high = -20.0, 1.0
     for _ in range(steps):
         middle = (low + high) / 2
-        if _voxel_count(cloud.points, extent * 2**middle) > max_points:
+        if cells.count(cells.extent.max() * 2**middle) > max_points:
             low = middle
         else:
             high = middle
-    return select(cloud, voxel_representatives(cloud.points, extent * 2**high))
+    return select(cloud, voxel_representatives(cloud.points, float(cells.extent.max()) * 2**high))
 
 
 def voxel_representatives(points: Float64, size: float) -> NDArray[np.int64]:
     """Indices, in order, of one point ``(N, 3)`` per voxel: the one nearest the mean of its points."""
-    _, voxel = np.unique(_keys(points, size), return_inverse=True)
+    keys = _Cells(points).keys(size)
+    order = np.argsort(keys, kind="stable")
+    begins = _begins(keys[order])
+    voxel = np.empty(len(points), np.int64)
+    voxel[order] = np.cumsum(begins) - 1
     count = np.bincount(voxel)
-    mean = np.stack([np.bincount(voxel, weights=axis) / count for axis in points.T], axis=1)
-    off = ((points - mean[voxel]) ** 2).sum(axis=1)
-    order = np.lexsort((off, voxel))
-    first = np.concatenate(([0], np.cumsum(count)[:-1]))
-    return np.sort(order[first])
+    off = np.zeros(len(points))
+    for axis in points.T:  # x, y and z
+        off += (axis - (np.bincount(voxel, weights=axis) / count)[voxel]) ** 2
+    nearest = np.lexsort((off, voxel))
+    return np.sort(nearest[np.flatnonzero(begins)])
 
 
 def spacing_of(points: Float64, *, share: float = 0.95, sample: int = 20_000) -> float:
@@ -76,12 +80,24 @@ def spacing_of(points: Float64, *, share: float = 0.95, sample: int = 20_000) ->
     return float(np.quantile(KDTree(shifted).query(asked, k=2)[0][:, 1], share))
 
 
-def _voxel_count(points: Float64, size: float) -> int:
-    return len(np.unique(_keys(points, size)))
+class _Cells:
+    """Points ``(N, 3)`` as cells of grids of any size, which all begin at the points' lowest corner."""
+
+    def __init__(self, points: Float64) -> None:
+        self._offsets = (points - points.min(axis=0)).T.copy()  # (3, N)
+        self.extent: Float64 = self._offsets.max(axis=1)
+
+    def keys(self, size: float) -> NDArray[np.int64]:
+        """One whole number per point, ``(N,)``, the same within a voxel with sides of ``size``."""
+        sides = np.floor(self.extent / size).astype(np.int64) + 1
+        x, y, z = (np.floor(axis / size).astype(np.int64) for axis in self._offsets)
+        return (x * sides[1] + y) * sides[2] + z
+
+    def count(self, size: float) -> int:
+        """How many voxels of ``size`` hold points."""
+        return int(_begins(np.sort(self.keys(size))).sum())
 
 
-def _keys(points: Float64, size: float) -> NDArray[np.int64]:
-    """One whole number per point and voxel."""
-    cells = np.floor((points - points.min(axis=0)) / size).astype(np.int64)
-    sides = cells.max(axis=0) + 1
-    return (cells[:, 0] * sides[1] + cells[:, 1]) * sides[2] + cells[:, 2]
+def _begins(ordered: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Where a number differs from the one before it; true at the first."""
+    return np.concatenate(([True], ordered[1:] != ordered[:-1]))
