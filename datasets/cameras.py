@@ -138,6 +138,12 @@ class Camera:
         pose[:3, 3] = torch.from_numpy(similarity.to_unit(self.eye.cpu().numpy()))
         return replace(self, world_from_camera=pose)
 
+    def strip(self, first: int, rows: int) -> Camera:
+        """The camera of ``rows`` rows of the image from row ``first`` on."""
+        intrinsics = self.intrinsics.clone()
+        intrinsics[1, 2] -= first
+        return replace(self, intrinsics=intrinsics, height=rows)
+
     def resized(self, width: int, height: int) -> Camera:
         """The same view in other pixels; where the aspect ratio changes, they are no longer square.
 

@@ -49,6 +49,7 @@ class Rays(NamedTuple):
         origin: ``(K, 3)``.
         direction: ``(K, 3)``.
         depth: ``(K,)`` where to look next.
+        entry: ``(K,)`` where the search may begin, at most ``depth``.
         far: ``(K,)`` where to give up.
         sign: ``(K,)`` −1 for a ray that began inside, else 1; values are multiplied by it.
         low: ``(K,)`` the last depth known to be in front of the surface.
@@ -64,6 +65,7 @@ class Rays(NamedTuple):
     origin: Tensor
     direction: Tensor
     depth: Tensor
+    entry: Tensor
     far: Tensor
     sign: Tensor
     low: Tensor
@@ -75,7 +77,7 @@ class Rays(NamedTuple):
     boldness: Tensor
 
     @classmethod
-    def begin(cls, origins: Tensor, directions: Tensor, starts: Tensor, ends: Tensor) -> Rays:
+    def begin(cls, origins: Tensor, directions: Tensor, entries: Tensor, starts: Tensor, ends: Tensor) -> Rays:
         index = (starts < ends).nonzero()[:, 0]
         depth, far = starts[index], ends[index]
         zero, infinite = torch.zeros_like(depth), torch.full_like(depth, torch.inf)
@@ -84,6 +86,7 @@ class Rays(NamedTuple):
             origin=origins[index],
             direction=directions[index],
             depth=depth,
+            entry=entries[index],
             far=far,
             sign=zero + 1,
             low=depth,
@@ -125,6 +128,7 @@ def march(field: Field, level: int, rays: Rays, found: Found, rule: Rule, max_st
             return
         value = field.value(rays.points(), level=level)
         if count == 1:
+            rays, value = _from_the_front(field, level, rays, value)
             rays = rays._replace(sign=torch.where(value < 0, -1.0, 1.0).to(value))
         gap = rule.resolution * 2.0 ** ((count - 1) // PATIENCE)
         rays, stand = _look(rays, value * rays.sign, rule, gap)
@@ -134,6 +138,16 @@ def march(field: Field, level: int, rays: Rays, found: Found, rule: Rule, max_st
             rays.ray[rows], mask=stand.hit[rows], depth=stand.depth[rows], level=stand.level[rows], steps=count
         )
         rays = rays.only((~ended).nonzero()[:, 0])
+
+
+def _from_the_front(field: Field, level: int, rays: Rays, value: Tensor) -> tuple[Rays, Tensor]:
+    """Send rays whose start is behind the surface back to where they may begin; with the values there."""
+    behind = ((value < 0) & (rays.depth > rays.entry)).nonzero()[:, 0]
+    if not len(behind):
+        return rays, value
+    depth = rays.depth.index_copy(0, behind, rays.entry[behind])
+    rays = rays._replace(depth=depth, low=depth)
+    return rays, value.index_copy(0, behind, field.value(rays.only(behind).points(), level=level))
 
 
 class Stand(NamedTuple):

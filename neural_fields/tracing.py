@@ -80,7 +80,8 @@ def sphere_trace(
         origins: ``(..., 3)``.
         directions: ``(..., 3)`` of unit length; broadcast with ``origins``.
         level: whose surface to find.
-        near: depth at which to start, a number or a tensor that broadcasts to ``(...,)``; see `cone_starts`.
+        near: depth at which to start, a number or a tensor that broadcasts to ``(...,)``: up to there nothing is
+            expected (see `cone_starts`). A ray that is behind the surface there starts from the beginning instead.
         far: depth at which to give up.
         tolerance: of the depth, in the field's units. The precision of the numbers sets a limit of its own.
         resolution: two crossings nearer to each other than this may be overlooked.
@@ -108,10 +109,11 @@ def sphere_trace(
     shape = directions.shape[:-1]
     starts, ends = (torch.as_tensor(x).to(directions).broadcast_to(shape).reshape(-1) for x in (near, far))
     origins, directions = origins.reshape(-1, 3), directions.reshape(-1, 3)
+    entries = torch.zeros_like(starts)
     if radius is not None:
         entry, leave = _ball_crossing(origins, directions, radius)
-        starts, ends = torch.maximum(starts, entry), torch.minimum(ends, leave)
-    rays = Rays.begin(origins, directions, starts.clamp(min=0), ends)
+        entries, ends = entry.clamp(min=0), torch.minimum(ends, leave)
+    rays = Rays.begin(origins, directions, entries, torch.maximum(starts, entries), ends)
     found = Found(starts)
     if budget is None:
         rule = Rule(field.deltas[:level].to(directions), tolerance, resolution, lipschitz)

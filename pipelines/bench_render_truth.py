@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ..datasets.cameras import Camera
 from ..neural_fields import Field, InputError, cone_starts, sphere_trace
-from ..neural_fields.meshing import NoSurfaceError, extract_mesh
+from ..neural_fields.meshing import Mesh, NoSurfaceError, extract_mesh
 from .picture import mesh_view
 from .seen import Seen
 from .shading import shade
@@ -22,7 +22,7 @@ __all__ = ["Agreement", "Truth"]
 
 OUTLINE_RESOLUTION = 64
 # A mesh and a trace that disagree about a pixel are settled by this search of the field itself along the ray.
-WINDOW, SPACING = 0.01, 1e-5
+WINDOW, SPACING = 0.01, 1e-4
 # A hit further behind the mesh than this has passed through a surface.
 PASSED = 0.02
 # Neighbouring pixels whose depths differ by more are on two sides of a silhouette.
@@ -81,10 +81,7 @@ class Truth:
         Raises:
             InputError: the field has no surface.
         """
-        try:
-            return extract_mesh(self._fields[name], resolution=OUTLINE_RESOLUTION, level=0).vertices
-        except NoSurfaceError as error:
-            raise InputError(f"{name}: the fit has no surface ({error}); give it more steps") from error
+        return self._mesh(name, 0, OUTLINE_RESOLUTION).vertices
 
     def judge(
         self, name: str, level: int, normal_level: int, cameras: Sequence[Camera], images: Sequence[Seen]
@@ -137,6 +134,12 @@ class Truth:
             self._traces[key] = Seen((camera.width, camera.height), pixel, depth, position, normal, direction)
         return self._traces[key]
 
+    def _mesh(self, name: str, level: int, resolution: int) -> Mesh:
+        try:
+            return extract_mesh(self._fields[name], resolution=resolution, level=level)
+        except NoSurfaceError as error:
+            raise InputError(f"{name}: the fit has no surface ({error}); fit it again with other settings") from error
+
     def _cast(self, name: str, level: int, camera: Camera) -> NDArray[np.float32]:
         """Depth ``(H, W)`` of a fine mesh in every pixel, infinite where there is none."""
         key = (name, level, camera)
@@ -144,9 +147,7 @@ class Truth:
             mesh = (name, level)
             if mesh not in self._meshes:
                 self._report(f"mesh of {name}, level {level}")
-                self._meshes[mesh] = from_mesh(
-                    extract_mesh(self._fields[name], resolution=self._resolution, level=level)
-                )
+                self._meshes[mesh] = from_mesh(self._mesh(name, level, self._resolution))
             self._casts[key] = _depths(mesh_view(self._meshes[mesh], camera)).numpy()
         return self._casts[key]
 

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from .config import input_error
 
-__all__ = ["Command", "add_json", "check_output", "positive", "whole", "write_json"]
+__all__ = ["Command", "add_json", "check_output", "counter_bar", "positive", "whole", "write_json"]
 
 
 @dataclass(frozen=True)
@@ -88,3 +89,18 @@ def write_json(path: Path | None, data: Any) -> None:
     partial = path.with_name(f".{path.name}.partial")
     partial.write_text(json.dumps(data, indent=2) + "\n", encoding="utf-8")
     partial.replace(path)
+
+
+@contextmanager
+def counter_bar(title: str) -> Iterator[Callable[[int, int], None] | None]:
+    """A progress bar with the time left on stderr, to be told ``(done, total)``; None where that is no terminal."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield None
+        return
+    with Progress(console=console, transient=True) as bar:
+        task = bar.add_task(title)
+        yield lambda done, total: bar.update(task, completed=done, total=total)

@@ -62,13 +62,18 @@ def load_config(
         raise input_error(f"{source}: {error}" if preset is not None else str(error)) from error
 
 
-def add_config_flags(parser: argparse.ArgumentParser, cls: type) -> None:
+def add_config_flags(parser: argparse.ArgumentParser, cls: type, *, about: str = "each overrides the preset") -> None:
     """Add one flag per field of ``cls`` (``learning_rates`` → ``--learning-rates 1e-3 5e-4``).
 
     A flag that is not given leaves no trace in the namespace, so that only given ones override. Values
     stay text: ``load_config`` checks them with the same rules as a file's.
+
+    Args:
+        parser: gets the flags.
+        cls: a dataclass of settings.
+        about: a few words above them in the help.
     """
-    group = parser.add_argument_group("settings", "each overrides the preset")
+    group = parser.add_argument_group("settings", about)
     hints = get_type_hints(cls)
     for field in dataclasses.fields(cls):
         kind = hints[field.name]

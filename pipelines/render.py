@@ -19,6 +19,10 @@ __all__ = ["pixel_size", "trace_hits", "trace_view"]
 TOLERANCE = 0.1
 # Two crossings within this share of a pixel may be overlooked.
 RESOLUTION = 0.75
+# Networks are a little steeper than a distance here and there, and a cone that goes too far loses thin parts.
+CONE_LIPSCHITZ = 1.15
+# No Newton step is longer than this, in pixels: a hit on the jump at a gate's edge is right where it is.
+NEWTON_REACH = 2 * TOLERANCE
 # Below this slope along the ray a Newton step is not to be trusted: the surface may turn away before it arrives.
 SHALLOW = 0.05
 # A camera in the shape looks at things at least this far away, in the field's units.
@@ -63,7 +67,7 @@ def trace_view(
     if normal_level == level:
         slope = (jet.gradient * direction).sum(dim=-1)
         trusted = slope.abs() > SHALLOW * jet.gradient.norm(dim=-1)
-        reach = pixel_size(camera)
+        reach = NEWTON_REACH * pixel_size(camera)
         step = torch.where(trusted, -jet.value / slope, 0).clamp(-reach, reach)
         depth, position = depth + step, torch.addcmul(position, step[:, None], direction)
     return Seen((camera.width, camera.height), pixel, depth, position, normalize(jet.gradient, dim=-1), direction)
@@ -82,7 +86,7 @@ def trace_hits(
     if budget is not None:
         return sphere_trace(field, eye, directions, level=level, budget=budget)
     size = pixel_size(camera)
-    near = cone_starts(field, eye, directions, level=level)
+    near = cone_starts(field, eye, directions, level=level, lipschitz=CONE_LIPSCHITZ)
     return sphere_trace(
         field, eye, directions, level=level, near=near, tolerance=TOLERANCE * size, resolution=RESOLUTION * size
     )

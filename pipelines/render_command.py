@@ -5,11 +5,10 @@ from __future__ import annotations
 import argparse
 import re
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 
-from .command import Command, check_output, positive, whole
+from .command import Command, check_output, counter_bar, positive, whole
 from .config import add_config_flags, given_flags, input_error, load_config
 from .shading_names import SHADINGS, ShadeOptions
 
@@ -77,7 +76,7 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     add("--frames", type=whole(1, 100_000), default=96, metavar="N", help="of a film around the shape (96)")
     add("--fps", type=positive, default=24.0, metavar="F", help="frames per second of a film (24)")
     add("--device", default="auto", help="where to evaluate the field: auto, cpu, cuda, ... (auto)")
-    add_config_flags(parser, ShadeOptions)
+    add_config_flags(parser, ShadeOptions, about="of the shading")
 
 
 def _render(arguments: argparse.Namespace) -> int:
@@ -111,7 +110,7 @@ def _render(arguments: argparse.Namespace) -> int:
         device=arguments.device,
     )
     started = time.monotonic()
-    with _bar() as progress:
+    with counter_bar("render") as progress:
         drawn = render_run(arguments.source, arguments.out, options, progress=progress)
     print(f"{arguments.out}: {drawn}, in {time.monotonic() - started:.1f} s")
     return 0
@@ -141,21 +140,6 @@ def _check(arguments: argparse.Namespace) -> None:
     for name in ORBIT_FLAGS:
         if arguments.cameras is not None and getattr(arguments, name) is not None:
             raise input_error(f"--{name}: the cameras of {arguments.cameras} say where to look from; leave it out")
-
-
-@contextmanager
-def _bar() -> Iterator[Callable[[int, int], None] | None]:
-    """A progress bar on stderr where that is a terminal."""
-    from rich.console import Console
-    from rich.progress import Progress
-
-    console = Console(stderr=True)
-    if not console.is_terminal:
-        yield None
-        return
-    with Progress(console=console, transient=True) as bar:
-        task = bar.add_task("render")
-        yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
 COMMAND = Command(

@@ -218,11 +218,8 @@ class _Artist:
         samples = self.options.samples
         rows = max(1, STRIP // samples**2 // camera.width)
         for first in range(0, camera.height, rows):
-            intrinsics = camera.intrinsics.clone()
-            intrinsics[1, 2] -= first
             height = min(rows, camera.height - first)
-            strip = dataclasses.replace(camera, intrinsics=intrinsics, height=height)
-            yield strip.resized(camera.width * samples, height * samples)
+            yield camera.strip(first, height).resized(camera.width * samples, height * samples)
 
     def _draw(self, camera: Camera, look: Look) -> Image:
         seen = self.scene.view(camera, look)

@@ -197,7 +197,7 @@ def _lambert(seen: Seen, camera: Camera, field: Field | None, level: int, option
     """
     if field is None and (options.shadows or options.occlusion):
         raise ValueError("shading='lambert': shadows and occlusion are traced in a field, and there is none")
-    normal = seen.normal * torch.where(_cosine(seen) > 0, -1, 1)[:, None]
+    normal = _towards_viewer(seen)
     axes = torch.stack((camera.right, -camera.down, -camera.forward)).to(normal)
     lamps = torch.nn.functional.normalize(normal.new_tensor((KEY_LAMP, FILL_LAMP)), dim=1) @ axes
     key, fill = (normal @ lamps.T).clamp(min=0).unbind(1)
@@ -216,6 +216,13 @@ def _lambert(seen: Seen, camera: Camera, field: Field | None, level: int, option
         rest = rest * open_[:, None]
     light = torch.addcmul(rest, key[:, None], _light(KEY_LIGHT, normal))
     return _to_display(_albedo(seen, options) * light)
+
+
+def _towards_viewer(seen: Seen) -> Tensor:
+    """Normals ``(P, 3)`` that face the viewer: a back's is turned round, that of a rim (a finer level's) mirrored."""
+    cosine = _cosine(seen)[:, None]
+    mirrored = seen.normal - 2 * cosine * seen.direction
+    return torch.where(cosine > SEEN_FROM_BEHIND, -seen.normal, torch.where(cosine > 0, mirrored, seen.normal))
 
 
 def _albedo(seen: Seen, options: ShadeOptions) -> Tensor:

@@ -5,11 +5,10 @@ from __future__ import annotations
 import argparse
 import math
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import nullcontext
 from pathlib import Path
 
-from .command import Command, check_output, positive, whole
+from .command import Command, check_output, counter_bar, positive, whole
 from .config import input_error
 
 __all__ = ["COMMAND"]
@@ -108,25 +107,11 @@ def _slice(arguments: argparse.Namespace) -> int:
         fps=arguments.fps,
     )
     started = time.monotonic()
-    with _bar(arguments.frames) if film else nullcontext() as progress:
+    with counter_bar("slices") if film else nullcontext() as bar:
+        progress = None if bar is None else lambda done: bar(done, arguments.frames)
         drawn = slice_run(arguments.run, arguments.out, options, progress=progress)
     print(f"{arguments.out}: {drawn}, in {time.monotonic() - started:.1f} s")
     return 0
-
-
-@contextmanager
-def _bar(frames: int) -> Iterator[Callable[[int], None] | None]:
-    """A progress bar on stderr where that is a terminal."""
-    from rich.console import Console
-    from rich.progress import Progress
-
-    console = Console(stderr=True)
-    if not console.is_terminal:
-        yield None
-        return
-    with Progress(console=console, transient=True) as bar:
-        task = bar.add_task("slices", total=frames)
-        yield lambda done: bar.update(task, completed=done)
 
 
 def _triple(values: list[float] | None) -> tuple[float, float, float] | None:

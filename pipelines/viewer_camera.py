@@ -65,9 +65,7 @@ def strips(camera: Camera, pixels: Callable[[], int]) -> Iterator[tuple[int, Cam
     first = 0
     while first < camera.height:
         rows = min(max(1, pixels() // camera.width), camera.height - first)
-        intrinsics = camera.intrinsics.clone()
-        intrinsics[1, 2] -= first
-        yield first, Camera(intrinsics, camera.world_from_camera, camera.width, rows)
+        yield first, camera.strip(first, rows)
         first += rows
 
 

@@ -242,3 +242,11 @@ def test_views_that_cannot_be_say_why():
 def test_intrinsics_of_a_vertical_angle_of_view():
     matrix = pinhole_intrinsics(90, 6, 4)
     torch.testing.assert_close(matrix, torch.tensor([[2.0, 0, 2.5], [0, 2.0, 1.5], [0, 0, 1]]).double())
+
+
+def test_a_strip_sees_what_its_rows_see():
+    camera = look_at((1, 2, 5), (0, 0.1, 0), width=7, height=12)
+    directions = camera.rays(dtype=torch.float64)[1]
+    strip = camera.strip(4, 5)
+    assert (strip.width, strip.height) == (7, 5)
+    torch.testing.assert_close(strip.rays(dtype=torch.float64)[1], directions[4:9])

@@ -322,11 +322,25 @@ def test_backs_are_tinted_only_where_asked():
     seen = ball(camera)
     turned = dataclasses.replace(seen, normal=-seen.normal)
     front = shade(seen, "lambert", camera=camera)
-    torch.testing.assert_close(shade(turned, "lambert", camera=camera), front)
+    # A normal that faces away just a little is a rim's, seen from in front.
+    facing = (seen.normal * seen.direction).sum(1).abs() > 0.21
+    assert 0.9 < float(facing.float().mean()) < 1
+    torch.testing.assert_close(shade(turned, "lambert", camera=camera)[facing], front[facing])
     tinted = ShadeOptions(back_faces=True)
     torch.testing.assert_close(shade(seen, "lambert", camera=camera, options=tinted), front)
     back = shade(turned, "lambert", camera=camera, options=tinted)
     assert ((back[:, 0] - back[:, 2]) > (front[:, 0] - front[:, 2]) + 0.05).float().mean() > 0.9
+
+
+def test_normals_of_a_rim_that_face_away_are_mirrored():
+    camera = camera_at()
+    seen = ball(camera)
+    cosine = (seen.normal * seen.direction).sum(1, keepdim=True)
+    rim = (cosine > -0.15)[:, 0]
+    beyond = torch.where(rim[:, None], seen.normal - 2 * cosine * seen.direction, seen.normal)
+    assert int(rim.sum()) > 20
+    lit, mirrored = (shade(s, "lambert", camera=camera) for s in (seen, dataclasses.replace(seen, normal=beyond)))
+    torch.testing.assert_close(mirrored, lit)
 
 
 def test_compose_puts_each_colour_at_its_pixel():

@@ -141,8 +141,9 @@ def test_every_field_against_a_dense_search(name):
     field = nested(THREE_D[name]()).double().requires_grad_(False)
     origins, directions = random_rays(300, spread=0.6)
     step = 5e-4
-    ladder = torch.arange(1.4, 3.6, step, dtype=torch.float64)
-    hits = sphere_trace(field, origins, directions, near=1.4, far=3.6, radius=None, lipschitz=2.0)
+    origins = origins + 1.4 * directions  # some begin inside
+    ladder = torch.arange(0.0, 2.2, step, dtype=torch.float64)
+    hits = sphere_trace(field, origins, directions, far=2.2, radius=None, lipschitz=2.0)
     values = field.value(origins[:, None] + ladder[:, None] * directions[:, None])
     flips = (values[:, :-1] < 0) != (values[:, 1:] < 0)
     first = torch.where(flips.any(1), ladder[flips.int().argmax(1)], torch.inf)
@@ -208,6 +209,9 @@ def test_near_and_far_bound_the_search():
     assert not behind.mask
     assert sphere_trace(field, origin, direction, near=torch.tensor(1.2)).depth == pytest.approx(1.5, abs=1e-5)
     assert not sphere_trace(field, origin, -direction).mask
+    # A start behind the surface was a wrong guess, unless the ray has nowhere else to begin.
+    assert sphere_trace(field, origin, direction, near=2.0).depth == pytest.approx(1.5, abs=1e-5)
+    assert sphere_trace(field, torch.zeros_like(origin), direction, near=0.3).depth == pytest.approx(0.5, abs=1e-5)
 
 
 class Steep(Field):
