@@ -1,6 +1,7 @@
 """Depth maps of closed forms → clouds on them, with their normals and colours, and without curtains."""
 
 import json
+import signal
 
 import cv2
 import numpy as np
@@ -19,6 +20,8 @@ from mplicits.datasets import (
 )
 from mplicits.neural_fields import InputError
 from mplicits.pipelines.cli import main
+from mplicits.pipelines.fit import FitConfig, Interrupted
+from mplicits.pipelines.fit_depth import DepthInput, fit_depth
 
 LENS = DepthCamera(96, 72, 90.0, 92.0, 46.5, 36.5)
 EXACT = DepthSettings(smoothing=0)
@@ -352,6 +355,26 @@ def test_fit_of_several_posed_depth_maps(scene, tmp_path, capsys):
     from_first = cloud.points[:, 0] > 0.95
     assert np.abs(cloud.colors[from_first] * 255 - (0, 100, 200)).max() < 1e-3
     assert len(np.unique(np.rint(cloud.colors[:, 0] * 255))) == 3
+
+
+def test_resuming_takes_the_cloud_of_the_run(scene, tmp_path, capsys):
+    run, depth = tmp_path / "run", scene / "depth" / "000.png"
+    source = DepthInput(depth, (str(scene / "camera.json"),))
+    config = FitConfig(
+        widths=(16,), depths=(1,), omegas=(5,), steps=(400,), learning_rates=(5e-3,), batch=256, samples=2000
+    )
+
+    def stop(progress):
+        if progress.step > 0:
+            signal.raise_signal(signal.SIGINT)
+
+    with pytest.raises(Interrupted):
+        fit_depth(source, config, out=run, progress=stop)
+    assert main(["fit", str(depth), "-o", str(run), "--resume", "--quiet"]) == 0  # neither lens nor scale again
+    assert "--trim-distance" in capsys.readouterr().out
+    assert json.loads((run / "run.json").read_text())["finished"]
+    with pytest.raises(InputError, match=r"holds no cloud.ply, so it was not fitted to depth maps"):
+        fit_depth(source, None, out=tmp_path, resume=True)
 
 
 def test_intrinsics_as_numbers_or_an_angle(scene, tmp_path):
