@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
 
+from .bench_colour_commands import NORMAL_MAP, TEXTURE
 from .command import Command, add_json, check_output, positive, whole, write_json
 from .fit_settings import add_fit_settings, fit_settings
 
@@ -177,5 +178,7 @@ BENCH_COMMANDS: Mapping[str, Command] = MappingProxyType(
             "Fit the networks of the paper's Tab. 4 to each shape, trace pictures of them in several ways, and judge "
             "the pictures by converged traces and by a raycast of fine meshes.",
         ),
+        "bench texture": TEXTURE,
+        "bench normal-map": NORMAL_MAP,
     }
 )

@@ -1,0 +1,241 @@
+"""``mplicits bench normal-map``: what the normals of a fine level do for a coarse surface, judged by the original."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..datasets import Camera, turntable
+from ..neural_fields import Field, InputError, MultiscaleSDF, load_field
+from ..neural_fields.meshing import NoSurfaceError, extract_mesh, map_normals
+from .fit import choose_device
+from .image_error import ImageError, draw, image_error, psnr
+from .picture import check_picture_path, contact_sheet, mesh_view, write_picture
+from .render import trace_view
+from .runs import find_field
+from .seen import Seen
+from .shading import ShadeOptions, compose, shade
+from .surface import Surface, from_mesh, read_surface
+from .timing import format_table
+
+__all__ = ["NormalMapRow", "bench_normal_map", "format_normal_map"]
+
+# A reference whose vertices are mostly further than this from the coarse surface is another shape (unit sphere).
+ELSEWHERE = 0.1
+PROBED = 10_000
+PLAIN = ShadeOptions(shadows=False, occlusion=False)
+
+View = Callable[[Camera], Seen]
+
+
+@dataclass(frozen=True)
+class NormalMapRow:
+    """One way to draw the run, compared with the original, all cameras together.
+
+    Attributes:
+        method: whose surface with whose normals.
+        parameters: of the levels that are evaluated.
+        error: of the shaded images, display RGB in [0, 1].
+        degrees: mean angle between the normals, over the pixels that see the shape in both images.
+        seconds: per image; the mean over the cameras of the best of some repeats.
+        prepare_seconds: extraction of the mesh, if one is drawn.
+    """
+
+    method: str
+    parameters: int
+    error: ImageError
+    degrees: float
+    seconds: float
+    prepare_seconds: float
+
+    def as_dict(self) -> dict[str, Any]:
+        """All figures, for JSON."""
+        return asdict(self) | {
+            "rmse_either": math.sqrt(self.error.either),
+            "rmse_both": math.sqrt(self.error.both),
+            "psnr_either": psnr(self.error.either),
+            "psnr_both": psnr(self.error.both),
+        }
+
+
+@dataclass(frozen=True)
+class _Method:
+    name: str
+    levels: int
+    prepare_seconds: float
+    view: View
+
+
+def bench_normal_map(
+    run: str | Path,
+    reference: str | Path,
+    *,
+    shading: str = "headlight",
+    size: int = 512,
+    views: int = 3,
+    up: str = "y",
+    resolution: int = 256,
+    repeats: int = 2,
+    device: str = "auto",
+    picture: Path | None = None,
+    report: Callable[[str], None] | None = None,
+) -> list[NormalMapRow]:
+    """Draw every level of a run, and the coarsest with the normals of the finest, as the original is drawn.
+
+    The original's normals are those of its vertices, interpolated. No shadows or occlusion: they would add errors of
+    their own.
+
+    Args:
+        run: run directory or .safetensors file of at least two levels.
+        reference: the mesh that the run was fitted to, in the same coordinates.
+        shading: "headlight", "lambert" or "normals".
+        size: width and height of the images.
+        views: how many cameras, evenly around the shape.
+        up: "y" or "z".
+        resolution: of the marching cubes of the coarsest level.
+        repeats: the best of so many is the time of an image.
+        device: where to trace.
+        picture: a contact sheet: one line per camera, the original first.
+        report: called with what is going on.
+
+    Raises:
+        InputError: the run or the mesh cannot be used, or they are not in the same coordinates.
+    """
+    say = report or (lambda _: None)
+    if picture is not None:
+        check_picture_path(picture)
+    file, place = find_field(run), choose_device(device)
+    field, similarity, _ = load_field(file, device=place)
+    if field.num_levels < 2:
+        raise InputError(f"{file}: has one level; normals are mapped from a finer level to a coarser one")
+    original = read_surface(reference)
+    if not len(original.faces):
+        raise InputError(f"{reference}: has no faces, so there is no surface to compare with; give a mesh")
+    original = original.moved(similarity)
+    _check_place(field, original, f"{reference}", place)
+    cameras = turntable(original.used_vertices(), views, width=size, height=size, up=up)
+    say("the original")
+    truth = [mesh_view(original, camera) for camera in cameras]
+    wanted = [draw(seen, shade(seen, shading, camera=c, options=PLAIN)) for seen, c in zip(truth, cameras, strict=True)]
+    rows, lines = [], [[("original", _image(seen, c, shading))] for seen, c in zip(truth, cameras, strict=True)]
+    for method in _methods(field, f"{file}", resolution, place, say):
+        say(method.name)
+        method.view(cameras[0].resized(64, 64))  # the first call pays for what later ones find ready
+        timed = [_best(method.view, camera, shading, repeats) for camera in cameras]
+        drawings = [draw(seen, colors) for _, seen, colors in timed]
+        rows.append(
+            NormalMapRow(
+                method=method.name,
+                parameters=_parameters(field, method.levels),
+                error=image_error(zip(wanted, drawings, strict=True)),
+                degrees=_degrees([(one, seen) for one, (_, seen, _) in zip(truth, timed, strict=True)]),
+                seconds=sum(seconds for seconds, _, _ in timed) / len(cameras),
+                prepare_seconds=method.prepare_seconds,
+            )
+        )
+        for line, (_, seen, colors) in zip(lines, timed, strict=True):
+            line.append((method.name, compose(seen, colors)))
+    if picture is not None:
+        write_picture(picture, np.concatenate([contact_sheet(line) for line in lines]))
+    return rows
+
+
+def _check_place(field: Field, original: Surface, name: str, device: torch.device) -> None:
+    points = torch.from_numpy(original.used_vertices().clip(-1.5, 1.5)).float()
+    probed = points[:: max(1, len(points) // PROBED)]
+    with torch.inference_mode():
+        distance = float(field.value(probed.to(device), level=0).abs().median())
+    if distance > ELSEWHERE:
+        raise InputError(
+            f"{name}: half of its vertices are further than {ELSEWHERE:g} of the run's size from its surface; give the "
+            "mesh that was fitted, in the same coordinates"
+        )
+
+
+def _methods(
+    field: Field, name: str, resolution: int, device: torch.device, say: Callable[[str], None]
+) -> list[_Method]:
+    finest = field.num_levels - 1
+    traced = partial(trace_view, field, device=device)
+    say("the mesh of level 0")
+    started = time.perf_counter()
+    try:
+        mesh = extract_mesh(field, resolution=resolution, level=0)
+    except NoSurfaceError as error:
+        raise InputError(f"{name}: level 0 has no surface ({error}); train it longer") from error
+    extracted = time.perf_counter()
+    mapped = map_normals(mesh, field, level=finest)
+    done = time.perf_counter()
+    fine = f"normals of level {finest}"
+    return [
+        _Method("level 0", 1, 0.0, partial(traced, level=0)),
+        _Method(f"level 0 + {fine}", finest + 1, 0.0, partial(traced, level=0, normal_level=finest)),
+        _Method("mesh of level 0", 1, extracted - started, partial(mesh_view, from_mesh(mesh))),
+        _Method(f"mesh of level 0 + {fine}", finest + 1, done - started, partial(mesh_view, from_mesh(mapped))),
+        *(_Method(f"level {level}", level + 1, 0.0, partial(traced, level=level)) for level in range(1, finest + 1)),
+    ]
+
+
+@torch.inference_mode()
+def _best(view: View, camera: Camera, shading: str, repeats: int) -> tuple[float, Seen, Tensor]:
+    """Seconds of the quickest of some drawings, what is seen in it, and its colours."""
+    drawn = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        seen = view(camera)
+        colors = shade(seen, shading, camera=camera, options=PLAIN)
+        if colors.is_cuda:
+            torch.cuda.synchronize()
+        drawn.append((time.perf_counter() - start, seen, colors))
+    return min(drawn, key=lambda one: one[0])
+
+
+def _image(seen: Seen, camera: Camera, shading: str) -> Any:
+    return compose(seen, shade(seen, shading, camera=camera, options=PLAIN))
+
+
+def _parameters(field: Field, levels: int) -> int:
+    """Of the first ``levels`` levels."""
+    parts = [field.base, *field.residuals] if isinstance(field, MultiscaleSDF) else [field]
+    return sum(parameter.numel() for part in parts[:levels] for parameter in part.parameters())
+
+
+def _degrees(pairs: Sequence[tuple[Seen, Seen]]) -> float:
+    """Mean angle between the normals of pixels that both see."""
+    angles = []
+    for first, second in pairs:
+        mine, other = (torch.zeros(first.size[0] * first.size[1], 3, dtype=torch.float64) for _ in range(2))
+        mine[first.pixel.cpu()], other[second.pixel.cpu()] = first.normal.cpu().double(), second.normal.cpu().double()
+        shared = first.pixel.cpu()[torch.isin(first.pixel.cpu(), second.pixel.cpu())]
+        sine = torch.linalg.cross(mine[shared], other[shared]).norm(dim=1)
+        angles.append(torch.atan2(sine, (mine[shared] * other[shared]).sum(dim=1)))
+    return math.degrees(float(torch.cat(angles).mean()))
+
+
+def format_normal_map(rows: Sequence[NormalMapRow]) -> str:
+    """The table that the command prints: errors over the pixels that see the shape in either image, or in both."""
+    header = ("method", "parameters", "RMSE either", "PSNR", "RMSE both", "PSNR", "normals", "ms per image", "mesh")
+    cells = [
+        (
+            row.method,
+            f"{row.parameters:,}",
+            f"{math.sqrt(row.error.either):.4f}",
+            f"{psnr(row.error.either):.1f} dB",
+            f"{math.sqrt(row.error.both):.4f}",
+            f"{psnr(row.error.both):.1f} dB",
+            f"{row.degrees:.1f}°",
+            f"{1e3 * row.seconds:.0f}",
+            f"{row.prepare_seconds:.1f} s" if row.prepare_seconds else "",
+        )
+        for row in rows
+    ]
+    return format_table(header, cells)
