@@ -96,12 +96,12 @@ def fit_texture(
     generator = torch.Generator().manual_seed(config.seed)
     home = next(geometry.parameters(), geometry.deltas).device
     geometry = geometry.to(device)
-    samples = match_colors(cloud, geometry, similarity, level=level, delta=delta, device=device)
+    samples = match_colors(cloud, geometry, similarity, level=level, delta=delta)
     band = band_directions(samples, geometry, config.samples // 2, level=level, delta=delta, generator=generator)
     mean = samples.colors.mean(dim=0).tolist()
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
-        network = ColorSiren(config.width, config.depth, omega=config.omega, mean=mean).to(device)
+        network = ColorSiren(config.width, config.depth, omega=config.omega, mean=mean).to(samples.points)
     sampling_seconds = time.monotonic() - started
     trainer = _Trainer(network, samples, band, config, delta=delta, generator=generator, spent=sampling_seconds)
     with stop_on_signals() as flag:

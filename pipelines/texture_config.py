@@ -23,11 +23,11 @@ class TextureConfig:
     width: int = _setting(256, "neurons per layer")
     depth: int = _setting(3, "sine layers")
     omega: float = _setting(60.0, "SIREN frequency: higher takes up finer detail, and more of the noise")
-    steps: int = _setting(800, "training steps")
-    learning_rate: float = _setting(1e-3, "peak learning rate")
+    steps: int = _setting(500, "training steps")
+    learning_rate: float = _setting(5e-4, "peak learning rate")
     batch: int = _setting(8192, "points with colours per training step")
     band_batch: int = _setting(2048, "points of the band per training step")
-    tangential_weight: float = _setting(0.1, "weight of the change of colour along the normals")
+    tangential_weight: float = _setting(0.3, "weight of the change of colour along the normals")
     samples: int = _setting(400_000, "points sampled on a mesh, and half as many in the band, drawn from at every step")
     delta: float | None = _setting(
         None, "half-width of the band in units of the field; none is that of the coarsest level, but at least 0.02"

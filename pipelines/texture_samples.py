@@ -84,17 +84,16 @@ def _has_faces(path: Path) -> bool:
 
 @torch.no_grad()
 def match_colors(
-    cloud: PointCloud, geometry: Field, similarity: Similarity, *, level: int, delta: float, device: torch.device
+    cloud: PointCloud, geometry: Field, similarity: Similarity, *, level: int, delta: float
 ) -> ColorSamples:
     """The points of a cloud that lie in the band, in the field's coordinates.
 
     Args:
         cloud: with colours, in input coordinates.
-        geometry: on ``device``.
+        geometry: the samples are made on its device and in its precision.
         similarity: from input to the field's coordinates.
         level: of the geometry.
         delta: half-width of the band, in field units.
-        device: where the samples go.
 
     Raises:
         InputError: there are no colours, or most of the points are not near the surface: another shape or scale.
@@ -103,7 +102,7 @@ def match_colors(
         raise InputError(f"{cloud.source}: colors: there are none; export the points with their colours")
     finite = np.isfinite(cloud.points).all(axis=1)
     unit = similarity.to_unit(cloud.points[finite])
-    distances = _distances(unit, geometry, level=level, device=device)
+    distances = _distances(unit, geometry, level=level)
     inside = distances < delta
     if inside.mean() < LEAST_SHARE:
         far, near = np.median(distances) * similarity.scale, delta * similarity.scale
@@ -112,17 +111,18 @@ def match_colors(
             f"half are further off than {far:.3g} (input units); give the shape that was fitted, in the same "
             "coordinates, or widen the band (--delta)"
         )
-    points = torch.from_numpy(unit[inside].astype(np.float32)).to(device)
-    colors = torch.from_numpy(cloud.colors[finite][inside]).to(device)
+    like = next(geometry.parameters(), geometry.deltas)
+    points = torch.from_numpy(unit[inside]).to(like)
+    colors = torch.from_numpy(cloud.colors[finite][inside]).to(like)
     return ColorSamples(points, colors, len(cloud) - len(points))
 
 
-def _distances(unit: NDArray[np.float64], geometry: Field, *, level: int, device: torch.device) -> NDArray[np.float64]:
+def _distances(unit: NDArray[np.float64], geometry: Field, *, level: int) -> NDArray[np.float64]:
     """|f|, and beyond the cube in which fields are trained the way back into it as well → ``(N,)``."""
     clamped = unit.clip(-DOMAIN, DOMAIN)
-    points = torch.from_numpy(clamped.astype(np.float32))
-    values = [geometry.value(part.to(device), level=level).abs().cpu() for part in points.split(BATCH)]
-    return torch.cat(values).numpy().astype(np.float64) + np.linalg.norm(unit - clamped, axis=1)
+    points = torch.from_numpy(clamped).to(next(geometry.parameters(), geometry.deltas))
+    values = torch.cat([geometry.value(part, level=level).abs() for part in points.split(BATCH)])
+    return values.double().cpu().numpy() + np.linalg.norm(unit - clamped, axis=1)
 
 
 @torch.no_grad()

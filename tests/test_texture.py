@@ -162,6 +162,13 @@ def test_ctrl_c_leaves_what_was_learnt() -> None:
     assert fitted.texture.value(torch.tensor([[0.5, 0.0, 0.0]])).isfinite().all()
 
 
+def test_a_geometry_in_double_precision_gets_a_texture_in_it() -> None:
+    geometry = plane_field().double()
+    cloud = replace(plane_cloud(), points=plane_cloud().points - np.array([5.0, 0.0, 0.0]))
+    texture = fit_texture(geometry, cloud, BRIEF).texture
+    assert texture.value(torch.zeros(4, 3, dtype=torch.float64)).dtype == torch.float64
+
+
 def test_a_time_budget_ends_the_training() -> None:
     fitted = fit_texture(Sphere(radius=0.5), sphere_cloud(), replace(SMALL, steps=1_000_000, time_budget=0.3))
     assert fitted.record["finished"]
