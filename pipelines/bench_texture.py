@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -15,22 +13,18 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ..datasets import Camera, TexturedMesh, read_textured, sample_textured, turntable
-from ..neural_fields import Field, InputError, Similarity, TextureField, load_field, load_texture, map_colors
+from ..datasets import Camera, TexturedMesh, read_textured, turntable
+from ..neural_fields import InputError, map_colors
 from ..neural_fields.meshing import NoSurfaceError, extract_mesh
-from .command import write_json
-from .fit import choose_device, fit
+from .bench_texture_fits import Fitted, Report, check_kept, fitted_texture
 from .fit_config import FitConfig
-from .fit_state import FIELD_FILE, RECORD_FILE, STATE_FILE, read_record
 from .image_error import Drawing, ImageError, draw, image_error, psnr
 from .picture import contact_sheet, mesh_view, write_picture
 from .render import trace_view
 from .surface import Surface, from_mesh
-from .texture import TEXTURE_FILE, texture_run
 from .texture_config import TextureConfig
 from .textured_view import textured_view
 from .timing import format_table
-from .training import Progress
 
 __all__ = ["PAPER_MSE", "TextureRow", "bench_texture", "format_texture"]
 
@@ -38,11 +32,7 @@ __all__ = ["PAPER_MSE", "TextureRow", "bench_texture", "format_texture"]
 PAPER_MSE: Mapping[str, float] = MappingProxyType(
     {"spot": 0.0329, "bob": 0.0434, "bunny": 0.0720, "egg": 0.0291, "earth": 0.0033}
 )
-FIT_POINTS = 100_000
-MESH_FILE = "mesh.json"
 MAGNIFIED = 4  # how much larger differences are drawn
-
-Report = Callable[[str, Progress], None]
 
 
 @dataclass(frozen=True)
@@ -77,27 +67,12 @@ class TextureRow:
 
 
 @dataclass(frozen=True)
-class _Fitted:
-    """A surface and its texture, and what ``run.json`` says of them."""
-
-    field: Field
-    similarity: Similarity
-    texture: TextureField
-    record: dict[str, Any]
-
-    @property
-    def name(self) -> str:
-        sizes = zip(self.record["config"]["widths"], self.record["config"]["depths"], strict=True)
-        return "▷".join(f"({width},{depth})" for width, depth in sizes)
-
-
-@dataclass(frozen=True)
 class _Series:
     """One surface with one texture, drawn for all cameras."""
 
-    surface: _Fitted
+    surface: Fitted
     how: str
-    painted: _Fitted
+    painted: Fitted
     drawings: list[Drawing]
 
 
@@ -148,13 +123,13 @@ def bench_texture(
         raise InputError(f"{max(names, key=names.count)}: two of the meshes are called that; rename one of them")
     directory.mkdir(parents=True, exist_ok=True)
     for path, mesh in zip(paths, originals, strict=True):
-        _check_kept(directory / path.stem, mesh, {"coarse": coarse, "full": full}, texture)
+        check_kept(directory / path.stem, mesh, {"coarse": coarse, "full": full}, texture)
     rows: list[TextureRow] = []
     for path, mesh in zip(paths, originals, strict=True):
         home = directory / path.stem
-        fits = [_fitted(path, mesh, home / "coarse", coarse, texture, progress)]
+        fits = [fitted_texture(path, mesh, home / "coarse", coarse, texture, progress)]
         if full is not None:
-            fits.append(_fitted(path, mesh, home / "full", full, texture, progress))
+            fits.append(fitted_texture(path, mesh, home / "full", full, texture, progress))
         outline = mesh.vertices[np.unique(mesh.faces)]
         cameras = turntable(outline, views, width=size, height=size, up=up)
         say(f"{path.stem}: the original")
@@ -172,54 +147,6 @@ def _read(path: Path) -> TexturedMesh:
     return mesh
 
 
-def _check_kept(home: Path, mesh: TexturedMesh, fits: Mapping[str, FitConfig | None], texture: TextureConfig) -> None:
-    """Whether what is kept in a folder was made from this mesh and with these settings, before any long work."""
-    digest = hashlib.sha256()
-    for array in (mesh.vertices, mesh.faces, mesh.uv, mesh.image):
-        digest.update(np.ascontiguousarray(array).tobytes())
-    file = home / MESH_FILE
-    if file.is_file() and file.read_text(encoding="utf-8") != json.dumps(digest.hexdigest(), indent=2) + "\n":
-        raise InputError(f"{home}: holds the fits of another mesh than {mesh.source}; choose another -o, or remove it")
-    for name, config in fits.items():
-        run = home / name
-        if config is None or not (run / RECORD_FILE).is_file():
-            continue
-        record = read_record(run)
-        _check_settings(run, record["config"], config)
-        if "texture" in record:
-            _check_settings(run / TEXTURE_FILE, record["texture"]["config"], texture)
-    home.mkdir(exist_ok=True)
-    write_json(file, digest.hexdigest())
-
-
-def _check_settings(where: Path, kept: Mapping[str, Any], wanted: FitConfig | TextureConfig) -> None:
-    given = json.loads(json.dumps(asdict(wanted)))  # lists, as the file has them
-    for name in given:
-        if name != "device" and kept.get(name) != given[name]:
-            raise InputError(
-                f"{where}: was made with {name} {kept.get(name)}, not {given[name]}; choose another -o, or remove it"
-            )
-
-
-def _fitted(
-    path: Path, mesh: TexturedMesh, run: Path, config: FitConfig, texture: TextureConfig, progress: Report | None
-) -> _Fitted:
-    """The surface and its texture; whatever is not in the folder ``run`` yet is trained."""
-
-    def told(step: Progress) -> None:
-        if progress is not None:
-            progress(f"{path.stem} {run.name}", step)
-
-    resume = (run / STATE_FILE).is_file()
-    if resume or not (run / FIELD_FILE).is_file():
-        fit(sample_textured(mesh, FIT_POINTS, seed=config.seed), config, out=run, resume=resume, progress=told)
-    trained = (run / TEXTURE_FILE).is_file() and read_record(run).get("texture", {}).get("finished", False)
-    if not trained and not texture_run(run, path, texture, progress=told).record["finished"]:
-        raise KeyboardInterrupt
-    field, similarity, _ = load_field(run / FIELD_FILE, device=choose_device(texture.device))
-    return _Fitted(field, similarity, load_texture(run / TEXTURE_FILE, field), read_record(run))
-
-
 def _original(mesh: TexturedMesh, camera: Camera, samples: int) -> Drawing:
     seen = textured_view(mesh, camera.resized(camera.width * samples, camera.height * samples))
     assert seen.color is not None
@@ -228,7 +155,7 @@ def _original(mesh: TexturedMesh, camera: Camera, samples: int) -> Drawing:
 
 def _drawn(
     shape: str,
-    fits: Sequence[_Fitted],
+    fits: Sequence[Fitted],
     cameras: Sequence[Camera],
     samples: int,
     resolution: int,
@@ -252,7 +179,7 @@ def _drawn(
 
 
 @torch.inference_mode()
-def _traced(surface: _Fitted, painted: _Fitted, camera: Camera, samples: int) -> Drawing:
+def _traced(surface: Fitted, painted: Fitted, camera: Camera, samples: int) -> Drawing:
     """The surface of one fit with the texture of another, both of which have the same similarity."""
     fine = camera.moved(surface.similarity).resized(camera.width * samples, camera.height * samples)
     device = painted.texture.delta.device
@@ -263,7 +190,7 @@ def _traced(surface: _Fitted, painted: _Fitted, camera: Camera, samples: int) ->
 
 
 @torch.inference_mode()
-def _rasterised(mesh: Surface, painted: _Fitted, camera: Camera, samples: int) -> Drawing:
+def _rasterised(mesh: Surface, painted: Fitted, camera: Camera, samples: int) -> Drawing:
     """A mesh in unit-sphere coordinates, with the texture looked up for every pixel."""
     fine = camera.moved(painted.similarity).resized(camera.width * samples, camera.height * samples)
     seen = mesh_view(mesh, fine)

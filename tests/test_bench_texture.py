@@ -12,8 +12,7 @@ import torch
 import trimesh
 from mplicits.datasets import Camera, TexturedMesh, linear_to_srgb, look_at, srgb_to_linear
 from mplicits.neural_fields import InputError
-from mplicits.pipelines import bench_colour_commands
-from mplicits.pipelines import bench_texture as module
+from mplicits.pipelines import bench_colour_commands, bench_texture_fits
 from mplicits.pipelines.bench_texture import PAPER_MSE, TextureRow, bench_texture, format_texture
 from mplicits.pipelines.cli import main
 from mplicits.pipelines.fit_config import FitConfig
@@ -193,7 +192,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, list[Te
     folder = tmp_path_factory.mktemp("ball")
     path, out = write_ball(folder), folder / "out"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(module, "FIT_POINTS", 3000)
+        patch.setattr(bench_texture_fits, "FIT_POINTS", 3000)
         return path, out, bench_texture([path], out, SMALL, coarse=COARSE, full=FULL, **VIEW)
 
 
@@ -276,7 +275,7 @@ def test_a_mesh_without_texture_coordinates_is_refused_before_any_work(tmp_path)
 
 def test_the_command(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(bench_colour_commands, "COARSE", COARSE)
-    monkeypatch.setattr(module, "FIT_POINTS", 3000)
+    monkeypatch.setattr(bench_texture_fits, "FIT_POINTS", 3000)
     path = write_ball(tmp_path)
     settings = "--coarse-width 16 --coarse-omega 6 --coarse-steps 60"
     settings += " --width 16 --depth 1 --steps 20 --samples 2000 --batch 512"
