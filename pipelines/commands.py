@@ -21,6 +21,7 @@ from .fit_depth_flags import add_depth_flags, depth_input
 from .fit_settings import add_fit_settings, fit_settings, were_given
 from .render_command import COMMAND as RENDER
 from .slice_command import COMMAND as SLICE
+from .texture_command import COMMAND as TEXTURE
 from .view_command import COMMAND as VIEW
 
 __all__ = ["COMMANDS", "Command"]
@@ -80,6 +81,7 @@ def _mesh_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--normal-level", type=whole(0), metavar="L", help="normals of this level on the mesh (default: of its own)"
     )
+    parser.add_argument("--no-colors", action="store_true", help="leave out the colours of the run's texture")
     parser.add_argument("--keep-largest", action="store_true", help="keep only the component of largest area")
     parser.add_argument(
         "--trim-distance",
@@ -98,6 +100,7 @@ def _mesh(arguments: argparse.Namespace) -> int:
         resolution=arguments.resolution,
         level=arguments.level,
         normal_level=arguments.normal_level,
+        colors=not arguments.no_colors,
         keep_largest=arguments.keep_largest,
         trim_distance=arguments.trim_distance,
         cloud=arguments.cloud,
@@ -200,6 +203,7 @@ COMMANDS: Mapping[str, Command] = MappingProxyType(
             _mesh,
             "Extract a mesh from a fit, in the coordinates of its input.",
         ),
+        "texture": TEXTURE,
         "render": RENDER,
         "slice": SLICE,
         "view": VIEW,

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from ..datasets import read_cloud
-from ..neural_fields import InputError, load_field
+from ..neural_fields import InputError, load_field, map_colors
 from ..neural_fields.meshing import Mesh, NoSurfaceError, extract_mesh, map_normals
 from .mesh_files import check_mesh_path, write_mesh
 from .mesh_trim import keep_largest, trim_distance
 from .runs import find_field
+from .texture import texture_of
 
 __all__ = ["MeshOptions", "mesh_run"]
 
@@ -26,6 +29,7 @@ class MeshOptions:
         resolution: cells along each side of the cube around the unit sphere.
         level: counted from 0, the coarsest; None is the finest.
         normal_level: the level whose gradients are the normals (neural normal mapping); None is ``level``.
+        colors: whether vertices get the colours of the run's texture, if it has one.
         keep_largest: whether to keep only the component of largest area.
         trim_distance: drop faces further than this from the points, in input units.
         cloud: the points for that; by default the file that was fitted.
@@ -34,6 +38,7 @@ class MeshOptions:
     resolution: int = 256
     level: int | None = None
     normal_level: int | None = None
+    colors: bool = True
     keep_largest: bool = False
     trim_distance: float | None = None
     cloud: str | Path | None = None
@@ -77,6 +82,10 @@ def mesh_run(run: str | Path, out: str | Path, options: MeshOptions | None = Non
         mesh = trim_distance(mesh, points, options.trim_distance / similarity.scale)
     if options.keep_largest:
         mesh = keep_largest(mesh)
+    texture = texture_of(file, field) if options.colors else None
+    if texture is not None:
+        colors = map_colors(texture, torch.from_numpy(mesh.vertices).float()).values
+        mesh = dataclasses.replace(mesh, colors=colors.numpy())
     write_mesh(out, mesh, similarity)
     return mesh
 

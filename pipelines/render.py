@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from ..datasets.cameras import Camera
-from ..neural_fields import Field, Hits, cone_starts, sphere_trace
+from ..neural_fields import Field, Hits, TextureField, cone_starts, map_colors, sphere_trace
 from ..neural_fields.tracing import BOUNDING_RADIUS
 from .seen import Seen
 
@@ -36,6 +36,7 @@ def trace_view(
     *,
     level: int = -1,
     normal_level: int | None = None,
+    texture: TextureField | None = None,
     budget: Sequence[int] | None = None,
     device: torch.device | str = "cpu",
 ) -> Seen:
@@ -50,6 +51,7 @@ def trace_view(
         camera: in the field's coordinates.
         level: whose surface is seen.
         normal_level: whose gradient is the normal; by default ``level``.
+        texture: the colours of the surface, mapped onto whichever level is seen (paper Sec. 3, neural texture mapping).
         budget: steps on each level, for the paper's fixed mode; by default the adaptive one (see `sphere_trace`).
         device: where to work, and where the result is.
 
@@ -70,7 +72,10 @@ def trace_view(
         reach = NEWTON_REACH * pixel_size(camera)
         step = torch.where(trusted, -jet.value / slope, 0).clamp(-reach, reach)
         depth, position = depth + step, torch.addcmul(position, step[:, None], direction)
-    return Seen((camera.width, camera.height), pixel, depth, position, normalize(jet.gradient, dim=-1), direction)
+    color = None if texture is None else map_colors(texture, position).values
+    return Seen(
+        (camera.width, camera.height), pixel, depth, position, normalize(jet.gradient, dim=-1), direction, color
+    )
 
 
 def trace_hits(

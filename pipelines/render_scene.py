@@ -23,6 +23,7 @@ from .render import trace_view
 from .runs import find_field, is_field
 from .seen import Seen
 from .surface import read_surface, sample_surface
+from .texture import texture_of
 
 __all__ = ["Look", "Scene", "open_scene", "reference_distance"]
 
@@ -116,19 +117,22 @@ def _field_scene(
             raise InputError(f"{flag} {given}: {file} has levels 0 to {finest}")
     level = finest if level is None else level
     normal_level = level if normal_level is None else normal_level
+    texture = texture_of(file, field)
     looks = [_look(level, normal_level)]
     if levels:
         looks = [_look(index, index) for index in range(finest + 1)] + ([_look(0, finest)] if finest else [])
 
     def view(camera: Camera, look: Look) -> Seen:
-        return trace_view(field, camera, level=look.level, normal_level=look.normal_level, device=device)
+        return trace_view(
+            field, camera, level=look.level, normal_level=look.normal_level, texture=texture, device=device
+        )
 
     return Scene(
         name=file,
         similarity=similarity,
         looks=tuple(looks),
         field=field,
-        colored=False,
+        colored=texture is not None,
         oriented=True,
         fitted_to=_fitted_to(metadata),
         outline=lambda: _outline(file, field),

@@ -15,8 +15,9 @@ from typing import Any
 import torch
 
 from ..datasets.cameras import UP_AXES
-from ..neural_fields import Field, InputError, Similarity, load_field
+from ..neural_fields import Field, InputError, Similarity, TextureField, load_field
 from .runs import find_field
+from .texture import texture_of
 from .viewer_camera import first_eye
 from .viewer_client import Client, Shown
 from .viewer_draw import Painter
@@ -128,7 +129,7 @@ def open_run(run: str | Path, *, side: int = 512, device: torch.device | str = "
     source = metadata.get("run", {}).get("cloud")
     cloud = Path(source) if source and Path(source).is_file() else None
     name = Path(run).resolve().stem if Path(run).is_dir() else path.stem
-    return show_field(field, name=name, similarity=similarity, cloud=cloud, side=side)
+    return show_field(field, name=name, similarity=similarity, cloud=cloud, texture=texture_of(path, field), side=side)
 
 
 def show_field(
@@ -137,12 +138,13 @@ def show_field(
     name: str = "field",
     similarity: Similarity | None = None,
     cloud: Path | None = None,
+    texture: TextureField | None = None,
     side: int = 512,
 ) -> Shown:
     """What a `Viewer` needs to show any three-dimensional field, such as one in a script."""
     similarity = similarity or Similarity.identity()
     shapes = Shapes(field, similarity, cloud=cloud)
-    return Shown(name, field, similarity, shapes, Painter(field, shapes.cloud), side)
+    return Shown(name, field, similarity, shapes, Painter(field, shapes.cloud, texture), side)
 
 
 def _import_viser() -> Any:

@@ -50,9 +50,9 @@ class Shown:
 
     @property
     def shadings(self) -> list[str]:
-        """The shadings that the field can be given: errors need a cloud, and a field has no colours."""
-        missing = {"color"} if self.shapes.cloud_file else {"color", "error"}
-        return [name for name in SHADINGS if name not in missing]
+        """The shadings that the field can be given: errors need a cloud, and colours a texture."""
+        there = {"color": self.painter.colored, "error": self.shapes.cloud_file is not None}
+        return [name for name in SHADINGS if there.get(name, True)]
 
 
 class Client:

@@ -15,7 +15,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from ..datasets.cameras import Camera, look_at
-from ..neural_fields import Field
+from ..neural_fields import Field, TextureField
 from .matcap import load_matcap
 from .render import trace_view
 from .seen import Seen
@@ -40,10 +40,18 @@ class Painter:
     Args:
         field: what to draw.
         reference: loads the cloud ``(N, 3)`` that "error" measures from, when it is first needed.
+        texture: its colours, if it has some.
     """
 
-    def __init__(self, field: Field, reference: Callable[[], NDArray[np.float32]]) -> None:
-        self._field, self._load_reference = field, reference
+    def __init__(
+        self, field: Field, reference: Callable[[], NDArray[np.float32]], texture: TextureField | None = None
+    ) -> None:
+        self._field, self._load_reference, self._texture = field, reference, texture
+
+    @property
+    def colored(self) -> bool:
+        """Whether the field has colours."""
+        return self._texture is not None
 
     def warm_up(self) -> None:
         """Draw a few pixels, so that the first image does not wait for what is loaded when it is first needed."""
@@ -65,7 +73,14 @@ class Painter:
     def _paint(self, camera: Camera, look: Look, check: Callable[[], None]) -> tuple[Seen, Tensor]:
         parts, device = [], self._field.deltas.device
         for first, strip in strips(camera, _Pace(check).next_block):
-            seen = trace_view(self._field, strip, level=look.level, normal_level=look.normal_level, device=device)
+            seen = trace_view(
+                self._field,
+                strip,
+                level=look.level,
+                normal_level=look.normal_level,
+                texture=self._texture,
+                device=device,
+            )
             parts.append((first, seen))
         seen = merge_strips((camera.width, camera.height), parts)
         if look.shading in MEASURED:

@@ -1,0 +1,79 @@
+"""A run with a texture: its colours in meshes, pictures and the viewer."""
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+import torch
+from mplicits.datasets import look_at
+from mplicits.neural_fields import ColorSiren, MultiscaleSDF, Siren, TextureField, load_field, save_field, save_texture
+from mplicits.pipelines.cli import main
+from mplicits.pipelines.render import trace_view
+from mplicits.pipelines.surface import read_surface
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """Two levels with a closed surface, and a texture of strong colours."""
+    base, residual = Siren(3, 1, omega=1.0), Siren(8, 1, omega=5.0, output_gain=0.02)
+    torch.manual_seed(1)
+    network = ColorSiren(16, 1, omega=6.0)
+    with torch.no_grad():
+        # Σ cos(2.2 xᵢ) has convex level sets around the origin.
+        (layer,) = base.layers
+        layer.weight.copy_(2.2 * torch.eye(3))
+        layer.bias.fill_(torch.pi / 2)
+        base.output.weight.fill_(-0.5)
+        base.output.bias.fill_(1.0)
+    field = MultiscaleSDF(base, [residual], [0.1])
+    texture = TextureField(field, network, delta=0.1)
+    directory = tmp_path_factory.mktemp("run")
+    save_field(directory / "field.safetensors", field)
+    save_texture(directory / "texture.safetensors", texture)
+    return directory, texture.requires_grad_(False)
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".glb"])
+def test_vertices_have_the_colours_of_the_texture(run, tmp_path, suffix):
+    directory, texture = run
+    out = tmp_path / f"mesh{suffix}"
+    assert main(["mesh", str(directory), "-o", str(out), "--resolution", "24"]) == 0
+    surface = read_surface(out)
+    expected = texture.colors(torch.from_numpy(surface.vertices).float()).numpy()
+    np.testing.assert_allclose(surface.colors, expected, atol=0.006)
+    assert float(expected.std(axis=0).min()) > 0.02
+    assert main(["mesh", str(directory), "-o", str(out), "--resolution", "24", "--no-colors"]) == 0
+    assert read_surface(out).colors is None
+
+
+@pytest.mark.parametrize("level", [0, 1])
+def test_pixels_have_the_colours_of_the_texture(run, level):
+    directory, texture = run
+    field = load_field(directory / "field.safetensors").field
+    camera = look_at((0.5, 0.8, 3.0), (0, 0, 0), width=40, height=40)
+    seen = trace_view(field, camera, level=level, texture=texture)
+    assert len(seen.pixel) > 200
+    torch.testing.assert_close(seen.color, texture.colors(seen.position), atol=1e-5, rtol=0)
+    assert trace_view(field, camera, level=level).color is None
+
+
+def test_points_outside_the_band_get_the_colour_of_the_surface_below_them(run):
+    directory, texture = run
+    field = load_field(directory / "field.safetensors").field
+    camera = look_at((0.5, 0.8, 3.0), (0, 0, 0), width=24, height=24)
+    narrow = TextureField(field, texture.network, delta=1e-7)  # no hit is as near as that
+    seen = trace_view(field, camera, texture=narrow)
+    assert float((seen.color - texture.colors(seen.position)).abs().max()) < 1e-3
+
+
+def test_render_shows_colours_and_the_viewer_offers_them(run, tmp_path):
+    directory, _ = run
+    for shading in ("color", "lambert"):
+        out = tmp_path / f"{shading}.png"
+        arguments = ["render", str(directory), "-o", str(out), "--size", "24", "--samples", "1", "--shading", shading]
+        assert main([*arguments, "--fast"]) == 0
+        image = iio.imread(out).astype(float)
+        assert np.ptp(image, axis=2).max() > 20  # not grey
+    pytest.importorskip("viser")
+    from mplicits.pipelines.viewer import open_run
+
+    assert "color" in open_run(directory).shadings
