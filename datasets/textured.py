@@ -1,0 +1,111 @@
+"""Meshes with colours: read from OBJ, glTF and PLY, and sampled into clouds with colours."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+import trimesh
+
+from ..neural_fields import InputError
+from .meshes import weld
+from .ply import read_ply
+from .point_cloud import PointCloud
+from .textured_gltf import read_gltf
+from .textured_mesh import TexturedMesh, colors_at
+from .textured_obj import read_textured_obj
+
+__all__ = ["TEXTURED_READERS", "TexturedMesh", "colors_at", "read_textured", "sample_textured"]
+
+
+def read_textured(path: str | Path) -> TexturedMesh:
+    """Read a mesh with its colours: from an image over texture coordinates, materials, or the vertices.
+
+    Args:
+        path: an OBJ file with its MTL files and images, a GLB or glTF file, or a PLY file with vertex colours.
+
+    Returns:
+        The mesh in input coordinates; vertices that a glTF file repeats along seams are one again.
+
+    Raises:
+        InputError: the file, a material or an image is missing or damaged, or there are no faces or no colours.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; check the path")
+    reader = TEXTURED_READERS.get(path.suffix.lower())
+    if reader is None:
+        known = ", ".join(TEXTURED_READERS)
+        raise InputError(f"{path}: meshes with colours are read from {known}; export it as one of them")
+    try:
+        mesh = reader(path)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error}); check its permissions") from error
+    if not np.isfinite(mesh.vertices[np.unique(mesh.faces)]).all():
+        raise InputError(f"{path}: a vertex has a coordinate that is not a finite number; export it again")
+    if not mesh.has_colors:
+        raise InputError(f"{path}: neither a texture nor vertex colours in it; export it with its colours")
+    return mesh
+
+
+def sample_textured(mesh: TexturedMesh, count: int, *, seed: int) -> PointCloud:
+    """Points uniform by area, with the colours of the surface there and the normals of their faces.
+
+    Args:
+        mesh: with colours.
+        count: how many points.
+        seed: the same seed gives the same points.
+
+    Raises:
+        InputError: the faces have no area, or the mesh has no colours.
+    """
+    if not mesh.has_colors:
+        raise InputError(f"{mesh.source}: neither a texture nor vertex colours in it; export it with its colours")
+    rng = np.random.default_rng(seed)
+    corners = mesh.vertices[mesh.faces]  # (F, 3, 3)
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    doubled = np.linalg.norm(cross, axis=1)  # twice the area
+    total = np.cumsum(doubled)
+    if not total[-1] > 0:
+        raise InputError(f"{mesh.source}: all of its faces have zero area; export it again")
+    face = np.searchsorted(total, rng.uniform(0, total[-1], count), side="right").clip(max=len(total) - 1)
+    face = np.sort(face)  # neighbours in memory are then neighbours in space, which k-d trees like
+    root, second = np.sqrt(rng.uniform(size=count)), rng.uniform(size=count)
+    weights = np.stack((1 - root, root * (1 - second), root * second), axis=1)  # (N, 3)
+    points = np.einsum("nk,nkc->nc", weights, corners[face])
+    normals = (cross[face] / doubled[face, None]).astype(np.float32)
+    return PointCloud(points, normals, colors_at(mesh, face, weights), mesh.source, "mesh")
+
+
+def _read_ply(path: Path) -> TexturedMesh:
+    cloud = read_ply(path)
+    try:
+        loaded: Any = trimesh.load(path, file_type="ply", process=False)
+    except Exception as error:  # trimesh lets through whatever its parser trips over
+        raise InputError(f"{path}: its faces cannot be read; export it again") from error
+    faces = np.asarray(getattr(loaded, "faces", ()), np.int64).reshape(-1, 3)
+    if not len(faces):
+        raise InputError(f"{path}: face: there are none; a cloud with colours is read as it is, without its texture")
+    if len(loaded.vertices) != len(cloud):
+        raise InputError(f"{path}: face: texture coordinates in PLY are not read; export OBJ or GLB")
+    return TexturedMesh(cloud.points, faces, None, None, cloud.colors, str(path))
+
+
+def _read_gltf(path: Path) -> TexturedMesh:
+    """Equal vertices become one; where their colours differ they stay two, so that no colour is lost."""
+    mesh = read_gltf(path)
+    colors = mesh.vertex_colors
+    keys = mesh.vertices if colors is None else np.concatenate((mesh.vertices, colors), axis=1, dtype=np.float64)
+    left, index = weld(keys)
+    colors = None if colors is None else left[:, 3:].astype(np.float32)
+    return replace(mesh, vertices=np.ascontiguousarray(left[:, :3]), faces=index[mesh.faces], vertex_colors=colors)
+
+
+TEXTURED_READERS: Mapping[str, Callable[[Path], TexturedMesh]] = MappingProxyType(
+    {".obj": read_textured_obj, ".glb": _read_gltf, ".gltf": _read_gltf, ".ply": _read_ply}
+)
+"""What reads which extension."""

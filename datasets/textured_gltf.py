@@ -1,0 +1,265 @@
+"""GLTF 2.0 and its binary form GLB: triangles, base colours and their textures, placed by the scene's nodes.
+
+Format: Khronos, "glTF 2.0 Specification". Read here and not with trimesh, which takes COLOR_0 for display colours
+and loses it beside a material, and forgets how textures go on beyond their sides.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+from urllib.parse import unquote
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from ..neural_fields import InputError
+from .color_space import linear_to_srgb, srgb_to_linear
+from .textured_mesh import Paint, TexturedMesh, Wrap, decode_image, pack
+
+__all__ = ["read_gltf"]
+
+Float64 = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+
+_KINDS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+_WRAPS: dict[int, Wrap] = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
+_TRIANGLES, _STRIP, _FAN = 4, 5, 6
+# Extensions that change where the numbers are; others that a file requires change how it looks only.
+_FOREIGN = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_texture_basisu")
+
+
+class _Piece(NamedTuple):
+    """One primitive of one node, in scene coordinates; colours are linear, v runs down."""
+
+    vertices: Float64
+    faces: Int64
+    uv: Float64
+    colors: Float64 | None
+    paint: int
+
+
+def read_gltf(path: Path, *, textures: bool = True) -> TexturedMesh:
+    """Read all triangles of the scene of a GLB or glTF file, vertices in the order of the file.
+
+    Args:
+        path: the file; buffers and images that it names lie beside it.
+        textures: whether to read images too, and base colours; without, only vertex colours are colours.
+
+    Raises:
+        InputError: it is damaged or compressed, holds no triangle, or an image is missing.
+    """
+    try:
+        scene = _Scene.load(path)
+        needed = next((name for name in _FOREIGN if name in scene.header.get("extensionsRequired", ())), None)
+        if needed is not None:
+            raise InputError(f"{path}: extensionsRequired: {needed} is not read; export it without compression")
+        materials: dict[str, Paint] = {}
+        pieces = list(_pieces(scene, materials, textures=textures))
+        mesh = _joined(pieces, list(materials.values()), str(path))
+    except InputError:
+        raise
+    except (AttributeError, ValueError, KeyError, IndexError, TypeError, struct.error) as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise InputError(f"{path}: not a readable glTF file ({reason}); export it again") from error
+    return mesh
+
+
+@dataclass(frozen=True)
+class _Scene:
+    """The JSON part of a file, and the binary chunk of a GLB."""
+
+    path: Path
+    header: dict[str, Any]
+    chunk: bytes
+
+    @classmethod
+    def load(cls, path: Path) -> _Scene:
+        data = path.read_bytes()
+        if data[:4] != b"glTF":
+            return cls(path, json.loads(data), b"")
+        if struct.unpack_from("<I", data, 4)[0] != 2:
+            raise InputError(f"{path}: glTF 1 is not read; export it as glTF 2")
+        length = struct.unpack_from("<I", data, 12)[0]
+        header = json.loads(data[20 : 20 + length])
+        return cls(path, header, data[28 + length :])
+
+    def buffer(self, number: int) -> bytes:
+        uri = self.header["buffers"][number].get("uri")
+        return self.chunk if uri is None else self.resource(uri, f"buffers[{number}]")
+
+    def resource(self, uri: str, what: str) -> bytes:
+        if uri.startswith("data:"):
+            return base64.b64decode(uri.partition(",")[2])
+        file = self.path.parent / unquote(uri)
+        if not file.is_file():
+            raise InputError(f"{self.path}: {what}: {file} is not there; put it beside the glTF file, or export a GLB")
+        return file.read_bytes()
+
+    def view(self, number: int) -> tuple[bytes, int, int]:
+        """A bufferView → its buffer, where it starts and its stride (0: tight)."""
+        view = self.header["bufferViews"][number]
+        return self.buffer(view["buffer"]), view.get("byteOffset", 0), view.get("byteStride", 0)
+
+    def accessor(self, number: int) -> NDArray[Any]:
+        """An accessor → ``(count, width)``; normalised integers become fractions."""
+        accessor = self.header["accessors"][number]
+        if "sparse" in accessor or "bufferView" not in accessor:
+            raise ValueError("sparse accessors are not read")
+        data, start, stride = self.view(accessor["bufferView"])
+        kind, width = np.dtype(_KINDS[accessor["componentType"]]), _WIDTHS[accessor["type"]]
+        rows = np.ndarray(
+            (accessor["count"], width),
+            kind,
+            data,
+            start + accessor.get("byteOffset", 0),
+            (stride or width * kind.itemsize, kind.itemsize),
+        )
+        if accessor.get("normalized", False):
+            return (rows / np.float64(np.iinfo(kind).max)).clip(-1, 1)
+        return rows
+
+    def image(self, number: int) -> NDArray[np.float32]:
+        image = self.header["images"][number]
+        if "bufferView" in image:
+            data, start, _ = self.view(image["bufferView"])
+            data = data[start : start + self.header["bufferViews"][image["bufferView"]]["byteLength"]]
+        else:
+            data = self.resource(image["uri"], f"images[{number}]")
+        try:
+            return decode_image(data)
+        except ValueError as error:
+            raise InputError(f"{self.path}: images[{number}]: {error}; export it with PNG or JPEG images") from error
+
+
+def _pieces(scene: _Scene, materials: dict[str, Paint], *, textures: bool) -> Iterator[_Piece]:
+    """All triangle primitives; their materials are collected in ``materials``."""
+    header = scene.header
+    nodes = header.get("nodes", [])
+    roots = range(len(nodes))
+    if header.get("scenes"):
+        roots = header["scenes"][header.get("scene", 0)].get("nodes", [])
+    open_nodes = [(root, np.eye(4)) for root in roots]
+    visits = 0
+    while open_nodes:
+        number, parent = open_nodes.pop(0)
+        visits += 1
+        if visits > len(nodes):
+            raise ValueError("a node is its own ancestor, or has two parents")
+        node = nodes[number]
+        placed = parent @ _transform(node)
+        open_nodes += [(child, placed) for child in node.get("children", [])]
+        if "mesh" not in node:
+            continue
+        for primitive in header["meshes"][node["mesh"]]["primitives"]:
+            if (
+                primitive.get("mode", _TRIANGLES) in (_TRIANGLES, _STRIP, _FAN)
+                and "POSITION" in primitive["attributes"]
+            ):
+                yield _piece(scene, primitive, placed, materials, textures=textures)
+
+
+def _transform(node: dict[str, Any]) -> Float64:
+    if "matrix" in node:
+        return np.array(node["matrix"], np.float64).reshape(4, 4).T
+    placed = np.eye(4)
+    placed[:3, :3] = Rotation.from_quat(node.get("rotation", (0, 0, 0, 1))).as_matrix() * np.array(
+        node.get("scale", (1, 1, 1)), np.float64
+    )
+    placed[:3, 3] = node.get("translation", (0, 0, 0))
+    return placed
+
+
+def _piece(
+    scene: _Scene, primitive: dict[str, Any], placed: Float64, materials: dict[str, Paint], *, textures: bool
+) -> _Piece:
+    attributes = primitive["attributes"]
+    vertices = scene.accessor(attributes["POSITION"]).astype(np.float64) @ placed[:3, :3].T + placed[:3, 3]
+    count = len(vertices)
+    order = np.arange(count)
+    if "indices" in primitive:
+        order = scene.accessor(primitive["indices"])[:, 0].astype(np.int64)
+    faces = _triangles(order, primitive.get("mode", _TRIANGLES))
+    if len(faces) and faces.max() >= count:
+        raise ValueError(f"a face names vertex {faces.max()}, but there are only {count}")
+    if np.linalg.det(placed[:3, :3]) < 0:  # a mirrored node shows the other side of its triangles
+        faces = faces[:, ::-1]
+    colors = None
+    if "COLOR_0" in attributes:
+        colors = scene.accessor(attributes["COLOR_0"])[:, :3].astype(np.float64).clip(0, 1)
+    uv = np.zeros((count, 2))
+    key, paint = "", Paint(np.ones((1, 1, 3), np.float32))
+    if textures and "material" in primitive:
+        material = scene.header["materials"][primitive["material"]].get("pbrMetallicRoughness", {})
+        info = material.get("baseColorTexture")
+        if info is not None:
+            uv = _texture_coordinates(scene, attributes, info)
+        key = json.dumps([info, material.get("baseColorFactor")])
+        paint = materials[key] if key in materials else _paint(scene, material)
+    materials.setdefault(key, paint)
+    return _Piece(vertices, faces, uv, colors, list(materials).index(key))
+
+
+def _triangles(order: Int64, mode: int) -> Int64:
+    if mode == _TRIANGLES:
+        return order[: len(order) // 3 * 3].reshape(-1, 3)
+    if mode == _FAN:
+        return np.stack((order[1:-1], order[2:], np.full(max(len(order) - 2, 0), order[0])), axis=1)
+    k = np.arange(max(len(order) - 2, 0))
+    odd = k % 2
+    return np.stack((order[k], order[k + 1 + odd], order[k + 2 - odd]), axis=1)
+
+
+def _texture_coordinates(scene: _Scene, attributes: dict[str, int], info: dict[str, Any]) -> Float64:
+    """Texture coordinates of the vertices, moved as KHR_texture_transform says."""
+    moved = info.get("extensions", {}).get("KHR_texture_transform", {})
+    name = f"TEXCOORD_{moved.get('texCoord', info.get('texCoord', 0))}"
+    if name not in attributes:
+        raise ValueError(f"{name} is missing, which its texture needs")
+    uv = scene.accessor(attributes[name]).astype(np.float64)
+    if not np.isfinite(uv).all():
+        raise ValueError(f"{name} has numbers that are not finite")
+    cos, sin = np.cos(moved.get("rotation", 0.0)), np.sin(moved.get("rotation", 0.0))
+    turned = (uv * np.array(moved.get("scale", (1, 1)), np.float64)) @ np.array([[cos, -sin], [sin, cos]])
+    return turned + np.array(moved.get("offset", (0, 0)), np.float64)
+
+
+def _paint(scene: _Scene, material: dict[str, Any]) -> Paint:
+    """The base colour of a material: its texture (display) times its factor (linear)."""
+    factor = np.array(material.get("baseColorFactor", (1, 1, 1, 1))[:3], np.float32)
+    info = material.get("baseColorTexture")
+    if info is None:
+        return Paint(linear_to_srgb(factor.reshape(1, 1, 3)))
+    texture = scene.header["textures"][info["index"]]
+    webp = texture.get("extensions", {}).get("EXT_texture_webp", {})
+    image = scene.image(webp.get("source", texture.get("source")))
+    if (factor != 1).any():
+        image = linear_to_srgb(srgb_to_linear(image) * factor)
+    sampler = scene.header["samplers"][texture["sampler"]] if "sampler" in texture else {}
+    return Paint(image, (_WRAPS[sampler.get("wrapS", 10497)], _WRAPS[sampler.get("wrapT", 10497)]))
+
+
+def _joined(pieces: list[_Piece], paints: list[Paint], source: str) -> TexturedMesh:
+    if not sum(len(piece.faces) for piece in pieces):
+        raise InputError(f"{source}: meshes: no triangles in it; export a mesh")
+    first = np.cumsum([0, *(len(piece.vertices) for piece in pieces)])
+    vertices = np.concatenate([piece.vertices for piece in pieces])
+    faces = np.concatenate([piece.faces + start for piece, start in zip(pieces, first, strict=False)])
+    uv = np.concatenate([piece.uv[piece.faces] for piece in pieces])
+    uv[..., 1] = 1 - uv[..., 1]
+    colors = None
+    if any(piece.colors is not None for piece in pieces):
+        light = [np.ones_like(piece.vertices) if piece.colors is None else piece.colors for piece in pieces]
+        colors = linear_to_srgb(np.concatenate(light)).astype(np.float32)
+    if all((paint.image == 1).all() for paint in paints):  # white paint says nothing
+        return TexturedMesh(vertices, faces, None, None, colors, source)
+    chosen = np.repeat([piece.paint for piece in pieces], [len(piece.faces) for piece in pieces])
+    image, parts = pack(paints, chosen)
+    return TexturedMesh(vertices, faces, uv, image, colors, source, parts)

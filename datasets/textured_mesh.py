@@ -1,0 +1,193 @@
+"""``TexturedMesh``: triangles with colours at their vertices or in images, and the lookup of those colours."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+import cv2
+import imageio.v3 as iio
+import numpy as np
+from numpy.typing import NDArray
+
+from .color_space import linear_to_srgb, srgb_to_linear
+from .point_cloud import colors_from
+
+__all__ = ["Paint", "Parts", "TexturedMesh", "colors_at", "decode_image", "lookup", "pack"]
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+Wrap = Literal["repeat", "clamp", "mirror"]
+
+_WRAPS: tuple[Wrap, ...] = ("repeat", "clamp", "mirror")
+
+
+class Paint(NamedTuple):
+    """The image of one material: ``(h, w, 3)`` display RGB, and how it goes on beyond its sides along u and v."""
+
+    image: Float32
+    wrap: tuple[Wrap, Wrap] = ("repeat", "repeat")
+
+
+@dataclass(frozen=True)
+class Parts:
+    """Which rectangle of a mesh's image each face is painted with; u and v run over that rectangle.
+
+    Attributes:
+        face: ``(F,)`` number of the rectangle.
+        box: ``(M, 4)`` first row, first column, rows and columns of each rectangle, in texels.
+        wrap: ``(M, 2)`` how it goes on along u and v: 0 repeats, 1 repeats its border, 2 mirrors.
+    """
+
+    face: Int64
+    box: Int64
+    wrap: NDArray[np.int8]
+
+
+@dataclass(frozen=True)
+class TexturedMesh:
+    """A triangle mesh in input coordinates, with its colours.
+
+    Where it has both an image and vertex colours, the colour is their product in linear light, as in glTF.
+
+    Attributes:
+        vertices: ``(V, 3)``, in input units.
+        faces: ``(F, 3)``; the two sides of a seam of the texture share their vertices.
+        uv: ``(F, 3, 2)`` texture coordinates of each corner; (0, 0) is the lower left corner of the image, v runs up.
+        image: ``(H, W, 3)`` display RGB in [0, 1], first row on top.
+        vertex_colors: ``(V, 3)`` display RGB in [0, 1].
+        source: what messages call this mesh; the file's path, say.
+        parts: which part of the image belongs to which face; None: the whole image, repeated.
+
+    Raises:
+        ValueError: an array has the wrong shape, or of ``uv`` and ``image`` there is only one.
+    """
+
+    vertices: Float64
+    faces: Int64
+    uv: Float64 | None = None
+    image: Float32 | None = None
+    vertex_colors: Float32 | None = None
+    source: str = "mesh"
+    parts: Parts | None = None
+
+    def __post_init__(self) -> None:
+        for name, rows in (("vertices", self.vertices), ("faces", self.faces)):
+            if rows.ndim != 2 or rows.shape[1] != 3:
+                raise ValueError(f"{name} has shape {rows.shape}; expected (N, 3)")
+        if (self.uv is None) != (self.image is None):
+            raise ValueError("uv, image: expected both or neither")
+        if self.uv is not None and self.uv.shape != (len(self.faces), 3, 2):
+            raise ValueError(f"uv has shape {self.uv.shape}; expected {(len(self.faces), 3, 2)}")
+        if self.image is not None and (self.image.ndim != 3 or self.image.shape[2] != 3 or not self.image.size):
+            raise ValueError(f"image has shape {self.image.shape}; expected (H, W, 3)")
+        if self.vertex_colors is not None and self.vertex_colors.shape != self.vertices.shape:
+            raise ValueError(f"vertex_colors has shape {self.vertex_colors.shape}; expected {self.vertices.shape}")
+
+    @property
+    def has_colors(self) -> bool:
+        """Whether `colors_at` has anything to say."""
+        return self.image is not None or self.vertex_colors is not None
+
+
+def colors_at(mesh: TexturedMesh, face: Int64, barycentric: NDArray[np.floating]) -> Float32:
+    """Display colours ``(N, 3)`` at points of faces; images and vertex colours are interpolated in linear light.
+
+    Args:
+        mesh: with an image, vertex colours, or both.
+        face: ``(N,)`` faces.
+        barycentric: ``(N, 3)`` weights of their corners.
+
+    Raises:
+        ValueError: the mesh has no colours.
+    """
+    if not mesh.has_colors:
+        raise ValueError(f"mesh: {mesh.source} has neither an image nor vertex colours")
+    light = np.ones((len(face), 3), np.float32)
+    if mesh.image is not None and mesh.uv is not None:
+        uv = np.einsum("nk,nkc->nc", barycentric, mesh.uv[face])
+        part = None if mesh.parts is None else mesh.parts.face[face]
+        light *= lookup(mesh.image, uv, mesh.parts, part)
+    if mesh.vertex_colors is not None:
+        corners = srgb_to_linear(mesh.vertex_colors)[mesh.faces[face]]  # (N, 3, 3)
+        light *= np.einsum("nk,nkc->nc", barycentric, corners).astype(np.float32)
+    return linear_to_srgb(light.clip(0, 1))
+
+
+def lookup(image: Float32, uv: Float64, parts: Parts | None = None, part: Int64 | None = None) -> Float32:
+    """Linear light ``(N, 3)`` of a display image at ``uv`` ``(N, 2)``, between the centres of its four nearest texels.
+
+    Texel (row i, column j) of an H × W image has its centre at ``u = (j + 1/2) / W``, ``v = 1 - (i + 1/2) / H``.
+
+    Args:
+        image: ``(H, W, 3)``.
+        uv: v runs up; may lie outside [0, 1].
+        parts: rectangles of the image; None: it is one, and repeats.
+        part: ``(N,)`` which of them.
+    """
+    if parts is None or part is None:
+        start, wrap = np.zeros(2, np.int64), np.zeros(2, np.int8)
+        size = np.array(image.shape[1::-1])
+    else:
+        start, wrap = parts.box[part][:, [1, 0]], parts.wrap[part]
+        size = parts.box[part][:, [3, 2]]
+    place = np.stack((uv[:, 0], 1 - uv[:, 1]), axis=1) * size - 0.5  # column, row
+    low = np.floor(place).astype(np.int64)
+    share = (place - low).astype(np.float32)
+    light = np.zeros((len(uv), 3), np.float32)
+    for step in ((0, 0), (1, 0), (0, 1), (1, 1)):
+        texel = _wrapped(low + np.array(step), size, wrap) + start
+        weight = np.where(step, share, 1 - share).prod(axis=1, keepdims=True)
+        light += weight * srgb_to_linear(image[texel[:, 1], texel[:, 0]])
+    return light
+
+
+def _wrapped(index: Int64, size: Int64, wrap: NDArray[np.int8]) -> Int64:
+    """Indices ``(N, 2)`` of any size → those of texels."""
+    turn = index % (2 * size)
+    mirrored = np.minimum(turn, 2 * size - 1 - turn)
+    return np.where(wrap == 0, index % size, np.where(wrap == 1, index.clip(0, size - 1), mirrored))
+
+
+def pack(paints: Sequence[Paint], face: Int64) -> tuple[Float32, Parts]:
+    """Put the images of several materials one under the other.
+
+    Args:
+        paints: at least one.
+        face: ``(F,)`` which of them each face has.
+    """
+    sizes = np.array([paint.image.shape[:2] for paint in paints], np.int64)
+    starts = np.cumsum(sizes[:, 0]) - sizes[:, 0]
+    image = np.zeros((int(sizes[:, 0].sum()), int(sizes[:, 1].max()), 3), np.float32)
+    for paint, start in zip(paints, starts.tolist(), strict=True):
+        rows, columns = paint.image.shape[:2]
+        image[start : start + rows, :columns] = paint.image
+    box = np.stack((starts, np.zeros_like(starts), *sizes.T), axis=1)
+    wrap = np.array([[_WRAPS.index(side) for side in paint.wrap] for paint in paints], np.int8)
+    return image, Parts(face, box, wrap)
+
+
+def decode_image(data: bytes) -> Float32:
+    """The bytes of an image file → ``(H, W, 3)`` display RGB in [0, 1]; its alpha channel is dropped.
+
+    Raises:
+        ValueError: it is no image, or of a kind we do not read.
+    """
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+    # OpenCV keeps 16 bits; what it does not know (TGA, say) Pillow may.
+    found = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
+    if found is not None:
+        rgb = np.asarray(found)[..., ::-1]
+    else:
+        try:
+            rgb = iio.imread(data, mode="RGB")
+        except Exception as error:  # imageio's plugins raise whatever they trip over
+            raise ValueError("not an image that can be read") from error
+    return np.ascontiguousarray(colors_from(rgb) if rgb.dtype == np.uint8 else _unit(rgb), np.float32)
+
+
+def _unit(rgb: NDArray[Any]) -> Float32:
+    scale = np.iinfo(rgb.dtype).max if np.issubdtype(rgb.dtype, np.integer) else 1
+    return (rgb.astype(np.float32) / np.float32(scale)).clip(0, 1)

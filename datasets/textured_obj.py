@@ -1,0 +1,187 @@
+"""Wavefront OBJ with its materials: faces, texture coordinates of corners, MTL files and their images.
+
+Read here and not with trimesh, which splits vertices at seams. Of a material, ``map_Kd`` is its colour, and where
+that is missing ``Kd``; both are display colours.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..neural_fields import InputError
+from .meshes import triangulate
+from .obj import _indices, _records
+from .point_cloud import colors_from
+from .text import numbers
+from .textured_mesh import Paint, TexturedMesh, Wrap, decode_image, pack
+
+__all__ = ["read_textured_obj"]
+
+Float64 = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+
+WHITE = (1.0, 1.0, 1.0)
+# Options of map_Kd and how many words follow each; those with several numbers may have fewer.
+_OPTIONS = {"-blendu": 1, "-blendv": 1, "-boost": 1, "-mm": 2, "-o": 3, "-s": 3, "-t": 3, "-texres": 1, "-clamp": 1}
+_OPTIONS |= {"-bm": 1, "-imfchan": 1, "-type": 1, "-cc": 1}
+
+
+class _Material(NamedTuple):
+    """What a material says: a colour, and perhaps an image with ``uv * scale + offset``."""
+
+    color: tuple[float, ...] = WHITE
+    image: Path | None = None
+    clamp: bool = False
+    scale: tuple[float, ...] = (1.0, 1.0)
+    offset: tuple[float, ...] = (0.0, 0.0)
+
+
+def read_textured_obj(path: Path) -> TexturedMesh:
+    """Read the faces of an OBJ file with the images and colours of its materials, or the colours of its vertices.
+
+    Raises:
+        InputError: there are no faces, an index or number is wrong, or a material or an image is missing.
+    """
+    text = path.read_bytes().decode("utf-8", "replace").replace("\\\n", " ")
+    vertices, vertex_starts = _records(text, "v")
+    polygons, polygon_starts = _records(text, "f")
+    if not vertices or not polygons:
+        raise InputError(f"{path}: f: no faces in it; a cloud has no texture, so give a mesh")
+    table = numbers("\n".join(vertices), path, first_line=1, what="vertex")
+    if table.shape[1] not in (3, 4, 6, 7):
+        raise InputError(f"{path}: v: {table.shape[1]} numbers per vertex; expected x y z, or x y z r g b")
+    lengths = np.array([len(polygon.split()) for polygon in polygons], np.int64)
+    owner = np.repeat(np.arange(len(polygons)), lengths)
+    words = " ".join(polygons)
+    corners = _indices(re.sub(r"/\S*", "", words), vertex_starts, polygon_starts[owner], path, "v")
+    triangles = triangulate(lengths, np.arange(len(corners)))  # (F, 3) corners
+    if not len(triangles):
+        raise InputError(f"{path}: f: no face has three corners; export it again")
+    faces, polygon = corners[triangles], owner[triangles[:, 0]]
+
+    names, name_starts = _records(text, "usemtl")
+    materials = _materials(text, path)
+    points = np.ascontiguousarray(table[:, :3])
+    colors = colors_from(table[:, 3:6]) if table.shape[1] == 6 else None
+    # Only images say more than vertex colours: a Kd beside them is what an exporter writes when it knows no better.
+    if not materials or (colors is not None and not any(material.image for material in materials.values())):
+        return TexturedMesh(points, faces, None, None, colors, str(path))
+    # What is current where a polygon starts; faces before the first usemtl have the last entry, which is white.
+    used = np.searchsorted(name_starts, polygon_starts) - 1
+    number = {name: k for k, name in enumerate(materials)}
+    unknown = next((name for name in names if name not in number), None)
+    if unknown is not None:
+        raise InputError(f"{path}: usemtl: no material {unknown!r} in its MTL file; export both again")
+    listed = [*materials.values(), _Material()]
+    chosen = np.array([*(number[name] for name in names), len(materials)])[used][polygon]  # (F,); −1 is the last
+
+    uv = np.zeros((len(corners), 2))
+    painted = np.array([material.image is not None for material in listed])[chosen]
+    mapped = np.zeros(len(corners), bool)
+    mapped[triangles[painted]] = True
+    if mapped.any():
+        uv[mapped] = _texture_coordinates(text, words, mapped, polygon_starts[owner], path)
+    scale, offset = (np.array([material[k] for material in listed])[chosen][:, None] for k in (3, 4))
+    some, chosen = np.unique(chosen % len(listed), return_inverse=True)
+    image, parts = pack([_paint(listed[k]) for k in some], chosen)
+    return TexturedMesh(points, faces, uv[triangles] * scale + offset, image, None, str(path), parts)
+
+
+def _texture_coordinates(text: str, words: str, mapped: NDArray[np.bool_], used_at: Int64, path: Path) -> Float64:
+    """Texture coordinates of the corners that need them."""
+    listed, starts = _records(text, "vt")
+    if not listed:
+        raise InputError(f"{path}: vt: no texture coordinates, but its materials have images; export it with them")
+    table = numbers("\n".join(listed), path, first_line=1, what="texture coordinate")
+    if table.shape[1] < 2 or not np.isfinite(table[:, :2]).all():
+        raise InputError(f"{path}: vt: expected two finite numbers, u and v; export it again")
+    second = [[*word.split("/"), ""][1] for word in words.split()]
+    needed = [second[k] for k in np.flatnonzero(mapped)]
+    if not all(needed):
+        raise InputError(f"{path}: f: a corner of a textured face has no vt index; export it with texture coordinates")
+    return table[_indices(" ".join(needed), starts, used_at[mapped], path, "vt"), :2]
+
+
+def _materials(text: str, path: Path) -> dict[str, _Material]:
+    """All materials of all MTL files that the OBJ names."""
+    found: dict[str, _Material] = {}
+    for name in _records(text, "mtllib")[0]:
+        # A line may name several files, or one with spaces in its name.
+        whole = _beside(path, name)
+        for file in [whole] if whole.is_file() else [_beside(path, word) for word in name.split()]:
+            if not file.is_file():
+                raise InputError(f"{path}: mtllib: {file} is not there; put the MTL file beside the OBJ file")
+            found |= _read_mtl(file)
+    return found
+
+
+def _read_mtl(file: Path) -> dict[str, _Material]:
+    found: dict[str, _Material] = {}
+    name: str | None = None
+    for line in file.read_bytes().decode("utf-8", "replace").splitlines():
+        keyword, rest = [*line.split(maxsplit=1), "", ""][:2]
+        rest = rest.split(" #")[0].strip()
+        if keyword == "newmtl":
+            name = rest
+            found[name] = _Material()
+        elif name is not None and keyword == "Kd":
+            found[name] = found[name]._replace(color=_color(rest, file, name))
+        elif name is not None and keyword.lower() == "map_kd":
+            found[name] = _with_map(found[name], rest, file, name)
+    return found
+
+
+def _color(words: str, file: Path, name: str) -> tuple[float, ...]:
+    try:
+        color = tuple(min(max(float(word), 0.0), 1.0) for word in words.split()[:3])
+    except ValueError as error:
+        raise InputError(f"{file}: {name}: Kd: expected three numbers, not {words!r}") from error
+    if len(color) not in (1, 3):
+        raise InputError(f"{file}: {name}: Kd: expected three numbers, not {words!r}")
+    return color * (3 // len(color))
+
+
+def _with_map(material: _Material, words: str, file: Path, name: str) -> _Material:
+    """Read ``map_Kd [options] file``; the file's name may hold spaces."""
+    left = words.split(" ")
+    while left and left[0] in _OPTIONS:
+        option, values, left = left[0], [], left[1:]
+        while left[1:] and len(values) < _OPTIONS[option] and (not values or _is_number(left[0])):
+            values.append(left.pop(0))
+        if option in ("-s", "-o") and values and _is_number(values[0]):
+            default = (1.0, 1.0) if option == "-s" else (0.0, 0.0)
+            pair = (*map(float, values[:2]), *default[len(values[:2]) :])
+            material = material._replace(scale=pair) if option == "-s" else material._replace(offset=pair)
+        elif option == "-clamp":
+            material = material._replace(clamp=values == ["on"])
+    named = " ".join(left)
+    image = _beside(file, named)
+    if not image.is_file():
+        raise InputError(f"{file}: {name}: map_Kd: {image} is not there; put the image beside the MTL file")
+    return material._replace(image=image)
+
+
+def _beside(file: Path, name: str) -> Path:
+    """A file named in another one; a path from somebody else's disc is looked for beside it."""
+    name = name.strip().strip('"').replace("\\", "/")
+    relative = file.parent / name
+    return relative if relative.is_file() else file.parent / name.rsplit("/", 1)[-1]
+
+
+def _is_number(word: str) -> bool:
+    return re.fullmatch(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", word) is not None
+
+
+def _paint(material: _Material) -> Paint:
+    if material.image is None:
+        return Paint(np.array(material.color, np.float32).reshape(1, 1, 3))
+    wrap: Wrap = "clamp" if material.clamp else "repeat"
+    try:
+        return Paint(decode_image(material.image.read_bytes()), (wrap, wrap))
+    except ValueError as error:
+        raise InputError(f"{material.image}: {error}; save it as PNG or JPEG") from error
