@@ -68,7 +68,8 @@ def read_gltf(path: Path, *, textures: bool = True) -> TexturedMesh:
         raise
     except (AttributeError, ValueError, KeyError, IndexError, TypeError, struct.error) as error:
         reason = " ".join(str(error).split()) or type(error).__name__
-        raise InputError(f"{path}: not a readable glTF file ({reason}); export it again") from error
+        kind = path.suffix[1:].upper()
+        raise InputError(f"{path}: cannot be read as a {kind} mesh ({reason}); export it again") from error
     return mesh
 
 

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..datasets import srgb_to_linear
 from ..neural_fields import InputError, Similarity
 from ..neural_fields.meshing import Mesh
 
@@ -21,7 +22,7 @@ __all__ = ["check_mesh_path", "needs_doubles", "write_mesh"]
 # hundredth of a cell at 2048³.
 FLOAT32_REACH = 128.0
 TEXT_ROWS = 1 << 16
-_GLTF_UBYTE, _GLTF_UINT, _GLTF_FLOAT = 5121, 5125, 5126
+_GLTF_USHORT, _GLTF_UINT, _GLTF_FLOAT = 5123, 5125, 5126
 
 
 def check_mesh_path(path: str | Path, similarity: Similarity | None = None) -> Path:
@@ -60,7 +61,8 @@ def write_mesh(path: str | Path, mesh: Mesh, similarity: Similarity | None = Non
     """Write ``mesh``, moved to input coordinates by ``similarity``; the extension chooses the format.
 
     PLY is binary, with double coordinates where float would spoil them (see `needs_doubles`), normals and
-    colours; OBJ has normals and colours; STL (binary) neither. GLB is float32 by its standard: far from the
+    colours; OBJ has normals and colours; STL (binary) neither. Colours are display numbers in PLY and OBJ, linear
+    light in GLB. GLB is float32 by its standard: far from the
     origin it holds coordinates relative to ``similarity.center``, which becomes the translation of its node
     and is repeated in the node's ``extras``. The file appears under its name only when it is complete.
 
@@ -152,9 +154,10 @@ def _write_glb(path: Path, mesh: Mesh, similarity: Similarity) -> None:
         arrays.append((mesh.normals.astype("<f4"), _GLTF_FLOAT, "VEC3", {}))
     if mesh.colors is not None:
         attributes["COLOR_0"] = len(arrays)
-        opaque = np.full((len(mesh.colors), 4), 255, np.uint8)  # four channels keep rows aligned to four bytes
-        opaque[:, :3] = _bytes(mesh.colors)
-        arrays.append((opaque, _GLTF_UBYTE, "VEC4", {"normalized": True}))
+        # COLOR_0 is linear by the standard; in 8 bits that would merge dark shades.
+        opaque = np.full((len(mesh.colors), 4), 65535, "<u2")  # four channels keep rows aligned to four bytes
+        opaque[:, :3] = np.rint(srgb_to_linear(np.clip(mesh.colors, 0, 1)) * 65535)
+        arrays.append((opaque, _GLTF_USHORT, "VEC4", {"normalized": True}))
     starts = np.cumsum([0] + [array.nbytes for array, *_ in arrays]).tolist()
     header = {
         "asset": {"version": "2.0", "generator": "mplicits"},

@@ -14,6 +14,7 @@ from scipy.sparse.csgraph import connected_components
 
 from ..datasets import PointCloud, read_cloud
 from ..datasets.point_cloud import unit_rows
+from ..datasets.textured_gltf import read_gltf
 from ..neural_fields import InputError, Similarity
 from ..neural_fields.meshing import Mesh
 
@@ -33,7 +34,7 @@ __all__ = [
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 
-MESH_SUFFIXES = (".ply", ".obj", ".stl", ".off", ".glb")
+MESH_SUFFIXES = (".ply", ".obj", ".stl", ".off", ".glb", ".gltf")
 
 
 @dataclass(frozen=True)
@@ -68,6 +69,8 @@ def read_surface(path: str | Path) -> Surface:
         InputError: the file is missing, damaged, empty or of a kind we do not read.
     """
     path = Path(path)
+    if path.suffix.lower() in (".glb", ".gltf"):
+        return _load_gltf(path)
     if path.suffix.lower() in MESH_SUFFIXES:
         mesh = _load_mesh(path)
         if mesh is not None:
@@ -100,17 +103,34 @@ def _load_mesh(path: Path) -> Surface | None:
     faces = np.asarray(getattr(loaded, "faces", ()), np.int64).reshape(-1, 3)
     if not len(faces):
         return None
-    vertices = np.asarray(loaded.vertices, np.float64)
+    colors = None
+    if loaded.visual.kind == "vertex":
+        colors = np.asarray(loaded.visual.vertex_colors, np.float64)[:, :3] / 255
+    return _checked(path, Surface(np.asarray(loaded.vertices, np.float64), faces, None, colors))
+
+
+def _load_gltf(path: Path) -> Surface:
+    if not path.is_file():
+        raise InputError(f"{path}: no such file")
+    mesh = read_gltf(path, textures=False)
+    colors = None if mesh.vertex_colors is None else mesh.vertex_colors.astype(np.float64)
+    return _checked(path, Surface(mesh.vertices, mesh.faces, None, colors))
+
+
+def _checked(path: Path, surface: Surface) -> Surface:
+    """The surface, if it is one.
+
+    Raises:
+        InputError: a face names no vertex, a coordinate is not finite, or all vertices coincide.
+    """
+    vertices, faces = surface.vertices, surface.faces
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise InputError(f"{path}: a face names vertex {faces.max()}, but there are only {len(vertices)}")
     if not np.isfinite(vertices[np.unique(faces)]).all():
         raise InputError(f"{path}: a vertex has a coordinate that is not a finite number")
     if not np.ptp(vertices[np.unique(faces)], axis=0).any():
         raise InputError(f"{path}: all vertices coincide")
-    colors = None
-    if loaded.visual.kind == "vertex":
-        colors = np.asarray(loaded.visual.vertex_colors, np.float64)[:, :3] / 255
-    return Surface(vertices, faces, None, colors)
+    return surface
 
 
 def from_mesh(mesh: Mesh) -> Surface:

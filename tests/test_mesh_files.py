@@ -5,7 +5,7 @@ import struct
 import numpy as np
 import pytest
 import trimesh
-from mplicits.datasets import read_cloud
+from mplicits.datasets import linear_to_srgb, read_cloud
 from mplicits.neural_fields import InputError, Similarity, Sphere
 from mplicits.neural_fields.meshing import Mesh, extract_mesh
 from mplicits.pipelines.mesh_files import check_mesh_path, needs_doubles, write_mesh
@@ -39,8 +39,9 @@ def stored_normals(path):
 
 
 def stored_colors(path):
-    # With a material, which viewers need, trimesh looks for a texture instead of colours at vertices.
-    return glb_attribute(path, "COLOR_0", "u1", 4)[:, :3] / 255 if path.suffix == ".glb" else read_surface(path).colors
+    if path.suffix == ".glb":  # linear by its standard; 65535 is 1
+        return linear_to_srgb(glb_attribute(path, "COLOR_0", "<u2", 4)[:, :3] / 65535)
+    return read_surface(path).colors
 
 
 def glb_attribute(path, name, kind, channels):
@@ -61,6 +62,7 @@ def test_round_trip(tmp_path, mesh, suffix, similarity):
     assert np.abs(back.vertices - similarity.to_input(mesh.vertices)).max() < 1e-6 * similarity.scale
     assert np.abs(stored_normals(path) - mesh.normals).max() < 1e-5
     assert np.abs(stored_colors(path) - mesh.colors).max() < 0.51 / 255
+    assert np.abs(back.colors - mesh.colors).max() < 0.51 / 255
     assert [file.name for file in tmp_path.iterdir()] == [path.name]
 
 
