@@ -33,7 +33,7 @@ Networks = Mapping[str, Sequence[tuple[int, int, float, int, float]]]
 # The networks of Tab. 4 with our frequencies; level by level (width, depth, ω₀, steps, learning rate).
 NETWORKS: Networks = MappingProxyType(
     {
-        "400x4": ((400, 4, 60.0, 400, 5e-4),),
+        "400x4": ((400, 4, 30.0, 300, 2e-4),),
         "128x2_256x2_400x2": ((128, 2, 30.0, 1200, 4e-3), (256, 2, 80.0, 800, 5e-4), (400, 2, 160.0, 600, 3e-4)),
         "128x2_400x2": ((128, 2, 30.0, 1200, 4e-3), (400, 2, 160.0, 600, 3e-4)),
     }
