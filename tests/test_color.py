@@ -20,6 +20,7 @@ from mplicits.neural_fields import (
     save_field,
     save_texture,
 )
+from mplicits.neural_fields.losses import color_loss, tangential_loss
 from torch import Tensor
 
 
@@ -207,6 +208,13 @@ def test_training_leaves_the_geometry_alone() -> None:
     (value.square().sum() + along.square().sum()).backward()
     assert all(parameter.grad is None for parameter in geometry.parameters())
     assert all(parameter.grad is not None for parameter in field.network.parameters())
+
+
+def test_loss_terms_are_those_of_the_paper() -> None:
+    color, target = torch.tensor([[0.5, 0.5, 0.5], [1.0, 0.0, 0.0]]), torch.tensor([[0.5, 0.5, 0.5], [0.4, 0.0, 0.3]])
+    torch.testing.assert_close(color_loss(color, target), torch.tensor([0.0, (0.36 + 0.09) / 3]))
+    derivative = torch.tensor([[3.0, 0.0, -4.0], [0.0, 0.0, 0.0]])
+    torch.testing.assert_close(tangential_loss(derivative, 0.1), torch.tensor([0.01 * 25 / 3, 0.0]))
 
 
 def test_bad_arguments() -> None:

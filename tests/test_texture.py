@@ -187,6 +187,11 @@ def test_the_default_preset_is_the_default() -> None:
     assert load_config(TextureConfig, "default", thing="texture") == TextureConfig()
 
 
+@pytest.mark.parametrize("name", ["fast", "sharp"])
+def test_the_other_presets_are_others(name: str) -> None:
+    assert load_config(TextureConfig, name, thing="texture") != TextureConfig()
+
+
 @pytest.mark.parametrize(
     ("setting", "message"),
     [({"width": 0}, "width: 0"), ({"delta": -1.0}, "delta: -1"), ({"tangential_weight": -0.5}, "tangential_weight")],
