@@ -15,7 +15,7 @@ from .texture_config import TextureConfig
 __all__ = ["NORMAL_MAP", "TEXTURE"]
 
 # The paper's (64,1), with a frequency and a schedule at which it is a closed surface that looks like the shape.
-COARSE = FitConfig(widths=(64,), depths=(1,), omegas=(30.0,), steps=(1500,), learning_rates=(2e-2,), samples=200_000)
+COARSE = FitConfig(widths=(64,), depths=(1,), omegas=(40.0,), steps=(1500,), learning_rates=(2e-2,), samples=200_000)
 
 
 def _view_arguments(parser: argparse.ArgumentParser, *, views: int) -> None:
@@ -42,7 +42,7 @@ def _texture_arguments(parser: argparse.ArgumentParser) -> None:
     coarse = parser.add_argument_group("coarse surface")
     coarse.add_argument("--coarse-width", type=whole(1), default=64, metavar="N", help="neurons per layer (64)")
     coarse.add_argument("--coarse-depth", type=whole(1), default=1, metavar="N", help="sine layers (1)")
-    coarse.add_argument("--coarse-omega", type=positive, default=30.0, metavar="X", help="SIREN frequency (30)")
+    coarse.add_argument("--coarse-omega", type=positive, default=40.0, metavar="X", help="SIREN frequency (40)")
     coarse.add_argument("--coarse-steps", type=whole(1), default=1500, metavar="N", help="training steps (1500)")
     coarse.add_argument("--full", action="store_true", help="compare with a fit of several levels as well")
     names = ", ".join(preset_names("fit"))
