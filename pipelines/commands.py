@@ -56,7 +56,9 @@ def _fit(arguments: argparse.Namespace) -> int:
     depth = depth_input(arguments)
     directory = check_new_run(arguments.out, resume=arguments.resume, force=arguments.force)
     if arguments.force:
-        (directory / STATE_FILE).unlink(missing_ok=True)  # a state of the old run must not be resumed into the new
+        # What is left of the old run must not be resumed into the new one, nor colour it.
+        for name in (STATE_FILE, TEXTURE_FILE):
+            (directory / name).unlink(missing_ok=True)
     try:
         with nullcontext() if arguments.quiet else progress_bars() as report:
             if depth is None:

@@ -209,6 +209,16 @@ def test_ctrl_c_leaves_a_run_that_resume_finishes(cloud, tmp_path):
     assert json.loads((out / "run.json").read_text())["finished"]
 
 
+def test_force_forgets_the_texture_of_the_old_run(capsys, cloud, tmp_path):
+    run = tmp_path / "run"
+    run.mkdir()
+    (run / "texture.safetensors").write_bytes(b"of the field that is replaced")
+    assert "exists and is not empty" in fails(capsys, "fit", cloud, "-o", run, *SMALL)
+    assert (run / "texture.safetensors").exists()
+    assert main(["fit", str(cloud), "-o", str(run), "--force", "--quiet", *SMALL]) == 0
+    assert sorted(path.name for path in run.iterdir()) == ["field.safetensors", "run.json"]
+
+
 def test_mesh_is_in_input_coordinates_and_evaluate_measures_it(capsys, run, tmp_path):
     out = tmp_path / "ball.ply"
     assert main(["mesh", str(run), "-o", str(out), "--resolution", "48", "--keep-largest"]) == 0
