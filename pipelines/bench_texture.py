@@ -246,10 +246,18 @@ def format_texture(rows: Sequence[TextureRow]) -> str:
                 f"{row.fit_seconds:.1f} s",
                 f"{row.texture_parameters:,}",
                 f"{row.texture_seconds:.1f} s",
-                *(f"{mse:.5f}" + (f" ({row.paper / mse:.0f}×)" if row.paper and mse else "") for mse in errors),
+                *(f"{mse:.5f}{_times(row.paper, mse)}" for mse in errors),
                 "" if row.paper is None else f"{row.paper:.4f}",
                 f"{psnr(row.error.either):.1f} dB",
                 f"{psnr(row.error.both):.1f} dB",
             )
         )
     return format_table(header, cells)
+
+
+def _times(paper: float | None, mse: float) -> str:
+    """How many times smaller than the paper's figure an error is, to one or two digits."""
+    if paper is None or not mse > 0:
+        return ""
+    ratio = paper / mse
+    return f" ({ratio:.0f}×)" if ratio >= 9.95 else f" ({ratio:.1f}×)"
