@@ -52,6 +52,7 @@ def _fit(arguments: argparse.Namespace) -> int:
     from .info import describe
     from .progress_bar import progress_bars
     from .runs import check_new_run
+    from .texture import TEXTURE_FILE
 
     depth = depth_input(arguments)
     directory = check_new_run(arguments.out, resume=arguments.resume, force=arguments.force)
