@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import os
-import struct
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,14 +13,14 @@ from numpy.typing import NDArray
 from ..datasets import srgb_to_linear
 from ..neural_fields import InputError, Similarity
 from ..neural_fields.meshing import Mesh
+from .glb import write_glb
 
-__all__ = ["check_mesh_path", "needs_doubles", "write_mesh"]
+__all__ = ["check_mesh_path", "glb_origin", "needs_doubles", "write_mesh"]
 
 # float32 rounds a coordinate c by up to 6e-8 |c|. Up to this many scales from the origin that is less than a
 # hundredth of a cell at 2048³.
 FLOAT32_REACH = 128.0
 TEXT_ROWS = 1 << 16
-_GLTF_USHORT, _GLTF_UINT, _GLTF_FLOAT = 5123, 5125, 5126
 
 
 def check_mesh_path(path: str | Path, similarity: Similarity | None = None) -> Path:
@@ -141,49 +139,22 @@ def _write_stl(path: Path, mesh: Mesh, similarity: Similarity) -> None:
 
 
 def _write_glb(path: Path, mesh: Mesh, similarity: Similarity) -> None:
-    """GlTF 2.0 in one binary file: a JSON chunk that describes the arrays of a second, binary chunk."""
-    origin = np.asarray(similarity.center if needs_doubles(similarity) else (0.0, 0.0, 0.0))
-    positions = (similarity.to_input(mesh.vertices) - origin).astype("<f4")
-    arrays: list[tuple[NDArray[np.generic], int, str, dict[str, Any]]] = [
-        (mesh.faces.astype("<u4").reshape(-1), _GLTF_UINT, "SCALAR", {}),
-        (positions, _GLTF_FLOAT, "VEC3", {"min": positions.min(0).tolist(), "max": positions.max(0).tolist()}),
-    ]
-    attributes = {"POSITION": 1}
+    origin = glb_origin(similarity)
+    attributes: dict[str, NDArray[Any]] = {"POSITION": (similarity.to_input(mesh.vertices) - origin).astype("<f4")}
     if mesh.normals is not None:
-        attributes["NORMAL"] = len(arrays)
-        arrays.append((mesh.normals.astype("<f4"), _GLTF_FLOAT, "VEC3", {}))
+        attributes["NORMAL"] = mesh.normals.astype("<f4")
     if mesh.colors is not None:
-        attributes["COLOR_0"] = len(arrays)
         # COLOR_0 is linear by the standard; in 8 bits that would merge dark shades.
         opaque = np.full((len(mesh.colors), 4), 65535, "<u2")  # four channels keep rows aligned to four bytes
         opaque[:, :3] = np.rint(srgb_to_linear(np.clip(mesh.colors, 0, 1)) * 65535)
-        arrays.append((opaque, _GLTF_USHORT, "VEC4", {"normalized": True}))
-    starts = np.cumsum([0] + [array.nbytes for array, *_ in arrays]).tolist()
-    header = {
-        "asset": {"version": "2.0", "generator": "mplicits"},
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"name": "mesh", "mesh": 0, "translation": origin.tolist(), "extras": {"origin": origin.tolist()}}],
-        "meshes": [{"primitives": [{"attributes": attributes, "indices": 0, "material": 0}]}],
-        "materials": [{"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.8}}],
-        "buffers": [{"byteLength": starts[-1]}],
-        "bufferViews": [
-            {"buffer": 0, "byteOffset": start, "byteLength": array.nbytes, "target": 34962 if index else 34963}
-            for index, (start, (array, *_)) in enumerate(zip(starts, arrays, strict=False))
-        ],
-        "accessors": [
-            {"bufferView": index, "componentType": kind, "count": len(array), "type": shape, **more}
-            for index, (array, kind, shape, more) in enumerate(arrays)
-        ],
-    }
-    text = json.dumps(header, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % 4)
-    with path.open("wb") as file:
-        file.write(struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + starts[-1]))
-        file.write(struct.pack("<I4s", len(text), b"JSON") + text)
-        file.write(struct.pack("<I4s", starts[-1], b"BIN\0"))
-        for array, *_ in arrays:
-            file.write(np.ascontiguousarray(array).data)
+        attributes["COLOR_0"] = opaque
+    material = {"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.8}}
+    write_glb(path, mesh.faces, attributes, material=material, origin=origin)
+
+
+def glb_origin(similarity: Similarity) -> tuple[float, float, float]:
+    """What the positions of a GLB file are relative to: far away, the centre, so that float32 suffices for them."""
+    return similarity.center if needs_doubles(similarity) else (0.0, 0.0, 0.0)
 
 
 _WRITERS: dict[str, Callable[[Path, Mesh, Similarity], None]] = {

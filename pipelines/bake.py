@@ -1,0 +1,138 @@
+"""Bake colours and normals of a surface into images over the texture coordinates of a mesh."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
+
+from ..datasets.point_cloud import unit_rows
+from ..neural_fields import InputError, Similarity
+from ..neural_fields.meshing import Mesh
+from .raster import cover
+from .tangents import to_frame
+from .textured_files import check_textured_path, write_textured
+from .unwrap import Unwrapped, decimate, unwrap
+
+__all__ = ["Baked", "bake", "check_texture_size", "textured_mesh"]
+
+Float64 = NDArray[np.float64]
+Image = NDArray[np.uint8]
+Attribute = Callable[[Float64], NDArray[np.floating]]
+
+BATCH = 1 << 17  # points per call
+SIZES = (16, 16384)
+# A normal map holds normals of the front only: what is steeper, or turned away, is laid down to this height.
+LOWEST = 0.05
+
+
+class Baked(NamedTuple):
+    """Images ``(size, size, 3)`` uint8, first row on top.
+
+    Attributes:
+        color: display RGB; None if there are no colours.
+        normal: tangent-space normals n as ``255 (n + 1) / 2``, +y upwards as in glTF and OpenGL; None without normals.
+    """
+
+    color: Image | None
+    normal: Image | None
+
+
+def bake(mesh: Unwrapped, colors_at: Attribute | None, normals_at: Attribute | None, *, size: int = 2048) -> Baked:
+    """Ask for the colour and the normal at the point of the mesh under the centre of every texel.
+
+    Texels that no triangle covers get the value of the nearest one that is covered, so that filters and mip maps do
+    not bleed.
+
+    Args:
+        mesh: with texture coordinates.
+        colors_at: ``(N, 3)`` points in the mesh's coordinates → display colours ``(N, 3)`` in [0, 1].
+        normals_at: the same → normals ``(N, 3)``, of any length, outward.
+        size: texels along each side.
+
+    Raises:
+        ValueError: there is nothing to bake, or a texture so small that no triangle covers a texel.
+    """
+    if colors_at is None and normals_at is None:
+        raise ValueError("colors_at, normals_at: expected at least one")
+    color = None if colors_at is None else np.zeros((size * size, 3), np.uint8)
+    normal = None if normals_at is None else np.zeros((size * size, 3), np.uint8)
+    covered = np.zeros(size * size, bool)
+    # With rows first, the columns of the raster are texels in row-major order; texel 0 has its centre at half a texel.
+    place = np.stack((1 - mesh.uv[:, 1], mesh.uv[:, 0]), axis=1) * size - 0.5
+    for found in cover(place, mesh.faces, (size, size), chunk=BATCH):
+        for part in np.array_split(np.arange(len(found.face)), -(-len(found.face) // BATCH) or 1):
+            corners, weights, texel = mesh.faces[found.face[part]], found.weights[part], found.column[part]
+            points = _interpolated(mesh.vertices, corners, weights)
+            covered[texel] = True
+            if color is not None and colors_at is not None:
+                color[texel] = np.rint(np.clip(colors_at(points), 0, 1) * 255)
+            if normal is not None and normals_at is not None:
+                directions = unit_rows(np.asarray(normals_at(points)))
+                frame = (_interpolated(rows, corners, weights) for rows in (mesh.normals, mesh.tangents))
+                normal[texel] = _encoded(to_frame(directions, *frame))
+    if not covered.any():
+        raise ValueError(f"size: no triangle covers a texel at {size}; expected more texels")
+    nearest = distance_transform_edt(~covered.reshape(size, size), return_distances=False, return_indices=True)
+    rows, columns = np.asarray(nearest)
+    return Baked(*(None if i is None else i.reshape(size, size, 3)[rows, columns] for i in (color, normal)))
+
+
+def _interpolated(rows: Float64, corners: NDArray[np.int64], weights: Float64) -> Float64:
+    return np.einsum("nk,nkc->nc", weights, rows[corners])
+
+
+def _encoded(coordinates: Float64) -> Image:
+    """Tangent-space normals → bytes; one of no length becomes that of the mesh."""
+    upright = coordinates.copy()
+    upright[:, 2] = np.where(coordinates.any(axis=1), coordinates[:, 2].clip(min=LOWEST), 1.0)
+    return np.rint((unit_rows(upright) + 1) * 127.5).astype(np.uint8)
+
+
+def check_texture_size(size: int) -> None:
+    """Refuse textures that are tiny, or larger than graphics cards take.
+
+    Raises:
+        InputError: it is one.
+    """
+    if not SIZES[0] <= size <= SIZES[1]:
+        raise InputError(f"--texture {size}: expected {SIZES[0]} to {SIZES[1]} texels along each side, 2048 say")
+
+
+def textured_mesh(
+    path: str | Path,
+    mesh: Mesh,
+    similarity: Similarity,
+    colors_at: Attribute | None,
+    normals_at: Attribute | None,
+    *,
+    size: int = 2048,
+    faces: int = 50_000,
+) -> Unwrapped:
+    """Decimate, unwrap, bake, and write a textured GLB, or an OBJ with its MTL and PNG files.
+
+    Args:
+        path: the .glb or .obj file.
+        mesh: in unit-sphere coordinates.
+        similarity: from there to input coordinates.
+        colors_at: see `bake`; points are in unit-sphere coordinates, on the decimated mesh, near the surface.
+        normals_at: likewise.
+        size: texels along each side.
+        faces: triangles to keep.
+
+    Returns:
+        The mesh as written, in unit-sphere coordinates.
+
+    Raises:
+        InputError: the file cannot be written, the size is out of range, or ``mplicits[texture]`` is not installed.
+    """
+    path = check_textured_path(path, similarity)
+    check_texture_size(size)
+    unwrapped = unwrap(*decimate(mesh.vertices, mesh.faces, faces), size=size)
+    color, normal = bake(unwrapped, colors_at, normals_at, size=size)
+    write_textured(path, unwrapped, similarity, color=color, normal=normal)
+    return unwrapped
