@@ -246,7 +246,7 @@ def format_texture(rows: Sequence[TextureRow]) -> str:
                 f"{row.fit_seconds:.1f} s",
                 f"{row.texture_parameters:,}",
                 f"{row.texture_seconds:.1f} s",
-                *(f"{mse:.5f}{_times(row.paper, mse)}" for mse in errors),
+                *(f"{mse:.3g}{_times(row.paper, mse)}" for mse in errors),
                 "" if row.paper is None else f"{row.paper:.4f}",
                 f"{psnr(row.error.either):.1f} dB",
                 f"{psnr(row.error.both):.1f} dB",

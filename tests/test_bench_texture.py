@@ -225,7 +225,7 @@ def test_the_table_prints_the_papers_figures_beside_ours(bench):
     assert "0.0329" in text
     assert "0.00329 (10×)" in text
     assert "0.00823 (4.0×)" in text
-    assert "0.06580 (0.5×)" in text
+    assert "0.0658 (0.5×)" in text
     assert f"{psnr(0.0658):.1f} dB" in text
     assert len(text.splitlines()) == 2 + len(rows)
     unknown = format_texture([dataclasses.replace(rows[0], shape="teapot", paper=None)])
