@@ -85,6 +85,15 @@ def _mesh_arguments(parser: argparse.ArgumentParser) -> None:
         "--normal-level", type=whole(0), metavar="L", help="normals of this level on the mesh (default: of its own)"
     )
     parser.add_argument("--no-colors", action="store_true", help="leave out the colours of the run's texture")
+    parser.add_argument(
+        "--texture",
+        type=whole(16, 16384),
+        metavar="N",
+        help="unwrap, and bake colours and fine normals into N × N images (.glb, .obj; needs mplicits[texture])",
+    )
+    parser.add_argument(
+        "--texture-faces", type=whole(4), default=50_000, metavar="N", help="triangles to keep with --texture (50000)"
+    )
     parser.add_argument("--keep-largest", action="store_true", help="keep only the component of largest area")
     parser.add_argument(
         "--trim-distance",
@@ -104,6 +113,8 @@ def _mesh(arguments: argparse.Namespace) -> int:
         level=arguments.level,
         normal_level=arguments.normal_level,
         colors=not arguments.no_colors,
+        texture=arguments.texture,
+        texture_faces=arguments.texture_faces,
         keep_largest=arguments.keep_largest,
         trim_distance=arguments.trim_distance,
         cloud=arguments.cloud,

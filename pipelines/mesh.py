@@ -9,14 +9,17 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from ..datasets import read_cloud
-from ..neural_fields import InputError, load_field, map_colors
+from ..neural_fields import Field, InputError, Similarity, TextureField, load_field, map_colors
 from ..neural_fields.meshing import Mesh, NoSurfaceError, extract_mesh, map_normals
+from .bake import check_texture_size, textured_mesh
 from .mesh_files import check_mesh_path, write_mesh
 from .mesh_trim import keep_largest, trim_distance
 from .runs import find_field
 from .texture import texture_of
+from .textured_files import check_textured_path
 
 __all__ = ["MeshOptions", "mesh_run"]
 
@@ -30,6 +33,9 @@ class MeshOptions:
         level: counted from 0, the coarsest; None is the finest.
         normal_level: the level whose gradients are the normals (neural normal mapping); None is ``level``.
         colors: whether vertices get the colours of the run's texture, if it has one.
+        texture: unwrap the mesh and bake colours and the normals of the finest level into images of so many texels
+            along each side (.glb or .obj); None leaves the colours at the vertices.
+        texture_faces: triangles to keep of a mesh that is unwrapped.
         keep_largest: whether to keep only the component of largest area.
         trim_distance: drop faces further than this from the points, in input units.
         cloud: the points for that; by default the file that was fitted.
@@ -39,6 +45,8 @@ class MeshOptions:
     level: int | None = None
     normal_level: int | None = None
     colors: bool = True
+    texture: int | None = None
+    texture_faces: int = 50_000
     keep_largest: bool = False
     trim_distance: float | None = None
     cloud: str | Path | None = None
@@ -59,10 +67,13 @@ def mesh_run(run: str | Path, out: str | Path, options: MeshOptions | None = Non
         InputError: there is no such run or level, it has no surface, or the file cannot be written.
     """
     options = options or MeshOptions()
-    check_mesh_path(out)
+    check = check_mesh_path if options.texture is None else check_textured_path
+    check(out)
+    if options.texture is not None:
+        check_texture_size(options.texture)
     file = find_field(run)
     field, similarity, metadata = load_field(file)
-    check_mesh_path(out, similarity)  # again: not every format can hold every place
+    check(out, similarity)  # again: not every format can hold every place
     level = field.num_levels - 1 if options.level is None else options.level
     normal_level = level if options.normal_level is None else options.normal_level
     for flag, number in (("--level", level), ("--normal-level", normal_level)):
@@ -83,11 +94,44 @@ def mesh_run(run: str | Path, out: str | Path, options: MeshOptions | None = Non
     if options.keep_largest:
         mesh = keep_largest(mesh)
     texture = texture_of(file, field) if options.colors else None
+    if options.texture is not None:
+        _write_textured(out, mesh, field, texture, similarity, options, options.texture)
+        return mesh
     if texture is not None:
-        colors = map_colors(texture, torch.from_numpy(mesh.vertices).float()).values
-        mesh = dataclasses.replace(mesh, colors=colors.numpy())
+        mesh = dataclasses.replace(mesh, colors=_colors(texture, mesh.vertices))
     write_mesh(out, mesh, similarity)
     return mesh
+
+
+def _colors(texture: TextureField, points: NDArray[np.float64]) -> NDArray[np.float32]:
+    return map_colors(texture, torch.from_numpy(points).float()).values.numpy()
+
+
+def _write_textured(
+    out: str | Path,
+    mesh: Mesh,
+    field: Field,
+    texture: TextureField | None,
+    similarity: Similarity,
+    options: MeshOptions,
+    size: int,
+) -> None:
+    """Bake the colours, if there are any, and the normals of the finest level, or of the one that was asked for."""
+    level = -1 if options.normal_level is None else options.normal_level
+
+    @torch.no_grad()
+    def normals_at(points: NDArray[np.float64]) -> NDArray[np.float32]:
+        return field.jet(torch.from_numpy(points).float(), level=level).gradient.numpy()
+
+    textured_mesh(
+        out,
+        mesh,
+        similarity,
+        None if texture is None else lambda points: _colors(texture, points),
+        normals_at,
+        size=size,
+        faces=options.texture_faces,
+    )
 
 
 def _fitted_cloud(file: Path, metadata: dict[str, Any]) -> Path:

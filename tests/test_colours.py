@@ -4,7 +4,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
-from mplicits.datasets import look_at
+from mplicits.datasets import look_at, read_textured, sample_textured
 from mplicits.neural_fields import ColorSiren, MultiscaleSDF, Siren, TextureField, load_field, save_field, save_texture
 from mplicits.pipelines.cli import main
 from mplicits.pipelines.render import trace_view
@@ -77,3 +77,16 @@ def test_render_shows_colours_and_the_viewer_offers_them(run, tmp_path):
     from mplicits.pipelines.viewer import open_run
 
     assert "color" in open_run(directory).shadings
+
+
+def test_a_baked_mesh_has_the_colours_of_the_texture(run, tmp_path):
+    pytest.importorskip("xatlas")
+    directory, texture = run
+    out = tmp_path / "baked.glb"
+    arguments = ["mesh", str(directory), "-o", str(out), "--resolution", "24", "--texture", "256"]
+    assert main([*arguments, "--texture-faces", "600"]) == 0
+    cloud = sample_textured(read_textured(out), 2000, seed=0)
+    expected = texture.colors(torch.from_numpy(cloud.points).float()).numpy()
+    assert float(np.abs(cloud.colors - expected).mean()) < 0.01
+    assert main(["mesh", str(directory), "-o", str(tmp_path / "baked.ply"), "--texture", "256"]) == 2
+    assert not (tmp_path / "baked.ply").exists()
