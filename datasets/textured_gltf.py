@@ -236,6 +236,8 @@ def _paint(scene: _Scene, material: dict[str, Any]) -> Paint:
     """The base colour of a material: its texture (display) times its factor (linear)."""
     factor = np.array(material.get("baseColorFactor", (1, 1, 1, 1))[:3], np.float32)
     info = material.get("baseColorTexture")
+    if info is None and (factor == 1).all():
+        return Paint(np.ones((1, 1, 3), np.float32))  # exactly, so that it is known for what it is
     if info is None:
         return Paint(linear_to_srgb(factor.reshape(1, 1, 3)))
     texture = scene.header["textures"][info["index"]]

@@ -182,8 +182,8 @@ def decode_image(data: bytes) -> Float32:
         rgb = np.asarray(found)[..., ::-1]
     else:
         try:
-            rgb = iio.imread(data, mode="RGB")
-        except Exception as error:  # imageio's plugins raise whatever they trip over
+            rgb = iio.imread(data, plugin="pillow", mode="RGB")
+        except Exception as error:  # Pillow's readers raise whatever they trip over
             raise ValueError("not an image that can be read") from error
     return np.ascontiguousarray(colors_from(rgb) if rgb.dtype == np.uint8 else _unit(rgb), np.float32)
 

@@ -72,9 +72,9 @@ def decimate(vertices: Float64, faces: NDArray[np.integer], count: int) -> tuple
     import fast_simplification
 
     middle, size = _box(vertices)
-    points, left = fast_simplification.simplify((vertices - middle) / size, faces.astype(np.int32), target_count=count)[
-        :2
-    ]
+    unit = (vertices - middle) / size
+    collapsed = fast_simplification.simplify(unit, faces.astype(np.int32), target_count=count, agg=AGGRESSION)
+    points, left = collapsed[0], collapsed[1]
     corners = points[left]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     used, index = np.unique(left[area > 0], return_inverse=True)

@@ -253,6 +253,7 @@ def test_obj_comes_with_its_files(tmp_path):
     library = (tmp_path / "ball.mtl").read_text()
     assert "map_Kd ball_color.png" in library
     assert "norm ball_normal.png" in library
+    assert "map_Bump ball_normal.png" in library
     # Nothing but normals: no colour is claimed.
     textured_mesh(tmp_path / "bare.obj", Mesh(vertices, faces.astype(np.int32)), UTM, None, bumpy, size=64)
     assert "map_Kd" not in (tmp_path / "bare.mtl").read_text()

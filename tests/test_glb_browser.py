@@ -1,0 +1,221 @@
+"""Textured meshes in a real browser with three.js; skipped where there is no Chromium, or no npm to fetch three.js.
+
+An orthographic camera looks down −z at a sphere, so that every pixel of the picture has its point on the sphere.
+"""
+
+import functools
+import http.server
+import io
+import shutil
+import subprocess
+import threading
+import time
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+import trimesh
+from mplicits.neural_fields import Similarity
+from mplicits.neural_fields.meshing import Mesh
+from mplicits.pipelines.bake import textured_mesh
+from mplicits.pipelines.mesh_files import write_mesh
+
+pytest.importorskip("xatlas", reason="the extra mplicits[texture] is not installed")
+pytest.importorskip("selenium")
+
+from selenium import webdriver
+
+THREE = "three@0.180.0"
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+CHROMEDRIVER = shutil.which("chromedriver")
+FLAGS = (
+    "--headless=new",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--use-gl=angle",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--force-device-scale-factor=1",
+    "--window-size=800,800",
+)
+PATIENCE = 60.0
+SIDE = 400  # pixels
+RADIUS = 0.8  # of the sphere, in units of its similarity
+UTM = Similarity((512_345.678, 5_403_210.987, 312.5), 40.0)
+NEAR = Similarity((10.0, -20.0, 30.0), 2.0)  # OBJ has no node to be placed by, and three.js reads it into float32
+
+PAGE = """<!doctype html><html><head><link rel="icon" href="data:,">
+<style>body { margin: 0 } canvas { display: block }</style>
+<script type="importmap">{"imports": {
+  "three": "/node_modules/three/build/three.module.js", "three/addons/": "/node_modules/three/examples/jsm/"
+}}</script></head><body><script type="module">
+import * as THREE from 'three';
+import { GLTFLoader } from 'three/addons/loaders/GLTFLoader.js';
+import { MTLLoader } from 'three/addons/loaders/MTLLoader.js';
+import { OBJLoader } from 'three/addons/loaders/OBJLoader.js';
+
+const wanted = new URLSearchParams(location.search);
+const [file, mode] = ['file', 'mode'].map((name) => wanted.get(name));
+const [x, y, z, half] = ['x', 'y', 'z', 'half'].map((name) => Number(wanted.get(name)));
+const renderer = new THREE.WebGLRenderer({ antialias: mode === 'lit', preserveDrawingBuffer: true });
+renderer.setSize(SIDE, SIDE);
+renderer.setClearColor(mode === 'lit' ? 0xffffff : 0x000000);
+document.body.append(renderer.domElement);
+
+async function load() {
+  if (!file.endsWith('.obj')) return (await new GLTFLoader().loadAsync(file)).scene;
+  const materials = await new MTLLoader().loadAsync(file.replace('.obj', '.mtl'));
+  return new OBJLoader().setMaterials(materials).loadAsync(file);
+}
+
+const scene = new THREE.Scene();
+const loaded = await load();
+const maps = [];
+loaded.traverse((node) => { if (node.isMesh && node.material.map) maps.push(node.material.map); });
+while (maps.some((map) => !map.image?.width)) await new Promise((resolve) => setTimeout(resolve, 20));  // of the OBJ
+loaded.traverse((node) => {
+  if (!node.isMesh) return;
+  const { map, normalMap, normalScale } = node.material;
+  if (mode === 'color') node.material = new THREE.MeshBasicMaterial({ map });
+  if (mode === 'vertices') node.material = new THREE.MeshBasicMaterial({ vertexColors: true });
+  if (mode === 'normal') node.material = new THREE.MeshNormalMaterial({ normalMap, normalScale });
+  if (mode === 'derived') {  // what GLTFLoader does with a file without tangents
+    node.geometry.deleteAttribute('tangent');
+    node.material = new THREE.MeshNormalMaterial({ normalMap, normalScale: new THREE.Vector2(1, -1) });
+  }
+});
+scene.add(loaded);
+const camera = new THREE.OrthographicCamera(-half, half, half, -half, 0.01 * half, 4 * half);
+camera.position.set(x, y, z + 2 * half);
+if (mode === 'lit') {
+  const sun = new THREE.DirectionalLight(0xffffff, 2.5);
+  sun.position.copy(camera.position).add(new THREE.Vector3(-half, 1.5 * half, half));
+  sun.target.position.set(x, y, z);
+  scene.add(sun, sun.target, new THREE.HemisphereLight(0xffffff, 0x888888, 1.2));
+  camera.position.set(x + 0.9 * half, y + 0.5 * half, z + 1.8 * half);
+  camera.lookAt(x, y, z);
+}
+renderer.render(scene, camera);
+document.title = 'drawn';
+</script></body></html>"""
+
+
+def painting(points):
+    """Colours that change smoothly with position; no two channels alike, and dark ones among them."""
+    return 0.5 + 0.45 * np.sin(np.stack((3 * points[:, 0], 4 * points[:, 1] + 1, 5 * points[:, 2] + 2), axis=1))
+
+
+def bumpy(points):
+    """Normals of the sphere, tilted by up to a third."""
+    normals = points / np.linalg.norm(points, axis=1, keepdims=True) + 0.3 * np.sin(5 * points[:, [1, 2, 0]])
+    return normals / np.linalg.norm(normals, axis=1, keepdims=True)
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    """A folder with three.js and baked spheres, served at an address of this machine."""
+    if CHROMIUM is None or CHROMEDRIVER is None:
+        pytest.skip("no chromium and chromedriver on this machine")
+    npm = shutil.which("npm")
+    if npm is None:
+        pytest.skip("no npm on this machine to fetch three.js with")
+    folder = tmp_path_factory.mktemp("site")
+    flags = ("--no-save", "--ignore-scripts", "--no-audit", "--no-fund", "--prefer-offline", "--fetch-retries=0")
+    try:
+        fetched = subprocess.run(
+            [npm, "install", "--prefix", str(folder), *flags, THREE], capture_output=True, timeout=60, check=False
+        )
+    except subprocess.TimeoutExpired:
+        pytest.skip(f"{THREE} is not to be had from npm: no answer")
+    if fetched.returncode:
+        pytest.skip(f"{THREE} is not to be had from npm: {fetched.stderr[-200:].decode(errors='replace')}")
+    (folder / "index.html").write_text(PAGE.replace("SIDE", str(SIDE)))
+    ball = trimesh.creation.icosphere(3, radius=RADIUS)
+    mesh = Mesh(np.asarray(ball.vertices), np.asarray(ball.faces, np.int32))
+    for name, similarity in (("baked.glb", UTM), ("baked.obj", NEAR)):
+        textured_mesh(folder / name, mesh, similarity, painting, bumpy, size=512)
+    fine = trimesh.creation.icosphere(5, radius=RADIUS)
+    vertices = np.asarray(fine.vertices)
+    colored = Mesh(vertices, np.asarray(fine.faces, np.int32), None, painting(vertices).astype(np.float32))
+    write_mesh(folder / "colored.glb", colored, UTM)
+
+    class Quiet(http.server.SimpleHTTPRequestHandler):
+        def log_message(self, *_):
+            pass
+
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Quiet, directory=str(folder))) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        yield f"http://127.0.0.1:{server.server_address[1]}"
+        server.shutdown()
+        thread.join()
+
+
+@pytest.fixture(scope="module")
+def browser(site, tmp_path_factory):
+    options = webdriver.ChromeOptions()
+    options.binary_location = CHROMIUM
+    for flag in (*FLAGS, f"--user-data-dir={tmp_path_factory.mktemp('chromium')}"):
+        options.add_argument(flag)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    driver = webdriver.Chrome(options=options, service=webdriver.ChromeService(CHROMEDRIVER))
+    yield driver
+    driver.quit()
+
+
+def drawn(browser, site, file, mode, similarity=UTM):
+    """The picture ``(SIDE, SIDE, 3)`` uint8 that three.js draws of ``file``."""
+    x, y, z = similarity.center
+    browser.get(f"{site}/index.html?file={file}&mode={mode}&x={x}&y={y}&z={z}&half={similarity.scale}")
+    deadline = time.monotonic() + PATIENCE
+    while browser.title != "drawn":
+        complaints = [entry["message"] for entry in browser.get_log("browser") if entry["level"] == "SEVERE"]
+        assert not complaints
+        assert time.monotonic() < deadline, "waited in vain"
+        time.sleep(0.05)
+    assert not [entry["message"] for entry in browser.get_log("browser") if entry["level"] == "SEVERE"]
+    return iio.imread(io.BytesIO(browser.get_screenshot_as_png()))[:SIDE, :SIDE, :3]
+
+
+def sphere_points():
+    """Pixels well inside the disc of the sphere, and their points on it."""
+    x = (np.arange(SIDE) + 0.5) / SIDE * 2 - 1
+    x, y = np.meshgrid(x, -x)
+    inside = x**2 + y**2 < (0.9 * RADIUS) ** 2
+    x, y = x[inside], y[inside]
+    return inside, np.stack((x, y, np.sqrt(RADIUS**2 - x**2 - y**2)), axis=1)
+
+
+@pytest.mark.parametrize(
+    ("file", "mode", "similarity"),
+    [("baked.glb", "color", UTM), ("baked.obj", "color", NEAR), ("colored.glb", "vertices", UTM)],
+)
+def test_colours_on_the_screen_are_those_baked(browser, site, file, mode, similarity):
+    image = drawn(browser, site, file, mode, similarity)
+    inside, points = sphere_points()
+    expected = painting(points)
+    assert np.abs(image[inside] / 255 - expected).mean() < 0.01
+    left = points[:, 0] < 0
+    for half in (left, ~left):
+        np.testing.assert_allclose(image[inside][half].mean(axis=0) / 255, expected[half].mean(axis=0), atol=0.005)
+    assert np.abs(expected[left].mean(axis=0) - expected[~left].mean(axis=0)).max() > 0.1
+    assert (image[:10] == 0).all()  # nothing beside the sphere
+
+
+@pytest.mark.parametrize("mode", ["normal", "derived"])
+def test_normals_on_the_screen_are_those_baked(browser, site, mode):
+    """With the tangents of the file, and with those that three.js derives on the screen."""
+    image = drawn(browser, site, "baked.glb", mode)
+    inside, points = sphere_points()
+    found = image[inside] / 127.5 - 1
+    cosine = (found * bumpy(points)).sum(axis=1) / np.linalg.norm(found, axis=1)
+    angle = np.degrees(np.arccos(cosine.clip(-1, 1)))
+    assert np.median(angle) < 1.5
+    assert np.percentile(angle, 95) < 4
+    bare = points / RADIUS
+    assert np.degrees(np.arccos((bumpy(points) * bare).sum(axis=1).clip(-1, 1))).mean() > 10

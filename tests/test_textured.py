@@ -1,0 +1,466 @@
+import base64
+import json
+import struct
+
+import cv2
+import imageio.v3 as iio
+import numpy as np
+import pytest
+import torch
+from mplicits.datasets import (
+    PointCloud,
+    TexturedMesh,
+    colors_at,
+    linear_to_srgb,
+    read_textured,
+    sample_textured,
+    srgb_to_linear,
+    write_cloud_ply,
+)
+from mplicits.datasets.textured_mesh import Paint, decode_image, lookup, pack
+from mplicits.neural_fields import InputError
+from mplicits.neural_fields.meshing import Mesh
+from mplicits.pipelines.mesh_files import write_mesh
+from mplicits.pipelines.surface import read_surface
+
+# A unit square in z = 0 of two triangles, corners counter-clockwise from the origin; u = x and v = y.
+SQUARE = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)], np.float64)
+FACES = np.array([(0, 1, 2), (0, 2, 3)])
+UV = SQUARE[FACES][..., :2]
+RED, GREEN, BLUE, WHITE = (1.0, 0, 0), (0, 1.0, 0), (0, 0, 1.0), (1.0, 1.0, 1.0)
+# 2 × 2 texels as one sees them: red and green above, blue and white below.
+QUARTERS = np.array([[RED, GREEN], [BLUE, WHITE]], np.float32)
+
+
+def write_png(path, image):
+    iio.imwrite(path, np.rint(np.asarray(image) * 255).astype(np.uint8))
+
+
+def at(mesh, x, y):
+    """Colours of points of the square."""
+    x, y = np.atleast_1d(x).astype(float), np.atleast_1d(y).astype(float)
+    lower = y <= x
+    face = np.where(lower, 0, 1)
+    weights = np.where(lower[:, None], np.stack((1 - x, x - y, y), 1), np.stack((1 - y, x, y - x), 1))
+    return colors_at(mesh, face, weights)
+
+
+# Colour space
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64, torch.float32, torch.float64])
+def test_color_space_has_its_known_values(kind):
+    display = [0.0, 0.04045, 0.5, 188 / 255, 1.0]
+    linear = [0.0, 0.0031308, 0.21404114, 0.50288646, 1.0]
+    make = torch.tensor if isinstance(kind, torch.dtype) else np.array
+    x, y = make(display, dtype=kind), make(linear, dtype=kind)
+    np.testing.assert_allclose(srgb_to_linear(x), y, atol=2e-7)
+    np.testing.assert_allclose(linear_to_srgb(y), x, atol=1e-6)
+    assert srgb_to_linear(x).dtype == linear_to_srgb(x).dtype == kind
+
+
+def test_color_space_goes_there_and_back_and_has_gradients():
+    x = np.linspace(0, 1, 1001)
+    np.testing.assert_allclose(linear_to_srgb(srgb_to_linear(x)), x, atol=1e-7)
+    for curve in (srgb_to_linear, linear_to_srgb):
+        t = torch.tensor([0.0, 0.001, 0.3, 1.0], dtype=torch.float64, requires_grad=True)
+        assert torch.autograd.gradcheck(curve, t[1:])
+        (gradient,) = torch.autograd.grad(curve(t).sum(), t)
+        assert torch.isfinite(gradient).all()
+
+
+# Lookup
+
+
+def test_centres_of_texels_are_half_a_texel_in():
+    mesh = TexturedMesh(SQUARE, FACES, UV, QUARTERS)
+    found = at(mesh, [0.25, 0.75, 0.25, 0.75], [0.75, 0.75, 0.25, 0.25])
+    np.testing.assert_allclose(found, [RED, GREEN, BLUE, WHITE], atol=1e-6)
+    # Between two centres there is half the light of each; beyond the border the image repeats.
+    half = linear_to_srgb(np.array(0.5))
+    np.testing.assert_allclose(at(mesh, 0.5, 0.75), [(half, half, 0)], atol=1e-6)
+    np.testing.assert_allclose(at(mesh, 0.0, 0.75), [(half, half, 0)], atol=1e-6)
+    np.testing.assert_allclose(at(mesh, 0.25, 1.0), [(half, 0, half)], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("wrap", "u", "expected"),
+    [
+        ("repeat", 1.25, RED),
+        ("repeat", -0.25, GREEN),
+        ("repeat", 7.75, GREEN),
+        ("clamp", 1.25, GREEN),
+        ("clamp", -3.0, RED),
+        ("mirror", 1.25, GREEN),
+        ("mirror", -0.25, RED),
+        ("mirror", 2.25, RED),
+    ],
+)
+def test_images_go_on_beyond_their_sides(wrap, u, expected):
+    other = Paint(np.full((3, 5, 3), 0.5, np.float32))
+    image, parts = pack([other, Paint(QUARTERS, (wrap, "repeat"))], np.array([1]))
+    light = lookup(image, np.array([(u, 0.75), (u, -0.25)]), parts, np.array([1, 1]))
+    np.testing.assert_allclose(light, [expected, expected], atol=1e-6)
+
+
+def test_lookup_is_bilinear_in_light():
+    rng = np.random.default_rng(0)
+    image = rng.uniform(size=(7, 5, 3)).astype(np.float32)
+    uv = rng.uniform(0.2, 0.8, (100, 2))
+    column, row = uv[:, 0] * 5 - 0.5, (1 - uv[:, 1]) * 7 - 0.5
+    place = np.stack((column, row), axis=1).astype(np.float32)
+    light = srgb_to_linear(image)
+    exact = cv2.remap(light, place[None, :, 0], place[None, :, 1], cv2.INTER_LINEAR)[0]
+    np.testing.assert_allclose(lookup(image, uv), exact, atol=0.02)  # OpenCV keeps 5 bits of the shares
+    j, i = np.floor(column).astype(int), np.floor(row).astype(int)
+    a, b = (column - j)[:, None], (row - i)[:, None]
+    above, below = (light[i + k, j] * (1 - a) + light[i + k, j + 1] * a for k in (0, 1))
+    np.testing.assert_allclose(lookup(image, uv), above * (1 - b) + below * b, atol=1e-6)
+
+
+def test_vertex_colours_are_interpolated_in_light_and_multiply_the_image():
+    shades = np.array([RED, RED, WHITE, WHITE], np.float32)
+    plain = TexturedMesh(SQUARE, FACES, None, None, shades)
+    half = linear_to_srgb(np.array(0.5))
+    np.testing.assert_allclose(at(plain, 0.5, 0.5), [(1, half, half)], atol=1e-6)
+    both = TexturedMesh(SQUARE, FACES, UV, np.full((1, 1, 3), half, np.float32), shades)
+    np.testing.assert_allclose(at(both, 0.5, 0.0), [(half, 0, 0)], atol=1e-6)
+
+
+# OBJ
+
+
+def write_obj(folder, *, mtl="newmtl paint\nmap_Kd paint.png\n", faces="f 1/1 2/2 3/3 4/4", head="mtllib square.mtl\n"):
+    if mtl is not None:
+        (folder / "square.mtl").write_text(mtl)
+    vertices = "".join(f"v {x:g} {y:g} {z:g}\n" for x, y, z in SQUARE)
+    coordinates = "".join(f"vt {x:g} {y:g}\n" for x, y, _ in SQUARE)
+    (folder / "square.obj").write_text(f"{head}{vertices}{coordinates}usemtl paint\n{faces}\n")
+    return folder / "square.obj"
+
+
+@pytest.mark.parametrize("faces", ["f 1/1 2/2 3/3 4/4", "f -4/-4 -3/-3 -2/-2\nf 1/1/ 3/3 4/4", "f 3/3 4/4 1/1 2/2"])
+def test_obj_with_an_image(tmp_path, faces):
+    write_png(tmp_path / "paint.png", QUARTERS)
+    mesh = read_textured(write_obj(tmp_path, faces=faces))
+    assert mesh.vertices.shape == (4, 3)
+    np.testing.assert_array_equal(mesh.image, QUARTERS)
+    # u = x and v = y everywhere on the square, whichever way it is cut.
+    np.testing.assert_allclose(mesh.uv, mesh.vertices[mesh.faces][..., :2])
+    cloud = sample_textured(mesh, 2000, seed=0)
+    expected = linear_to_srgb(lookup(QUARTERS, cloud.points[:, :2]).clip(0, 1))
+    np.testing.assert_allclose(cloud.colors, expected, atol=1e-5)
+
+
+def test_obj_seams_keep_both_sides(tmp_path):
+    # The two triangles share an edge, but not its texture coordinates.
+    write_png(tmp_path / "paint.png", QUARTERS)
+    path = write_obj(tmp_path, faces="vt 0.25 0.25\nf 1/1 2/2 3/3\nf 1/5 3/5 4/5")
+    mesh = read_textured(path)
+    assert len(mesh.vertices) == 4
+    np.testing.assert_allclose(at(mesh, [0.75, 0.25], [0.25, 0.75]), [WHITE, BLUE], atol=1e-6)
+
+
+def test_obj_with_several_materials(tmp_path):
+    (tmp_path / "maps").mkdir()
+    write_png(tmp_path / "maps" / "some paint.png", QUARTERS)
+    mtl = (
+        "# two\nnewmtl plain\nKd 0.25 0.5 0.75\r\nillum 1\n\nnewmtl paint\nKd 0.1 0.1 0.1\n"
+        "map_Kd -clamp on -s 2 2 1 -o 0.5 C:\\old\\maps\\some paint.png\n"
+    )
+    with pytest.raises(InputError, match=r"square\.mtl: paint: map_Kd: .*some paint\.png is not there"):
+        read_textured(write_obj(tmp_path, mtl=mtl))
+    mtl = mtl.replace("C:\\old\\", "")
+    faces = "f 1/1 2/2 3/3\nusemtl plain\nf 1 3 4\nusemtl paint"
+    mesh = read_textured(write_obj(tmp_path, mtl=mtl, faces=faces))
+    np.testing.assert_allclose(at(mesh, 0.1, 0.9), [(0.25, 0.5, 0.75)], atol=1e-6)
+    # u = 2 · 0.9 + 0.5 and v = 2 · 0.05, clamped: the lower right texel.
+    np.testing.assert_allclose(at(mesh, 0.9, 0.05), [WHITE], atol=1e-6)
+
+
+def test_obj_faces_before_any_material_are_white(tmp_path):
+    mesh = read_textured(write_obj(tmp_path, mtl="newmtl paint\nKd 1 0 0\n", faces="f 1 2 3"))
+    np.testing.assert_allclose(at(mesh, 0.5, 0.1), [RED], atol=1e-6)
+    path = tmp_path / "square.obj"
+    path.write_text(path.read_text().replace("usemtl paint\n", "") + "usemtl paint\nf 1 3 4\n")
+    mesh = read_textured(path)
+    np.testing.assert_allclose(at(mesh, [0.5, 0.5], [0.1, 0.9]), [WHITE, RED], atol=1e-6)
+
+
+def test_obj_with_vertex_colours(tmp_path):
+    path = tmp_path / "shades.obj"
+    table = np.concatenate((SQUARE, (RED, GREEN, BLUE, WHITE)), axis=1)
+    path.write_text("".join("v " + " ".join(map(str, row)) + "\n" for row in table.tolist()) + "f 1 2 3 4\n")
+    mesh = read_textured(path)
+    assert mesh.image is None
+    np.testing.assert_array_equal(mesh.vertex_colors, [RED, GREEN, BLUE, WHITE])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"mtl": None}, r"square\.obj: mtllib: .*square\.mtl is not there; put the MTL file beside the OBJ file"),
+        ({"mtl": "newmtl paint\nmap_Kd gone.png\n"}, r"square\.mtl: paint: map_Kd: .*gone\.png is not there"),
+        ({"mtl": "newmtl paint\nmap_Kd square.obj\n"}, r"square\.obj: not an image that can be read; save it as PNG"),
+        ({"mtl": "newmtl paint\nKd red\n"}, r"square\.mtl: paint: Kd: expected three numbers, not 'red'"),
+        ({"mtl": "newmtl other\nKd 1 0 0\n"}, r"square\.obj: usemtl: no material 'paint' in its MTL file"),
+        ({"faces": "f 1/1 2/2 3"}, r"square\.obj: f: a corner of a textured face has no vt index"),
+        ({"faces": "f 1/1 2/2 3/9"}, r"square\.obj: f: names a vt beyond the 4 there are"),
+        ({"faces": "f 1/1 2/2 9/3"}, r"square\.obj: f: names a v beyond the 4 there are"),
+        ({"faces": ""}, r"square\.obj: f: no faces in it"),
+        ({"head": ""}, r"square\.obj: neither a texture nor vertex colours in it; export it with its colours"),
+    ],
+)
+def test_bad_obj_is_one_line(tmp_path, change, message):
+    write_png(tmp_path / "paint.png", QUARTERS)
+    with pytest.raises(InputError, match=message) as error:
+        read_textured(write_obj(tmp_path, **change))
+    assert "\n" not in str(error.value)
+
+
+# GLB and glTF
+
+
+def gltf(*, image=None, factor=None, colors=None, node=None, sampler=None, transform=None, indices=FACES, mode=4):
+    """The square in glTF, its buffer within; every triangle has vertices of its own, as at seams."""
+    corners = SQUARE[FACES].reshape(-1, 3)
+    uv = UV.reshape(-1, 2) * (1, -1) + (0, 1)  # v runs down
+    arrays = [corners.astype("<f4"), uv.astype("<f4")]
+    arrays.append(np.arange(6, dtype="<u2") if indices is FACES else np.asarray(indices, "<u2"))
+    attributes = {"POSITION": 0, "TEXCOORD_0": 1}
+    if colors is not None:
+        attributes["COLOR_0"] = 3
+        arrays.append(np.asarray(colors))
+    blobs = [array.tobytes() for array in arrays]
+    material = {}
+    if factor is not None:
+        material["baseColorFactor"] = [*factor, 1.0]
+    if image is not None:
+        material["baseColorTexture"] = {"index": 0} | (
+            {"extensions": {"KHR_texture_transform": transform}} if transform else {}
+        )
+        blobs.append(iio.imwrite("<bytes>", np.rint(image * 255).astype(np.uint8), extension=".png"))
+    starts = np.cumsum([0, *((len(blob) + 3) // 4 * 4 for blob in blobs)]).tolist()
+    body = b"".join(blob + bytes(-len(blob) % 4) for blob in blobs)
+    kinds = {"<f4": 5126, "<u2": 5123, "|u1": 5121}
+    accessors = [
+        {
+            "bufferView": k,
+            "componentType": kinds[array.dtype.str],
+            "count": len(array),
+            "type": {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}[array.shape[1] if array.ndim == 2 else 1],
+            "normalized": k == 3 and array.dtype != np.float32,
+        }
+        for k, array in enumerate(arrays)
+    ]
+    header = {
+        "asset": {"version": "2.0"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [node or {"mesh": 0}, {"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": attributes, "indices": 2, "material": 0, "mode": mode}]}],
+        "materials": [{"pbrMetallicRoughness": material}],
+        "accessors": accessors,
+        "buffers": [{"byteLength": len(body)}],
+        "bufferViews": [
+            {"buffer": 0, "byteOffset": start, "byteLength": len(blob)}
+            for start, blob in zip(starts, blobs, strict=False)
+        ],
+        "textures": [{"source": 0} | ({"sampler": 0} if sampler else {})],
+        "samplers": [sampler] if sampler else [],
+        "images": [{"bufferView": len(blobs) - 1}],
+    }
+    return header, body
+
+
+def write_gltf(path, header, body):
+    if path.suffix == ".gltf":
+        header["buffers"][0]["uri"] = "data:application/octet-stream;base64," + base64.b64encode(body).decode()
+        path.write_text(json.dumps(header))
+        return path
+    text = json.dumps(header).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(body), b"BIN\0") + body
+    path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
+    return path
+
+
+@pytest.mark.parametrize("suffix", [".glb", ".gltf"])
+def test_gltf_with_an_image(tmp_path, suffix):
+    mesh = read_textured(write_gltf(tmp_path / f"square{suffix}", *gltf(image=QUARTERS)))
+    assert len(mesh.vertices) == 4  # six in the file
+    found = at(mesh, [0.25, 0.75, 0.25, 0.75], [0.75, 0.75, 0.25, 0.25])
+    np.testing.assert_allclose(found, [RED, GREEN, BLUE, WHITE], atol=1e-6)
+
+
+def test_gltf_factor_is_light(tmp_path):
+    grey = np.full((2, 2, 3), 188 / 255, np.float32)
+    mesh = read_textured(write_gltf(tmp_path / "square.glb", *gltf(image=grey, factor=(1.0, 0.5, 0.25))))
+    light = np.array([1, 0.5, 0.25]) * srgb_to_linear(np.array(188 / 255))
+    np.testing.assert_allclose(at(mesh, 0.5, 0.5), [linear_to_srgb(light)], atol=1e-6)
+    mesh = read_textured(write_gltf(tmp_path / "square.glb", *gltf(factor=(1.0, 0.5, 0.25))))
+    np.testing.assert_allclose(at(mesh, 0.5, 0.5), [linear_to_srgb(np.array([1, 0.5, 0.25]))], atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["<f4", "<u2", "u1"])
+def test_gltf_vertex_colours_are_light(tmp_path, kind):
+    light = np.array([(1, 0.5, 0.2, 1)] * 6)
+    stored = light.astype(kind) if kind == "<f4" else np.rint(light * np.iinfo(kind).max).astype(kind)
+    mesh = read_textured(write_gltf(tmp_path / "square.glb", *gltf(colors=stored)))
+    assert mesh.image is None
+    assert len(mesh.vertices) == 4
+    np.testing.assert_allclose(mesh.vertex_colors, [linear_to_srgb(light[0, :3])] * 4, atol=1 / 255)
+    factor = read_textured(write_gltf(tmp_path / "square.glb", *gltf(colors=stored, factor=(0.5, 1.0, 1.0))))
+    np.testing.assert_allclose(at(factor, 0.5, 0.5), [linear_to_srgb(light[0, :3] * (0.5, 1, 1))], atol=1 / 255)
+
+
+def test_gltf_hard_edges_of_vertex_colours_stay(tmp_path):
+    colors = np.array([RED] * 3 + [BLUE] * 3, "<f4")
+    mesh = read_textured(write_gltf(tmp_path / "square.glb", *gltf(colors=colors)))
+    cloud = sample_textured(mesh, 1000, seed=0)
+    np.testing.assert_allclose(
+        cloud.colors, np.where(cloud.points[:, [1]] < cloud.points[:, [0]], RED, BLUE), atol=1e-6
+    )
+
+
+def test_gltf_nodes_place_and_mirror(tmp_path):
+    quarter = [0, 0, np.sqrt(0.5), np.sqrt(0.5)]  # about z
+    turned = {"children": [1], "translation": [1e6, 0, 0], "rotation": quarter, "scale": [2, 2, 2]}
+    mesh = read_textured(write_gltf(tmp_path / "square.glb", *gltf(image=QUARTERS, node=turned)))
+    np.testing.assert_allclose(mesh.vertices[mesh.faces].min(axis=(0, 1)), (1e6 - 2, 0, 0), atol=1e-9)
+    np.testing.assert_allclose(mesh.vertices[mesh.faces].max(axis=(0, 1)), (1e6, 2, 0), atol=1e-9)
+    matrix = {"mesh": 0, "matrix": [-1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 5, 0, 0, 1]}
+    mesh = read_textured(write_gltf(tmp_path / "square.glb", *gltf(image=QUARTERS, node=matrix)))
+    cloud = sample_textured(mesh, 100, seed=0)
+    assert cloud.points[:, 0].min() > 4
+    np.testing.assert_allclose(cloud.normals, np.tile((0, 0, 1), (100, 1)), atol=1e-6)  # not turned inside out
+
+
+@pytest.mark.parametrize(("mode", "order"), [(5, [0, 1, 5, 2]), (6, [0, 1, 2, 5])])
+def test_gltf_strips_and_fans(tmp_path, mode, order):
+    mesh = read_textured(write_gltf(tmp_path / "square.glb", *gltf(factor=RED, mode=mode, indices=order)))
+    corners = mesh.vertices[mesh.faces]
+    area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
+    np.testing.assert_allclose(area, [(0, 0, 0.5)] * 2)
+
+
+def test_gltf_textures_wrap_and_move_as_they_say(tmp_path):
+    # Twice as large, turned by nothing, moved by half: u = 2 x + 0.5, v (down) = 2 (1 - y).
+    move = {"scale": [2, 2], "offset": [0.5, 0]}
+    image = QUARTERS
+    for sampler, color in (({"wrapS": 33071, "wrapT": 33071}, WHITE), ({"wrapS": 10497, "wrapT": 10497}, BLUE)):
+        mesh = read_textured(write_gltf(tmp_path / "s.glb", *gltf(image=image, sampler=sampler, transform=move)))
+        # u = 2.25 and v (down) = 1.75: clamped, the lower right texel; repeated, the lower left one.
+        np.testing.assert_allclose(at(mesh, 0.875, 0.125), [color], atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("break_it", "message"),
+    [
+        (
+            lambda h: h.update(extensionsRequired=["KHR_draco_mesh_compression"]),
+            "KHR_draco_mesh_compression is not read",
+        ),
+        (lambda h: h["images"].__setitem__(0, {"uri": "gone.png"}), r"images\[0\]: .*gone\.png is not there"),
+        (lambda h: h["images"].__setitem__(0, {"bufferView": 0}), r"images\[0\]: not an image that can be read"),
+        (lambda h: h["nodes"][0].update(children=[0]), "its own ancestor"),
+        (lambda h: h["accessors"][0].update(count=99), "cannot be read as a GLB mesh"),
+        (lambda h: h["accessors"][0].update(count=2), "a face names vertex 5, but there are only 2"),
+        (lambda h: h["meshes"][0]["primitives"][0].update(mode=1), "no triangles in it"),
+        (lambda h: h["materials"][0].clear(), "neither a texture nor vertex colours"),
+    ],
+)
+def test_bad_gltf_is_one_line(tmp_path, break_it, message):
+    header, body = gltf(image=QUARTERS)
+    break_it(header)
+    path = write_gltf(tmp_path / "square.glb", header, body)
+    with pytest.raises(InputError, match=message) as error:
+        read_textured(path)
+    assert "\n" not in str(error.value)
+    assert "square.glb" in str(error.value)
+
+
+# PLY, and what is common
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".glb"])
+def test_vertex_colours_survive_two_round_trips(tmp_path, suffix):
+    shades = np.linspace(0, 1, 256)
+    vertices = np.random.default_rng(0).normal(size=(256, 3))
+    faces = np.arange(255, dtype=np.int32)[:, None] % 254 + np.arange(3, dtype=np.int32)
+    colors = np.stack((shades, shades[::-1], shades**2), axis=1).astype(np.float32)
+    write_mesh(tmp_path / f"a{suffix}", Mesh(vertices, faces, None, colors))
+    once = read_surface(tmp_path / f"a{suffix}")
+    write_mesh(tmp_path / f"b{suffix}", Mesh(once.vertices, faces, None, once.colors.astype(np.float32)))
+    twice = read_surface(tmp_path / f"b{suffix}")
+    assert np.abs(twice.colors - colors).max() < 0.51 / 255
+    mesh = read_textured(tmp_path / f"b{suffix}")
+    cloud = sample_textured(mesh, 1000, seed=0)
+    assert np.isfinite(cloud.colors).all()
+    found = colors_at(mesh, np.arange(len(mesh.faces)), np.tile((1.0, 0, 0), (len(mesh.faces), 1)))
+    np.testing.assert_allclose(found, colors[faces[:, 0]], atol=0.51 / 255)
+
+
+def test_samples_are_uniform_by_area_and_repeat():
+    vertices = np.concatenate((SQUARE, SQUARE * 3 + (0, 0, 1)))
+    faces = np.concatenate((FACES, FACES + 4, [[0, 0, 1]]))  # areas 1, 9 and 0
+    colors = np.repeat(np.array([RED, BLUE], np.float32), 4, axis=0)
+    mesh = TexturedMesh(vertices, faces, None, None, colors)
+    cloud = sample_textured(mesh, 20_000, seed=3)
+    assert (cloud.colors[:, 0] > 0.5).mean() == pytest.approx(0.1, abs=0.01)
+    np.testing.assert_allclose(cloud.points[cloud.points[:, 2] == 1].mean(axis=0), (1.5, 1.5, 1), atol=0.03)
+    np.testing.assert_allclose(cloud.normals, np.tile((0, 0, 1), (20_000, 1)))
+    again, other = sample_textured(mesh, 20_000, seed=3), sample_textured(mesh, 20_000, seed=4)
+    np.testing.assert_array_equal(again.points, cloud.points)
+    assert not np.array_equal(other.points, cloud.points)
+    assert len(sample_textured(mesh, 0, seed=0)) == 0
+
+
+@pytest.mark.parametrize(("kind", "extension"), [(np.uint8, ".png"), (np.uint16, ".png"), (np.uint8, ".bmp")])
+@pytest.mark.parametrize("channels", [1, 3, 4])
+def test_images_of_all_kinds_become_rgb(kind, extension, channels):
+    if extension == ".bmp" and channels == 4:
+        pytest.skip("BMP with alpha is not written by OpenCV as it is read")
+    values = (np.arange(2 * 3 * channels).reshape(2, 3, channels) * (np.iinfo(kind).max // 24)).astype(kind)
+    rgb = np.repeat(values, 3, axis=2) if channels == 1 else values[..., 2::-1]
+    found = decode_image(cv2.imencode(extension, values)[1].tobytes())
+    np.testing.assert_allclose(found, rgb / np.iinfo(kind).max, atol=1e-6)
+
+
+def test_bad_files_are_one_line(tmp_path):
+    write_cloud_ply(tmp_path / "cloud.ply", PointCloud(SQUARE, None, np.zeros((4, 3), np.float32)))
+    write_mesh(tmp_path / "bare.ply", Mesh(SQUARE, FACES.astype(np.int32)))
+    (tmp_path / "shape.stl").write_text("solid")
+    (tmp_path / "nan.obj").write_text("v 0 0 0 1 0 0\nv 1 0 nan 1 0 0\nv 0 1 0 1 0 0\nf 1 2 3\n")
+    for name, message in (
+        ("gone.obj", "no such file"),
+        ("shape.stl", r"are read from \.obj, \.glb, \.gltf, \.ply"),
+        ("cloud.ply", "face: there are none"),
+        ("bare.ply", "neither a texture nor vertex colours"),
+        ("nan.obj", "nan|not a finite number"),
+    ):
+        with pytest.raises(InputError, match=message) as error:
+            read_textured(tmp_path / name)
+        assert "\n" not in str(error.value)
+        assert name in str(error.value)
+    with pytest.raises(InputError, match="zero area"):
+        sample_textured(TexturedMesh(SQUARE * 0, FACES, None, None, np.zeros((4, 3), np.float32)), 5, seed=0)
+    with pytest.raises(InputError, match="neither a texture"):
+        sample_textured(TexturedMesh(SQUARE, FACES), 5, seed=0)
+    with pytest.raises(ValueError, match="neither an image"):
+        colors_at(TexturedMesh(SQUARE, FACES), np.zeros(1, np.int64), np.ones((1, 3)) / 3)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"faces": FACES[:, :2]}, r"faces has shape \(2, 2\)"),
+        ({"uv": UV}, "uv, image: expected both"),
+        ({"uv": UV[:1], "image": QUARTERS}, r"uv has shape \(1, 3, 2\)"),
+        ({"uv": UV, "image": QUARTERS[..., 0]}, r"image has shape \(2, 2\)"),
+        ({"vertex_colors": np.zeros((3, 3), np.float32)}, r"vertex_colors has shape \(3, 3\)"),
+    ],
+)
+def test_wrong_shapes_are_named(change, message):
+    with pytest.raises(ValueError, match=message):
+        TexturedMesh(**({"vertices": SQUARE, "faces": FACES} | change))
