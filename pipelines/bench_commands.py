@@ -84,21 +84,26 @@ def _fit(arguments: argparse.Namespace) -> int:
     check_output(arguments.json, (".json",))
     config = fit_settings(arguments)
     from .bench_fit import bench_fit, format_fit
+    from .fit import Interrupted
     from .progress_bar import progress_bars
 
     if arguments.pictures is not None:
         arguments.pictures.mkdir(parents=True, exist_ok=True)
-    with progress_bars() as report:
-        rows = bench_fit(
-            arguments.shapes,
-            config,
-            noise=arguments.noise or 0.0,
-            resolution=arguments.resolution,
-            samples=arguments.eval_samples,
-            poisson_depth=arguments.poisson_depth,
-            pictures=arguments.pictures,
-            progress=lambda shape, step: report(dataclasses.replace(step, stage=f"{shape} {step.stage}")),
-        )
+    try:
+        with progress_bars() as report:
+            rows = bench_fit(
+                arguments.shapes,
+                config,
+                noise=arguments.noise or 0.0,
+                resolution=arguments.resolution,
+                samples=arguments.eval_samples,
+                poisson_depth=arguments.poisson_depth,
+                pictures=arguments.pictures,
+                progress=lambda shape, step: report(dataclasses.replace(step, stage=f"{shape} {step.stage}")),
+            )
+    except Interrupted:
+        print("interrupted", file=sys.stderr)
+        return 130
     print(format_fit(rows))
     write_json(arguments.json, [row.as_dict() for row in rows])
     return 0
@@ -121,25 +126,28 @@ def _render(arguments: argparse.Namespace) -> int:
     check_output(arguments.json, (".json",))
     config = fit_settings(arguments)
     from .bench_render import bench_render, format_render
-    from .fit import choose_device
+    from .fit import Interrupted, choose_device
     from .progress_bar import progress_bars
     from .timing import sgemm_rate
 
     device = choose_device(config.device)
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    with progress_bars() as report:
-        rows = bench_render(
-            arguments.shapes,
-            arguments.out,
-            config,
-            size=arguments.size,
-            views=arguments.views,
-            repeats=arguments.repeats,
-            naive=not arguments.no_naive,
-            device=str(device),
-            progress=lambda name, step: report(dataclasses.replace(step, stage=f"{name} {step.stage}")),
-            report=lambda text: print(f"{text} …", file=sys.stderr),
-        )
+    try:
+        with progress_bars() as report:
+            rows = bench_render(
+                arguments.shapes,
+                arguments.out,
+                config,
+                size=arguments.size,
+                views=arguments.views,
+                repeats=arguments.repeats,
+                naive=not arguments.no_naive,
+                device=str(device),
+                progress=lambda name, step: report(dataclasses.replace(step, stage=f"{name} {step.stage}")),
+                report=lambda text: print(f"{text} …", file=sys.stderr),
+            )
+    except Interrupted:
+        print("interrupted; the same command goes on from here", file=sys.stderr)
+        return 130
     rate = sgemm_rate(256, device=device)
     print(format_render(rows, sgemm=rate))
     print(f"this machine multiplies float32 matrices at {rate / 1e9:.0f} GFLOP/s on {device}")

@@ -8,6 +8,7 @@ from mplicits.datasets import look_at, sample_sphere, write_cloud_ply
 from mplicits.neural_fields import InputError, Plane, Sphere, load_field
 from mplicits.pipelines.bench_render import NETWORKS, RenderRow, bench_render, format_render, naive_view
 from mplicits.pipelines.bench_render_truth import Truth
+from mplicits.pipelines.cli import main
 from mplicits.pipelines.fit_config import FitConfig
 from mplicits.pipelines.render import trace_view
 
@@ -122,6 +123,12 @@ def test_judging_notices_holes_and_false_hits():
     grown = truth.judge("ball", 0, 0, [camera], [larger])
     assert grown.false_hits == pytest.approx(len(larger.pixel) - len(seen.pixel), abs=2)
     assert grown.depth_error > 0.05
+
+
+def test_mistakes_are_one_line_and_leave_nothing(tmp_path, capsys):
+    assert main(["bench", "render", str(tmp_path / "no.ply"), "-o", str(tmp_path / "bench")]) == 2
+    assert "no.ply: no such file" in capsys.readouterr().err
+    assert not (tmp_path / "bench").exists()
 
 
 def test_a_fit_without_a_surface_says_so():
