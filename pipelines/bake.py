@@ -23,6 +23,7 @@ __all__ = ["Baked", "bake", "check_texture_size", "textured_mesh"]
 Float64 = NDArray[np.float64]
 Image = NDArray[np.uint8]
 Attribute = Callable[[Float64], NDArray[np.floating]]
+Progress = Callable[[str, int, int], None]
 
 BATCH = 1 << 17  # points per call
 SIZES = (16, 16384)
@@ -42,7 +43,14 @@ class Baked(NamedTuple):
     normal: Image | None
 
 
-def bake(mesh: Unwrapped, colors_at: Attribute | None, normals_at: Attribute | None, *, size: int = 2048) -> Baked:
+def bake(
+    mesh: Unwrapped,
+    colors_at: Attribute | None,
+    normals_at: Attribute | None,
+    *,
+    size: int = 2048,
+    progress: Progress | None = None,
+) -> Baked:
     """Ask for the colour and the normal at the point of the mesh under the centre of every texel.
 
     Texels that no triangle covers get the value of the nearest one that is covered, so that filters and mip maps do
@@ -53,6 +61,7 @@ def bake(mesh: Unwrapped, colors_at: Attribute | None, normals_at: Attribute | N
         colors_at: ``(N, 3)`` points in the mesh's coordinates → display colours ``(N, 3)`` in [0, 1].
         normals_at: the same → normals ``(N, 3)``, of any length, outward.
         size: texels along each side.
+        progress: told "bake", how many triangles are done, and of how many.
 
     Raises:
         ValueError: there is nothing to bake, or a texture so small that no triangle covers a texel.
@@ -75,6 +84,8 @@ def bake(mesh: Unwrapped, colors_at: Attribute | None, normals_at: Attribute | N
                 directions = unit_rows(np.asarray(normals_at(points)))
                 frame = (_interpolated(rows, corners, weights) for rows in (mesh.normals, mesh.tangents))
                 normal[texel] = _encoded(to_frame(directions, *frame))
+        if progress is not None and len(found.face):
+            progress("bake", int(found.face.max()) + 1, len(mesh.faces))
     if not covered.any():
         raise ValueError(f"size: no triangle covers a texel at {size}; expected more texels")
     nearest = distance_transform_edt(~covered.reshape(size, size), return_distances=False, return_indices=True)
@@ -112,6 +123,7 @@ def textured_mesh(
     *,
     size: int = 2048,
     faces: int = 50_000,
+    progress: Progress | None = None,
 ) -> Unwrapped:
     """Decimate, unwrap, bake, and write a textured GLB, or an OBJ with its MTL and PNG files.
 
@@ -123,6 +135,7 @@ def textured_mesh(
         normals_at: likewise.
         size: texels along each side.
         faces: triangles to keep.
+        progress: told the stage ("unwrap", "bake"), how much of it is done, and of how much.
 
     Returns:
         The mesh as written, in unit-sphere coordinates.
@@ -132,7 +145,9 @@ def textured_mesh(
     """
     path = check_textured_path(path, similarity)
     check_texture_size(size)
+    if progress is not None:
+        progress("unwrap", 0, 1)
     unwrapped = unwrap(*decimate(mesh.vertices, mesh.faces, faces), size=size)
-    color, normal = bake(unwrapped, colors_at, normals_at, size=size)
+    color, normal = bake(unwrapped, colors_at, normals_at, size=size, progress=progress)
     write_textured(path, unwrapped, similarity, color=color, normal=normal)
     return unwrapped

@@ -114,8 +114,8 @@ def _mtl(files: Mapping[str, Path]) -> str:
     if "color" in files:
         lines.append(f"map_Kd {files['color'].name}")
     if "normal" in files:
-        # three.js reads the first as a normal map, and prefers it; Blender so reads the second.
-        lines += [f"norm {files['normal'].name}", f"map_Bump {files['normal'].name}"]
+        # Not map_Bump: most programs take that for heights, and Blender takes its image for display colours.
+        lines.append(f"norm {files['normal'].name}")
     return "\n".join(lines) + "\n"
 
 
