@@ -416,11 +416,10 @@ def test_samples_are_uniform_by_area_and_repeat():
     assert len(sample_textured(mesh, 0, seed=0)) == 0
 
 
-@pytest.mark.parametrize(("kind", "extension"), [(np.uint8, ".png"), (np.uint16, ".png"), (np.uint8, ".bmp")])
+@pytest.mark.parametrize("extension", [".png", ".tiff"])
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
 @pytest.mark.parametrize("channels", [1, 3, 4])
 def test_images_of_all_kinds_become_rgb(kind, extension, channels):
-    if extension == ".bmp" and channels == 4:
-        pytest.skip("BMP with alpha is not written by OpenCV as it is read")
     values = (np.arange(2 * 3 * channels).reshape(2, 3, channels) * (np.iinfo(kind).max // 24)).astype(kind)
     rgb = np.repeat(values, 3, axis=2) if channels == 1 else values[..., 2::-1]
     found = decode_image(cv2.imencode(extension, values)[1].tobytes())
