@@ -22,7 +22,16 @@ from .raster import clip, cover
 from .seen import Seen
 from .surface import Surface
 
-__all__ = ["check_picture_path", "cloud_view", "contact_sheet", "mesh_view", "picture_of", "write_picture"]
+__all__ = [
+    "check_picture_path",
+    "cloud_view",
+    "contact_sheet",
+    "mesh_view",
+    "nearest_faces",
+    "picture_of",
+    "rows_seen",
+    "write_picture",
+]
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
@@ -57,11 +66,12 @@ def mesh_view(surface: Surface, camera: Camera) -> Seen:
     clipped = clip(z - _near(z), surface.faces)
     share = clipped.share[:, None]
     values = np.concatenate((values, (1 - share) * values[clipped.kept] + share * values[clipped.dropped]))
-    pixel, corners, weights = _nearest_faces(values[:, :3], clipped.faces, camera)
+    pixel, face, weights = nearest_faces(values[:, :3], clipped.faces, camera)
+    corners = clipped.faces[face]
     rows = np.zeros((len(pixel), values.shape[1]))
     for k in range(3):
         rows += weights[:, k, None] * values[corners[:, k]]
-    return _seen(camera, pixel, rows[:, :3], rows[:, 3:6], None if surface.colors is None else rows[:, 6:])
+    return rows_seen(camera, pixel, rows[:, :3], rows[:, 3:6], None if surface.colors is None else rows[:, 6:])
 
 
 def cloud_view(surface: Surface, camera: Camera, *, point_size: float | None = None) -> Seen:
@@ -84,7 +94,7 @@ def cloud_view(surface: Surface, camera: Camera, *, point_size: float | None = N
     pixel, index = _nearest_points(xy, z, size, diameter)
     index = front[index]
     normal = np.zeros((len(pixel), 3)) if surface.normals is None else surface.normals[index]
-    return _seen(
+    return rows_seen(
         camera, pixel, surface.vertices[index], normal, None if surface.colors is None else surface.colors[index]
     )
 
@@ -93,7 +103,9 @@ def _near(z: Float64) -> float:
     return NEAR * max(float(z.max(initial=0.0)), 0.0)
 
 
-def _seen(camera: Camera, pixel: Int64, position: Float64, normal: Float64, color: Float64 | None) -> Seen:
+def rows_seen(
+    camera: Camera, pixel: Int64, position: Float64, normal: Float64, color: NDArray[np.floating] | None
+) -> Seen:
     """Round to float32, after the eye has been taken off; a normal of length zero becomes one that faces the eye."""
     offset = torch.from_numpy(position) - camera.eye
     depth = offset.norm(dim=1, keepdim=True)
@@ -112,8 +124,11 @@ def _seen(camera: Camera, pixel: Int64, position: Float64, normal: Float64, colo
     )
 
 
-def _nearest_faces(vertices: Float64, faces: Int64, camera: Camera) -> tuple[Int64, Int64, Float64]:
-    """Pixels ``(P,)`` that see a face, the vertices ``(P, 3)`` of the nearest and their weights ``(P, 3)`` in space."""
+def nearest_faces(vertices: Float64, faces: Int64, camera: Camera) -> tuple[Int64, Int64, Float64]:
+    """Pixels ``(P,)`` that see a face, the nearest one ``(P,)``, and weights ``(P, 3)`` of its vertices in space.
+
+    All of each face must be in front of the camera.
+    """
     xy, z = (array.numpy() for array in camera.project(torch.from_numpy(vertices)))
     count = camera.width * camera.height
     nearest = np.full(count, np.inf, np.float32)
@@ -129,7 +144,7 @@ def _nearest_faces(vertices: Float64, faces: Int64, camera: Camera) -> tuple[Int
         face[pixel] = found.face[won]
         weights[pixel] = (inverse / inverse.sum(axis=1, keepdims=True))[won]
     pixel = np.flatnonzero(face >= 0)
-    return pixel, faces[face[pixel]], weights[pixel]
+    return pixel, face[pixel], weights[pixel]
 
 
 def _touching(xy: Float64, size: tuple[int, int]) -> float:

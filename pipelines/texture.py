@@ -29,7 +29,7 @@ from .fit_state import RECORD_FILE, environment, read_record, write_record
 from .runs import find_field
 from .texture_config import TextureConfig
 from .texture_samples import BandSamples, ColorSamples, band_directions, match_colors, read_colors
-from .training import Progress, StopFlag, stop_on_signals
+from .training import Progress, StopFlag, set_rate, stop_on_signals
 
 __all__ = ["TEXTURE_FILE", "FittedTexture", "default_delta", "fit_texture", "texture_of", "texture_run"]
 
@@ -227,12 +227,7 @@ class _Trainer:
         return True
 
     def _step(self) -> dict[str, torch.Tensor]:
-        progress = self.fraction
-        rate = (
-            self.config.learning_rate * min(1.0, (progress + 0.001) / 0.02) * 0.5 * (1 + math.cos(math.pi * progress))
-        )
-        for group in self.adam.param_groups:
-            group["lr"] = rate
+        set_rate(self.adam, self.config.learning_rate, self.fraction)
         here, there = (
             self._draw(self.samples.points, self.config.batch),
             self._draw(self.band.points, self.config.band_batch),

@@ -86,6 +86,16 @@ def stop_on_signals() -> Iterator[StopFlag]:
             signal.signal(number, before[number])
 
 
+def set_rate(adam: torch.optim.Adam, peak: float, progress: float) -> None:
+    """Give the optimiser the learning rate for a schedule done to ``progress`` in [0, 1]: warm-up, then a cosine.
+
+    Adam's first steps are as long as its later ones, whatever the gradient: warm up over 2 % of the schedule.
+    """
+    rate = peak * min(1.0, (progress + 0.001) / 0.02) * 0.5 * (1 + math.cos(math.pi * progress))
+    for group in adam.param_groups:
+        group["lr"] = rate
+
+
 class LevelTrainer:
     """Trains one SIREN on sources of samples, with Adam and a warm-up + cosine schedule.
 
@@ -154,11 +164,7 @@ class LevelTrainer:
         return True
 
     def _step(self) -> dict[str, Tensor]:
-        progress = self.fraction
-        # Adam's first steps are as long as its later ones, whatever the gradient: warm up over 2 % of the schedule.
-        rate = self.learning_rate * min(1.0, (progress + 0.001) / 0.02) * 0.5 * (1 + math.cos(math.pi * progress))
-        for group in self.adam.param_groups:
-            group["lr"] = rate
+        set_rate(self.adam, self.learning_rate, self.fraction)
         terms, total = self._losses()
         self.adam.zero_grad(set_to_none=True)
         total.backward()
