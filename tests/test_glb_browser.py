@@ -15,6 +15,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import trimesh
+from browser import CHROMEDRIVER, CHROMIUM, FLAGS
 from mplicits.neural_fields import Similarity
 from mplicits.neural_fields.meshing import Mesh
 from mplicits.pipelines.bake import textured_mesh
@@ -26,20 +27,7 @@ pytest.importorskip("selenium")
 from selenium import webdriver
 
 THREE = "three@0.180.0"
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-CHROMEDRIVER = shutil.which("chromedriver")
-FLAGS = (
-    "--headless=new",
-    "--no-sandbox",
-    "--disable-gpu",
-    "--use-gl=angle",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
+WINDOW = (
     "--force-device-scale-factor=1",
     "--window-size=800,800",
 )
@@ -160,7 +148,7 @@ def site(tmp_path_factory):
 def browser(site, tmp_path_factory):
     options = webdriver.ChromeOptions()
     options.binary_location = CHROMIUM
-    for flag in (*FLAGS, f"--user-data-dir={tmp_path_factory.mktemp('chromium')}"):
+    for flag in (*FLAGS, *WINDOW, f"--user-data-dir={tmp_path_factory.mktemp('chromium')}"):
         options.add_argument(flag)
     options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
     driver = webdriver.Chrome(options=options, service=webdriver.ChromeService(CHROMEDRIVER))

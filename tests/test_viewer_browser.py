@@ -2,12 +2,12 @@
 
 import io
 import re
-import shutil
 import time
 
 import imageio.v3 as iio
 import numpy as np
 import pytest
+from browser import CHROMEDRIVER, CHROMIUM, FLAGS
 from mplicits.neural_fields import MultiscaleSDF, Similarity, Siren, Sphere
 from mplicits.pipelines.viewer import Viewer, show_field
 
@@ -18,22 +18,7 @@ from selenium import webdriver
 from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.by import By
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-CHROMEDRIVER = shutil.which("chromedriver")
-FLAGS = (
-    "--headless=new",
-    "--no-sandbox",
-    "--disable-gpu",
-    "--use-gl=angle",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-    "--window-size=1000,700",
-)
+WINDOW = ("--window-size=1000,700",)
 PATIENCE = 30.0
 
 
@@ -55,7 +40,7 @@ def browser(tmp_path_factory):
     options = webdriver.ChromeOptions()
     options.binary_location = CHROMIUM
     home = tmp_path_factory.mktemp("chromium")
-    for flag in (*FLAGS, f"--user-data-dir={home / 'profile'}"):
+    for flag in (*FLAGS, *WINDOW, f"--user-data-dir={home / 'profile'}"):
         options.add_argument(flag)
     allowed = {"profile.default_content_setting_values.automatic_downloads": 1}
     options.add_experimental_option("prefs", {"download.default_directory": str(home), **allowed})
