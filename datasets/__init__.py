@@ -10,6 +10,7 @@ from .depth_poses import read_poses, read_trajectory
 from .ply import write_cloud_ply
 from .point_cloud import PointCloud
 from .posed_cameras import read_cameras
+from .posed_images import PosedImage, PosedImages, read_posed_images
 from .prepare import CleaningReport, OrientedCloud, prepare_cloud
 from .reading import read_cloud
 from .rgbd import RgbdFrame, read_frame
@@ -28,6 +29,8 @@ __all__ = [
     "DepthSettings",
     "OrientedCloud",
     "PointCloud",
+    "PosedImage",
+    "PosedImages",
     "RgbdFrame",
     "Statue",
     "TexturedMesh",
@@ -47,6 +50,7 @@ __all__ = [
     "read_depth",
     "read_frame",
     "read_intrinsics",
+    "read_posed_images",
     "read_poses",
     "read_textured",
     "read_trajectory",
