@@ -1,0 +1,249 @@
+"""Exact synthetic scenes: shapes and colours in closed form, and posed images of them by our own sphere tracer.
+
+Whatever reconstructs a scene can be held against the truth: the field is the distance (or, of the statue, an implicit
+function that vanishes exactly on the surface), the colour is a function of the position.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import MappingProxyType
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ..neural_fields import Box, Capsule, Field, Similarity, Sphere, Torus, Union, sphere_trace
+from ..neural_fields.meshing import Mesh, extract_mesh
+from .cameras import UP_AXES, Camera, look_at
+from .color_space import linear_to_srgb, srgb_to_linear
+from .orientation import fibonacci_directions
+from .point_cloud import PointCloud
+from .posed_images import PosedImage, PosedImages
+from .statue import Statue
+from .synthetic import sample_surface
+
+__all__ = ["SCENES", "Scene", "render_scene", "render_view", "sample_scene", "scene_cameras", "scene_mesh"]
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+Rgb = tuple[float, float, float]
+
+LAMP = (0.4, 0.7, 0.6)  # towards the lamp, for shaded scenes
+AMBIENT = 0.35  # share of the light that comes from everywhere
+DISTANCE = 4.0  # of the eyes from the middle, in radii of the shape
+MARGIN = 1.1  # radius of the ball that just fills the images, in radii of the shape
+RAYS_AT_ONCE = 1 << 17
+SPARSE_POINTS = 1000  # as many as structure from motion would give, more or less
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A shape and its paint, both in closed form.
+
+    Attributes:
+        name: what files and messages call it.
+        field: whose zero set is the surface; inside the unit sphere.
+        color: display RGB ``(N, 3)`` in [0, 1] of points ``(N, 3)``, the same from all directions.
+        radius: of a ball around the origin that holds the surface.
+        up: "y" or "z", the axis that points up.
+        lipschitz: bound on the slope of the field.
+    """
+
+    name: str
+    field: Field
+    color: Callable[[Float64], Float64]
+    radius: float
+    up: str = "y"
+    lipschitz: float = 1.0
+
+
+def scene_cameras(scene: Scene, *, views: int = 24, size: int = 64, seed: int = 0) -> list[Camera]:
+    """Cameras spread evenly over a sphere around a scene, upright, with all of the shape in view.
+
+    They stand on a Fibonacci lattice that is turned at random, so that another seed gives views to hold out.
+
+    Args:
+        scene: what they look at.
+        views: how many.
+        size: width and height of the images, in pixels.
+        seed: of the turn.
+
+    Raises:
+        ValueError: ``views`` or ``size`` is not positive.
+    """
+    for name, number in (("views", views), ("size", size)):
+        if number < 1:
+            raise ValueError(f"{name}={number}: expected at least one")
+    # The orthogonal factor of a Gaussian matrix is an evenly distributed rotation (or reflection, which is as good).
+    turn = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))[0]
+    eyes = DISTANCE * scene.radius * fibonacci_directions(views) @ turn.T
+    # A ball of radius r at distance d is seen within asin(r / d) of its middle.
+    fov = 2 * float(np.degrees(np.arcsin(MARGIN / DISTANCE)))
+    up = UP_AXES[scene.up]
+    return [look_at(torch.from_numpy(eye), (0, 0, 0), up=up, fov=fov, width=size, height=size) for eye in eyes]
+
+
+def render_scene(
+    scene: Scene, views: int = 24, size: int = 64, *, seed: int = 0, samples: int = 3, shaded: bool = False
+) -> PosedImages:
+    """Posed images of a scene, with exact poses, colours and masks, and a few points of its surface.
+
+    Args:
+        scene: what to draw.
+        views: how many images.
+        size: width and height of the images, in pixels.
+        seed: of the cameras and the points.
+        samples: rays per pixel and direction.
+        shaded: whether a fixed lamp lights the shape; without, the images show the paint itself.
+
+    Raises:
+        ValueError: ``views``, ``size`` or ``samples`` is not positive.
+    """
+    images = []
+    for index, camera in enumerate(scene_cameras(scene, views=views, size=size, seed=seed)):
+        color, mask = render_view(scene, camera, samples=samples, shaded=shaded)
+        images.append(PosedImage(f"{index:03d}.png", camera, color, mask))
+    points = sample_surface(scene.field, SPARSE_POINTS, seed=seed).points
+    return PosedImages(tuple(images), Similarity.identity(), "the unit sphere", points, Path(scene.name))
+
+
+def render_view(scene: Scene, camera: Camera, *, samples: int = 3, shaded: bool = False) -> tuple[Float32, Float32]:
+    """Draw a scene from one camera.
+
+    The colour of a pixel is the mean light of those of its rays that hit (straight alpha, black where none does), the
+    mask is their share.
+
+    Args:
+        scene: what to draw.
+        camera: in the scene's coordinates.
+        samples: rays per pixel and direction.
+        shaded: whether a fixed lamp lights the shape.
+
+    Returns:
+        Display RGB ``(H, W, 3)`` and the mask ``(H, W)``, both in [0, 1].
+
+    Raises:
+        ValueError: ``samples`` is not positive.
+    """
+    if samples < 1:
+        raise ValueError(f"samples={samples}: expected at least one")
+    rows = max(1, RAYS_AT_ONCE // (camera.width * samples**2))
+    strips = [
+        _strip(scene, camera.strip(first, min(rows, camera.height - first)), samples, shaded)
+        for first in range(0, camera.height, rows)
+    ]
+    light, hits = (np.concatenate(part) for part in zip(*strips, strict=True))
+    mean = light / np.maximum(hits, 1)[..., None]
+    return linear_to_srgb(mean).clip(0, 1).astype(np.float32), (hits / samples**2).astype(np.float32)
+
+
+def _strip(scene: Scene, camera: Camera, samples: int, shaded: bool) -> tuple[Float64, NDArray[np.int64]]:
+    """Sum of the light ``(H, W, 3)`` of the rays of each pixel that hit, and their number ``(H, W)``."""
+    fine = camera.resized(samples * camera.width, samples * camera.height)
+    eye, directions = fine.rays(dtype=torch.float64)
+    hits = sphere_trace(scene.field, eye, directions, tolerance=1e-9, lipschitz=scene.lipschitz)
+    mask, position = hits.mask.numpy(), hits.position.numpy()
+    light = np.zeros((*mask.shape, 3))
+    light[mask] = _light(scene, position[mask], shaded)
+    tiles = (camera.height, samples, camera.width, samples)
+    return light.reshape(*tiles, 3).sum(axis=(1, 3)), mask.reshape(tiles).sum(axis=(1, 3))
+
+
+def _light(scene: Scene, points: Float64, shaded: bool) -> Float64:
+    """Linear light ``(N, 3)`` that points ``(N, 3)`` of the surface send everywhere."""
+    light = srgb_to_linear(scene.color(points))
+    if not shaded:
+        return light
+    with torch.inference_mode():
+        gradient = scene.field.jet(torch.from_numpy(points)).gradient.numpy()
+    towards = np.array(LAMP) / np.linalg.norm(LAMP)
+    cosine = (gradient @ towards) / np.maximum(np.linalg.norm(gradient, axis=1), 1e-12)
+    return light * (AMBIENT + (1 - AMBIENT) * np.maximum(cosine, 0))[:, None]
+
+
+def scene_mesh(scene: Scene, *, resolution: int = 256) -> Mesh:
+    """The true surface with its colours, as a mesh to hold reconstructions against.
+
+    Args:
+        scene: whose surface.
+        resolution: cells along the side of the cube around it.
+    """
+    side = 1.02 * scene.radius
+    bounds = ((-side, -side, -side), (side, side, side))
+    mesh = extract_mesh(scene.field, resolution=resolution, bounds=bounds, lipschitz=max(1.25, scene.lipschitz))
+    return replace(mesh, colors=scene.color(mesh.vertices).astype(np.float32))
+
+
+def sample_scene(scene: Scene, count: int, *, seed: int = 0) -> PointCloud:
+    """``count`` points of the true surface, evenly by area, with exact normals and colours.
+
+    Args:
+        scene: whose surface.
+        count: how many points.
+        seed: of the random numbers.
+    """
+    cloud = sample_surface(scene.field, count, seed=seed)
+    return replace(cloud, colors=scene.color(cloud.points).astype(np.float32), source=scene.name)
+
+
+def _painted_sphere() -> Scene:
+    return Scene("painted-sphere", Sphere(radius=0.6), _spots, radius=0.6)
+
+
+def _striped_torus() -> Scene:
+    return Scene("striped-torus", Torus(major=0.45, minor=0.2), _stripes, radius=0.65, up="z")
+
+
+def _figure() -> Scene:
+    corners = [(x, -0.2, z) for x in (-0.24, 0.24) for z in (-0.24, 0.24)]
+    field = Union(
+        Box(half_size=(0.36, 0.1, 0.36), center=(0.0, -0.36, 0.0)),
+        Sphere(radius=0.29, center=(0.0, 0.0, 0.0)),
+        Sphere(radius=0.16, center=(0.0, 0.38, 0.0)),
+        Capsule(start=(-0.15, 0.05, 0.0), end=(-0.5, 0.28, 0.12), radius=0.065),
+        Capsule(start=(0.15, 0.05, 0.0), end=(0.42, -0.05, 0.3), radius=0.065),
+        *(Sphere(radius=0.09, center=corner) for corner in corners),
+    )
+    return Scene("figure", field, _checks, radius=0.7)
+
+
+def _statue() -> Scene:
+    statue = Statue()
+    return Scene("statue", statue, lambda points: statue.colors(points).astype(np.float64), 1.0, up="z", lipschitz=1.5)
+
+
+def _mix(first: Rgb, second: Rgb, share: Float64) -> Float64:
+    return np.array(first) + share[:, None] * (np.array(second) - np.array(first))
+
+
+def _spots(points: Float64) -> Float64:
+    """Soft patches of many hues: sines of the coordinates, another phase for each channel."""
+    x, y, z = points.T
+    waves = [9 * x + 4 * np.sin(5 * y), 9 * y + 4 * np.sin(5 * z) + 1, 9 * z + 4 * np.sin(5 * x) + 2]
+    return 0.5 + 0.4 * np.sin(np.stack(waves, axis=1))
+
+
+def _stripes(points: Float64) -> Float64:
+    """Ten stripes that wind three times around the tube of the torus, with soft edges."""
+    x, y, z = points.T
+    around, tube = np.arctan2(y, x), np.arctan2(z, np.hypot(x, y) - 0.45)
+    share = 0.5 + 0.5 * np.tanh(2.5 * np.sin(10 * around + 3 * tube))
+    return _mix((0.93, 0.76, 0.25), (0.12, 0.28, 0.52), share) * (0.9 + 0.1 * np.cos(tube))[:, None]
+
+
+def _checks(points: Float64) -> Float64:
+    """A board of cubes a tenth wide with soft edges; its two colours change slowly with the place."""
+    board = np.prod(np.tanh(4 * np.sin(10 * np.pi * (points + 0.013))), axis=1)
+    hue = 0.5 + 0.5 * np.sin(4 * points[:, 1] + 3 * points[:, 0])
+    light = _mix((0.95, 0.90, 0.78), (0.70, 0.88, 0.80), hue)
+    dark = _mix((0.62, 0.18, 0.14), (0.20, 0.22, 0.50), hue)
+    return dark + (0.5 + 0.5 * board)[:, None] * (light - dark)
+
+
+SCENES: Mapping[str, Callable[[], Scene]] = MappingProxyType(
+    {"painted-sphere": _painted_sphere, "striped-torus": _striped_torus, "figure": _figure, "statue": _statue}
+)
+"""What builds each scene."""

@@ -1,0 +1,171 @@
+"""Scenes whose images are known in closed form: what is drawn must be that."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from mplicits.datasets.cameras import look_at
+from mplicits.datasets.color_space import linear_to_srgb, srgb_to_linear
+from mplicits.datasets.scenes import (
+    AMBIENT,
+    LAMP,
+    SCENES,
+    Scene,
+    render_scene,
+    render_view,
+    sample_scene,
+    scene_cameras,
+    scene_mesh,
+)
+from mplicits.neural_fields import Box, Similarity, Sphere
+
+CHEAP = [name for name in SCENES if name != "statue"]
+
+
+@pytest.fixture
+def sphere() -> Scene:
+    return SCENES["painted-sphere"]()
+
+
+def sphere_hits(camera, radius=0.6):
+    """Where the rays of a camera first meet a sphere around the origin: mask ``(H, W)`` and points ``(H, W, 3)``."""
+    eye, directions = (x.numpy() for x in camera.rays(dtype=torch.float64))
+    along = directions @ eye
+    discriminant = along**2 - (eye @ eye - radius**2)
+    depth = -along - np.sqrt(np.maximum(discriminant, 0))
+    return discriminant > 0, eye + depth[..., None] * directions
+
+
+def test_pixels_have_the_colour_of_the_point_they_see(sphere):
+    camera = look_at((1.2, 0.9, 2.0), (0.1, 0.0, -0.1), fov=32, width=23, height=17)
+    color, mask = render_view(sphere, camera, samples=1)
+    expected, points = sphere_hits(camera)
+    assert 100 < expected.sum() < expected.size
+    assert np.array_equal(mask, expected.astype(np.float32))
+    assert np.abs(color[expected] - sphere.color(points[expected])).max() < 1e-6
+    assert not color[~expected].any()
+    assert color.dtype == mask.dtype == np.float32
+
+
+def test_samples_of_a_pixel_are_averaged_in_linear_light(sphere):
+    camera = look_at((0.0, 0.0, 2.4), (0.5, 0.0, 0.0), fov=20, width=12, height=10)
+    color, mask = render_view(sphere, camera, samples=3)
+    hit, points = sphere_hits(camera.resized(36, 30))
+    light = np.where(hit[..., None], srgb_to_linear(sphere.color(points.reshape(-1, 3))).reshape(30, 36, 3), 0)
+    count = hit.reshape(10, 3, 12, 3).sum(axis=(1, 3))
+    mean = light.reshape(10, 3, 12, 3, 3).sum(axis=(1, 3)) / np.maximum(count, 1)[..., None]
+    assert np.abs(mask - count / 9).max() < 1e-6
+    assert np.abs(color - linear_to_srgb(mean)).max() < 1e-6
+    assert ((mask > 0) & (mask < 1)).any()
+
+
+def test_shading_is_lambert_times_the_paint(sphere):
+    camera = look_at((0.5, 1.0, 2.0), (0, 0, 0), fov=32, width=15, height=15)
+    color, mask = render_view(sphere, camera, samples=1, shaded=True)
+    hit, points = sphere_hits(camera)
+    cosine = points[hit] / 0.6 @ (np.array(LAMP) / np.linalg.norm(LAMP))
+    light = srgb_to_linear(sphere.color(points[hit])) * (AMBIENT + (1 - AMBIENT) * cosine.clip(0))[:, None]
+    assert cosine.min() < -0.05  # some of it lies in the shade
+    assert np.array_equal(mask > 0, hit)
+    assert np.abs(color[hit] - linear_to_srgb(light)).max() < 1e-6
+
+
+def test_the_mask_has_the_area_of_the_projected_sphere(sphere):
+    """A sphere seen along the axis is a disc of radius f r / √(d² − r²)."""
+    images = render_scene(sphere, 5, 48, seed=3)
+    for view in images.views:
+        distance = float(view.camera.eye.norm())
+        radius = float(view.camera.intrinsics[0, 0]) * 0.6 / math.sqrt(distance**2 - 0.36)
+        assert view.mask.sum() == pytest.approx(math.pi * radius**2, rel=2e-3)
+
+
+def test_a_box_covers_a_square_with_even_edges():
+    """Its near face alone is seen: f·2a/(d − a) pixels wide, of which the outermost ones are covered by shares."""
+    scene = Scene("box", Box(half_size=(0.3, 0.3, 0.3)), lambda points: np.ones_like(points), radius=0.55)
+    camera = look_at((0, 0, 2.3), (0, 0, 0), fov=2 * math.degrees(math.atan(0.25)), width=20, height=20)
+    _, mask = render_view(scene, camera, samples=3)  # 40 px of focal length: 12 px wide, pixels 4 to 15
+    assert mask[:, 10].tolist() == [0.0] * 4 + [1.0] * 12 + [0.0] * 4
+    camera = look_at((0, 0, 2.3), (0, 0, 0), fov=2 * math.degrees(math.atan(0.25)), width=15, height=15)
+    _, mask = render_view(scene, camera, samples=3)  # 9 px wide, pixels 3 to 11
+    assert mask[7].tolist() == [0.0] * 3 + [1.0] * 9 + [0.0] * 3
+    _, mask = render_view(scene, camera.resized(25, 25), samples=3)  # 15 px wide, pixels 5 to 19
+    assert mask.sum() == pytest.approx(225)
+
+
+def test_strips_do_not_show(sphere, monkeypatch):
+    camera = look_at((0, 1, 2.2), (0, 0, 0), fov=32, width=11, height=13)
+    whole = render_view(sphere, camera)
+    monkeypatch.setattr("mplicits.datasets.scenes.RAYS_AT_ONCE", 500)
+    for one, other in zip(whole, render_view(sphere, camera), strict=True):
+        assert np.abs(one - other).max() < 1e-6
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_shapes_lie_in_their_ball_and_colours_in_range(name):
+    scene = SCENES[name]()
+    assert scene.name == name
+    cloud = sample_scene(scene, 3000, seed=1)
+    values = scene.field.value(torch.from_numpy(cloud.points))
+    assert float(values.abs().max()) < 1e-8
+    assert 0.9 * scene.radius < np.linalg.norm(cloud.points, axis=1).max() <= scene.radius + 1e-9 <= 1 + 1e-9
+    assert np.array_equal(cloud.colors, scene.color(cloud.points).astype(np.float32))
+    assert cloud.colors.min() >= 0
+    assert cloud.colors.max() <= 1
+    assert cloud.colors.std(axis=0).min() > 0.1  # painted, not plain
+
+
+@pytest.mark.parametrize("name", CHEAP)
+def test_all_of_the_shape_is_in_view(name):
+    images = render_scene(SCENES[name](), 6, 24, seed=2)
+    for view in images.views:
+        assert view.mask.max() == 1
+        assert not any(edge.any() for edge in (view.mask[0], view.mask[-1], view.mask[:, 0], view.mask[:, -1]))
+        pixels, z = view.camera.project(torch.from_numpy(images.points))
+        assert float(z.min()) > 0
+        assert float(pixels.min()) > 0
+        assert float(pixels.max()) < 23
+    assert images.similarity == Similarity.identity()
+    assert [view.name for view in images.views] == [f"00{k}.png" for k in range(6)]
+    assert images.points.shape == (1000, 3)
+
+
+def test_cameras_are_even_upright_and_held_out_by_seed(sphere):
+    cameras = scene_cameras(sphere, views=50, size=8, seed=1)
+    eyes = torch.stack([camera.eye for camera in cameras])
+    assert torch.allclose(eyes.norm(dim=1), torch.tensor(2.4, dtype=torch.float64))
+    assert float(eyes.mean(dim=0).norm()) < 0.05
+    near = torch.cdist(eyes, eyes).fill_diagonal_(9).amin(dim=1)
+    assert float(near.min()) > 0.5  # 50 discs on a sphere of radius 2.4 are about 0.68 apart at best
+    assert all(float(camera.down[1]) <= 0 for camera in cameras)
+    again, other = (torch.stack([c.eye for c in scene_cameras(sphere, views=50, size=8, seed=s)]) for s in (1, 2))
+    assert torch.equal(eyes, again)
+    assert float(torch.cdist(eyes, other).diagonal().min()) > 0.1
+
+
+@pytest.mark.parametrize("name", CHEAP)
+def test_the_mesh_is_the_surface(name):
+    scene = SCENES[name]()
+    mesh = scene_mesh(scene, resolution=64)
+    assert np.abs(scene.field.value(torch.from_numpy(mesh.vertices)).numpy()).max() < 0.01
+    assert np.array_equal(mesh.colors, scene.color(mesh.vertices).astype(np.float32))
+    if name == "painted-sphere":
+        corners = mesh.vertices[mesh.faces]
+        volume = np.linalg.det(corners).sum() / 6
+        assert volume == pytest.approx(4 / 3 * math.pi * 0.6**3, rel=2e-3)
+
+
+def test_bad_arguments_are_named(sphere):
+    with pytest.raises(ValueError, match=r"views=0"):
+        render_scene(sphere, 0)
+    with pytest.raises(ValueError, match=r"size=0"):
+        render_scene(sphere, 2, 0)
+    with pytest.raises(ValueError, match=r"samples=0"):
+        render_scene(sphere, 1, 8, samples=0)
+
+
+def test_a_shape_that_is_not_in_view_leaves_an_empty_picture():
+    scene = Scene("far", Sphere(radius=0.1, center=(0.0, 0.9, 0.0)), lambda points: 0 * points, radius=1.0)
+    color, mask = render_view(scene, look_at((0, 0, 4), (0, 0, 0), fov=10, width=6, height=6))
+    assert not mask.any()
+    assert not color.any()
