@@ -1,0 +1,180 @@
+"""Posed images on disk: what other programs would find in the files is what was written."""
+
+import json
+import math
+import struct
+from pathlib import Path
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+import torch
+from mplicits.datasets.cameras import Camera, look_at
+from mplicits.datasets.posed_cameras import read_cameras
+from mplicits.datasets.posed_images import PosedImage, PosedImages
+from mplicits.datasets.scene_files import check_new_folder, write_colmap, write_neus, write_transforms
+from mplicits.neural_fields import InputError, Similarity
+from scipy.spatial.transform import Rotation
+
+CENTER, SCALE = (10.0, -4.0, 2.0), 1.7
+
+
+def photograph(index: int, *, masked: bool = True) -> PosedImage:
+    """Noise seen from a place off centre, through a lens of no symmetry; sizes and lenses come in two kinds."""
+    random = np.random.default_rng(index)
+    width, height = (9, 7) if index % 2 else (8, 6)
+    eye = np.array(CENTER) + 4 * random.normal(size=3)
+    pose = look_at(eye.tolist(), CENTER, up=(0.1, 0.2, 1.0), width=width, height=height).world_from_camera
+    lens = torch.tensor([[11.25, 0, 3.9], [0, 12.5, 2.7 + index % 2], [0, 0, 1]], dtype=torch.float64)
+    color = random.integers(0, 256, (height, width, 3)) / np.float32(255)
+    mask = random.integers(0, 256, (height, width)) / np.float32(255)
+    return PosedImage(f"shot {index}.jpg", Camera(lens, pose, width, height), color, mask if masked else None)
+
+
+@pytest.fixture
+def photographs() -> PosedImages:
+    points = np.random.default_rng(9).normal(size=(5, 3)) + CENTER
+    views = tuple(photograph(index) for index in range(4))
+    return PosedImages(views, Similarity(CENTER, SCALE), "made up", points, Path("nowhere"))
+
+
+def same_cameras(found: list[Camera], images: PosedImages) -> None:
+    for camera, view in zip(found, images.views, strict=True):
+        assert (camera.width, camera.height) == (view.camera.width, view.camera.height)
+        assert float((camera.intrinsics - view.camera.intrinsics).abs().max()) < 1e-9
+        assert float((camera.world_from_camera - view.camera.world_from_camera).abs().max()) < 1e-9
+
+
+def bytes_of(values) -> np.ndarray:
+    return np.rint(values * 255).astype(np.uint8)
+
+
+def test_neus_projects_world_points_onto_pixels(tmp_path, photographs):
+    write_neus(tmp_path / "neus", photographs)
+    archive = np.load(tmp_path / "neus" / "cameras_sphere.npz", allow_pickle=False)
+    assert len(archive.files) == 8
+    for index, view in enumerate(photographs.views):
+        world, scale = archive[f"world_mat_{index}"], archive[f"scale_mat_{index}"]
+        projected = np.c_[photographs.points, np.ones(5)] @ world.T
+        pixels, depth = view.camera.project(torch.from_numpy(photographs.points))
+        assert np.abs(projected[:, :2] / projected[:, 2:3] - pixels.numpy()).max() < 1e-9
+        assert np.abs(projected[:, 2] - depth.numpy()).max() < 1e-9
+        assert np.allclose(scale @ [0, 1, 0, 1], [10, -4 + SCALE, 2, 1], atol=1e-12)
+        assert np.array_equal(iio.imread(tmp_path / "neus" / "image" / f"00{index}.png"), bytes_of(view.color))
+        assert np.array_equal(iio.imread(tmp_path / "neus" / "mask" / f"00{index}.png"), bytes_of(view.mask))
+    named = read_cameras(tmp_path / "neus" / "cameras_sphere.npz")
+    assert [name for name, _ in named] == [f"image/00{index}.png" for index in range(4)]
+    same_cameras([camera for _, camera in named], photographs)
+
+
+def test_transforms_have_opengl_poses_and_corners_of_pixels(tmp_path, photographs):
+    write_transforms(tmp_path / "nerf", photographs)
+    content = json.loads((tmp_path / "nerf" / "transforms.json").read_text())
+    assert content["camera_angle_x"] == pytest.approx(2 * math.atan(4 / 11.25))
+    for frame, view in zip(content["frames"], photographs.views, strict=True):
+        pose, camera = np.array(frame["transform_matrix"]), view.camera
+        right, up, backward, eye = pose[:3].T
+        for vector, expected in ((right, camera.right), (up, -camera.down), (backward, -camera.forward)):
+            assert np.abs(vector - expected.numpy()).max() < 1e-12
+        assert np.abs(eye - camera.eye.numpy()).max() < 1e-12
+        assert (frame["fl_x"], frame["fl_y"], frame["cx"]) == (11.25, 12.5, 4.4)
+        picture = iio.imread(tmp_path / "nerf" / frame["file_path"])
+        assert np.array_equal(picture[..., :3], bytes_of(view.color))
+        assert np.array_equal(picture[..., 3], bytes_of(view.mask))
+    same_cameras([camera for _, camera in read_cameras(tmp_path / "nerf" / "transforms.json")], photographs)
+
+
+def colmap_text(model: Path):
+    """Cameras by number, images ``(w x y z, t, camera, name)`` and points, as COLMAP's documentation has the files."""
+
+    def rows(name):
+        lines = (model / name).read_text().splitlines()
+        return [line.split() for line in lines if not line.startswith("#")]
+
+    cameras = {int(row[0]): (row[1], *map(int, row[2:4]), *map(float, row[4:])) for row in rows("cameras.txt")}
+    lines = rows("images.txt")
+    assert not any(lines[1::2])  # no observations
+    images = [(list(map(float, row[1:5])), list(map(float, row[5:8])), int(row[8]), row[9]) for row in lines[::2]]
+    points = np.array([list(map(float, row[1:4])) for row in rows("points3D.txt")])
+    return cameras, images, points
+
+
+def colmap_binary(model: Path):
+    """The same from the binary files."""
+
+    def take(data: bytearray, form: str):
+        form = "<" + form
+        values = struct.unpack_from(form, data)
+        del data[: struct.calcsize(form)]
+        return values
+
+    data = bytearray((model / "cameras.bin").read_bytes())
+    cameras = {}
+    for _ in range(*take(data, "Q")):
+        number, kind, *rest = take(data, "iiQQ4d")
+        cameras[number] = ({1: "PINHOLE"}[kind], *rest)
+    assert not data
+    data, images = bytearray((model / "images.bin").read_bytes()), []
+    for _ in range(*take(data, "Q")):
+        row = take(data, "i7di")
+        name, _, data = data.partition(b"\0")
+        assert take(data, "Q") == (0,)
+        images.append((list(row[1:5]), list(row[5:8]), row[8], name.decode()))
+    assert not data
+    data, points = bytearray((model / "points3D.bin").read_bytes()), []
+    for _ in range(*take(data, "Q")):
+        row = take(data, "Q3d3BdQ")
+        assert row[-1] == 0
+        points.append(row[1:4])
+    assert not data
+    return cameras, images, np.array(points)
+
+
+@pytest.mark.parametrize(("form", "read"), [("text", colmap_text), ("binary", colmap_binary)])
+def test_colmap_projects_world_points_onto_pixels(tmp_path, photographs, form, read):
+    write_colmap(tmp_path / "colmap", photographs, form=form)
+    cameras, images, points = read(tmp_path / "colmap" / "sparse" / "0")
+    assert len(cameras) == 2  # one for each lens, not for each view
+    assert np.array_equal(points, photographs.points)
+    assert len(images) == 4
+    for (quaternion, shift, number, name), view in zip(images, photographs.views, strict=True):
+        model, width, height, fx, fy, cx, cy = cameras[number]
+        assert (model, width, height) == ("PINHOLE", view.camera.width, view.camera.height)
+        seen = Rotation.from_quat(quaternion, scalar_first=True).apply(points) + shift
+        pixels = seen[:, :2] / seen[:, 2:] * [fx, fy] + [cx, cy]
+        expected, _ = view.camera.project(torch.from_numpy(points))
+        assert np.abs(pixels - 0.5 - expected.numpy()).max() < 1e-9  # COLMAP counts from the image's corner
+        picture = iio.imread(tmp_path / "colmap" / "images" / name)
+        assert np.array_equal(picture, bytes_of(np.concatenate((view.color, view.mask[..., None]), axis=-1)))
+
+
+def test_pictures_without_masks_have_no_alpha(tmp_path, photographs):
+    bare = PosedImages((photograph(0, masked=False),), photographs.similarity, "", None, Path())
+    write_transforms(tmp_path / "nerf", bare)
+    assert iio.imread(tmp_path / "nerf" / "images" / "000.png").shape == (6, 8, 3)
+    write_colmap(tmp_path / "colmap", bare, form="text")
+    assert iio.imread(tmp_path / "colmap" / "images" / "000.png").shape == (6, 8, 3)
+    assert colmap_text(tmp_path / "colmap" / "sparse" / "0")[2].size == 0
+    write_neus(tmp_path / "neus", bare)
+    assert iio.imread(tmp_path / "neus" / "mask" / "000.png").min() == 255
+
+
+def test_nothing_is_overwritten_and_nothing_is_left_behind(tmp_path, photographs, monkeypatch):
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "mine.txt").write_text("mine")
+    (tmp_path / "file").write_text("mine")
+    for folder, message in (("full", "is not empty"), ("file", "is a file"), ("no/where", "make it first")):
+        with pytest.raises(InputError, match=message):
+            write_neus(tmp_path / folder, photographs)
+    (tmp_path / "empty").mkdir()
+    assert check_new_folder(tmp_path / "empty") == tmp_path / "empty"
+    write_neus(tmp_path / "empty", photographs)
+    assert (tmp_path / "empty" / "cameras_sphere.npz").is_file()
+
+    def full_disk(*_arguments):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("mplicits.datasets.scene_files._write_png", full_disk)
+    with pytest.raises(InputError, match=r"new: cannot be written \(No space left on device\)"):
+        write_colmap(tmp_path / "new", photographs)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["empty", "file", "full"]
