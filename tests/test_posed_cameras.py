@@ -204,7 +204,7 @@ def test_what_is_wrong_with_a_neus_file_is_said_in_one_line(changes, message, tm
 def test_files_that_cannot_be_read_say_so(tmp_path):
     for name, message in [
         ("absent.json", "no such file"),
-        ("", "is a directory"),
+        ("", r"none of cameras_sphere\.npz, .* in it; name the file"),
         ("cameras.txt", "unknown extension '.txt'; cameras are read from"),
         ("cameras.npz", "damaged or not an NPZ"),
     ]:

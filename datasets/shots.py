@@ -1,0 +1,71 @@
+"""``Shot``: what a file says of one photograph, and what the readers of all such files share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from ..neural_fields import InputError
+from .cameras import Camera
+
+__all__ = ["IMAGE_SUFFIXES", "Shot", "find_image", "image_size", "intrinsics", "list_images"]
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """One photograph as a file of cameras describes it; the photograph itself is not read.
+
+    Attributes:
+        name: of the image, as the file has it.
+        camera: the pinhole that is left without the lens's distortion.
+        image: where the photograph should be.
+        mask: where its mask should be, or None.
+        distortion: k1, k2, p1, p2, k3, k4, k5, k6 of OpenCV's model, or the first of them; the rest are zero.
+        named: file and record, as the beginning of a message.
+    """
+
+    name: str
+    camera: Camera
+    image: Path
+    mask: Path | None
+    distortion: tuple[float, ...]
+    named: str
+
+
+def intrinsics(fx: float, fy: float, cx: float, cy: float) -> Tensor:
+    """``(3, 3)``: ``[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]`` in float64."""
+    return torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
+
+
+def find_image(folder: Path, name: str) -> Path:
+    """The image of that name; Blender's scenes leave its extension out. Whether there is one is not said."""
+    beside = folder / name
+    files = [beside, *(beside.with_name(beside.name + suffix) for suffix in IMAGE_SUFFIXES)]
+    return next((file for file in files if file.is_file()), beside)
+
+
+def list_images(folder: Path) -> list[Path]:
+    """The images of a folder in the order of their names; none where there is no such folder."""
+    if not folder.is_dir():
+        return []
+    return sorted(file for file in folder.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES)
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Width and height, from the header alone.
+
+    Raises:
+        InputError: the file is damaged or no image.
+    """
+    import imageio.v3 as iio  # here, because most files of cameras say it themselves
+
+    try:
+        shape = iio.improps(path).shape
+    except (OSError, ValueError, SyntaxError) as error:  # Pillow's PNG reader raises SyntaxError
+        raise InputError(f"{path}: cannot be read as an image; export it again") from error
+    return int(shape[1]), int(shape[0])
