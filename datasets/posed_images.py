@@ -2,16 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..neural_fields import Similarity
+from ..neural_fields import InputError, Similarity
 from .cameras import Camera
+from .colmap import read_colmap_points
+from .neus_cameras import read_neus_sphere
+from .pictures import read_mask, read_picture, resample, shrink
+from .posed_cameras import find_source, read_shots
+from .region import region_from_cameras, region_from_masks, region_from_points
+from .shots import Shot
+from .undistort import undistort, undistorted_camera
 
 __all__ = ["PosedImage", "PosedImages", "read_posed_images"]
+
+Float32 = NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +51,7 @@ class PosedImages:
         similarity: from world coordinates to the unit sphere around the region of interest.
         region: where that came from, in words.
         points: ``(P, 3)`` sparse points of the surface in world coordinates, or None.
-        source: the file that the cameras were read from.
+        source: the file that the cameras were read from; for COLMAP the folder of the model.
     """
 
     views: tuple[PosedImage, ...]
@@ -51,5 +62,112 @@ class PosedImages:
 
 
 def read_posed_images(path: str | Path, *, width: int | None = None, region: Similarity | None = None) -> PosedImages:
-    """Read photographs with their cameras."""
-    raise NotImplementedError
+    """Read photographs, their cameras and masks, and find out where the object is.
+
+    Lens distortion is taken out of the pictures, and the cameras are those of the new pictures. Where a picture is
+    larger or smaller than its file of cameras says, both sides by one factor, the camera follows. A picture's mask is
+    the file that goes with it, or its transparency.
+
+    Args:
+        path: a file or folder that `read_cameras` knows: NeuS (with ``image`` and ``mask`` beside cameras_sphere.npz),
+            transforms.json, COLMAP (``sparse/0`` with ``images`` beside it).
+        width: pictures that are wider are shrunk to this, in pixels, in linear light; none is enlarged.
+        region: the sphere around the object. By default that of ``scale_mat_i``, of the masks' visual hull, of the
+            sparse points, or that which the cameras look at: the first that there is.
+
+    Raises:
+        InputError: a file is missing or damaged, a picture and its camera or mask do not go together, a lens cannot
+            be undistorted, or nothing says where the object is.
+        ValueError: ``width`` is not positive.
+
+    Example:
+        >>> read_posed_images("photos")
+        Traceback (most recent call last):
+        ...
+        mplicits.neural_fields.errors.InputError: photos: no such file; check the path
+    """
+    if width is not None and width < 1:
+        raise ValueError(f"width={width}: expected at least one pixel")
+    source = find_source(path)
+    shots = read_shots(source)
+    neus = source.suffix.lower() == ".npz"
+    sphere = read_neus_sphere(source) if neus else None
+    points = read_colmap_points(source) if source.is_dir() else None
+    _check_files(shots)
+    views = tuple(_view(shot, width) for shot in shots)
+    if region is not None:
+        similarity, words = region, "given"
+    elif sphere is not None:
+        similarity, words = sphere, f"scale_mat_i of {source.name}"
+    else:
+        similarity, words = _find_region(views, points, source)
+    return PosedImages(views, similarity, words, points, source)
+
+
+def _check_files(shots: Sequence[Shot]) -> None:
+    """Say before any long work what is missing."""
+    for kind, fix in (("image", "add it, or leave that camera out"), ("mask", "add it, or leave all masks out")):
+        files = [(shot, file) for shot in shots if (file := getattr(shot, kind)) is not None]
+        missing = [(shot, file) for shot, file in files if not file.is_file()]
+        if missing:
+            shot, file = missing[0]
+            more = f" ({len(missing)} of {len(files)} are missing)" if len(missing) > 1 else ""
+            raise InputError(f"{shot.named}: no {kind} {file}{more}; {fix}")
+
+
+def _view(shot: Shot, width: int | None) -> PosedImage:
+    color, mask = read_picture(shot.image)
+    see_through = mask is not None  # then what is not object has no colour of its own
+    camera = _fitted(shot, color.shape[1], color.shape[0])
+    if shot.mask is not None:
+        mask, see_through = read_mask(shot.mask), False
+        if mask.shape != color.shape[:2]:
+            sizes = [f"{shape[1]} × {shape[0]}" for shape in (mask.shape, color.shape)]
+            raise InputError(f"{shot.mask}: {sizes[0]} pixels, but {shot.image} has {sizes[1]}; make them match")
+    try:
+        pinhole = undistorted_camera(camera, shot.distortion)
+    except ValueError as error:
+        raise InputError(f"{shot.named}: {error}; check the coefficients, or undistort the images") from error
+    steps: list[Callable[[Float32], Float32]] = []
+    if pinhole is not camera:
+        steps.append(partial(undistort, camera=camera, distortion=shot.distortion, pinhole=pinhole))
+    if width is not None and width < camera.width:
+        pinhole = pinhole.resized(width, max(1, round(camera.height * width / camera.width)))
+        steps.append(partial(shrink, width=pinhole.width, height=pinhole.height))
+    for step in steps:
+        if see_through:
+            color, mask = resample(color, mask, step)
+        else:
+            color, mask = resample(color, None, step)[0], mask if mask is None else step(mask)
+    return PosedImage(shot.name, pinhole, color, mask)
+
+
+def _fitted(shot: Shot, width: int, height: int) -> Camera:
+    """The camera for the picture that is there: files often keep the size of the original photographs."""
+    camera = shot.camera
+    if abs(camera.height * width / camera.width - height) >= 1:  # a pixel, because sizes are rounded
+        sizes = f"{width} × {height} pixels, but its camera has {camera.width} × {camera.height}"
+        raise InputError(f"{shot.named}: {shot.image} has {sizes}; turn, crop or export it as it was")
+    same = (camera.width, camera.height) == (width, height)
+    return camera if same else camera.resized(width, height)
+
+
+def _find_region(
+    views: Sequence[PosedImage], points: NDArray[np.float64] | None, source: Path
+) -> tuple[Similarity, str]:
+    """The first of masks, sparse points and cameras that says where the object is, and which it was."""
+    cameras = [view.camera for view in views]
+    masks = [view.mask for view in views if view.mask is not None]
+    tries: list[tuple[str, Callable[[], Similarity]]] = []
+    if len(masks) == len(views):
+        tries.append(("visual hull of the masks", lambda: region_from_masks(cameras, masks)))
+    if points is not None:
+        tries.append(("sparse points", lambda: region_from_points(points, cameras)))
+    tries.append(("what the cameras look at", lambda: region_from_cameras(cameras)))
+    refused: list[str] = []
+    for words, attempt in tries:
+        try:
+            return attempt(), "; ".join((words, *(f"not {reason}" for reason in refused)))
+        except ValueError as error:
+            refused.append(str(error))
+    raise InputError(f"{source}: region: not found ({'; '.join(refused)}); give its center and scale")

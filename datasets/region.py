@@ -1,0 +1,155 @@
+"""Where the object is, that posed photographs show: a sphere from cameras, sparse points, or masks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ..neural_fields import Similarity
+from .cameras import Camera
+
+__all__ = ["region_from_cameras", "region_from_masks", "region_from_points"]
+
+Float64 = NDArray[np.float64]
+
+PARALLEL = 1e-6  # squared sine between axes of view below which they meet nowhere
+CLEAR = 0.9  # of the distance to the nearest camera, that the sphere may reach to
+MARGIN = 1.05  # by how much the sphere is larger than what it is put around
+CELLS = 64  # of the grid of the visual hull, along each side
+FEWEST = 8  # points or grid points that say where something is
+TAIL = 0.02  # share of the sparse points on either side that are not trusted
+
+
+def region_from_cameras(cameras: Sequence[Camera]) -> Similarity:
+    """The sphere that the cameras look at.
+
+    Its centre is the point c with the least sum of squared distances to the axes of view,
+    ``Σ (I − d dᵀ)(c − eye) = 0``. Its radius is the median, over the cameras, of the largest that is seen whole: the
+    distance from c to the nearest of the four planes through the eye and the sides of the image. It is at most 0.9 of
+    the distance from c to the nearest camera, so that no camera is inside.
+
+    Raises:
+        ValueError: the axes of view are parallel, or half of the cameras have the centre behind them or out of view.
+    """
+    eyes = np.array([camera.eye.tolist() for camera in cameras]).reshape(-1, 3)
+    axes = np.array([camera.forward.tolist() for camera in cameras]).reshape(-1, 3)
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # (V, 3, 3) takes the part along the axis away
+    middle = eyes.mean(axis=0) if len(eyes) else np.zeros(3)  # taken off first: map coordinates have many digits
+    total = across.sum(axis=0)
+    if not len(eyes) or np.linalg.eigvalsh(total)[0] < PARALLEL * len(eyes):
+        raise ValueError("cameras: their axes of view are parallel, so they meet nowhere")
+    center = middle + np.linalg.solve(total, np.einsum("vij,vj->i", across, eyes - middle))
+    radius = float(np.median([_seen_whole(camera, center) for camera in cameras]))
+    if radius <= 0:
+        raise ValueError("cameras: half of them do not see the point that is nearest to all axes of view")
+    nearest = float(np.linalg.norm(eyes - center, axis=1).min())
+    if nearest == 0:
+        raise ValueError("cameras: one stands where the axes of view meet")
+    return _sphere(center, min(radius, CLEAR * nearest))
+
+
+def region_from_points(points: Float64, cameras: Sequence[Camera]) -> Similarity:
+    """The sphere around the sparse points ``(P, 3)`` that most cameras share.
+
+    Points count if at least half of the cameras have them in view, and if they are nearer to the point that the cameras
+    look at than the median camera is: what is further away is background. The centre is the middle of the box
+    between the 2 % and 98 % quantiles along the axes, the radius 1.05 times the 98 % quantile of the distances from it.
+
+    Raises:
+        ValueError: fewer than eight points are left, or all of them coincide.
+    """
+    views = np.zeros(len(points), np.int64)
+    for camera in cameras:
+        views += _in_view(camera, points)[1]
+    kept = points[views * 2 >= len(cameras)]
+    try:
+        focus = np.array(region_from_cameras(cameras).center)
+    except ValueError:  # cameras side by side: there is no middle to be far from
+        pass
+    else:
+        reach = np.median([np.linalg.norm(camera.eye.numpy() - focus) for camera in cameras])
+        kept = kept[np.linalg.norm(kept - focus, axis=1) < reach]
+    if len(kept) < FEWEST:
+        raise ValueError(f"points: {len(kept)} of {len(points)} are where most cameras look; expected {FEWEST}")
+    center = np.quantile(kept, (TAIL, 1 - TAIL), axis=0).mean(axis=0)
+    radius = float(np.quantile(np.linalg.norm(kept - center, axis=1), 1 - TAIL))
+    if radius == 0:
+        raise ValueError("points: all of them coincide")
+    return _sphere(center, MARGIN * radius)
+
+
+def region_from_masks(cameras: Sequence[Camera], masks: Sequence[NDArray[np.floating]]) -> Similarity:
+    """The sphere around the visual hull: the points that are object in every view that has them in the picture.
+
+    Points of a grid of 64³ are tried, first in the cube around twice the sphere of `region_from_cameras`, then in the
+    box of those that are left. At least half of the views must have a point in the picture. The sphere is centred on
+    the box of the hull, and reaches a step of the grid and 5 % beyond it.
+
+    Args:
+        cameras: V of them.
+        masks: V times ``(H, W)``, in [0, 1]; object is more than a half.
+
+    Raises:
+        ValueError: the masks show no background, the hull is empty, or as for `region_from_cameras`.
+    """
+    solid = [mask > 0.5 for mask in masks]
+    if all(mask.all() for mask in solid):
+        raise ValueError("masks: show no background")
+    start = region_from_cameras(cameras)
+    low, high = (np.array(start.center) + side * 2 * start.scale for side in (-1, 1))
+    hull, step = _hull(low, high, cameras, solid)
+    low, high = hull.min(axis=0) - step, hull.max(axis=0) + step
+    hull, step = _hull(low, high, cameras, solid)
+    center = (hull.min(axis=0) + hull.max(axis=0)) / 2
+    reach = np.linalg.norm(np.abs(hull - center) + step, axis=1).max()
+    return _sphere(center, MARGIN * float(reach))
+
+
+def _hull(
+    low: Float64, high: Float64, cameras: Sequence[Camera], solid: Sequence[NDArray[np.bool_]]
+) -> tuple[Float64, Float64]:
+    """The points of the grid between two corners that are object ``(N, 3)``, and its steps ``(3,)``."""
+    lines = [np.linspace(low[axis], high[axis], CELLS) for axis in range(3)]
+    points = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, 3)
+    views = np.zeros(len(points), np.int64)
+    for camera, mask in zip(cameras, solid, strict=True):
+        pixels, inside = _in_view(camera, points)
+        hit = np.zeros(len(points), np.bool_)
+        column, row = np.rint(pixels[inside]).astype(np.int64).T
+        hit[inside] = mask[row.clip(0, camera.height - 1), column.clip(0, camera.width - 1)]
+        views += inside
+        kept = hit | ~inside
+        points, views = points[kept], views[kept]
+    hull = points[views * 2 >= len(cameras)]
+    if len(hull) < FEWEST:
+        raise ValueError("masks: no part of space is object in all of them")
+    return hull, (high - low) / (CELLS - 1)
+
+
+def _in_view(camera: Camera, points: Float64) -> tuple[Float64, NDArray[np.bool_]]:
+    """Pixels ``(N, 2)``, and which of the points are in front of the camera and in its picture ``(N,)``."""
+    pixels, depths = (array.numpy() for array in camera.project(torch.from_numpy(points)))
+    size = np.array((camera.width, camera.height))
+    inside = (depths > 0) & (pixels >= -0.5).all(axis=1) & (pixels < size - 0.5).all(axis=1)
+    return pixels, inside
+
+
+def _seen_whole(camera: Camera, center: Float64) -> float:
+    """The radius of the largest sphere around ``center`` that is in the picture; not positive if the centre is not."""
+    return min(_clearances(camera, center))
+
+
+def _clearances(camera: Camera, center: Float64) -> Iterator[float]:
+    """Distances of a point from the planes through the eye and the picture's sides, positive on the inside."""
+    (fx, _, cx), (_, fy, cy), _ = camera.intrinsics.tolist()
+    x, y, z = (camera.world_from_camera[:3, :3].T @ (torch.from_numpy(center) - camera.eye)).tolist()
+    for place, focal, axis, size in ((x, fx, cx, camera.width), (y, fy, cy, camera.height)):
+        for sign, edge in ((1, (-0.5 - axis) / focal), (-1, (size - 0.5 - axis) / focal)):
+            yield sign * (place - edge * z) / (1 + edge**2) ** 0.5
+
+
+def _sphere(center: Float64, radius: float) -> Similarity:
+    return Similarity((float(center[0]), float(center[1]), float(center[2])), radius)
