@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -27,9 +28,10 @@ def region_from_cameras(cameras: Sequence[Camera]) -> Similarity:
     """The sphere that the cameras look at.
 
     Its centre is the point c with the least sum of squared distances to the axes of view,
-    ``Σ (I − d dᵀ)(c − eye) = 0``. Its radius is the median, over the cameras, of the largest that is seen whole: the
-    distance from c to the nearest of the four planes through the eye and the sides of the image. It is at most 0.9 of
-    the distance from c to the nearest camera, so that no camera is inside.
+    ``Σ (I − d dᵀ)(c − eye) = 0``. Its radius is the median, over the cameras, of that of the sphere at the distance of
+    c that just fits between the ends of the picture's longer side, wherever in the picture c is. (People frame an
+    object so that it fills the picture; a sphere that fits into the shorter side would cut it.) The radius is at most
+    0.9 of the distance from c to the nearest camera, so that no camera is inside.
 
     Raises:
         ValueError: the axes of view are parallel, or half of the cameras have the centre behind them or out of view.
@@ -42,8 +44,8 @@ def region_from_cameras(cameras: Sequence[Camera]) -> Similarity:
     if not len(eyes) or np.linalg.eigvalsh(total)[0] < PARALLEL * len(eyes):
         raise ValueError("cameras: their axes of view are parallel, so they meet nowhere")
     center = middle + np.linalg.solve(total, np.einsum("vij,vj->i", across, eyes - middle))
-    radius = float(np.median([_seen_whole(camera, center) for camera in cameras]))
-    if radius <= 0:
+    radius = float(np.median([_view_radius(camera, center) for camera in cameras]))
+    if radius == 0:
         raise ValueError("cameras: half of them do not see the point that is nearest to all axes of view")
     nearest = float(np.linalg.norm(eyes - center, axis=1).min())
     if nearest == 0:
@@ -137,18 +139,18 @@ def _in_view(camera: Camera, points: Float64) -> tuple[Float64, NDArray[np.bool_
     return pixels, inside
 
 
-def _seen_whole(camera: Camera, center: Float64) -> float:
-    """The radius of the largest sphere around ``center`` that is in the picture; not positive if the centre is not."""
-    return min(_clearances(camera, center))
-
-
-def _clearances(camera: Camera, center: Float64) -> Iterator[float]:
-    """Distances of a point from the planes through the eye and the picture's sides, positive on the inside."""
+def _view_radius(camera: Camera, center: Float64) -> float:
+    """The radius of the sphere at that distance that fits the picture's longer side; 0 if the point is out of view."""
     (fx, _, cx), (_, fy, cy), _ = camera.intrinsics.tolist()
     x, y, z = (camera.world_from_camera[:3, :3].T @ (torch.from_numpy(center) - camera.eye)).tolist()
-    for place, focal, axis, size in ((x, fx, cx, camera.width), (y, fy, cy, camera.height)):
-        for sign, edge in ((1, (-0.5 - axis) / focal), (-1, (size - 0.5 - axis) / focal)):
-            yield sign * (place - edge * z) / (1 + edge**2) ** 0.5
+    across = _clearances(x, z, (-0.5 - cx) / fx, (camera.width - 0.5 - cx) / fx)
+    down = _clearances(y, z, (-0.5 - cy) / fy, (camera.height - 0.5 - cy) / fy)
+    return max(sum(across), sum(down)) / 2 if min(*across, *down) > 0 else 0.0
+
+
+def _clearances(place: float, z: float, low: float, high: float) -> tuple[float, float]:
+    """How far (place, z) is inside either side of the wedge with slopes low and high and its edge at the origin."""
+    return (place - low * z) / math.hypot(1, low), (high * z - place) / math.hypot(1, high)
 
 
 def _sphere(center: Float64, radius: float) -> Similarity:
