@@ -7,17 +7,14 @@ Whatever a command needs is imported when it runs; this module itself stays ligh
 from __future__ import annotations
 
 import argparse
-import sys
 import time
 from collections.abc import Mapping
-from contextlib import nullcontext
 from pathlib import Path
 from types import MappingProxyType
 
 from .bench_commands import BENCH_COMMANDS
 from .command import Command, add_json, check_output, positive, whole
-from .config import input_error
-from .fit_depth_flags import add_depth_flags, depth_input
+from .fit_command import COMMAND as FIT
 from .fit_settings import add_fit_settings, fit_settings, were_given
 from .render_command import COMMAND as RENDER
 from .slice_command import COMMAND as SLICE
@@ -28,52 +25,6 @@ __all__ = ["COMMANDS", "Command"]
 
 MESH_FILES = (".ply", ".obj", ".stl", ".glb")
 SAMPLES = ("statue",)
-
-
-def _fit_arguments(parser: argparse.ArgumentParser) -> None:
-    what = "PLY, OBJ, STL, OFF, XYZ, TXT, CSV, NPY, NPZ, LAS or LAZ file; a depth map, or a folder of them"
-    parser.add_argument("cloud", metavar="CLOUD", help=what)
-    parser.add_argument("-o", "--out", required=True, type=Path, metavar="RUN", help="directory of the run")
-    begin = parser.add_mutually_exclusive_group()
-    begin.add_argument("--resume", action="store_true", help="continue the interrupted run in RUN, with its settings")
-    begin.add_argument("--force", action="store_true", help="overwrite the run in RUN")
-    parser.add_argument("--quiet", action="store_true", help="no progress bars")
-    add_fit_settings(parser)
-    add_depth_flags(parser)
-
-
-def _fit(arguments: argparse.Namespace) -> int:
-    if arguments.resume and were_given(arguments):
-        raise input_error("--resume: continues with the run's own settings; leave out --preset, --config and the rest")
-    config = None if arguments.resume else fit_settings(arguments)
-    from .fit import Interrupted, fit
-    from .fit_depth import fit_depth, trim_suggestion
-    from .fit_state import STATE_FILE
-    from .info import describe
-    from .progress_bar import progress_bars
-    from .runs import check_new_run
-    from .texture import TEXTURE_FILE
-
-    depth = depth_input(arguments)
-    directory = check_new_run(arguments.out, resume=arguments.resume, force=arguments.force)
-    if arguments.force:
-        # What is left of the old run must not be resumed into the new one, nor colour it.
-        for name in (STATE_FILE, TEXTURE_FILE):
-            (directory / name).unlink(missing_ok=True)
-    try:
-        with nullcontext() if arguments.quiet else progress_bars() as report:
-            if depth is None:
-                fit(arguments.cloud, config, out=directory, resume=arguments.resume, progress=report)
-            else:
-                fit_depth(depth, config, out=directory, resume=arguments.resume, progress=report, say=print)
-    except Interrupted:
-        print(f"interrupted; to continue: mplicits fit {arguments.cloud} -o {directory} --resume", file=sys.stderr)
-        return 130
-    print(describe(directory))
-    # A depth map shows one side of things; what the fit closes behind it is no part of them.
-    trim = "" if depth is None else f" --trim-distance {trim_suggestion(directory):.2g}"
-    print(f"next: mplicits mesh {directory} -o {directory / 'mesh.ply'}{trim}")
-    return 0
 
 
 def _mesh_arguments(parser: argparse.ArgumentParser) -> None:
@@ -196,18 +147,7 @@ def _demo(arguments: argparse.Namespace) -> int:
 
 COMMANDS: Mapping[str, Command] = MappingProxyType(
     {
-        "fit": Command(
-            "fit a multiscale SDF to a point cloud or depth maps",
-            """  mplicits fit scan.ply -o runs/scan
-  mplicits fit scan.ply -o runs/quick --preset fast
-  mplicits fit scan.ply -o runs/scan --resume
-  mplicits fit scan.xyz -o runs/mine --normals estimate --time-budget 120 --steps 2000 1000 1000
-  mplicits fit depth.png --intrinsics camera.json --color color.png -o runs/room
-  mplicits fit depth/ --intrinsics camera.json --color color/ --poses trajectory.log -o runs/room""",
-            _fit_arguments,
-            _fit,
-            "Fit a multiscale SDF to a point cloud, or to depth maps. RUN will hold field.safetensors and run.json.",
-        ),
+        "fit": FIT,
         "mesh": Command(
             "extract a mesh from a fit",
             """  mplicits mesh runs/scan -o scan.ply --resolution 512

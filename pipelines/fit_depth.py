@@ -30,7 +30,7 @@ from ..neural_fields import InputError
 from .fit import FitConfig, Run, choose_device, fit
 from .training import Progress
 
-__all__ = ["CLOUD_FILE", "DepthInput", "depth_cloud", "fit_depth", "read_frames", "trim_suggestion"]
+__all__ = ["CLOUD_FILE", "DepthInput", "depth_cloud", "fit_depth", "kept_cloud", "read_frames", "trim_suggestion"]
 
 CLOUD_FILE = "cloud.ply"
 """The cloud of a run that was fitted to depth maps; `mesh --trim-distance` and `texture` read it."""
@@ -129,11 +129,8 @@ def fit_depth(
         InputError: the depth maps cannot be used, or there is nothing to resume.
         Interrupted: see `fit`.
     """
-    kept = out / CLOUD_FILE
     if resume:
-        if not kept.is_file():
-            raise InputError(f"{out}: holds no {CLOUD_FILE}, so it was not fitted to depth maps; name its own cloud")
-        return fit(kept, config, out=out, resume=True, progress=progress)
+        return fit(kept_cloud(out), config, out=out, resume=True, progress=progress)
     config = config or FitConfig()
     choose_device(config.device)  # or it would fail after the directory has been made
     cloud, report = depth_cloud(source)
@@ -142,8 +139,21 @@ def fit_depth(
     if config.normals == "auto":
         config = dataclasses.replace(config, normals="file")
     out.mkdir(parents=True, exist_ok=True)
+    kept = out / CLOUD_FILE
     write_cloud_ply(kept, cloud)
     return fit(kept, config, out=out, progress=progress)
+
+
+def kept_cloud(run: Path) -> Path:
+    """The file of the cloud that was made of the depth maps of a run.
+
+    Raises:
+        InputError: the run was not fitted to depth maps.
+    """
+    kept = run / CLOUD_FILE
+    if not kept.is_file():
+        raise InputError(f"{run}: holds no {CLOUD_FILE}, so it was not fitted to depth maps; name its own cloud")
+    return kept
 
 
 def trim_suggestion(run: Path) -> float:

@@ -7,12 +7,13 @@ import importlib.metadata
 import json
 import os
 import platform
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
@@ -24,6 +25,7 @@ __all__ = [
     "FIELD_FILE",
     "RECORD_FILE",
     "STATE_FILE",
+    "digest_of",
     "environment",
     "fingerprint",
     "load_state",
@@ -39,8 +41,13 @@ STATE_FILE = "resume.safetensors"
 
 def fingerprint(cloud: OrientedCloud) -> str:
     """A digest of points and normals, to tell whether a resumed run sees the same cloud."""
+    return digest_of((cloud.points, cloud.normals))
+
+
+def digest_of(arrays: Iterable[NDArray[Any]]) -> str:
+    """SHA-256 of what is in the arrays, one after the other."""
     digest = hashlib.sha256()
-    for array in (cloud.points, cloud.normals):
+    for array in arrays:
         digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()
 
@@ -83,21 +90,23 @@ def read_record(directory: Path) -> dict[str, Any]:
     return record
 
 
-def save_state(directory: Path, tensors: Mapping[str, Tensor], progress: Mapping[str, Any]) -> None:
+def save_state(
+    directory: Path, tensors: Mapping[str, Tensor], progress: Mapping[str, Any], *, name: str = STATE_FILE
+) -> None:
     """Write the resume file, whole or not at all; ``progress`` is JSON."""
-    partial = directory / f".{STATE_FILE}.{os.getpid()}.partial"
+    partial = directory / f".{name}.{os.getpid()}.partial"
     plain = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in tensors.items()}
     partial.write_bytes(save(plain, metadata={"progress": json.dumps(dict(progress))}))
-    partial.replace(directory / STATE_FILE)
+    partial.replace(directory / name)
 
 
-def load_state(directory: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+def load_state(directory: Path, *, name: str = STATE_FILE) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Read what `save_state` wrote.
 
     Raises:
         InputError: there is no resume file, or it is damaged.
     """
-    path = directory / STATE_FILE
+    path = directory / name
     if not path.is_file():
         raise InputError(f"{path}: no such file, so there is nothing to resume; leave out --resume and choose a new -o")
     try:
@@ -105,4 +114,4 @@ def load_state(directory: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
             progress = json.loads(file.metadata()["progress"])
             return {name: file.get_tensor(name) for name in file.keys()}, progress  # noqa: SIM118
     except (SafetensorError, KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{path}: damaged ({error}); fit again into a new directory") from error
+        raise InputError(f"{path}: damaged ({error}); begin again without --resume") from error

@@ -23,12 +23,13 @@ FLOAT32_REACH = 128.0
 TEXT_ROWS = 1 << 16
 
 
-def check_mesh_path(path: str | Path, similarity: Similarity | None = None) -> Path:
+def check_mesh_path(path: str | Path, similarity: Similarity | None = None, *, new_folder: bool = False) -> Path:
     """Whether a mesh can be written to ``path``, to be asked before any long work.
 
     Args:
         path: the file to be; an existing file would be replaced.
         similarity: that of the field, where it is known already.
+        new_folder: whether its folder will be made before the mesh, so that it need not be there yet.
 
     Raises:
         InputError: the extension is unknown or cannot hold the coordinates, the folder does not exist or may not
@@ -40,9 +41,9 @@ def check_mesh_path(path: str | Path, similarity: Similarity | None = None) -> P
         raise InputError(f"{path}: unknown mesh format {path.suffix or '(no extension)'!r}; use one of {known}")
     if path.is_dir():
         raise InputError(f"{path}: is a folder; give the name of a file in it")
-    if not path.absolute().parent.is_dir():
+    if not new_folder and not path.absolute().parent.is_dir():
         raise InputError(f"{path}: the folder {path.absolute().parent} does not exist; make it first")
-    if not os.access(path.absolute().parent, os.W_OK):
+    if not new_folder and not os.access(path.absolute().parent, os.W_OK):
         raise InputError(f"{path}: the folder {path.absolute().parent} may not be written; choose another")
     if path.suffix.lower() == ".stl" and similarity is not None and needs_doubles(similarity):
         center = ", ".join(f"{c:.0f}" for c in similarity.center)

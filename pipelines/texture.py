@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,7 +29,8 @@ from .fit_state import RECORD_FILE, environment, read_record, write_record
 from .runs import find_field
 from .texture_config import TextureConfig
 from .texture_samples import BandSamples, ColorSamples, band_directions, match_colors, read_colors
-from .training import Progress, StopFlag, set_rate, stop_on_signals
+from .texture_state import TextureState, texture_state_file
+from .training import Progress, StopFlag, pack_training, set_rate, stop_on_signals, unpack_training
 
 __all__ = ["TEXTURE_FILE", "FittedTexture", "default_delta", "fit_texture", "texture_of", "texture_run"]
 
@@ -40,6 +41,8 @@ LEAST_DELTA = 0.02
 SINGLE_LEVEL_DELTA = 0.05
 # Points of the pool at which the final error is measured.
 JUDGED = 100_000
+# Seconds between two states that a killed training can be resumed from.
+SAVE_EVERY = 20.0
 
 
 @dataclass(frozen=True)
@@ -63,6 +66,8 @@ def fit_texture(
     similarity: Similarity | None = None,
     level: int = -1,
     progress: Callable[[Progress], None] | None = None,
+    save: Callable[[dict[str, torch.Tensor]], None] | None = None,
+    state: Mapping[str, torch.Tensor] | None = None,
 ) -> FittedTexture:
     """Train a texture field by the paper's 𝒯(φ): the colours at points, and none of their change along ∇f.
 
@@ -76,6 +81,8 @@ def fit_texture(
         similarity: from input to the geometry's coordinates; the identity if there is none.
         level: the level of the geometry that the colours belong to.
         progress: called now and then with how far the training is.
+        save: called now and then, and when the training is interrupted, with what ``state`` takes.
+        state: of an interrupted training of the same cloud and settings, to be continued to the same result.
 
     Raises:
         InputError: the cloud has no colours, or lies somewhere else than the surface.
@@ -104,8 +111,10 @@ def fit_texture(
         network = ColorSiren(config.width, config.depth, omega=config.omega, mean=mean).to(samples.points)
     sampling_seconds = time.monotonic() - started
     trainer = _Trainer(network, samples, band, config, delta=delta, generator=generator, spent=sampling_seconds)
+    if state is not None:
+        trainer.restore(state)
     with stop_on_signals() as flag:
-        finished = trainer.run(flag, report)
+        finished = trainer.run(flag, report, save or (lambda _: None))
     record = {
         "finished": finished,
         "source": cloud.source,
@@ -134,9 +143,12 @@ def texture_run(
     *,
     out: str | Path | None = None,
     level: int | None = None,
+    resume: bool = False,
     progress: Callable[[Progress], None] | None = None,
 ) -> FittedTexture:
     """Train a texture for a run and write it, by default beside its field, where ``run.json`` records it.
+
+    Until it is trained, the state of the training lies beside it; see `texture_state_file`.
 
     Args:
         run: run directory or .safetensors file.
@@ -144,24 +156,46 @@ def texture_run(
         config: settings.
         out: another place for the texture.
         level: of the run, counted from 0; None is the finest.
+        resume: continue the interrupted training with its own settings and level; those given are then ignored.
         progress: see `fit_texture`.
 
     Raises:
-        InputError: there is no such run or level, or the source cannot be used.
+        InputError: there is no such run or level, the source cannot be used, or there is nothing to resume.
     """
     config = config or TextureConfig()
     file = find_field(run)
+    target = file.with_name(TEXTURE_FILE) if out is None else Path(out)
+    state_file = texture_state_file(target)
+    before = TextureState.load(state_file) if resume else None
+    if before is not None:
+        config, level = before.config, before.level
     geometry, similarity, _ = load_field(file)
     if level is not None and not 0 <= level < geometry.num_levels:
         raise InputError(f"--level {level}: {file} has levels 0 to {geometry.num_levels - 1}")
     cloud = read_colors(source, samples=config.samples, seed=config.seed)
+    state = TextureState(config, level, TextureState.fingerprint_of(cloud, geometry), {})
+    if before is not None and before.fingerprint != state.fingerprint:
+        raise InputError(
+            f"{source}: not the colours, or {file} not the field, that the interrupted training began with; "
+            "resume with those, or leave out --resume"
+        )
+    if before is None:
+        state_file.unlink(missing_ok=True)  # of another training; this one shall not be resumed from it
     fitted = fit_texture(
-        geometry, cloud, config, similarity=similarity, level=-1 if level is None else level, progress=progress
+        geometry,
+        cloud,
+        config,
+        similarity=similarity,
+        level=-1 if level is None else level,
+        progress=progress,
+        save=lambda tensors: dataclasses.replace(state, tensors=tensors).save(state_file),
+        state=None if before is None else before.tensors,
     )
-    target = file.with_name(TEXTURE_FILE) if out is None else Path(out)
     save_texture(target, fitted.texture, metadata={"texture": fitted.record})
     if target == file.with_name(TEXTURE_FILE) and file.with_name(RECORD_FILE).is_file():
         write_record(file.parent, read_record(file.parent) | {"texture": fitted.record})
+    if fitted.record["finished"]:
+        state_file.unlink(missing_ok=True)
     return fitted
 
 
@@ -213,18 +247,37 @@ class _Trainer:
         by_time = self.elapsed / self.seconds if self.seconds else 0.0
         return min(1.0, max(self.step / self.config.steps, by_time))
 
-    def run(self, flag: StopFlag, report: Callable[[Progress], None], *, report_every: int = 20) -> bool:
+    def run(
+        self,
+        flag: StopFlag,
+        report: Callable[[Progress], None],
+        save: Callable[[dict[str, torch.Tensor]], None],
+        *,
+        report_every: int = 20,
+    ) -> bool:
         """Train until the schedule ends → True, or until somebody asks to stop → False."""
-        start = time.monotonic()
+        start, saved = time.monotonic() - self.elapsed, time.monotonic()
         while self.fraction < 1:
             if flag.requested:
+                save(self.state())
                 return False
             terms = self._step()
             self.elapsed = time.monotonic() - start
             if self.step % report_every == 0 or self.fraction >= 1:
                 self.losses = {name: float(term) for name, term in terms.items()}
                 report(Progress("texture", self.step, self.config.steps, self.fraction, self.losses))
+            if time.monotonic() - saved > SAVE_EVERY:
+                save(self.state())
+                saved = time.monotonic()
         return True
+
+    def state(self) -> dict[str, torch.Tensor]:
+        """All that `restore` needs to continue as if nothing had happened."""
+        return pack_training(self.network, self.adam, self.generator, step=self.step, elapsed=self.elapsed)
+
+    def restore(self, state: Mapping[str, torch.Tensor]) -> None:
+        """Continue from what `state` returned."""
+        self.step, self.elapsed = unpack_training(state, self.network, self.adam, self.generator)
 
     def _step(self) -> dict[str, torch.Tensor]:
         set_rate(self.adam, self.config.learning_rate, self.fraction)

@@ -16,7 +16,7 @@ from ..datasets.textured import TEXTURED_READERS, read_textured, sample_textured
 from ..neural_fields import Field, InputError, Similarity
 from .sampling import DOMAIN
 
-__all__ = ["BandSamples", "ColorSamples", "band_directions", "match_colors", "read_colors"]
+__all__ = ["BandSamples", "ColorSamples", "band_directions", "has_colors", "match_colors", "read_colors"]
 
 # With fewer points than this in the band, the colours are those of something else.
 LEAST_SHARE = 0.5
@@ -68,6 +68,19 @@ def read_colors(path: str | Path, *, samples: int, seed: int) -> PointCloud:
     if cloud.colors is None:
         raise InputError(f"{path}: colors: there are none; export the points with their colours, or name a mesh")
     return cloud
+
+
+def has_colors(path: str | Path) -> bool:
+    """Whether `read_colors` would find colours in the file of a cloud or mesh.
+
+    Raises:
+        InputError: the file, or an image of its texture, cannot be read.
+    """
+    path = Path(path)
+    cloud = read_cloud(path)
+    if path.suffix.lower() in TEXTURED_READERS and _has_faces(path):
+        return TEXTURED_READERS[path.suffix.lower()](path).has_colors
+    return cloud.colors is not None
 
 
 def _has_faces(path: Path) -> bool:

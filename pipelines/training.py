@@ -12,13 +12,22 @@ from dataclasses import dataclass
 from types import FrameType
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from ..neural_fields import Siren
 from ..neural_fields.losses import data_loss, eikonal_loss, normal_loss
 from .sampling import Samples
 
-__all__ = ["LevelTrainer", "Progress", "Source", "StopFlag", "stop_on_signals"]
+__all__ = [
+    "LevelTrainer",
+    "Progress",
+    "Source",
+    "StopFlag",
+    "pack_training",
+    "set_rate",
+    "stop_on_signals",
+    "unpack_training",
+]
 
 
 @dataclass(frozen=True)
@@ -94,6 +103,35 @@ def set_rate(adam: torch.optim.Adam, peak: float, progress: float) -> None:
     rate = peak * min(1.0, (progress + 0.001) / 0.02) * 0.5 * (1 + math.cos(math.pi * progress))
     for group in adam.param_groups:
         group["lr"] = rate
+
+
+def pack_training(
+    network: nn.Module, adam: torch.optim.Adam, generator: torch.Generator, *, step: int, elapsed: float
+) -> dict[str, Tensor]:
+    """All of a training that `unpack_training` needs to continue as if nothing had happened."""
+    state = {f"network.{name}": tensor for name, tensor in network.state_dict().items()}
+    for index, parameter in enumerate(network.parameters()):
+        for name, tensor in adam.state.get(parameter, {}).items():
+            state[f"adam.{index}.{name}"] = tensor
+    state["generator"] = generator.get_state()
+    state["progress"] = torch.tensor([step, elapsed], dtype=torch.float64)
+    return state
+
+
+def unpack_training(
+    state: Mapping[str, Tensor], network: nn.Module, adam: torch.optim.Adam, generator: torch.Generator
+) -> tuple[int, float]:
+    """Give network, optimiser and generator what `pack_training` took → steps done and seconds spent."""
+    prefix = "network."
+    network.load_state_dict({k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)})
+    for index, parameter in enumerate(network.parameters()):
+        prefix = f"adam.{index}."
+        # Adam counts its steps on the CPU, or beside the parameter where the kernel is fused.
+        found = {k.removeprefix(prefix): v.to(parameter.device) for k, v in state.items() if k.startswith(prefix)}
+        if found:
+            adam.state[parameter] = found
+    generator.set_state(state["generator"].cpu())
+    return int(state["progress"][0]), float(state["progress"][1])
 
 
 class LevelTrainer:
@@ -200,23 +238,8 @@ class LevelTrainer:
 
     def state(self) -> dict[str, Tensor]:
         """All that `restore` needs to continue as if nothing had happened."""
-        state = {f"network.{name}": tensor for name, tensor in self.network.state_dict().items()}
-        for index, parameter in enumerate(self.network.parameters()):
-            for name, tensor in self.adam.state.get(parameter, {}).items():
-                state[f"adam.{index}.{name}"] = tensor
-        state["generator"] = self.generator.get_state()
-        state["progress"] = torch.tensor([self.step, self.elapsed], dtype=torch.float64)
-        return state
+        return pack_training(self.network, self.adam, self.generator, step=self.step, elapsed=self.elapsed)
 
     def restore(self, state: Mapping[str, Tensor]) -> None:
         """Continue from what `state` returned."""
-        prefix = "network."
-        self.network.load_state_dict({k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)})
-        for index, parameter in enumerate(self.network.parameters()):
-            prefix = f"adam.{index}."
-            # Adam counts its steps on the CPU, or beside the parameter where the kernel is fused.
-            found = {k.removeprefix(prefix): v.to(parameter.device) for k, v in state.items() if k.startswith(prefix)}
-            if found:
-                self.adam.state[parameter] = found
-        self.generator.set_state(state["generator"].cpu())
-        self.step, self.elapsed = int(state["progress"][0]), float(state["progress"][1])
+        self.step, self.elapsed = unpack_training(state, self.network, self.adam, self.generator)
