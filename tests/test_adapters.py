@@ -1,31 +1,19 @@
-"""Each shell is called exactly as its host calls it, written out here in small stubs."""
+"""Each shell is called exactly as its host calls it; the hosts are written out in hosts.py."""
 
-import copy
 import enum
-import gc
-import io
-import weakref
-from collections.abc import Callable
-from dataclasses import dataclass
 
 import pytest
 import torch
 from fields import small_multiscale
-from mplicits.neural_fields import (
-    Field,
-    InstantNSRGeometry,
-    Jet,
-    MultiscaleSDF,
-    NerfstudioField,
-    NeuSGeometry,
-    Siren,
-    Sphere,
-)
+from hosts import Heads, NeuSHost, OldHeads, Separate, points, ray_samples, rays
+from mplicits.neural_fields import InstantNSRGeometry, MultiscaleSDF, NerfstudioField, NeuSGeometry, Siren, Sphere
 from mplicits.neural_fields.radiance import ViewColor
 from mplicits.neural_fields.volume import transmittance_weights
 from mplicits.pipelines.counting import Counted, counted
 from torch import Tensor, nn
 from torch.nn.functional import normalize, relu
+
+# NeuS
 
 
 def neus(*, scale: float = 1.0, double: bool = False) -> tuple[NeuSGeometry, Counted]:
@@ -33,77 +21,6 @@ def neus(*, scale: float = 1.0, double: bool = False) -> tuple[NeuSGeometry, Cou
     field = Counted(small_multiscale(0.5))
     shell = NeuSGeometry(field.double() if double else field, scale=scale)
     return shell, field
-
-
-def points(count: int = 50, dtype: torch.dtype = torch.float32) -> Tensor:
-    return torch.rand(count, 3, dtype=dtype) - 0.5
-
-
-# NeuS
-
-
-class NeuSHost:
-    """What NeuS's renderer and runner do with their networks in one step: same calls, same order, same shapes."""
-
-    def __init__(self, geometry: "NeuSGeometry | Separate", features: int) -> None:
-        self.geometry = geometry
-        self.color = nn.Sequential(nn.Linear(9 + features, 16), nn.ReLU(), nn.Linear(16, 3), nn.Sigmoid())
-        self.inverse_deviation = nn.Parameter(torch.tensor(0.3))
-
-    def parameters(self) -> list[nn.Parameter]:
-        return [*self.geometry.parameters(), *self.color.parameters(), self.inverse_deviation]
-
-    def finer_depths(self, origins: Tensor, directions: Tensor, depths: Tensor) -> Tensor:
-        """Up-sampling: the distance alone, without gradients, in rounds."""
-        with torch.no_grad():
-            for _ in range(2):
-                x = origins[:, None, :] + directions[:, None, :] * depths[..., :, None]
-                sdf = self.geometry.sdf(x.reshape(-1, 3)).reshape(depths.shape)
-                nearest = depths.gather(1, sdf.abs().argmin(dim=1, keepdim=True))
-                depths = torch.cat((depths, nearest + 0.01), -1).sort(dim=-1)[0]
-        return depths
-
-    def loss(self, origins: Tensor, directions: Tensor, depths: Tensor, wanted: Tensor) -> Tensor:
-        rays, samples = depths.shape
-        x = (origins[:, None, :] + directions[:, None, :] * depths[..., :, None]).reshape(-1, 3)
-        toward = directions[:, None, :].expand(rays, samples, 3).reshape(-1, 3)
-        output = self.geometry(x)
-        sdf, feature = output[:, :1], output[:, 1:]
-        gradients = self.geometry.gradient(x).squeeze()
-        color = self.color(torch.cat((x, toward, gradients, feature), -1)).reshape(rays, samples, 3)
-        slope = -relu(-(toward * gradients).sum(-1, keepdim=True))
-        inverse = (10 * self.inverse_deviation).exp()
-        ahead, behind = (torch.sigmoid((sdf + sign * slope * 0.05) * inverse) for sign in (-1, 1))
-        alpha = ((ahead - behind + 1e-5) / (ahead + 1e-5)).reshape(rays, samples).clip(0, 1)
-        passed = torch.cumprod(torch.cat((torch.ones(rays, 1), 1 - alpha + 1e-7), -1), -1)[:, :-1]
-        rendered = (color * (alpha * passed)[..., None]).sum(dim=1)
-        eikonal = ((gradients.reshape(rays, samples, 3).norm(dim=-1) - 1) ** 2).mean()
-        return (rendered - wanted).abs().mean() + 0.1 * eikonal
-
-
-class Separate(nn.Module):
-    """The same geometry as NeuS itself has it: every question is an evaluation of its own."""
-
-    def __init__(self, field: Field) -> None:
-        super().__init__()
-        self.field = field
-
-    def sdf(self, x: Tensor) -> Tensor:
-        return self.field.value(x)[:, None]
-
-    def forward(self, x: Tensor) -> Tensor:
-        jet = self.field.jet(x)
-        return torch.cat((jet.value[:, None], jet.features), -1)
-
-    def gradient(self, x: Tensor) -> Tensor:
-        x.requires_grad_(True)
-        return self.field.jet(x).gradient[:, None]
-
-
-def rays(count: int = 6) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    origins = torch.tensor([0.0, 0.0, -1.0]) + 0.1 * torch.rand(count, 3)
-    directions = normalize(torch.tensor([0.0, 0.0, 1.0]) + 0.2 * torch.rand(count, 3), dim=-1)
-    return origins, directions, torch.linspace(0.2, 1.8, 8).expand(count, 8), torch.rand(count, 3)
 
 
 def test_neus_step_costs_one_jet_per_sample_and_values_elsewhere() -> None:
@@ -205,236 +122,6 @@ def test_forward_alone_leaves_the_points_as_they_were() -> None:
     assert x.grad is None
 
 
-# The memo: when it serves, and when it must not
-
-
-def test_either_order_is_one_jet_and_each_half_is_served_once() -> None:
-    shell, field = neus()
-    x = points()
-    gradient = shell.gradient(x)
-    output = shell(x)
-    assert field.jets == 50
-    again = shell(x)
-    assert field.jets == 100
-    assert torch.equal(output, again)
-    assert torch.equal(gradient, shell.gradient(x))
-    assert field.jets == 100
-
-
-def halved(parameter: Tensor) -> None:
-    with torch.no_grad():
-        parameter.mul_(0.5)
-
-
-def replaced(shell: NeuSGeometry) -> None:
-    parameter = next(shell.parameters())
-    parameter.data = 0.5 * parameter.data
-
-
-def reloaded(shell: NeuSGeometry) -> None:
-    shell.load_state_dict({name: 0.5 * tensor for name, tensor in shell.state_dict().items()})
-
-
-def stepped(shell: NeuSGeometry) -> None:
-    for parameter in shell.parameters():
-        parameter.grad = torch.ones_like(parameter)
-    torch.optim.SGD(shell.parameters(), lr=0.1).step()
-
-
-CHANGES: dict[str, Callable[[NeuSGeometry, Tensor], object]] = {
-    "points in place": lambda shell, x: x.mul_(0.5),
-    "a view of the points": lambda shell, x: x[:25].zero_(),
-    "optimizer step": lambda shell, x: stepped(shell),
-    "one parameter": lambda shell, x: halved(next(shell.parameters())),
-    "memory of a parameter": lambda shell, x: replaced(shell),
-    "checkpoint": lambda shell, x: reloaded(shell),
-    "band": lambda shell, x: halved(shell.get_buffer("field.inner.deltas")),
-    "another field": lambda shell, x: setattr(shell, "field", small_multiscale(0.5)),
-    "double precision": lambda shell, x: (shell.double(), setattr(x, "data", x.data.double())),
-}
-
-
-@pytest.mark.parametrize("change", CHANGES)
-def test_a_change_between_the_calls_is_seen(change: str) -> None:
-    shell, _ = neus()
-    x = points()
-    output = shell(x)
-    before = shell.field.jet(x).gradient.detach()
-    CHANGES[change](shell, x)
-    gradient = shell.gradient(x)[:, 0]
-    assert torch.equal(gradient, shell.field.jet(x).gradient)
-    assert not torch.equal(gradient.to(before), before)
-    assert len(output) == 50
-
-
-def test_other_points_of_the_same_values_are_evaluated() -> None:
-    shell, field = neus()
-    x = points()
-    output = shell(x)
-    other = x.clone()
-    gradient = shell.gradient(other)
-    assert field.jets == 100
-    shell.gradient(x)
-    assert field.jets == 150
-    assert len(output) == len(gradient)
-
-
-def test_marking_the_points_in_between_is_no_change() -> None:
-    shell, field = neus()
-    x = points()
-    output = shell(x)
-    x.requires_grad_(True)
-    shell.gradient(x).square().sum().backward()
-    assert field.jets == 50
-    assert x.grad is not None
-    assert output.requires_grad
-
-
-def test_an_evaluation_without_graph_does_not_serve_a_training_step() -> None:
-    shell, field = neus()
-    x = points()
-    with torch.no_grad():
-        output = shell(x)
-        assert not output.requires_grad
-    gradient = shell.gradient(x)
-    assert field.jets == 100
-    assert gradient.requires_grad
-    graph = shell(x)
-    with torch.no_grad():
-        assert not shell.gradient(x).requires_grad
-    assert graph.requires_grad
-    with torch.inference_mode():
-        output = shell(x)
-    with torch.no_grad():
-        gradient = shell.gradient(x)
-    assert output.is_inference()
-    assert not gradient.is_inference()
-
-
-def test_freezing_a_parameter_in_between_is_seen() -> None:
-    shell, _ = neus()
-    x = points()
-    output = shell(x)
-    shell.requires_grad_(False)
-    with torch.no_grad():
-        expected = shell.field.jet(x).gradient
-    gradient = shell.gradient(x)
-    x.grad = None
-    gradient.sum().backward()
-    assert all(parameter.grad is None for parameter in shell.parameters())
-    assert torch.equal(gradient[:, 0], expected)
-    assert len(output) == 50
-
-
-def test_a_backward_pass_between_the_calls_leaves_a_whole_graph_for_the_second() -> None:
-    """Autograd frees the graph of both halves at the first backward pass."""
-    shell, field = neus()
-    x = points()
-    output = shell(x)
-    output.square().sum().backward()
-    shell.gradient(x).square().sum().backward()
-    assert field.jets == 100
-    gradient = shell.gradient(x)
-    gradient.square().sum().backward()
-    shell(x).sum().backward()
-    assert field.jets == 200
-
-
-class Watched(Field):
-    """Keeps weak references to what its jets return."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.inner = Siren(16, 2, num_features=2)
-        self.in_dim, self.num_levels, self.deltas = 3, 1, self.inner.deltas
-        self.seen: list[weakref.ref[Tensor]] = []
-
-    def value(self, x: Tensor, *, level: int = -1) -> Tensor:
-        return self.inner.value(x, level=level)
-
-    def jet(self, x: Tensor, *, level: int = -1) -> Jet:
-        value, gradient, features = self.inner.jet(x, level=level)
-        gradient = gradient.clone()  # a tensor of its own, which lives as long as any view of it
-        self.seen.append(weakref.ref(gradient))
-        return Jet(value, gradient, features)
-
-    def alive(self) -> int:
-        return sum(reference() is not None for reference in self.seen)
-
-
-@pytest.mark.parametrize("marked", [False, True])
-@pytest.mark.parametrize("dead", ["output", "both"])
-def test_nothing_outlives_what_the_caller_has(marked: bool, dead: str) -> None:
-    field = Watched()
-    shell = NeuSGeometry(field)
-    gc.disable()  # what dies here must die by itself, not be found later as a cycle
-    try:
-        x = points().requires_grad_(marked)
-        output = shell(x)
-        assert field.alive() == 1
-        del output
-        if dead == "both":
-            del x
-        assert field.alive() == 0
-        x = points().requires_grad_(marked)
-        output = shell(x)
-        gradient = shell.gradient(x)
-        assert field.alive() == 1
-        del gradient
-        assert field.alive() == 0
-        assert len(output) == 50
-    finally:
-        gc.enable()
-
-
-def test_nothing_waits_for_points_that_died() -> None:
-    field = Watched()
-    shell = NeuSGeometry(field)
-    with torch.no_grad():
-        x = points()
-        output = shell(x)
-        del x
-    assert field.alive() == 0
-    assert len(output) == 50
-
-
-def test_slices_of_the_output_keep_the_gradient_waiting() -> None:
-    shell, field = neus()
-    x = points()
-    sdf = shell(x)[:, :1]
-    shell.gradient(x)
-    assert field.jets == 50
-    assert sdf.shape == (50, 1)
-
-
-def test_a_shell_with_something_waiting_can_be_copied_and_saved() -> None:
-    shell, _ = neus()
-    x = points()
-    output = shell(x)
-    copied = copy.deepcopy(shell)
-    file = io.BytesIO()
-    torch.save(shell, file)
-    file.seek(0)
-    loaded = torch.load(file, weights_only=False)
-    for other in (copied, loaded):
-        halved(next(other.parameters()))
-        assert not torch.equal(other.gradient(x), shell.field.jet(x).gradient[:, None])
-    assert set(shell.state_dict()) == set(copied.state_dict())
-    assert len(output) == 50
-
-
-def test_inference_tensors_have_no_version_and_are_evaluated_each_time() -> None:
-    shell, field = neus()
-    with torch.inference_mode():
-        x = points()
-        shell(x)
-        shell.gradient(x)
-    assert field.jets == 100
-    shell(x).sum().backward()
-    assert not x.requires_grad
-    shell.gradient(x).sum().backward()
-
-
 # instant-nsr-pl
 
 
@@ -527,52 +214,6 @@ def test_instant_nsr_mesh_is_in_the_hosts_units() -> None:
 
 
 # nerfstudio and sdfstudio
-
-
-class Heads(enum.Enum):
-    RGB = "rgb"
-    SDF = "sdf"
-    NORMALS = "normals"
-    GRADIENT = "gradient"
-    ALPHA = "alpha"
-
-
-class OldHeads(enum.Enum):
-    RGB = "rgb"
-    SDF = "sdf"
-    NORMAL = "normal"
-    GRADIENT = "gradient"
-    ALPHA = "alpha"
-
-
-@dataclass
-class Frustums:
-    """The part of nerfstudio's class that fields use."""
-
-    origins: Tensor
-    directions: Tensor
-    starts: Tensor
-
-    @property
-    def shape(self) -> torch.Size:
-        return self.origins.shape[:-1]
-
-    def get_start_positions(self) -> Tensor:
-        return self.origins + self.directions * self.starts
-
-
-@dataclass
-class RaySamples:
-    frustums: Frustums
-    deltas: Tensor
-    camera_indices: Tensor
-
-
-def ray_samples(depths: Tensor) -> RaySamples:
-    origins, directions, _, _ = rays(len(depths))
-    shape = (*depths.shape, 3)
-    frustums = Frustums(origins[:, None].expand(shape), directions[:, None].expand(shape), depths[..., None])
-    return RaySamples(frustums, torch.full((*depths.shape, 1), 0.2), torch.zeros(*depths.shape, 1, dtype=torch.long))
 
 
 def studio(heads: type[enum.Enum] = Heads) -> tuple[NerfstudioField, Counted]:
