@@ -2,14 +2,18 @@
 
 from .analytic import Box, Capsule, Plane, Sphere, Torus, Union
 from .attributes import Mapped, map_attribute, map_colors, project_to_surface
+from .characteristics import IntegrationError, Solver, Tracks, flow, track, trajectories, transport_error
 from .checkpoint import SavedField, load_field, load_texture, save_field, save_texture
 from .color import ColorSiren, TextureField
 from .errors import InputError
-from .field import Field, Jet
+from .evolution import Law, curvature, key_loss, law_loss, mean_curvature, morph, near_surface, normal_speed, transport
+from .field import Field, Jet, SecondJet
 from .meshing import Mesh, NoSurfaceError, extract_mesh, map_normals
+from .moving import Keyframes, Moving, RigidMotion, ShrinkingSphere
 from .multiscale import MultiscaleSDF
 from .similarity import Similarity
 from .siren import Siren
+from .spacetime import SpaceTimeJet, SpaceTimeSDF, TimeSlice, at_time, spacetime_jet
 from .tracing import Hits, cone_starts, sphere_trace
 
 __all__ = [
@@ -19,28 +23,54 @@ __all__ = [
     "Field",
     "Hits",
     "InputError",
+    "IntegrationError",
     "Jet",
+    "Keyframes",
+    "Law",
     "Mapped",
     "Mesh",
+    "Moving",
     "MultiscaleSDF",
     "NoSurfaceError",
     "Plane",
+    "RigidMotion",
     "SavedField",
+    "SecondJet",
+    "ShrinkingSphere",
     "Similarity",
     "Siren",
+    "Solver",
+    "SpaceTimeJet",
+    "SpaceTimeSDF",
     "Sphere",
     "TextureField",
+    "TimeSlice",
     "Torus",
+    "Tracks",
     "Union",
+    "at_time",
     "cone_starts",
+    "curvature",
     "extract_mesh",
+    "flow",
+    "key_loss",
+    "law_loss",
     "load_field",
     "load_texture",
     "map_attribute",
     "map_colors",
     "map_normals",
+    "mean_curvature",
+    "morph",
+    "near_surface",
+    "normal_speed",
     "project_to_surface",
     "save_field",
     "save_texture",
+    "spacetime_jet",
     "sphere_trace",
+    "track",
+    "trajectories",
+    "transport",
+    "transport_error",
 ]

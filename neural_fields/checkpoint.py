@@ -21,6 +21,7 @@ from .field import Field
 from .multiscale import MultiscaleSDF
 from .similarity import Similarity
 from .siren import Siren
+from .spacetime import SpaceTimeSDF
 
 __all__ = ["SavedField", "load_field", "load_texture", "save_field", "save_texture"]
 
@@ -54,7 +55,7 @@ def save_field(
 
     Args:
         path: where to write.
-        field: a `Siren` or a `MultiscaleSDF` of them.
+        field: a `Siren`, a `MultiscaleSDF` of them, or a `SpaceTimeSDF` of that.
         similarity: the map from input to unit-sphere coordinates; the identity if there is none.
         metadata: JSON values to keep with the field.
 
@@ -217,7 +218,11 @@ def _describe(field: Field) -> dict[str, Any]:
             "taper": field.taper,
             "levels": [_describe(level) for level in levels],  # pyright: ignore[reportArgumentType]
         }
-    raise TypeError(f"a {type(field).__name__} cannot be saved; expected a Siren or a MultiscaleSDF of Sirens")
+    if isinstance(field, SpaceTimeSDF):
+        return {"type": "SpaceTimeSDF", "sdf": _describe(field.sdf)}
+    raise TypeError(
+        f"a {type(field).__name__} cannot be saved; expected a Siren, a MultiscaleSDF of Sirens or a SpaceTimeSDF"
+    )
 
 
 def _build(description: Mapping[str, Any]) -> Field:
@@ -228,4 +233,9 @@ def _build(description: Mapping[str, Any]) -> Field:
         levels = [_build(level) for level in description["levels"]]
         # The band widths are among the tensors; the constructor only needs as many of them.
         return MultiscaleSDF(levels[0], levels[1:], [1.0] * (len(levels) - 1), taper=description["taper"])
+    if description["type"] == "SpaceTimeSDF":
+        sdf = _build(description["sdf"])
+        if not isinstance(sdf, MultiscaleSDF):
+            raise ValueError(f"a SpaceTimeSDF of a {type(sdf).__name__}")
+        return SpaceTimeSDF(sdf)
     raise ValueError(f"unknown field type {description['type']!r}")

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 import torch
 from torch import Tensor, nn
 
-from .field import Field, Jet
+from .field import Field, Jet, SecondJet
 from .siren import Siren
 
 __all__ = ["MultiscaleSDF"]
@@ -137,6 +137,41 @@ class MultiscaleSDF(Field):
         shape = x.shape[:-1]
         return Jet(f.reshape(shape), gradient.reshape(x.shape), features.reshape(*shape, features.shape[-1]))
 
+    def second_jet(self, x: Tensor, *, level: int = -1, dims: int | None = None) -> SecondJet:
+        """See `Field.second_jet`; inside a tapered band the product rule is applied twice."""
+        level, dims = self.resolve_level(level), self.resolve_dims(dims)
+        rows = self.check_points(x).reshape(-1, self.in_dim)
+        f, gradient, features, hessian = self.base.second_jet(rows, dims=dims)
+        inside = _Inside(rows)
+        for residual, delta in zip(self._levels(level), self.deltas, strict=False):
+            here = inside.narrow(f, delta)
+            r = residual.second_jet(inside.points, dims=dims)
+            gate, slope = self._gate(here, delta)
+            steeper, before = 1 + slope * r.value, gradient[inside.rows]
+            cross = before[:, :dims, None] * r.gradient[:, None, :dims]
+            bend = (
+                (self._gate_bend(here, delta) * r.value)[:, None, None]
+                * before[:, :dims, None]
+                * before[:, None, :dims]
+            )
+            bent = (
+                steeper[:, None, None] * hessian[inside.rows]
+                + gate[:, None, None] * r.hessian
+                + slope[:, None, None] * (cross + cross.mT)
+                + bend
+            )
+            f = f.index_copy(0, inside.rows, here + gate * r.value)
+            gradient = gradient.index_copy(0, inside.rows, steeper[:, None] * before + gate[:, None] * r.gradient)
+            features = features.index_copy(0, inside.rows, features[inside.rows] + gate[:, None] * r.features)
+            hessian = hessian.index_copy(0, inside.rows, bent)
+        shape = x.shape[:-1]
+        return SecondJet(
+            f.reshape(shape),
+            gradient.reshape(x.shape),
+            features.reshape(*shape, features.shape[-1]),
+            hessian.reshape(*shape, dims, dims),
+        )
+
     def in_band(self, x: Tensor, *, level: int) -> Tensor:
         """See `Field.in_band`; each level is evaluated only where the coarser ones allow it."""
         level = self.resolve_level(level)
@@ -165,6 +200,13 @@ class MultiscaleSDF(Field):
             return torch.ones_like(f), torch.zeros_like(f)
         u = ((f.abs() / delta - (1 - self.taper)) / self.taper).clamp(0, 1)
         return 1 - u * u * (3 - 2 * u), -6 * u * (1 - u) * f.sign() / (delta * self.taper)
+
+    def _gate_bend(self, f: Tensor, delta: Tensor) -> Tensor:
+        """d²γ/df² at values f inside the band; 0 where the gate is fully open."""
+        if self.taper == 0:
+            return torch.zeros_like(f)
+        u = (f.abs() / delta - (1 - self.taper)) / self.taper
+        return torch.where((u > 0) & (u < 1), -6 * (1 - 2 * u) / (delta * self.taper) ** 2, 0.0)
 
 
 class _Inside:

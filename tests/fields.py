@@ -2,7 +2,23 @@
 
 from collections.abc import Callable
 
-from mplicits.neural_fields import Box, Capsule, Field, MultiscaleSDF, Plane, Siren, Sphere, Torus, Union
+from mplicits.neural_fields import (
+    Box,
+    Capsule,
+    Field,
+    Keyframes,
+    Moving,
+    MultiscaleSDF,
+    Plane,
+    RigidMotion,
+    ShrinkingSphere,
+    Siren,
+    SpaceTimeSDF,
+    Sphere,
+    TimeSlice,
+    Torus,
+    Union,
+)
 
 
 def small_multiscale(taper: float = 0.0) -> MultiscaleSDF:
@@ -17,6 +33,21 @@ def small_multiscale(taper: float = 0.0) -> MultiscaleSDF:
     )
 
 
+def small_spacetime(taper: float = 0.0) -> SpaceTimeSDF:
+    """`small_multiscale` in space-time."""
+    return SpaceTimeSDF.from_widths(
+        [(16, 2), (24, 2), (32, 1)],
+        omegas=[3, 5, 8],
+        deltas=[0.3, 0.2],
+        taper=taper,
+        num_features=2,
+        residual_gain=1.0,
+    )
+
+
+# Turns and travels, about an axis off the origin.
+SCREW = RigidMotion(axis=(1.0, 2.0, -1.0), angle=1.5, center=(0.1, -0.2, 0.0), velocity=(0.3, 0.0, -0.2))
+
 FIELDS: dict[str, Callable[[], Field]] = {
     "sphere": lambda: Sphere(radius=0.6, center=(0.1, 0.0, -0.1)),
     "plane": lambda: Plane(normal=(1.0, 2.0, 2.0), offset=0.1),
@@ -30,7 +61,17 @@ FIELDS: dict[str, Callable[[], Field]] = {
     "multiscale": small_multiscale,
     "multiscale-tapered": lambda: small_multiscale(0.4),
     "multiscale-over-sphere": lambda: MultiscaleSDF(Sphere(radius=0.5), [Siren(16, 2, omega=5.0)], [0.1], taper=0.3),
+    "spacetime": small_spacetime,
+    "spacetime-tapered": lambda: small_spacetime(0.4),
+    "slice": lambda: TimeSlice(small_spacetime(0.4), 0.3),
+    "slice-at": lambda: small_spacetime().at(0.3),
+    "slice-of-moving": lambda: TimeSlice(Moving(Torus(major=0.5, minor=0.2), SCREW), 0.7),
+    "moving": lambda: Moving(Torus(major=0.5, minor=0.2), SCREW),
+    "moving-multiscale": lambda: Moving(small_multiscale(0.4), SCREW),
+    "shrinking-sphere": lambda: ShrinkingSphere(radius=0.8, alpha=0.1),
+    "growing-sphere-exact-law": lambda: ShrinkingSphere(radius=0.8, alpha=-0.001, exact_law=True),
+    "keyframes": lambda: Keyframes([-0.4, 0.1, 0.5], [Sphere(radius=0.3), small_multiscale(0.4), Torus()]),
 }
 EXACT = {
-    name: FIELDS[name] for name in ("sphere", "plane", "torus", "box", "capsule")
+    name: FIELDS[name] for name in ("sphere", "plane", "torus", "box", "capsule", "slice-of-moving")
 }  # signed distances everywhere, not only signs

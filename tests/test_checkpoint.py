@@ -4,12 +4,14 @@ from pathlib import Path
 
 import pytest
 import torch
-from fields import small_multiscale
+from fields import small_multiscale, small_spacetime
 from mplicits.neural_fields import Field, InputError, Similarity, Siren, Sphere, load_field, save_field
 from safetensors.torch import save_file
 
 
-@pytest.mark.parametrize("field", [Siren(8, 2, omega=3.0, in_dim=4, num_features=2), small_multiscale(0.2)])
+@pytest.mark.parametrize(
+    "field", [Siren(8, 2, omega=3.0, in_dim=4, num_features=2), small_multiscale(0.2), small_spacetime(0.2)]
+)
 def test_round_trip(field: Field, dtype: torch.dtype, tmp_path: Path) -> None:
     field = field.to(dtype)
     similarity = Similarity((4.5e6, -3.0, 0.25), 12.5)

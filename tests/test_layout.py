@@ -10,12 +10,14 @@ import pytest
 ROOT = Path(__file__).parent.parent
 BELOW = {"neural_fields": set(), "datasets": {"neural_fields"}, "pipelines": {"neural_fields", "datasets"}}
 OUTSIDE = {"torch", "numpy", "skimage", "safetensors"}  # what neural_fields may import
+LATE = {"torchdiffeq"}  # and what only inside a function that needs it
 
 
-def imports(path: Path) -> list[tuple[int, str]]:
-    """(relative level, module) of every import statement, nested ones included."""
+def imports(path: Path, *, nested: bool = True) -> list[tuple[int, str]]:
+    """(relative level, module) of every import statement, or of those that run on import."""
     found = []
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    for node in ast.walk(tree) if nested else tree.body:
         if isinstance(node, ast.ImportFrom):
             found.append((node.level, node.module or ""))
         elif isinstance(node, ast.Import):
@@ -39,7 +41,10 @@ def test_neural_fields_is_light() -> None:
         for level, module in imports(path):
             top = module.split(".")[0]
             if level == 0:
-                assert top in OUTSIDE or top in sys.stdlib_module_names, f"{path} imports {top}"
+                assert top in OUTSIDE | LATE or top in sys.stdlib_module_names, f"{path} imports {top}"
+        assert not LATE & {module for _, module in imports(path, nested=False)}, (
+            f"{path} imports one of {LATE} too early"
+        )
 
 
 def test_no_top_level_name_is_taken() -> None:

@@ -1,0 +1,256 @@
+"""Flows and tracks against closed forms, and failures that say how far they came."""
+
+import math
+import subprocess
+import sys
+
+import pytest
+import torch
+from fields import SCREW, small_spacetime
+from mplicits.neural_fields import (
+    IntegrationError,
+    Moving,
+    RigidMotion,
+    ShrinkingSphere,
+    Siren,
+    Solver,
+    Sphere,
+    at_time,
+    flow,
+    track,
+    trajectories,
+    transport_error,
+)
+from torch import Tensor, nn
+
+STRICT = Solver(rtol=1e-9, atol=1e-10)
+
+
+def sphere_points(count: int, radius: float) -> Tensor:
+    return radius * torch.nn.functional.normalize(torch.randn(count, 3, dtype=torch.float64), dim=-1)
+
+
+@pytest.mark.parametrize(
+    ("solver", "tolerance"),
+    [
+        (STRICT, 1e-8),
+        (Solver(method="dopri8", rtol=1e-9, atol=1e-10), 1e-8),
+        (Solver(method="bosh3", rtol=1e-7, atol=1e-8), 1e-6),
+        (Solver(method="rk4", step=0.01), 1e-8),
+        (Solver(method="midpoint", step=0.002), 1e-5),
+    ],
+)
+def test_flow_of_a_rigid_motion(solver: Solver, tolerance: float) -> None:
+    x = torch.randn(50, 3, dtype=torch.float64)
+    there = flow(SCREW.velocity, x, 0.0, 1.0, solver=solver)
+    torch.testing.assert_close(there, SCREW.forward(x, 1.0), rtol=0, atol=tolerance)
+    back = flow(SCREW.velocity, there, 1.0, 0.0, solver=solver)
+    torch.testing.assert_close(back, x, rtol=0, atol=tolerance)
+
+
+def test_every_point_has_its_own_time() -> None:
+    x, t = torch.randn(200, 3, dtype=torch.float64), torch.rand(200, dtype=torch.float64)
+    t[:20] = 0  # some are there already
+    home = flow(SCREW.velocity, SCREW.forward(x, t), t, 0.0, solver=STRICT)
+    torch.testing.assert_close(home, x, rtol=0, atol=1e-7)
+
+
+def test_the_default_serves_single_precision() -> None:
+    x = torch.randn(500, 3)
+    torch.testing.assert_close(flow(SCREW.velocity, x, 0.0, 1.0), SCREW.forward(x, 1.0), rtol=0, atol=5e-5)
+
+
+def test_tolerances_hold_for_every_point() -> None:
+    """One point in a fast eddy among ten thousand that hardly move."""
+    speed = torch.full((10_000,), 0.01, dtype=torch.float64)
+    speed[7] = 40.0
+    x = sphere_points(10_000, 1.0)
+
+    def velocity(x: Tensor, t: Tensor) -> Tensor:
+        return speed[:, None] * torch.stack((-x[:, 1], x[:, 0], torch.zeros_like(t)), dim=-1)
+
+    end = flow(velocity, x, 0.0, 1.0, solver=Solver(rtol=1e-8, atol=1e-8))
+    angle = math.atan2(x[7, 1], x[7, 0]) + 40.0
+    expected = x[7, :2].norm() * torch.tensor([math.cos(angle), math.sin(angle)], dtype=torch.float64)
+    torch.testing.assert_close(end[7, :2], expected, rtol=0, atol=1e-5)
+
+
+def test_trajectories_and_transport_error() -> None:
+    times = [0.0, 0.3, 0.5, 1.0]
+    x = torch.randn(40, 3, dtype=torch.float64)
+    path = trajectories(SCREW.velocity, x, times, solver=STRICT)
+    for index, time in enumerate(times):
+        torch.testing.assert_close(path[index], SCREW.forward(x, time), rtol=0, atol=1e-7)
+    shape = Sphere(radius=0.4)
+    error = transport_error(Moving(shape, SCREW), shape, SCREW.velocity, x, times, solver=STRICT)
+    assert error.shape == (4, 40)
+    assert float(error.max()) < 1e-7
+    still = transport_error(Moving(shape, RigidMotion()), shape, SCREW.velocity, x, times, solver=STRICT)
+    torch.testing.assert_close(still[-1], (SCREW.forward(x, 1.0).norm(dim=-1) - x.norm(dim=-1)).abs())
+
+
+def test_points_of_a_shrinking_sphere_go_straight_to_its_centre() -> None:
+    field = ShrinkingSphere(radius=0.8, alpha=0.12)
+    x = sphere_points(100, 0.8)
+    times = [0.0, 0.25, 0.5, 1.0]
+    for project in (False, True):
+        tracks = track(field, x, times, project=project, solver=Solver(rtol=1e-8, atol=1e-9))
+        radii = field.radius_at(torch.tensor(times, dtype=torch.float64))
+        torch.testing.assert_close(tracks.points, x * (radii / 0.8)[:, None, None], rtol=0, atol=1e-6)
+        assert float(tracks.distance.max()) < 1e-6
+    back = track(field, tracks.points[-1], times[::-1], solver=STRICT)
+    torch.testing.assert_close(back.points[-1], x, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("project", [False, True])
+def test_points_of_a_moving_sphere_stay_on_it(project: bool) -> None:
+    """They move along normals only, so they slide over a sphere that travels, but never leave it."""
+    motion = RigidMotion(velocity=(0.4, -0.1, 0.0), center=(0.3, 0.0, 0.0), angle=1.0)
+    field = Moving(Sphere(radius=0.5), motion)
+    x = sphere_points(100, 0.5)
+    times = torch.linspace(0, 1, 6, dtype=torch.float64)
+    tracks = track(field, x, times, project=project)
+    centers = motion.forward(torch.zeros(6, 3, dtype=torch.float64), times)
+    assert float(((tracks.points - centers[:, None]).norm(dim=-1) - 0.5).abs().max()) < 1e-5
+    assert float(tracks.distance.max()) < 1e-5
+    assert float((tracks.points[-1] - motion.forward(x, 1.0)).norm(dim=-1).max()) > 0.1
+
+
+def test_points_of_a_translating_sphere_slide_as_the_closed_form_says() -> None:
+    """With n the normal of a point, n′ = −(v − ⟨v, n⟩n)/r: tan(θ/2) grows as e^{|v|t/r}, θ its angle from v."""
+    field = Moving(Sphere(radius=0.5), RigidMotion(velocity=(0.0, 0.0, 0.6)))
+    x = sphere_points(100, 0.5)
+    moved = track(field, x, [0.0, 1.0], solver=Solver(rtol=1e-9, atol=1e-10)).points[-1]
+    normal = (moved - moved.new_tensor([0.0, 0.0, 0.6])) / 0.5
+    half = (x[:, 2] / 0.5).acos() / 2
+    expected = 2 * (half.tan() * math.exp(0.6 / 0.5)).atan()
+    torch.testing.assert_close(normal[:, 2].clamp(-1, 1).acos(), expected, rtol=0, atol=1e-6)
+
+
+def test_a_turning_sphere_leaves_its_points_where_they_are() -> None:
+    x = sphere_points(20, 0.5)
+    tracks = track(Moving(Sphere(radius=0.5), RigidMotion(angle=3.0)), x, [0.0, 1.0])
+    torch.testing.assert_close(tracks.points[-1], x, rtol=0, atol=1e-12)
+
+
+class Swirl(nn.Module):
+    """dx/dt = a x, so x(1) = e^a x(0)."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.a = nn.Parameter(torch.tensor(0.3, dtype=torch.float64))
+
+    def forward(self, x: Tensor, t: Tensor) -> Tensor:
+        return self.a * x
+
+
+@pytest.mark.parametrize("adjoint", [False, True])
+@pytest.mark.parametrize("method", ["dopri5", "rk4"])
+def test_gradients_of_a_flow(adjoint: bool, method: str) -> None:
+    swirl, x = Swirl(), torch.randn(10, 3, dtype=torch.float64, requires_grad=True)
+    solver = Solver(method=method, rtol=1e-9, atol=1e-10, adjoint=adjoint)
+    flow(swirl, x, 0.0, 1.0, solver=solver).sum().backward()
+    assert x.grad is not None
+    assert swirl.a.grad is not None
+    torch.testing.assert_close(x.grad, torch.full_like(x, math.exp(0.3)), rtol=0, atol=1e-6)
+    torch.testing.assert_close(swirl.a.grad, math.exp(0.3) * x.detach().sum(), rtol=0, atol=1e-6)
+
+
+def test_the_adjoint_of_a_track_reaches_the_field() -> None:
+    field = Siren(16, 2, omega=3.0, in_dim=4).double()
+    x = torch.rand(8, 3, dtype=torch.float64)
+    gradients = []
+    for adjoint in (False, True):
+        field.zero_grad()
+        solver = Solver(method="rk4", step=0.02, adjoint=adjoint)
+        track(field, x, [0.0, 0.3], project=False, solver=solver).points[-1].square().sum().backward()
+        gradients.append(torch.cat([p.grad.flatten() for p in field.parameters() if p.grad is not None]))
+    torch.testing.assert_close(*gradients, rtol=1e-3, atol=1e-5)
+
+
+def blow_up(x: Tensor, t: Tensor) -> Tensor:
+    """dx/dt = x², which is at infinity at t = 1/x₀."""
+    return x.square()
+
+
+def test_a_flow_that_blows_up_reports_the_time_reached() -> None:
+    x = torch.tensor([[2.0, 0.0, 0.0]], dtype=torch.float64)
+    with pytest.raises(IntegrationError, match=r"reached time 0\.(49|5)") as caught:
+        flow(blow_up, x, 0.0, 1.0)
+    assert float(caught.value.time) == pytest.approx(0.5, abs=1e-2)
+    assert caught.value.points.shape == (1, 3)
+    assert float(caught.value.points[0, 0]) > 100
+    with pytest.raises(IntegrationError, match=r"more than 5 steps; reached time 0\.\d+") as caught:
+        flow(blow_up, x, 0.0, 1.0, solver=Solver(max_steps=5))
+    reached = float(caught.value.time)
+    assert 0 < reached < 0.5
+    torch.testing.assert_close(float(caught.value.points[0, 0]), 2 / (1 - 2 * reached), rtol=1e-3, atol=0)
+
+
+@pytest.mark.parametrize("solver", [Solver(), Solver(method="rk4", step=0.05), Solver(min_step=1e-3)])
+def test_a_velocity_that_is_not_finite(solver: Solver) -> None:
+    def velocity(x: Tensor, t: Tensor) -> Tensor:
+        return torch.where(t[:, None] < 0.5, torch.ones_like(x), torch.nan)
+
+    with pytest.raises(IntegrationError, match="the velocity is not finite") as caught:
+        flow(velocity, torch.zeros(4, 3), 0.0, 1.0, solver=solver)
+    assert 0 <= float(caught.value.time) < 0.6
+    assert bool(torch.isfinite(caught.value.points).all())
+
+
+def test_backward_in_time_and_with_own_times_failures_report_too() -> None:
+    x = torch.tensor([[-2.0, 0.0, 0.0], [-2.0, 0.0, 0.0]], dtype=torch.float64)
+    with pytest.raises(IntegrationError) as caught:
+        flow(blow_up, x, 1.0, 0.0)
+    assert float(caught.value.time) == pytest.approx(0.5, abs=1e-2)
+    with pytest.raises(IntegrationError, match=r"reached time 0\.\d+ to 0\.\d+") as caught:
+        flow(blow_up, x, torch.tensor([1.0, 0.8]), 0.0)
+    assert caught.value.time.shape == (2,)
+
+
+def test_a_least_step_takes_a_stiff_field_to_its_end() -> None:
+    """Towards a wall at 10⁵ per unit of time: without a limit thousands of steps, with one as many as it allows."""
+
+    def velocity(x: Tensor, t: Tensor) -> Tensor:
+        return torch.where(x > 0.5, -1e5 * (x - 0.5), torch.ones_like(x)).clamp(min=-10)
+
+    x = torch.zeros(1, 3, dtype=torch.float64)
+    with pytest.raises(IntegrationError, match="more than 200 steps"):
+        flow(velocity, x, 0.0, 1.0, solver=Solver(max_steps=200, rtol=1e-9, atol=1e-9))
+    there = flow(velocity, x, 0.0, 1.0, solver=Solver(max_steps=200, min_step=0.01, rtol=1e-9, atol=1e-9))
+    assert float((there - 0.5).abs().max()) < 0.15
+
+
+def test_no_points() -> None:
+    assert flow(SCREW.velocity, torch.zeros(0, 3), 0.0, 1.0).shape == (0, 3)
+    assert track(small_spacetime(), torch.zeros(0, 3), [0.0, 0.5, 1.0]).points.shape == (3, 0, 3)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: Solver(method="magic"), "method='magic': expected one of dopri5"),
+        (lambda: Solver(rtol=0.0), "rtol=0.0: expected > 0"),
+        (lambda: Solver(min_step=-1.0), "min_step=-1.0"),
+        (lambda: flow(SCREW.velocity, torch.zeros(3), 0.0, 1.0), r"points has shape \(3,\)"),
+        (lambda: flow(SCREW.velocity, torch.zeros(4, 3), torch.zeros(2), 1.0), r"start has shape \(2,\)"),
+        (lambda: trajectories(SCREW.velocity, torch.zeros(4, 3), [0.0, 0.5, 0.2]), "all increasing or all decreasing"),
+        (lambda: track(small_spacetime(), torch.zeros(4, 3), []), "at least one number"),
+    ],
+)
+def test_bad_arguments(call: object, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        call()  # pyright: ignore[reportCallIssue]
+
+
+def test_importing_the_package_does_not_need_torchdiffeq() -> None:
+    code = "import sys; sys.modules['torchdiffeq'] = None; import mplicits.neural_fields as n; n.track, n.Solver()"
+    subprocess.run([sys.executable, "-c", code], check=True, cwd="/")
+
+
+def test_the_first_time_is_where_the_points_are() -> None:
+    x = sphere_points(5, 0.5)
+    tracks = track(Moving(Sphere(radius=0.5), SCREW), x, [0.25])
+    assert torch.equal(tracks.points, x[None])
+    expected = Moving(Sphere(radius=0.5), SCREW).value(at_time(x, 0.25)).abs()
+    torch.testing.assert_close(tracks.distance[0], expected)
