@@ -87,7 +87,14 @@ def scene_cameras(scene: Scene, *, views: int = 24, size: int = 64, seed: int = 
 
 
 def render_scene(
-    scene: Scene, views: int = 24, size: int = 64, *, seed: int = 0, samples: int = 3, shaded: bool = False
+    scene: Scene,
+    views: int = 24,
+    size: int = 64,
+    *,
+    seed: int = 0,
+    samples: int = 3,
+    shaded: bool = False,
+    progress: Callable[[int, int], None] | None = None,
 ) -> PosedImages:
     """Posed images of a scene, with exact poses, colours and masks, and a few points of its surface.
 
@@ -98,6 +105,7 @@ def render_scene(
         seed: of the cameras and the points.
         samples: rays per pixel and direction.
         shaded: whether a fixed lamp lights the shape; without, the images show the paint itself.
+        progress: called with ``(done, total)`` after every image.
 
     Raises:
         ValueError: ``views``, ``size`` or ``samples`` is not positive.
@@ -106,6 +114,8 @@ def render_scene(
     for index, camera in enumerate(scene_cameras(scene, views=views, size=size, seed=seed)):
         color, mask = render_view(scene, camera, samples=samples, shaded=shaded)
         images.append(PosedImage(f"{index:03d}.png", camera, color, mask))
+        if progress is not None:
+            progress(index + 1, views)
     points = sample_surface(scene.field, SPARSE_POINTS, seed=seed).points
     return PosedImages(tuple(images), Similarity.identity(), "the unit sphere", points, Path(scene.name))
 

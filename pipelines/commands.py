@@ -13,10 +13,12 @@ from pathlib import Path
 from types import MappingProxyType
 
 from .bench_commands import BENCH_COMMANDS
+from .check_cameras_command import COMMAND as CHECK_CAMERAS
 from .command import Command, add_json, check_output, positive, whole
 from .fit_command import COMMAND as FIT
 from .fit_settings import add_fit_settings, fit_settings, were_given
 from .render_command import COMMAND as RENDER
+from .scene_command import COMMAND as SCENE
 from .slice_command import COMMAND as SLICE
 from .texture_command import COMMAND as TEXTURE
 from .view_command import COMMAND as VIEW
@@ -161,6 +163,7 @@ COMMANDS: Mapping[str, Command] = MappingProxyType(
         "render": RENDER,
         "slice": SLICE,
         "view": VIEW,
+        "check-cameras": CHECK_CAMERAS,
         "evaluate": Command(
             "measure a mesh against a reference",
             """  mplicits evaluate scan.ply truth.ply
@@ -187,6 +190,7 @@ COMMANDS: Mapping[str, Command] = MappingProxyType(
             _sample_arguments,
             _sample,
         ),
+        "scene": SCENE,
         "demo": Command(
             "fit, mesh and draw the bundled scan, or any cloud",
             "  mplicits demo\n  mplicits demo scan.ply -o demo-scan --up z",
