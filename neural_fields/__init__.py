@@ -1,5 +1,6 @@
 """Neural signed distance fields, and the mathematics that evaluates them."""
 
+from .adapters import Deviation, InstantNSRGeometry, NerfstudioField, NeuSGeometry
 from .analytic import Box, Capsule, Plane, Sphere, Torus, Union
 from .attributes import Mapped, map_attribute, map_colors, project_to_surface
 from .characteristics import IntegrationError, Solver, Tracks, flow, track, trajectories, transport_error
@@ -11,18 +12,22 @@ from .field import Field, Jet, SecondJet
 from .meshing import Mesh, NoSurfaceError, extract_mesh, map_normals
 from .moving import Keyframes, Moving, RigidMotion, ShrinkingSphere
 from .multiscale import MultiscaleSDF
+from .radiance import Outside, ViewColor
 from .similarity import Similarity
 from .siren import Siren
 from .spacetime import SpaceTimeJet, SpaceTimeSDF, TimeSlice, at_time, spacetime_jet
 from .tracing import Hits, cone_starts, sphere_trace
+from .volume_renderer import Rendered, Sampling, render_volume
 
 __all__ = [
     "Box",
     "Capsule",
     "ColorSiren",
+    "Deviation",
     "Field",
     "Hits",
     "InputError",
+    "InstantNSRGeometry",
     "IntegrationError",
     "Jet",
     "Keyframes",
@@ -31,9 +36,14 @@ __all__ = [
     "Mesh",
     "Moving",
     "MultiscaleSDF",
+    "NerfstudioField",
+    "NeuSGeometry",
     "NoSurfaceError",
+    "Outside",
     "Plane",
+    "Rendered",
     "RigidMotion",
+    "Sampling",
     "SavedField",
     "SecondJet",
     "ShrinkingSphere",
@@ -48,6 +58,7 @@ __all__ = [
     "Torus",
     "Tracks",
     "Union",
+    "ViewColor",
     "at_time",
     "cone_starts",
     "curvature",
@@ -65,6 +76,7 @@ __all__ = [
     "near_surface",
     "normal_speed",
     "project_to_surface",
+    "render_volume",
     "save_field",
     "save_texture",
     "spacetime_jet",

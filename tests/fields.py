@@ -19,6 +19,7 @@ from mplicits.neural_fields import (
     Torus,
     Union,
 )
+from mplicits.neural_fields.baselines import NeusSDF
 
 
 def small_multiscale(taper: float = 0.0) -> MultiscaleSDF:
@@ -58,6 +59,7 @@ FIELDS: dict[str, Callable[[], Field]] = {
     "siren": lambda: Siren(24, 2, omega=4.0),
     "siren-deep-features": lambda: Siren(16, 4, omega=4.0, num_features=3),
     "siren-one-layer-4d": lambda: Siren(16, 1, omega=4.0, in_dim=4),
+    "neus": lambda: NeusSDF(48, 4, num_features=3),
     "multiscale": small_multiscale,
     "multiscale-tapered": lambda: small_multiscale(0.4),
     "multiscale-over-sphere": lambda: MultiscaleSDF(Sphere(radius=0.5), [Siren(16, 2, omega=5.0)], [0.1], taper=0.3),

@@ -1,0 +1,5 @@
+"""The systems that this one is compared with, each as a `Field`, so that every consumer serves them unchanged."""
+
+from .neus import NeusSDF
+
+__all__ = ["NeusSDF"]

@@ -1,0 +1,237 @@
+"""``render_volume``: colours, depths and normals of rays through any field, by NeuS's volume rendering.
+
+Where to sample is asked of the coarsest level alone; then one jet per sample gives value, gradient and features, and
+inside a `MultiscaleSDF` the residual levels see only the samples in their bands. Colours are asked only for the samples
+that contribute to their pixel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+
+from .field import Field, Jet
+from .volume import (
+    composite,
+    importance_depths,
+    invert_outside,
+    neus_optical_depth,
+    outside_depths,
+    ray_points,
+    sphere_span,
+    stratified_depths,
+    transmittance_weights,
+)
+
+__all__ = ["RayColor", "RayOutside", "Rendered", "Sampling", "render_volume", "sample_depths"]
+
+RayColor = Callable[[Tensor, Tensor, Jet], Tensor]
+"""Colours ``(N, 3)`` of points ``(N, 3)`` seen along unit directions ``(N, 3)``, given the geometry's jet there."""
+
+
+class RayOutside(Protocol):
+    """What lies outside the unit sphere."""
+
+    def __call__(self, inverted: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
+        """Density ``(N,)`` ≥ 0 and colour ``(N, 3)`` at `invert_outside` points ``(N, 4)``."""
+        ...
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """How many samples a ray gets, and where.
+
+    Attributes:
+        uniform: evenly spaced depths.
+        importance: further depths near the surface, at the coarsest level.
+        rounds: in how many rounds these come, each with twice the sharpness of the one before.
+        sharpness: inv_std of the first round.
+        outside: samples behind the region of interest, if something is there.
+
+    Raises:
+        ValueError: a number is out of range.
+    """
+
+    uniform: int = 64
+    importance: int = 64
+    rounds: int = 4
+    sharpness: float = 64.0
+    outside: int = 32
+
+    def __post_init__(self) -> None:
+        for name, least in (("uniform", 2), ("importance", 0), ("rounds", 1), ("outside", 1)):
+            if getattr(self, name) < least:
+                raise ValueError(f"{name}={getattr(self, name)}: expected at least {least}")
+        if not self.sharpness > 0:
+            raise ValueError(f"sharpness={self.sharpness}: expected > 0")
+
+
+class Rendered(NamedTuple):
+    """What rays see.
+
+    Attributes:
+        color: ``(R, 3)``, the background included.
+        opacity: ``(R,)`` share of the ray that ends inside the unit sphere, in [0, 1].
+        depth: ``(R,)`` Σ w t, so depth / opacity is the mean depth of what is seen.
+        normal: ``(R, 3)`` Σ w ∇f/|∇f|; shorter than 1 where normals differ or the ray passes.
+        weights: ``(R, S)``.
+        depths: ``(R, S)`` the middles of the sections.
+        jet: of the field there, ``(R, S, …)``.
+    """
+
+    color: Tensor
+    opacity: Tensor
+    depth: Tensor
+    normal: Tensor
+    weights: Tensor
+    depths: Tensor
+    jet: Jet
+
+
+def render_volume(
+    field: Field,
+    color: RayColor,
+    origins: Tensor,
+    directions: Tensor,
+    *,
+    inv_std: Tensor | float,
+    sampling: Sampling | None = None,
+    cos_anneal: float = 1.0,
+    level: int = -1,
+    background: Tensor | None = None,
+    outside: RayOutside | None = None,
+    least_weight: float = 0.0,
+    generator: torch.Generator | None = None,
+) -> Rendered:
+    """Render rays through the unit sphere; differentiable in the parameters of field, colour and ``inv_std``.
+
+    Args:
+        field: the geometry, in unit-sphere coordinates.
+        color: for example a `ViewColor`, or ``lambda x, v, jet: texture.colors(x)``.
+        origins: ``(R, 3)``.
+        directions: ``(R, 3)`` unit vectors.
+        inv_std: s of NeuS; 1/s is how far around the surface light is stopped.
+        sampling: where to sample.
+        cos_anneal: see `neus_optical_depth`.
+        level: level of the field to render.
+        background: ``(3,)`` or ``(R, 3)`` colour of what light passes the sphere; None is black.
+        outside: what is behind the sphere; ``background`` is then behind that.
+        least_weight: no colour is asked for samples of a smaller weight; a pixel's error is at most
+            ``least_weight`` times the number of its samples.
+        generator: jitters the samples, for training; None is deterministic.
+
+    Raises:
+        ValueError: shapes do not match, or there is no such level.
+
+    Example:
+        >>> import torch
+        >>> from mplicits.neural_fields import Sphere, render_volume
+        >>> red = lambda x, direction, jet: torch.tensor([1.0, 0.0, 0.0]).expand_as(x)
+        >>> eye, ahead = torch.tensor([[0.0, 0.0, 2.0]]), torch.tensor([[0.0, 0.0, -1.0]])
+        >>> seen = render_volume(Sphere(radius=0.5), red, eye, ahead, inv_std=1000.0)
+        >>> seen.color.round(decimals=3).tolist(), round(float(seen.depth), 2)
+        ([[1.0, 0.0, 0.0]], 1.5)
+    """
+    if origins.shape != directions.shape or origins.ndim != 2 or origins.shape[1] != 3:
+        raise ValueError(
+            f"origins {tuple(origins.shape)}, directions {tuple(directions.shape)}: expected (R, 3) for both"
+        )
+    level, sampling = field.resolve_level(level), sampling or Sampling()
+    near, far = sphere_span(origins, directions)
+    edges = sample_depths(field, origins, directions, near, far, sampling, level=level, generator=generator)
+    interval = edges.diff(dim=1)
+    depths = edges[:, :-1] + 0.5 * interval
+    points = ray_points(origins, directions, depths)  # (R, S, 3)
+    jet = field.jet(points, level=level)
+    slope = (jet.gradient * directions[:, None]).sum(dim=-1)
+    optical = neus_optical_depth(jet.value, slope, interval, inv_std, cos_anneal=cos_anneal)
+    weights, remaining = transmittance_weights(optical)
+    seen = _colors(color, points, directions, jet, weights, least_weight)
+    mixed = composite(weights, seen)
+    behind = _behind(outside, origins, directions, far, sampling, background, generator)
+    if behind is not None:
+        mixed = mixed + remaining[:, None] * behind
+    normals = torch.nn.functional.normalize(jet.gradient, dim=-1)
+    return Rendered(
+        color=mixed,
+        opacity=1 - remaining,
+        depth=(weights * depths).sum(dim=1),
+        normal=composite(weights, normals),
+        weights=weights,
+        depths=depths,
+        jet=jet,
+    )
+
+
+@torch.no_grad()
+def sample_depths(
+    field: Field,
+    origins: Tensor,
+    directions: Tensor,
+    near: Tensor,
+    far: Tensor,
+    sampling: Sampling,
+    *,
+    level: int = -1,
+    generator: torch.Generator | None = None,
+) -> Tensor:
+    """The ends of the sections of each ray, ``(R, uniform + importance + 2)``, from ``near`` to ``far``, sorted.
+
+    Only the coarsest level is asked. If a finer one is meant, the sharpness ends at 2/δ₀, so that the whole band in
+    which the finer surface may lie is sampled.
+    """
+    depths = stratified_depths(near, far, sampling.uniform, generator=generator)
+    sharpest = 2 / float(field.deltas[0]) if field.resolve_level(level) else float("inf")
+    if sampling.importance:
+        values = field.value(ray_points(origins, directions, depths), level=0)
+        share, extra = divmod(sampling.importance, sampling.rounds)
+        for index in range(sampling.rounds):
+            count = share + (index < extra)
+            sharpness = min(sampling.sharpness * 2**index, sharpest)
+            more = importance_depths(depths, values, count, sharpness, generator=generator)
+            depths, order = torch.cat((depths, more), dim=1).sort(dim=1)
+            if index + 1 < sampling.rounds:
+                found = field.value(ray_points(origins, directions, more), level=0)
+                values = torch.cat((values, found), dim=1).gather(1, order)
+    return torch.cat((near[:, None], depths, far[:, None]), dim=1)
+
+
+def _colors(
+    color: RayColor, points: Tensor, directions: Tensor, jet: Jet, weights: Tensor, least_weight: float
+) -> Tensor:
+    """Colours ``(R, S, 3)`` of the samples that matter, 0 for the others."""
+    along = directions[:, None].expand_as(points).reshape(-1, 3)
+    flat = Jet(jet.value.flatten(), jet.gradient.flatten(0, 1), jet.features.flatten(0, 1))
+    if least_weight <= 0:
+        return color(points.flatten(0, 1), along, flat).reshape(points.shape)
+    rows = (weights.detach().flatten() > least_weight).nonzero()[:, 0]
+    found = color(points.flatten(0, 1)[rows], along[rows], Jet(*(part[rows] for part in flat)))
+    return points.new_zeros(points.shape).flatten(0, 1).index_copy(0, rows, found).reshape(points.shape)
+
+
+def _behind(
+    outside: RayOutside | None,
+    origins: Tensor,
+    directions: Tensor,
+    far: Tensor,
+    sampling: Sampling,
+    background: Tensor | None,
+    generator: torch.Generator | None,
+) -> Tensor | None:
+    """The colour ``(R, 3)`` of what lies behind the unit sphere, or None for black."""
+    if outside is None:
+        return background
+    # A ray that misses the sphere begins to see the outside where it is nearest to the centre.
+    nearest = torch.maximum(far, -(origins * directions).sum(dim=-1))
+    depths = outside_depths(nearest, sampling.outside, generator=generator)
+    points = invert_outside(ray_points(origins, directions, depths))
+    along = directions[:, None].expand(-1, sampling.outside, -1).reshape(-1, 3)
+    density, seen = outside(points.flatten(0, 1), along)
+    interval = torch.cat((depths.diff(dim=1), depths[:, -1:]), dim=1)
+    weights, remaining = transmittance_weights(density.reshape(depths.shape) * interval)
+    mixed = composite(weights, seen.reshape(*depths.shape, 3))
+    return mixed if background is None else mixed + remaining[:, None] * background

@@ -1,0 +1,186 @@
+"""Rendered rays against exact surfaces, a loop over rays and samples, and every kind of field."""
+
+import pytest
+import torch
+from fields import FIELDS
+from mplicits.neural_fields import Field, Jet, MultiscaleSDF, Sampling, Siren, Sphere, ViewColor, render_volume
+from mplicits.neural_fields.volume import sphere_span
+from mplicits.neural_fields.volume_renderer import sample_depths
+from mplicits.pipelines.counting import counted
+from torch import Tensor
+
+
+def rays(count: int, *, seed: int = 0) -> tuple[Tensor, Tensor]:
+    """Rays from distance 2 towards points near the centre."""
+    generator = torch.Generator().manual_seed(seed)
+    origins = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=1) * 2
+    targets = (torch.rand(count, 3, generator=generator) - 0.5) * 0.8
+    return origins, torch.nn.functional.normalize(targets - origins, dim=1)
+
+
+def position_color(x: Tensor, direction: Tensor, jet: Jet) -> Tensor:
+    """A colour in closed form."""
+    return 0.5 + 0.5 * x
+
+
+def test_a_sharp_sphere_is_seen_where_it_is() -> None:
+    sphere = Sphere(radius=0.5)
+    origins, directions = rays(200)
+    seen = render_volume(sphere, position_color, origins, directions, inv_std=2000.0, background=torch.ones(3))
+    near, far = sphere_span(origins, directions, radius=0.5)
+    hit = (far - near) > 0.2
+    assert int(hit.sum()) > 50
+    point = origins + near[:, None] * directions
+    torch.testing.assert_close(seen.depth[hit], near[hit], atol=2e-3, rtol=0)
+    torch.testing.assert_close(seen.color[hit], 0.5 + 0.5 * point[hit], atol=2e-3, rtol=0)
+    torch.testing.assert_close(seen.normal[hit], point[hit] / 0.5, atol=6e-3, rtol=0)
+    assert float(seen.opacity[hit].min()) > 0.999
+    missed = sphere.value(origins - (origins * directions).sum(1, keepdim=True) * directions) > 0.02
+    assert float(seen.opacity[missed].max()) < 1e-6
+    torch.testing.assert_close(seen.color[missed], torch.ones(int(missed.sum()), 3))
+
+
+def test_agrees_with_a_loop_over_rays_and_samples() -> None:
+    field = Siren(24, 2, omega=4.0).double().requires_grad_(False)
+    origins, directions = (part.double() for part in rays(5))
+    sampling = Sampling(uniform=12, importance=8, rounds=2)
+    seen = render_volume(field, position_color, origins, directions, inv_std=20.0, sampling=sampling)
+    near, far = sphere_span(origins, directions)
+    edges = sample_depths(field, origins, directions, near, far, sampling)
+    for ray in range(5):
+        light, color, depth = 1.0, torch.zeros(3, dtype=torch.float64), 0.0
+        for start, end in zip(edges[ray, :-1], edges[ray, 1:], strict=True):
+            t = (start + end) / 2
+            x = (origins[ray] + t * directions[ray]).requires_grad_()
+            f = field.value(x)
+            slope = float(torch.autograd.grad(f, x)[0] @ directions[ray])
+            f = f.detach()
+            step = min(slope, 0.0) * float(end - start) / 2
+            entering, leaving = (torch.sigmoid(20 * (f - sign * step)) for sign in (1, -1))
+            alpha = float(1 - leaving / entering)
+            color, depth = color + light * alpha * (0.5 + 0.5 * x.detach()), depth + light * alpha * float(t)
+            light *= 1 - alpha
+        torch.testing.assert_close(seen.color[ray], color)
+        assert float(seen.depth[ray]) == pytest.approx(depth, abs=1e-9)
+        assert float(seen.opacity[ray]) == pytest.approx(1 - light, abs=1e-9)
+
+
+@pytest.mark.parametrize("name", [name for name in FIELDS if FIELDS[name]().in_dim == 3])
+def test_every_field_renders_and_trains(name: str) -> None:
+    field = FIELDS[name]()
+    features = field.jet(torch.zeros(1, 3)).features.shape[-1]
+    color, inv_std = ViewColor(features, width=16, depth=1), torch.tensor(20.0, requires_grad=True)
+    sampling = Sampling(uniform=8, importance=4, rounds=2)
+    seen = render_volume(field, color, *rays(6), inv_std=inv_std, sampling=sampling)
+    assert seen.color.shape == (6, 3)
+    assert seen.weights.shape == seen.depths.shape == (6, 13)
+    (seen.color.sum() + seen.jet.gradient.square().sum()).backward()
+    assert inv_std.grad is not None
+    trained = [p for p in (*field.parameters(), *color.parameters()) if p.requires_grad]
+    for parameter in trained:
+        assert parameter.grad is not None
+        assert bool(parameter.grad.isfinite().all())
+
+
+def test_no_rays_are_legal() -> None:
+    seen = render_volume(Sphere(), position_color, torch.empty(0, 3), torch.empty(0, 3), inv_std=10.0)
+    assert seen.color.shape == (0, 3)
+
+
+def test_rays_of_other_shapes_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"origins \(3,\).*expected \(R, 3\)"):
+        render_volume(Sphere(), position_color, torch.zeros(3), torch.zeros(3), inv_std=10.0)
+
+
+class TestBands:
+    def field(self) -> MultiscaleSDF:
+        return MultiscaleSDF(Sphere(radius=0.5), [Siren(16, 2, omega=5.0, output_gain=0.01)], [0.05], taper=0.3)
+
+    def test_samples_outside_the_band_never_reach_the_residual(self) -> None:
+        field = self.field()
+        wrapped, (base, residual) = counted(field)
+        origins, directions = rays(100)
+        seen = render_volume(wrapped, position_color, origins, directions, inv_std=100.0)
+        points = origins[:, None] + seen.depths[..., None] * directions[:, None]
+        inside = int((field.value(points, level=0).abs() < 0.05).sum())
+        assert 0 < inside < 0.7 * seen.depths.numel()
+        assert residual.jets == inside
+        assert residual.values == 0
+        assert base.jets == seen.depths.numel()
+
+    def test_a_level_costs_nothing_when_a_coarser_one_is_rendered(self) -> None:
+        wrapped, (_, residual) = counted(self.field())
+        render_volume(wrapped, position_color, *rays(10), inv_std=100.0, level=0)
+        assert residual.jets == residual.values == 0
+
+    def test_samples_cover_the_band_where_the_finer_surface_may_lie(self) -> None:
+        # Were the guide as sharp as it gets, all samples would sit on the coarse surface.
+        origins, directions = rays(50)
+        near, far = sphere_span(origins, directions)
+        edges = sample_depths(self.field(), origins, directions, near, far, Sampling(importance=64, sharpness=1e4))
+        values = Sphere(radius=0.5).value(origins[:, None] + edges[..., None] * directions[:, None])
+        hit = (values < 0).any(dim=1)
+        assert float((values[hit].abs() < 0.04).float().mean()) > 0.3
+        assert float((values[hit].abs() < 0.01).float().mean()) < 0.3
+
+    def test_light_samples_get_no_colour(self) -> None:
+        asked: list[int] = []
+
+        def color(x: Tensor, direction: Tensor, jet: Jet) -> Tensor:
+            asked.append(len(x))
+            return position_color(x, direction, jet)
+
+        field = self.field()
+        everywhere = render_volume(field, color, *rays(50), inv_std=200.0)
+        only = render_volume(field, color, *rays(50), inv_std=200.0, least_weight=1e-4)
+        assert asked[1] < asked[0] / 3
+        torch.testing.assert_close(only.color, everywhere.color, atol=1e-4 * 129, rtol=0)
+        assert float((only.color - everywhere.color).abs().max()) > 0
+
+
+def test_the_outside_is_seen_past_the_sphere_only() -> None:
+    def fog(inverted: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
+        assert inverted.shape[-1] == 4
+        return torch.full(inverted.shape[:1], 1e3), torch.tensor([0.0, 1.0, 0.0]).expand(len(inverted), 3)
+
+    origins = torch.tensor([[0.0, 0, 2], [1.5, 0, 2]])
+    ahead = torch.tensor([0.0, 0, -1]).expand(2, 3)
+
+    def red(x: Tensor, direction: Tensor, jet: Jet) -> Tensor:
+        return torch.tensor([1.0, 0, 0]).expand_as(x)
+
+    seen = render_volume(Sphere(radius=0.5), red, origins, ahead, inv_std=1000.0, outside=fog)
+    torch.testing.assert_close(seen.color, torch.tensor([[1.0, 0, 0], [0, 1, 0]]), atol=1e-3, rtol=0)
+
+
+@pytest.mark.parametrize(
+    "setting", [{"uniform": 1}, {"importance": -1}, {"rounds": 0}, {"sharpness": 0.0}, {"outside": 0}]
+)
+def test_sampling_refuses(setting: dict[str, int]) -> None:
+    with pytest.raises(ValueError, match=next(iter(setting))):
+        Sampling(**setting)
+
+
+def test_gradients_reach_the_field_through_the_weights() -> None:
+    # Growing the sphere brings its surface nearer: ∂depth/∂bias of f = |x| − r is +1 along the axis.
+    class Shifted(Field):
+        def __init__(self) -> None:
+            super().__init__()
+            self.in_dim, self.num_levels = 3, 1
+            self.register_buffer("deltas", torch.empty(0))
+            self.bias = torch.nn.Parameter(torch.tensor(0.0, dtype=torch.float64))
+            self.sphere = Sphere(radius=0.5).double()
+
+        def value(self, x: Tensor, *, level: int = -1) -> Tensor:
+            return self.sphere.value(x) + self.bias
+
+        def jet(self, x: Tensor, *, level: int = -1) -> Jet:
+            value, gradient, features = self.sphere.jet(x)
+            return Jet(value + self.bias, gradient, features)
+
+    field, eye = Shifted(), torch.tensor([[0.0, 0, 2]], dtype=torch.float64)
+    seen = render_volume(
+        field, position_color, eye, -eye / 2, inv_std=100.0, sampling=Sampling(uniform=256, importance=256)
+    )
+    (slope,) = torch.autograd.grad(seen.depth.sum(), field.bias)
+    assert float(slope) == pytest.approx(1, abs=0.02)
