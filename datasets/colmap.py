@@ -81,7 +81,9 @@ def read_colmap(model: Path) -> list[Shot]:
     poses = _binary_poses(images) if images.suffix == ".bin" else _text_poses(images)
     if not poses:
         raise InputError(f"{images}: no images; expected at least one that COLMAP registered")
-    folder = _beside(model, IMAGE_FOLDERS) or model.parent / IMAGE_FOLDERS[0]
+    folder = _beside(model, IMAGE_FOLDERS)
+    if folder is None:
+        folder = (model.parent.parent if model.parent.name == "sparse" else model.parent) / IMAGE_FOLDERS[0]
     masks = _beside(model, MASK_FOLDERS)
     shots = []
     for pose in sorted(poses, key=lambda pose: pose.name):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -23,6 +23,8 @@ from .undistort import undistort, undistorted_camera
 __all__ = ["PosedImage", "PosedImages", "read_posed_images"]
 
 Float32 = NDArray[np.float32]
+
+OPAQUE = 0.999  # what is left of 1 after resampling
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +68,7 @@ def read_posed_images(path: str | Path, *, width: int | None = None, region: Sim
 
     Lens distortion is taken out of the pictures, and the cameras are those of the new pictures. Where a picture is
     larger or smaller than its file of cameras says, both sides by one factor, the camera follows. A picture's mask is
-    the file that goes with it, or its transparency.
+    the file that goes with it, or its transparency; masks that are white in all views are none.
 
     Args:
         path: a file or folder that `read_cameras` knows: NeuS (with ``image`` and ``mask`` beside cameras_sphere.npz),
@@ -95,6 +97,8 @@ def read_posed_images(path: str | Path, *, width: int | None = None, region: Sim
     points = read_colmap_points(source) if source.is_dir() else None
     _check_files(shots)
     views = tuple(_view(shot, width) for shot in shots)
+    if all(view.mask is None or view.mask.min() > OPAQUE for view in views):
+        views = tuple(replace(view, mask=None) for view in views)  # white masks in all views say nothing
     if region is not None:
         similarity, words = region, "given"
     elif sphere is not None:
