@@ -17,6 +17,9 @@ __all__ = ["DepthReport", "DepthSettings", "frame_cloud"]
 
 Float64 = NDArray[np.float64]
 
+TYPICAL = 0.99  # share of the points that are nearer than what is called typical
+STRAY = 1.5  # what is further away than so many times that makes everything else coarse
+
 
 @dataclass(frozen=True)
 class DepthSettings:
@@ -72,6 +75,7 @@ class DepthReport:
         smoothing: radius of the smoothing windows in pixels, the largest over the frames.
         nearest: the smallest depth of a point kept.
         furthest: the largest one.
+        typical: the depth below which 99 % of them are; of several frames, the largest.
         seen_through: points where other frames see free space.
         thinned: points that others stand for, after thinning.
     """
@@ -88,6 +92,7 @@ class DepthReport:
     smoothing: int
     nearest: float
     furthest: float
+    typical: float
     seen_through: int = 0
     thinned: int = 0
 
@@ -105,12 +110,14 @@ class DepthReport:
         parts = ", ".join(f"{count:,} {what}" for what, count in dropped.items() if count)
         maps = "1 depth map" if self.frames == 1 else f"{self.frames} depth maps"
         smoothing = f"smoothed over {self.smoothing} pixels" if self.smoothing else "not smoothed"
-        return "\n".join(
-            (
-                f"{maps}: {self.kept:,} points of {self.pixels:,} pixels" + (f"; dropped {parts}" if parts else ""),
-                f"depths {self.nearest:.4g} to {self.furthest:.4g} units, noise {self.noise:.2%}, {smoothing}",
-            )
-        )
+        lines = [
+            f"{maps}: {self.kept:,} points of {self.pixels:,} pixels" + (f"; dropped {parts}" if parts else ""),
+            f"depths {self.nearest:.4g} to {self.furthest:.4g} units, noise {self.noise:.2%}, {smoothing}",
+        ]
+        if self.furthest > STRAY * self.typical:
+            limit = f"--max-depth {1.05 * self.typical:.2g}"
+            lines.append(f"hint: 99 % of the points are nearer than {self.typical:.3g}; {limit} makes them finer")
+        return "\n".join(lines)
 
 
 def frame_cloud(frame: RgbdFrame, settings: DepthSettings | None = None) -> tuple[PointCloud, DepthReport]:
@@ -166,5 +173,6 @@ def frame_cloud(frame: RgbdFrame, settings: DepthSettings | None = None) -> tupl
         smoothing=radius,
         nearest=float(depth[kept].min()),
         furthest=float(depth[kept].max()),
+        typical=float(np.quantile(depth[kept], TYPICAL)),
     )
     return cloud, report

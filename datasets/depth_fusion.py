@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from functools import partial
+from itertools import count
 
 import cv2
 import numpy as np
@@ -13,18 +15,20 @@ from ..neural_fields import InputError
 from .depth_cloud import DepthReport, DepthSettings, frame_cloud
 from .point_cloud import PointCloud
 from .rgbd import RgbdFrame
-from .voxels import select, thin
+from .voxels import select, spread, thin
 
 __all__ = ["fuse_frames"]
 
 Float64 = NDArray[np.float64]
+Int64 = NDArray[np.int64]
 
 TOLERANCE = 0.03  # of the depth: a point this much nearer than what a frame sees there is in its way
 WITNESSES = 12  # frames that are asked about each point, so that long sequences take linear time
+ROOM = 4  # times as many points as will stay are kept until all frames have been asked about them
 
 
 def fuse_frames(
-    frames: Sequence[RgbdFrame],
+    frames: Iterable[RgbdFrame],
     settings: DepthSettings | None = None,
     *,
     tolerance: float = TOLERANCE,
@@ -37,7 +41,9 @@ def fuse_frames(
     frames saw.
 
     Args:
-        frames: with poses in one world, and depths in one unit, that of the poses.
+        frames: with poses in one world, and depths in one unit, that of the poses. They are gone through twice, and
+            none is held longer than it is looked at: what reads its frames anew each time needs memory for one of
+            them, however many there are.
         settings: of the cleaning; ``max_points`` is for all frames together.
         tolerance: relative difference of depths up to which a frame sees the same point.
         witnesses: how many other frames, evenly spread over the sequence, are asked about a frame's points.
@@ -47,39 +53,76 @@ def fuse_frames(
 
     Raises:
         InputError: there are no frames, nothing is left, or only some frames have colours.
-        ValueError: ``tolerance`` is not between 0 and 1, or ``witnesses`` is negative.
+        ValueError: ``tolerance`` is not between 0 and 1, ``witnesses`` is negative, or ``frames`` is an iterator.
     """
     settings = settings or DepthSettings()
     if not 0 < tolerance < 1 or witnesses < 0:
         raise ValueError(f"tolerance={tolerance}, witnesses={witnesses}: expected one in (0, 1) and one >= 0")
-    if not frames:
+    if isinstance(frames, Iterator):
+        raise ValueError("frames: an iterator, which ends after one pass; expected a list, or what begins anew")
+    pool = _Pool(settings)
+    # `map` and not a loop over frames, whose variable would hold each of them until the next has been read.
+    reports = list(map(pool.add, frames))
+    if not reports:
         raise InputError("frames: none given; name at least one depth map")
-    colored = [frame.color is not None for frame in frames]
-    if any(colored) != all(colored):
-        raise InputError(f"{frames[colored.index(False)].source}: has no colour picture, but other frames have one")
-    clouds, reports, seen_through = [], [], 0
-    nearest_depths = [_nearest_around(frame.depth) for frame in frames]
-    for index, frame in enumerate(frames):
-        cloud, report = frame_cloud(frame, settings)
-        cloud = thin(cloud, settings.max_points)
-        through = np.zeros(len(cloud), np.int64)
-        for other in _witnesses(index, len(frames), witnesses):
-            through += _verdict(cloud.points, frames[other], nearest_depths[other], tolerance)
-        seen_through += int((through > 0).sum())
-        clouds.append(select(cloud, through <= 0))
-        reports.append(report)
-    thinned = thin(_concatenated(clouds), settings.max_points)
-    if not len(thinned):
-        raise InputError(f"{frames[0].source}: the frames see through all of each other's points; check the poses")
-    return thinned, _summed(reports, kept=len(thinned), seen_through=seen_through)
+    (cloud, owner), seen_through = pool.joined(), 0
+    if len(reports) > 1 and witnesses:
+        asked = _witnesses(len(reports), witnesses)
+        ask = partial(_votes, cloud.points, owner, asked, tolerance)
+        through = sum(map(ask, count(), frames), np.zeros(len(cloud), np.int64))
+        seen_through = int((through > 0).sum())
+        cloud = select(cloud, through <= 0)
+    cloud = thin(cloud, settings.max_points)
+    if not len(cloud):
+        raise InputError(f"{pool.source}: the frames see through all of each other's points; check the poses")
+    return cloud, _summed(reports, kept=len(cloud), seen_through=seen_through)
 
 
-def _witnesses(index: int, count: int, limit: int) -> list[int]:
-    """At most ``limit`` of the other frames, evenly spread."""
-    others = [other for other in range(count) if other != index]
-    if len(others) <= limit:
-        return others
-    return [others[k] for k in np.linspace(0, len(others) - 1, limit).round().astype(int)]
+class _Pool:
+    """The points of the frames so far, and which frame each of them is from; never many more than will stay."""
+
+    def __init__(self, settings: DepthSettings) -> None:
+        self.settings = settings
+        self.clouds: list[PointCloud] = []
+        self.owners: list[Int64] = []
+        self.frames = 0
+        self.source, self.colored = "", False
+
+    def add(self, frame: RgbdFrame) -> DepthReport:
+        """Take in the points of the next frame."""
+        colored = frame.color is not None
+        if not self.frames:
+            self.source, self.colored = frame.source, colored
+        if colored != self.colored:
+            bare = self.source if colored else frame.source
+            raise InputError(f"{bare}: has no colour picture, but other frames have one")
+        cloud, report = frame_cloud(frame, self.settings)
+        self.clouds.append(thin(cloud, self.settings.max_points))
+        self.owners.append(np.full(len(self.clouds[-1]), self.frames))
+        self.frames += 1
+        if sum(map(len, self.clouds)) > 2 * ROOM * self.settings.max_points:
+            cloud, owner = self.joined()
+            kept = spread(cloud.points, ROOM * self.settings.max_points)
+            self.clouds, self.owners = [select(cloud, kept)], [owner[kept]]
+        return report
+
+    def joined(self) -> tuple[PointCloud, Int64]:
+        """All points, and the number of the frame of each."""
+        return _concatenated(self.clouds), np.concatenate(self.owners)
+
+
+def _witnesses(frames: int, limit: int) -> Int64:
+    """At most ``limit`` of the other frames, evenly spread, for each frame ``(frames, K)``."""
+    others = np.linspace(0, frames - 2, min(limit, frames - 1)).round().astype(np.int64)
+    return others + (others >= np.arange(frames)[:, None])
+
+
+def _votes(points: Float64, owner: Int64, asked: Int64, tolerance: float, index: int, frame: RgbdFrame) -> Int64:
+    """What a frame has to say of the points ``(N, 3)`` of those frames that ask it, see `_verdict`; else 0."""
+    mine = np.flatnonzero((asked == index).any(axis=1)[owner])
+    votes = np.zeros(len(points), np.int64)
+    votes[mine] = _verdict(points[mine], frame, _nearest_around(frame.depth), tolerance)
+    return votes
 
 
 def _nearest_around(depth: Float64) -> Float64:
@@ -90,7 +133,7 @@ def _nearest_around(depth: Float64) -> Float64:
     return np.asarray(cv2.erode(np.nan_to_num(depth, nan=0.0), np.ones((3, 3), np.uint8)), np.float64)
 
 
-def _verdict(points: Float64, frame: RgbdFrame, nearest: Float64, tolerance: float) -> NDArray[np.int64]:
+def _verdict(points: Float64, frame: RgbdFrame, nearest: Float64, tolerance: float) -> Int64:
     """Of each point ``(N, 3)`` in world coordinates: 1 if the frame sees through it, −1 if it sees it, else 0."""
     seen = (points - frame.eye) @ frame.world_from_camera[:3, :3]
     pixels, inside = frame.camera.project(seen)
@@ -127,6 +170,7 @@ def _summed(reports: Sequence[DepthReport], *, kept: int, seen_through: int) -> 
         smoothing=max(report.smoothing for report in reports),
         nearest=min(report.nearest for report in reports),
         furthest=max(report.furthest for report in reports),
+        typical=max(report.typical for report in reports),
         seen_through=seen_through,
         thinned=sum(report.kept for report in reports) - seen_through - kept,
         kept=kept,

@@ -8,7 +8,7 @@ from scipy.spatial import KDTree
 
 from .point_cloud import PointCloud
 
-__all__ = ["select", "spacing_of", "thin", "voxel_representatives"]
+__all__ = ["select", "spacing_of", "spread", "thin", "voxel_representatives"]
 
 Float64 = NDArray[np.float64]
 
@@ -24,13 +24,19 @@ def select(cloud: PointCloud, index: NDArray[np.integer] | NDArray[np.bool_]) ->
     )
 
 
-def thin(cloud: PointCloud, max_points: int, *, steps: int = 12) -> PointCloud:
-    """At most ``max_points`` points, evenly spread: those nearest the middle of the points of their voxel.
+def thin(cloud: PointCloud, max_points: int) -> PointCloud:
+    """At most ``max_points`` points of a cloud, evenly spread; see `spread`."""
+    return cloud if len(cloud) <= max_points else select(cloud, spread(cloud.points, max_points))
 
-    Points stay where they are; the smallest voxel that leaves few enough is found by bisection.
+
+def spread(points: Float64, max_points: int, *, steps: int = 12) -> NDArray[np.int64]:
+    """Indices, in order, of at most ``max_points`` points ``(N, 3)``, evenly spread.
+
+    They are those nearest the middle of the points of their voxel; the smallest voxel that leaves few enough is found
+    by bisection.
 
     Args:
-        cloud: its points must be finite.
+        points: finite.
         max_points: as many or fewer stay.
         steps: halvings of the voxel's exponent; 12 leave it a few percent too large at most.
 
@@ -39,9 +45,9 @@ def thin(cloud: PointCloud, max_points: int, *, steps: int = 12) -> PointCloud:
     """
     if max_points < 1:
         raise ValueError(f"max_points={max_points}: expected at least one")
-    if len(cloud) <= max_points:
-        return cloud
-    cells = _Cells(cloud.points)
+    if len(points) <= max_points:
+        return np.arange(len(points))
+    cells = _Cells(points)
     # One voxel holds all at the top; at the bottom a million of them stand along a side.
     low, high = -20.0, 1.0
     for _ in range(steps):
@@ -50,7 +56,7 @@ def thin(cloud: PointCloud, max_points: int, *, steps: int = 12) -> PointCloud:
             low = middle
         else:
             high = middle
-    return select(cloud, voxel_representatives(cloud.points, float(cells.extent.max()) * 2**high))
+    return voxel_representatives(points, float(cells.extent.max()) * 2**high)
 
 
 def voxel_representatives(points: Float64, size: float) -> NDArray[np.int64]:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -28,9 +29,10 @@ from ..datasets.depth_images import COLOR_SUFFIXES, DEPTH_SUFFIXES
 from ..datasets.depth_poses import PosedFrame
 from ..neural_fields import InputError
 from .fit import FitConfig, Run, choose_device, fit
+from .fit_state import read_record
 from .training import Progress
 
-__all__ = ["CLOUD_FILE", "DepthInput", "depth_cloud", "fit_depth", "kept_cloud", "read_frames", "trim_suggestion"]
+__all__ = ["CLOUD_FILE", "DepthInput", "depth_cloud", "fit_depth", "kept_cloud", "trim_suggestion"]
 
 CLOUD_FILE = "cloud.ply"
 """The cloud of a run that was fitted to depth maps; `mesh --trim-distance` and `texture` read it."""
@@ -69,38 +71,39 @@ def depth_cloud(source: DepthInput) -> tuple[PointCloud, DepthReport]:
     Raises:
         InputError: a file cannot be read, or they do not fit together.
     """
-    return fuse_frames(read_frames(source), source.settings)
+    return fuse_frames(_Files(source), source.settings)
 
 
-def read_frames(source: DepthInput) -> list[RgbdFrame]:
-    """Read the depth maps with their pictures and poses.
+class _Files:
+    """The frames of a `DepthInput`: which files belong together is found at once, each is read when its turn comes."""
 
-    Raises:
-        InputError: a file cannot be read, or they do not fit together.
-    """
-    files = _files(source.depth, DEPTH_SUFFIXES, "depth maps")
-    own: list[PosedFrame] = [(None, np.eye(4), None)]
-    poses = own if source.poses is None else read_poses(source.poses)
-    if source.poses is None and len(files) > 1:
-        raise InputError(
-            f"{source.depth}: {len(files)} depth maps, but no poses to join them by; give --poses trajectory.log or "
-            "transforms.json, or name one depth map"
-        )
-    posed = _in_order_of(files, poses, source)
-    colors = _colors(files, source.color)
-    cameras = _cameras(files, posed, source)
-    return [
-        read_frame(
-            file,
-            camera,
-            color=color,
-            world_from_camera=pose,
-            scale=source.scale,
-            inverse=source.inverse,
-            resize_color=source.resize_color,
-        )
-        for file, camera, color, (_, pose, _) in zip(files, cameras, colors, posed, strict=True)
-    ]
+    def __init__(self, source: DepthInput) -> None:
+        self.source = source
+        files = _files(source.depth, DEPTH_SUFFIXES, "depth maps")
+        own: list[PosedFrame] = [(None, np.eye(4), None)]
+        poses = own if source.poses is None else read_poses(source.poses)
+        if source.poses is None and len(files) > 1:
+            raise InputError(
+                f"{source.depth}: {len(files)} depth maps, but no poses to join them by; give --poses trajectory.log "
+                "or transforms.json, or name one depth map"
+            )
+        posed = _in_order_of(files, poses, source)
+        colors = _colors(files, source.color)
+        cameras = _cameras(files, posed, source)
+        self.parts = list(zip(files, cameras, colors, (pose for _, pose, _ in posed), strict=True))
+
+    def __iter__(self) -> Iterator[RgbdFrame]:
+        source = self.source
+        for file, camera, color, pose in self.parts:
+            yield read_frame(
+                file,
+                camera,
+                color=color,
+                world_from_camera=pose,
+                scale=source.scale,
+                inverse=source.inverse,
+                resize_color=source.resize_color,
+            )
 
 
 def fit_depth(
@@ -159,10 +162,12 @@ def kept_cloud(run: Path) -> Path:
 def trim_suggestion(run: Path) -> float:
     """A distance for ``mplicits mesh --trim-distance`` that cuts off what closes an open surface behind.
 
-    Three times the distance to the nearest neighbour (of 95 % of the points): no holes between points, and only a
-    narrow rim beyond the last of them.
+    Three times the distance to the nearest neighbour (of 95 % of the points), so that there are no holes between
+    points, and three times how far the surface passes by them, square to that: a fit with an error larger than the
+    spacing would otherwise be cut away as a whole.
     """
-    return 3 * spacing_of(read_cloud(run / CLOUD_FILE).points)
+    error = read_record(run)["stages"][-1]["rms_at_points"]
+    return 3 * math.hypot(spacing_of(read_cloud(run / CLOUD_FILE).points), error)
 
 
 def _files(path: Path, suffixes: tuple[str, ...], what: str) -> list[Path]:

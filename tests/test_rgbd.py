@@ -2,6 +2,7 @@
 
 import json
 import signal
+import weakref
 
 import cv2
 import numpy as np
@@ -11,6 +12,7 @@ from mplicits.datasets import (
     DepthSettings,
     PointCloud,
     RgbdFrame,
+    depth_fusion,
     frame_cloud,
     fuse_frames,
     look_at,
@@ -19,6 +21,7 @@ from mplicits.datasets import (
     thin,
 )
 from mplicits.neural_fields import InputError
+from mplicits.pipelines import fit_depth as fit_depth_module
 from mplicits.pipelines.cli import main
 from mplicits.pipelines.fit import FitConfig, Interrupted
 from mplicits.pipelines.fit_depth import DepthInput, fit_depth
@@ -259,6 +262,67 @@ def test_fusion_thins_what_several_frames_saw():
     assert fuse_frames(frames, EXACT, witnesses=2)[1].seen_through == 0
 
 
+class Watched:
+    """Frames that are made anew in each pass, and noticed if they are still there when the next one is."""
+
+    def __init__(self, eyes):
+        self.eyes, self.passes, self.alive, self.most = eyes, 0, weakref.WeakSet(), 0
+
+    def __iter__(self):
+        self.passes += 1
+        for eye in self.eyes:
+            self.most = max(self.most, len(self.alive))
+            frames = sphere_frames([eye])
+            self.alive.add(frames[0])
+            yield frames.pop()
+
+
+def test_fusion_holds_no_frame_longer_than_it_looks_at_it():
+    frames = Watched([(4 * np.cos(a), 4 * np.sin(a), 0.2) for a in np.linspace(0, 5, 6)])
+    cloud, report = fuse_frames(frames, EXACT)
+    assert (frames.passes, frames.most, report.frames) == (2, 0, 6)
+    whole, same = fuse_frames(list(frames), EXACT)
+    assert same == report
+    assert np.array_equal(whole.points, cloud.points)
+    assert frames.most == 5  # a list holds them
+    with pytest.raises(ValueError, match="frames: an iterator"):
+        fuse_frames(iter(frames), EXACT)
+
+
+def test_fusion_keeps_few_points_of_long_sequences():
+    settings = DepthSettings(smoothing=0, max_points=100)
+    pool = depth_fusion._Pool(settings)
+    for frame in sphere_frames([(4 * np.cos(a), 4 * np.sin(a), 0.2) for a in np.linspace(0, 6, 20)]):
+        pool.add(frame)
+        cloud, owner = pool.joined()
+        assert len(cloud) == len(owner) <= 2 * depth_fusion.ROOM * settings.max_points
+    # Rows stay together: a point was seen by the camera of its frame, from the front.
+    angle = np.linspace(0, 6, 20)[owner]
+    towards = np.stack((4 * np.cos(angle), 4 * np.sin(angle), np.full(len(angle), 0.2)), axis=1) - cloud.points
+    assert ((towards * cloud.points).sum(axis=1) > 0).all()
+    assert len(np.unique(owner)) == 20
+
+
+def test_witnesses_are_other_frames_spread_evenly():
+    asked = depth_fusion._witnesses(9, 4)
+    assert asked.shape == (9, 4)
+    assert asked[0].tolist() == [1, 3, 6, 8]  # of 1 to 8, with steps of 7/3
+    for index, others in enumerate(asked):
+        assert index not in others
+        assert len(set(others)) == 4
+    assert depth_fusion._witnesses(3, 12).tolist() == [[1, 2], [0, 2], [0, 1]]
+
+
+def test_far_strays_give_a_hint():
+    depth = np.full((72, 96), 1.0)
+    depth[60:66, :10] = 7.0
+    _, report = frame_cloud(RgbdFrame(depth, LENS), EXACT)
+    assert "--max-depth 1.1 " in report.summary()
+    depth[60:66, :10] = 1.4
+    _, report = frame_cloud(RgbdFrame(depth, LENS), EXACT)
+    assert "--max-depth" not in report.summary()
+
+
 def test_fusion_refuses_what_does_not_fit():
     bare, other = sphere_frames([(4.0, 0, 0), (0, 4.0, 0)])
     colored = RgbdFrame(bare.depth, LENS, np.zeros((72, 96, 3), np.uint8), bare.world_from_camera, "a.png")
@@ -345,11 +409,21 @@ def test_fit_of_one_depth_map(scene, tmp_path, capsys):
     assert main(["mesh", str(run), "-o", str(tmp_path / "m.ply"), "--resolution", "48", "--trim-distance", trim]) == 0
 
 
-def test_fit_of_several_posed_depth_maps(scene, tmp_path, capsys):
+def test_fit_of_several_posed_depth_maps(scene, tmp_path, capsys, monkeypatch):
+    alive, most = weakref.WeakSet(), 0
+
+    def watched(*arguments, **options):
+        nonlocal most
+        most = max(most, len(alive))
+        alive.add(frame := read_frame(*arguments, **options))
+        return frame
+
+    monkeypatch.setattr(fit_depth_module, "read_frame", watched)
     run = tmp_path / "run"
     given = ["--intrinsics", scene / "camera.json", "--color", scene / "color", "--poses", scene / "trajectory.log"]
     assert run_fit(scene / "depth", *given, "-o", run) == 0
     assert "3 depth maps: " in capsys.readouterr().out
+    assert most == 0
     cloud = read_cloud(run / "cloud.ply")
     assert np.abs(np.linalg.norm(cloud.points, axis=1) - 1).max() < 1e-3
     from_first = cloud.points[:, 0] > 0.95
