@@ -3,6 +3,7 @@
 import json
 import math
 import struct
+from functools import partial
 from pathlib import Path
 
 import imageio.v3 as iio
@@ -11,8 +12,9 @@ import pytest
 import torch
 from mplicits.datasets.cameras import Camera, look_at
 from mplicits.datasets.posed_cameras import read_cameras
-from mplicits.datasets.posed_images import PosedImage, PosedImages
+from mplicits.datasets.posed_images import PosedImage, PosedImages, read_posed_images
 from mplicits.datasets.scene_files import check_new_folder, write_colmap, write_neus, write_transforms
+from mplicits.datasets.scenes import SCENES, render_scene
 from mplicits.neural_fields import InputError, Similarity
 from scipy.spatial.transform import Rotation
 
@@ -36,6 +38,14 @@ def photographs() -> PosedImages:
     points = np.random.default_rng(9).normal(size=(5, 3)) + CENTER
     views = tuple(photograph(index) for index in range(4))
     return PosedImages(views, Similarity(CENTER, SCALE), "made up", points, Path("nowhere"))
+
+
+WRITERS = {
+    "neus": write_neus,
+    "transforms": write_transforms,
+    "colmap": write_colmap,
+    "colmap-text": partial(write_colmap, form="text"),
+}
 
 
 def same_cameras(found: list[Camera], images: PosedImages) -> None:
@@ -146,6 +156,36 @@ def test_colmap_projects_world_points_onto_pixels(tmp_path, photographs, form, r
         assert np.abs(pixels - 0.5 - expected.numpy()).max() < 1e-9  # COLMAP counts from the image's corner
         picture = iio.imread(tmp_path / "colmap" / "images" / name)
         assert np.array_equal(picture, bytes_of(np.concatenate((view.color, view.mask[..., None]), axis=-1)))
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_what_is_read_is_what_was_written(tmp_path, photographs, name):
+    WRITERS[name](tmp_path / "data", photographs)
+    read = read_posed_images(tmp_path / "data", region=None if name == "neus" else photographs.similarity)
+    same_cameras([view.camera for view in read.views], photographs)
+    for view, written in zip(read.views, photographs.views, strict=True):
+        assert Path(view.name).suffix == ".png"
+        assert np.array_equal(bytes_of(view.color), bytes_of(written.color))
+        # A file of masks says object or not; transparency says how much.
+        mask = written.mask > 0.5 if name == "neus" else written.mask
+        assert np.array_equal(bytes_of(view.mask), bytes_of(mask))
+    assert np.allclose(read.similarity.center, CENTER, atol=1e-9)
+    assert read.similarity.scale == pytest.approx(SCALE, rel=1e-9)
+    assert (read.points is not None) == name.startswith("colmap")
+    if read.points is not None:
+        assert np.array_equal(read.points, photographs.points)
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_the_object_is_found_again(tmp_path, name):
+    scene = SCENES["painted-sphere"]()
+    images = render_scene(scene, 12, 40, samples=2)
+    WRITERS[name](tmp_path / "data", images)
+    read = read_posed_images(tmp_path / "data")
+    center, radius = np.array(read.similarity.center), read.similarity.scale
+    assert np.linalg.norm(center) < 0.1
+    assert radius >= scene.radius + np.linalg.norm(center)  # all of it is in the region
+    assert radius == (1.0 if name == "neus" else pytest.approx(0.85, abs=0.2))
 
 
 def test_pictures_without_masks_have_no_alpha(tmp_path, photographs):
