@@ -49,7 +49,7 @@ def spacetime_jet(field: Field, x: Tensor, *, level: int = -1, order: int = 1) -
         field: four-dimensional.
         x: points (x, y, z, t).
         level: as in `Field.jet`.
-        order: 1, or 2 for the second derivatives by space too (about two and a half times the cost).
+        order: 1, or 2 for the second derivatives by space too (about three times the cost).
 
     Raises:
         ValueError: the field is not four-dimensional, a shape does not fit, or ``order`` is neither.
