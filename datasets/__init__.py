@@ -13,6 +13,7 @@ from .posed_cameras import read_cameras
 from .posed_images import PosedImage, PosedImages, read_posed_images
 from .prepare import CleaningReport, OrientedCloud, prepare_cloud
 from .reading import read_cloud
+from .region import region_from_cameras, region_from_masks, region_from_points
 from .rgbd import RgbdFrame, read_frame
 from .scanner import STATUE_PLACEMENT, simulate_scan, statue_scan
 from .statue import Statue
@@ -54,6 +55,9 @@ __all__ = [
     "read_poses",
     "read_textured",
     "read_trajectory",
+    "region_from_cameras",
+    "region_from_masks",
+    "region_from_points",
     "sample_sphere",
     "sample_surface",
     "sample_textured",
