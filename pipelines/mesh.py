@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from ..datasets import read_cloud
-from ..neural_fields import Field, InputError, Similarity, TextureField, load_field, map_colors
+from ..neural_fields import Field, InputError, Similarity, TextureField, load_field, map_attribute, map_colors
 from ..neural_fields.meshing import Mesh, NoSurfaceError, extract_mesh, map_normals
 from .bake import check_texture_size, textured_mesh
 from .mesh_files import check_mesh_path, write_mesh
@@ -21,7 +22,7 @@ from .runs import find_field
 from .texture import texture_of
 from .textured_files import check_textured_path
 
-__all__ = ["MeshOptions", "mesh_run"]
+__all__ = ["MeshOptions", "mesh_run", "normals_near"]
 
 
 @dataclass(frozen=True)
@@ -107,6 +108,28 @@ def _colors(texture: TextureField, points: NDArray[np.float64]) -> NDArray[np.fl
     return map_colors(texture, torch.from_numpy(points).float()).values.numpy()
 
 
+@torch.no_grad()
+def normals_near(field: Field, points: NDArray[np.float64], *, level: int) -> NDArray[np.float32]:
+    """Neural normal mapping: the gradients ``(N, 3)`` of a level at points of a mesh nearby.
+
+    A level above the coarsest differs from those before it only in their bands, which a coarse mesh, or one that has
+    been decimated, may leave. Its points there take the gradient at the surface point nearest to them.
+
+    Args:
+        field: on the CPU.
+        points: ``(N, 3)``, in unit-sphere coordinates.
+        level: counted from 0.
+
+    Returns:
+        The gradients; zero where no surface was found.
+    """
+    # Outside the band of a level i all finer ones are f_i, and |f_i| ≥ δ_i: so |f| below every δ is inside all bands.
+    delta = float(field.deltas[:level].min()) if level else math.inf
+    rows = torch.from_numpy(points).float()
+    mapped = map_attribute(field, lambda x: field.jet(x, level=level).gradient, rows, delta=delta, level=level)
+    return mapped.values.numpy()
+
+
 def _write_textured(
     out: str | Path,
     mesh: Mesh,
@@ -117,18 +140,13 @@ def _write_textured(
     size: int,
 ) -> None:
     """Bake the colours, if there are any, and the normals of the finest level, or of the one that was asked for."""
-    level = -1 if options.normal_level is None else options.normal_level
-
-    @torch.no_grad()
-    def normals_at(points: NDArray[np.float64]) -> NDArray[np.float32]:
-        return field.jet(torch.from_numpy(points).float(), level=level).gradient.numpy()
-
+    level = field.num_levels - 1 if options.normal_level is None else options.normal_level
     textured_mesh(
         out,
         mesh,
         similarity,
         None if texture is None else lambda points: _colors(texture, points),
-        normals_at,
+        lambda points: normals_near(field, points, level=level),
         size=size,
         faces=options.texture_faces,
     )

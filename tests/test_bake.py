@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 import trimesh
 from mplicits.datasets import read_textured, sample_textured
-from mplicits.neural_fields import InputError, Similarity, Sphere
+from mplicits.neural_fields import InputError, MultiscaleSDF, Plane, Similarity, Sphere
 from mplicits.neural_fields.meshing import Mesh, extract_mesh
 from mplicits.pipelines import unwrap as unwrap_module
 from mplicits.pipelines.bake import bake, check_texture_size, textured_mesh
+from mplicits.pipelines.mesh import normals_near
 from mplicits.pipelines.raster import cover
 from mplicits.pipelines.surface import Surface, is_closed, read_surface
 from mplicits.pipelines.tangents import from_frame, to_frame, vertex_tangents
@@ -213,6 +214,17 @@ def test_baked_normals_are_those_of_the_surface(subdivisions):
         angle = np.degrees(np.arccos(cosine.clip(-1, 1)))
         assert np.median(angle) < 0.5
         assert np.percentile(angle, 99) < (1.0 if truth is not bumpy else 2.0)
+
+
+def test_normals_of_fine_levels_reach_beyond_their_band():
+    """f_1 = |x| − ½ + x₀ in the band: on the circle x₀ = 0 its gradient is the radius plus the first axis."""
+    field = MultiscaleSDF(Sphere(radius=0.5), [Plane(normal=(1.0, 0.0, 0.0), offset=0.0)], [0.2])
+    angle = np.linspace(0, 6, 50)
+    outward = np.stack((np.zeros(50), np.cos(angle), np.sin(angle)), axis=1)
+    for radius in (0.45, 0.6, 0.8, 0.95):  # the last two are outside
+        fine, coarse = (normals_near(field, radius * outward, level=level) for level in (1, 0))
+        np.testing.assert_allclose(fine, outward + np.array([1, 0, 0]), atol=1e-5)
+        np.testing.assert_allclose(coarse, outward, atol=1e-6)
 
 
 def test_normals_of_a_flat_map_are_upright():
