@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -350,6 +351,21 @@ def test_doctor_finds_nothing_wrong_here(capsys):
     assert "GFLOP/s" in text
     assert re.search(r"ok +torch +\d", text)
     assert "error" not in text.replace("errors", "")
+
+
+def test_doctor_knows_all_extras(monkeypatch, tmp_path):
+    """As installers write them into the metadata, from pyproject.toml."""
+    project = tomllib.loads((Path(__file__).parent.parent / "pyproject.toml").read_text())["project"]
+    extras = project["optional-dependencies"]
+    lines = [f'{line}; extra == "{extra}"' for extra, wanted in extras.items() for line in wanted]
+    monkeypatch.setattr(doctor.importlib.metadata, "requires", lambda name: [*project["dependencies"], *lines])
+    monkeypatch.setattr(doctor, "_installed", lambda name: None)
+    report = doctor.format_findings(doctor.examine(tmp_path))
+    for extra in ("las", "poisson", "texture", "view"):
+        assert f"optional, not installed; pip install 'mplicits[{extra}]'" in report
+    assert "mplicits[dev]" not in report
+    assert "viser" in report
+    assert "xatlas" in report
 
 
 def test_doctor_names_what_is_missing_and_what_clashes(monkeypatch, tmp_path):

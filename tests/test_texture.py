@@ -23,11 +23,15 @@ from mplicits.neural_fields import (
     map_colors,
     save_field,
 )
+from mplicits.pipelines import texture as texture_module
 from mplicits.pipelines.config import load_config
+from mplicits.pipelines.progress_bar import _Lines
 from mplicits.pipelines.texture import TEXTURE_FILE, default_delta, fit_texture, texture_of, texture_run
 from mplicits.pipelines.texture_command import COMMAND
 from mplicits.pipelines.texture_config import TextureConfig
 from mplicits.pipelines.texture_samples import read_colors
+from mplicits.pipelines.texture_state import texture_state_file
+from mplicits.pipelines.training import Progress
 from numpy.typing import NDArray
 
 SMALL = TextureConfig(
@@ -264,6 +268,78 @@ def test_levels_that_are_not_there(run: Path, cloud: Path) -> None:
         texture_run(run, cloud, BRIEF, level=1)
 
 
+def press_ctrl_c(progress: Progress) -> None:
+    if progress.stage == "texture":
+        os.kill(os.getpid(), signal.SIGINT)
+
+
+def test_an_interrupted_training_leaves_a_usable_texture_and_continues_to_the_same(run: Path, cloud: Path) -> None:
+    config = replace(SMALL, steps=60)
+    whole = texture_run(run, cloud, config, out=run.parent / "whole.safetensors").texture
+    texture_run(run, cloud, config, progress=press_ctrl_c)
+    record = json.loads((run / "run.json").read_text())["texture"]
+    assert not record["finished"]
+    assert record["steps"] == 20
+    partial = texture_of(run, load_field(run / "field.safetensors").field)
+    assert partial is not None
+    x = torch.rand(100, 3) * torch.tensor([1.0, 1.0, 0.05])
+    assert partial.value(x).isfinite().all()
+    assert texture_state_file(run / TEXTURE_FILE).is_file()
+    resumed = texture_run(run, cloud, BRIEF, level=7, resume=True)  # its own settings and level count
+    assert torch.equal(resumed.texture.value(x), whole.value(x))
+    assert resumed.record["config"]["steps"] == 60
+    assert not texture_state_file(run / TEXTURE_FILE).exists()
+    record = json.loads((run / "run.json").read_text())["texture"]
+    assert record["finished"]
+    assert record["steps"] == 60
+
+
+def test_a_killed_training_continues_from_its_last_state(
+    run: Path, cloud: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = replace(SMALL, steps=60)
+    whole = texture_run(run, cloud, config, out=run.parent / "whole.safetensors").texture
+    monkeypatch.setattr(texture_module, "SAVE_EVERY", 0.0)
+
+    def die(progress: Progress) -> None:
+        if progress.step == 40:
+            raise RuntimeError("killed")
+
+    with pytest.raises(RuntimeError, match="killed"):
+        texture_run(run, cloud, config, progress=die)
+    assert not (run / TEXTURE_FILE).exists()
+    resumed = texture_run(run, cloud, resume=True)
+    x = torch.rand(100, 3) * torch.tensor([1.0, 1.0, 0.05])
+    assert torch.equal(resumed.texture.value(x), whole.value(x))
+    assert sorted(path.name for path in run.iterdir()) == ["field.safetensors", "run.json", TEXTURE_FILE]
+
+
+def test_a_training_is_not_continued_with_other_colours_or_another_field(run: Path, cloud: Path) -> None:
+    texture_run(run, cloud, replace(SMALL, steps=60), progress=press_ctrl_c)
+    state = texture_state_file(run / TEXTURE_FILE)
+    kept = state.read_bytes()
+    other = plane_cloud()
+    assert other.colors is not None
+    write_cloud_ply(run.parent / "other.ply", replace(other, colors=other.colors[::-1]))
+    with pytest.raises(InputError, match="not the colours"):
+        texture_run(run, run.parent / "other.ply", resume=True)
+    bent = plane_field()
+    with torch.no_grad():
+        next(bent.parameters()).add_(1e-3)
+    before = (run / "field.safetensors").read_bytes()
+    save_field(run / "field.safetensors", bent, similarity=Similarity((5.0, 0.0, 0.0), 1.0))
+    with pytest.raises(InputError, match="not the field"):
+        texture_run(run, cloud, resume=True)
+    (run / "field.safetensors").write_bytes(before)
+    state.write_bytes(kept[:-100])
+    with pytest.raises(InputError, match=r"resume\.safetensors: damaged"):
+        texture_run(run, cloud, resume=True)
+    state.write_bytes(kept)
+    texture_run(run, cloud, resume=True)
+    with pytest.raises(InputError, match="nothing to resume"):
+        texture_run(run, cloud, resume=True)
+
+
 def square(path: Path, *, colors: bool = True) -> Path:
     """A PLY mesh of two triangles, red at x = 4.5 and black at x = 5.5."""
     kinds = "property uchar red\nproperty uchar green\nproperty uchar blue\n" if colors else ""
@@ -315,6 +391,30 @@ def test_the_command(run: Path, cloud: Path, capsys: pytest.CaptureFixture[str])
     assert (run / TEXTURE_FILE).read_bytes() == before
     assert command(run, cloud, *QUICK, "--force", "--seed", 5) == 0
     assert (run / TEXTURE_FILE).read_bytes() != before
+
+
+def test_the_command_resumes(
+    run: Path, cloud: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(InputError, match=r"texture\.safetensors: was not begun, so there is nothing to resume"):
+        command(run, cloud, "--resume")
+    words = ("--steps", "60", "--width", "16", "--depth", "1", "--samples", "1000")
+    with monkeypatch.context() as patch:
+        patch.setattr(_Lines, "__call__", lambda self, progress, /: press_ctrl_c(progress))
+        assert command(run, cloud, *words) == 130
+    said = capsys.readouterr().err
+    assert f"to continue: mplicits texture {run} {cloud} --resume" in said
+    with pytest.raises(InputError, match="exists; --resume continues it, --force replaces it"):
+        command(run, cloud, *words)
+    (run / TEXTURE_FILE).unlink()
+    with pytest.raises(InputError, match="an interrupted training; --resume continues it, --force replaces it"):
+        command(run, cloud, *words)
+    with pytest.raises(InputError, match="--resume: continues with its own settings"):
+        command(run, cloud, "--resume", "--steps", 7)
+    assert command(run, cloud, "--resume", "--quiet") == 0
+    assert "(16, 1), 115 parameters, 60 steps" in capsys.readouterr().out
+    with pytest.raises(InputError, match=r"texture\.safetensors: is finished, so there is nothing to resume"):
+        command(run, cloud, "--resume")
 
 
 def test_the_command_warns_of_points_left_out(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
