@@ -16,6 +16,7 @@ from .radiance import Outside, ViewColor
 from .similarity import Similarity
 from .siren import Siren
 from .spacetime import SpaceTimeJet, SpaceTimeSDF, TimeSlice, at_time, spacetime_jet
+from .sphere_start import fit_sphere
 from .tracing import Hits, cone_starts, sphere_trace
 from .volume_renderer import Rendered, Sampling, render_volume
 
@@ -63,6 +64,7 @@ __all__ = [
     "cone_starts",
     "curvature",
     "extract_mesh",
+    "fit_sphere",
     "flow",
     "key_loss",
     "law_loss",

@@ -15,6 +15,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
+from .baselines import NeusSDF
 from .color import ColorSiren, TextureField
 from .errors import InputError
 from .field import Field
@@ -211,6 +212,14 @@ def _describe(field: Field) -> dict[str, Any]:
             "in_dim": field.in_dim,
             "num_features": field.num_features,
         }
+    if isinstance(field, NeusSDF):
+        return {
+            "type": "NeusSDF",
+            "width": field.width,
+            "depth": field.depth,
+            "frequencies": field.frequencies,
+            "num_features": field.num_features,
+        }
     if isinstance(field, MultiscaleSDF):
         levels = [field.base, *field.residuals]
         return {
@@ -229,6 +238,8 @@ def _build(description: Mapping[str, Any]) -> Field:
     arguments = {key: value for key, value in description.items() if key != "type"}
     if description["type"] == "Siren":
         return Siren(arguments.pop("width"), arguments.pop("depth"), **arguments)
+    if description["type"] == "NeusSDF":
+        return NeusSDF(**arguments)
     if description["type"] == "MultiscaleSDF":
         levels = [_build(level) for level in description["levels"]]
         # The band widths are among the tensors; the constructor only needs as many of them.

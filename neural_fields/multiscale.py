@@ -79,7 +79,7 @@ class MultiscaleSDF(Field):
                 paper measures, suppl. "Measured adaptive band widths").
             taper: see the class.
             in_dim: dimension of the domain.
-            num_features: extra outputs of every level.
+            num_features: extra outputs of every level; they begin with unit variance.
             residual_gain: factor on the residuals' initial output weights, so that a new level starts close to
                 the one before it.
 
@@ -96,6 +96,7 @@ class MultiscaleSDF(Field):
                 in_dim=in_dim,
                 num_features=num_features,
                 output_gain=residual_gain if index else 1.0,
+                feature_gain=omega,
             )
             for index, ((width, depth), omega) in enumerate(zip(sizes, omegas, strict=True))
         ]

@@ -48,6 +48,7 @@ class Siren(Field):
         in_dim: dimension of the domain.
         num_features: extra outputs F beside the value, returned in ``Jet.features``.
         output_gain: factor on the initial output weights; a residual starts small with 0.1.
+        feature_gain: the same for the features; with ω₀ they begin with unit variance, as who reads them expects.
 
     Raises:
         ValueError: an argument is out of range.
@@ -69,6 +70,7 @@ class Siren(Field):
         in_dim: int = 3,
         num_features: int = 0,
         output_gain: float = 1.0,
+        feature_gain: float = 1.0,
     ) -> None:
         super().__init__()
         for name, number, least in (
@@ -87,17 +89,18 @@ class Siren(Field):
         sizes = [in_dim] + [width] * depth
         self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in itertools.pairwise(sizes))
         self.output = nn.Linear(width, 1 + num_features)
-        self._initialise(output_gain)
+        self._initialise(output_gain, feature_gain)
 
     @torch.no_grad()
-    def _initialise(self, output_gain: float) -> None:
+    def _initialise(self, output_gain: float, feature_gain: float) -> None:
         for index, layer in enumerate([*self._sine_layers(), self.output]):
             fan_in = layer.in_features
             bound = 1 / fan_in if index == 0 else math.sqrt(6 / fan_in) / self.omega
             layer.weight.uniform_(-bound, bound)
             layer.bias.uniform_(-bound, bound)
-        self.output.weight.mul_(output_gain)
-        self.output.bias.mul_(output_gain)
+        for rows, gain in ((slice(0, 1), output_gain), (slice(1, None), feature_gain)):
+            self.output.weight[rows] *= gain
+            self.output.bias[rows] *= gain
 
     def value(self, x: Tensor, *, level: int = -1) -> Tensor:
         """See `Field.value`; ``x`` may have any leading shape, N = 0 included."""

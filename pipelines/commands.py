@@ -17,6 +17,7 @@ from .check_cameras_command import COMMAND as CHECK_CAMERAS
 from .command import Command, add_json, check_output, positive, whole
 from .fit_command import COMMAND as FIT
 from .fit_settings import add_fit_settings, fit_settings, were_given
+from .reconstruct_command import COMMAND as RECONSTRUCT
 from .render_command import COMMAND as RENDER
 from .scene_command import COMMAND as SCENE
 from .slice_command import COMMAND as SLICE
@@ -160,6 +161,7 @@ COMMANDS: Mapping[str, Command] = MappingProxyType(
             "Extract a mesh from a fit, in the coordinates of its input.",
         ),
         "texture": TEXTURE,
+        "reconstruct": RECONSTRUCT,
         "render": RENDER,
         "slice": SLICE,
         "view": VIEW,

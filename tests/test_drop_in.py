@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import torch
 from hosts import Heads, points, ray_samples
-from mplicits.pipelines import scene_model
+from mplicits import neural_fields
 from torch import nn
 
 DOCUMENT = Path(__file__).parent.parent / "docs" / "drop-in.md"
@@ -40,7 +40,7 @@ def apply(section: str, names: dict[str, Any]) -> dict[str, Any]:
 
 @pytest.fixture(autouse=True)
 def _short_start(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(scene_model, "fit_sphere", functools.partial(scene_model.fit_sphere, steps=2, batch=16))
+    monkeypatch.setattr(neural_fields, "fit_sphere", functools.partial(neural_fields.fit_sphere, steps=2, batch=16))
 
 
 def provide(monkeypatch: pytest.MonkeyPatch, module: str, *names: str) -> None:

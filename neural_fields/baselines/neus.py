@@ -110,7 +110,8 @@ class NeusSDF(Field):
                 g, encoded = g[:, :-inputs], g[:, -inputs:]
         gradient = _through_encoding(rows, g + encoded, self.frequencies)
         shape = x.shape[:-1]
-        return Jet(output[:, 0].reshape(shape), gradient.reshape(x.shape), output[:, 1:].reshape(*shape, self.num_features))
+        features = output[:, 1:].reshape(*shape, self.num_features)
+        return Jet(output[:, 0].reshape(shape), gradient.reshape(x.shape), features)
 
     def _forward(self, x: Tensor) -> tuple[Tensor, list[Tensor], list[Tensor]]:
         """Outputs ``(N, 1 + F)``, the pre-activations of the hidden layers, and the weights."""

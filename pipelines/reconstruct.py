@@ -1,0 +1,256 @@
+"""``reconstruct``: from posed photographs to a surface with colours, by volume rendering (NeuS) of a multiscale SDF."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from ..datasets.posed_images import PosedImage, PosedImages, read_posed_images
+from ..neural_fields import InputError, NoSurfaceError, TextureField, save_field, save_texture
+from .config import load_config
+from .fit import Interrupted, choose_device
+from .fit_state import FIELD_FILE, STATE_FILE, environment, load_state, read_record, save_state, write_record
+from .picture import write_picture
+from .ray_pool import RayPool
+from .reconstruct_config import ReconstructConfig
+from .reconstruct_texture import scene_texture
+from .reconstruct_train import SceneTrainer
+from .reconstruct_views import ViewImage, comparison_sheet, held_out, measure, render_image
+from .scene_model import SceneModel, build_scene
+from .texture import TEXTURE_FILE
+from .training import Progress, stop_on_signals
+
+__all__ = ["HELD_OUT_FILE", "PREVIEW_FILE", "Reconstruction", "reconstruct"]
+
+HELD_OUT_FILE = "held_out.png"
+PREVIEW_FILE = "preview.png"
+PREVIEWS = 5  # pictures of the first view on the way
+SHEET_VIEWS = 4  # rows of the sheet of held-out views
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """A finished reconstruction.
+
+    Attributes:
+        model: geometry, colour and background, on the CPU.
+        texture: the colours of the surface as a field, or None.
+        images: what it was trained on, and held-out views.
+        directory: where it was written, or None.
+        record: what ``run.json`` holds.
+    """
+
+    model: SceneModel
+    texture: TextureField | None
+    images: PosedImages
+    directory: Path | None
+    record: dict[str, Any]
+
+
+def reconstruct(
+    data: str | Path | PosedImages,
+    config: ReconstructConfig | None = None,
+    *,
+    out: str | Path | None = None,
+    resume: bool = False,
+    progress: Callable[[Progress], None] | None = None,
+) -> Reconstruction:
+    """Train geometry and colour on posed photographs.
+
+    Args:
+        data: a data set (see `read_posed_images`), or images in memory.
+        config: settings; the defaults are those of the ``default`` preset.
+        out: run directory for field, texture, pictures, checkpoints and ``run.json``; None writes nothing.
+        resume: continue the interrupted run in ``out`` with its own settings; ``config`` is then ignored.
+        progress: called now and then with how far the training is.
+
+    Raises:
+        InputError: the data cannot be read or used, or there is nothing to resume.
+        Interrupted: Ctrl-C or SIGTERM; ``out`` then holds a checkpoint and a usable field.
+
+    Example:
+        >>> run = reconstruct("data/dtu_scan24")  # doctest: +SKIP
+        >>> run.record["held_out"]["psnr"]  # doctest: +SKIP
+    """
+    directory = None if out is None else Path(out)
+    if resume:
+        if directory is None:
+            raise InputError("resume: needs the run directory (out=...)")
+        config = load_config(ReconstructConfig, None, read_record(directory)["config"], thing="reconstruct")
+    config = config or ReconstructConfig()
+    device = choose_device(config.device)
+    images = data if isinstance(data, PosedImages) else read_posed_images(data, width=config.width)
+    if directory is not None:
+        directory.mkdir(parents=True, exist_ok=True)
+    return _Reconstruction(images, config, device, directory, progress or (lambda _: None)).run(resume=resume)
+
+
+class _Reconstruction:
+    """One reconstruction under way."""
+
+    def __init__(
+        self,
+        images: PosedImages,
+        config: ReconstructConfig,
+        device: torch.device,
+        directory: Path | None,
+        progress: Callable[[Progress], None],
+    ) -> None:
+        self.images, self.config, self.device = images, config, device
+        self.directory, self.progress = directory, progress
+        self.train_views, self.test_views = held_out(images.views, config.test_every)
+        self.pool = RayPool(self.train_views, images.similarity, device)
+        progress(Progress("reconstruct: a sphere to begin with", 0, config.steps, 0.0, {}))
+        model = build_scene(config, has_masks=self.pool.has_masks).to(device)
+        self.trainer = SceneTrainer(model, self.pool, config, seconds=config.time_budget)
+        self.shown = 0
+
+    def run(self, *, resume: bool) -> Reconstruction:
+        """Train to the end, measure, colour, write."""
+        if resume:
+            self._restore()
+        if self.directory is not None:
+            write_record(self.directory, self._record(finished=False))
+        with stop_on_signals() as flag:
+            finished = self.trainer.run(flag, report=self._report, save=self._save)
+            if not finished:
+                self._save(self.trainer)
+                raise Interrupted(self.directory)
+        model = self.trainer.model.requires_grad_(False)
+        pairs = self._render_held_out()
+        record = self._record(finished=True) | {"held_out": self._figures(pairs)}
+        model.cpu()
+        texture, record["texture"] = self._texture(model)
+        if self.directory is not None:
+            self._write(model, texture, pairs, record)
+        return Reconstruction(model, texture, self.images, self.directory, record)
+
+    def _report(self, trainer: SceneTrainer) -> None:
+        stage = f"reconstruct, level {trainer.level}"
+        self.progress(Progress(stage, trainer.step, self.config.steps, trainer.fraction, trainer.losses))
+        if self.directory is not None and trainer.fraction * (PREVIEWS + 1) >= self.shown + 1 and trainer.fraction < 1:
+            self.shown = int(trainer.fraction * (PREVIEWS + 1))
+            view = (self.test_views or self.train_views)[0]
+            pairs = [(view, self._image(view))]
+            write_picture(self.directory / PREVIEW_FILE, comparison_sheet(pairs, trainer.model.background))
+
+    def _image(self, view: PosedImage) -> ViewImage:
+        trainer = self.trainer
+        return render_image(trainer.model, view, self.images.similarity, trainer.sampling, level=trainer.level)
+
+    def _render_held_out(self) -> list[tuple[PosedImage, ViewImage]]:
+        pairs = []
+        for index, view in enumerate(self.test_views):
+            pairs.append((view, self._image(view)))
+            count = len(self.test_views)
+            self.progress(Progress("held-out views", index + 1, count, (index + 1) / count, {}))
+        return pairs
+
+    def _figures(self, pairs: Sequence[tuple[PosedImage, ViewImage]]) -> dict[str, Any] | None:
+        """Means over the held-out views, and each one's figures; None without such views."""
+        if not pairs:
+            return None
+        views = {view.name: measure(image, view, self.trainer.model.background) for view, image in pairs}
+        names = sorted({name for figures in views.values() for name in figures})
+        means = {
+            name: float(np.mean([figures[name] for figures in views.values() if name in figures])) for name in names
+        }
+        return means | {"views": views}
+
+    def _texture(self, model: SceneModel) -> tuple[TextureField | None, dict[str, Any] | None]:
+        if self.config.texture_steps == 0:
+            return None, None
+        try:
+            fitted = scene_texture(model, self.images, self.config, progress=self.progress)
+        except NoSurfaceError as error:
+            raise InputError(
+                f"{self.images.source}: the training found no surface ({error}); see `mplicits check-cameras`, "
+                "and train longer (--steps)"
+            ) from error
+        return fitted.texture, fitted.record
+
+    def _write(
+        self,
+        model: SceneModel,
+        texture: TextureField | None,
+        pairs: Sequence[tuple[PosedImage, ViewImage]],
+        record: dict[str, Any],
+    ) -> None:
+        assert self.directory is not None
+        kept = self._field_record(record)
+        save_field(
+            self.directory / FIELD_FILE, model.geometry, similarity=self.images.similarity, metadata={"run": kept}
+        )
+        if texture is not None:
+            save_texture(self.directory / TEXTURE_FILE, texture, metadata={"texture": record["texture"]})
+        if pairs:
+            write_picture(self.directory / HELD_OUT_FILE, comparison_sheet(pairs[:SHEET_VIEWS], model.background))
+        write_record(self.directory, record)
+        for name in (STATE_FILE, PREVIEW_FILE):
+            (self.directory / name).unlink(missing_ok=True)
+
+    def _save(self, trainer: SceneTrainer) -> None:
+        """Write a usable field and all that `_restore` needs."""
+        if self.directory is None:
+            return
+        record = self._record(finished=False)
+        save_field(
+            self.directory / FIELD_FILE,
+            trainer.model.geometry,
+            similarity=self.images.similarity,
+            metadata={"run": self._field_record(record)},
+        )
+        save_state(self.directory, trainer.state(), {"fingerprint": self._fingerprint(), "shown": self.shown})
+        write_record(self.directory, record)
+
+    def _restore(self) -> None:
+        assert self.directory is not None
+        tensors, progress = load_state(self.directory)
+        if progress.get("fingerprint") != self._fingerprint():
+            raise InputError(
+                f"{self.images.source}: not the pictures that {self.directory} was trained on; "
+                "resume with those, or leave out --resume and choose a new -o"
+            )
+        self.shown = progress["shown"]
+        self.trainer.restore(tensors)
+
+    def _fingerprint(self) -> str:
+        """A digest of the training pixels and the cameras."""
+        digest = hashlib.sha256(self.pool.colors.cpu().numpy().tobytes())
+        for tensor in (self.pool.eyes, self.pool.axes, self.pool.lens):
+            digest.update(tensor.cpu().numpy().tobytes())
+        return digest.hexdigest()
+
+    def _field_record(self, record: dict[str, Any]) -> dict[str, Any]:
+        """What goes into the field's own file: not every view's figures."""
+        return {name: value for name, value in record.items() if name != "held_out"}
+
+    def _record(self, *, finished: bool) -> dict[str, Any]:
+        """What ``run.json`` holds."""
+        trainer = self.trainer
+        counts = {
+            name: sum(p.numel() for p in module.parameters())
+            for name, module in (("geometry", trainer.model.geometry), ("color", trainer.model.color))
+        }
+        return {
+            "finished": finished,
+            "data": str(self.images.source),
+            "views": {"trained": len(self.train_views), "held_out": len(self.test_views)},
+            "region": self.images.region,
+            "similarity": dataclasses.asdict(self.images.similarity),
+            "config": dataclasses.asdict(self.config),
+            "parameters": counts,
+            "deltas": trainer.model.geometry.deltas.tolist(),
+            "inv_std": float(trainer.model.inv_std.detach()),
+            "steps": trainer.step,
+            "training_seconds": round(trainer.elapsed, 3),
+            "losses": trainer.losses,
+            "environment": environment(self.device),
+        }

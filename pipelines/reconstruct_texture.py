@@ -1,0 +1,61 @@
+"""From colours that depend on the view to the texture of a surface, which every other command can use."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..datasets import PointCloud
+from ..datasets.posed_images import PosedImages
+from ..neural_fields import Jet, extract_mesh
+from .reconstruct_config import ReconstructConfig
+from .scene_model import SceneModel
+from .surface import from_mesh, sample_surface
+from .texture import FittedTexture, fit_texture
+from .texture_config import TextureConfig
+from .training import Progress
+
+__all__ = ["scene_texture", "surface_colors"]
+
+RESOLUTION = 128  # of the mesh whose points are coloured: finer than the texture's band is wide
+SAMPLES = 100_000
+BATCH = 1 << 15
+
+
+@torch.no_grad()
+def surface_colors(model: SceneModel, points: Tensor) -> Tensor:
+    """Colours ``(N, 3)`` of points ``(N, 3)`` near the surface, each seen along its normal, from outside."""
+    parts = []
+    for part in points.split(BATCH):
+        jet: Jet = model.geometry.jet(part)
+        parts.append(model.color(part, -torch.nn.functional.normalize(jet.gradient, dim=-1), jet))
+    return torch.cat(parts)
+
+
+def scene_texture(
+    model: SceneModel,
+    images: PosedImages,
+    config: ReconstructConfig,
+    *,
+    progress: Callable[[Progress], None] | None = None,
+) -> FittedTexture:
+    """Train a `TextureField` on the head-on colours of a scene's surface.
+
+    Args:
+        model: trained, on the CPU.
+        images: of it; for the coordinates and the name.
+        config: the reconstruction's; ``texture_steps``, seed and device are used.
+        progress: see `fit_texture`.
+
+    Raises:
+        NoSurfaceError: the geometry has no surface.
+    """
+    mesh = extract_mesh(model.geometry, resolution=RESOLUTION)
+    points, _ = sample_surface(from_mesh(mesh), SAMPLES, np.random.default_rng(config.seed))
+    colors = surface_colors(model, torch.from_numpy(points).float()).numpy()
+    cloud = PointCloud(images.similarity.to_input(points), colors=colors, source=str(images.source))
+    settings = TextureConfig(steps=config.texture_steps, seed=config.seed, device=config.device)
+    return fit_texture(model.geometry, cloud, settings, similarity=images.similarity, progress=progress)

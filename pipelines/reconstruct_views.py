@@ -1,0 +1,140 @@
+"""Pictures of a scene under training: rendered views, how near they are to the photographs, contact sheets."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ..datasets.posed_images import PosedImage
+from ..neural_fields import Similarity
+from ..neural_fields.volume import sphere_span
+from ..neural_fields.volume_renderer import Sampling
+from .ray_pool import camera_rays
+from .scene_model import SceneModel
+
+__all__ = ["ViewImage", "comparison_sheet", "held_out", "measure", "render_image", "target_of"]
+
+Float32 = NDArray[np.float32]
+
+RAYS = 4096  # rendered at a time
+SSIM_WINDOW = 11
+OBJECT = 0.5  # a pixel with a larger share of object counts as one
+
+
+@dataclass(frozen=True)
+class ViewImage:
+    """A rendered view.
+
+    Attributes:
+        color: ``(H, W, 3)`` display RGB in [0, 1].
+        normal: ``(H, W, 3)`` in unit-sphere coordinates; shorter than 1 where the view passes the object.
+        opacity: ``(H, W)``.
+    """
+
+    color: Float32
+    normal: Float32
+    opacity: Float32
+
+
+@torch.no_grad()
+def render_image(
+    model: SceneModel,
+    view: PosedImage,
+    similarity: Similarity,
+    sampling: Sampling,
+    *,
+    level: int = -1,
+    least_weight: float = 1e-4,
+    progress: Callable[[int, int], None] | None = None,
+) -> ViewImage:
+    """Render a view with the model's volume renderer.
+
+    Args:
+        model: on any device.
+        view: whose camera it is.
+        similarity: from world to unit-sphere coordinates.
+        sampling: where to sample.
+        level: of the geometry.
+        least_weight: see `render_volume`.
+        progress: told (rays done, rays in all).
+    """
+    device = model.background.device
+    origins, directions = (part.to(device) for part in camera_rays(view, similarity))
+    color = model.background.expand(len(origins), 3).clone()
+    normal, opacity = torch.zeros_like(color), torch.zeros_like(color[:, 0])
+    near, far = sphere_span(origins, directions)
+    # Rays that pass the region of interest see the background, whose colour is known unless it is learnt.
+    asked = (far > near).nonzero()[:, 0] if model.outside is None else torch.arange(len(origins), device=device)
+    done = 0
+    for rows in asked.split(RAYS):
+        seen = model.render(origins[rows], directions[rows], sampling, level=level, least_weight=least_weight)
+        color[rows], normal[rows], opacity[rows] = seen.color, seen.normal, seen.opacity
+        done += len(rows)
+        if progress:
+            progress(done, len(asked))
+    shape = view.color.shape[:2]
+    return ViewImage(
+        color.clamp(0, 1).reshape(*shape, 3).cpu().numpy(),
+        normal.reshape(*shape, 3).cpu().numpy(),
+        opacity.reshape(shape).cpu().numpy(),
+    )
+
+
+def held_out(views: Sequence[PosedImage], every: int) -> tuple[list[PosedImage], list[PosedImage]]:
+    """Split views into those to train on and those held out: every n-th one, from the first; none for 0.
+
+    At least one view is trained on, so of a single view none is held out.
+    """
+    if every == 0 or len(views) == 1:
+        return list(views), []
+    chosen = set(range(0, len(views), max(2, every)))
+    train = [view for index, view in enumerate(views) if index not in chosen]
+    return train, [view for index, view in enumerate(views) if index in chosen]
+
+
+def target_of(view: PosedImage, background: Tensor) -> Float32:
+    """The photograph ``(H, W, 3)`` on the scene's background, where a mask says what is object."""
+    if view.mask is None:
+        return view.color
+    share = view.mask[..., None]
+    return (share * view.color + (1 - share) * background.cpu().numpy()).astype(np.float32)
+
+
+def measure(image: ViewImage, view: PosedImage, background: Tensor) -> dict[str, float]:
+    """PSNR in dB and SSIM of a rendered view against its photograph; with a mask, PSNR inside the object as well."""
+    from kornia.metrics import psnr, ssim
+
+    target = target_of(view, background)
+    ours, theirs = (torch.from_numpy(picture).permute(2, 0, 1)[None] for picture in (image.color, target))
+    figures = {
+        "psnr": float(psnr(ours, theirs, 1.0)),
+        "ssim": float(ssim(ours, theirs, SSIM_WINDOW).mean()),
+    }
+    if view.mask is not None and bool((view.mask > OBJECT).any()):
+        inside = torch.from_numpy(view.mask > OBJECT)
+        figures["psnr_object"] = float(psnr(ours[0, :, inside], theirs[0, :, inside], 1.0))
+    return figures
+
+
+def comparison_sheet(pairs: Sequence[tuple[PosedImage, ViewImage]], background: Tensor) -> NDArray[np.uint8]:
+    """Photograph, rendering and normals of each view, side by side, one row per view."""
+    rows = []
+    for view, image in pairs:
+        normals = 0.5 + 0.5 * image.normal
+        normals = image.opacity[..., None] * normals + (1 - image.opacity[..., None])
+        panels = [target_of(view, background), image.color, np.clip(normals, 0, 1)]
+        rows.append(np.concatenate(panels, axis=1))
+    widest = max(row.shape[1] for row in rows)
+    padded = [np.pad(row, ((0, 4), (0, widest - row.shape[1]), (0, 0)), constant_values=1.0) for row in rows]
+    return _enlarged((np.concatenate(padded) * 255).round().astype(np.uint8))
+
+
+def _enlarged(picture: NDArray[np.uint8], least: int = 600) -> NDArray[np.uint8]:
+    """Small pictures in whole multiples of their size, so that their pixels can be seen."""
+    factor = max(1, least // picture.shape[1])
+    return picture.repeat(factor, axis=0).repeat(factor, axis=1)
