@@ -60,7 +60,7 @@ def camera_mesh(images: PosedImages) -> Mesh:
     parts = [_wire_sphere(), _axes()]
     for view, camera, color in zip(images.views, cameras, colors, strict=True):
         corners = _plane(camera, size, reach)
-        parts += [_frame(camera.eye.numpy(), corners, color, TUBE * size), _picture(corners, view.color)]
+        parts += [_frame(camera.eye.numpy(), corners, color, TUBE * size), _picture(corners, view.color, TUBE * size)]
     if images.points is not None:
         step = 1 + (len(images.points) - 1) // SPARSE_POINTS
         parts.append(_octahedra(images.similarity.to_unit(images.points[::step]), POINT, DARK))
@@ -99,8 +99,8 @@ def _frame(eye: Float64, corners: Float64, color: Float64, radius: float) -> _Pa
     return _tubes(np.concatenate((rays, rim, roof)), radius, color)
 
 
-def _picture(corners: Float64, color: NDArray[np.float32]) -> _Part:
-    """The image plane, seen from both sides, with the picture as colours of a grid of vertices."""
+def _picture(corners: Float64, color: NDArray[np.float32], gap: float) -> _Part:
+    """The image plane, seen from both sides (``gap`` apart), with the picture as colours of a grid of vertices."""
     height, width = color.shape[:2]
     share = min(1.0, THUMBNAIL / max(height, width))
     columns, rows = max(2, round(share * width)), max(2, round(share * height))
@@ -111,10 +111,12 @@ def _picture(corners: Float64, color: NDArray[np.float32]) -> _Part:
     grid = upper + along * (lower - upper)  # (rows, columns, 3)
     number = np.arange(rows * columns).reshape(rows, columns)
     a, b, c, d = (part.ravel() for part in (number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]))
-    front = np.concatenate((np.stack((a, b, c), axis=1), np.stack((a, c, d), axis=1)))
-    # Vertices of their own for each side: viewers that work out normals would average the two sides to nothing.
-    faces = np.concatenate((front, front[:, ::-1] + number.size))
-    return _Part(np.tile(grid.reshape(-1, 3), (2, 1)), faces, np.tile(small.reshape(-1, 3).astype(np.float64), (2, 1)))
+    faces = np.concatenate((np.stack((a, b, c), axis=1), np.stack((a, c, d), axis=1)))  # normals point forward
+    forward = np.cross(corners[1] - corners[0], corners[3] - corners[0])
+    # Each side has its own sheet, or the two would flicker where a viewer draws back faces.
+    sheets = np.stack((grid + gap * forward / np.linalg.norm(forward), grid)).reshape(-1, 3)
+    colors = np.tile(small.reshape(-1, 3).astype(np.float64), (2, 1))
+    return _Part(sheets, np.concatenate((faces, faces[:, ::-1] + number.size)), colors)
 
 
 def _wire_sphere(*, meridians: int = 6, parallels: int = 5, sides: int = 64) -> _Part:

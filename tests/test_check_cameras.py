@@ -196,13 +196,16 @@ def test_a_picture_hangs_where_its_pixels_are_seen(good):
     blue = np.abs(mesh.colors[:, 2] - 0.5) < 1e-6
     assert blue.sum() == 2 * 40 * 20
     pixels, z = camera.project(torch.from_numpy(mesh.vertices[blue]))
-    assert float(z.max() - z.min()) < 1e-9
-    assert 0 < float(z[0]) < float(camera.eye.norm())
+    eye_side = (z < z.min() + 1e-9).numpy()
+    assert eye_side.sum() == 40 * 20
+    assert 0 < float(z.min()) < float(z.max()) < 1.02 * float(z.min()) < float(camera.eye.norm())
     shares = (pixels.numpy() + 0.5) / [40, 20]
-    assert np.abs(shares - mesh.colors[blue, :2]).max() < 1e-5
+    assert np.abs(shares - mesh.colors[blue, :2])[eye_side].max() < 1e-5
     triangle = mesh.vertices[mesh.faces[blue[mesh.faces].all(axis=1)]]
     facing = np.cross(triangle[:, 1] - triangle[:, 0], triangle[:, 2] - triangle[:, 0]) @ camera.forward.numpy()
-    assert (facing > 0).sum() == (facing < 0).sum() == 2 * 39 * 19  # both sides
+    assert (facing > 0).sum() == (facing < 0).sum() == 2 * 39 * 19
+    nearest = camera.project(torch.from_numpy(triangle[:, 0]))[1].numpy() < float(z.min()) + 1e-9
+    assert np.array_equal(nearest, facing < 0)  # the side towards the eye is nearer to it
 
 
 def test_the_roof_is_above_the_picture(good):
@@ -295,14 +298,15 @@ def test_mistakes_end_in_one_line(tmp_path, capsys, good):
 @pytest.mark.parametrize("form", ["transforms", "colmap-text"])
 def test_scenes_come_with_their_truth(tmp_path, capsys, form):
     folder = tmp_path / "scene"
-    command = ["scene", "painted-sphere", "-o", str(folder), "--format", form]
+    command = ["scene", "striped-torus", "-o", str(folder), "--format", form]
     assert main([*command, "--views", "6", "--size", "16", "--samples", "1"]) == 0
     assert "6 views of 16 × 16 pixels" in capsys.readouterr().out
     images, check, _ = check_files(folder)
     assert check.warnings == ()
     assert len(images.views) == 6
     truth = read_surface(folder / "surface.ply")
-    assert np.abs(np.linalg.norm(truth.vertices, axis=1) - 0.6).max() < 1e-5
+    distance = SCENES["striped-torus"]().field.value(torch.from_numpy(truth.vertices))
+    assert float(distance.abs().max()) < 1e-5
     assert truth.colors is not None
     assert main(command) == 2  # nothing is overwritten
     assert "is not empty" in capsys.readouterr().err
