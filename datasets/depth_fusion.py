@@ -20,11 +20,12 @@ from .voxels import select, spread, thin
 __all__ = ["fuse_frames"]
 
 Float64 = NDArray[np.float64]
+Int32 = NDArray[np.int32]
 Int64 = NDArray[np.int64]
 
 TOLERANCE = 0.03  # of the depth: a point this much nearer than what a frame sees there is in its way
 WITNESSES = 12  # frames that are asked about each point, so that long sequences take linear time
-ROOM = 4  # times as many points as will stay are kept until all frames have been asked about them
+ROOM = 2  # times as many points as will stay are kept until all frames have been asked about them
 
 
 def fuse_frames(
@@ -84,7 +85,7 @@ class _Pool:
     def __init__(self, settings: DepthSettings) -> None:
         self.settings = settings
         self.clouds: list[PointCloud] = []
-        self.owners: list[Int64] = []
+        self.owners: list[Int32] = []
         self.frames = 0
         self.source, self.colored = "", False
 
@@ -98,7 +99,7 @@ class _Pool:
             raise InputError(f"{bare}: has no colour picture, but other frames have one")
         cloud, report = frame_cloud(frame, self.settings)
         self.clouds.append(thin(cloud, self.settings.max_points))
-        self.owners.append(np.full(len(self.clouds[-1]), self.frames))
+        self.owners.append(np.full(len(self.clouds[-1]), self.frames, np.int32))
         self.frames += 1
         if sum(map(len, self.clouds)) > 2 * ROOM * self.settings.max_points:
             cloud, owner = self.joined()
@@ -106,7 +107,7 @@ class _Pool:
             self.clouds, self.owners = [select(cloud, kept)], [owner[kept]]
         return report
 
-    def joined(self) -> tuple[PointCloud, Int64]:
+    def joined(self) -> tuple[PointCloud, Int32]:
         """All points, and the number of the frame of each."""
         return _concatenated(self.clouds), np.concatenate(self.owners)
 
@@ -117,7 +118,7 @@ def _witnesses(frames: int, limit: int) -> Int64:
     return others + (others >= np.arange(frames)[:, None])
 
 
-def _votes(points: Float64, owner: Int64, asked: Int64, tolerance: float, index: int, frame: RgbdFrame) -> Int64:
+def _votes(points: Float64, owner: Int32, asked: Int64, tolerance: float, index: int, frame: RgbdFrame) -> Int64:
     """What a frame has to say of the points ``(N, 3)`` of those frames that ask it, see `_verdict`; else 0."""
     mine = np.flatnonzero((asked == index).any(axis=1)[owner])
     votes = np.zeros(len(points), np.int64)
