@@ -6,17 +6,29 @@ Everything here works on the grid of pixels. Where there is no reading, depth is
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["edge_pixels", "grid_normals", "noise_of", "smooth_depth", "smoothing_radius", "specks"]
+__all__ = [
+    "Noise",
+    "edge_pixels",
+    "grid_normals",
+    "measure_noise",
+    "noise_of",
+    "smooth_depth",
+    "smoothing_radius",
+    "specks",
+]
 
 Float64 = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-MAX_RADIUS = 8  # pixels; beyond that smoothing rounds off what the sensor did see
+MAX_RADIUS = 12  # pixels; beyond that smoothing rounds off what the sensor did see
+BLOCKS = (2, 4)  # sides in pixels of the blocks over which noise may be alike
+ALIKE = 2.0  # averages of blocks have so many times the noise that they would have if it were independent
 LEAST_NOISE = 1e-4  # for readings without any noise, whose smoothing somebody asks for
 
 
@@ -82,6 +94,50 @@ def noise_of(depth: Float64, *, jump: float = 0.01) -> float:
             found.append(second[second < math.sqrt(6) * jump])
     values = np.concatenate(found) if found else np.empty(0)
     return float(values.mean() / math.sqrt(12 / math.pi)) if len(values) else 0.0
+
+
+class Noise(NamedTuple):
+    """What is known of the noise of a depth map.
+
+    Attributes:
+        deviation: relative standard deviation of the readings.
+        radius: of the window in pixels that averages it away; see `smoothing_radius`.
+        patchy: whether it is alike over several pixels, as a Kinect's, whose steps of depth have plateaus between them.
+    """
+
+    deviation: float
+    radius: int
+    patchy: bool
+
+
+def measure_noise(depth: Float64, *, pixel_angle: float, jump: float = 0.01) -> Noise:
+    """Measure noise pixel by pixel, and on averages of blocks, which shows whether it is alike over several pixels.
+
+    Noise that is independent from pixel to pixel is s times less in averages of s × s. Where it hardly gets less, the
+    second differences of pixels see little of it, and the averages count: as readings s pixels apart.
+
+    Args:
+        depth: ``(H, W)``, NaN without reading.
+        pixel_angle: slope between the rays of neighbouring pixels.
+        jump: see `noise_of`.
+    """
+    fine = noise_of(depth, jump=jump)
+    found = Noise(fine, smoothing_radius(fine, pixel_angle), patchy=False)
+    if not found.radius:  # what is left is shape
+        return found
+    for side in BLOCKS:
+        coarse = noise_of(_block_means(depth, side), jump=jump)
+        if side * coarse > ALIKE * fine:
+            radius = side * smoothing_radius(coarse, side * pixel_angle)
+            found = Noise(max(found.deviation, coarse), min(max(found.radius, radius), MAX_RADIUS), patchy=True)
+    return found
+
+
+def _block_means(depth: Float64, side: int) -> Float64:
+    """Harmonic means over blocks, since inverse depth is linear on planes; NaN where a reading is missing."""
+    rows, columns = depth.shape[0] // side, depth.shape[1] // side
+    blocks = (1 / depth[: rows * side, : columns * side]).reshape(rows, side, columns, side)
+    return 1 / blocks.mean(axis=(1, 3))
 
 
 def smoothing_radius(noise: float, pixel_angle: float, *, tilt: float = 3.0) -> int:

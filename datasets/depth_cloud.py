@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..neural_fields import InputError
-from .depth_cleaning import edge_pixels, grid_normals, noise_of, smooth_depth, smoothing_radius, specks
+from .depth_cleaning import edge_pixels, grid_normals, measure_noise, smooth_depth, specks
 from .point_cloud import PointCloud, colors_from
 from .reading import MIN_POINTS
 from .rgbd import RgbdFrame
@@ -138,12 +138,14 @@ def frame_cloud(frame: RgbdFrame, settings: DepthSettings | None = None) -> tupl
     depth = depth if settings.max_depth is None else np.where(depth <= settings.max_depth, depth, np.nan)
     ranged = np.isfinite(depth)
     edges = edge_pixels(depth, pixel_angle=pixel_angle, jump=settings.jump) & ranged
-    noise = noise_of(np.where(edges, np.nan, depth), jump=settings.jump)
-    radius = smoothing_radius(noise, pixel_angle) if settings.smoothing is None else settings.smoothing
+    noise = measure_noise(np.where(edges, np.nan, depth), pixel_angle=pixel_angle, jump=settings.jump)
+    radius = noise.radius if settings.smoothing is None else settings.smoothing
     if radius:
-        depth = smooth_depth(np.where(edges, np.nan, depth), radius, noise=noise, color=frame.color)
+        depth = smooth_depth(np.where(edges, np.nan, depth), radius, noise=noise.deviation, color=frame.color)
     points = frame.camera.unproject(depth)
-    normals = grid_normals(points, pixel_angle=pixel_angle, jump=settings.jump, radius=radius // 2)
+    # The filter keeps some of the steps between plateaus; the mean of many tangents does not.
+    window = radius if noise.patchy else radius // 2
+    normals = grid_normals(points, pixel_angle=pixel_angle, jump=settings.jump, radius=window)
     facing = -(normals * points).sum(axis=2) / np.linalg.norm(points, axis=2)
     clear = ranged & ~edges & (facing >= np.cos(np.radians(settings.max_incidence)))
     small = specks(clear, max(4, round(settings.smallest_piece * depth.size)))
@@ -169,7 +171,7 @@ def frame_cloud(frame: RgbdFrame, settings: DepthSettings | None = None) -> tupl
         grazing=int((ranged & ~edges & ~clear).sum()),
         specks=int(small.sum()),
         kept=len(cloud),
-        noise=noise,
+        noise=noise.deviation,
         smoothing=radius,
         nearest=float(depth[kept].min()),
         furthest=float(depth[kept].max()),

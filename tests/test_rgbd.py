@@ -20,6 +20,7 @@ from mplicits.datasets import (
     read_frame,
     thin,
 )
+from mplicits.datasets.depth_cleaning import measure_noise
 from mplicits.neural_fields import InputError
 from mplicits.pipelines import fit_depth as fit_depth_module
 from mplicits.pipelines.cli import main
@@ -145,6 +146,33 @@ def test_noise_is_measured_and_smoothed_away_but_not_over_the_edge():
 def lens_depth(points, depth, lens):
     u, v = np.rint(lens.project(points)[0]).astype(int).T
     return depth[v, u]
+
+
+def test_plateaus_of_quantised_depth_are_smoothed_over():
+    """A Kinect's depth has steps, here of 2 cm with noise that flips whole patches; pixel by pixel little is seen."""
+    random = np.random.default_rng(0)
+    lens = DepthCamera(160, 120, 525.0, 525.0, 79.5, 59.5)
+    normal = np.array([0.3, 0.1, 0.95])
+    normal /= np.linalg.norm(normal)
+    depth = plane_depth(normal, 2.5 * normal[2], lens)
+    patches = cv2.resize(random.normal(size=(20, 27)), (160, 120), interpolation=cv2.INTER_CUBIC)
+    quantised = np.rint((depth + 0.01 * patches) / 0.02) * 0.02
+    noise = measure_noise(quantised, pixel_angle=lens.pixel_angle)
+    assert noise.patchy
+    white = measure_noise(depth * (1 + 0.002 * random.normal(size=depth.shape)), pixel_angle=lens.pixel_angle)
+    assert not white.patchy
+    assert white.deviation == pytest.approx(0.002, rel=0.1)
+    assert noise.radius > white.radius
+    off = {}
+    for name, settings in (("auto", DepthSettings()), ("narrow", DepthSettings(smoothing=4)), ("raw", EXACT)):
+        cloud, _ = frame_cloud(RgbdFrame(quantised, lens), settings)
+        off[name] = np.mean(degrees_between(cloud.normals, -normal[None]))
+    assert off["auto"] < 8 < 0.6 * off["narrow"] < off["raw"]
+
+
+def test_exact_curved_surfaces_are_not_smoothed():
+    depth = sphere_depth((0.1, 0, 3.0), 0.8)
+    assert measure_noise(depth, pixel_angle=LENS.pixel_angle).radius == 0
 
 
 def test_colours_guide_the_smoothing():
