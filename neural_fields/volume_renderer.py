@@ -29,6 +29,9 @@ from .volume import (
 
 __all__ = ["RayColor", "RayOutside", "Rendered", "Sampling", "render_volume", "sample_depths"]
 
+# Sharpness of the importance samples in units of 1/δ₀: half of them lie within δ₀ / 15 of the coarse surface.
+BAND_SHARPNESS = 16.0
+
 RayColor = Callable[[Tensor, Tensor, Jet], Tensor]
 """Colours ``(N, 3)`` of points ``(N, 3)`` seen along unit directions ``(N, 3)``, given the geometry's jet there."""
 
@@ -181,11 +184,11 @@ def sample_depths(
 ) -> Tensor:
     """The ends of the sections of each ray, ``(R, uniform + importance + 2)``, from ``near`` to ``far``, sorted.
 
-    Only the coarsest level is asked. If a finer one is meant, the sharpness ends at 2/δ₀, so that the whole band in
-    which the finer surface may lie is sampled.
+    Only the coarsest level is asked. If a finer one is meant, the sharpness ends at BAND_SHARPNESS / δ₀, so that
+    samples reach into the band in which the finer surface may lie.
     """
     depths = stratified_depths(near, far, sampling.uniform, generator=generator)
-    sharpest = 2 / float(field.deltas[0]) if field.resolve_level(level) else float("inf")
+    sharpest = BAND_SHARPNESS / float(field.deltas[0]) if field.resolve_level(level) else float("inf")
     if sampling.importance:
         values = field.value(ray_points(origins, directions, depths), level=0)
         share, extra = divmod(sampling.importance, sampling.rounds)

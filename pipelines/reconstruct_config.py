@@ -25,7 +25,7 @@ class ReconstructConfig:
     )
     widths: tuple[int, ...] = _setting((128, 256), "neurons per layer, one number per level")
     depths: tuple[int, ...] = _setting((4, 5), "sine layers, one number per level")
-    omegas: tuple[float, ...] = _setting((10.0, 30.0), "SIREN frequency of each level (Eq. 2)")
+    omegas: tuple[float, ...] = _setting((10.0, 25.0), "SIREN frequency of each level (Eq. 2)")
     starts: tuple[float, ...] = _setting((0.0, 0.25), "when each level is switched on, as shares of the training")
     features: int = _setting(32, "appearance features of every level of the multiscale geometry")
     taper: float = _setting(0.3, "share of a band over which the next level fades out")
@@ -38,13 +38,15 @@ class ReconstructConfig:
     background: Literal["auto", "black", "white", "outside"] = _setting(
         "auto", "what is behind the object: black, white, or a learnt outside; auto is white with masks, else outside"
     )
-    steps: int = _setting(20_000, "training steps")
-    rays: int = _setting(512, "rays per training step")
-    uniform: int = _setting(64, "evenly spaced samples per ray")
-    importance: int = _setting(64, "samples per ray near the surface")
+    steps: int = _setting(5000, "training steps")
+    rays: int = _setting(256, "rays per training step")
+    uniform: int = _setting(32, "evenly spaced samples per ray")
+    importance: int = _setting(32, "samples per ray near the surface")
     texture_steps: int = _setting(500, "training steps of the texture of the finished surface; 0 leaves it uncoloured")
-    learning_rate: float = _setting(5e-4, "peak learning rate")
-    eikonal_weight: float = _setting(0.1, "weight of (|grad f| - 1)^2")
+    learning_rate: float = _setting(3e-4, "peak learning rate of the geometry")
+    color_rate: float = _setting(6.0, "learning rate of the colours, in units of the geometry's")
+    sharpening: float = _setting(8.0, "learning rate of the surface's uncertainty, in units of the others'")
+    eikonal_weight: float = _setting(0.05, "weight of (|grad f| - 1)^2")
     mask_weight: float = _setting(0.1, "weight of the masks' cross-entropy, where there are masks")
     anneal: float = _setting(0.2, "share of the training in which slopes are annealed (cos_anneal)")
     least_weight: float = _setting(1e-4, "samples that contribute less to their pixel get no colour")
@@ -104,4 +106,6 @@ _POSITIVE = (
     "steps",
     "rays",
     "learning_rate",
+    "color_rate",
+    "sharpening",
 )

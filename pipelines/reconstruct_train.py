@@ -34,7 +34,13 @@ class SceneTrainer:
         self.model, self.pool, self.config, self.seconds = model, pool, config, seconds
         self.generator = torch.Generator().manual_seed(config.seed)
         self.sampling = Sampling(uniform=config.uniform, importance=config.importance)
-        self.adam = torch.optim.Adam(model.parameters(), lr=config.learning_rate, betas=(0.9, 0.99), fused=True)
+        colors = [*model.color.parameters(), *(model.outside.parameters() if model.outside else ())]
+        groups = [
+            {"params": list(model.geometry.parameters()), "share": 1.0},
+            {"params": colors, "share": config.color_rate},
+            {"params": [model.variance], "share": config.sharpening},
+        ]
+        self.adam = torch.optim.Adam(groups, lr=config.learning_rate, betas=(0.9, 0.99), fused=True)
         self.step, self.elapsed = 0, 0.0
         self.losses: dict[str, float] = {}
 
@@ -76,6 +82,8 @@ class SceneTrainer:
 
     def _step(self) -> dict[str, Tensor]:
         set_rate(self.adam, self.config.learning_rate, self.fraction)
+        for group in self.adam.param_groups:
+            group["lr"] *= group["share"]
         self.model.widen(self.config.band, self.config.least_delta)
         terms, total = self._losses()
         self.adam.zero_grad(set_to_none=True)

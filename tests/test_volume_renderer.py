@@ -121,7 +121,7 @@ class TestBands:
         values = Sphere(radius=0.5).value(origins[:, None] + edges[..., None] * directions[:, None])
         hit = (values < 0).any(dim=1)
         assert float((values[hit].abs() < 0.04).float().mean()) > 0.3
-        assert float((values[hit].abs() < 0.01).float().mean()) < 0.3
+        assert float((values[hit].abs() < 0.001).float().mean()) < 0.2
 
     def test_light_samples_get_no_colour(self) -> None:
         asked: list[int] = []
@@ -133,7 +133,7 @@ class TestBands:
         field = self.field()
         everywhere = render_volume(field, color, *rays(50), inv_std=200.0)
         only = render_volume(field, color, *rays(50), inv_std=200.0, least_weight=1e-4)
-        assert asked[1] < asked[0] / 3
+        assert asked[1] < 0.6 * asked[0]
         torch.testing.assert_close(only.color, everywhere.color, atol=1e-4 * 129, rtol=0)
         assert float((only.color - everywhere.color).detach().abs().max()) > 0
 
