@@ -16,12 +16,15 @@ from .reading import read_cloud
 from .region import region_from_cameras, region_from_masks, region_from_points
 from .rgbd import RgbdFrame, read_frame
 from .scanner import STATUE_PLACEMENT, simulate_scan, statue_scan
+from .scene_files import write_colmap, write_neus, write_transforms
+from .scenes import SCENES, Scene, render_scene, sample_scene, scene_mesh
 from .statue import Statue
 from .synthetic import add_noise, add_outliers, sample_sphere, sample_surface, sample_torus
 from .textured import TexturedMesh, colors_at, read_textured, sample_textured
 from .voxels import spacing_of, thin
 
 __all__ = [
+    "SCENES",
     "STATUE_PLACEMENT",
     "Camera",
     "CleaningReport",
@@ -33,6 +36,7 @@ __all__ = [
     "PosedImage",
     "PosedImages",
     "RgbdFrame",
+    "Scene",
     "Statue",
     "TexturedMesh",
     "add_noise",
@@ -58,10 +62,13 @@ __all__ = [
     "region_from_cameras",
     "region_from_masks",
     "region_from_points",
+    "render_scene",
+    "sample_scene",
     "sample_sphere",
     "sample_surface",
     "sample_textured",
     "sample_torus",
+    "scene_mesh",
     "simulate_scan",
     "spacing_of",
     "srgb_to_linear",
@@ -69,4 +76,7 @@ __all__ = [
     "thin",
     "turntable",
     "write_cloud_ply",
+    "write_colmap",
+    "write_neus",
+    "write_transforms",
 ]

@@ -65,7 +65,7 @@ def image_size(path: Path) -> tuple[int, int]:
     import imageio.v3 as iio  # here, because most files of cameras say it themselves
 
     try:
-        shape = iio.improps(path).shape
+        shape = iio.improps(path, plugin="pillow").shape
     except (OSError, ValueError, SyntaxError) as error:  # Pillow's PNG reader raises SyntaxError
         raise InputError(f"{path}: cannot be read as an image; export it again") from error
     return int(shape[1]), int(shape[0])
