@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +15,16 @@ from ..datasets.posed_images import PosedImage, PosedImages, read_posed_images
 from ..neural_fields import InputError, NoSurfaceError, TextureField, save_field, save_texture
 from .config import load_config
 from .fit import Interrupted, choose_device
-from .fit_state import FIELD_FILE, STATE_FILE, environment, load_state, read_record, save_state, write_record
+from .fit_state import (
+    FIELD_FILE,
+    STATE_FILE,
+    digest_of,
+    environment,
+    load_state,
+    read_record,
+    save_state,
+    write_record,
+)
 from .picture import write_picture
 from .ray_pool import RayPool
 from .reconstruct_config import ReconstructConfig
@@ -25,6 +33,7 @@ from .reconstruct_train import SceneTrainer
 from .reconstruct_views import ViewImage, comparison_sheet, held_out, measure, render_image
 from .scene_model import SceneModel, build_scene
 from .texture import TEXTURE_FILE
+from .texture_state import texture_state_file
 from .training import Progress, stop_on_signals
 
 __all__ = ["HELD_OUT_FILE", "PREVIEW_FILE", "Reconstruction", "reconstruct"]
@@ -116,12 +125,15 @@ class _Reconstruction:
         """Train to the end, measure, colour, write."""
         if resume:
             self._restore()
+        elif self.directory is not None:
+            _forget(self.directory)
         if self.directory is not None:
             write_record(self.directory, self._record(finished=False))
         with stop_on_signals() as flag:
             finished = self.trainer.run(flag, report=self._report, save=self._save)
+            # What was trained is safe before pictures and texture are made, which may be interrupted or fail too.
+            self._save(self.trainer)
             if not finished:
-                self._save(self.trainer)
                 raise Interrupted(self.directory)
         model = self.trainer.model.requires_grad_(False)
         pairs = self._render_held_out()
@@ -174,6 +186,8 @@ class _Reconstruction:
                 f"{self.images.source}: the training found no surface ({error}); see `mplicits check-cameras`, "
                 "and train longer (--steps)"
             ) from error
+        if not fitted.record["finished"]:
+            raise Interrupted(self.directory)
         return fitted.texture, fitted.record
 
     def _write(
@@ -207,7 +221,8 @@ class _Reconstruction:
             similarity=self.images.similarity,
             metadata={"run": self._field_record(record)},
         )
-        save_state(self.directory, trainer.state(), {"fingerprint": self._fingerprint(), "shown": self.shown})
+        progress = {"fingerprint": self._fingerprint(), "shown": self.shown, "losses": trainer.losses}
+        save_state(self.directory, trainer.state(), progress)
         write_record(self.directory, record)
 
     def _restore(self) -> None:
@@ -218,15 +233,14 @@ class _Reconstruction:
                 f"{self.images.source}: not the pictures that {self.directory} was trained on; "
                 "resume with those, or leave out --resume and choose a new -o"
             )
-        self.shown = progress["shown"]
+        self.shown, self.trainer.losses = progress["shown"], progress["losses"]
         self.trainer.restore(tensors)
 
     def _fingerprint(self) -> str:
-        """A digest of the training pixels and the cameras."""
-        digest = hashlib.sha256(self.pool.colors.cpu().numpy().tobytes())
-        for tensor in (self.pool.eyes, self.pool.axes, self.pool.lens):
-            digest.update(tensor.cpu().numpy().tobytes())
-        return digest.hexdigest()
+        """A digest of the training pixels, their masks and the cameras."""
+        pool = self.pool
+        tensors = (pool.colors, pool.eyes, pool.axes, pool.lens, *([] if pool.masks is None else [pool.masks]))
+        return digest_of(tensor.cpu().numpy() for tensor in tensors)
 
     def _field_record(self, record: dict[str, Any]) -> dict[str, Any]:
         """What goes into the field's own file: not every view's figures."""
@@ -254,3 +268,10 @@ class _Reconstruction:
             "losses": trainer.losses,
             "environment": environment(self.device),
         }
+
+
+def _forget(directory: Path) -> None:
+    """Remove what is left of another run there, once the new data are known to be good."""
+    texture = directory / TEXTURE_FILE
+    for path in (directory / STATE_FILE, texture, texture_state_file(texture), directory / HELD_OUT_FILE):
+        path.unlink(missing_ok=True)

@@ -41,18 +41,12 @@ def _reconstruct(arguments: argparse.Namespace) -> int:
         None if arguments.resume else load_config(ReconstructConfig, preset or "default", flags, thing="reconstruct")
     )
     from .fit import Interrupted
-    from .fit_state import STATE_FILE
     from .mesh import mesh_run
     from .progress_bar import progress_bars
     from .reconstruct import HELD_OUT_FILE, reconstruct
     from .runs import check_new_run
-    from .texture import TEXTURE_FILE
 
     directory = check_new_run(arguments.out, resume=arguments.resume, force=arguments.force)
-    if arguments.force:
-        # What is left of the old run must not be resumed into the new one, nor colour it.
-        for name in (STATE_FILE, TEXTURE_FILE):
-            (directory / name).unlink(missing_ok=True)
     try:
         with nullcontext() if arguments.quiet else progress_bars() as report:
             run = reconstruct(arguments.data, config, out=directory, resume=arguments.resume, progress=report)
