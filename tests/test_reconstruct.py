@@ -1,0 +1,414 @@
+"""Reconstruction from files to files: what a run holds, where it is, how it is interrupted and resumed."""
+
+import json
+import os
+import signal
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+import torch
+from mplicits.datasets import read_cloud
+from mplicits.datasets.posed_images import PosedImages
+from mplicits.datasets.scene_files import write_neus, write_transforms
+from mplicits.datasets.scenes import SCENES, render_scene, sample_scene
+from mplicits.neural_fields import InputError, Similarity, load_field, load_texture
+from mplicits.pipelines import reconstruct_texture
+from mplicits.pipelines.cli import main
+from mplicits.pipelines.config import load_config
+from mplicits.pipelines.evaluate import chamfer
+from mplicits.pipelines.fit import Interrupted
+from mplicits.pipelines.mesh import MeshOptions, mesh_run
+from mplicits.pipelines.reconstruct import Reconstruction, reconstruct
+from mplicits.pipelines.reconstruct_config import ReconstructConfig
+from mplicits.pipelines.texture_config import TextureConfig
+from mplicits.pipelines.training import Progress
+from torch import Tensor
+
+WORLD = Similarity(center=(120.0, -30.0, 8.0), scale=5.0)
+TINY = ReconstructConfig(
+    widths=(16, 16),
+    depths=(1, 1),
+    omegas=(10.0, 15.0),
+    starts=(0.0, 0.4),
+    features=4,
+    color_width=16,
+    color_depth=1,
+    color_frequencies=2,
+    steps=40,
+    rays=16,
+    uniform=8,
+    importance=4,
+    texture_steps=3,
+    test_every=3,
+)
+FLAGS = "--widths 16 16 --depths 1 1 --omegas 10 15 --starts 0 0.4 --features 4 --color-width 16 --color-depth 1"
+FLAGS += " --color-frequencies 2 --steps 3 --rays 16 --uniform 8 --importance 4 --texture-steps 3 --quiet"
+
+
+def small_textures(patch: pytest.MonkeyPatch) -> None:
+    """Colour fewer points of a coarser mesh by a smaller network: how textures are trained is tested elsewhere."""
+    patch.setattr(reconstruct_texture, "SAMPLES", 2000)
+    patch.setattr(reconstruct_texture, "RESOLUTION", 32)
+    small = partial(TextureConfig, samples=2000, width=16, depth=1, batch=256, band_batch=256)
+    patch.setattr(reconstruct_texture, "TextureConfig", small)
+
+
+@pytest.fixture(autouse=True)
+def _small_textures(monkeypatch: pytest.MonkeyPatch) -> None:
+    small_textures(monkeypatch)
+
+
+def moved(images: PosedImages, similarity: Similarity) -> PosedImages:
+    """Images of the unit sphere as if all had happened elsewhere."""
+    views = []
+    for view in images.views:
+        pose = view.camera.world_from_camera.clone()
+        pose[:3, 3] = torch.from_numpy(similarity.to_input(view.camera.eye.numpy()))
+        views.append(replace(view, camera=replace(view.camera, world_from_camera=pose)))
+    points = None if images.points is None else similarity.to_input(images.points)
+    return replace(images, views=tuple(views), similarity=similarity, points=points)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A painted sphere of radius 3 around WORLD.center, in NeuS's files."""
+    folder = tmp_path_factory.mktemp("data") / "sphere"
+    write_neus(folder, moved(render_scene(SCENES["painted-sphere"](), views=6, size=12, samples=2), WORLD))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def finished(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    directory = tmp_path_factory.mktemp("runs") / "whole"
+    with pytest.MonkeyPatch.context() as patch:
+        small_textures(patch)
+        reconstruct(data, TINY, out=directory)
+    return directory
+
+
+def tensors(directory: Path) -> dict[str, Tensor]:
+    """All numbers of a run's field and texture."""
+    field, _, _ = load_field(directory / "field.safetensors")
+    texture = load_texture(directory / "texture.safetensors", field)
+    return {**field.state_dict(), **{f"texture.{name}": tensor for name, tensor in texture.state_dict().items()}}
+
+
+def assert_same(first: Path, second: Path) -> None:
+    expected, found = tensors(first), tensors(second)
+    assert expected.keys() == found.keys()
+    assert all(torch.equal(found[name], tensor) for name, tensor in expected.items())
+
+
+def interrupt(stage: str, step: int) -> Callable[[Progress], None]:
+    """A progress display that asks for an end, once, at a step of a stage."""
+    done = []
+
+    def report(progress: Progress) -> None:
+        if progress.stage.startswith(stage) and progress.step == step and not done:
+            done.append(step)
+            os.kill(os.getpid(), signal.SIGINT)
+
+    return report
+
+
+def fails(capsys: pytest.CaptureFixture[str], line: str) -> str:
+    """Run a command that must fail as bad input does → its one line."""
+    capsys.readouterr()
+    assert main(line.split()) == 2
+    output, error = capsys.readouterr()
+    assert output == ""
+    (message,) = error.splitlines()
+    return message
+
+
+# --- what a run holds --------------------------------------------------------------------------------
+
+
+def test_the_run_directory(finished: Path, data: Path) -> None:
+    names = ["field.safetensors", "held_out.png", "run.json", "texture.safetensors"]
+    assert sorted(path.name for path in finished.iterdir()) == names
+    record = json.loads((finished / "run.json").read_text())
+    assert record["finished"] is True
+    assert record["data"] == str(data / "cameras_sphere.npz")
+    assert record["views"] == {"trained": 4, "held_out": 2}
+    assert record["region"] == "scale_mat_i of cameras_sphere.npz"
+    assert record["steps"] == 40
+    assert record["texture"]["steps"] == 3
+    assert record["inv_std"] > 1
+    assert set(record["held_out"]["views"]) == {"image/000.png", "image/003.png"}
+    for name in ("psnr", "ssim", "psnr_object"):
+        figures = [view[name] for view in record["held_out"]["views"].values()]
+        assert record["held_out"][name] == pytest.approx(np.mean(figures))
+    config = load_config(ReconstructConfig, None, record["config"], thing="reconstruct")
+    assert config == TINY
+
+
+def test_the_field_and_its_texture_can_be_read(finished: Path) -> None:
+    field, similarity, metadata = load_field(finished / "field.safetensors")
+    assert similarity.center == pytest.approx(WORLD.center)
+    assert similarity.scale == pytest.approx(WORLD.scale)
+    assert field.num_levels == 2
+    assert field.deltas.tolist() == pytest.approx(metadata["run"]["deltas"])
+    record = json.loads((finished / "run.json").read_text())
+    assert record["parameters"]["geometry"] == sum(parameter.numel() for parameter in field.parameters())
+    texture = load_texture(finished / "texture.safetensors", field)
+    with torch.no_grad():
+        colors = texture.value(torch.rand(50, 3) - 0.5)
+    assert colors.shape == (50, 3)
+
+
+def test_the_mesh_is_in_world_coordinates(finished: Path, tmp_path: Path) -> None:
+    mesh_run(finished, tmp_path / "mesh.ply", MeshOptions(resolution=48))
+    vertices = read_cloud(tmp_path / "mesh.ply")
+    radii = np.linalg.norm(vertices.points - np.array(WORLD.center), axis=1) / WORLD.scale
+    assert 0.3 < radii.min() < radii.max() < 0.8  # the start of radius 0.5, after a few steps towards 0.6
+    assert vertices.colors is not None
+
+
+def test_the_sheet_of_held_out_views_shows_them_all(finished: Path) -> None:
+    sheet = iio.imread(finished / "held_out.png")
+    factor = sheet.shape[1] // 36
+    assert sheet.shape == (2 * 16 * factor, 36 * factor, 3)
+
+
+def test_what_comes_back_is_what_was_written(data: Path, finished: Path) -> None:
+    run = reconstruct(data, TINY)
+    assert isinstance(run, Reconstruction)
+    assert run.directory is None
+    expected = tensors(finished)
+    assert all(torch.equal(tensor, expected[name]) for name, tensor in run.model.geometry.state_dict().items())
+    assert run.texture is not None
+    assert run.record["held_out"]["psnr"] == json.loads((finished / "run.json").read_text())["held_out"]["psnr"]
+
+
+def test_the_softplus_network_of_neus_takes_the_same_way(data: Path, tmp_path: Path) -> None:
+    run = reconstruct(data, replace(TINY, geometry="neus", steps=2), out=tmp_path)
+    field, _, _ = load_field(tmp_path / "field.safetensors")
+    assert type(field).__name__ == "NeusSDF"
+    assert run.record["deltas"] == []
+    assert run.record["parameters"]["geometry"] == 529_076
+    x = torch.rand(20, 3) - 0.5
+    with torch.inference_mode():
+        torch.testing.assert_close(field.value(x), run.model.geometry.value(x))
+    assert load_texture(tmp_path / "texture.safetensors", field).geometry_level == 0
+
+
+def test_all_views_can_be_trained_on_and_colours_left_out(data: Path, tmp_path: Path) -> None:
+    run = reconstruct(data, replace(TINY, steps=2, test_every=0, texture_steps=0), out=tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["field.safetensors", "run.json"]
+    assert run.record["views"] == {"trained": 6, "held_out": 0}
+    assert run.record["held_out"] is None
+    assert run.record["texture"] is None
+    assert run.texture is None
+
+
+def test_pictures_without_masks_have_an_outside(data: Path, tmp_path: Path) -> None:
+    images = render_scene(SCENES["painted-sphere"](), views=4, size=12, samples=1)
+    bare = replace(images, views=tuple(replace(view, mask=None) for view in images.views))
+    run = reconstruct(bare, replace(TINY, steps=2, texture_steps=0))
+    assert run.model.outside is not None
+    assert "psnr_object" not in run.record["held_out"]
+
+
+def test_pictures_on_the_way(data: Path, tmp_path: Path) -> None:
+    def report(progress: Progress) -> None:
+        if progress.stage == "held-out views":
+            assert (tmp_path / "preview.png").exists()
+            seen.append(progress)
+
+    seen: list[Progress] = []
+    reconstruct(data, replace(TINY, texture_steps=0), out=tmp_path, progress=report)
+    assert [progress.step for progress in seen] == [1, 2]
+    assert not (tmp_path / "preview.png").exists()
+
+
+# --- interruption ------------------------------------------------------------------------------------
+
+
+def test_an_interrupted_run_is_usable_and_resumes_to_the_same_bits(data: Path, finished: Path, tmp_path: Path) -> None:
+    with pytest.raises(Interrupted, match="checkpoint"):
+        reconstruct(data, TINY, out=tmp_path, progress=interrupt("reconstruct, level 1", 20))
+    assert json.loads((tmp_path / "run.json").read_text())["finished"] is False
+    assert load_field(tmp_path / "field.safetensors").field.num_levels == 2
+    assert len(mesh_run(tmp_path, tmp_path / "mesh.ply", MeshOptions(resolution=32)).faces) > 100
+    run = reconstruct(data, out=tmp_path, resume=True)
+    assert run.record["finished"] is True
+    assert run.record["steps"] == 40
+    assert not (tmp_path / "resume.safetensors").exists()
+    assert_same(finished, tmp_path)
+    whole = json.loads((finished / "run.json").read_text())
+    assert run.record["losses"] == whole["losses"]
+    assert run.record["held_out"] == whole["held_out"]
+
+
+def test_nothing_is_lost_while_the_views_are_measured(data: Path, finished: Path, tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        reconstruct(data, TINY, out=tmp_path, progress=interrupt("held-out views", 1))
+    reconstruct(data, out=tmp_path, resume=True)
+    assert_same(finished, tmp_path)
+
+
+def test_nothing_is_lost_while_the_texture_is_trained(data: Path, tmp_path: Path) -> None:
+    config = replace(TINY, steps=2, texture_steps=21)
+    with pytest.raises(Interrupted, match="checkpoint"):
+        reconstruct(data, config, out=tmp_path, progress=interrupt("texture", 20))
+    assert json.loads((tmp_path / "run.json").read_text())["finished"] is False
+    run = reconstruct(data, out=tmp_path, resume=True)
+    assert run.record["texture"]["finished"] is True
+    assert run.record["texture"]["steps"] == 21
+
+
+@pytest.fixture
+def stopped(data: Path, tmp_path: Path) -> Path:
+    directory = tmp_path / "stopped"
+    with pytest.raises(Interrupted):
+        reconstruct(data, TINY, out=directory, progress=interrupt("reconstruct, level", 20))
+    return directory
+
+
+def test_other_pictures_are_refused(stopped: Path, tmp_path: Path) -> None:
+    images = moved(render_scene(SCENES["painted-sphere"](), views=6, size=12, samples=2), WORLD)
+    held = {path.name: path.read_bytes() for path in stopped.iterdir()}
+
+    def changed(**parts: object) -> PosedImages:
+        return replace(images, views=(*images.views[:-1], replace(images.views[-1], **parts)))
+
+    last = images.views[-1]
+    assert last.mask is not None
+    pose = last.camera.world_from_camera.clone()
+    pose[0, 3] += 0.01
+    others = {
+        "colour": changed(color=1 - last.color),
+        "mask": changed(mask=1 - last.mask),
+        "camera": changed(camera=replace(last.camera, world_from_camera=pose)),
+        "fewer": replace(images, views=images.views[:-1]),
+    }
+    for name, other in others.items():
+        folder = tmp_path / name
+        write_neus(folder, other)
+        with pytest.raises(InputError, match=r"not the pictures that .* was trained on; resume with those"):
+            reconstruct(folder, out=stopped, resume=True)
+    assert {path.name: path.read_bytes() for path in stopped.iterdir()} == held
+
+
+def test_there_must_be_something_to_resume(data: Path, finished: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="needs the run directory"):
+        reconstruct(data, resume=True)
+    with pytest.raises(InputError, match=r"run\.json: no such file"):
+        reconstruct(data, out=tmp_path, resume=True)
+    with pytest.raises(InputError, match="nothing to resume"):
+        reconstruct(data, out=finished, resume=True)
+
+
+# --- the command -------------------------------------------------------------------------------------
+
+
+def test_the_command_leaves_a_coloured_mesh(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = tmp_path / "run"
+    assert main(f"reconstruct {data} -o {run} {FLAGS}".split()) == 0
+    output = capsys.readouterr().out
+    assert f"{data / 'cameras_sphere.npz'}: 5 views, 3 steps" in output
+    assert "1 held-out views: PSNR" in output
+    assert f"next: mplicits view {run}" in output
+    assert (run / "mesh.ply").read_bytes().startswith(b"ply")
+
+    message = fails(capsys, f"reconstruct {data} -o {run} {FLAGS}")
+    assert "exists and is not empty" in message
+    assert "--force" in message
+    # A mistake in the new run costs nothing of the old one.
+    held = {path.name: path.read_bytes() for path in run.iterdir()}
+    assert "no such file" in fails(capsys, f"reconstruct {tmp_path / 'nowhere'} -o {run} --force {FLAGS}")
+    assert {path.name: path.read_bytes() for path in run.iterdir()} == held
+    # A new one leaves nothing of it.
+    again = f"reconstruct {data} -o {run} --force {FLAGS} --texture-steps 0 --test-every 0"
+    assert main(again.split()) == 0
+    assert sorted(path.name for path in run.iterdir()) == ["field.safetensors", "mesh.ply", "run.json"]
+    assert "is finished, so there is nothing to resume" in fails(capsys, f"reconstruct {data} -o {run} --resume")
+
+
+def test_the_command_says_how_to_go_on(
+    stopped: Path, data: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert "--resume continues it" in fails(capsys, f"reconstruct {data} -o {stopped}")
+    assert "--resume: continues with the run's own settings" in fails(
+        capsys, f"reconstruct {data} -o {stopped} --resume --steps 3"
+    )
+
+    def interrupted(*_: object, **__: object) -> None:
+        raise Interrupted(stopped)
+
+    monkeypatch.setattr("mplicits.pipelines.reconstruct.reconstruct", interrupted)
+    assert main(["reconstruct", str(data), "-o", str(stopped), "--resume", "--quiet"]) == 130
+    assert f"to continue: mplicits reconstruct {data} -o {stopped} --resume" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        ("--uniform 1", "uniform: 1; expected at least 2"),
+        ("--geometry grid", "--geometry: got 'grid', expected one of multiscale, neus"),
+        ("--background red", "--background: got 'red', expected one of auto, black, white, outside"),
+        ("--widths 16", "depths: 2 entries for 1 widths; expected one for each"),
+        ("--starts 0.5 0.6", "starts: (0.5, 0.6); expected 0 first"),
+        ("--starts 0 1", "starts: (0.0, 1.0); expected 0 first, then growing shares below 1"),
+        ("--steps 0", "steps: 0; expected > 0"),
+        ("--taper 1.5", "taper: 1.5; expected a share from 0 to 1"),
+        ("--anneal -1", "anneal: -1.0; expected a share"),
+        ("--width 0", "width: 0; expected > 0, or none"),
+        ("--rays many", "--rays: got 'many', expected a whole number"),
+        ("--ryas 8", "unknown flag --ryas; did you mean '--rays'?"),
+        ("--preset fats", "no preset 'fats' for reconstruct; did you mean 'fast'?"),
+        ("--device abacus", "device"),
+    ],
+)
+def test_settings_that_make_no_sense_are_refused_at_once(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], flags: str, message: str
+) -> None:
+    assert message in fails(capsys, f"reconstruct {data} -o {tmp_path / 'run'} {flags}")
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_file_of_settings(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    settings = tmp_path / "mine.yaml"
+    settings.write_text("uniforms: 3\n")
+    message = fails(capsys, f"reconstruct {data} -o {tmp_path / 'run'} --config {settings}")
+    assert f"{settings}: unknown key 'uniforms'; did you mean 'uniform'?" in message
+
+
+def test_pictures_that_cannot_be_used_are_refused(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    message = fails(capsys, f"reconstruct {tmp_path} -o {tmp_path / 'run'} {FLAGS}")
+    assert str(tmp_path) in message
+    away = replace(
+        moved(render_scene(SCENES["painted-sphere"](), views=2, size=8, samples=1), Similarity((0, 0, 90), 1.0)),
+        similarity=Similarity.identity(),
+    )
+    write_neus(tmp_path / "away", away)
+    message = fails(capsys, f"reconstruct {tmp_path / 'away'} -o {tmp_path / 'run'} {FLAGS}")
+    assert "no pixel of any picture sees the region of interest; see `mplicits check-cameras`" in message
+
+
+# --- for real ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_a_painted_sphere_is_recovered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.undo()
+    scene = SCENES["painted-sphere"]()
+    write_transforms(tmp_path / "data", moved(render_scene(scene, views=24, size=64), WORLD))
+    config = load_config(ReconstructConfig, "fast", thing="reconstruct")
+    run = reconstruct(tmp_path / "data", config, out=tmp_path / "run")
+    mesh = mesh_run(tmp_path / "run", tmp_path / "mesh.ply", MeshOptions(resolution=128))
+    here = WORLD.to_unit(run.images.similarity.to_input(mesh.vertices))
+    radii = np.linalg.norm(here, axis=1)
+    assert abs(radii - 0.6).mean() < 0.01
+    assert run.record["held_out"]["psnr"] > 25
+    truth = sample_scene(scene, 20_000)
+    assert mesh.colors is not None
+    assert sum(chamfer(here, truth.points)) < 2e-4

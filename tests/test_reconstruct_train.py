@@ -1,0 +1,196 @@
+"""Training of a scene on a few rays of a painted sphere: schedule, interruption, time."""
+
+from dataclasses import replace
+from functools import partial
+
+import pytest
+import torch
+from mplicits.datasets.posed_images import PosedImages
+from mplicits.datasets.scenes import SCENES, render_scene
+from mplicits.neural_fields import MultiscaleSDF
+from mplicits.neural_fields.sphere_start import fit_sphere
+from mplicits.pipelines import scene_model
+from mplicits.pipelines.ray_pool import RayPool
+from mplicits.pipelines.reconstruct_config import ReconstructConfig
+from mplicits.pipelines.reconstruct_train import SceneTrainer
+from mplicits.pipelines.scene_model import build_scene
+from mplicits.pipelines.training import StopFlag
+from torch import Tensor
+
+TINY = ReconstructConfig(
+    widths=(16, 16),
+    depths=(1, 1),
+    omegas=(10.0, 15.0),
+    starts=(0.0, 0.5),
+    features=4,
+    color_width=16,
+    color_depth=1,
+    color_frequencies=2,
+    steps=8,
+    rays=32,
+    uniform=8,
+    importance=4,
+    learning_rate=2e-3,
+)
+
+
+@pytest.fixture(autouse=True)
+def _short_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A rough sphere will do to begin with."""
+    monkeypatch.setattr(scene_model, "fit_sphere", partial(fit_sphere, steps=40, batch=256))
+
+
+@pytest.fixture(scope="module")
+def images() -> PosedImages:
+    return render_scene(SCENES["painted-sphere"](), views=4, size=16, samples=1)
+
+
+def make(images: PosedImages, config: ReconstructConfig, *, seconds: float | None = None) -> SceneTrainer:
+    pool = RayPool(images.views, images.similarity, torch.device("cpu"))
+    return SceneTrainer(build_scene(config, has_masks=pool.has_masks), pool, config, seconds=seconds)
+
+
+def train(trainer: SceneTrainer, *, until: int | None = None) -> list[tuple[int, int]]:
+    """Train, to the end or until so many steps are done → (steps done, level) of every report."""
+    flag, seen = StopFlag(), []
+
+    def report(current: SceneTrainer) -> None:
+        seen.append((current.step, current.level))
+        flag.requested = current.step == until
+
+    finished = trainer.run(flag, report=report, save=lambda _: None, report_every=1)
+    assert finished is (until is None)
+    return seen
+
+
+def weights(trainer: SceneTrainer) -> dict[str, Tensor]:
+    return {name: tensor.clone() for name, tensor in trainer.model.state_dict().items()}
+
+
+def errors(trainer: SceneTrainer) -> tuple[float, float]:
+    """Mean absolute errors of colours and of opacities over many rays."""
+    rays = trainer.pool.draw(1500, torch.Generator().manual_seed(5))
+    with torch.no_grad():
+        seen = trainer.model.render(rays.origins, rays.directions, trainer.sampling, level=trainer.level)
+    target = torch.lerp(torch.ones(3).expand(1500, 3), rays.color, rays.mask[:, None])
+    return float((seen.color - target).abs().mean()), float((seen.opacity - rays.mask).abs().mean())
+
+
+def test_some_steps_lower_the_errors(images: PosedImages) -> None:
+    trainer = make(images, replace(TINY, steps=60, rays=64, learning_rate=5e-3))
+    color, opacity = errors(trainer)
+    train(trainer)
+    after = errors(trainer)
+    assert after[0] < 0.9 * color
+    assert after[1] < 0.5 * opacity
+    assert trainer.step == 60
+    assert trainer.fraction == 1
+    assert set(trainer.losses) == {"color", "eikonal", "mask", "uncertainty"}
+
+
+def test_the_softplus_network_of_neus_is_trained_by_the_same_steps(images: PosedImages) -> None:
+    trainer = make(images, replace(TINY, geometry="neus", steps=3, rays=16))
+    before = weights(trainer)
+    assert [level for _, level in train(trainer)] == [0, 0, 0]
+    assert all(0 <= value < 10 for value in trainer.losses.values())
+    still = [name for name, tensor in weights(trainer).items() if torch.equal(tensor, before[name])]
+    assert still == ["background"]
+
+
+def test_levels_are_switched_on_at_their_starts(images: PosedImages) -> None:
+    config = replace(TINY, widths=(16,) * 3, depths=(1,) * 3, omegas=(10.0,) * 3, starts=(0.0, 0.25, 0.75))
+    trainer = make(images, config)
+    assert trainer.level == 0
+    # After step k the level is that with which step k + 1 is made.
+    assert [level for _, level in train(trainer)] == [0, 1, 1, 1, 1, 2, 2, 2]
+
+
+def test_a_level_is_not_trained_before_its_start(images: PosedImages) -> None:
+    trainer = make(images, TINY)
+    geometry = trainer.model.geometry
+    assert isinstance(geometry, MultiscaleSDF)
+    residual = list(geometry.residuals.parameters())
+    first, base = [p.detach().clone() for p in residual], geometry.base.output.weight.detach().clone()
+    train(trainer, until=4)
+    assert trainer.level == 1
+    assert all(parameter.grad is None for parameter in residual)
+    assert all(torch.equal(p, before) for p, before in zip(residual, first, strict=True))
+    assert not torch.equal(geometry.base.output.weight, base)
+    train(trainer)
+    assert all(parameter.grad is not None for parameter in residual)
+    assert any(not torch.equal(p, before) for p, before in zip(residual, first, strict=True))
+
+
+def test_bands_are_as_wide_as_the_surface_is_unsure(images: PosedImages) -> None:
+    trainer = make(images, replace(TINY, band=3.0, least_delta=0.001))
+    with torch.no_grad():
+        trainer.model.variance.fill_(0.4)
+    expected = 3 / float(trainer.model.inv_std.detach())
+    train(trainer, until=1)
+    assert trainer.model.geometry.deltas.tolist() == pytest.approx([expected], rel=1e-5)
+
+
+@pytest.mark.parametrize("stop", [3, 6])  # before the second level begins, and after
+def test_a_stopped_training_continues_to_the_same_bits(images: PosedImages, stop: int) -> None:
+    whole, first, second = (make(images, TINY) for _ in range(3))
+    train(whole)
+    train(first, until=stop)
+    assert first.step == stop
+    state = {name: tensor.clone() for name, tensor in first.state().items()}
+    with torch.no_grad():  # nothing of the new trainer may matter
+        for parameter in second.model.parameters():
+            parameter.zero_()
+    second.restore(state)
+    assert second.step == stop
+    assert second.elapsed == first.elapsed
+    assert [step for step, _ in train(second)] == list(range(stop + 1, 9))
+    expected = weights(whole)
+    assert all(torch.equal(tensor, expected[name]) for name, tensor in weights(second).items())
+    assert second.losses == whole.losses
+
+
+@pytest.mark.parametrize("part", ["adam.", "generator"])
+def test_without_a_part_of_the_state_the_bits_differ(images: PosedImages, part: str) -> None:
+    whole, first, second = (make(images, TINY) for _ in range(3))
+    train(whole)
+    train(first, until=3)
+    fresh = {"generator": torch.Generator().manual_seed(99).get_state()}
+    kept = {name: tensor for name, tensor in first.state().items() if not name.startswith(part)}
+    second.restore(fresh | kept)
+    train(second)
+    name = "geometry.base.output.weight"
+    assert not torch.equal(weights(second)[name], weights(whole)[name])
+
+
+def test_the_seed_decides(images: PosedImages) -> None:
+    trainers = [make(images, replace(TINY, seed=seed)) for seed in (0, 0, 1)]
+    for trainer in trainers:
+        train(trainer)
+    first, again, other = (weights(trainer)["geometry.base.output.weight"] for trainer in trainers)
+    assert torch.equal(first, again)
+    assert not torch.equal(first, other)
+
+
+def test_a_time_budget_ends_the_schedule(images: PosedImages) -> None:
+    trainer = make(images, replace(TINY, steps=100_000), seconds=0.3)
+    seen = train(trainer)
+    assert 0 < trainer.step < 100_000
+    assert trainer.fraction == 1
+    assert 0.3 <= trainer.elapsed < 5
+    assert seen[-1][1] == 1  # levels follow the time as well
+
+
+def test_checkpoints_come_by_the_clock(images: PosedImages) -> None:
+    trainer, saved = make(images, TINY), []
+    trainer.run(StopFlag(), report=lambda _: None, save=lambda current: saved.append(current.step), save_every=0.0)
+    assert saved == list(range(1, 9))
+
+
+def test_masks_are_trained_for_only_where_they_are(images: PosedImages) -> None:
+    bare = replace(images, views=tuple(replace(view, mask=None) for view in images.views))
+    trainer = make(bare, replace(TINY, background="black"))
+    train(trainer)
+    assert "mask" not in trainer.losses
+    trainer = make(images, replace(TINY, mask_weight=0.0))
+    train(trainer)
+    assert "mask" not in trainer.losses
