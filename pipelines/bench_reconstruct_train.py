@@ -1,0 +1,214 @@
+"""Training of a scene under observation: how long every step takes, and what its networks multiply.
+
+Rows are counted while they are asked for: points whose value alone is wanted (to find out where to sample), points
+whose jet is trained, and colours. What one row costs is what torch's counter of FLOPs finds in the same module, in
+matrix products alone (a product of (a, b) and (b, c) is 2 abc FLOPs; sines and the like are not counted):
+
+- a value: one pass, about 2 FLOPs per weight;
+- a jet that is trained: one pass forward and one sweep back, and for each of these two a product for the cotangent of
+  the weights and one for that of the activations: six passes, about 12 FLOPs per weight;
+- a colour that is trained: forward and its two cotangents, three passes, about 6 FLOPs per weight.
+
+"About", because the points themselves are not trained, and because outputs that are features are not swept back.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor, nn
+from torch.utils.flop_counter import FlopCounterMode
+
+from ..neural_fields import Field, Jet
+from ..neural_fields.radiance import Outside, ViewColor
+from .counting import Counted, counted
+from .ray_pool import RayPool
+from .reconstruct_config import ReconstructConfig
+from .reconstruct_train import SceneTrainer
+from .scene_model import SceneModel
+from .training import StopFlag
+
+__all__ = ["Watched", "color_flops", "jet_flops", "outside_flops", "product_counter", "train_watched", "value_flops"]
+
+PROBE = 64  # rows on which the FLOPs of one are counted
+ENDLESS = 10**9  # steps that no training comes to the end of
+REPORT_EVERY = 20
+
+
+@dataclass(frozen=True)
+class Watched:
+    """A training that has ended.
+
+    Attributes:
+        trainer: with its model.
+        finished: False if it was asked to stop.
+        step_seconds: median of the steps.
+        values: rows of each level without gradient.
+        jets: rows of each level with gradient.
+        colors: rows of the colour network.
+        finest_share: rows of the finest level over the samples of those steps in which it was switched on.
+        geometry_flops: of the whole training.
+        color_flops: the same of colours and of what is outside.
+    """
+
+    trainer: SceneTrainer
+    finished: bool
+    step_seconds: float
+    values: tuple[int, ...]
+    jets: tuple[int, ...]
+    colors: int
+    finest_share: float | None
+    geometry_flops: float
+    color_flops: float
+
+
+def train_watched(
+    model: SceneModel,
+    pool: RayPool,
+    config: ReconstructConfig,
+    flag: StopFlag,
+    *,
+    seconds: float | None = None,
+    report: Callable[[SceneTrainer], None] | None = None,
+) -> Watched:
+    """Train to the end of the schedule, or until ``flag`` asks to stop.
+
+    Args:
+        model: on the pool's device.
+        pool: the pixels.
+        config: settings.
+        flag: see `stop_on_signals`.
+        seconds: end the schedule after so long, and not after ``config.steps``.
+        report: called now and then.
+    """
+    plain = model.geometry
+    costs = [(value_flops(level), jet_flops(level)) for level in _levels(plain)]
+    color_cost, outside_cost = color_flops(model.color), 0.0 if model.outside is None else outside_flops(model.outside)
+    model.geometry, levels = counted(plain)
+    colors, outsides = _RowCounter(model.color), _RowCounter(model.outside)
+    if seconds is not None:
+        config = replace(config, steps=ENDLESS)
+    trainer = SceneTrainer(model, pool, config, seconds=seconds)
+    watch = _Watch(trainer, levels, report)
+    try:
+        finished = trainer.run(flag, report=watch, save=lambda _: None, report_every=1, save_every=math.inf)
+    finally:
+        colors.remove()
+        outsides.remove()
+        plain.deltas.copy_(model.geometry.deltas)
+        model.geometry = plain
+    geometry = sum(v * level.values + j * level.jets for (v, j), level in zip(costs, levels, strict=True))
+    return Watched(
+        trainer=trainer,
+        finished=finished,
+        step_seconds=statistics.median(watch.times) if watch.times else 0.0,
+        values=tuple(level.values for level in levels),
+        jets=tuple(level.jets for level in levels),
+        colors=colors.rows,
+        finest_share=levels[-1].jets / watch.samples if watch.samples else None,
+        geometry_flops=geometry,
+        color_flops=color_cost * colors.rows + outside_cost * outsides.rows,
+    )
+
+
+class _Watch:
+    """What the trainer reports to after every step: takes the time, and counts the samples that are rendered."""
+
+    def __init__(
+        self, trainer: SceneTrainer, levels: Sequence[Counted], report: Callable[[SceneTrainer], None] | None
+    ) -> None:
+        self.levels, self.report = levels, report
+        self.times: list[float] = []
+        self.samples = self.before = 0
+        self.level, self.started = trainer.level, time.perf_counter()
+
+    def __call__(self, trainer: SceneTrainer) -> None:
+        self.times.append(time.perf_counter() - self.started)
+        if self.level == len(self.levels) - 1:  # the level of the step that has just been made
+            self.samples += self.levels[0].jets - self.before
+        if self.report is not None and (trainer.step % REPORT_EVERY == 0 or trainer.fraction >= 1):
+            self.report(trainer)
+        self.before, self.level = self.levels[0].jets, trainer.level
+        self.started = time.perf_counter()
+
+
+class _RowCounter:
+    """Counts the rows that a network is called with."""
+
+    def __init__(self, module: nn.Module | None) -> None:
+        self.rows = 0
+        self.hook = None if module is None else module.register_forward_pre_hook(self._count)
+
+    def _count(self, _module: nn.Module, inputs: tuple[Tensor, ...]) -> None:
+        self.rows += inputs[0].shape[:-1].numel()
+
+    def remove(self) -> None:
+        """Stop counting."""
+        if self.hook is not None:
+            self.hook.remove()
+
+
+def _levels(field: Field) -> list[Field]:
+    """The levels as fields of their own, in the order of `counted`."""
+    levels = [level.inner for level in counted(field)[1]]
+    assert all(isinstance(level, Field) for level in levels)
+    return levels
+
+
+def value_flops(level: Field) -> float:
+    """FLOPs of the matrix products of one value without a graph."""
+    x = _points(level, level.in_dim)
+    with torch.no_grad():
+        return _flops(lambda: level.value(x))
+
+
+def jet_flops(level: Field) -> float:
+    """FLOPs of the matrix products of one jet that is trained, its way back included."""
+    level, x = copy.deepcopy(level), _points(level, level.in_dim)
+    return _flops(lambda: _go_back(level.jet(x)))
+
+
+def color_flops(color: ViewColor) -> float:
+    """The same of one colour, whose cotangent goes on to the geometry."""
+    color, x = copy.deepcopy(color), _points(color, 3)
+    jet = Jet(x[:, 0], x.clone().requires_grad_(), _points(color, color.num_features).requires_grad_())
+    return _flops(lambda: _go_back((color(x, x, jet),)))
+
+
+def outside_flops(outside: Outside) -> float:
+    """The same of density and colour of one point outside."""
+    outside, x = copy.deepcopy(outside), _points(outside, 4)
+    return _flops(lambda: _go_back(outside(x, x[:, :3])))
+
+
+def _points(module: nn.Module, width: int) -> Tensor:
+    return torch.full((PROBE, width), 0.5, device=next(module.parameters()).device)
+
+
+def _go_back(outputs: Sequence[Tensor]) -> None:
+    """From the sum of all outputs to the parameters, whose gradients are filled: these are a copy's."""
+    torch.stack([part.sum() for part in outputs]).sum().backward()
+
+
+def _flops(work: Callable[[], object]) -> float:
+    """Per row of the probe."""
+    with product_counter() as counter:
+        work()
+    return counter.get_total_flops() / PROBE
+
+
+def product_counter() -> FlopCounterMode:
+    """A context that counts the FLOPs of all matrix products, those in place and those with vectors included."""
+    products = (torch.ops.aten.addmm_, torch.ops.aten.addmv, torch.ops.aten.addmv_)
+    return FlopCounterMode(display=False, custom_mapping=dict.fromkeys(products, _product_flops))
+
+
+def _product_flops(_sum: Sequence[int], a: Sequence[int], b: Sequence[int], **_options: object) -> int:
+    """Of S + A B, from the shapes; B may be a vector."""
+    return 2 * math.prod(a) * math.prod(b[1:])

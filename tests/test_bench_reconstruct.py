@@ -1,0 +1,335 @@
+"""The reconstruction benchmark: what is counted, the rows of a tiny scene end to end, and what is kept."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import imageio.v3 as iio
+import pytest
+import torch
+from mplicits.datasets.scenes import SCENES, render_scene
+from mplicits.neural_fields import InputError, Siren, Sphere, Union, extract_mesh
+from mplicits.neural_fields.baselines import NeusSDF
+from mplicits.neural_fields.radiance import Outside, ViewColor
+from mplicits.pipelines import bench_reconstruct as module
+from mplicits.pipelines.bench_reconstruct import BenchOptions, bench_reconstruct
+from mplicits.pipelines.bench_reconstruct_figures import in_region, surface_figures
+from mplicits.pipelines.bench_reconstruct_row import EQUAL_TIME, MULTISCALE, NEUS, ReconstructRow
+from mplicits.pipelines.bench_reconstruct_scene import BenchScene, read_scene
+from mplicits.pipelines.bench_reconstruct_table import comparisons, format_reconstruct
+from mplicits.pipelines.bench_reconstruct_train import (
+    color_flops,
+    jet_flops,
+    outside_flops,
+    product_counter,
+    train_watched,
+    value_flops,
+)
+from mplicits.pipelines.cli import main
+from mplicits.pipelines.ray_pool import RayPool
+from mplicits.pipelines.reconstruct_config import ReconstructConfig
+from mplicits.pipelines.reconstruct_train import SceneTrainer
+from mplicits.pipelines.scene_model import build_scene
+from mplicits.pipelines.surface import from_mesh
+from mplicits.pipelines.training import StopFlag
+
+TINY = ReconstructConfig(
+    widths=(16, 24),
+    depths=(1, 1),
+    omegas=(5.0, 10.0),
+    starts=(0.0, 0.5),
+    features=4,
+    color_width=16,
+    color_depth=1,
+    steps=4,
+    rays=8,
+    uniform=4,
+    importance=4,
+    test_every=3,
+    device="cpu",
+)
+FLAGS = ["--widths", "16", "24", "--depths", "1", "1", "--omegas", "5", "10", "--starts", "0", "0.5"]
+FLAGS += ["--features", "4", "--color-width", "16", "--color-depth", "1", "--steps", "4", "--rays", "8"]
+FLAGS += ["--uniform", "4", "--importance", "4", "--test-every", "3", "--device", "cpu"]
+FLAGS += ["--views", "6", "--size", "8", "--resolution", "16", "--eval-samples", "2000"]
+
+
+@pytest.fixture(scope="module")
+def scene() -> BenchScene:
+    return read_scene("painted-sphere", views=6, size=8)
+
+
+def test_flops_of_one_row_of_a_siren():
+    level = Siren(16, 2, num_features=4)
+    # The value alone needs no features.
+    assert value_flops(level) == 2 * (3 * 16 + 16 * 16 + 16)
+    # Six products with every weight, but the points have no cotangent, and features are not swept back.
+    assert jet_flops(level) == 2 * (5 * 3 * 16 + 6 * 16 * 16 + 3 * 16 * 5)
+
+
+def test_flops_of_one_row_of_the_other_networks():
+    assert color_flops(ViewColor(4, width=16, depth=2)) == 6 * ((3 + 27 + 3 + 4) * 16 + 16 * 16 + 16 * 3)
+    outside = Outside(width=16, depth=1, point_frequencies=2, view_frequencies=1)
+    weights = 20 * 16 + 16 * 17 + (16 + 9) * 8 + 8 * 3
+    # The points have no cotangent in the first layer.
+    assert outside_flops(outside) == 6 * weights - 2 * 20 * 16
+    neus = NeusSDF()
+    weights = sum(layer.in_features * layer.out_features for layer in neus.layers)
+    assert value_flops(neus) == 2 * weights
+    assert 10 * weights < jet_flops(neus) < 12 * weights
+
+
+@pytest.mark.parametrize("geometry", ["multiscale", "neus"])
+def test_counted_flops_are_those_of_a_training(scene: BenchScene, geometry: str):
+    config = dataclasses.replace(TINY, geometry=geometry, widths=(48, 64), features=16, color_width=64)
+    pool = RayPool(scene.images.views, scene.images.similarity, torch.device("cpu"))
+    watched = train_watched(build_scene(config, has_masks=True), pool, config, StopFlag())
+    trainer = SceneTrainer(build_scene(config, has_masks=True), pool, config)
+    with product_counter() as counter:
+        trainer.run(StopFlag(), report=lambda _: None, save=lambda _: None)
+    assert watched.finished
+    assert watched.trainer.losses == trainer.losses  # watching changes nothing
+    assert watched.geometry_flops + watched.color_flops == pytest.approx(counter.get_total_flops(), rel=0.02)
+
+
+def test_a_training_that_is_asked_to_stop_has_not_finished(scene: BenchScene):
+    flag = StopFlag()
+    flag.requested = True
+    pool = RayPool(scene.images.views, scene.images.similarity, torch.device("cpu"))
+    model = build_scene(TINY, has_masks=True)
+    geometry = model.geometry
+    watched = train_watched(model, pool, TINY, flag)
+    assert not watched.finished
+    assert watched.finest_share is None
+    assert model.geometry is geometry
+
+
+@pytest.fixture(scope="module")
+def bench(scene, tmp_path_factory) -> tuple[Path, BenchOptions, list[ReconstructRow], list[torch.Tensor]]:
+    """Folder, options, rows, and the directions of the rays that were drawn."""
+    out = tmp_path_factory.mktemp("bench") / "out"
+    options = BenchOptions(out, test_views=1, resolution=16, samples=2000)
+    drawn: list[torch.Tensor] = []
+    draw = RayPool.draw
+
+    def spy(self, count, generator):
+        rays = draw(self, count, generator)
+        drawn.append(rays.directions)
+        return rays
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(RayPool, "draw", spy)
+        return out, options, list(bench_reconstruct([scene], TINY, options)), drawn
+
+
+def test_rows(bench):
+    neus, ours, timed = bench[2]
+    assert [row.kind for row in bench[2]] == [NEUS, MULTISCALE, EQUAL_TIME]
+    assert (neus.network, ours.network) == ("NeuS (256,8)", "(16,1)▷(24,1)")
+    assert neus.steps == ours.steps == 4
+    assert timed.steps > 4
+    assert timed.seconds >= neus.seconds
+    assert neus.parameters == 529_076
+    assert ours.parameters == timed.parameters == (4 * 16 + 17 * 5) + (4 * 24 + 25 * 5)
+    # NeuS's colours see 256 features and the bare position, ours 4 and six octaves.
+    assert neus.color_parameters == (3 + 27 + 3 + 256 + 1) * 16 + 17 * 3
+    assert ours.color_parameters == (39 + 27 + 3 + 4 + 1) * 16 + 17 * 3
+    for row in bench[2]:
+        # Four rounds of one more sample; after the last one nobody asks for the values there.
+        assert row.values_per_ray[0] == 4 + 3
+        assert row.jets_per_ray[0] == 4 + 4 + 1
+        assert row.views == 1
+        assert 0 < row.psnr < 40
+        assert 0 < row.psnr_object < 40
+        assert -1 <= row.ssim <= 1
+        assert row.step_seconds > 0
+        assert 0 < row.colors_per_ray <= 9
+        assert row.outside_parameters == 0
+    assert neus.finest_share == 1
+    assert neus.geometry_flops == 7 * value_flops(NeusSDF()) + 9 * jet_flops(NeusSDF())
+    # The second level was on in two of the four steps.
+    assert 0 < ours.finest_share < 1
+    assert ours.jets_per_ray[1] == pytest.approx(ours.finest_share * 9 / 2)
+    assert ours.values_per_ray[1] == 0
+    assert len(ours.deltas) == 1
+    assert len(neus.deltas) == 0
+
+
+def test_all_rows_see_the_same_rays(bench):
+    drawn = bench[3]
+    for step in range(4):
+        assert torch.equal(drawn[step], drawn[4 + step])
+        assert torch.equal(drawn[step], drawn[8 + step])
+    assert not torch.equal(drawn[0], drawn[1])
+
+
+def test_surfaces_are_held_against_the_exact_one(bench):
+    truth = from_mesh(extract_mesh(Sphere(radius=0.6), resolution=48))
+    ball = surface_figures(extract_mesh(Sphere(radius=0.5), resolution=48), truth, samples=5000, columns=48)
+    # In units of the exact sphere, all distances are a sixth.
+    assert ball.chamfer == pytest.approx(2 / 36, rel=0.03)
+    assert ball.largest_chamfer == ball.chamfer
+    assert ball.iou == pytest.approx((5 / 6) ** 3, rel=0.03)
+    assert ball.components == 1
+    astray = Union(Sphere(radius=0.5), Sphere(radius=0.1, center=(0.9, 0.0, 0.0)))
+    two = surface_figures(extract_mesh(astray, resolution=48), truth, samples=5000, columns=48)
+    assert two.components == 2
+    assert two.chamfer > 1.05 * two.largest_chamfer
+    assert two.largest_chamfer == pytest.approx(ball.chamfer, rel=0.03)
+    assert two.floor == ball.floor < 2e-3
+    for row in bench[2]:
+        # They have begun as spheres of radius 0.5.
+        assert row.exact
+        assert 0.3 * ball.chamfer < row.surface.chamfer < 1.5 * ball.chamfer
+
+
+def test_what_lies_outside_the_region_of_interest_is_left_out():
+    ball = extract_mesh(Sphere(radius=0.5), resolution=32)
+    assert in_region(ball) is ball
+    corner = Sphere(radius=0.1, center=(0.8, 0.8, 0.8))
+    both = in_region(extract_mesh(Union(Sphere(radius=0.5), corner), resolution=32))
+    assert len(both.faces) == len(ball.faces)
+    assert in_region(extract_mesh(corner, resolution=32)) is None
+
+
+def test_pictures_and_meshes(bench):
+    out = bench[0]
+    names = {f"{kind}.{suffix}" for kind in (NEUS, MULTISCALE, EQUAL_TIME) for suffix in ("json", "png", "ply")}
+    assert {path.name for path in (out / "painted-sphere").iterdir()} == names
+    factor = 600 // 24
+    sheet = iio.imread(out / "painted-sphere" / "neus.png")
+    assert sheet.shape == (12 * factor, 24 * factor, 3)
+    common = iio.imread(out / "painted-sphere.png")
+    assert common.shape == (2 * (8 * factor + 40), 4 * (8 * factor + 12), 3)
+    # The photograph, then what NeuS renders, as they are on its own sheet.
+    side = 8 * factor
+    for column in range(2):
+        left = 6 + column * (side + 12)
+        assert (common[40 : 40 + side, left : left + side] == sheet[:side, column * side : (column + 1) * side]).all()
+    assert (common[80 + side :, side + 18 : 2 * side + 18] == sheet[:side, 2 * side :]).all()
+
+
+def test_finished_rows_are_used_again(bench, scene):
+    out, options, rows, _ = bench
+    home = out / "painted-sphere"
+    files = [home / f"{kind}.json" for kind in (NEUS, MULTISCALE, EQUAL_TIME)]
+    before = [file.stat().st_mtime_ns for file in files]
+    said: list[str] = []
+    assert list(bench_reconstruct([scene], TINY, options, report=said.append)) == rows
+    assert said == [f"painted-sphere, {kind}: from {home}" for kind in (NEUS, MULTISCALE, EQUAL_TIME)]
+    assert [file.stat().st_mtime_ns for file in files] == before
+    # The row of equal time belongs to the time of NeuS.
+    kept = json.loads(files[2].read_text())
+    files[2].write_text(json.dumps(kept | {"seconds": kept["seconds"] + 1}))
+    again = list(bench_reconstruct([scene], TINY, options))
+    assert again[:2] == rows[:2]
+    assert json.loads(files[2].read_text())["seconds"] == rows[0].seconds
+    assert [file.stat().st_mtime_ns == then for file, then in zip(files, before, strict=True)] == [True, True, False]
+
+
+def test_rows_of_other_settings_are_refused(bench, scene, tmp_path):
+    _, options, _, _ = bench
+    other = dataclasses.replace(TINY, steps=5)
+    with pytest.raises(InputError, match=r"neus\.json: was made with steps 4, not 5; choose another -o, or remove it"):
+        list(bench_reconstruct([scene], other, options))
+    repainted = dataclasses.replace(scene, images=render_scene(SCENES["painted-sphere"](), 6, 8, seed=1))
+    with pytest.raises(InputError, match=r"neus\.json: was made with pictures"):
+        list(bench_reconstruct([repainted], TINY, options))
+    damaged = tmp_path / "painted-sphere"
+    damaged.mkdir()
+    for suffix in ("json", "png"):
+        (damaged / f"neus.{suffix}").write_text("{}")
+    with pytest.raises(InputError, match=r"neus\.json: damaged .*; remove it"):
+        list(bench_reconstruct([scene], TINY, dataclasses.replace(options, directory=tmp_path)))
+
+
+def test_what_cannot_be_measured_is_refused(scene, tmp_path):
+    options = BenchOptions(tmp_path / "out")
+    with pytest.raises(InputError, match="painted-sphere: no picture is held out"):
+        list(bench_reconstruct([scene], dataclasses.replace(TINY, test_every=0), options))
+    with pytest.raises(InputError, match="painted-sphere: two of the scenes are called that"):
+        list(bench_reconstruct([scene, scene], TINY, options))
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_tables(bench):
+    neus, ours, timed = bench[2]
+    neus = dataclasses.replace(neus, psnr=25.0, step_seconds=0.3, steps=10, seconds=4.0, geometry_flops=5e6)
+    neus = dataclasses.replace(neus, color_flops=1e6, parameters=1000)
+    ours = dataclasses.replace(ours, psnr=26.5, step_seconds=0.1, steps=10, seconds=1.0, geometry_flops=1.5e6)
+    ours = dataclasses.replace(ours, color_flops=0.5e6, parameters=620, finest_share=0.125)
+    timed = dataclasses.replace(timed, psnr=28.0)
+    second = [dataclasses.replace(row, scene="figure", psnr=row.psnr - 2, surface=None) for row in (neus, ours)]
+    second[1] = dataclasses.replace(second[1], step_seconds=0.2, psnr=24.0)
+    first, other, mean = comparisons([neus, ours, timed, *second])
+    assert (first.neus, first.ours, first.equal_time) == (25.0, 26.5, 28.0)
+    assert (first.fewer, first.step, first.mean_step, first.flops) == pytest.approx((0.38, 3.0, 4.0, 3.0))
+    assert first.chamfer == pytest.approx(neus.surface.largest_chamfer / ours.surface.largest_chamfer)
+    assert (other.step, other.equal_time, other.chamfer) == (pytest.approx(1.5), None, None)
+    assert (mean.neus, mean.ours, mean.step) == pytest.approx((24.0, 25.25, 4.5**0.5))
+    assert (mean.equal_time, mean.chamfer) == (None, None)
+    text = format_reconstruct([neus, ours, timed, *second], sgemm=50e9)
+    for part in ("+1.50 dB", "+3.00 dB", "-38%", "12.5%", "6.0 MFLOP", "100.0 ms", "mean of 2 scenes", "50 GFLOP/s"):
+        assert part in text
+    # NeuS: 6 MFLOP a ray, 8 rays, 10 steps, 4 seconds.
+    assert neus.rate == pytest.approx(1.2e8)
+    lines = [" ".join(line.split()) for line in text.splitlines()]
+    assert "paper, DTU scan 24 28.20 dB 31.50 dB +3.30 dB -37%" in lines
+    assert "paper, mean of 5 DTU scans 28.86 dB 29.94 dB +1.08 dB -37%" in lines
+    assert "no surface" in text
+    alone = format_reconstruct([neus], sgemm=50e9)
+    assert "against" not in alone
+    assert ReconstructRow.from_dict(json.loads(json.dumps(ours.as_dict()))) == ours
+
+
+def run(*arguments: object) -> int:
+    return main(["bench", "reconstruct", *map(str, arguments)])
+
+
+def test_the_command_goes_on_after_an_interruption(tmp_path, capsys, monkeypatch):
+    train, calls = module.train_watched, []
+
+    def stops_at_the_second(*arguments, **keywords):
+        calls.append(keywords)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return train(*arguments, **keywords)
+
+    monkeypatch.setattr(module, "train_watched", stops_at_the_second)
+    command = ["painted-sphere", *FLAGS, "--no-equal-time", "-o", tmp_path / "out", "--json", tmp_path / "rows.json"]
+    assert run(*command) == 130
+    output, error = capsys.readouterr()
+    assert "painted-sphere NeuS (256,8)" in output
+    assert "interrupted; the same command goes on after the last finished row" in error
+    assert [row["kind"] for row in json.loads((tmp_path / "rows.json").read_text())] == [NEUS]
+    assert run(*command) == 0
+    output, error = capsys.readouterr()
+    assert "painted-sphere, neus: from" in error
+    assert "painted-sphere (16,1)▷(24,1)" in output
+    assert "equal time" not in output.split("\n\n")[0]
+    assert len(calls) == 3
+    figures = json.loads((tmp_path / "rows.json").read_text())
+    assert [row["kind"] for row in figures] == [NEUS, MULTISCALE]
+    assert figures[1]["flops_per_second"] > 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["painted-shpere"], "painted-shpere: no such data set, and no scene of that name; did you mean"),
+        (["figure", "--geometry", "neus"], "--geometry: the benchmark trains both; leave it out"),
+        (["figure", "--time-budget", "9"], "--time-budget: rows are compared after as many steps"),
+        (["figure", "--views", "2", "--size", "8", "--test-every", "0"], "figure: no picture is held out"),
+        (["figure", "--json", "rows.txt"], "rows.txt: unknown extension '.txt'"),
+        (["figure", "--equaltime"], "unknown flag --equaltime; did you mean '--equal-time'?"),
+        (["figure", "--steps", "0"], "steps: 0; expected > 0"),
+    ],
+)
+def test_mistakes_are_one_line(arguments, message, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert run(*arguments) == 2
+    output, error = capsys.readouterr()
+    assert output == ""
+    assert len(error.splitlines()) == 1
+    assert message in error
+    assert list(tmp_path.iterdir()) == []
