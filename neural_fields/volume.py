@@ -88,9 +88,9 @@ def transmittance_weights(optical_depth: Tensor) -> Weights:
 
     Example:
         >>> import torch
-        >>> weights, remaining = transmittance_weights(torch.tensor([[0.5, 1.0]]).log().neg())  # α = 0.5, 0
+        >>> weights, remaining = transmittance_weights(-torch.tensor([[0.5, 0.5]]).log())  # α = 0.5 twice
         >>> weights.tolist(), remaining.tolist()
-        ([[0.5, 0.0]], [0.5])
+        ([[0.5, 0.25]], [0.25])
     """
     passed = optical_depth.cumsum(dim=-1)
     weights = (optical_depth - passed).exp() * -torch.expm1(-optical_depth)
