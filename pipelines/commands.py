@@ -15,6 +15,7 @@ from types import MappingProxyType
 from .bench_commands import BENCH_COMMANDS
 from .check_cameras_command import COMMAND as CHECK_CAMERAS
 from .command import Command, add_json, check_output, positive, whole
+from .evolve_command import COMMAND as EVOLVE
 from .fit_command import COMMAND as FIT
 from .fit_settings import add_fit_settings, fit_settings, were_given
 from .reconstruct_command import COMMAND as RECONSTRUCT
@@ -162,6 +163,7 @@ COMMANDS: Mapping[str, Command] = MappingProxyType(
         ),
         "texture": TEXTURE,
         "reconstruct": RECONSTRUCT,
+        "evolve": EVOLVE,
         "render": RENDER,
         "slice": SLICE,
         "view": VIEW,

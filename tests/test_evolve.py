@@ -1,0 +1,385 @@
+"""Evolutions from shapes to run directories: they learn, they are judged, they are interrupted and resumed."""
+
+import json
+import math
+import os
+import signal
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from mplicits.neural_fields import (
+    Field,
+    InputError,
+    Jet,
+    Moving,
+    MultiscaleSDF,
+    Plane,
+    RigidMotion,
+    ShrinkingSphere,
+    Similarity,
+    Siren,
+    SpaceTimeSDF,
+    Sphere,
+    at_time,
+    load_field,
+    save_field,
+)
+from mplicits.pipelines import bench_evolve, evolve_checks, evolve_problem
+from mplicits.pipelines.bench_evolve import CASES, bench_exact, format_exact, measure_exact
+from mplicits.pipelines.cli import main
+from mplicits.pipelines.config import load_config, preset_names
+from mplicits.pipelines.evolve import evolve
+from mplicits.pipelines.evolve_checks import check_evolution, slope_figures
+from mplicits.pipelines.evolve_config import EvolveConfig
+from mplicits.pipelines.evolve_problem import End
+from mplicits.pipelines.evolve_train import band_points
+from mplicits.pipelines.fit import Interrupted
+from mplicits.pipelines.training import Progress
+from torch import Tensor
+
+TRAVEL = RigidMotion(velocity=(0.4, 0.0, 0.0))
+BRIEF = EvolveConfig(
+    kind="transport",
+    shapes=("sphere:0.4@-0.2,0,0",),
+    velocity=(0.4, 0.0, 0.0),
+    widths=(16, 16),
+    depths=(1, 1),
+    omegas=(5.0, 10.0),
+    steps=(60, 30),
+    learning_rates=(5e-3, 1e-3),
+    data_weights=(100.0, 300.0),
+    start_steps=40,
+    batch=256,
+    samples=2000,
+    frames=3,
+    resolution=24,
+    least_delta=0.05,
+)
+QUICK = replace(
+    BRIEF,
+    widths=(32,),
+    depths=(2,),
+    omegas=(6.0,),
+    steps=(250,),
+    learning_rates=(5e-3,),
+    data_weights=(100.0,),
+    batch=768,
+    samples=8000,
+)
+FLAGS = (
+    "--widths 16 --depths 1 --omegas 5 --steps 5 --learning-rates 1e-3 --data-weights 100 --start-steps 5 --batch 64 "
+    "--samples 500 --frames 2 --resolution 16 --quiet"
+)
+
+
+@pytest.fixture(autouse=True)
+def _few_points() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        shrink(patch)
+        yield
+
+
+def shrink(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(evolve_problem, "END_POINTS", 1000)
+    patch.setattr(evolve_problem, "REACH_POINTS", 200)
+    patch.setattr(evolve_checks, "END_RESOLUTION", 32)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    directory = tmp_path_factory.mktemp("runs") / "whole"
+    with pytest.MonkeyPatch.context() as patch:
+        shrink(patch)
+        evolve(BRIEF, out=directory)
+    return directory
+
+
+def tensors(directory: Path) -> dict[str, Tensor]:
+    return dict(load_field(directory / "field.safetensors").field.state_dict())
+
+
+def interrupt(stage: str, step: int) -> Callable[[Progress], None]:
+    """A progress display that asks for an end, once, at a step of a stage."""
+    done = []
+
+    def report(progress: Progress) -> None:
+        if progress.stage.startswith(stage) and progress.step == step and not done:
+            done.append(step)
+            os.kill(os.getpid(), signal.SIGINT)
+
+    return report
+
+
+def fails(capsys: pytest.CaptureFixture[str], line: str) -> str:
+    """Run a command that must fail as bad input does → its one line."""
+    capsys.readouterr()
+    assert main(line.split()) == 2
+    output, error = capsys.readouterr()
+    assert output == ""
+    (message,) = error.splitlines()
+    return message
+
+
+# Training
+
+
+def test_a_travelling_sphere_is_learnt() -> None:
+    field = evolve(QUICK).field
+    truth = Moving(Sphere(radius=0.4, center=(-0.2, 0.0, 0.0)), TRAVEL)
+    points = torch.nn.functional.normalize(torch.randn(3000, 3), dim=1) * 0.4 + torch.tensor([-0.2, 0.0, 0.0])
+    time = torch.rand(3000)
+    x = TRAVEL.forward(points, time)
+    assert truth.value(at_time(x, time)).abs().max() < 1e-5
+    assert field.value(at_time(x, time)).abs().mean() < 5e-3
+    assert slope_figures(field)["mean"] == pytest.approx(1, abs=0.05)
+
+
+def test_the_second_level_improves_on_the_first(finished: Path) -> None:
+    record = json.loads((finished / "run.json").read_text())
+    first, second = record["stages"]
+    assert second["rms_at_ends"] < first["rms_at_ends"]
+    assert second["delta"] >= 0.05
+    assert first["parameters"] == 16 * 5 + 17
+    assert record["parameters"] == 2 * first["parameters"]
+
+
+def test_points_of_a_band_are_spread_over_it() -> None:
+    truth = ShrinkingSphere(radius=0.8, alpha=0.1)
+    points = band_points(truth, 4000, 0.2, torch.Generator().manual_seed(0))
+    value = truth.value(points)
+    assert 3000 < len(points) <= 4000
+    assert value.abs().max() < 0.2 + 1e-3
+    assert [float(x) for x in value.histc(4, -0.2, 0.2) / len(value)] == pytest.approx([0.25] * 4, abs=0.03)
+    assert [float(x) for x in points[:, 3].histc(4, 0, 1) / len(value)] == pytest.approx([0.25] * 4, abs=0.12)
+
+
+def test_points_of_a_residual_band_lie_in_it() -> None:
+    field = MultiscaleSDF(ShrinkingSphere(radius=0.8, alpha=0.1), [Siren(16, 1, omega=5.0, in_dim=4)], [0.05])
+    points = band_points(field, 2000, 0.05, torch.Generator().manual_seed(0), level=1)
+    assert len(points) > 500
+    assert bool(field.in_band(points, level=1).all())
+
+
+# Checks
+
+
+def test_the_checks_of_an_exact_field() -> None:
+    truth = ShrinkingSphere(radius=0.8, alpha=0.12)
+    unit = torch.nn.functional.normalize(torch.randn(4000, 3), dim=1)
+    other = torch.nn.functional.normalize(torch.randn(4000, 3), dim=1)
+    checks = check_evolution(truth, [End("ball", 1.0, 0.4 * unit, 0.4 * other)], frames=3, resolution=48)
+    for frame, radius in zip(checks["frames"], (0.8, math.sqrt(0.64 - 0.24), 0.4), strict=True):
+        assert frame["volume"] == pytest.approx(4 / 3 * math.pi * radius**3, rel=0.01)
+        assert frame["components"] == 1
+        assert frame["slope_error"] < 1e-5
+    (end,) = checks["ends"]
+    assert end["max_value"] < 1e-5
+    assert end["ratio"] == pytest.approx(1, abs=0.2)
+    assert checks["slopes"]["mean"] == pytest.approx(1, abs=1e-5)
+    assert checks["warnings"] == []
+
+
+def test_empty_frames_and_missed_ends_are_warned_about() -> None:
+    class Nothing(Plane):
+        """Positive in the whole cube from t = 0 on."""
+
+        def __init__(self) -> None:
+            super().__init__(offset=-5.0)
+            self.in_dim = 4
+
+        def _evaluate(self, x: Tensor) -> tuple[Tensor, Tensor]:
+            value, gradient = super()._evaluate(x[..., :3])
+            return value, torch.nn.functional.pad(gradient, (0, 1))
+
+    points = torch.rand(100, 3)
+    checks = check_evolution(Nothing(), [End("ball", 0.0, points, points)], frames=4, resolution=16)
+    assert [frame["components"] for frame in checks["frames"]] == [0] * 4
+    empty, missed = checks["warnings"]
+    assert empty.startswith("no surface at 4 of 4 times, the first at t = 0")
+    assert missed.startswith("ball is not met at t = 0 (nothing is there)")
+    others = torch.rand(100, 3)
+    wrong = check_evolution(
+        ShrinkingSphere(radius=0.8, alpha=0.1), [End("ball", 0.0, 0.5 * points, 0.5 * others)], frames=2, resolution=24
+    )
+    assert "times its floor" in wrong["warnings"][0]
+
+
+# Runs
+
+
+def test_a_run_holds_its_field_and_its_record(finished: Path) -> None:
+    field, similarity, metadata = load_field(finished / "field.safetensors")
+    assert isinstance(field, SpaceTimeSDF)
+    assert field.num_levels == 2
+    assert similarity == Similarity.identity()
+    assert sorted(path.name for path in finished.iterdir()) == ["field.safetensors", "run.json"]
+    record = json.loads((finished / "run.json").read_text())
+    assert record["finished"]
+    assert record["kind"] == "transport"
+    assert record["shapes"] == ["sphere:0.4@-0.2,0,0"]
+    assert record["placements"][0]["shift"] == [-0.2, 0.0, 0.0]
+    assert len(record["checks"]["frames"]) == 3
+    assert [end["time"] for end in record["checks"]["ends"]] == [0.0, 1.0]
+    assert "torch" in record["environment"]["versions"]
+    assert load_config(EvolveConfig, None, record["config"]) == BRIEF
+    assert metadata["run"]["kind"] == "transport"
+
+
+@pytest.mark.parametrize(("stage", "step"), [("level 0", 40), ("level 1", 20), ("checks", 1)])
+def test_an_interrupted_run_resumes_to_the_same_field(finished: Path, tmp_path: Path, stage: str, step: int) -> None:
+    directory = tmp_path / "run"
+    if stage == "checks":  # what was trained is kept; the flag is only read between steps
+        evolve(BRIEF, out=directory, progress=interrupt(stage, step))
+    else:
+        with pytest.raises(Interrupted):
+            evolve(BRIEF, out=directory, progress=interrupt(stage, step))
+        assert (directory / "resume.safetensors").is_file()
+        assert not json.loads((directory / "run.json").read_text())["finished"]
+        assert load_field(directory / "field.safetensors").field.num_levels == 1 + (stage == "level 1")
+        evolve(EvolveConfig(), out=directory, resume=True)
+    expected, found = tensors(finished), tensors(directory)
+    assert expected.keys() == found.keys()
+    assert all(torch.equal(found[name], tensor) for name, tensor in expected.items())
+
+
+def test_other_shapes_cannot_be_resumed(tmp_path: Path) -> None:
+    file = tmp_path / "ball.safetensors"
+    ball(file, 0.4)
+    config = replace(BRIEF, shapes=(str(file),))
+    with pytest.raises(Interrupted):
+        evolve(config, out=tmp_path / "run", progress=interrupt("level 0", 20))
+    ball(file, 0.5)
+    with pytest.raises(InputError, match="not the shapes that"):
+        evolve(config, out=tmp_path / "run", resume=True)
+
+
+def ball(path: Path, radius: float) -> None:
+    """A fitted field that is a ball of the radius, nearly: a sine layer in its linear range."""
+    siren = Siren(16, 2, omega=5.0)
+    adam = torch.optim.Adam(siren.parameters(), lr=5e-3)
+    for _ in range(150):
+        x = 2 * torch.rand(512, 3) - 1
+        loss = (siren.value(x) - Sphere(radius=radius).value(x)).square().mean()
+        adam.zero_grad()
+        loss.backward()
+        adam.step()
+    save_field(path, siren, similarity=Similarity((5.0, 0.0, 0.0), 2.0))
+
+
+def test_a_time_budget_ends_the_training() -> None:
+    record = evolve(replace(BRIEF, steps=(100_000, 100_000), time_budget=1.0)).record
+    assert all(stage["ended_by_time_budget"] for stage in record["stages"])
+    assert record["training_seconds"] < 5
+
+
+def test_a_morph_of_two_runs_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    files = [tmp_path / f"{name}.safetensors" for name in "ab"]
+    for file, radius in zip(files, (0.4, 0.6), strict=True):
+        ball(file, radius)
+    run = tmp_path / "run"
+    assert main(f"evolve {files[0]} {files[1]} -o {run} {FLAGS}".split()) == 0
+    output = capsys.readouterr().out
+    assert "morph of" in output
+    assert "t = 1" in output
+    record = json.loads((run / "run.json").read_text())
+    assert record["align"] == "center"
+    assert record["similarity"] == {"center": [5.0, 0.0, 0.0], "scale": 2.0}
+    message = fails(capsys, f"evolve {files[0]} {files[1]} -o {run} {FLAGS}")
+    assert "--force overwrites it" in message
+    assert "nothing to resume" in fails(capsys, f"evolve -o {run} --resume")
+
+
+def test_a_yaml_file_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "scene.yaml"
+    file.write_text("kind: smooth\nshapes: [sphere:0.6]\nalpha: 0.03\n")
+    assert main(f"evolve {file} -o {tmp_path / 'run'} {FLAGS}".split()) == 0
+    record = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert record["kind"] == "smooth"
+    assert record["config"]["alpha"] == 0.03
+    assert "holds all settings" in fails(capsys, f"evolve {file} sphere -o {tmp_path / 'b'}")
+    file.write_text("shapes: [sphere:0.6]\nalhpa: 1\n")
+    assert "did you mean 'alpha'" in fails(capsys, f"evolve {file} -o {tmp_path / 'b'}")
+    assert not (tmp_path / "b").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("-o RUN", "no shapes to evolve"),
+        ("sphere -o RUN", "1 shapes for kind morph; expected at least 2"),
+        ("sphere nothing -o RUN", "nothing: no such run directory or file"),
+        ("sphere torus --shapes box -o RUN", "--shapes: the shapes are given already"),
+        ("sphere torus --kind melt -o RUN", "--kind: got 'melt', expected one of morph, transport, smooth"),
+        ("sphere -o RUN --resume", "--resume: continues with the run's own shapes and settings"),
+        ("sphere torus -o RUN --alpha x", "--alpha: got 'x', expected a finite number"),
+    ],
+)
+def test_bad_arguments(tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: str, message: str) -> None:
+    run = tmp_path / "run"
+    assert message in fails(capsys, f"evolve {arguments.replace('RUN', str(run))} --quiet")
+    assert not run.exists()
+
+
+@pytest.mark.parametrize("name", preset_names("evolve"))
+def test_the_bundled_presets_are_valid(name: str) -> None:
+    load_config(EvolveConfig, name, thing="evolve")
+
+
+def test_the_defaults_are_the_default_preset() -> None:
+    assert load_config(EvolveConfig, "default", thing="evolve") == EvolveConfig()
+
+
+# The benchmark
+
+
+class United(Field):
+    """The union of fields of space-time."""
+
+    def __init__(self, parts: list[Field]) -> None:
+        super().__init__()
+        self.parts, self.in_dim, self.num_levels, self.deltas = parts, 4, 1, torch.empty(0)
+
+    def value(self, x: Tensor, *, level: int = -1) -> Tensor:
+        return self.jet(x).value
+
+    def jet(self, x: Tensor, *, level: int = -1) -> Jet:
+        jets = [part.jet(x) for part in self.parts]
+        value, nearest = torch.stack([jet.value for jet in jets]).min(dim=0)
+        gradients = torch.stack([jet.gradient for jet in jets])
+        index = nearest[None, ..., None].expand(1, *x.shape)
+        return Jet(value, gradients.gather(0, index)[0], x.new_empty((*x.shape[:-1], 0)))
+
+
+@pytest.mark.parametrize("name", list(CASES))
+def test_the_truth_of_an_exact_case_scores_no_error(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    monkeypatch.setattr(bench_evolve, "RESOLUTION", 32)
+    row = measure_exact(name, United(CASES[name].truth()), CASES[name], 0.0)
+    assert row.mean_error < 1e-4
+    assert row.mean_value < 1e-4
+    assert row.slopes["mean"] == pytest.approx(1, abs=1e-4)
+    # Spheres that are nearer than a cell look like one.
+    wrong = [found != expected for found, expected in zip(row.components, row.expected, strict=True)]
+    assert sum(wrong) <= 1
+    assert len(row.times) == 20
+
+
+def test_a_missing_part_is_seen() -> None:
+    case = CASES["two spheres, merging"]
+    assert [case.components(t) for t in (0.0, 0.62, 0.63, 1.0)] == [2, 2, 1, 1]
+    row = measure_exact("half of it", case.truth()[0], case, 0.0)
+    assert row.components == (1,) * 20
+    assert row.mean_value > 0.1
+
+
+def test_exact_cases_are_trained_and_printed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bench_evolve, "TIMES", 3)
+    monkeypatch.setattr(bench_evolve, "RESOLUTION", 24)
+    (name, *_) = CASES
+    rows = bench_exact(replace(QUICK, steps=(120,)), cases=[name])
+    assert rows[0].mean_error < 0.05
+    assert rows[0].components == (1, 1, 1)
+    assert name in format_exact(rows)
+    assert json.loads(json.dumps(rows[0].as_dict()))["case"] == name

@@ -1,0 +1,299 @@
+"""What evolutions are taught: known samples, bounds and ends, against closed forms; and where shapes are put."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from fields import small_spacetime
+from mplicits.neural_fields import (
+    Box,
+    InputError,
+    Moving,
+    RigidMotion,
+    ShrinkingSphere,
+    Similarity,
+    Sphere,
+    Torus,
+    at_time,
+    extract_mesh,
+    save_field,
+    spacetime_jet,
+)
+from mplicits.pipelines import evolve_problem
+from mplicits.pipelines.evolve_config import EvolveConfig
+from mplicits.pipelines.evolve_problem import between, build_problem, velocity_field
+from mplicits.pipelines.evolve_shapes import Placed, Placement, Shape, aligned, into_unit_sphere, read_shape
+from mplicits.pipelines.surface import from_mesh
+
+CONFIG = EvolveConfig(samples=2000)
+TURN = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
+TURN *= np.sign(np.linalg.det(TURN))
+
+
+@pytest.fixture(autouse=True)
+def _few_points(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(evolve_problem, "END_POINTS", 500)
+    monkeypatch.setattr(evolve_problem, "REACH_POINTS", 200)
+
+
+def shape_of(field, *, similarity: Similarity | None = None) -> Shape:
+    mesh = extract_mesh(field, resolution=48)
+    return Shape("made", field, similarity or Similarity.identity(), from_mesh(mesh))
+
+
+def test_a_placement_and_its_inverse() -> None:
+    there = Placement(TURN, 0.5, np.array([0.1, 0.2, -0.3]))
+    points = np.random.default_rng(0).normal(size=(50, 3))
+    assert np.allclose(there.inverse().apply(there.apply(points)), points)
+    other = Placement(TURN.T, 3.0, np.array([1.0, 0.0, 0.0]))
+    assert np.allclose(there.then(other).apply(points), other.apply(there.apply(points)))
+    assert Placement(**{k: np.array(v) for k, v in there.as_dict().items()}).scale == 0.5
+
+
+def test_a_placed_field_is_the_moved_shape() -> None:
+    placement = Placement(TURN, 0.5, np.array([0.1, 0.2, -0.3]))
+    box = Box(half_size=(0.5, 0.3, 0.4)).double()
+    placed = Placed(box, placement).double()
+    x = 2 * torch.rand(500, 3, dtype=torch.float64) - 1
+    moved = torch.from_numpy(placement.apply(x.numpy()))
+    jet, expected = placed.jet(moved), box.jet(x)
+    assert torch.allclose(jet.value, 0.5 * expected.value, atol=1e-6)
+    assert torch.allclose(jet.gradient, expected.gradient @ torch.from_numpy(TURN).T, atol=1e-5)
+    assert torch.equal(jet.value, placed.value(moved))
+
+
+def test_exact_shapes_are_read() -> None:
+    shape = read_shape("torus:0.4,0.15@0.1,0,-0.2")
+    x = 2 * torch.rand(100, 3) - 1
+    exact = Torus(major=0.4, minor=0.15).value(x - torch.tensor([0.1, 0.0, -0.2]))
+    assert torch.allclose(shape.field.value(x), exact, atol=1e-6)
+    assert shape.field.value(shape.points(300, 0)).abs().max() < 1e-4
+    assert float(read_shape("sphere").field.value(torch.zeros(1, 3))) == -0.5
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("cube", "cube: no such run directory or file, and no exact shape; those are sphere, torus, box, capsule"),
+        ("sphere:big", "sphere:big: got 'big', expected 1 number with commas"),
+        ("torus:0.4", "torus:0.4: got '0.4', expected 2 numbers"),
+        ("sphere:0.4@1,2", "got '1,2', expected 3 numbers"),
+        ("sphere:-1", "sphere:-1: radius=-1.0: expected > 0"),
+        ("sphere:7", "sphere:7: has no surface in the unit sphere"),
+    ],
+)
+def test_bad_shapes_are_named(text: str, message: str) -> None:
+    with pytest.raises(InputError) as caught:
+        read_shape(text)
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_field_that_moves_already_is_refused(tmp_path) -> None:
+    file = tmp_path / "moving.safetensors"
+    save_field(file, small_spacetime())
+    with pytest.raises(InputError, match="moves already"):
+        read_shape(str(file))
+
+
+def test_alignment_none_keeps_input_coordinates() -> None:
+    # Two fits of one ball of radius 5 around (10, 0, 0), each in a unit sphere of its own.
+    first = shape_of(Sphere(radius=0.5), similarity=Similarity((10.0, 0.0, 0.0), 10.0))
+    second = shape_of(Sphere(radius=0.25, center=(0.1, 0.0, 0.0)), similarity=Similarity((8.0, 0.0, 0.0), 20.0))
+    _, moved = aligned([first, second], "none")
+    x = 2 * torch.rand(200, 3) - 1
+    assert torch.allclose(moved.field.value(x), first.field.value(x), atol=1e-6)
+    assert np.abs(np.linalg.norm(moved.surface.vertices, axis=1) - 0.5).max() < 1e-3
+    _, kept = aligned([first, second], "center")
+    assert kept is second
+
+
+def test_alignment_pca_turns_a_shape_back() -> None:
+    """The shape has no symmetry, so that only one of the four ways round is right."""
+    from mplicits.neural_fields import Union
+
+    lump = Union(Box(half_size=(0.5, 0.3, 0.2)), Sphere(radius=0.2, center=(0.45, 0.3, 0.15)))
+    first = shape_of(lump)
+    second = shape_of(lump).placed(Placement(rotation=TURN))
+    _, back = aligned([first, second], "pca")
+    x = 2 * torch.rand(2000, 3) - 1
+    assert (back.field.value(x) - first.field.value(x)).abs().mean() < 0.02
+    assert (second.field.value(x) - first.field.value(x)).abs().mean() > 0.05
+
+
+def test_what_reaches_too_far_is_shrunk() -> None:
+    shapes, region = into_unit_sphere([read_shape("sphere:0.5@0.5,0,0")], np.array([[0.0, 0, 0], [3.0, 0, 0]]))
+    assert region == Similarity((1.5, 0.0, 0.0), 1.5)
+    x = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+    unit = torch.from_numpy(region.to_unit(x.double().numpy())).float()
+    assert torch.allclose(shapes[0].field.value(unit), torch.zeros(2), atol=1e-6)
+    kept = [read_shape("sphere")]
+    assert into_unit_sphere(kept, np.array([[1.0, 0.0, 0.0]])) == (kept, Similarity.identity())
+
+
+def test_transport_by_rigid_motions_is_known_exactly_and_unions_too() -> None:
+    config = replace(
+        CONFIG,
+        kind="transport",
+        shapes=("sphere:0.3@-0.5,0,0", "torus:0.3,0.1@0.4,0,0"),
+        velocity=(0.4, 0.0, 0.1, -0.3, 0.0, 0.0),
+        angle=(0.0, 2.0),
+        axis=(0.0, 0.0, 1.0, 1.0, 1.0, 0.0),
+        center=(0.0, 0.0, 0.0, 0.4, 0.0, 0.0),
+    )
+    problem = build_problem([read_shape(text) for text in config.shapes], config)
+    placed = Placed(Torus(major=0.3, minor=0.1), Placement(shift=np.array([0.4, 0.0, 0.0])))
+    turning = RigidMotion(axis=(1.0, 1.0, 0.0), angle=2.0, center=(0.4, 0.0, 0.0), velocity=(-0.3, 0.0, 0.0))
+    parts = [
+        Moving(Sphere(radius=0.3, center=(-0.5, 0.0, 0.0)), RigidMotion(velocity=(0.4, 0.0, 0.1))),
+        Moving(placed, turning),
+    ]
+    known = problem.known
+    jets = [spacetime_jet(part, known.points) for part in parts]
+    value, nearest = torch.stack([jet.value for jet in jets]).min(dim=0)
+    assert (known.value - value).abs().max() < 1e-4
+    gradients = torch.where((nearest == 0)[:, None], jets[0].gradient, jets[1].gradient)
+    clear = (jets[0].value - jets[1].value).abs() > 1e-3
+    assert (known.gradient - gradients)[clear].abs().max() < 5e-3
+    assert problem.law is None
+    assert not len(problem.bounds)
+    assert (known.points[:, 3] == 0).float().mean() == pytest.approx(0.25, abs=0.05)
+    for end in problem.ends:
+        values = torch.stack([part.value(at_time(end.points, end.time)) for part in parts])
+        assert values.amin(dim=0).abs().max() < 1e-3
+    assert [end.time for end in problem.ends] == [0.0, 1.0]
+
+
+def test_transport_out_of_the_unit_sphere_shrinks_the_stage() -> None:
+    config = replace(CONFIG, kind="transport", shapes=("sphere:0.5",), velocity=(2.0, 0.0, 0.0))
+    problem = build_problem([read_shape("sphere:0.5")], config)
+    scale = problem.similarity.scale
+    assert scale == pytest.approx(1.5, abs=0.01)
+    assert problem.similarity.center == pytest.approx((1.0, 0.0, 0.0), abs=0.01)
+    points = problem.similarity.to_input(problem.ends[1].points.double().numpy())
+    assert np.abs(np.linalg.norm(points - [2.0, 0.0, 0.0], axis=1) - 0.5).max() < 1e-3
+    x = torch.from_numpy(problem.similarity.to_input(problem.known.points[:, :3].double().numpy())).float()
+    travelled = torch.nn.functional.pad(2 * problem.known.points[:, 3:], (0, 2))
+    assert (scale * problem.known.value - (Sphere(radius=0.5).value(x - travelled))).abs().max() < 1e-4
+
+
+def test_a_twist_gives_surface_points_normals_and_signs() -> None:
+    config = replace(CONFIG, kind="transport", shapes=("box:0.3,0.2,0.5",), twist=(1.5,))
+    problem = build_problem([read_shape("box:0.3,0.2,0.5")], config)
+    box = Box(half_size=(0.3, 0.2, 0.5))
+
+    def untwisted(points: torch.Tensor) -> torch.Tensor:
+        angle = -1.5 * points[:, 2] * points[:, 3]
+        x, y, z, _ = points.unbind(dim=1)
+        return torch.stack((angle.cos() * x - angle.sin() * y, angle.sin() * x + angle.cos() * y, z), dim=1)
+
+    moving = problem.known.points[:, 3] > 0
+    assert moving.any()
+    assert box.value(untwisted(problem.known.points[moving])).abs().max() < 2e-3
+    assert (problem.known.gradient.norm(dim=1) - 1).abs().max() < 1e-4
+    # The normals are those of the transported function, by its own derivatives.
+    points = problem.known.points[moving].clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(box.value(untwisted(points)).sum(), points)
+    cosine = torch.nn.functional.cosine_similarity(gradient[:, :3], problem.known.gradient[moving], dim=1)
+    assert cosine.min() > 0.999
+    value = box.value(untwisted(problem.bounds.points))
+    assert bool(((problem.bounds.low == 0) == (value > 0)).all())
+    assert bool(((problem.bounds.high == 0) == (value <= 0)).all())
+    assert problem.law is not None
+
+
+def test_the_velocity_of_a_twist_is_the_derivative_of_the_motion() -> None:
+    velocity = velocity_field(RigidMotion(angle=0.5, velocity=(0.1, 0.0, 0.2)), 1.5)
+    x0 = 2 * torch.rand(50, 3, dtype=torch.float64) - 1
+    drift = torch.tensor([0.1, 0.0, 0.2], dtype=torch.float64)
+
+    def position(t: float) -> torch.Tensor:
+        angle = (0.5 + 1.5 * x0[:, 2]) * t
+        x, y, z = x0.unbind(dim=1)
+        turned = (angle.cos() * x - angle.sin() * y, angle.sin() * x + angle.cos() * y, z)
+        return torch.stack(turned, dim=1) + drift * t
+
+    t, h = 0.7, 1e-5
+    expected = (position(t + h) - position(t - h)) / (2 * h)
+    found = velocity(position(t), torch.full((50,), t, dtype=torch.float64))
+    assert torch.allclose(found, expected, atol=1e-8)
+
+
+def test_bounds_between_shapes() -> None:
+    values = torch.tensor([[0.1, 0.3, 9.0], [0.1, -0.3, 9.0], [-0.1, -0.3, 9.0], [9.0, 0.2, 0.4], [9.0, -0.2, -0.1]])
+    low, high = between(torch.tensor([0.1, 0.2, 0.3, 0.6, 0.9]), (0.0, 0.5, 1.0), values)
+    inf = math.inf
+    assert torch.allclose(low, torch.tensor([0.1, -inf, -inf, 0.2, -inf]))
+    assert torch.allclose(high, torch.tensor([inf, inf, -0.1, inf, -0.1]))
+
+
+def test_a_morph_knows_its_shapes_and_bounds_what_is_between() -> None:
+    config = replace(CONFIG, shapes=("sphere:0.4", "sphere:0.7"))
+    problem = build_problem([read_shape(text) for text in config.shapes], config)
+    for time, radius in ((0.0, 0.4), (1.0, 0.7)):
+        here = problem.known.take((problem.known.points[:, 3] == time).nonzero()[:, 0])
+        assert len(here) == 1000
+        assert torch.allclose(here.value, here.points[:, :3].norm(dim=1) - radius, atol=1e-5)
+    # Any sphere in between obeys the bounds.
+    length = problem.bounds.points[:, :3].norm(dim=1)
+    for radius in (0.4, 0.55, 0.7):
+        assert bool((length - radius >= problem.bounds.low - 1e-5).all())
+        assert bool((length - radius <= problem.bounds.high + 1e-5).all())
+    inside, outside = length < 0.4, length > 0.7
+    assert bool((inside | outside).all())
+    assert len(problem.bounds) > 500
+    assert problem.law is not None
+    # The law of concentric spheres: r grows by 0.3 in unit time; the distance falls by as much everywhere.
+    growing = ShrinkingSphere(radius=0.5, alpha=-1e-9)
+    jet = spacetime_jet(growing, 0.1 + 0.8 * torch.rand(100, 4))
+    assert torch.allclose(problem.law.rate(jet), torch.full((100,), -0.3), atol=1e-4)
+
+
+def test_smoothing_is_bounded_by_the_sphere_around_the_shape() -> None:
+    config = replace(CONFIG, kind="smooth", shapes=("sphere:0.8",), alpha=0.12)
+    problem = build_problem([read_shape("sphere:0.8")], config)
+    truth = ShrinkingSphere(radius=0.8, alpha=0.12)
+    value = truth.value(problem.bounds.points)
+    assert len(problem.bounds) > 500
+    assert bool((value >= problem.bounds.low - 1e-3).all())
+    assert bool((problem.known.points[:, 3] == 0).all())
+    x = problem.ends[0].points
+    assert problem.law is not None
+    jet = spacetime_jet(truth, at_time(1.1 * x, 0.5), order=2)
+    assert problem.law.residual(jet).abs().max() < 1e-4
+    swelling = build_problem([read_shape("sphere:0.8")], replace(config, alpha=-0.01))
+    assert not len(swelling.bounds)
+
+
+@pytest.mark.parametrize(("kind", "count"), [("morph", 1), ("smooth", 2), ("transport", 0)])
+def test_the_number_of_shapes_is_checked(kind, count: int) -> None:
+    with pytest.raises(InputError, match=f"{count} shapes for kind {kind}; expected"):
+        build_problem([read_shape("sphere")] * count, replace(CONFIG, kind=kind))
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"shapes": ("a", "b"), "times": (0.0, 0.5)}, "times: (0.0, 0.5); expected growing numbers from 0 to 1"),
+        ({"shapes": ("a", "b"), "times": (0.0,)}, "times: 1 numbers for 2 shapes"),
+        ({"velocity": (1.0, 2.0)}, "velocity: 2 numbers; expected 3, or 3 per shape"),
+        ({"axis": (0.0, 0.0, 0.0)}, "axis: (0.0, 0.0, 0.0); expected a vector of non-zero length"),
+        ({"depths": (2,)}, "depths: 1 entries for 2 widths"),
+        ({"widths": ()}, "widths: expected at least one level"),
+        ({"batch": 0}, "batch: 0; expected > 0"),
+        ({"law_weight": -1.0}, "law_weight: -1.0; expected ≥ 0"),
+        ({"frames": 1}, "frames: 1"),
+        ({"time_budget": 0.0}, "time_budget: 0.0; expected > 0, or none"),
+    ],
+)
+def test_settings_out_of_range_are_named(settings: dict, message: str) -> None:
+    with pytest.raises(ValueError, match="expected") as caught:
+        EvolveConfig(**settings)
+    assert message in str(caught.value)
+
+
+def test_key_times() -> None:
+    assert EvolveConfig(shapes=("a", "b", "c")).key_times() == (0.0, 0.5, 1.0)
+    assert EvolveConfig(shapes=("a", "b", "c"), times=(0.0, 0.2, 1.0)).key_times() == (0.0, 0.2, 1.0)
