@@ -17,13 +17,13 @@ from .bench_reconstruct_row import EQUAL_TIME, ReconstructRow, SurfaceFigures
 from .bench_reconstruct_scene import BenchScene
 from .bench_reconstruct_train import Watched
 from .evaluate import Metrics, evaluate_surfaces
-from .mesh_trim import keep_faces, keep_largest
+from .mesh_trim import keep_largest
 from .picture import contact_sheet
 from .reconstruct_config import ReconstructConfig
 from .reconstruct_views import ViewImage, measure
 from .surface import Surface, from_mesh
 
-__all__ = ["common_sheet", "in_region", "row_of", "surface_figures"]
+__all__ = ["common_sheet", "row_of", "surface_figures"]
 
 Image = NDArray[np.uint8]
 
@@ -92,18 +92,6 @@ def row_of(
 
 def _size(module: nn.Module) -> int:
     return sum(parameter.numel() for parameter in module.parameters())
-
-
-def in_region(mesh: Mesh) -> Mesh | None:
-    """The part of a mesh in the unit sphere, the region of interest; None where there is none.
-
-    Outside no ray is ever sampled, so that a network may have any sign there.
-    """
-    inside = (mesh.vertices**2).sum(axis=1) <= 1
-    kept = inside[mesh.faces].all(axis=1)
-    if kept.all():
-        return mesh
-    return keep_faces(mesh, kept) if kept.any() else None
 
 
 def surface_figures(mesh: Mesh, truth: Surface, *, samples: int, columns: int = 512, seed: int = 0) -> SurfaceFigures:

@@ -17,7 +17,7 @@ from ..neural_fields import Field, InputError, Similarity, TextureField, load_fi
 from ..neural_fields.meshing import Mesh, NoSurfaceError, extract_mesh, map_normals
 from .bake import check_texture_size, textured_mesh
 from .mesh_files import check_mesh_path, write_mesh
-from .mesh_trim import keep_largest, trim_distance
+from .mesh_trim import in_region, keep_largest, trim_distance
 from .runs import find_field
 from .texture import texture_of
 from .textured_files import check_textured_path
@@ -88,6 +88,10 @@ def mesh_run(run: str | Path, out: str | Path, options: MeshOptions | None = Non
         mesh = extract_mesh(field, resolution=options.resolution, level=level)
     except NoSurfaceError as error:
         raise InputError(f"{file}: no surface to mesh ({error})") from error
+    if "region" in metadata.get("run", {}):
+        mesh = in_region(mesh)
+        if mesh is None:
+            raise InputError(f"{file}: no surface in the region of interest; train it longer (--steps)")
     if normal_level != level:
         mesh = map_normals(mesh, field, level=normal_level)
     if points is not None and options.trim_distance is not None:

@@ -1,4 +1,4 @@
-"""Parts of a mesh: the largest component, or what lies near the input points."""
+"""Parts of a mesh: the largest component, what lies near the input points, or in the region of interest."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from scipy.spatial import KDTree
 from ..neural_fields import InputError
 from ..neural_fields.meshing import Mesh
 
-__all__ = ["face_areas", "keep_faces", "keep_largest", "trim_distance"]
+__all__ = ["face_areas", "in_region", "keep_faces", "keep_largest", "trim_distance"]
 
 
 def face_areas(mesh: Mesh) -> NDArray[np.float64]:
@@ -44,6 +44,18 @@ def keep_largest(mesh: Mesh) -> Mesh:
     graph = coo_array((np.ones(len(a), np.int8), (a, b)), shape=(size, size)).tocsr()
     component = connected_components(graph, directed=False)[1][mesh.faces[:, 0]]
     return keep_faces(mesh, component == np.bincount(component, weights=face_areas(mesh)).argmax())
+
+
+def in_region(mesh: Mesh) -> Mesh | None:
+    """The part of a mesh in the unit sphere, the region of interest of photographs; None where there is none.
+
+    Outside no ray is ever sampled, so that a network may have any sign there.
+    """
+    inside = (mesh.vertices**2).sum(axis=1) <= 1
+    kept = inside[mesh.faces].all(axis=1)
+    if kept.all():
+        return mesh
+    return keep_faces(mesh, kept) if kept.any() else None
 
 
 def trim_distance(mesh: Mesh, points: NDArray[np.floating], distance: float) -> Mesh:

@@ -10,7 +10,8 @@ from torch import Tensor
 
 from ..datasets import PointCloud
 from ..datasets.posed_images import PosedImages
-from ..neural_fields import Jet, extract_mesh
+from ..neural_fields import Jet, NoSurfaceError, extract_mesh
+from .mesh_trim import in_region
 from .reconstruct_config import ReconstructConfig
 from .scene_model import SceneModel
 from .surface import from_mesh, sample_surface
@@ -53,9 +54,11 @@ def scene_texture(
     Raises:
         NoSurfaceError: the geometry has no surface.
     """
-    mesh = extract_mesh(model.geometry, resolution=RESOLUTION)
+    mesh = in_region(extract_mesh(model.geometry, resolution=RESOLUTION))
+    if mesh is None:
+        raise NoSurfaceError("all of it is outside the region of interest")
     points, _ = sample_surface(from_mesh(mesh), SAMPLES, np.random.default_rng(config.seed))
     colors = surface_colors(model, torch.from_numpy(points).float()).numpy()
     cloud = PointCloud(images.similarity.to_input(points), colors=colors, source=str(images.source))
-    settings = TextureConfig(steps=config.texture_steps, seed=config.seed, device=config.device)
+    settings = TextureConfig(steps=config.texture_steps, samples=SAMPLES, seed=config.seed, device=config.device)
     return fit_texture(model.geometry, cloud, settings, similarity=images.similarity, progress=progress)

@@ -13,7 +13,7 @@ from mplicits.neural_fields.baselines import NeusSDF
 from mplicits.neural_fields.radiance import Outside, ViewColor
 from mplicits.pipelines import bench_reconstruct as module
 from mplicits.pipelines.bench_reconstruct import BenchOptions, bench_reconstruct
-from mplicits.pipelines.bench_reconstruct_figures import in_region, surface_figures
+from mplicits.pipelines.bench_reconstruct_figures import surface_figures
 from mplicits.pipelines.bench_reconstruct_row import EQUAL_TIME, MULTISCALE, NEUS, ReconstructRow
 from mplicits.pipelines.bench_reconstruct_scene import BenchScene, read_scene
 from mplicits.pipelines.bench_reconstruct_table import comparisons, format_reconstruct
@@ -26,6 +26,7 @@ from mplicits.pipelines.bench_reconstruct_train import (
     value_flops,
 )
 from mplicits.pipelines.cli import main
+from mplicits.pipelines.mesh_trim import in_region
 from mplicits.pipelines.ray_pool import RayPool
 from mplicits.pipelines.reconstruct_config import ReconstructConfig
 from mplicits.pipelines.reconstruct_train import SceneTrainer
