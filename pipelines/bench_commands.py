@@ -10,6 +10,7 @@ from pathlib import Path
 from types import MappingProxyType
 
 from .bench_colour_commands import NORMAL_MAP, TEXTURE
+from .bench_evolve_command import COMMAND as EVOLVE
 from .bench_reconstruct_command import COMMAND as RECONSTRUCT
 from .command import Command, add_json, check_output, positive, whole, write_json
 from .fit_settings import add_fit_settings, fit_settings
@@ -190,5 +191,6 @@ BENCH_COMMANDS: Mapping[str, Command] = MappingProxyType(
         "bench texture": TEXTURE,
         "bench normal-map": NORMAL_MAP,
         "bench reconstruct": RECONSTRUCT,
+        "bench evolve": EVOLVE,
     }
 )

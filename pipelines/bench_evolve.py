@@ -1,7 +1,4 @@
-"""``mplicits bench evolve``: evolutions whose every frame is known, and morphs between fits of meshes.
-
-One function per table: `bench_exact` and `bench_morph` measure, `format_exact` and `format_morph` print.
-"""
+"""``mplicits bench evolve``: evolutions whose every frame is known."""
 
 from __future__ import annotations
 
@@ -9,7 +6,6 @@ import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
@@ -18,7 +14,6 @@ from torch import Tensor
 
 from ..neural_fields import (
     Field,
-    InputError,
     Moving,
     NoSurfaceError,
     RigidMotion,
@@ -28,21 +23,15 @@ from ..neural_fields import (
     Torus,
     at_time,
     extract_mesh,
-    load_field,
 )
-from .evaluate import evaluate_surfaces
 from .evolve import evolve
 from .evolve_checks import slope_figures
 from .evolve_config import EvolveConfig
-from .evolve_shapes import Placed, Placement
-from .fit import fit
-from .fit_config import FitConfig
-from .fit_state import FIELD_FILE
-from .surface import Surface, components, from_mesh, read_surface
+from .surface import components, from_mesh
 from .timing import format_table
 from .training import Progress
 
-__all__ = ["CASES", "ExactCase", "ExactRow", "MorphRow", "bench_exact", "bench_morph", "format_exact", "format_morph"]
+__all__ = ["CASES", "ExactCase", "ExactRow", "bench_exact", "format_exact", "measure_exact"]
 
 TIMES = 20
 RESOLUTION = 64
@@ -91,37 +80,6 @@ class ExactRow:
     components: tuple[int, ...]
     expected: tuple[int, ...]
     times: tuple[float, ...]
-
-    def as_dict(self) -> dict[str, Any]:
-        """All figures, for JSON."""
-        return dataclasses.asdict(self)
-
-
-@dataclass(frozen=True)
-class MorphRow:
-    """A morph between two meshes.
-
-    Attributes:
-        shapes: names of the files.
-        seconds: training of the morph, without the fits.
-        fits: Chamfer distance of each static fit to its mesh, squared and both ways, in units of its bounding sphere.
-        ends: the same of the morph at its ends.
-        floors: what a perfect mesh would score.
-        volumes: at each time.
-        components: at each time.
-        times: those times.
-        warnings: as in ``run.json``.
-    """
-
-    shapes: tuple[str, str]
-    seconds: float
-    fits: tuple[float, float]
-    ends: tuple[float, float]
-    floors: tuple[float, float]
-    volumes: tuple[float, ...]
-    components: tuple[int, ...]
-    times: tuple[float, ...]
-    warnings: tuple[str, ...]
 
     def as_dict(self) -> dict[str, Any]:
         """All figures, for JSON."""
@@ -255,83 +213,6 @@ def format_exact(rows: Sequence[ExactRow]) -> str:
     return f"{format_table(header, cells)}\n{note}"
 
 
-def bench_morph(
-    first: str | Path,
-    second: str | Path,
-    config: EvolveConfig,
-    *,
-    directory: Path,
-    fit_config: FitConfig | None = None,
-    resolution: int = 256,
-    samples: int = 500_000,
-    progress: Callable[[str, Progress], None] | None = None,
-) -> MorphRow:
-    """Fit two meshes, morph between the fits, and measure both ends against the meshes.
-
-    Args:
-        first: mesh file.
-        second: mesh file.
-        config: how the morph is trained and aligned.
-        directory: keeps the fits and the morph; fits that are there are used.
-        fit_config: of the fits.
-        resolution: of the meshes that are measured.
-        samples: points drawn on each surface.
-        progress: called with what is being trained and its progress.
-
-    Raises:
-        InputError: a file cannot be read, or holds no faces to compare with.
-    """
-    paths = [Path(first), Path(second)]
-    references = [_reference(path) for path in paths]
-    runs = [directory / path.stem for path in paths]
-    for path, run in zip(paths, runs, strict=True):
-        if not (run / FIELD_FILE).is_file():
-            run.mkdir(parents=True, exist_ok=True)
-            fit(path, fit_config, out=run, progress=None if progress is None else _named(progress, path.stem))
-    own = dataclasses.replace(config, kind="morph", shapes=tuple(map(str, runs)), times=())
-    tell = None if progress is None else _named(progress, "morph")
-    run = evolve(own, out=directory / "morph", progress=tell)
-    fits, ends, floors = [], [], []
-    for time, (path, reference) in enumerate(zip(runs, references, strict=True)):
-        field, similarity, _ = load_field(path / FIELD_FILE)
-        moved = reference.moved(similarity)
-        back = Placement(**run.record["placements"][time]).inverse()
-        for found, into in ((field, fits), (Placed(run.field.at(float(time)), back), ends)):
-            mesh = from_mesh(extract_mesh(found, resolution=resolution))
-            metrics = evaluate_surfaces(mesh, moved, samples=samples)
-            into.append(metrics.chamfer)
-            floor = metrics.chamfer_floor
-        floors.append(floor)
-    frames = run.record["checks"]["frames"]
-    return MorphRow(
-        (paths[0].stem, paths[1].stem),
-        run.record["training_seconds"],
-        (fits[0], fits[1]),
-        (ends[0], ends[1]),
-        (floors[0], floors[1]),
-        tuple(frame["volume"] for frame in frames),
-        tuple(frame["components"] for frame in frames),
-        tuple(frame["time"] for frame in frames),
-        tuple(run.record["checks"]["warnings"]),
-    )
-
-
-def format_morph(row: MorphRow) -> str:
-    """The table that the command prints, and the curves below it."""
-    header = ("morph", "Chamfer", "of the fit", "floor", "ratio")
-    cells = [
-        (f"{name} at t = {time}", f"{end:.2e}", f"{fitted:.2e}", f"{floor:.2e}", f"{end / fitted:.2f}")
-        for time, (name, end, fitted, floor) in enumerate(zip(row.shapes, row.ends, row.fits, row.floors, strict=True))
-    ]
-    curve = [
-        (f"{time:.2f}", f"{volume:.3f}", str(count))
-        for time, volume, count in zip(row.times, row.volumes, row.components, strict=True)
-    ]
-    lines = [format_table(header, cells), f"trained in {row.seconds:.0f} s; the aim is a ratio below 1.5", ""]
-    lines.append(format_table(("t", "volume", "components"), curve))
-    return "\n".join([*lines, *(f"warning: {warning}" for warning in row.warnings)])
-
-
 def _nearest(parts: Sequence[Field], points: Tensor, time: float) -> Tensor:
     """Exact signed distances of points ``(N, 3)`` from the union of the parts."""
     return torch.stack([part.value(at_time(points, time)) for part in parts]).amin(dim=0)
@@ -345,13 +226,6 @@ def _exact_points(parts: Sequence[Field], time: float) -> Tensor:
         points = torch.from_numpy(mesh.vertices).float()
         kept.append(points[_nearest(parts, points, time) > -1e-4])
     return torch.cat(kept)
-
-
-def _reference(path: Path) -> Surface:
-    surface = read_surface(path)
-    if not len(surface.faces):
-        raise InputError(f"{path}: has no faces, so there is no surface to compare with; give a mesh")
-    return surface
 
 
 def _named(progress: Callable[[str, Progress], None], name: str) -> Callable[[Progress], None]:

@@ -37,7 +37,8 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
 
 def _evolve(arguments: argparse.Namespace) -> int:
     check_output(arguments.json, (".json",))
-    if arguments.meshes and arguments.out is None:
+    directory: Path | None = arguments.out
+    if arguments.meshes and directory is None:
         raise input_error("--meshes: the fits need a folder; add -o DIR")
     if arguments.no_exact and not arguments.meshes:
         raise input_error("--no-exact: nothing is left to measure; add --meshes A B")
@@ -47,12 +48,13 @@ def _evolve(arguments: argparse.Namespace) -> int:
             raise input_error(f"--{name}: the benchmark says what is trained; leave it out")
     preset = arguments.config or arguments.preset
     exact, morph = (load_config(EvolveConfig, preset or name, flags, thing="evolve") for name in ("exact", "default"))
-    from .bench_evolve import bench_exact, bench_morph, format_exact, format_morph
+    from .bench_evolve import bench_exact, format_exact
+    from .bench_evolve_morph import bench_morph, format_morph
     from .fit import Interrupted
     from .progress_bar import progress_bars
 
-    if arguments.out is not None:
-        arguments.out.mkdir(parents=True, exist_ok=True)
+    if directory is not None:
+        directory.mkdir(parents=True, exist_ok=True)
     figures: dict[str, Any] = {}
     tables = []
     try:
@@ -66,13 +68,13 @@ def _evolve(arguments: argparse.Namespace) -> int:
                 figures["exact"] = [row.as_dict() for row in rows]
                 tables.append(format_exact(rows))
                 write_json(arguments.json, figures)
-            if arguments.meshes:
+            if arguments.meshes and directory is not None:
                 first, second = arguments.meshes
                 row = bench_morph(
                     first,
                     second,
                     morph,
-                    directory=arguments.out,
+                    directory=directory,
                     resolution=arguments.mesh_resolution,
                     samples=arguments.eval_samples,
                     progress=tell,

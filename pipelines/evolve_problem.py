@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +13,7 @@ from torch import Tensor
 from ..neural_fields import (
     Field,
     InputError,
+    IntegrationError,
     Keyframes,
     Law,
     RigidMotion,
@@ -26,70 +27,17 @@ from ..neural_fields import (
 )
 from ..neural_fields.evolution import VectorField
 from .evolve_config import EvolveConfig
+from .evolve_samples import Bounds, Carried, Known, around, joined, known_at, no_bounds, signs, uniform
 from .evolve_shapes import Placement, Shape, aligned, into_unit_sphere
-from .sampling import DOMAIN
 
-__all__ = ["Bounds", "End", "Known", "Problem", "between", "build_problem", "velocity_field"]
+__all__ = ["End", "Problem", "between", "build_problem", "morph_law", "velocity_field"]
 
 END_POINTS = 50_000  # on a surface that shall be met
-FLOW_ROWS = 8192  # characteristics that are differentiated at a time
 REACH_TIMES = 9
 REACH_POINTS = 2000
 STILL = 0.25  # share of the known samples of a transport at its first moment
 # Fitted fields are distances only about so far from their surfaces; a bound from them is taken for so much less.
 CAUTION = 0.8
-
-
-@dataclass(frozen=True, eq=False)
-class Known:
-    """Samples of space-time where the field is known.
-
-    Attributes:
-        points: ``(N, 4)``.
-        value: ``(N,)``.
-        gradient: ``(N, 3)``, by space.
-    """
-
-    points: Tensor
-    value: Tensor
-    gradient: Tensor
-
-    def __len__(self) -> int:
-        return len(self.points)
-
-    def take(self, index: Tensor) -> Known:
-        """The samples at ``index``."""
-        return Known(self.points[index], self.value[index], self.gradient[index])
-
-    def to(self, device: torch.device) -> Known:
-        """The same samples on another device."""
-        return Known(self.points.to(device), self.value.to(device), self.gradient.to(device))
-
-
-@dataclass(frozen=True, eq=False)
-class Bounds:
-    """Samples of space-time where the field is only known to lie between two numbers.
-
-    Attributes:
-        points: ``(N, 4)``.
-        low: ``(N,)``; −∞ where nothing is known.
-        high: ``(N,)``; ∞ likewise.
-    """
-
-    points: Tensor
-    low: Tensor
-    high: Tensor
-
-    def __len__(self) -> int:
-        return len(self.points)
-
-    def take(self, index: Tensor) -> Bounds:
-        """The samples at ``index``."""
-        return Bounds(self.points[index], self.low[index], self.high[index])
-
-    def to(self, device: torch.device) -> Bounds:
-        """The same samples on another device."""
-        return Bounds(self.points.to(device), self.low.to(device), self.high.to(device))
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +82,7 @@ def build_problem(shapes: Sequence[Shape], config: EvolveConfig) -> Problem:
     """The problem that a configuration means.
 
     Raises:
-        InputError: too few or too many shapes for this kind.
+        InputError: too few or too many shapes for this kind, or a motion that cannot be followed.
     """
     counts = {"morph": (2, math.inf), "transport": (1, math.inf), "smooth": (1, 1)}
     least, most = counts[config.kind]
@@ -142,7 +90,12 @@ def build_problem(shapes: Sequence[Shape], config: EvolveConfig) -> Problem:
         expected = f"{least}" if least == most else f"at least {least}"
         raise InputError(f"{len(shapes)} shapes for kind {config.kind}; expected {expected}")
     build = {"morph": _morph, "transport": _transport, "smooth": _smooth}[config.kind]
-    return build(list(shapes), config)
+    try:
+        return build(list(shapes), config)
+    except IntegrationError as error:
+        raise InputError(
+            f"the motion cannot be followed ({error}); use a smaller --angle, --twist or --velocity"
+        ) from error
 
 
 def between(times: Tensor, keys: Sequence[float], values: Tensor) -> tuple[Tensor, Tensor]:
@@ -189,8 +142,8 @@ def _morph(shapes: list[Shape], config: EvolveConfig) -> Problem:
     generator, keys = torch.Generator().manual_seed(config.seed), config.key_times()
     per_shape = -(-config.samples // len(placed))
     pairs = list(zip(placed, keys, strict=True))
-    known = [_known_at(shape, time, per_shape, config.seed, generator) for shape, time in pairs]
-    x, t = _uniform(config.samples, generator), torch.rand(config.samples, generator=generator)
+    known = [known_at(shape, time, per_shape, config.seed, generator) for shape, time in pairs]
+    x, t = uniform(config.samples, generator), torch.rand(config.samples, generator=generator)
     values = torch.stack([_values(shape.field, x) for shape in placed], dim=1)
     low, high = between(t, keys, values)
     bounded = torch.isfinite(low) | torch.isfinite(high)
@@ -198,7 +151,7 @@ def _morph(shapes: list[Shape], config: EvolveConfig) -> Problem:
     guide = Keyframes(keys, [shape.field for shape in placed]).requires_grad_(False)
     ends = tuple(_end(shape, time, config.seed) for shape, time in pairs)
     return Problem(
-        _composed(shapes[0].similarity, region), _joined(known), bounds, morph_law(guide), ends, _placements(placed)
+        _composed(shapes[0].similarity, region), joined(known), bounds, morph_law(guide), ends, _placements(placed)
     )
 
 
@@ -211,7 +164,7 @@ def morph_law(guide: Field) -> Law:
 
     @torch.no_grad()
     def speed(x: Tensor, t: Tensor) -> Tensor:
-        return -guide.jet(at_time(x, t)).gradient[..., 3]
+        return -guide.to(x.device).jet(at_time(x, t)).gradient[..., 3]
 
     return normal_speed(speed, extend=True)
 
@@ -220,9 +173,9 @@ def _smooth(shapes: list[Shape], config: EvolveConfig) -> Problem:
     placed, region = into_unit_sphere(shapes, shapes[0].surface.vertices)
     (shape,), alpha = placed, config.alpha / region.scale**2
     generator = torch.Generator().manual_seed(config.seed)
-    known = _known_at(shape, 0.0, config.samples, config.seed, generator)
+    known = known_at(shape, 0.0, config.samples, config.seed, generator)
     # What is inside a sphere stays inside it while both shrink.
-    x, t = _uniform(config.samples, generator), torch.rand(config.samples, generator=generator)
+    x, t = uniform(config.samples, generator), torch.rand(config.samples, generator=generator)
     squared = float((shape.surface.vertices**2).sum(axis=1).max())
     beyond = x.norm(dim=1) - (squared - 4 * max(alpha, 0.0) * t).clamp(min=0).sqrt()
     outside = (beyond > 0) & (alpha > 0)
@@ -241,72 +194,22 @@ def _transport(shapes: list[Shape], config: EvolveConfig) -> Problem:
     ]
     placed, region = into_unit_sphere(shapes, torch.cat(reach).reshape(-1, 3).double().numpy())
     velocities = [_velocity(config, index, region) for index in range(len(placed))]
-    carried = _Carried([shape.field for shape in placed], velocities)
+    carried = Carried([shape.field for shape in placed], velocities)
     generator, count = torch.Generator().manual_seed(config.seed), -(-config.samples // len(placed))
     points = []
     for index, (shape, velocity) in enumerate(zip(placed, velocities, strict=True)):
-        y = _around(shape, count, config.seed + index, generator)
+        y = around(shape, count, config.seed + index, generator)
         t = torch.rand(count, generator=generator) * (torch.rand(count, generator=generator) > STILL)
         points.append(at_time(flow(velocity, y, 0.0, t), t))
     samples = carried.samples(torch.cat(points))
     rigid = not any(config.twist)
-    known, bounds = (samples, _nothing()) if rigid else _signs(samples)
+    known, bounds = (samples, no_bounds()) if rigid else signs(samples)
     law = transport(velocities[0], extend=not rigid) if len(placed) == 1 else None
+    name = " + ".join(shape.name for shape in shapes)
     ends = tuple(
-        End(f"{name} at t = {time:g}", time, *(carried.surface(placed, time, seed) for seed in (0, 1)))
-        for name, time in ((" + ".join(shape.name for shape in shapes), time) for time in (0.0, 1.0))
+        End(name, time, *(carried.surface(placed, time, END_POINTS, seed) for seed in (0, 1))) for time in (0.0, 1.0)
     )
     return Problem(_composed(shapes[0].similarity, region), known, bounds, law, ends, _placements(placed))
-
-
-class _Carried:
-    """The union of shapes, each one carried by its own vector field, by characteristics back to time 0."""
-
-    def __init__(self, fields: Sequence[Field], velocities: Sequence[VectorField]) -> None:
-        self.fields, self.velocities = fields, velocities
-
-    def samples(self, points: Tensor) -> Known:
-        """Value f_i(x at time 0) of the nearest part at ``(N, 4)`` points, and its gradient by space."""
-        parts = [self._nearest(rows) for rows in points.split(FLOW_ROWS)]
-        value, gradient = (torch.cat(part) for part in zip(*parts, strict=True))
-        return Known(points, value, gradient)
-
-    def surface(self, shapes: Sequence[Shape], time: float, seed: int) -> Tensor:
-        """Points of the surface at a time: those of every part that are in no other one."""
-        kept = []
-        for index, (shape, velocity) in enumerate(zip(shapes, self.velocities, strict=True)):
-            points = flow(velocity, shape.points(END_POINTS, 2 * index + seed), 0.0, time)
-            others = [self._at_home(other, points, time) for other in range(len(shapes)) if other != index]
-            outside = [field.value(home) > 0 for field, home in others]
-            kept.append(points[torch.stack(outside).all(dim=0)] if outside else points)
-        return torch.cat(kept)
-
-    def _at_home(self, index: int, points: Tensor, time: float) -> tuple[Field, Tensor]:
-        return self.fields[index], flow(self.velocities[index], points, time, 0.0)
-
-    def _nearest(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        values, gradients = [], []
-        for field, velocity in zip(self.fields, self.velocities, strict=True):
-            x = points[:, :3].clone().requires_grad_()
-            home = flow(velocity, x, points[:, 3], 0.0)
-            jet = field.jet(home.detach())
-            (gradient,) = torch.autograd.grad(home, x, jet.gradient.detach())  # ∇ f(y(x)) = (dy/dx)ᵀ ∇f
-            values.append(jet.value.detach())
-            gradients.append(gradient)
-        value, nearest = torch.stack(values).min(dim=0)
-        index = nearest[None, :, None].expand(1, -1, 3)
-        return value, torch.stack(gradients).gather(0, index)[0]
-
-
-def _signs(samples: Known, tolerance: float = 1e-3) -> tuple[Known, Bounds]:
-    """Of values that are no distances: those on the surface, with unit gradients, and the signs of the others."""
-    slope = samples.gradient.norm(dim=1).clamp(min=1e-6)
-    still = samples.points[:, 3] == 0
-    near = still | (samples.value.abs() < tolerance)
-    known = Known(samples.points[near], (samples.value / slope)[near], (samples.gradient / slope[:, None])[near])
-    positive = samples.value[~near] > 0
-    low = torch.where(positive, 0.0, -math.inf)
-    return known, Bounds(samples.points[~near], low, torch.where(positive, math.inf, 0.0))
 
 
 def _velocity(config: EvolveConfig, index: int, region: Similarity) -> VectorField:
@@ -322,27 +225,6 @@ def _velocity(config: EvolveConfig, index: int, region: Similarity) -> VectorFie
     return velocity_field(motion, config.per_shape("twist", index)[0] * region.scale)
 
 
-def _known_at(shape: Shape, time: float, count: int, seed: int, generator: torch.Generator) -> Known:
-    """Samples of a shape at the time when it is reached."""
-    points = _around(shape, count, seed, generator)
-    jets = [shape.field.jet(part) for part in points.split(1 << 16)]
-    value, gradient = torch.cat([jet.value for jet in jets]), torch.cat([jet.gradient for jet in jets])
-    return Known(at_time(points, time), value.detach(), gradient.detach())
-
-
-def _around(shape: Shape, count: int, seed: int, generator: torch.Generator) -> Tensor:
-    """Points ``(count, 3)``: half of them on the surface, a quarter near it, a quarter anywhere."""
-    on = shape.points(count // 2, seed)
-    near = on[torch.randint(len(on), (count // 4,), generator=generator)]
-    deviation = 0.005 * 20 ** torch.rand(len(near), 1, generator=generator)  # from 0.005 to 0.1
-    near = near + deviation * torch.randn(near.shape, generator=generator)
-    return torch.cat((on, near, _uniform(count - len(on) - len(near), generator)))
-
-
-def _uniform(count: int, generator: torch.Generator) -> Tensor:
-    return (2 * torch.rand(count, 3, generator=generator) - 1) * DOMAIN
-
-
 @torch.no_grad()
 def _values(field: Field, points: Tensor) -> Tensor:
     return torch.cat([field.value(part) for part in points.split(1 << 17)])
@@ -350,15 +232,6 @@ def _values(field: Field, points: Tensor) -> Tensor:
 
 def _end(shape: Shape, time: float, seed: int) -> End:
     return End(shape.name, time, *(shape.points(END_POINTS, seed + 101 + index) for index in range(2)))
-
-
-def _joined(parts: Sequence[Known]) -> Known:
-    pick: Callable[[str], Tensor] = lambda name: torch.cat([getattr(part, name) for part in parts])  # noqa: E731
-    return Known(pick("points"), pick("value"), pick("gradient"))
-
-
-def _nothing() -> Bounds:
-    return Bounds(torch.empty(0, 4), torch.empty(0), torch.empty(0))
 
 
 def _reach_times() -> list[float]:

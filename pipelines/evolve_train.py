@@ -11,7 +11,8 @@ from torch import Tensor
 from ..neural_fields import Field, Jet, Siren, SpaceTimeSDF, key_loss, law_loss, spacetime_jet
 from ..neural_fields.losses import eikonal_loss
 from .evolve_config import EvolveConfig
-from .evolve_problem import Known, Problem
+from .evolve_problem import Problem
+from .evolve_samples import Known, uniform
 from .sampling import DOMAIN
 from .training import Progress, StopFlag, pack_training, set_rate, unpack_training
 
@@ -169,7 +170,7 @@ class EvolveTrainer:
 
 def uniform_spacetime(count: int, generator: torch.Generator) -> Tensor:
     """Points ``(count, 4)`` anywhere in the cube, at any time."""
-    x = (2 * torch.rand(count, 3, generator=generator) - 1) * DOMAIN
+    x = uniform(count, generator)
     return torch.cat((x, torch.rand(count, 1, generator=generator)), dim=1)
 
 

@@ -297,3 +297,9 @@ def test_settings_out_of_range_are_named(settings: dict, message: str) -> None:
 def test_key_times() -> None:
     assert EvolveConfig(shapes=("a", "b", "c")).key_times() == (0.0, 0.5, 1.0)
     assert EvolveConfig(shapes=("a", "b", "c"), times=(0.0, 0.2, 1.0)).key_times() == (0.0, 0.2, 1.0)
+
+
+def test_a_motion_that_cannot_be_followed_is_bad_input() -> None:
+    config = replace(CONFIG, kind="transport", shapes=("sphere",), angle=(1e7,))
+    with pytest.raises(InputError, match=r"the motion cannot be followed .*reached time"):
+        build_problem([read_shape("sphere")], config)

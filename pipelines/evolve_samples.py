@@ -1,0 +1,155 @@
+"""Samples of space-time that ``evolve`` learns from: where a field is known, and where bounds on it are."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ..neural_fields import Field, at_time, flow
+from ..neural_fields.evolution import VectorField
+from .evolve_shapes import Shape
+from .sampling import DOMAIN
+
+__all__ = ["Bounds", "Carried", "Known", "around", "joined", "known_at", "no_bounds", "signs", "uniform"]
+
+FLOW_ROWS = 8192  # characteristics that are differentiated at a time
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """Samples of space-time where the field is known.
+
+    Attributes:
+        points: ``(N, 4)``.
+        value: ``(N,)``.
+        gradient: ``(N, 3)``, by space.
+    """
+
+    points: Tensor
+    value: Tensor
+    gradient: Tensor
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def take(self, index: Tensor) -> Known:
+        """The samples at ``index``."""
+        return Known(self.points[index], self.value[index], self.gradient[index])
+
+    def to(self, device: torch.device) -> Known:
+        """The same samples on another device."""
+        return Known(self.points.to(device), self.value.to(device), self.gradient.to(device))
+
+
+@dataclass(frozen=True, eq=False)
+class Bounds:
+    """Samples of space-time where the field is only known to lie between two numbers.
+
+    Attributes:
+        points: ``(N, 4)``.
+        low: ``(N,)``; −∞ where nothing is known.
+        high: ``(N,)``; ∞ likewise.
+    """
+
+    points: Tensor
+    low: Tensor
+    high: Tensor
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def take(self, index: Tensor) -> Bounds:
+        """The samples at ``index``."""
+        return Bounds(self.points[index], self.low[index], self.high[index])
+
+    def to(self, device: torch.device) -> Bounds:
+        """The same samples on another device."""
+        return Bounds(self.points.to(device), self.low.to(device), self.high.to(device))
+
+
+class Carried:
+    """The union of shapes, each one carried by its own vector field, by characteristics back to time 0."""
+
+    def __init__(self, fields: Sequence[Field], velocities: Sequence[VectorField]) -> None:
+        self.fields, self.velocities = fields, velocities
+
+    def samples(self, points: Tensor) -> Known:
+        """Value f_i(x at time 0) of the nearest part at ``(N, 4)`` points, and its gradient by space."""
+        parts = [self._nearest(rows) for rows in points.split(FLOW_ROWS)]
+        value, gradient = (torch.cat(part) for part in zip(*parts, strict=True))
+        return Known(points, value, gradient)
+
+    def surface(self, shapes: Sequence[Shape], time: float, count: int, seed: int) -> Tensor:
+        """Points of the surface at a time: of ``count`` on each part those that are in no other one."""
+        kept = []
+        for index, (shape, velocity) in enumerate(zip(shapes, self.velocities, strict=True)):
+            points = flow(velocity, shape.points(count, 2 * index + seed), 0.0, time)
+            others = [self._at_home(other, points, time) for other in range(len(shapes)) if other != index]
+            outside = [field.value(home) > 0 for field, home in others]
+            kept.append(points[torch.stack(outside).all(dim=0)] if outside else points)
+        return torch.cat(kept)
+
+    def _at_home(self, index: int, points: Tensor, time: float) -> tuple[Field, Tensor]:
+        return self.fields[index], flow(self.velocities[index], points, time, 0.0)
+
+    def _nearest(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        values, gradients = [], []
+        for field, velocity in zip(self.fields, self.velocities, strict=True):
+            x = points[:, :3].clone().requires_grad_()
+            home = flow(velocity, x, points[:, 3], 0.0)
+            jet = field.jet(home.detach())
+            (gradient,) = torch.autograd.grad(home, x, jet.gradient.detach())  # ∇ f(y(x)) = (dy/dx)ᵀ ∇f
+            values.append(jet.value.detach())
+            gradients.append(gradient)
+        value, nearest = torch.stack(values).min(dim=0)
+        index = nearest[None, :, None].expand(1, -1, 3)
+        return value, torch.stack(gradients).gather(0, index)[0]
+
+
+def signs(samples: Known, tolerance: float = 1e-3) -> tuple[Known, Bounds]:
+    """Of values that are no distances: those on the surface, with unit gradients, and the signs of the others."""
+    slope = samples.gradient.norm(dim=1).clamp(min=1e-6)
+    still = samples.points[:, 3] == 0
+    near = still | (samples.value.abs() < tolerance)
+    known = Known(samples.points[near], (samples.value / slope)[near], (samples.gradient / slope[:, None])[near])
+    positive = samples.value[~near] > 0
+    low = torch.where(positive, 0.0, -math.inf)
+    return known, Bounds(samples.points[~near], low, torch.where(positive, math.inf, 0.0))
+
+
+def known_at(shape: Shape, time: float, count: int, seed: int, generator: torch.Generator) -> Known:
+    """Samples of a shape at the time when it is reached."""
+    points = around(shape, count, seed, generator)
+    jets = [shape.field.jet(part) for part in points.split(1 << 16)]
+    value, gradient = torch.cat([jet.value for jet in jets]), torch.cat([jet.gradient for jet in jets])
+    return Known(at_time(points, time), value.detach(), gradient.detach())
+
+
+def around(shape: Shape, count: int, seed: int, generator: torch.Generator) -> Tensor:
+    """Points ``(count, 3)``: half of them on the surface, a quarter near it, a quarter anywhere."""
+    on = shape.points(count // 2, seed)
+    near = on[torch.randint(len(on), (count // 4,), generator=generator)]
+    deviation = 0.005 * 20 ** torch.rand(len(near), 1, generator=generator)  # from 0.005 to 0.1
+    near = near + deviation * torch.randn(near.shape, generator=generator)
+    return torch.cat((on, near, uniform(count - len(on) - len(near), generator)))
+
+
+def uniform(count: int, generator: torch.Generator) -> Tensor:
+    """Points ``(count, 3)`` anywhere in the cube."""
+    return (2 * torch.rand(count, 3, generator=generator) - 1) * DOMAIN
+
+
+def joined(parts: Sequence[Known]) -> Known:
+    """All samples in one."""
+    columns = zip(*((part.points, part.value, part.gradient) for part in parts), strict=True)
+    points, value, gradient = (torch.cat(column) for column in columns)
+    return Known(points, value, gradient)
+
+
+def no_bounds() -> Bounds:
+    """No samples."""
+    return Bounds(torch.empty(0, 4), torch.empty(0), torch.empty(0))
