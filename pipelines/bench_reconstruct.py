@@ -51,7 +51,7 @@ class BenchOptions:
         test_views: at most so many of the held-out views are measured, evenly chosen.
         resolution: of the marching cubes, of the exact surface as well.
         samples: points on each surface for Chamfer distances.
-        neus_learning_rate: of NeuS, if not that of the configuration.
+        neus_learning_rate: peak rate of the NeuS rows, where geometry and colours have the same.
     """
 
     directory: Path | None = None
@@ -59,7 +59,7 @@ class BenchOptions:
     test_views: int = 8
     resolution: int = 256
     samples: int = 500_000
-    neus_learning_rate: float | None = None
+    neus_learning_rate: float = 1e-3
 
 
 def bench_reconstruct(
@@ -72,8 +72,9 @@ def bench_reconstruct(
 ) -> Iterator[ReconstructRow]:
     """Train NeuS's network, the multiscale one with as many steps, and again for as long as NeuS took, on every scene.
 
-    All see the same rays in the same order, with the same numbers of samples. NeuS has its own colour network:
-    256 features and the position as it is.
+    All see the same rays in the same order, with the same numbers of samples. NeuS has its own colour network,
+    256 features and the position as it is, and one learning rate for everything but the uncertainty, which both
+    sharpen alike.
 
     Args:
         scenes: of different names.
@@ -121,7 +122,8 @@ class _SceneBench:
             config,
             geometry="neus",
             color_frequencies=0,
-            learning_rate=options.neus_learning_rate or config.learning_rate,
+            learning_rate=options.neus_learning_rate,
+            color_rate=1.0,
         )
         self.configs = {NEUS: neus, MULTISCALE: ours}
         if options.equal_time:

@@ -32,7 +32,9 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--resolution", type=whole(8, 2048), default=256, metavar="N", help="of the meshes (256)")
     parser.add_argument("--eval-samples", type=whole(1), default=500_000, metavar="N", help="per surface (500000)")
-    parser.add_argument("--neus-learning-rate", type=positive, metavar="X", help="of NeuS (default: that of ours)")
+    parser.add_argument(
+        "--neus-learning-rate", type=positive, default=1e-3, metavar="X", help="peak rate of the NeuS rows (1e-3)"
+    )
     add_json(parser)
     source = parser.add_mutually_exclusive_group()
     names = ", ".join(preset_names("reconstruct"))
