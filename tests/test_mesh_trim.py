@@ -2,7 +2,14 @@ import numpy as np
 import pytest
 from mplicits.neural_fields import InputError, Sphere, Union
 from mplicits.neural_fields.meshing import Mesh, extract_mesh
-from mplicits.pipelines.mesh_trim import face_areas, keep_faces, keep_largest, trim_distance
+from mplicits.pipelines.mesh_trim import (
+    face_areas,
+    in_region,
+    keep_faces,
+    keep_largest,
+    trim_distance,
+    without_voids,
+)
 
 
 @pytest.fixture(scope="module")
@@ -50,3 +57,24 @@ def test_trim_distance_never_gives_an_empty_mesh(two):
         trim_distance(two, np.array([[9.0, 9.0, 9.0]]), 0.1)
     with pytest.raises(ValueError, match=r"distance=0\.0"):
         trim_distance(two, two.vertices, 0.0)
+
+
+def test_voids_are_dropped_and_what_is_solid_or_open_stays(two):
+    void = extract_mesh(Sphere(radius=0.2, center=(0.3, 0, 0)), resolution=40)
+    count = len(two.vertices)
+    both = Mesh(np.concatenate((two.vertices, void.vertices)), np.concatenate((two.faces, void.faces[:, ::-1] + count)))
+    solid = without_voids(both)
+    assert len(solid.faces) == len(two.faces)
+    assert np.array_equal(solid.vertices, two.vertices)
+    opened = keep_faces(both, np.arange(len(both.faces)) > len(two.faces))  # the void's wall with one face missing
+    assert len(without_voids(opened).faces) == len(void.faces) - 1
+
+
+def test_the_region_is_the_unit_sphere():
+    corner = Sphere(radius=0.2, center=(0.8, 0.8, 0.8))
+    mesh = extract_mesh(Union(Sphere(radius=0.5), corner), resolution=32)
+    kept = in_region(mesh)
+    assert kept is not None
+    assert len(kept.faces) < len(mesh.faces)
+    assert np.linalg.norm(kept.vertices, axis=1).max() < 0.6
+    assert in_region(extract_mesh(corner, resolution=32)) is None
