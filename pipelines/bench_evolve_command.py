@@ -28,11 +28,13 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     add_json(parser)
     source = parser.add_mutually_exclusive_group()
     names = ", ".join(preset_names("evolve"))
-    source.add_argument(
-        "--preset", metavar="NAME", help=f"one of {names} (default: exact for the exact cases, default for --meshes)"
-    )
+    source.add_argument("--preset", metavar="NAME", help=f"one of {names} (default: exact, or default with --meshes)")
     source.add_argument("--config", type=Path, metavar="FILE", help="a YAML file of settings")
-    add_config_flags(parser, EvolveConfig, about="of the training; what is trained is the benchmark's")
+    add_config_flags(
+        parser,
+        EvolveConfig,
+        about="of the exact cases; with --meshes of the morph instead, and the exact cases have their preset",
+    )
 
 
 def _evolve(arguments: argparse.Namespace) -> int:
@@ -46,8 +48,9 @@ def _evolve(arguments: argparse.Namespace) -> int:
     for name in FROM_CASES:
         if name in flags:
             raise input_error(f"--{name}: the benchmark says what is trained; leave it out")
-    preset = arguments.config or arguments.preset
-    exact, morph = (load_config(EvolveConfig, preset or name, flags, thing="evolve") for name in ("exact", "default"))
+    preset, own = arguments.config or arguments.preset, "default" if arguments.meshes else "exact"
+    given = load_config(EvolveConfig, preset or own, flags, thing="evolve")
+    exact = load_config(EvolveConfig, "exact", thing="evolve") if arguments.meshes else given
     from .bench_evolve import bench_exact, format_exact
     from .bench_evolve_morph import bench_morph, format_morph
     from .fit import Interrupted
@@ -73,7 +76,7 @@ def _evolve(arguments: argparse.Namespace) -> int:
                 row = bench_morph(
                     first,
                     second,
-                    morph,
+                    given,
                     directory=directory,
                     resolution=arguments.mesh_resolution,
                     samples=arguments.eval_samples,

@@ -15,7 +15,7 @@ from .evolve_config import EvolveConfig
 from .evolve_shapes import Placed, Placement
 from .fit import fit
 from .fit_config import FitConfig
-from .fit_state import FIELD_FILE
+from .fit_state import FIELD_FILE, STATE_FILE
 from .surface import Surface, from_mesh, read_surface
 from .timing import format_table
 from .training import Progress
@@ -71,22 +71,25 @@ def bench_morph(
         first: mesh file.
         second: mesh file.
         config: how the morph is trained and aligned.
-        directory: keeps the fits and the morph; fits that are there are used.
+        directory: keeps the fits and the morph; fits that are there are used, and continued if interrupted.
         fit_config: of the fits.
         resolution: of the meshes that are measured.
         samples: points drawn on each surface.
         progress: called with what is being trained and its progress.
 
     Raises:
-        InputError: a file cannot be read, or holds no faces to compare with.
+        InputError: a file cannot be read, holds no faces to compare with, or both have one name.
     """
     paths = [Path(first), Path(second)]
+    if len({"morph", *(path.stem for path in paths)}) < 3:
+        raise InputError(f"--meshes {first} {second}: their names are those of their runs; rename one")
     references = [_reference(path) for path in paths]
     runs = [directory / path.stem for path in paths]
     for path, run in zip(paths, runs, strict=True):
-        if not (run / FIELD_FILE).is_file():
-            run.mkdir(parents=True, exist_ok=True)
-            fit(path, fit_config, out=run, progress=None if progress is None else _named(progress, path.stem))
+        interrupted = (run / STATE_FILE).is_file()
+        if not (run / FIELD_FILE).is_file() or interrupted:
+            tell = None if progress is None else _named(progress, path.stem)
+            fit(path, fit_config, out=run, resume=interrupted, progress=tell)
     own = dataclasses.replace(config, kind="morph", shapes=tuple(map(str, runs)), times=())
     tell = None if progress is None else _named(progress, "morph")
     run = evolve(own, out=directory / "morph", progress=tell)
@@ -94,7 +97,7 @@ def bench_morph(
     for time, (path, reference) in enumerate(zip(runs, references, strict=True)):
         field, similarity, _ = load_field(path / FIELD_FILE)
         moved = reference.moved(similarity)
-        back = Placement(**run.record["placements"][time]).inverse()
+        back = Placement.from_dict(run.record["placements"][time]).inverse()
         for found, into in ((field, fits), (Placed(run.field.at(float(time)), back), ends)):
             mesh = from_mesh(extract_mesh(found, resolution=resolution))
             metrics = evaluate_surfaces(mesh, moved, samples=samples)

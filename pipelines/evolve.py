@@ -86,7 +86,12 @@ def evolve(
             raise InputError("resume: needs the run directory (out=...)")
         config = load_config(EvolveConfig, None, read_record(directory)["config"], thing="evolve")
     choose_device(config.device)
-    shapes = [read_shape(text) for text in config.shapes]
+    report, count = progress or (lambda _: None), len(config.shapes) + 1
+    shapes = []
+    for index, text in enumerate(config.shapes):
+        report(Progress("shapes", index, count, index / count, {}))
+        shapes.append(read_shape(text))
+    report(Progress("shapes", count - 1, count, 1 - 1 / count, {}))
     problem = build_problem(shapes, config)
     return train_evolution(problem, config, shapes=shapes, out=directory, resume=resume, progress=progress)
 

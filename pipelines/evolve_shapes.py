@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -77,9 +77,14 @@ class Placement:
         turned = -self.shift @ self.rotation / self.scale
         return Placement(self.rotation.T, 1 / self.scale, turned)
 
-    def as_dict(self) -> dict[str, object]:
+    def as_dict(self) -> dict[str, Any]:
         """For JSON."""
         return {"rotation": self.rotation.tolist(), "scale": self.scale, "shift": self.shift.tolist()}
+
+    @classmethod
+    def from_dict(cls, numbers: Mapping[str, Any]) -> Placement:
+        """What `as_dict` gave."""
+        return cls(np.array(numbers["rotation"]), float(numbers["scale"]), np.array(numbers["shift"]))
 
 
 class Placed(Field):

@@ -4,16 +4,15 @@ import json
 import math
 import os
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
+from evolutions import BRIEF, QUICK, ball, fails, few_points
 from mplicits.neural_fields import (
-    Field,
     InputError,
-    Jet,
     Moving,
     MultiscaleSDF,
     Plane,
@@ -25,10 +24,7 @@ from mplicits.neural_fields import (
     Sphere,
     at_time,
     load_field,
-    save_field,
 )
-from mplicits.pipelines import bench_evolve, evolve_checks, evolve_problem
-from mplicits.pipelines.bench_evolve import CASES, bench_exact, format_exact, measure_exact
 from mplicits.pipelines.cli import main
 from mplicits.pipelines.config import load_config, preset_names
 from mplicits.pipelines.evolve import evolve
@@ -41,34 +37,6 @@ from mplicits.pipelines.training import Progress
 from torch import Tensor
 
 TRAVEL = RigidMotion(velocity=(0.4, 0.0, 0.0))
-BRIEF = EvolveConfig(
-    kind="transport",
-    shapes=("sphere:0.4@-0.2,0,0",),
-    velocity=(0.4, 0.0, 0.0),
-    widths=(16, 16),
-    depths=(1, 1),
-    omegas=(5.0, 10.0),
-    steps=(60, 30),
-    learning_rates=(5e-3, 1e-3),
-    data_weights=(100.0, 300.0),
-    start_steps=40,
-    batch=256,
-    samples=2000,
-    frames=3,
-    resolution=24,
-    least_delta=0.05,
-)
-QUICK = replace(
-    BRIEF,
-    widths=(32,),
-    depths=(2,),
-    omegas=(6.0,),
-    steps=(250,),
-    learning_rates=(5e-3,),
-    data_weights=(100.0,),
-    batch=768,
-    samples=8000,
-)
 FLAGS = (
     "--widths 16 --depths 1 --omegas 5 --steps 5 --learning-rates 1e-3 --data-weights 100 --start-steps 5 --batch 64 "
     "--samples 500 --frames 2 --resolution 16 --quiet"
@@ -76,23 +44,15 @@ FLAGS = (
 
 
 @pytest.fixture(autouse=True)
-def _few_points() -> Iterator[None]:
-    with pytest.MonkeyPatch.context() as patch:
-        shrink(patch)
-        yield
-
-
-def shrink(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(evolve_problem, "END_POINTS", 1000)
-    patch.setattr(evolve_problem, "REACH_POINTS", 200)
-    patch.setattr(evolve_checks, "END_RESOLUTION", 32)
+def _few_points(monkeypatch: pytest.MonkeyPatch) -> None:
+    few_points(monkeypatch)
 
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     directory = tmp_path_factory.mktemp("runs") / "whole"
     with pytest.MonkeyPatch.context() as patch:
-        shrink(patch)
+        few_points(patch)
         evolve(BRIEF, out=directory)
     return directory
 
@@ -111,16 +71,6 @@ def interrupt(stage: str, step: int) -> Callable[[Progress], None]:
             os.kill(os.getpid(), signal.SIGINT)
 
     return report
-
-
-def fails(capsys: pytest.CaptureFixture[str], line: str) -> str:
-    """Run a command that must fail as bad input does → its one line."""
-    capsys.readouterr()
-    assert main(line.split()) == 2
-    output, error = capsys.readouterr()
-    assert output == ""
-    (message,) = error.splitlines()
-    return message
 
 
 # Training
@@ -256,19 +206,6 @@ def test_other_shapes_cannot_be_resumed(tmp_path: Path) -> None:
         evolve(config, out=tmp_path / "run", resume=True)
 
 
-def ball(path: Path, radius: float) -> None:
-    """A fitted field that is a ball of the radius, nearly: a sine layer in its linear range."""
-    siren = Siren(16, 2, omega=5.0)
-    adam = torch.optim.Adam(siren.parameters(), lr=5e-3)
-    for _ in range(150):
-        x = 2 * torch.rand(512, 3) - 1
-        loss = (siren.value(x) - Sphere(radius=radius).value(x)).square().mean()
-        adam.zero_grad()
-        loss.backward()
-        adam.step()
-    save_field(path, siren, similarity=Similarity((5.0, 0.0, 0.0), 2.0))
-
-
 def test_a_time_budget_ends_the_training() -> None:
     record = evolve(replace(BRIEF, steps=(100_000, 100_000), time_budget=1.0)).record
     assert all(stage["ended_by_time_budget"] for stage in record["stages"])
@@ -330,56 +267,3 @@ def test_the_bundled_presets_are_valid(name: str) -> None:
 
 def test_the_defaults_are_the_default_preset() -> None:
     assert load_config(EvolveConfig, "default", thing="evolve") == EvolveConfig()
-
-
-# The benchmark
-
-
-class United(Field):
-    """The union of fields of space-time."""
-
-    def __init__(self, parts: list[Field]) -> None:
-        super().__init__()
-        self.parts, self.in_dim, self.num_levels, self.deltas = parts, 4, 1, torch.empty(0)
-
-    def value(self, x: Tensor, *, level: int = -1) -> Tensor:
-        return self.jet(x).value
-
-    def jet(self, x: Tensor, *, level: int = -1) -> Jet:
-        jets = [part.jet(x) for part in self.parts]
-        value, nearest = torch.stack([jet.value for jet in jets]).min(dim=0)
-        gradients = torch.stack([jet.gradient for jet in jets])
-        index = nearest[None, ..., None].expand(1, *x.shape)
-        return Jet(value, gradients.gather(0, index)[0], x.new_empty((*x.shape[:-1], 0)))
-
-
-@pytest.mark.parametrize("name", list(CASES))
-def test_the_truth_of_an_exact_case_scores_no_error(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
-    monkeypatch.setattr(bench_evolve, "RESOLUTION", 32)
-    row = measure_exact(name, United(CASES[name].truth()), CASES[name], 0.0)
-    assert row.mean_error < 1e-4
-    assert row.mean_value < 1e-4
-    assert row.slopes["mean"] == pytest.approx(1, abs=1e-4)
-    # Spheres that are nearer than a cell look like one.
-    wrong = [found != expected for found, expected in zip(row.components, row.expected, strict=True)]
-    assert sum(wrong) <= 1
-    assert len(row.times) == 20
-
-
-def test_a_missing_part_is_seen() -> None:
-    case = CASES["two spheres, merging"]
-    assert [case.components(t) for t in (0.0, 0.62, 0.63, 1.0)] == [2, 2, 1, 1]
-    row = measure_exact("half of it", case.truth()[0], case, 0.0)
-    assert row.components == (1,) * 20
-    assert row.mean_value > 0.1
-
-
-def test_exact_cases_are_trained_and_printed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bench_evolve, "TIMES", 3)
-    monkeypatch.setattr(bench_evolve, "RESOLUTION", 24)
-    (name, *_) = CASES
-    rows = bench_exact(replace(QUICK, steps=(120,)), cases=[name])
-    assert rows[0].mean_error < 0.05
-    assert rows[0].components == (1, 1, 1)
-    assert name in format_exact(rows)
-    assert json.loads(json.dumps(rows[0].as_dict()))["case"] == name

@@ -1,0 +1,71 @@
+"""What the tests of evolutions share: small settings, a fit that takes no time, bad input."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from mplicits.neural_fields import Similarity, Siren, Sphere, save_field
+from mplicits.pipelines import evolve_checks, evolve_problem
+from mplicits.pipelines.cli import main
+from mplicits.pipelines.evolve_config import EvolveConfig
+
+BRIEF = EvolveConfig(
+    kind="transport",
+    shapes=("sphere:0.4@-0.2,0,0",),
+    velocity=(0.4, 0.0, 0.0),
+    widths=(16, 16),
+    depths=(1, 1),
+    omegas=(5.0, 10.0),
+    steps=(60, 30),
+    learning_rates=(5e-3, 1e-3),
+    data_weights=(100.0, 300.0),
+    start_steps=40,
+    batch=256,
+    samples=2000,
+    frames=3,
+    resolution=24,
+    least_delta=0.05,
+)
+QUICK = replace(
+    BRIEF,
+    widths=(32,),
+    depths=(2,),
+    omegas=(6.0,),
+    steps=(250,),
+    learning_rates=(5e-3,),
+    data_weights=(100.0,),
+    batch=768,
+    samples=8000,
+)
+
+
+def few_points(patch: pytest.MonkeyPatch) -> None:
+    """Check ends on fewer points."""
+    patch.setattr(evolve_problem, "END_POINTS", 1000)
+    patch.setattr(evolve_problem, "REACH_POINTS", 200)
+    patch.setattr(evolve_checks, "END_RESOLUTION", 32)
+
+
+def ball(path: Path, radius: float) -> None:
+    """A fit of a ball around (5, 0, 0), twice as large in input coordinates; off by less than 0.01."""
+    siren = Siren(24, 2, omega=3.0)
+    adam = torch.optim.Adam(siren.parameters(), lr=1e-2, betas=(0.9, 0.99))
+    for step in range(200):
+        x = 2 * torch.rand(1024, 3) - 1
+        loss = (siren.value(x) - Sphere(radius=radius).value(x)).square().mean()
+        adam.param_groups[0]["lr"] = 1e-2 * (1 - step / 200)
+        adam.zero_grad()
+        loss.backward()
+        adam.step()
+    save_field(path, siren, similarity=Similarity((5.0, 0.0, 0.0), 2.0))
+
+
+def fails(capsys: pytest.CaptureFixture[str], line: str) -> str:
+    """Run a command that must fail as bad input does → its one line."""
+    capsys.readouterr()
+    assert main(line.split()) == 2
+    output, error = capsys.readouterr()
+    assert output == ""
+    (message,) = error.splitlines()
+    return message
