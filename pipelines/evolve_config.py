@@ -40,7 +40,7 @@ class EvolveConfig:
     widths: tuple[int, ...] = _setting((128, 256), "neurons per layer, one number per level")
     depths: tuple[int, ...] = _setting((2, 2), "sine layers, one number per level")
     omegas: tuple[float, ...] = _setting((15.0, 40.0), "SIREN frequency of each level (Eq. 2)")
-    steps: tuple[int, ...] = _setting((1500, 800), "training steps, one number per level")
+    steps: tuple[int, ...] = _setting((1000, 500), "training steps, one number per level")
     learning_rates: tuple[float, ...] = _setting((4e-3, 5e-4), "peak learning rate of each level")
     data_weights: tuple[float, ...] = _setting((100.0, 1000.0), "weight of known values and gradients, per level")
     start_steps: int = _setting(300, "steps in which level 0 learns the first shape, before it learns to move")
