@@ -14,7 +14,7 @@ from torch import Tensor
 
 from .field import Field
 
-__all__ = ["Found", "Rays", "Rule", "march", "march_budget"]
+__all__ = ["Expected", "Found", "Rays", "Rule", "march", "march_budget"]
 
 # Steps at a gap of one `resolution`, before it doubles: few rays need as many, and none may need thousands.
 PATIENCE = 32
@@ -24,8 +24,24 @@ BAND_ENTRY = 0.5
 BOLDNESS = 0.9
 # A ray that leaves the surface faster than this may not stride out any further for it.
 STEEPEST_RISE = 0.6
+# A fall slower than this is not reckoned with: such a ray grazes the surface.
+LEAST_FALL = 0.1
+# A ray that expects a hit looks first a little nearer to its start than it would have to.
+FORESIGHT = 1.2
 # Values this many rounding errors from zero are zero: no step would bring them nearer.
 FLOOR = 8
+
+
+class Expected(NamedTuple):
+    """What is expected of rays; it says where to look first, and nothing about what is there.
+
+    Attributes:
+        depth: ``(...,)`` of their hits, infinite for no idea.
+        slope: ``(...,)`` how fast the field falls along the ray there, positive.
+    """
+
+    depth: Tensor
+    slope: Tensor
 
 
 class Found:
@@ -36,9 +52,14 @@ class Found:
         self.mask = torch.zeros_like(depth, dtype=torch.bool)
         self.level = torch.zeros_like(depth, dtype=torch.int64)
         self.steps = torch.zeros_like(self.level)
+        self.slope = torch.ones_like(self.depth)
 
     def record(self, index: Tensor, *, mask: Tensor, depth: Tensor, level: Tensor | int, steps: Tensor | int) -> None:
         self.mask[index], self.depth[index], self.level[index], self.steps[index] = mask, depth, level, steps
+
+    def record_slope(self, index: Tensor, slope: Tensor) -> None:
+        """How fast the field fell along the rays at their last step."""
+        self.slope[index] = slope
 
 
 class Rays(NamedTuple):
@@ -59,6 +80,8 @@ class Rays(NamedTuple):
         high: ``(K,)`` a depth known to be behind the surface, infinite if there is none yet.
         high_value: ``(K,)`` the value there, negative.
         boldness: ``(K,)`` share of the widest step that is taken.
+        expected: ``(K,)`` depth of the hit that is expected, infinite for no idea.
+        fall: ``(K,)`` how fast the field is expected to fall there.
     """
 
     ray: Tensor
@@ -75,6 +98,8 @@ class Rays(NamedTuple):
     high: Tensor
     high_value: Tensor
     boldness: Tensor
+    expected: Tensor
+    fall: Tensor
 
     @classmethod
     def begin(cls, origins: Tensor, directions: Tensor, entries: Tensor, starts: Tensor, ends: Tensor) -> Rays:
@@ -96,7 +121,31 @@ class Rays(NamedTuple):
             high=infinite,
             high_value=zero,
             boldness=zero + BOLDNESS,
+            expected=infinite,
+            fall=zero + 1,
         )
+
+    def expecting(self, expected: Expected, rule: Rule) -> Rays:
+        """The same rays, each looking first where its ball is to reach back to the start if all is as expected."""
+        depth, fall = expected.depth[self.ray], expected.slope[self.ray].clamp(LEAST_FALL, 1)
+        known = depth.isfinite() & (depth > self.depth) & (depth < self.far)
+        way = torch.where(known, depth - self.depth, 0)
+        ahead = torch.zeros_like(way)
+        for _ in range(len(rule.deltas) + 1):  # a ball outside a band is smaller by its δ, so its middle is further off
+            delta = rule.band(fall * ahead)[1]
+            reach = way - rule.resolution + delta / rule.lipschitz
+            ahead = (reach / (1 + fall / rule.lipschitz)).clamp(min=0)
+        ahead = torch.minimum(FORESIGHT * ahead, way)
+        return self._replace(
+            depth=torch.where(known, depth - ahead, self.depth),
+            gap=torch.where(known & (ahead < way), rule.resolution, self.gap),
+            expected=torch.where(known, depth, torch.inf),
+            fall=fall,
+        )
+
+    def is_fresh(self) -> Tensor:
+        """Which rays are at their start, where nothing is known yet."""
+        return self.low_value.isinf() & (self.depth == self.low)
 
     def only(self, rows: Tensor) -> Rays:
         return Rays(*(column[rows] for column in self))
@@ -128,8 +177,10 @@ def march(field: Field, level: int, rays: Rays, found: Found, rule: Rule, max_st
             return
         value = field.value(rays.points(), level=level)
         if count == 1:
+            rays, value = _from_the_start(field, level, rays, value, rule)
+        if count <= 2:  # a ray that looked ahead in vain is at its start now
             rays, value = _from_the_front(field, level, rays, value)
-            rays = rays._replace(sign=torch.where(value < 0, -1.0, 1.0).to(value))
+            rays = rays._replace(sign=torch.where(rays.is_fresh() & (value < 0), -1.0, rays.sign))
         gap = rule.resolution * 2.0 ** ((count - 1) // PATIENCE)
         rays, stand = _look(rays, value * rays.sign, rule, gap)
         ended = stand.hit | stand.passed if count < max_steps else torch.ones_like(stand.hit)
@@ -137,12 +188,24 @@ def march(field: Field, level: int, rays: Rays, found: Found, rule: Rule, max_st
         found.record(
             rays.ray[rows], mask=stand.hit[rows], depth=stand.depth[rows], level=stand.level[rows], steps=count
         )
+        found.record_slope(rays.ray[rows], stand.slope[rows])
         rays = rays.only((~ended).nonzero()[:, 0])
+
+
+def _from_the_start(field: Field, level: int, rays: Rays, value: Tensor, rule: Rule) -> tuple[Rays, Tensor]:
+    """Send rays that looked ahead, and are behind the surface there, back to their start; with the values there."""
+    # Where the hit itself was looked at, half of all that found it are behind it by less than the tolerance.
+    found = (value >= -rule.tolerance * rays.fall) & (rays.expected - rays.depth <= rule.resolution)
+    behind = ((rays.depth > rays.low) & (value < 0) & ~found).nonzero()[:, 0]
+    if not len(behind):
+        return rays, value
+    rays = rays._replace(depth=rays.depth.index_copy(0, behind, rays.low[behind]))
+    return rays, value.index_copy(0, behind, field.value(rays.only(behind).points(), level=level))
 
 
 def _from_the_front(field: Field, level: int, rays: Rays, value: Tensor) -> tuple[Rays, Tensor]:
     """Send rays whose start is behind the surface back to where they may begin; with the values there."""
-    behind = ((value < 0) & (rays.depth > rays.entry)).nonzero()[:, 0]
+    behind = ((value < 0) & (rays.depth > rays.entry) & rays.is_fresh()).nonzero()[:, 0]
     if not len(behind):
         return rays, value
     depth = rays.depth.index_copy(0, behind, rays.entry[behind])
@@ -157,13 +220,18 @@ class Stand(NamedTuple):
     passed: Tensor
     depth: Tensor
     level: Tensor
+    slope: Tensor
 
 
 def _look(rays: Rays, value: Tensor, rule: Rule, resolution: float) -> tuple[Rays, Stand]:
     """Take in the ``value`` at ``rays.depth``, and say where to look next."""
     level, delta = rule.band(value.abs())
     free = ((value.abs() - delta) / rule.lipschitz).clamp(min=0)
-    slope = torch.where(rays.low_value.isfinite(), (value - rays.low_value) / (rays.depth - rays.low), -1.0)
+    # Before there are two values: a hit that is expected ahead says how steep the way there is, or else it is head-on.
+    way = rays.expected - rays.depth
+    foretold = torch.where(way > resolution, -value / way, -rays.fall)
+    foretold = torch.where(rays.expected.isfinite(), foretold, -1.0)
+    slope = torch.where(rays.low_value.isfinite(), (value - rays.low_value) / (rays.depth - rays.low), foretold)
     enclosed = rays.high.isfinite()
     sound = enclosed | (rays.depth - rays.low - rays.free - free <= rays.gap)
     before, behind = sound & (value > 0), sound & (value <= 0)
@@ -196,6 +264,7 @@ def _look(rays: Rays, value: Tensor, rule: Rule, resolution: float) -> tuple[Ray
         passed=passed & ~near,
         depth=torch.where(near, landing, torch.where(pinned, chord, rays.depth)),
         level=level,
+        slope=steep,
     )
     rays = rays._replace(
         depth=torch.minimum(torch.where(closed, closing, ahead), rays.far),
@@ -205,7 +274,7 @@ def _look(rays: Rays, value: Tensor, rule: Rule, resolution: float) -> tuple[Ray
         gap=gap,
         high=high,
         high_value=high_value,
-        boldness=torch.where(sound, rays.boldness, rays.boldness / 2),
+        boldness=torch.where(sound | rays.low_value.isinf(), rays.boldness, rays.boldness / 2),
     )
     return rays, stand
 

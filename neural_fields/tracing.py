@@ -17,10 +17,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ._march import Found, Rays, Rule, march, march_budget
+from ._march import Expected, Found, Rays, Rule, march, march_budget
 from .field import Field
 
-__all__ = ["BOUNDING_RADIUS", "Hits", "cone_starts", "sphere_trace"]
+__all__ = ["BOUNDING_RADIUS", "Expected", "Hits", "cone_ends", "cone_starts", "sphere_trace", "trace_expected"]
 
 # Fields live in the unit sphere; their surfaces may pass it by a little.
 BOUNDING_RADIUS = 1.05
@@ -105,29 +105,107 @@ def sphere_trace(
     _check(field, origins, directions, tolerance=tolerance, resolution=resolution, lipschitz=lipschitz)
     if budget is not None and len(budget) != level + 1:
         raise ValueError(f"budget={list(budget)}: expected {level + 1} number(s) of steps, one for each level")
+    rule = Rule(field.deltas[:level].to(directions), tolerance, resolution, lipschitz)
+    ends = _Ends(near, far, radius)
+    hits, _ = _trace(field, origins, directions, level, ends, rule, None, max_steps, budget, capture)
+    return hits
+
+
+@torch.no_grad()
+def trace_expected(
+    field: Field,
+    origins: Tensor,
+    directions: Tensor,
+    expected: Expected | None,
+    *,
+    level: int = -1,
+    near: Tensor | float = 0.0,
+    far: Tensor | float = torch.inf,
+    tolerance: float = 1e-5,
+    resolution: float = 1e-4,
+    lipschitz: float = 1.0,
+    radius: float | None = BOUNDING_RADIUS,
+    max_steps: int = 512,
+) -> tuple[Hits, Tensor]:
+    """`sphere_trace` in the default mode, with an idea of where the hits will be.
+
+    A ray that expects a hit looks first at a point so near to it that the ball there just reaches back to ``near``, if
+    the field falls as it is said to, and steps from there as if it did. Where it does not, the ray finds a gap between
+    its balls, or itself behind the surface, and goes back. A wrong expectation costs steps, and changes nothing else.
+
+    Args:
+        field: see `sphere_trace`.
+        origins: see there.
+        directions: see there.
+        expected: depths and slopes ``(...,)`` of the hits; None for no idea.
+        level: see there.
+        near: see there.
+        far: see there.
+        tolerance: see there.
+        resolution: see there.
+        lipschitz: see there.
+        radius: see there.
+        max_steps: see there.
+
+    Returns:
+        The hits, and how fast the field fell along each ray at its last step ``(...,)``, to be expected the next time.
+
+    Raises:
+        ValueError: see `sphere_trace`.
+    """
+    level = field.resolve_level(level)
+    _check(field, origins, directions, tolerance=tolerance, resolution=resolution, lipschitz=lipschitz)
+    rule = Rule(field.deltas[:level].to(directions), tolerance, resolution, lipschitz)
+    return _trace(field, origins, directions, level, _Ends(near, far, radius), rule, expected, max_steps, None, 0.0)
+
+
+class _Ends(NamedTuple):
+    """Where rays begin and end."""
+
+    near: Tensor | float
+    far: Tensor | float
+    radius: float | None
+
+
+def _trace(
+    field: Field,
+    origins: Tensor,
+    directions: Tensor,
+    level: int,
+    limits: _Ends,
+    rule: Rule,
+    expected: Expected | None,
+    max_steps: int,
+    budget: Sequence[int] | None,
+    capture: float,
+) -> tuple[Hits, Tensor]:
+    """The hits, and the slopes of the last steps; both modes."""
     origins, directions = torch.broadcast_tensors(origins, directions)
     shape = directions.shape[:-1]
-    starts, ends = (torch.as_tensor(x).to(directions).broadcast_to(shape).reshape(-1) for x in (near, far))
+    starts, ends = (torch.as_tensor(x).to(directions).broadcast_to(shape).reshape(-1) for x in limits[:2])
     origins, directions = origins.reshape(-1, 3), directions.reshape(-1, 3)
     entries = torch.zeros_like(starts)
-    if radius is not None:
-        entry, leave = _ball_crossing(origins, directions, radius)
+    if limits.radius is not None:
+        entry, leave = _ball_crossing(origins, directions, limits.radius)
         entries, ends = entry.clamp(min=0), torch.minimum(ends, leave)
     rays = Rays.begin(origins, directions, entries, torch.maximum(starts, entries), ends)
     found = Found(starts)
+    if expected is not None:
+        flat = Expected(*(part.to(directions).broadcast_to(shape).reshape(-1) for part in expected))
+        rays = rays.expecting(flat, rule)
     if budget is None:
-        rule = Rule(field.deltas[:level].to(directions), tolerance, resolution, lipschitz)
         march(field, level, rays, found, rule, max_steps)
     else:
-        march_budget(field, rays, found, budget, tolerance, capture)
+        march_budget(field, rays, found, budget, rule.tolerance, capture)
     position = origins + found.depth[:, None] * directions
-    return Hits(
+    hits = Hits(
         found.mask.reshape(shape),
         found.depth.reshape(shape),
         position.reshape(*shape, 3),
         found.level.reshape(shape),
         found.steps.reshape(shape),
     )
+    return hits, found.slope.reshape(shape)
 
 
 @torch.no_grad()
@@ -165,34 +243,80 @@ def cone_starts(
         ValueError: shapes do not fit, or the field is not three-dimensional.
     """
     level = field.resolve_level(level)
-    if origin.shape != (3,) or directions.ndim != 3:
-        raise ValueError(
-            f"origin {tuple(origin.shape)}, directions {tuple(directions.shape)}: expected (3,), (H, W, 3)"
-        )
-    _check(field, origin, directions, lipschitz=lipschitz)
-    height, width = directions.shape[:2]
-    rows, columns = (torch.arange(count, device=directions.device) for count in (height, width))
-    depth = directions.new_zeros(height, width)
+    _check_image(field, origin, directions, lipschitz)
+    depth = torch.zeros_like(directions[..., 0])
     for tile in tiles:
-        across = -(-width // tile)
-        of_pixel = (rows[:, None] // tile) * across + columns // tile
-        middle_row, middle_column = (
-            (count // tile * tile + tile // 2).clamp(max=len(count) - 1) for count in (rows, columns)
-        )
-        axis = directions[middle_row[::tile]][:, middle_column[::tile]].reshape(-1, 3)
-        away = (directions - directions[middle_row][:, middle_column]).norm(dim=-1)
-        spread = away.new_zeros(len(axis)).scatter_reduce(0, of_pixel.flatten(), away.flatten(), "amax")
+        cones = _Cones.of(directions, tile)
         starts = depth[::tile, ::tile].reshape(-1)
-        free = _march_cones(field, origin, axis, spread, starts, level, lipschitz, radius, max_steps)
-        depth = free[of_pixel]
+        free = _march_cones(field, origin, cones, starts, level, lipschitz, radius, max_steps)
+        depth = free[cones.of_pixel]
+    return depth
+
+
+@torch.no_grad()
+def cone_ends(
+    field: Field,
+    origin: Tensor,
+    directions: Tensor,
+    wanted: Tensor,
+    *,
+    level: int = -1,
+    tiles: Sequence[int] = (32, 8),
+    lipschitz: float = 1.0,
+    radius: float = BOUNDING_RADIUS,
+    max_steps: int = 64,
+) -> Tensor:
+    """Depths from which on whole tiles of an image see nothing: `cone_starts` from the other side.
+
+    Rays that pass a shape closely would take many steps to get away from it again. From behind, with v = |f_0| at depth
+    t on the axis, the tile is empty from (t − (v − δ_0)/L) / (1 − σ) on.
+
+    Args:
+        field: see `cone_starts`.
+        origin: see there.
+        directions: see there.
+        wanted: ``(H, W)`` bool; tiles without such a pixel are left out.
+        level: see there.
+        tiles: see there.
+        lipschitz: see there.
+        radius: see there.
+        max_steps: see there.
+
+    Returns:
+        ``(H, W)`` depths for ``far`` of `sphere_trace`, infinite in tiles that were left out.
+
+    Raises:
+        ValueError: shapes do not fit, or the field is not three-dimensional.
+    """
+    level = field.resolve_level(level)
+    _check_image(field, origin, directions, lipschitz)
+    reach = origin.norm() + radius
+    depth = torch.full_like(directions[..., 0], torch.inf)
+    delta = float(field.deltas[0]) if level else 0.0
+    for tile in tiles:
+        cones = _Cones.of(directions, tile)
+        count = len(cones.axis)
+        asked = wanted.new_zeros(count, dtype=torch.uint8)
+        asked = asked.scatter_reduce(0, cones.of_pixel.flatten(), wanted.flatten().to(torch.uint8), "amax").bool()
+        entry, leave = _ball_crossing(origin.expand_as(cones.axis), cones.axis, radius + cones.spread * reach)
+        ends = torch.minimum(depth[::tile, ::tile].reshape(-1), leave / (1 - cones.spread))
+        active = (asked & (ends > entry)).nonzero()[:, 0]
+        for _ in range(max_steps):
+            if not len(active):
+                break
+            t, sigma = ends[active], cones.spread[active]
+            value = field.value(origin + t[:, None] * cones.axis[active], level=0)
+            closer = (t - ((value.abs() - delta) / lipschitz).clamp(min=0)) / (1 - sigma)
+            ends[active] = torch.minimum(t, closer)
+            active = active[(t - closer > t * sigma) & (closer > entry[active])]
+        depth = torch.where(asked, ends, torch.inf)[cones.of_pixel]
     return depth
 
 
 def _march_cones(
     field: Field,
     origin: Tensor,
-    axis: Tensor,
-    spread: Tensor,
+    cones: _Cones,
     starts: Tensor,
     level: int,
     lipschitz: float,
@@ -200,6 +324,7 @@ def _march_cones(
     max_steps: int,
 ) -> Tensor:
     """How far each cone is empty; infinite where it leaves the ball of ``radius`` untouched."""
+    axis, spread = cones.axis, cones.spread
     delta = field.deltas[0].to(axis) if level else axis.new_zeros(())
     # A ray of the cone may be in the ball where its axis is not; spread · reach is the most that they are apart.
     reach = origin.norm() + radius
@@ -222,6 +347,42 @@ def _march_cones(
         # Once a step is shorter than the cone is wide, smaller cones get on better.
         active = active[(step > t * sigma) & (ahead < leave[active]) & ~passed]
     return depth
+
+
+class _Cones(NamedTuple):
+    """The tiles of an image, ``C`` of them.
+
+    Attributes:
+        axis: ``(C, 3)`` the direction of the middle pixel of each.
+        spread: ``(C,)`` the largest distance of the directions of its pixels from that.
+        of_pixel: ``(H, W)`` which tile each pixel is in.
+    """
+
+    axis: Tensor
+    spread: Tensor
+    of_pixel: Tensor
+
+    @classmethod
+    def of(cls, directions: Tensor, tile: int) -> _Cones:
+        height, width = directions.shape[:2]
+        rows, columns = (torch.arange(count, device=directions.device) for count in (height, width))
+        across = -(-width // tile)
+        of_pixel = (rows[:, None] // tile) * across + columns // tile
+        middle_row, middle_column = (
+            (count // tile * tile + tile // 2).clamp(max=len(count) - 1) for count in (rows, columns)
+        )
+        axis = directions[middle_row[::tile]][:, middle_column[::tile]].reshape(-1, 3)
+        away = (directions - directions[middle_row][:, middle_column]).norm(dim=-1)
+        spread = away.new_zeros(len(axis)).scatter_reduce(0, of_pixel.flatten(), away.flatten(), "amax")
+        return cls(axis, spread, of_pixel)
+
+
+def _check_image(field: Field, origin: Tensor, directions: Tensor, lipschitz: float) -> None:
+    if origin.shape != (3,) or directions.ndim != 3:
+        raise ValueError(
+            f"origin {tuple(origin.shape)}, directions {tuple(directions.shape)}: expected (3,), (H, W, 3)"
+        )
+    _check(field, origin, directions, lipschitz=lipschitz)
 
 
 def _check(field: Field, origins: Tensor, directions: Tensor, **positive: float) -> None:
