@@ -33,12 +33,12 @@ def _view(arguments: argparse.Namespace) -> int:
 
     shown = open_run(arguments.run, side=arguments.size, device=choose_device(arguments.device))
     with Viewer(shown, host=arguments.host, port=arguments.port, up=arguments.up) as viewer:
-        print(f"{arguments.run}: open {viewer.url} in a browser; Ctrl-C ends it", flush=True)
-        if arguments.open:
-            import webbrowser
-
-            webbrowser.open(viewer.url)
         try:
+            print(f"{arguments.run}: open {viewer.url} in a browser; Ctrl-C ends it", flush=True)
+            if arguments.open:
+                import webbrowser
+
+                webbrowser.open(viewer.url)
             while not threading.Event().wait(3600):  # with a time limit, or Windows would not notice Ctrl-C
                 pass
         except KeyboardInterrupt:

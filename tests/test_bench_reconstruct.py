@@ -109,7 +109,7 @@ def test_a_training_that_is_asked_to_stop_has_not_finished(scene: BenchScene):
 def bench(scene, tmp_path_factory) -> tuple[Path, BenchOptions, list[ReconstructRow], list[torch.Tensor]]:
     """Folder, options, rows, and the directions of the rays that were drawn."""
     out = tmp_path_factory.mktemp("bench") / "out"
-    options = BenchOptions(out, test_views=1, resolution=16, samples=2000)
+    options = BenchOptions(out, test_views=1, resolution=16, samples=2000, neus_learning_rate=3e-4)
     drawn: list[torch.Tensor] = []
     draw = RayPool.draw
 

@@ -162,7 +162,7 @@ def test_every_field_can_be_seen(name):
         reach = 0.25 * pixel_size(camera) * seen.direction
         before, behind = (field.value(seen.position + side * reach) > 0 for side in (-1, 1))
         gradient = field.jet(seen.position).gradient
-    assert float((before != behind).float().mean()) > 0.97  # but for rays that graze it
+    assert float((before != behind).float().mean()) > 0.95  # but for rays that graze it
     same = (normalize(gradient, dim=1) - seen.normal).norm(dim=1) < 0.05
     # Not at edges, to either side of which a Newton step may lead; the untrained levels' gates are all edge.
     assert name == "multiscale" or float(same.float().mean()) > 0.95
@@ -443,7 +443,7 @@ def test_it_says_when_nothing_is_in_view(shapes, tmp_path, capsys):
         ("blob.safetensors -o a.png --frame a", "goes with --cameras"),
         ("blob.safetensors -o a.png --device abacus", "--device abacus"),
         ("nothing.safetensors -o a.png", "nothing.safetensors: no surface to render"),
-        ("time.safetensors -o a.png", "time.safetensors: a field of 4 coordinates"),
+        ("time.safetensors -o a.png", "time.safetensors: a surface that moves; say when with --time"),
         ("dot.xyz -o a.png", "dot.xyz: points: all 3 coincide"),
     ],
 )
