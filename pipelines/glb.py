@@ -1,23 +1,41 @@
-"""GLB, the binary form of glTF 2.0: one mesh, one material and its images in one file."""
+"""GLB, the binary form of glTF 2.0: one mesh, one material and its images in one file; the mesh may move."""
 
 from __future__ import annotations
 
 import json
 import struct
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["write_glb"]
+__all__ = ["Motion", "write_glb"]
 
 _COMPONENTS = {"<u2": 5123, "<u4": 5125, "<f4": 5126}
 _SHAPES = ("SCALAR", "SCALAR", "VEC2", "VEC3", "VEC4")
 _VERTEX_BUFFER, _INDEX_BUFFER = 34962, 34963
 # Trilinear filtering; beyond its sides a texture repeats its border.
 _SAMPLER = {"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """How a mesh moves: morph targets, one for each frame after the first, faded into one another.
+
+    Attributes:
+        times: ``(T,)`` seconds, increasing from 0.
+        targets: ``T − 1`` frames, each with the same names of attributes: by how much they differ from the mesh.
+    """
+
+    times: NDArray[np.floating]
+    targets: Sequence[Mapping[str, NDArray[Any]]]
+
+    def weights(self) -> NDArray[np.float32]:
+        """``(T, T − 1)``: at each time, how much of each target; in between they are interpolated."""
+        return np.eye(len(self.times), dtype="<f4")[:, 1:]
 
 
 def write_glb(
@@ -28,6 +46,7 @@ def write_glb(
     material: Mapping[str, Any],
     images: Sequence[bytes] = (),
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    motion: Motion | None = None,
 ) -> None:
     """Write a JSON chunk that describes the arrays of a second, binary chunk.
 
@@ -39,8 +58,15 @@ def write_glb(
         material: as glTF writes it; texture k is image k.
         images: PNG files.
         origin: translation of the node, repeated in its ``extras``: positions are relative to it.
+        motion: of the attributes, played by an animation.
     """
     arrays = [faces.astype("<u4").reshape(-1), *attributes.values()]
+    still = len(arrays)
+    if motion is not None:
+        arrays += [array for target in motion.targets for array in target.values()]
+    shaped = len(arrays)
+    if motion is not None:
+        arrays += [motion.times.astype("<f4"), motion.weights().reshape(-1)]
     chunks = [*(array.tobytes() for array in arrays), *images]
     sizes = np.array([len(chunk) for chunk in chunks])
     ends = np.cumsum((sizes + 3) // 4 * 4)  # each array starts at a multiple of four bytes
@@ -48,7 +74,7 @@ def write_glb(
     views: list[dict[str, Any]] = [
         {"buffer": 0, "byteOffset": start, "byteLength": int(size)} for start, size in zip(starts, sizes, strict=True)
     ]
-    for number, view in enumerate(views[: len(arrays)]):
+    for number, view in enumerate(views[:shaped]):
         view["target"] = _VERTEX_BUFFER if number else _INDEX_BUFFER
     place = {"translation": list(origin), "extras": {"origin": list(origin)}}
     primitive = {"attributes": {name: k for k, name in enumerate(attributes, start=1)}, "indices": 0, "material": 0}
@@ -63,9 +89,9 @@ def write_glb(
         "bufferViews": views,
         "accessors": [_accessor(k, array) for k, array in enumerate(arrays)],
     }
-    positions = attributes["POSITION"]
-    bounds = {"min": positions.min(axis=0).tolist(), "max": positions.max(axis=0).tolist()}
-    header["accessors"][1 + list(attributes).index("POSITION")] |= bounds
+    header["accessors"][1 + list(attributes).index("POSITION")] |= _bounds(attributes["POSITION"])
+    if motion is not None:
+        _add_motion(header, motion, still, shaped)
     if images:
         header["images"] = [{"bufferView": len(arrays) + k, "mimeType": "image/png"} for k in range(len(images))]
         header["samplers"] = [_SAMPLER]
@@ -78,6 +104,25 @@ def write_glb(
         file.write(struct.pack("<I4s", int(ends[-1]), b"BIN\0"))
         for chunk in chunks:
             file.write(chunk + bytes(-len(chunk) % 4))
+
+
+def _add_motion(header: dict[str, Any], motion: Motion, first: int, times: int) -> None:
+    """Describe a motion whose arrays begin at the accessor ``first``, and whose times are the accessor ``times``."""
+    described, accessor = [], first
+    for target in motion.targets:
+        described.append({name: accessor + k for k, name in enumerate(target)})
+        header["accessors"][described[-1]["POSITION"]] |= _bounds(target["POSITION"])
+        accessor += len(target)
+    header["accessors"][times] |= _bounds(motion.times.astype("<f4")[:, None])
+    header["meshes"][0]["primitives"][0]["targets"] = described
+    header["meshes"][0]["weights"] = [0.0] * len(motion.targets)
+    sampler = {"input": times, "interpolation": "LINEAR", "output": times + 1}
+    channel = {"sampler": 0, "target": {"node": 0, "path": "weights"}}
+    header["animations"] = [{"name": "motion", "samplers": [sampler], "channels": [channel]}]
+
+
+def _bounds(rows: NDArray[Any]) -> dict[str, list[float]]:
+    return {"min": rows.min(axis=0).tolist(), "max": rows.max(axis=0).tolist()}
 
 
 def _accessor(view: int, array: NDArray[Any]) -> dict[str, Any]:

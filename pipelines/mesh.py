@@ -13,13 +13,13 @@ import torch
 from numpy.typing import NDArray
 
 from ..datasets import read_cloud
-from ..neural_fields import Field, InputError, Similarity, TextureField, load_field, map_attribute, map_colors
+from ..neural_fields import Field, InputError, Similarity, map_attribute
 from ..neural_fields.meshing import Mesh, NoSurfaceError, extract_mesh, map_normals
 from .bake import check_texture_size, textured_mesh
 from .mesh_files import check_mesh_path, write_mesh
 from .mesh_trim import in_region, keep_largest, trim_distance
-from .runs import find_field
-from .texture import texture_of
+from .riding import Colors, colors_at
+from .runs import find_field, load_still
 from .textured_files import check_textured_path
 
 __all__ = ["MeshOptions", "mesh_run", "normals_near"]
@@ -31,6 +31,7 @@ class MeshOptions:
 
     Attributes:
         resolution: cells along each side of the cube around the unit sphere.
+        time: the moment, for a surface that moves.
         level: counted from 0, the coarsest; None is the finest.
         normal_level: the level whose gradients are the normals (neural normal mapping); None is ``level``.
         colors: whether vertices get the colours of the run's texture, if it has one.
@@ -43,6 +44,7 @@ class MeshOptions:
     """
 
     resolution: int = 256
+    time: float | None = None
     level: int | None = None
     normal_level: int | None = None
     colors: bool = True
@@ -73,7 +75,7 @@ def mesh_run(run: str | Path, out: str | Path, options: MeshOptions | None = Non
     if options.texture is not None:
         check_texture_size(options.texture)
     file = find_field(run)
-    field, similarity, metadata = load_field(file)
+    field, similarity, metadata = load_still(file, options.time)
     check(out, similarity)  # again: not every format can hold every place
     level = field.num_levels - 1 if options.level is None else options.level
     normal_level = level if options.normal_level is None else options.normal_level
@@ -98,18 +100,18 @@ def mesh_run(run: str | Path, out: str | Path, options: MeshOptions | None = Non
         mesh = trim_distance(mesh, points, options.trim_distance / similarity.scale)
     if options.keep_largest:
         mesh = keep_largest(mesh)
-    texture = texture_of(file, field) if options.colors else None
+    colors = colors_at(file, field, options.time) if options.colors else None
     if options.texture is not None:
-        _write_textured(out, mesh, field, texture, similarity, options, options.texture)
+        _write_textured(out, mesh, field, colors, similarity, options, options.texture)
         return mesh
-    if texture is not None:
-        mesh = dataclasses.replace(mesh, colors=_colors(texture, mesh.vertices))
+    if colors is not None:
+        mesh = dataclasses.replace(mesh, colors=_evaluated(colors, mesh.vertices))
     write_mesh(out, mesh, similarity)
     return mesh
 
 
-def _colors(texture: TextureField, points: NDArray[np.float64]) -> NDArray[np.float32]:
-    return map_colors(texture, torch.from_numpy(points).float()).values.numpy()
+def _evaluated(colors: Colors, points: NDArray[np.float64]) -> NDArray[np.float32]:
+    return colors(torch.from_numpy(points).float()).numpy()
 
 
 @torch.no_grad()
@@ -138,7 +140,7 @@ def _write_textured(
     out: str | Path,
     mesh: Mesh,
     field: Field,
-    texture: TextureField | None,
+    colors: Colors | None,
     similarity: Similarity,
     options: MeshOptions,
     size: int,
@@ -149,7 +151,7 @@ def _write_textured(
         out,
         mesh,
         similarity,
-        None if texture is None else lambda points: _colors(texture, points),
+        None if colors is None else lambda points: _evaluated(colors, points),
         lambda points: normals_near(field, points, level=level),
         size=size,
         faces=options.texture_faces,

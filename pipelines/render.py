@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -13,7 +13,7 @@ from ..neural_fields import Field, Hits, TextureField, cone_starts, map_colors, 
 from ..neural_fields.tracing import BOUNDING_RADIUS
 from .seen import Seen
 
-__all__ = ["pixel_size", "trace_hits", "trace_view"]
+__all__ = ["pixel_size", "see_hits", "trace_hits", "trace_view"]
 
 # A trace ends within this share of a pixel; the jet's Newton step, which costs nothing, then leaves about its square.
 TOLERANCE = 0.1
@@ -37,6 +37,7 @@ def trace_view(
     level: int = -1,
     normal_level: int | None = None,
     texture: TextureField | None = None,
+    colors: Callable[[Tensor], Tensor] | None = None,
     budget: Sequence[int] | None = None,
     device: torch.device | str = "cpu",
 ) -> Seen:
@@ -52,6 +53,7 @@ def trace_view(
         level: whose surface is seen.
         normal_level: whose gradient is the normal; by default ``level``.
         texture: the colours of the surface, mapped onto whichever level is seen (paper Sec. 3, neural texture mapping).
+        colors: they may also come from any function of points ``(P, 3)``.
         budget: steps on each level, for the paper's fixed mode; by default the adaptive one (see `sphere_trace`).
         device: where to work, and where the result is.
 
@@ -62,6 +64,23 @@ def trace_view(
     normal_level = level if normal_level is None else field.resolve_level(normal_level)
     eye, directions = camera.rays(device=device)
     hits = trace_hits(field, camera, eye, directions, level=level, budget=budget)
+    if texture is not None:
+        colors = lambda points: map_colors(texture, points).values  # noqa: E731  either way it is a function
+    return see_hits(field, camera, hits, directions, level=level, normal_level=normal_level, colors=colors)
+
+
+@torch.inference_mode()
+def see_hits(
+    field: Field,
+    camera: Camera,
+    hits: Hits,
+    directions: Tensor,
+    *,
+    level: int,
+    normal_level: int,
+    colors: Callable[[Tensor], Tensor] | None = None,
+) -> Seen:
+    """What pixels see where their rays ``(H, W, 3)`` were traced already; the rest is as in `trace_view`."""
     pixel = hits.mask.flatten().nonzero()[:, 0]
     depth, direction = hits.depth.flatten()[pixel], directions.reshape(-1, 3)[pixel]
     position = hits.position.reshape(-1, 3)[pixel]
@@ -72,7 +91,7 @@ def trace_view(
         reach = NEWTON_REACH * pixel_size(camera)
         step = torch.where(trusted, -jet.value / slope, 0).clamp(-reach, reach)
         depth, position = depth + step, torch.addcmul(position, step[:, None], direction)
-    color = None if texture is None else map_colors(texture, position).values
+    color = None if colors is None else colors(position)
     return Seen(
         (camera.width, camera.height), pixel, depth, position, normalize(jet.gradient, dim=-1), direction, color
     )

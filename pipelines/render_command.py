@@ -55,6 +55,7 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     add("-o", "--out", required=True, type=Path, metavar="FILE", help=what)
     size = whole(1, 16384)
     add("--size", type=size, nargs="+", metavar="N", help="width, or width and height (640, or that of the images)")
+    add("--time", type=_between(0, 1), metavar="T", help="the moment from 0 to 1, of a run that moves")
     add("--level", type=whole(0), metavar="L", help="0 is the coarsest (default: the finest)")
     add("--normal-level", type=whole(0), metavar="L", help="take the normals of this level (neural normal mapping)")
     add("--levels", action="store_true", help="all levels side by side, and the coarsest with the finest's normals")
@@ -93,6 +94,7 @@ def _render(arguments: argparse.Namespace) -> int:
     chosen = {name: value for name in ORBIT_FLAGS if (value := getattr(arguments, name)) is not None}
     options = RenderOptions(
         size=None if arguments.size is None else tuple(arguments.size),
+        time=arguments.time,
         level=arguments.level,
         normal_level=arguments.normal_level,
         levels=arguments.levels,

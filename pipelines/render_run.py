@@ -48,6 +48,7 @@ class RenderOptions:
     Attributes:
         size: width and height; of posed cameras only the width, the height follows. None is (640, 640), or that of
             the posed images.
+        time: the moment, of a run that moves.
         level: of a field; None is the finest.
         normal_level: whose normals (neural normal mapping); None is ``level``.
         levels: all levels side by side, and the coarsest with the normals of the finest.
@@ -67,6 +68,7 @@ class RenderOptions:
     """
 
     size: tuple[int, ...] | None = None
+    time: float | None = None
     level: int | None = None
     normal_level: int | None = None
     levels: bool = False
@@ -115,6 +117,7 @@ def render_run(
         raise InputError(f"{out}: films know no transparency; write a .png, or give a background")
     scene = open_scene(
         source,
+        time=options.time,
         level=options.level,
         normal_level=options.normal_level,
         levels=options.levels,

@@ -14,16 +14,16 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from ..datasets.cameras import Camera
-from ..neural_fields import Field, InputError, Similarity, load_field
+from ..neural_fields import Field, InputError, Similarity
 from ..neural_fields.meshing import NoSurfaceError, extract_mesh
 from ..neural_fields.tracing import BOUNDING_RADIUS
 from .cloud_distance import CloudDistance
 from .picture import cloud_view, mesh_view
 from .render import trace_view
-from .runs import find_field, is_field
+from .riding import colors_at
+from .runs import find_field, is_field, load_still
 from .seen import Seen
 from .surface import read_surface, sample_surface
-from .texture import texture_of
 
 __all__ = ["Look", "Scene", "open_scene", "reference_distance"]
 
@@ -80,6 +80,7 @@ class Scene:
 def open_scene(
     source: str | Path,
     *,
+    time: float | None = None,
     level: int | None = None,
     normal_level: int | None = None,
     levels: bool = False,
@@ -89,6 +90,7 @@ def open_scene(
 
     Args:
         source: which.
+        time: the moment, of a run that moves.
         level: to draw; by default the finest.
         normal_level: whose normals; by default ``level``.
         levels: whether to draw all levels side by side, and the coarsest with the normals of the finest.
@@ -98,41 +100,44 @@ def open_scene(
         InputError: it cannot be read, or there is no such level.
     """
     if is_field(source):
-        return _field_scene(find_field(source), level, normal_level, levels, device)
+        return _field_scene(find_field(source), time, level, normal_level, levels, device)
     for flag, given in (("--level", level), ("--normal-level", normal_level), ("--levels", levels or None)):
         if given is not None:
             raise InputError(f"{flag}: {source} has no levels; render the run that it was made from")
+    if time is not None:
+        raise InputError(f"--time {time:g}: {source} does not move; leave it out")
     return _surface_scene(Path(source))
 
 
 def _field_scene(
-    file: Path, level: int | None, normal_level: int | None, levels: bool, device: torch.device | str
+    file: Path,
+    time: float | None,
+    level: int | None,
+    normal_level: int | None,
+    levels: bool,
+    device: torch.device | str,
 ) -> Scene:
-    field, similarity, metadata = load_field(file, device=device)
-    if field.in_dim != 3:
-        raise InputError(f"{file}: a field of {field.in_dim} coordinates; pictures are made of fields of 3")
+    field, similarity, metadata = load_still(file, time, device=device)
     finest = field.num_levels - 1
     for flag, given in (("--level", level), ("--normal-level", normal_level)):
         if given is not None and not 0 <= given <= finest:
             raise InputError(f"{flag} {given}: {file} has levels 0 to {finest}")
     level = finest if level is None else level
     normal_level = level if normal_level is None else normal_level
-    texture = texture_of(file, field)
+    colors = colors_at(file, field, time)
     looks = [_look(level, normal_level)]
     if levels:
         looks = [_look(index, index) for index in range(finest + 1)] + ([_look(0, finest)] if finest else [])
 
     def view(camera: Camera, look: Look) -> Seen:
-        return trace_view(
-            field, camera, level=look.level, normal_level=look.normal_level, texture=texture, device=device
-        )
+        return trace_view(field, camera, level=look.level, normal_level=look.normal_level, colors=colors, device=device)
 
     return Scene(
         name=file,
         similarity=similarity,
         looks=tuple(looks),
         field=field,
-        colored=texture is not None,
+        colored=colors is not None,
         oriented=True,
         fitted_to=_fitted_to(metadata),
         outline=lambda: _outline(file, field),

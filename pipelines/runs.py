@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ..neural_fields import InputError
+import torch
+
+from ..neural_fields import InputError, SavedField, load_field
+from ..neural_fields.dynamic_tracing import moment
 from .fit_state import FIELD_FILE, RECORD_FILE, STATE_FILE
 
-__all__ = ["check_new_run", "find_field", "is_field"]
+__all__ = ["check_new_run", "find_field", "is_field", "load_still"]
 
 
 def find_field(path: str | Path) -> Path:
@@ -36,6 +39,31 @@ def find_field(path: str | Path) -> Path:
 def is_field(path: str | Path) -> bool:
     """Whether ``path`` is meant as a run or a checkpoint rather than as a mesh or a cloud."""
     return Path(path).is_dir() or Path(path).suffix.lower() == ".safetensors"
+
+
+def load_still(path: str | Path, time: float | None = None, *, device: torch.device | str = "cpu") -> SavedField:
+    """The field of a run as it is, or that of one moment if it moves.
+
+    Args:
+        path: run directory or .safetensors file.
+        time: the moment, in [0, 1]; None for a field that does not move.
+        device: where to put it.
+
+    Raises:
+        InputError: there is no such run; it moves and no time is given, or the other way round; or the time is not
+            from 0 to 1.
+    """
+    file = find_field(path)
+    saved = load_field(file, device=device)
+    if time is None:
+        if saved.field.in_dim != 3:
+            raise InputError(f"{file}: a surface that moves; say when with --time T, from 0 to 1")
+        return saved
+    if saved.field.in_dim == 3:
+        raise InputError(f"--time {time:g}: {file} does not move; leave it out")
+    if not 0 <= time <= 1:
+        raise InputError(f"--time {time:g}: expected a time from 0 to 1")
+    return saved._replace(field=moment(saved.field, time))
 
 
 def check_new_run(path: str | Path, *, resume: bool, force: bool) -> Path:

@@ -23,6 +23,7 @@ from ..neural_fields import (
     load_texture,
     save_texture,
 )
+from ..neural_fields.dynamic_tracing import moment
 from ..neural_fields.losses import color_loss, tangential_loss
 from .fit import choose_device
 from .fit_state import RECORD_FILE, environment, read_record, write_record
@@ -170,6 +171,8 @@ def texture_run(
     if before is not None:
         config, level = before.config, before.level
     geometry, similarity, _ = load_field(file)
+    if geometry.in_dim == 4:
+        geometry = moment(geometry, 0.0)  # from there, colours ride along
     if level is not None and not 0 <= level < geometry.num_levels:
         raise InputError(f"--level {level}: {file} has levels 0 to {geometry.num_levels - 1}")
     cloud = read_colors(source, samples=config.samples, seed=config.seed)

@@ -16,8 +16,8 @@ import torch
 
 from ..datasets.cameras import UP_AXES
 from ..neural_fields import Field, InputError, Similarity, TextureField, load_field
+from .riding import start_texture
 from .runs import find_field
-from .texture import texture_of
 from .viewer_camera import first_eye
 from .viewer_client import Client, Shown
 from .viewer_draw import Painter
@@ -120,16 +120,16 @@ def open_run(run: str | Path, *, side: int = 512, device: torch.device | str = "
         device: where to evaluate the field.
 
     Raises:
-        InputError: there is no such run, or its field is not three-dimensional.
+        InputError: there is no such run.
     """
     path = find_field(run)
     field, similarity, metadata = load_field(path, device=device)
-    if field.in_dim != 3:
-        raise InputError(f"{path}: a field in {field.in_dim} dimensions; the viewer shows fields in 3")
     source = metadata.get("run", {}).get("cloud")
     cloud = Path(source) if source and Path(source).is_file() else None
     name = Path(run).resolve().stem if Path(run).is_dir() else path.stem
-    return show_field(field, name=name, similarity=similarity, cloud=cloud, texture=texture_of(path, field), side=side)
+    return show_field(
+        field, name=name, similarity=similarity, cloud=cloud, texture=start_texture(path, field), side=side
+    )
 
 
 def show_field(
@@ -141,7 +141,7 @@ def show_field(
     texture: TextureField | None = None,
     side: int = 512,
 ) -> Shown:
-    """What a `Viewer` needs to show any three-dimensional field, such as one in a script."""
+    """What a `Viewer` needs to show any field in three dimensions, or in space and time, such as one in a script."""
     similarity = similarity or Similarity.identity()
     shapes = Shapes(field, similarity, cloud=cloud)
     return Shown(name, field, similarity, shapes, Painter(field, shapes.cloud, texture), side)

@@ -34,7 +34,7 @@ class Shown:
 
     Attributes:
         name: of the run, for the names of saved pictures.
-        field: in unit-sphere coordinates.
+        field: in unit-sphere coordinates, three- or four-dimensional.
         similarity: from input to unit-sphere coordinates.
         shapes: meshes and points beside the traced image.
         painter: draws the traced image.
@@ -74,9 +74,10 @@ class Client:
             levels=shown.field.num_levels,
             shadings=shown.shadings,
             has_cloud=shown.shapes.cloud_file is not None,
+            moves=shown.field.in_dim == 4,
         )
         scale = shown.similarity.scale
-        self._scene = Scene(handle.scene, shown.field, shown.shapes, self._controls, scale=scale, check=self._check)
+        self._scene = Scene(handle.scene, shown.shapes, self._controls, scale=scale, check=self._check)
         self._controls.on_change(self._redraw, self._rearrange)
         self._controls.on_save(self._save_picture, self._save_screenshot)
 
@@ -99,6 +100,7 @@ class Client:
         self._last = frame
         self._send(frame)
         self._say_size()
+        self._controls.play_on()
 
     def fail(self, error: Exception) -> None:
         """Say that an image could not be drawn; called by the scheduler."""
@@ -156,7 +158,7 @@ class Client:
 
     def _read(self, event: Any) -> None:
         reading = probe(
-            self._shown.field,
+            self._shown.shapes.moments.at(self._controls.time),
             self._shown.similarity,
             event.ray_origin,
             event.ray_direction,

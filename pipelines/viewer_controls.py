@@ -13,6 +13,8 @@ TRACED, MESH, BOTH, NOTHING = SURFACES = ("traced", "mesh", "traced and wires", 
 NO_BAND = "none"
 SAME = "same level"
 AXES = ("x", "y", "z")
+# From the start to the end of a motion while it plays; images come as fast as they are drawn.
+TIME_STEP = 1 / 48
 NOTHING_READ = "Click on the surface, or on the slice plane."
 
 
@@ -24,11 +26,16 @@ class Controls:
         levels: number of levels of the field.
         shadings: the names to choose from, the first one first shown.
         has_cloud: whether there is a cloud to be shown.
+        moves: whether the field moves.
     """
 
-    def __init__(self, gui: Any, *, levels: int, shadings: Sequence[str], has_cloud: bool) -> None:
+    def __init__(self, gui: Any, *, levels: int, shadings: Sequence[str], has_cloud: bool, moves: bool = False) -> None:
         self._levels = levels
         names = [str(level) for level in range(levels)]
+        self._moves = moves
+        with gui.add_folder("Time", visible=moves):
+            self._time = gui.add_slider("Time", min=0.0, max=1.0, step=0.001, initial_value=0.0)
+            self._play = gui.add_checkbox("Play", False, hint="while the traced surface is shown")
         with gui.add_folder("Surface"):
             self._surface = gui.add_dropdown("Show", SURFACES, hint="wires and meshes are extracted once per level")
             self._shading = gui.add_dropdown("Shading", tuple(shadings))
@@ -66,9 +73,12 @@ class Controls:
 
     def on_change(self, look: Callable[[], None], scene: Callable[[], None]) -> None:
         """Call ``look`` when the traced image has to be drawn anew, ``scene`` when what stands beside it changes."""
-        for control in (self._surface, self._shading, self._shadows, self._occlusion, self._level, self._normals):
+        looks = (self._surface, self._shading, self._shadows, self._occlusion, self._level, self._normals)
+        for control in (*looks, self._time):
             control.on_update(lambda _event: look())
-        for control in (self._surface, self._level, self._cloud, self._band, self._slice, self._axis, self._position):
+        self._play.on_update(lambda _event: look() if self._play.value else None)
+        scenes = (self._surface, self._level, self._cloud, self._band, self._slice, self._axis, self._position)
+        for control in (*scenes, self._time):
             control.on_update(lambda _event: scene())
 
     def on_save(self, picture: Callable[[], None], screenshot: Callable[[], None]) -> None:
@@ -80,7 +90,18 @@ class Controls:
     def look(self) -> Look:
         """How the field is drawn; normals come from no coarser level than the surface."""
         normals = self.level if self._normals.value == SAME else max(self.level, int(self._normals.value))
-        return Look(self.level, normals, self._shading.value, self._shadows.value, self._occlusion.value)
+        return Look(self.level, normals, self._shading.value, self._shadows.value, self._occlusion.value, self.time)
+
+    @property
+    def time(self) -> float:
+        """When; 0 for a field that does not move."""
+        return float(self._time.value)
+
+    def play_on(self) -> None:
+        """An image is shown: on to the next time if the motion is played, and from the end to the start."""
+        if self._moves and self._play.value:
+            later = self.time + TIME_STEP
+            self._time.value = 0.0 if self.time >= 1 else min(round(later, 3), 1.0)
 
     @property
     def level(self) -> int:

@@ -15,13 +15,15 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from ..datasets.cameras import Camera, look_at
-from ..neural_fields import Field, TextureField
+from ..neural_fields import Field, TextureField, map_colors
 from .matcap import load_matcap
 from .render import trace_view
+from .riding import Colors, RidingColors
 from .seen import Seen
 from .shading import ShadeOptions, compose, measure, shade
 from .viewer_camera import merge_strips, strips, z_buffer
 from .viewer_frames import Look
+from .viewer_time import Moments
 
 __all__ = ["Painter"]
 
@@ -38,15 +40,15 @@ class Painter:
     """Draws a field.
 
     Args:
-        field: what to draw.
+        field: what to draw, three- or four-dimensional.
         reference: loads the cloud ``(N, 3)`` that "error" measures from, when it is first needed.
-        texture: its colours, if it has some.
+        texture: its colours, if it has some; of a field that moves, those at time 0.
     """
 
     def __init__(
         self, field: Field, reference: Callable[[], NDArray[np.float32]], texture: TextureField | None = None
     ) -> None:
-        self._field, self._load_reference, self._texture = field, reference, texture
+        self._moments, self._load_reference, self._texture = Moments(field), reference, texture
 
     @property
     def colored(self) -> bool:
@@ -71,31 +73,44 @@ class Painter:
 
     @torch.inference_mode()
     def _paint(self, camera: Camera, look: Look, check: Callable[[], None]) -> tuple[Seen, Tensor]:
-        parts, device = [], self._field.deltas.device
+        parts, field, colors = [], self._moments.at(look.time), self._colors(look)
         for first, strip in strips(camera, _Pace(check).next_block):
             seen = trace_view(
-                self._field,
+                field,
                 strip,
                 level=look.level,
                 normal_level=look.normal_level,
-                texture=self._texture,
-                device=device,
+                colors=colors,
+                device=field.deltas.device,
             )
             parts.append((first, seen))
         seen = merge_strips((camera.width, camera.height), parts)
         if look.shading in MEASURED:
             numbers = [
-                measure(part, look.shading, field=self._field, level=look.normal_level, reference=self._reference(look))
+                measure(part, look.shading, field=field, level=look.normal_level, reference=self._reference(look))
                 for part in _pieces(seen, _Pace(check).next_block)
             ]
             return seen, shade(seen, look.shading, camera=camera, values=torch.cat(numbers))
         # Shadows and occlusion look further than a band is wide, and a coarse level answers that as well and sooner.
         options = ShadeOptions(shadows=look.shadows, occlusion=look.occlusion, light_level=0)
         colors = [
-            shade(part, look.shading, camera=camera, field=self._field, options=options, matcap=self._matcap)
+            shade(part, look.shading, camera=camera, field=field, options=options, matcap=self._matcap)
             for part in _pieces(seen, _Pace(check).next_block)
         ]
         return seen, torch.cat(colors)
+
+    def _colors(self, look: Look) -> Colors | None:
+        texture = self._texture
+        if texture is None:
+            return None
+        if self._moments.moves:
+            return self._riding.at(look.time)
+        return lambda points: map_colors(texture, points).values
+
+    @cached_property
+    def _riding(self) -> RidingColors:
+        assert self._texture is not None
+        return RidingColors(self._moments.field, self._texture)
 
     def _reference(self, look: Look) -> KDTree | None:
         return self._tree if look.shading == "error" else None

@@ -6,7 +6,7 @@ import threading
 import time
 import traceback
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
@@ -37,6 +37,7 @@ class Look:
         shading: one of ``SHADINGS``.
         shadows: whether lambert's lamp throws shadows.
         occlusion: whether lambert darkens hollows.
+        time: when, for a field that moves; it costs the same at all times.
     """
 
     level: int
@@ -44,6 +45,7 @@ class Look:
     shading: str
     shadows: bool = False
     occlusion: bool = False
+    time: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -119,7 +121,7 @@ class _Job:
         return not self.first, -self.halvings, self.order
 
     def __post_init__(self) -> None:
-        self.key = (self.view.look, self.view.camera.width, self.view.camera.height)
+        self.key = (replace(self.view.look, time=0.0), self.view.camera.width, self.view.camera.height)
 
 
 class FrameScheduler:

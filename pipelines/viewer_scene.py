@@ -8,7 +8,6 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from ..neural_fields import Field
 from .viewer_controls import Controls
 from .viewer_probe import Reading
 from .viewer_shapes import Shapes, slice_image
@@ -36,17 +35,16 @@ class Scene:
 
     Args:
         scene: viser's interface to the scene of one browser.
-        field: what is shown.
-        shapes: makes the meshes.
+        shapes: knows the field, and makes the meshes.
         controls: say what is wanted.
         scale: input units per unit of the field.
         check: raises `Superseded` when the browser has left.
     """
 
     def __init__(
-        self, scene: Any, field: Field, shapes: Shapes, controls: Controls, *, scale: float, check: Callable[[], None]
+        self, scene: Any, shapes: Shapes, controls: Controls, *, scale: float, check: Callable[[], None]
     ) -> None:
-        self._scene, self._field, self._shapes, self._controls = scene, field, shapes, controls
+        self._scene, self._shapes, self._controls = scene, shapes, controls
         self._scale, self._check = scale, check
         self._nodes: dict[str, list[Any]] = {}
         self._wanted: dict[str, object] = {}
@@ -70,11 +68,16 @@ class Scene:
             InputError: the input cloud cannot be read.
         """
         with self._lock:
-            plane = self._controls.slice
-            self._want("slice", plane and (*plane, self._controls.level), self._add_slice)
+            plane, mesh, band, time = (
+                self._controls.slice,
+                self._controls.mesh,
+                self._controls.band,
+                self._controls.time,
+            )
+            self._want("slice", plane and (*plane, self._controls.level, time), self._add_slice)
             self._want("cloud", self._controls.cloud or None, self._add_cloud)
-            self._want("mesh", self._controls.mesh, self._add_mesh, busy)
-            self._want("shells", self._controls.band, self._add_shells, busy)
+            self._want("mesh", mesh and (*mesh, time), self._add_mesh, busy)
+            self._want("shells", None if band is None else (band, time), self._add_shells, busy)
 
     def mark(self, reading: Reading | None) -> None:
         """Mark the point that was read, with its normal."""
@@ -94,9 +97,9 @@ class Scene:
             self._nodes[name] = add(wanted)
         self._wanted[name] = wanted
 
-    def _add_mesh(self, wanted: tuple[int, bool]) -> list[Any]:
-        level, wires = wanted
-        mesh = self._shapes.surface(level)
+    def _add_mesh(self, wanted: tuple[int, bool, float]) -> list[Any]:
+        level, wires, time = wanted
+        mesh = self._shapes.surface(level, time=time)
         self._check()
         if mesh is None:
             return []
@@ -112,8 +115,9 @@ class Scene:
         look: dict[str, Any] = {"point_size": size, "point_shape": "circle", "precision": "float32"}
         return [self._scene.add_point_cloud("/cloud", points, CLOUD_COLOR, **look)]
 
-    def _add_shells(self, band: int) -> list[Any]:
-        shells = self._shapes.shells(band)
+    def _add_shells(self, wanted: tuple[int, float]) -> list[Any]:
+        band, time = wanted
+        shells = self._shapes.shells(band, time=time)
         self._check()
         look: dict[str, Any] = {"opacity": SHELL_OPACITY, "side": "double", "cast_shadow": False}
         return [
@@ -122,9 +126,9 @@ class Scene:
             if mesh is not None
         ]
 
-    def _add_slice(self, wanted: tuple[int, float, int]) -> list[Any]:
-        axis, position, level = wanted
-        image, pose = slice_image(self._field, axis, position, level=level, scale=self._scale)
+    def _add_slice(self, wanted: tuple[int, float, int, float]) -> list[Any]:
+        axis, position, level, time = wanted
+        image, pose = slice_image(self._shapes.moments.at(time), axis, position, level=level, scale=self._scale)
         self._check()
         look: dict[str, Any] = {"format": "png", "cast_shadow": False, "receive_shadow": False}
         return [self._scene.add_image("/slice", image, *pose.size, wxyz=pose.wxyz, position=pose.center, **look)]

@@ -18,6 +18,7 @@ from ..neural_fields import Field, InputError, Jet, Similarity
 from ..neural_fields.meshing import Mesh, NoSurfaceError, extract_mesh
 from .slice import draw_slice, plane_axes, round_step, take_slice
 from .viewer_frames import Superseded
+from .viewer_time import KEPT, Moments
 
 __all__ = ["OffsetField", "Placement", "Shapes", "slice_image"]
 
@@ -56,27 +57,28 @@ class Shapes:
     Each is made once, in the thread that asks first; whoever asks meanwhile waits for it.
 
     Args:
-        field: the field.
+        field: the field, three- or four-dimensional.
         similarity: from input to unit-sphere coordinates.
         cloud: the file that the field was fitted to, if it is known and still there.
     """
 
     def __init__(self, field: Field, similarity: Similarity, *, cloud: Path | None = None) -> None:
-        self._field, self._similarity = field, similarity
+        self.moments, self._similarity = Moments(field), similarity
         self._closed = threading.Event()
         self.cloud_file = cloud
-        self._meshes: dict[tuple[int, float], Mesh | None] = {}
+        self._meshes: dict[tuple[float, int, float], Mesh | None] = {}
         self._points: NDArray[np.float32] | None = None
         self._lock = threading.Lock()
 
-    def surface(self, level: int) -> Mesh | None:
+    def surface(self, level: int, *, time: float = 0.0) -> Mesh | None:
         """The zero set of a level; None where it has none."""
-        return self._mesh(level, 0.0, MESH_RESOLUTION)
+        return self._mesh(time, level, 0.0, MESH_RESOLUTION)
 
-    def shells(self, level: int) -> tuple[Mesh | None, Mesh | None]:
+    def shells(self, level: int, *, time: float = 0.0) -> tuple[Mesh | None, Mesh | None]:
         """The surfaces f_i = −δ_i and f_i = δ_i of a level but the last; where all is thin there is no inner one."""
-        delta = float(self._field.deltas[level])
-        return self._mesh(level, -delta, SHELL_RESOLUTION), self._mesh(level, delta, SHELL_RESOLUTION)
+        delta = float(self.moments.field.deltas[level])
+        inner, outer = (self._mesh(time, level, offset, SHELL_RESOLUTION) for offset in (-delta, delta))
+        return inner, outer
 
     def cloud(self) -> NDArray[np.float32]:
         """Points of the input ``(N, 3)``, at most `MOST_POINTS` of them, evenly taken.
@@ -102,14 +104,17 @@ class Shapes:
         if self._closed.is_set():
             raise Superseded
 
-    def _mesh(self, level: int, offset: float, resolution: int) -> Mesh | None:
+    def _mesh(self, time: float, level: int, offset: float, resolution: int) -> Mesh | None:
         with self._lock:
-            key = (level, offset)
+            key = (time if self.moments.moves else 0.0, level, offset)
             if key not in self._meshes:
+                field = self.moments.at(time)
+                while self.moments.moves and len(self._meshes) >= KEPT:
+                    del self._meshes[next(iter(self._meshes))]  # the oldest
                 reach = 1.02 + abs(offset)
                 try:
                     self._meshes[key] = extract_mesh(
-                        OffsetField(self._field, level=level, offset=offset) if offset else self._field,
+                        OffsetField(field, level=level, offset=offset) if offset else field,
                         resolution=resolution,
                         level=0 if offset else level,
                         bounds=((-reach, -reach, -reach), (reach, reach, reach)),

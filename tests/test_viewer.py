@@ -7,12 +7,24 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 from mplicits.datasets.cameras import look_at
-from mplicits.neural_fields import InputError, MultiscaleSDF, Similarity, Siren, Sphere, save_field
+from mplicits.neural_fields import (
+    InputError,
+    Moving,
+    MultiscaleSDF,
+    RigidMotion,
+    Similarity,
+    Siren,
+    SpaceTimeSDF,
+    Sphere,
+    TimeSlice,
+    save_field,
+)
 from mplicits.neural_fields.analytic import Plane
 from mplicits.pipelines.render import trace_view
 from mplicits.pipelines.viewer import free_port, open_run, show_field
@@ -21,6 +33,7 @@ from mplicits.pipelines.viewer_draw import Painter
 from mplicits.pipelines.viewer_frames import FrameScheduler, Look, View, halvings_in_time
 from mplicits.pipelines.viewer_probe import describe_reading, probe
 from mplicits.pipelines.viewer_shapes import OffsetField, Shapes, slice_image
+from mplicits.pipelines.viewer_time import Moments
 from scipy.spatial.transform import Rotation
 
 LOOK = Look(level=0, normal_level=0, shading="normals")
@@ -359,10 +372,30 @@ def test_a_missing_viser_is_an_error_with_its_cure(monkeypatch):
         Viewer(show_field(Sphere()))
 
 
-def test_only_fields_in_three_dimensions_are_shown(tmp_path):
-    save_field(tmp_path / "moving.safetensors", Siren(8, 1, in_dim=4))
-    with pytest.raises(InputError, match=r"moving\.safetensors: a field in 4 dimensions"):
-        open_run(tmp_path / "moving.safetensors")
+def test_a_field_that_moves_is_shown_as_it_is_at_each_time(tmp_path):
+    field = Moving(Sphere(radius=0.4), RigidMotion(velocity=(0.0, 0.0, 0.5)))
+    shown = show_field(field)
+    shown.painter.warm_up()
+    for t in (0.0, 0.5, 1.0):
+        z = shown.painter(some_camera(), replace(LOOK, time=t), lambda: None)[1]
+        expected = z_buffer(trace_view(TimeSlice(field, t), some_camera()), some_camera())
+        np.testing.assert_array_equal(z, expected)
+        mesh = shown.shapes.surface(0, time=t)
+        assert mesh is not None
+        np.testing.assert_allclose(mesh.vertices.mean(axis=0), (0.0, 0.0, 0.5 * t), atol=0.01)
+    save_field(tmp_path / "moving.safetensors", SpaceTimeSDF.from_widths([(8, 1)], omegas=[5]))
+    assert open_run(tmp_path / "moving.safetensors").shapes.moments.moves
+
+
+def test_few_moments_are_kept():
+    moments = Moments(Moving(Sphere(), RigidMotion()))
+    first = moments.at(0.0)
+    assert moments.at(0.0) is first
+    for k in range(1, 100):
+        moments.at(k / 100)
+    assert moments.at(0.0) is not first
+    still = Sphere()
+    assert Moments(still).at(0.7) is still
 
 
 def test_ctrl_c_ends_the_command_cleanly(tmp_path):

@@ -1,0 +1,182 @@
+"""Frames per second of the dynamic tracer, against tracing every frame from scratch and against meshing it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from ..datasets.cameras import Camera, orbit
+from ..neural_fields import Field, Hits, SpaceTimeSDF, extract_mesh, sphere_trace
+from ..neural_fields.dynamic_tracing import DynamicTracer, moment
+from .counting import counted
+from .render import RESOLUTION, TOLERANCE, pixel_size, trace_hits
+from .timing import format_table
+
+__all__ = ["DynamicRow", "dynamic_table", "format_dynamic"]
+
+FIRST = 2  # frames that the dynamic tracer needs to know a motion; they are left out of all figures
+FRAMES_OF_MOTION = 96  # from t = 0 to t = 1: four seconds of a film
+START = 0.25
+OUTLINE_RESOLUTION = 64
+
+# From a time to the hits, if that is what is made.
+Draw = Callable[[float], Hits | None]
+
+
+@dataclass(frozen=True)
+class DynamicRow:
+    """One way to see every frame; means over the frames but the first two.
+
+    Attributes:
+        way: its name.
+        seconds: per frame.
+        speedup: of the dynamic tracer over it.
+        evaluations: points per frame, of each level.
+        differing: pixels per frame whose hit is not that of tracing from scratch; None for meshes.
+        deviation: the 99.9 % quantile of how far depths are from those, in pixels; None for meshes.
+    """
+
+    way: str
+    seconds: float
+    speedup: float
+    evaluations: tuple[float, ...]
+    differing: float | None
+    deviation: float | None
+
+    @property
+    def fps(self) -> float:
+        """Frames per second."""
+        return 1 / self.seconds
+
+    def as_dict(self) -> dict[str, Any]:
+        """All figures, for JSON."""
+        return asdict(self) | {"fps": self.fps}
+
+
+def dynamic_table(
+    field: Field, *, frames: int = 12, size: int = 512, cells: int = 256, meshes: int = 2, level: int = -1
+) -> list[DynamicRow]:
+    """Trace a part of a motion in three ways, and mesh some of its frames.
+
+    Hits alone are compared; normals and shading cost all ways the same, and a mesh would still have to be drawn. Frames
+    are 1/96 apart, from t = 0.25 on.
+
+    Args:
+        field: four-dimensional.
+        frames: of the film, at least 3.
+        size: pictures have so many pixels squared.
+        cells: of the meshes, along each side.
+        meshes: frames that are meshed, at least 1.
+        level: whose surface.
+
+    Raises:
+        ValueError: too few frames or meshes.
+    """
+    if frames <= FIRST or meshes < 1:
+        raise ValueError(f"frames={frames}, meshes={meshes}: expected at least {FIRST + 1} and 1")
+    level = field.resolve_level(level)
+    times = [START + index / FRAMES_OF_MOTION for index in range(frames)]
+    camera = _camera(field, times, size)
+    eye, directions = camera.rays(device=field.deltas.device)
+    tolerance, resolution = TOLERANCE * pixel_size(camera), RESOLUTION * pixel_size(camera)
+
+    def dynamic(field: Field) -> Draw:
+        return DynamicTracer(field, eye, directions, level=level, tolerance=tolerance, resolution=resolution).trace
+
+    def tiles(field: Field) -> Draw:
+        return lambda t: trace_hits(moment(field, t), camera, eye, directions, level=level)
+
+    def scratch(field: Field) -> Draw:
+        return lambda t: sphere_trace(
+            moment(field, t), eye, directions, level=level, tolerance=tolerance, resolution=resolution
+        )
+
+    def meshing(field: Field) -> Draw:
+        def draw(t: float) -> None:
+            extract_mesh(moment(field, t), resolution=cells, level=level, normals=False)
+
+        return draw
+
+    ways = {
+        "dynamic tracer": (dynamic, times),
+        "from scratch, tiles first": (tiles, times),
+        "from scratch": (scratch, times),
+        f"marching cubes at {cells}³": (meshing, times[: FIRST + meshes]),
+    }
+    figures = {name: _run(way, field, moments) for name, (way, moments) in ways.items()}
+    fastest, reference = figures["dynamic tracer"][0], figures["from scratch"][2]
+    rows = []
+    for name, (seconds, evaluations, seen) in figures.items():
+        differing, deviation = _compare(seen, reference, pixel_size(camera))
+        rows.append(DynamicRow(name, seconds, seconds / fastest, evaluations, differing, deviation))
+    return rows
+
+
+def format_dynamic(rows: Sequence[DynamicRow]) -> str:
+    """The table that ``mplicits bench evolve`` prints."""
+    header = (
+        "every frame",
+        "s",
+        "frames / s",
+        "dynamic is faster",
+        "evaluations / 1000",
+        "hits differ",
+        "depth, px",
+    )
+    cells = [
+        (
+            row.way,
+            f"{row.seconds:.3f}",
+            f"{row.fps:.2f}",
+            f"{row.speedup:.1f}×",
+            " ".join(f"{count / 1000:,.0f}" for count in row.evaluations),
+            "" if row.differing is None else f"{row.differing:.1f}",
+            "" if row.deviation is None else f"{row.deviation:.2f}",
+        )
+        for row in rows
+    ]
+    return format_table(header, cells)
+
+
+def _camera(field: Field, times: Sequence[float], size: int) -> Camera:
+    ends = (times[0], times[-1])
+    points = [extract_mesh(moment(field, t), resolution=OUTLINE_RESOLUTION, normals=False).vertices for t in ends]
+    return orbit(np.concatenate(points), width=size, height=size)
+
+
+def _run(
+    way: Callable[[Field], Draw], field: Field, times: Sequence[float]
+) -> tuple[float, tuple[float, ...], list[Hits]]:
+    """Seconds and evaluations per frame, and the hits, if that is what it gives."""
+    draw = way(field)
+    for t in times[:FIRST]:
+        draw(t)
+    started = time.perf_counter()
+    seen = [hits for t in times[FIRST:] if (hits := draw(t)) is not None]
+    seconds = (time.perf_counter() - started) / len(times[FIRST:])
+    # Once more with counters, which the clock shall not see.
+    whole, levels = counted(field.sdf if isinstance(field, SpaceTimeSDF) else field)
+    draw = way(whole)
+    for t in times[:FIRST]:
+        draw(t)
+    for counter in levels:
+        counter.values = counter.jets = 0
+    for t in times[FIRST:]:
+        draw(t)
+    return seconds, tuple((counter.values + counter.jets) / len(times[FIRST:]) for counter in levels), seen
+
+
+def _compare(seen: Sequence[Hits], reference: Sequence[Hits], pixel: float) -> tuple[float | None, float | None]:
+    if not seen:
+        return None, None
+    apart, differing = [], 0
+    for found, fresh in zip(seen, reference, strict=True):
+        differing += int((found.mask != fresh.mask).sum())
+        apart.append((found.depth - fresh.depth)[found.mask & fresh.mask].abs())
+    # torch.quantile takes no more than 2²⁴ numbers.
+    together = np.concatenate([part.cpu().numpy() for part in apart])
+    return differing / len(seen), float(np.quantile(together, 0.999)) / pixel

@@ -1,0 +1,276 @@
+"""A surface that moves, written down: a film, a folder of meshes, or one mesh that moves."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ..datasets import srgb_to_linear
+from ..datasets.cameras import Camera
+from ..neural_fields import Field, InputError, Similarity, TextureField, load_field
+from ..neural_fields.dynamic_tracing import DynamicTracer, moment
+from ..neural_fields.meshing import NoSurfaceError, extract_mesh
+from ..neural_fields.tracing import BOUNDING_RADIUS
+from .animation import ANIMATIONS, write_animation
+from .fit import choose_device
+from .glb import Motion, write_glb
+from .mesh_files import glb_origin, write_mesh
+from .render import RESOLUTION, TOLERANCE, pixel_size, see_hits
+from .render_cameras import Orbit, orbit_cameras
+from .riding import RidingColors, borrowed_texture, start_texture
+from .runs import find_field
+from .shading import ShadeOptions, compose, downsample, shade
+from .tracked_mesh import follow_mesh
+
+__all__ = ["SequenceOptions", "animate_run", "check_sequence_path", "film_frames"]
+
+Image = NDArray[np.uint8]
+Tell = Callable[[int, int], None]
+
+STRIP = 1 << 19  # rays that are worked on at a time: about a third of a gigabyte
+OUTLINE_RESOLUTION = 48
+OUTLINES = 9  # of the times from which the camera takes what it has to have in view
+WHITE = (1.0, 1.0, 1.0)
+
+
+@dataclass(frozen=True)
+class SequenceOptions:
+    """What is written, and how.
+
+    Attributes:
+        frames: times from 0 to 1, both among them.
+        fps: frames per second.
+        size: width and height of a film.
+        level: counted from 0; None is the finest.
+        resolution: of meshes, in cells along the cube.
+        colors: a run that does not move, in the same coordinates, whose texture is the surface's at time 0; None is the
+            run's own, if it has one.
+        no_colors: leave colours out.
+        orbit: where the camera of a film stands.
+        shading: of a film.
+        shadows: whether lambert has shadows and occlusion.
+        samples: rays per pixel and direction.
+        device: where to evaluate the field, "auto" is CUDA where there is one.
+    """
+
+    frames: int = 48
+    fps: float = 24.0
+    size: tuple[int, int] = (640, 640)
+    level: int | None = None
+    resolution: int = 128
+    colors: str | Path | None = None
+    no_colors: bool = False
+    orbit: Orbit = dataclasses.field(default_factory=Orbit)
+    shading: str = "lambert"
+    shadows: bool = False
+    samples: int = 2
+    device: str = "auto"
+
+    @property
+    def times(self) -> list[float]:
+        """When the frames are."""
+        return np.linspace(0, 1, self.frames).tolist()
+
+
+def check_sequence_path(path: str | Path) -> Path:
+    """Whether a sequence can be written to ``path``, to be asked before any long work.
+
+    Raises:
+        InputError: it is a file of another kind, its folder does not exist, or it is a folder that is not empty.
+    """
+    path = Path(path)
+    if path.suffix and path.suffix.lower() not in (*ANIMATIONS, ".glb"):
+        raise InputError(f"{path}: write a film ({', '.join(ANIMATIONS)}), a .glb, or a folder of meshes")
+    if not path.absolute().parent.is_dir():
+        raise InputError(f"{path}: the folder {path.absolute().parent} does not exist; make it first")
+    if path.suffix and path.is_dir():
+        raise InputError(f"{path}: is a folder; give the name of a file in it")
+    if not path.suffix and path.exists() and (not path.is_dir() or any(path.iterdir())):
+        raise InputError(f"{path}: exists already; choose another folder, so that frames of two runs are not mixed")
+    return path
+
+
+def animate_run(
+    run: str | Path, out: str | Path, options: SequenceOptions | None = None, *, progress: Tell | None = None
+) -> str:
+    """Write the surface of a run over time.
+
+    Args:
+        run: run directory or .safetensors file, of a field of space-time.
+        out: an .mp4 or .gif film, traced; a .glb of one mesh that moves; or a folder, for a .ply per frame.
+        options: what, and how.
+        progress: called with how many frames are done, and of how many.
+
+    Returns:
+        What was written, in a few words.
+
+    Raises:
+        InputError: there is no such run, it does not move or has no such level or no surface; it cannot be one mesh; or
+            ``out`` cannot be written.
+    """
+    options, out = options or SequenceOptions(), check_sequence_path(out)
+    file = find_field(run)
+    field, similarity, _ = load_field(file, device=choose_device(options.device))
+    if field.in_dim != 4:
+        raise InputError(f"{file}: does not move; use `mplicits render` or `mplicits mesh`")
+    level = field.num_levels - 1 if options.level is None else options.level
+    if not 0 <= level < field.num_levels:
+        raise InputError(f"--level {level}: {file} has levels 0 to {field.num_levels - 1}")
+    texture = _texture(file, field, similarity, options)
+    if options.shading == "color" and texture is None:
+        raise InputError(f"--shading color: {file} has no texture; name a textured run with --colors RUN")
+    if out.suffix.lower() in ANIMATIONS:
+        write_animation(out, film_frames(file, field, texture, level, options, progress), fps=options.fps)
+        return f"{options.frames} frames of {options.size[0]}×{options.size[1]}"
+    if out.suffix:
+        return _write_moving_mesh(out, file, field, texture, similarity, level, options, progress)
+    return _write_series(out, file, field, texture, similarity, level, options, progress)
+
+
+def _texture(file: Path, field: Field, similarity: Similarity, options: SequenceOptions) -> TextureField | None:
+    if options.no_colors:
+        return None
+    if options.colors is None:
+        return start_texture(file, field)
+    return borrowed_texture(options.colors, similarity).to(field.deltas.device)
+
+
+def film_frames(
+    file: Path,
+    field: Field,
+    texture: TextureField | None,
+    level: int,
+    options: SequenceOptions,
+    progress: Tell | None = None,
+) -> Iterator[Image]:
+    """The pictures of a film, each traced with what the one before it knew."""
+    camera = orbit_cameras(_outline(file, field, options), options.orbit, size=options.size, frames=1)[0]
+    samples, device = options.samples, field.deltas.device
+    rows = max(1, STRIP // samples**2 // camera.width)
+    strips = []
+    for first in range(0, camera.height, rows):
+        height = min(rows, camera.height - first)
+        strip = camera.strip(first, height).resized(camera.width * samples, height * samples)
+        strips.append((strip, _tracer(field, strip, level)))
+    riding = None if texture is None else RidingColors(field, texture, level=level)
+    lit = ShadeOptions(shadows=options.shadows, occlusion=options.shadows)
+    for index, time in enumerate(options.times, start=1):
+        still = moment(field, time)
+        colors = None if riding is None else riding.at(time)
+        parts = []
+        for strip, tracer in strips:
+            directions = strip.rays(device=device)[1]
+            hits = tracer.trace(time)
+            seen = see_hits(still, strip, hits, directions, level=level, normal_level=level, colors=colors)
+            rgb = seen.position
+            if len(seen.pixel):
+                rgb = shade(seen, options.shading, camera=strip, field=still, level=level, options=lit)
+            parts.append(downsample(compose(seen, rgb, background=WHITE), samples))
+        if progress is not None:
+            progress(index, options.frames)
+        yield np.concatenate(parts)
+
+
+def _tracer(field: Field, camera: Camera, level: int) -> DynamicTracer:
+    eye, directions = camera.rays(device=field.deltas.device)
+    size = pixel_size(camera)
+    return DynamicTracer(field, eye, directions, level=level, tolerance=TOLERANCE * size, resolution=RESOLUTION * size)
+
+
+def _outline(file: Path, field: Field, options: SequenceOptions) -> NDArray[np.float64]:
+    """Points that the camera has to have in view at all times."""
+    seen = []
+    for time in np.linspace(0, 1, min(OUTLINES, options.frames)).tolist():
+        try:
+            seen.append(extract_mesh(moment(field, time), resolution=OUTLINE_RESOLUTION, normals=False).vertices)
+        except NoSurfaceError:
+            continue  # a surface may come and go
+    if not seen:
+        raise InputError(f"{file}: no surface at any time")
+    points = np.concatenate(seen)
+    inside = np.linalg.norm(points, axis=1) <= BOUNDING_RADIUS
+    return points[inside] if inside.any() else points
+
+
+def _write_series(
+    folder: Path,
+    file: Path,
+    field: Field,
+    texture: TextureField | None,
+    similarity: Similarity,
+    level: int,
+    options: SequenceOptions,
+    progress: Tell | None,
+) -> str:
+    """frame_0000.ply and so on; a frame without a surface has no file."""
+    folder.mkdir(exist_ok=True)
+    digits = max(4, len(str(options.frames - 1)))
+    riding = None if texture is None else RidingColors(field, texture, level=level)
+    written = 0
+    for index, time in enumerate(options.times):
+        try:
+            mesh = extract_mesh(moment(field, time), resolution=options.resolution, level=level)
+        except NoSurfaceError:
+            continue
+        if riding is not None:
+            points = torch.from_numpy(mesh.vertices).to(field.deltas)
+            mesh = dataclasses.replace(mesh, colors=riding.at(time)(points).cpu().numpy())
+        write_mesh(folder / f"frame_{index:0{digits}d}.ply", mesh, similarity)
+        written += 1
+        if progress is not None:
+            progress(index + 1, options.frames)
+    if not written:
+        folder.rmdir()
+        raise InputError(f"{file}: no surface at any time")
+    missing = options.frames - written
+    return f"{written} meshes" + (f"; {missing} frames have no surface" if missing else "")
+
+
+def _write_moving_mesh(
+    out: Path,
+    file: Path,
+    field: Field,
+    texture: TextureField | None,
+    similarity: Similarity,
+    level: int,
+    options: SequenceOptions,
+    progress: Tell | None,
+) -> str:
+    if options.frames < 2:
+        raise InputError(f"--frames {options.frames}: a mesh moves in 2 frames or more")
+    tracked = follow_mesh(
+        field, options.times, resolution=options.resolution, level=level, name=str(file), progress=progress
+    )
+    origin = glb_origin(similarity)
+    places = [(similarity.to_input(vertices) - origin).astype("<f4") for vertices in tracked.vertices]
+    attributes = {"POSITION": places[0], "NORMAL": tracked.normals[0].astype("<f4")}
+    targets = [
+        {"POSITION": place - places[0], "NORMAL": (normals - tracked.normals[0]).astype("<f4")}
+        for place, normals in zip(places[1:], tracked.normals[1:], strict=True)
+    ]
+    if texture is not None:
+        points = torch.from_numpy(tracked.vertices[0]).to(field.deltas)
+        colors = RidingColors(field, texture, level=level).at(0.0)(points).cpu().numpy()
+        opaque = np.full((len(colors), 4), 65535, "<u2")  # linear by the standard; 8 bits would merge dark shades
+        opaque[:, :3] = np.rint(srgb_to_linear(np.clip(colors, 0, 1)) * 65535)
+        attributes["COLOR_0"] = opaque
+    motion = Motion(np.arange(options.frames) / options.fps, targets)
+    material = {"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.8}}
+    partial = out.with_name(f".{out.name}.{os.getpid()}.partial")
+    try:
+        write_glb(partial, tracked.faces, attributes, material=material, origin=origin, motion=motion)
+        partial.replace(out)
+    except OSError as error:
+        raise InputError(f"{out}: cannot be written ({error.strerror}); choose another place") from error
+    finally:
+        partial.unlink(missing_ok=True)
+    size = math.ceil(out.stat().st_size / 1e6)
+    return f"{len(places[0]):,} vertices in {options.frames} frames, {size} MB"

@@ -1,0 +1,144 @@
+"""One mesh that follows a surface through time: its vertices move, its triangles stay."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ..neural_fields import Field, InputError, IntegrationError, Solver, flow, project_to_surface
+from ..neural_fields.carried import CarriedVelocity
+from ..neural_fields.dynamic_tracing import moment
+from ..neural_fields.meshing import NoSurfaceError, extract_mesh
+from .surface import components, from_mesh, merged
+
+__all__ = ["TrackedMesh", "follow_mesh"]
+
+# Vertices further from the surface than this, in cells of the mesh, have lost it.
+LOST = 0.5
+# So many cells on a side show how many pieces and holes a surface has; smaller ones than theirs do not count.
+TOPOLOGY_RESOLUTION = 64
+# Triangles that look inward: more of them than this, as a share of the area, and the mesh is folded.
+FOLDED = 0.02
+# A fixed step: near a change of topology adaptive ones would shrink to nothing before we can say when that was.
+FOLLOW = Solver(method="rk4", step=0.02)
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedMesh:
+    """A mesh, and where its vertices are at some times.
+
+    Attributes:
+        faces: ``(F, 3)`` int32, the same at all times.
+        times: ``(T,)``.
+        vertices: ``(T, V, 3)``.
+        normals: ``(T, V, 3)``, of unit length.
+    """
+
+    faces: NDArray[np.int32]
+    times: tuple[float, ...]
+    vertices: NDArray[np.float32]
+    normals: NDArray[np.float32]
+
+
+@torch.no_grad()
+def follow_mesh(
+    field: Field,
+    times: Sequence[float],
+    *,
+    resolution: int = 96,
+    level: int = -1,
+    name: str = "the run",
+    progress: Callable[[int, int], None] | None = None,
+) -> TrackedMesh:
+    """Mesh a surface at the first time and follow its vertices (see `CarriedVelocity`) to the others.
+
+    That is possible as long as the surface neither tears nor joins nor closes a hole, and every time is checked: the
+    pieces and the Euler number of the slice are those of the start, the vertices have not lost the surface, and the
+    mesh has not folded over.
+
+    Args:
+        field: four-dimensional.
+        times: increasing.
+        resolution: of the mesh, in cells along the cube.
+        level: whose surface.
+        name: of the run, for messages.
+        progress: called with how many times are done, and of how many.
+
+    Raises:
+        InputError: there is no surface at the start, or it cannot be followed; says to which time.
+    """
+    start = moment(field, times[0])
+    try:
+        mesh = extract_mesh(start, resolution=resolution, level=level)
+    except NoSurfaceError as error:
+        raise InputError(f"{name}: no surface at time {times[0]:.3g} ({error})") from error
+    shape = _topology(start, level)
+    # The mesher's vertices are on the edges of its lattice, and as near to the surface as one step along them brings.
+    points = project_to_surface(start, torch.from_numpy(mesh.vertices).to(field.deltas), level=level)[0]
+    cell = 2.0 / resolution
+    faces = torch.from_numpy(mesh.faces).long().to(points.device)
+    velocity = CarriedVelocity(field, level=level)
+    path, normals = [points], [_normals(start, points, level)]
+    for index in range(1, len(times)):
+        before, time = times[index - 1], times[index]
+        still = moment(field, time)
+        now = _topology(still, level)
+        if now != shape:
+            raise _lost(name, time, f"it has {_words(now)}, after {_words(shape)}")
+        try:
+            moved = flow(velocity, path[-1], before, time, solver=FOLLOW)
+        except IntegrationError as error:
+            raise _lost(name, time, str(error)) from error
+        points, arrived = project_to_surface(still, moved, level=level)
+        away = float((points - moved).norm(dim=-1).max())
+        if not away <= LOST * cell or not bool(arrived.all()):
+            raise _lost(name, time, f"a vertex is {away:.2g} from it")
+        path.append(points)
+        normals.append(_normals(still, path[-1], level))
+        share = _folded(path[-1], normals[-1], faces)
+        if share > FOLDED:
+            raise _lost(name, time, f"{share:.0%} of the mesh has folded over")
+        if progress is not None:
+            progress(index, len(times) - 1)
+    vertices, directions = (torch.stack(rows).float().cpu().numpy() for rows in (path, normals))
+    return TrackedMesh(mesh.faces, tuple(times), vertices, directions)
+
+
+def _lost(name: str, time: float, reason: str) -> InputError:
+    return InputError(
+        f"{name}: its mesh cannot be followed to time {time:.3g} ({reason}); write a folder of meshes, -o FOLDER"
+    )
+
+
+def _topology(field: Field, level: int) -> tuple[int, int]:
+    """Pieces, and V − E + F; without a surface (0, 0)."""
+    try:
+        surface = merged(from_mesh(extract_mesh(field, resolution=TOPOLOGY_RESOLUTION, level=level, normals=False)))
+    except NoSurfaceError:
+        return 0, 0
+    sides = np.sort(surface.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    edges = len(np.unique(sides, axis=0))
+    return components(surface), len(np.unique(surface.faces)) - edges + len(surface.faces)
+
+
+def _words(shape: tuple[int, int]) -> str:
+    pieces, euler = shape
+    return f"{pieces} piece{'s' * (pieces != 1)} with {pieces - euler // 2} hole{'s' * (pieces - euler // 2 != 1)}"
+
+
+def _normals(field: Field, points: Tensor, level: int) -> Tensor:
+    return torch.nn.functional.normalize(field.jet(points, level=level).gradient, dim=-1)
+
+
+def _folded(points: Tensor, normals: Tensor, faces: Tensor) -> float:
+    """Share of the area whose triangles look against the normals of the field."""
+    a, b, c = points[faces].unbind(dim=1)
+    facing = torch.linalg.cross(b - a, c - a)
+    area = facing.norm(dim=-1)
+    against = (facing * normals[faces].sum(dim=1)).sum(dim=-1) < 0
+    return float(area[against].sum() / area.sum().clamp(min=1e-30))

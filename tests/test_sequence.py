@@ -1,0 +1,328 @@
+"""Films, folders of meshes and moving meshes of surfaces whose motion is known."""
+
+import json
+import struct
+from pathlib import Path
+
+import cv2
+import imageio.v3 as iio
+import numpy as np
+import pytest
+import torch
+import trimesh
+from mplicits.datasets import linear_to_srgb
+from mplicits.neural_fields import (
+    ColorSiren,
+    Field,
+    InputError,
+    Jet,
+    Moving,
+    RigidMotion,
+    ShrinkingSphere,
+    Similarity,
+    Siren,
+    SpaceTimeSDF,
+    Sphere,
+    TextureField,
+    TimeSlice,
+    extract_mesh,
+    load_field,
+    load_texture,
+    save_field,
+    save_texture,
+)
+from mplicits.neural_fields.dynamic_tracing import moment
+from mplicits.pipelines.animate_command import COMMAND
+from mplicits.pipelines.mesh import MeshOptions, mesh_run
+from mplicits.pipelines.render_run import RenderOptions, render_run
+from mplicits.pipelines.riding import RidingColors
+from mplicits.pipelines.runs import load_still
+from mplicits.pipelines.sequence import SequenceOptions, animate_run, check_sequence_path, film_frames
+from mplicits.pipelines.surface import read_surface
+from mplicits.pipelines.tracked_mesh import follow_mesh
+from torch import Tensor
+
+RADIUS, DRIFT = 0.3, torch.tensor([0.5, 0.0, 0.0])
+START = torch.tensor([-0.25, 0.0, 0.0])
+PLACE = Similarity((100.0, -20.0, 3.0), 2.0)
+
+
+class Both(Field):
+    """Two moving fields in one."""
+
+    def __init__(self, *parts: Field) -> None:
+        super().__init__()
+        self.parts, self.in_dim, self.num_levels = torch.nn.ModuleList(parts), 4, 1
+        self.register_buffer("deltas", torch.empty(0))
+
+    def value(self, x: Tensor, *, level: int = -1) -> Tensor:
+        return self.jet(x, level=level).value
+
+    def jet(self, x: Tensor, *, level: int = -1) -> Jet:
+        jets = [part.jet(x) for part in self.parts]
+        value, which = torch.stack([jet.value for jet in jets]).min(dim=0)
+        gradient = torch.where((which == 0)[..., None], jets[0].gradient, jets[1].gradient)
+        return Jet(value, gradient, x.new_empty((*x.shape[:-1], 0)))
+
+
+def travelling_ball() -> SpaceTimeSDF:
+    """A small network that is a ball, nearly, and whose motion is exact: W(x − v t) + b."""
+    torch.manual_seed(0)
+    siren = Siren(32, 2, omega=5.0)
+    adam = torch.optim.Adam(siren.parameters(), lr=5e-3)
+    still = Sphere(radius=RADIUS, center=tuple(START.tolist()))
+    for _ in range(400):
+        x = 2.4 * torch.rand(512, 3) - 1.2
+        loss = (siren.value(x) - still.value(x)).square().mean()
+        adam.zero_grad()
+        loss.backward()
+        adam.step()
+    field = SpaceTimeSDF.from_static(siren)
+    first = field.sdf.base.layers[0]
+    with torch.no_grad():
+        first.weight[:, 3] = -first.weight[:, :3] @ DRIFT
+    return field.requires_grad_(False)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    directory = tmp_path_factory.mktemp("run")
+    field = travelling_ball()
+    save_field(directory / "field.safetensors", field, similarity=PLACE)
+    torch.manual_seed(3)
+    texture = TextureField(moment(field, 0.0), ColorSiren(16, 1, omega=4.0), delta=0.1)
+    save_texture(directory / "texture.safetensors", texture)
+    return directory
+
+
+@pytest.fixture(scope="module")
+def still(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    file = tmp_path_factory.mktemp("still") / "ball.safetensors"
+    save_field(file, travelling_ball().at(0.0))
+    return file
+
+
+def center(t: float) -> np.ndarray:
+    return PLACE.to_input((START + t * DRIFT).double().numpy()[None])[0]
+
+
+def read_glb(path: Path) -> tuple[dict, list[np.ndarray]]:
+    """The header, and the array of every accessor."""
+    data = path.read_bytes()
+    assert struct.unpack("<4sII", data[:12]) == (b"glTF", 2, len(data))
+    length = struct.unpack("<I", data[12:16])[0]
+    header, body = json.loads(data[20 : 20 + length]), data[28 + length :]
+    assert header["buffers"][0]["byteLength"] == len(body)
+    kinds, widths = {5123: "<u2", 5125: "<u4", 5126: "<f4"}, {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+    arrays = []
+    for accessor in header["accessors"]:
+        view = header["bufferViews"][accessor["bufferView"]]
+        part = body[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]
+        array = np.frombuffer(part, kinds[accessor["componentType"]])
+        assert len(array) == accessor["count"] * widths[accessor["type"]]
+        arrays.append(array.reshape(accessor["count"], -1))
+        for bound, of in (("min", np.min), ("max", np.max)):
+            if bound in accessor:
+                np.testing.assert_array_equal(accessor[bound], of(arrays[-1], axis=0))
+    return header, arrays
+
+
+# Moments of runs
+
+
+def test_a_time_goes_with_what_moves_and_with_nothing_else(run, still, tmp_path):
+    with pytest.raises(InputError, match=r"field\.safetensors: a surface that moves; say when with --time"):
+        load_still(run)
+    with pytest.raises(InputError, match=r"--time 0\.5: .*ball\.safetensors does not move; leave it out"):
+        load_still(still, 0.5)
+    with pytest.raises(InputError, match=r"--time 1\.5: expected a time from 0 to 1"):
+        load_still(run, 1.5)
+    x = 2 * torch.rand(50, 3) - 1
+    whole = load_field(run / "field.safetensors").field
+    torch.testing.assert_close(load_still(run, 0.25).field.value(x), TimeSlice(whole, 0.25).value(x))
+    with pytest.raises(InputError, match=r"say when with --time"):
+        mesh_run(run, tmp_path / "mesh.ply")
+    with pytest.raises(InputError, match=r"--time 0: .* does not move"):
+        render_run(still, tmp_path / "picture.png", RenderOptions(time=0.0))
+    trimesh.creation.icosphere().export(tmp_path / "ball.ply")
+    with pytest.raises(InputError, match=r"--time 0: .*ball\.ply does not move"):
+        render_run(tmp_path / "ball.ply", tmp_path / "picture.png", RenderOptions(time=0.0))
+
+
+@pytest.mark.parametrize("time", [0.0, 0.5, 1.0])
+def test_a_mesh_of_a_moment_is_where_the_surface_is_then(run, tmp_path, time):
+    mesh_run(run, tmp_path / "mesh.ply", MeshOptions(time=time, resolution=32))
+    surface = read_surface(tmp_path / "mesh.ply")
+    away = np.linalg.norm(surface.vertices - center(time), axis=1)
+    np.testing.assert_allclose(away, RADIUS * PLACE.scale, atol=0.05)
+    assert surface.colors is not None
+
+
+def test_a_picture_of_a_moment_is_drawn(run, tmp_path):
+    drawn = render_run(run, tmp_path / "picture.png", RenderOptions(time=0.5, size=(48,), shading="color"))
+    assert "color" in drawn
+    assert (iio.imread(tmp_path / "picture.png") < 250).any()
+
+
+# Films
+
+
+def test_every_frame_of_a_film_is_what_tracing_it_alone_shows(run):
+    field = load_field(run / "field.safetensors").field
+    options = SequenceOptions(frames=4, size=(40, 32), samples=1, shading="normals")
+    frames = list(film_frames(run, field, None, 0, options))
+    assert {frame.shape for frame in frames} == {(32, 40, 3)}
+    middles = []
+    for frame in frames:
+        ball = (frame < 255).any(axis=2)
+        assert 30 < ball.sum() < 600
+        middles.append(np.nonzero(ball)[1].mean())
+    steps = np.diff(middles)
+    assert (steps > 1).all()  # the ball travels to the right, evenly
+    assert steps.std() < 0.5
+
+
+def test_films_are_written(run, tmp_path):
+    options = SequenceOptions(frames=3, size=(32, 32), fps=10.0)
+    for name in ("ball.gif", "ball.mp4"):
+        told: list[tuple[int, int]] = []
+        said = animate_run(run, tmp_path / name, options, progress=lambda *done, told=told: told.append(done))
+        assert said == "3 frames of 32×32"
+        assert told == [(1, 3), (2, 3), (3, 3)]
+    assert len(iio.imread(tmp_path / "ball.gif", index=None)) == 3
+    assert cv2.VideoCapture(str(tmp_path / "ball.mp4")).get(cv2.CAP_PROP_FRAME_COUNT) == 3
+
+
+# Folders of meshes
+
+
+def test_a_folder_holds_a_mesh_of_every_frame(run, tmp_path):
+    assert animate_run(run, tmp_path / "meshes", SequenceOptions(frames=3, resolution=24)) == "3 meshes"
+    files = sorted((tmp_path / "meshes").iterdir())
+    assert [file.name for file in files] == ["frame_0000.ply", "frame_0001.ply", "frame_0002.ply"]
+    for file, t in zip(files, (0.0, 0.5, 1.0), strict=True):
+        surface = read_surface(file)
+        np.testing.assert_allclose(surface.vertices.mean(axis=0), center(t), atol=0.03)
+        assert surface.colors is not None
+    with pytest.raises(InputError, match=r"meshes: exists already"):
+        animate_run(run, tmp_path / "meshes", SequenceOptions(frames=3))
+
+
+# Meshes that move
+
+
+def test_a_moving_mesh_is_on_the_surface_in_every_frame(run, tmp_path):
+    file = tmp_path / "ball.glb"
+    said = animate_run(run, file, SequenceOptions(frames=5, fps=8.0, resolution=20))
+    header, arrays = read_glb(file)
+    (primitive,) = header["meshes"][0]["primitives"]
+    attributes = {name: arrays[k] for name, k in primitive["attributes"].items()}
+    base = attributes["POSITION"]
+    assert said.startswith(f"{len(base):,} vertices in 5 frames")
+    (animation,) = header["animations"]
+    sampler, channel = animation["samplers"][0], animation["channels"][0]
+    assert channel == {"sampler": 0, "target": {"node": 0, "path": "weights"}}
+    np.testing.assert_allclose(arrays[sampler["input"]][:, 0], np.arange(5) / 8.0)
+    weights = arrays[sampler["output"]].reshape(5, 4)
+    assert len(header["meshes"][0]["weights"]) == len(primitive["targets"]) == 4
+    field = load_field(run / "field.safetensors").field
+    for frame, t in enumerate(np.linspace(0, 1, 5)):
+        frames = {}
+        for name in ("POSITION", "NORMAL"):
+            targets = np.stack([arrays[target[name]] for target in primitive["targets"]])
+            frames[name] = attributes[name] + np.tensordot(weights[frame], targets, axes=1)
+        points = torch.from_numpy(PLACE.to_unit(frames["POSITION"].astype(np.float64))).float()
+        jet = TimeSlice(field, float(t)).jet(points)
+        assert float(jet.value.abs().max()) < 1e-3
+        np.testing.assert_allclose(points.mean(dim=0), START + t * DRIFT, atol=0.02)
+        np.testing.assert_allclose(frames["NORMAL"], torch.nn.functional.normalize(jet.gradient, dim=-1), atol=1e-4)
+    loaded = trimesh.load_mesh(file, process=False)
+    np.testing.assert_allclose(loaded.vertices, base)
+
+
+def test_colours_of_a_moving_mesh_are_those_of_its_start(run, tmp_path):
+    animate_run(run, tmp_path / "ball.glb", SequenceOptions(frames=2, resolution=16))
+    mesh_run(run, tmp_path / "start.ply", MeshOptions(time=0.0, resolution=16))
+    header, arrays = read_glb(tmp_path / "ball.glb")
+    attributes = header["meshes"][0]["primitives"][0]["attributes"]
+    colors = linear_to_srgb(arrays[attributes["COLOR_0"]][:, :3] / 65535)
+    np.testing.assert_allclose(colors, read_surface(tmp_path / "start.ply").colors, atol=2 / 255)
+
+
+@pytest.mark.parametrize(("speed", "when"), [(0.4, 0.6), (0.0, None)])
+def test_a_mesh_is_not_followed_through_a_merger(speed, when):
+    parts = [
+        Moving(Sphere(radius=0.3, center=(side * 0.55, 0.0, 0.0)), RigidMotion(velocity=(-side * speed, 0.0, 0.0)))
+        for side in (-1.0, 1.0)
+    ]
+    times = [0.0, 0.2, 0.4, 0.6, 0.8, 1.0]
+    if when is None:
+        assert follow_mesh(Both(*parts), times, resolution=24).vertices.shape[0] == 6
+        return
+    with pytest.raises(InputError, match=r"two: its mesh cannot be followed to time 0\.[68] \(it has 1 piece with"):
+        follow_mesh(Both(*parts), times, resolution=24, name="two")
+
+
+def test_colours_ride_along_with_a_rigid_motion(run):
+    field = load_field(run / "field.safetensors").field
+    texture = load_texture(run / "texture.safetensors", moment(field, 0.0))
+    riding = RidingColors(field, texture)
+    points = torch.from_numpy(extract_mesh(moment(field, 0.0), resolution=16).vertices).float()
+    there = torch.from_numpy(extract_mesh(moment(field, 1.0), resolution=16).vertices).float()
+    torch.testing.assert_close(riding.at(0.0)(points), texture.colors(points))
+    torch.testing.assert_close(riding.at(1.0)(there), texture.colors(there - DRIFT), atol=0.01, rtol=0)
+
+
+def test_colours_ride_along_the_normals():
+    """The points of a sphere that shrinks go straight inward."""
+    field, start = ShrinkingSphere(radius=0.8, alpha=0.12), Sphere(radius=0.8)
+    texture = TextureField(start, ColorSiren(16, 1, omega=4.0), delta=0.1).requires_grad_(False)
+    towards = torch.nn.functional.normalize(torch.randn(200, 3), dim=-1)
+    expected = texture.colors(0.8 * towards)
+    assert float(expected.std(dim=0).min()) > 0.01
+    for t in (0.0, 0.3, 1.0):
+        points = towards * field.radius_at(torch.tensor(t))
+        torch.testing.assert_close(RidingColors(field, texture).at(t)(points), expected, atol=2e-3, rtol=0)
+
+
+# Bad input
+
+
+def test_what_cannot_be_written_is_refused_first(run, still, tmp_path):
+    for name, message in (
+        ("film.avi", r"film\.avi: write a film \(\.mp4, \.gif\), a \.glb, or a folder"),
+        ("none/film.mp4", r"the folder .*none does not exist"),
+    ):
+        with pytest.raises(InputError, match=message):
+            check_sequence_path(tmp_path / name)
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "notes.txt").write_text("mine")
+    with pytest.raises(InputError, match=r"full: exists already"):
+        check_sequence_path(tmp_path / "full")
+    with pytest.raises(InputError, match=r"ball\.safetensors: does not move"):
+        animate_run(still, tmp_path / "film.mp4")
+    with pytest.raises(InputError, match=r"--level 3: .* has levels 0 to 0"):
+        animate_run(run, tmp_path / "film.mp4", SequenceOptions(level=3))
+    with pytest.raises(InputError, match=r"--colors .*ball\.safetensors: has no texture"):
+        animate_run(run, tmp_path / "film.mp4", SequenceOptions(colors=still))
+    with pytest.raises(InputError, match=r"--frames 1: a mesh moves in 2 frames or more"):
+        animate_run(run, tmp_path / "ball.glb", SequenceOptions(frames=1))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["full"]
+
+
+def test_flags_of_films_go_with_films(run, tmp_path):
+    import argparse
+
+    parser = argparse.ArgumentParser()
+    COMMAND.add_arguments(parser)
+    for line, message in (
+        ("-o meshes --size 64", "--size: goes with a film"),
+        ("-o film.mp4 --resolution 64", "--resolution: goes with meshes"),
+        ("-o film.mp4 --no-colors --colors x", "--colors: --no-colors leaves them out"),
+    ):
+        with pytest.raises(InputError, match=message):
+            COMMAND.run(parser.parse_args([str(run), *line.split()]))
+    out = tmp_path / "ball.gif"
+    line = f"-o {out} --frames 2 --size 24 --samples 1 --shading headlight --up z --no-colors"
+    assert COMMAND.run(parser.parse_args([str(run), *line.split()])) == 0
+    assert len(iio.imread(out, index=None)) == 2
