@@ -21,6 +21,9 @@ __all__ = ["EvolveTrainer", "band_points", "learn_start", "uniform_spacetime"]
 REFRESH = 25  # steps after which the points near the surface are drawn anew, since it has moved
 POOL_STEPS = 6  # batches that a pool near the surface holds
 CANDIDATES = 6  # points tried for one that is near the surface
+# Norm of the gradient by the weights. Second derivatives have spikes, and a single one, at the peak of the learning
+# rate, would throw the field so far from any distance that it does not come back.
+LONGEST_GRADIENT = 1.0
 
 
 class EvolveTrainer:
@@ -62,8 +65,8 @@ class EvolveTrainer:
             self.known = self.known.take(_inside(field, self.known.points, level))
             if not len(self.known):
                 raise ValueError(f"level {level}: no known samples in its band")
-        trained = [parameter for parameter in field.parameters() if parameter.requires_grad]
-        self.adam = torch.optim.Adam(trained, lr=config.learning_rates[level], betas=(0.9, 0.99), fused=True)
+        self.trained = [parameter for parameter in field.parameters() if parameter.requires_grad]
+        self.adam = torch.optim.Adam(self.trained, lr=config.learning_rates[level], betas=(0.9, 0.99), fused=True)
         self.pool = torch.empty(0, 4, device=device)
         self.step, self.elapsed, self.ended_early = 0, 0.0, False
         self.losses: dict[str, float] = {}
@@ -106,6 +109,7 @@ class EvolveTrainer:
         terms, total = self._losses()
         self.adam.zero_grad(set_to_none=True)
         total.backward()
+        torch.nn.utils.clip_grad_norm_(self.trained, LONGEST_GRADIENT)
         self.adam.step()
         self.step += 1
         return terms
