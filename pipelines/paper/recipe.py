@@ -1,0 +1,127 @@
+"""What every method of the comparison is: a `Recipe`, which trains fields on a cloud as its own paper says."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from ...datasets import OrientedCloud
+from ...neural_fields import Field
+from ..training import Progress
+
+__all__ = ["Output", "Preset", "Recipe", "Report", "Trained", "descend"]
+
+# smoke: seconds, for tests; cpu: 15 to 30 s of training on two cores, each method; paper: as published.
+Preset = Literal["smoke", "cpu", "paper"]
+Report = Callable[[Progress], None]
+
+
+class Output(NamedTuple):
+    """One surface that a method gives.
+
+    Attributes:
+        name: as in the tables, e.g. "IDF".
+        field: in unit-sphere coordinates, on the CPU.
+        level: of the field, whose zero set it is.
+        parameters: trained numbers that this level needs.
+    """
+
+    name: str
+    field: Field
+    level: int
+    parameters: int
+
+
+class Trained(NamedTuple):
+    """What a recipe returns.
+
+    Attributes:
+        outputs: coarse to fine.
+        seconds: of sampling and training together.
+        steps: optimisation steps, of all stages together.
+    """
+
+    outputs: tuple[Output, ...]
+    seconds: float
+    steps: int
+
+
+class Recipe(ABC):
+    """A method: its network, its losses, its schedule and its sampling.
+
+    Attributes:
+        name: as in the command, e.g. "idf".
+        source: the paper, and what it says.
+        differs: what differs here.
+    """
+
+    name: str
+    source: str
+    differs: str
+
+    @abstractmethod
+    def train(
+        self,
+        cloud: OrientedCloud,
+        preset: Preset,
+        *,
+        seed: int = 0,
+        device: str = "cpu",
+        progress: Report | None = None,
+    ) -> Trained:
+        """Fit the method to a cloud.
+
+        Args:
+            cloud: clean oriented points in the unit sphere; all that any method learns from.
+            preset: how large and how long.
+            seed: of the weights, the samples and the batches.
+            device: a torch device.
+            progress: called now and then with how far the training is.
+        """
+
+
+def descend(
+    parameters: Iterable[nn.Parameter],
+    loss: Callable[[int], Tensor],
+    *,
+    steps: int,
+    rate: Callable[[float], float],
+    stage: str,
+    progress: Report | None = None,
+    clip: float | None = None,
+    betas: tuple[float, float] = (0.9, 0.999),
+    eps: float = 1e-8,
+    report_every: int = 20,
+) -> None:
+    """Minimise ``loss`` with Adam.
+
+    Args:
+        parameters: what is trained.
+        loss: of one fresh batch; called with the number of steps done.
+        steps: how many.
+        rate: learning rate for a schedule done to a fraction in [0, 1).
+        stage: name for ``progress``.
+        progress: told the loss every ``report_every`` steps and at the end.
+        clip: largest norm of the whole gradient, or None.
+        betas: of Adam.
+        eps: of Adam.
+        report_every: steps between reports; reading the loss makes a GPU wait.
+    """
+    trained = list(parameters)
+    adam = torch.optim.Adam(trained, lr=rate(0.0), betas=betas, eps=eps, fused=True)
+    for step in range(steps):
+        for group in adam.param_groups:
+            group["lr"] = rate(step / steps)
+        adam.zero_grad(set_to_none=True)
+        total = loss(step)
+        total.backward()
+        if clip is not None:
+            nn.utils.clip_grad_norm_(trained, clip)
+        adam.step()
+        done = step + 1
+        if progress is not None and (done % report_every == 0 or done == steps):
+            progress(Progress(stage, done, steps, done / steps, {"loss": float(total.detach())}))
