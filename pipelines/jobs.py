@@ -1,0 +1,175 @@
+"""Many independent pieces of work: one after the other here, or side by side in the workers of Ray.
+
+Ray (https://ray.io) is the extra ``ray``. It starts on this machine alone, joins no cluster, serves no dashboard and
+reports to nobody.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+import os
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
+
+import torch
+
+from ..neural_fields import InputError
+from .fit import Interrupted
+
+__all__ = ["Outcome", "check_jobs", "run_jobs"]
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+# How long workers may take to write their checkpoints after Ctrl-C.
+GRACE_SECONDS = 60.0
+# Read by Ray when it is imported: no usage reports, and devices stay visible to tasks that ask for none.
+RAY_ENVIRONMENT = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0"}
+
+
+@dataclass(frozen=True)
+class Outcome(Generic[Item, Result]):
+    """What became of one item.
+
+    Attributes:
+        item: what was asked for.
+        value: what the function returned; None if it failed.
+        error: why it failed, in one line; None if it did not.
+        seconds: how long it took.
+    """
+
+    item: Item
+    value: Result | None
+    error: str | None
+    seconds: float
+
+
+def check_jobs(jobs: int) -> None:
+    """Refuse more than one job where there is no Ray, before any work.
+
+    Raises:
+        InputError: ``jobs`` is not positive, or Ray is needed and not installed.
+    """
+    if jobs < 1:
+        raise InputError(f"--jobs {jobs}: expected a whole number from 1")
+    if jobs > 1 and importlib.util.find_spec("ray") is None:
+        raise InputError(f"--jobs {jobs}: needs Ray; pip install mplicits[ray], or leave --jobs out")
+
+
+def run_jobs(
+    function: Callable[[Item], Result],
+    items: Sequence[Item],
+    *,
+    jobs: int = 1,
+    report: Callable[[Outcome[Item, Result]], None] | None = None,
+) -> list[Outcome[Item, Result]]:
+    """Call ``function`` on every item; an item that raises does not stop the others.
+
+    Args:
+        function: what to do. With several jobs it runs in other processes: what it takes, holds and returns is
+            pickled, and torch there has its share of the cores, ``cores // jobs``.
+        items: what to do it on.
+        jobs: how many at a time. One needs no Ray, and runs in this process.
+        report: told every outcome, as it comes.
+
+    Returns:
+        One outcome per item, in their order.
+
+    Raises:
+        InputError: see `check_jobs`.
+        KeyboardInterrupt: Ctrl-C. Fits under way have written their checkpoints, nothing else is begun.
+        Interrupted: the same, where ``function`` is a fit in this process.
+    """
+    check_jobs(jobs)
+    report = report or (lambda _: None)
+    if jobs == 1 or len(items) < 2:
+        outcomes = []
+        for item in items:
+            outcomes.append(_outcome(function, item))
+            report(outcomes[-1])
+        return outcomes
+    return _side_by_side(function, items, min(jobs, len(items)), report)
+
+
+def _outcome(function: Callable[[Item], Result], item: Item) -> Outcome[Item, Result]:
+    started = time.monotonic()
+    try:
+        value = function(item)
+    except Interrupted:
+        raise
+    except Exception as error:  # whatever went wrong with one item is no reason to leave out the next
+        return Outcome(item, None, _one_line(error), time.monotonic() - started)
+    return Outcome(item, value, None, time.monotonic() - started)
+
+
+def _one_line(error: Exception) -> str:
+    text = " ".join(str(error).split())
+    return text if isinstance(error, InputError) else f"{type(error).__name__}: {text}".removesuffix(": ")
+
+
+def _side_by_side(
+    function: Callable[[Item], Result],
+    items: Sequence[Item],
+    jobs: int,
+    report: Callable[[Outcome[Item, Result]], None],
+) -> list[Outcome[Item, Result]]:
+    for name, value in RAY_ENVIRONMENT.items():
+        os.environ.setdefault(name, value)
+    import ray  # after its environment is set
+
+    threads, gpus = max(1, torch.get_num_threads() // jobs), _gpus_each(torch.cuda.device_count(), jobs)
+
+    def work(item: Item) -> Outcome[Item, Result]:
+        torch.set_num_threads(threads)
+        return _outcome(function, item)
+
+    ray.init(
+        address="local",
+        num_cpus=threads * jobs,
+        include_dashboard=False,
+        log_to_driver=False,
+        logging_level="error",
+        object_store_memory=128 << 20,  # items and results are small
+    )
+    try:
+        task: Any = ray.remote(num_cpus=threads, num_gpus=gpus, max_retries=0)(work)
+        waiting = {task.remote(item): index for index, item in enumerate(items)}
+        outcomes: dict[int, Outcome[Item, Result]] = {}
+        try:
+            while waiting:
+                for done in ray.wait(list(waiting), num_returns=1)[0]:
+                    index = waiting.pop(done)
+                    outcomes[index] = _collected(ray, done, items[index])
+                    report(outcomes[index])
+        except KeyboardInterrupt:
+            _stop(ray, list(waiting))
+            raise
+    finally:
+        ray.shutdown()
+    return [outcomes[index] for index in range(len(items))]
+
+
+def _collected(ray: Any, done: Any, item: Item) -> Outcome[Item, Any]:
+    """The outcome that a task returned, or one that says how its worker died."""
+    try:
+        return ray.get(done)
+    except ray.exceptions.RayError as error:
+        reason = (str(error).splitlines() or [""])[0]
+        return Outcome(item, None, f"{type(error).__name__}: {reason}", math.nan)
+
+
+def _stop(ray: Any, tasks: list[Any]) -> None:
+    """Interrupt what runs, as Ctrl-C would, forget what waits, and let checkpoints be written."""
+    for task in tasks:
+        ray.cancel(task)
+    ray.wait(tasks, num_returns=len(tasks), timeout=GRACE_SECONDS)
+
+
+def _gpus_each(gpus: int, jobs: int) -> float:
+    """GPUs, or the part of one, for each job."""
+    if gpus >= jobs:
+        return gpus // jobs
+    return 1 / math.ceil(jobs / gpus) if gpus else 0
