@@ -1,0 +1,82 @@
+"""What stands in a row of a table: a `Method`, which does the work of a cell and says what it found."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from .cell import Cell
+from .recipe import Report
+
+__all__ = ["Findings", "Method", "Workplace"]
+
+
+@dataclass(frozen=True)
+class Workplace:
+    """Where a method works.
+
+    Attributes:
+        out: the folder of the bench, which holds ``meshes`` and ``fields``.
+        key: of the cell; names of files begin with it.
+        device: a torch device.
+        progress: called now and then with how far the training is.
+    """
+
+    out: Path
+    key: str
+    device: str = "cpu"
+    progress: Report | None = None
+
+    def mesh(self, output: str) -> Path:
+        """Where the mesh of an output goes."""
+        return self.out / "meshes" / f"{self.key}-{output.lower().replace(' ', '-')}.ply"
+
+    def field(self) -> Path:
+        """Where a trained field goes that can be loaded again."""
+        return self.out / "fields" / f"{self.key}.safetensors"
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What a cell found.
+
+    Attributes:
+        outputs: one dict of figures per surface, coarse to fine, each with its "name"; all of it JSON.
+        deltas: half-widths of the bands, where there are any.
+        details: anything else worth keeping.
+    """
+
+    outputs: tuple[Mapping[str, Any], ...]
+    deltas: tuple[float, ...] = ()
+    details: Mapping[str, Any] = field(default_factory=dict)
+
+
+class Method(ABC):
+    """A method, or a measurement, that tables ask for by name.
+
+    Attributes:
+        name: as on the command line and in `Cell.method`.
+        source: where it comes from.
+        differs: what differs from its source here.
+        optional: the extra of ours that it needs and that is not installed here, or "".
+    """
+
+    name: str
+    source: str
+    differs: str
+    optional: str = ""
+
+    def settings(self, cell: Cell) -> Mapping[str, Any]:
+        """What decides the result beside the cell itself; part of the key."""
+        return {}
+
+    @abstractmethod
+    def run(self, cell: Cell, work: Workplace) -> Findings:
+        """Do the work of a cell.
+
+        Raises:
+            InputError: the cloud cannot be read or used.
+        """
