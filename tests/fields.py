@@ -19,7 +19,7 @@ from mplicits.neural_fields import (
     Torus,
     Union,
 )
-from mplicits.neural_fields.baselines import NeusSDF
+from mplicits.neural_fields.baselines import BaconSDF, NeusSDF
 
 
 def small_multiscale(taper: float = 0.0) -> MultiscaleSDF:
@@ -60,6 +60,7 @@ FIELDS: dict[str, Callable[[], Field]] = {
     "siren-deep-features": lambda: Siren(16, 4, omega=4.0, num_features=3),
     "siren-one-layer-4d": lambda: Siren(16, 1, omega=4.0, in_dim=4),
     "neus": lambda: NeusSDF(48, 4, num_features=3),
+    "bacon": lambda: BaconSDF(12, bands=(1, 1, 2, 2), outputs=(3,)),
     "multiscale": small_multiscale,
     "multiscale-tapered": lambda: small_multiscale(0.4),
     "multiscale-over-sphere": lambda: MultiscaleSDF(Sphere(radius=0.5), [Siren(16, 2, omega=5.0)], [0.1], taper=0.3),

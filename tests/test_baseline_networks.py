@@ -1,0 +1,181 @@
+"""BACON, IDF and the single SIREN: what their papers say of the fields, and what their recipes reach."""
+
+import itertools
+import math
+
+import pytest
+import torch
+from mplicits.neural_fields import Field, Jet, extract_mesh, sphere_trace
+from mplicits.neural_fields.baselines import BaconSDF, IdfSDF
+from mplicits.neural_fields.baselines.idf import attenuation
+
+# The contract, over the fields below in place of those of the common table, whose levels are nested in bands.
+from test_field_contract import (  # noqa: F401
+    test_jet_agrees_with_value_and_autograd,
+    test_levels_count_from_both_ends_and_stop_there,
+    test_results_without_a_graph_are_the_same,
+    test_shapes_and_types_follow_the_input,
+    test_wrong_dimension_is_refused,
+)
+
+
+def small_bacon() -> BaconSDF:
+    return BaconSDF(12, bands=(1, 1, 2, 2), outputs=(1, 3))
+
+
+def small_idf() -> IdfSDF:
+    """An untrained displacement of a base that has the unit cube within its reach."""
+    field = IdfSDF(16, 2, omegas=(2.0, 4.0), limit=0.2, reach=0.5)
+    with torch.no_grad():
+        field.base.output.weight.mul_(3.0)
+    return field
+
+
+LEVELS = {"bacon": small_bacon, "idf": small_idf}
+
+
+@pytest.fixture(params=LEVELS)
+def field(request: pytest.FixtureRequest, dtype: torch.dtype, device: torch.device) -> Field:
+    return LEVELS[request.param]().to(device=device, dtype=dtype)
+
+
+def test_levels_are_alternatives_everywhere(field: Field, dtype: torch.dtype, device: torch.device) -> None:
+    x = 2 * torch.rand(500, 3, dtype=dtype, device=device) - 1
+    assert field.in_band(x, level=1).all()
+    assert bool((field.value(x, level=0) != field.value(x, level=1)).any())
+
+
+class Spheres(Field):
+    """Two concentric spheres as alternatives, which notes the levels that it is asked for."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.in_dim, self.num_levels = 3, 2
+        self.register_buffer("deltas", torch.tensor([math.inf]))
+        self.asked: set[int] = set()
+
+    def value(self, x: torch.Tensor, *, level: int = -1) -> torch.Tensor:
+        self.asked.add(self.resolve_level(level))
+        return x.norm(dim=-1) - (0.3, 0.6)[self.resolve_level(level)]
+
+    def jet(self, x: torch.Tensor, *, level: int = -1) -> Jet:
+        return Jet(self.value(x, level=level), x / x.norm(dim=-1, keepdim=True), x.new_empty(*x.shape[:-1], 0))
+
+
+@pytest.mark.parametrize(("level", "radius"), [(0, 0.3), (1, 0.6)])
+def test_infinite_bands_make_levels_alternatives_for_mesher_and_tracer(level: int, radius: float) -> None:
+    """What BACON and IDF rely on: where a coarse level bounds nothing, nothing is concluded from it."""
+    mesh = extract_mesh(spheres := Spheres(), resolution=24, level=level)
+    assert spheres.asked == {level}
+    lengths = torch.from_numpy(mesh.vertices).norm(dim=1)
+    torch.testing.assert_close(lengths, torch.full_like(lengths, radius), atol=1e-4, rtol=0)
+    hits = sphere_trace(spheres, torch.tensor([[0.1, 0.0, -2.0]]), torch.tensor([[0.0, 0.0, 1.0]]), level=level)
+    assert bool(hits.mask)
+    assert float(hits.depth) == pytest.approx(2 - math.sqrt(radius**2 - 0.01), abs=1e-4)
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_bacon_holds_no_frequency_above_its_bound(axis: int) -> None:
+    """On a line of one period an output has the harmonics up to the sum of its filters' bands, and no other."""
+    field = BaconSDF(10, bands=(1, 2, 2, 3), outputs=(1, 2, 3), period=2.5).double()
+    samples = 64
+    line = torch.rand(1, 3, dtype=torch.float64).repeat(samples, 1)
+    line[:, axis] += torch.arange(samples) * (field.period / samples)
+    values = field.values(line).detach()
+    for level, bound in enumerate((3, 5, 8)):
+        assert field.harmonics(level=level) == bound
+        torch.testing.assert_close(values[level], field.value(line, level=level), atol=1e-13, rtol=0)
+        spectrum = torch.fft.rfft(values[level]).abs() / samples
+        assert float(spectrum[bound + 1 :].max()) < 1e-14
+        assert float(spectrum[1 : bound + 1].max()) > 1e-3
+
+
+def test_bacon_is_a_sum_of_the_sines_that_its_bound_allows() -> None:
+    """One layer of one neuron by hand: sin a · (w sin b + c) = w/2 (cos(a − b) − cos(a + b)) + c sin a."""
+    field = BaconSDF(1, bands=(2, 3), outputs=(1,), period=2.0).double()
+    x = torch.rand(20, 3, dtype=torch.float64)
+    b, a = (x @ (math.pi * field.frequencies[i, 0]) + field.phases[i] for i in range(2))
+    w, c = field.layers[0].weight[0, 0], field.layers[0].bias[0]
+    expected = w / 2 * ((a - b).cos() - (a + b).cos()) + c * a.sin()
+    head = field.heads[0]
+    torch.testing.assert_close(field.value(x), expected * head.weight[0, 0] + head.bias[0])
+
+
+def test_bacon_has_the_published_size_but_for_what_is_never_used() -> None:
+    field = BaconSDF()
+    assert field.harmonics(level=-1) == 192
+    # 530,953 with five filters and five outputs that take no part.
+    assert sum(p.numel() for p in field.parameters()) == 530_953 - 5 * 256 - 5 * 257
+    assert field.parameters_to(-1) == sum(p.numel() for p in field.parameters()) - 3 * 257
+    assert field.parameters_to(0) == 256 + 2 * 257 * 256 + 257
+
+
+@pytest.mark.parametrize(
+    ("options", "word"),
+    [
+        ({"width": 0}, "width"),
+        ({"bands": (3,)}, "bands"),
+        ({"bands": (1, 0)}, "bands"),
+        ({"outputs": ()}, "outputs"),
+        ({"outputs": (2, 2)}, "outputs"),
+        ({"outputs": (9,)}, "outputs"),
+        ({"period": 0.0}, "period"),
+    ],
+)
+def test_bacon_says_what_is_wrong(options: dict[str, object], word: str) -> None:
+    with pytest.raises(ValueError, match=f"{word}="):
+        BaconSDF(**options)  # pyright: ignore[reportArgumentType]
+
+
+def test_idf_without_displacement_is_its_base() -> None:
+    field = small_idf().double()
+    x = 2 * torch.rand(200, 3, dtype=torch.float64) - 1
+    assert bool((field.value(x) != field.value(x, level=0)).any())
+    with torch.no_grad():
+        field.displacement.output.weight.zero_()
+        field.displacement.output.bias.zero_()
+    assert torch.equal(field.value(x), field.value(x, level=0))
+    torch.testing.assert_close(field.jet(x).gradient, field.jet(x, level=0).gradient, atol=1e-14, rtol=0)
+
+
+def test_idf_moves_the_surface_by_no_more_than_its_limit() -> None:
+    """A base that is a plane and a displacement that is always full: the surface is where y is on the plane."""
+    field = IdfSDF(4, 1, limit=0.1, reach=0.3).double()
+    with torch.no_grad():
+        # sin(1e-3 x) / 1e-3, which is x to seven digits, and tanh 50, which is 1.
+        for network in (field.base, field.displacement):
+            for parameter in network.parameters():
+                parameter.zero_()
+        field.base.layers[0].weight[0, 0] = 1e-3 / field.base.omega
+        field.base.output.weight[0, 0] = 1e3
+        field.displacement.output.bias[:] = 50.0
+    x = torch.zeros(41, 3, dtype=torch.float64)
+    x[:, 0] = torch.linspace(-1, 1, 41)
+    chi = 1 / (1 + (x[:, 0] / 0.3) ** 4)
+    torch.testing.assert_close(field.value(x), x[:, 0] + 0.1 * chi, atol=1e-5, rtol=0)
+    with torch.no_grad():
+        field.displacement.output.bias[:] = -50.0
+    torch.testing.assert_close(field.value(x), x[:, 0] - 0.1 * chi, atol=1e-5, rtol=0)
+
+
+def test_attenuation_is_a_half_at_its_reach_and_has_its_derivative() -> None:
+    value = torch.linspace(-0.5, 0.5, 101, dtype=torch.float64, requires_grad=True)
+    chi, slope = attenuation(value, 0.05)
+    torch.testing.assert_close(torch.autograd.grad(chi.sum(), value)[0], slope)
+    assert float(attenuation(torch.tensor(0.05), 0.05)[0]) == pytest.approx(0.5)
+    assert all(a > b for a, b in itertools.pairwise(chi[50:].detach().tolist()))
+
+
+@pytest.mark.parametrize("name", ["limit", "reach"])
+def test_idf_says_what_is_wrong(name: str) -> None:
+    with pytest.raises(ValueError, match=f"{name}=0"):
+        IdfSDF(8, 2, **{name: 0.0})  # pyright: ignore[reportArgumentType]
+
+
+def test_both_train_through_their_gradients() -> None:
+    for make in LEVELS.values():
+        field = make()
+        jet = field.jet(2 * torch.rand(50, 3) - 1)
+        ((jet.gradient.norm(dim=1) - 1).square().mean() + jet.value.square().mean()).backward()
+        missing = [name for name, p in field.named_parameters() if p.grad is None and not name.startswith("heads.0")]
+        assert missing == []
