@@ -19,7 +19,7 @@ class Workplace:
     """Where a method works.
 
     Attributes:
-        out: the folder of the bench, which holds ``meshes`` and ``fields``.
+        out: the folder of the bench, which holds ``meshes``, ``pictures`` and ``runs``.
         key: of the cell; names of files begin with it.
         device: a torch device.
         progress: called now and then with how far the training is.
@@ -31,12 +31,16 @@ class Workplace:
     progress: Report | None = None
 
     def mesh(self, output: str) -> Path:
-        """Where the mesh of an output goes."""
-        return self.out / "meshes" / f"{self.key}-{output.lower().replace(' ', '-')}.ply"
+        """Where the mesh of an output goes, in input coordinates."""
+        return self.out / "meshes" / f"{self.key}-{_slug(output)}.ply"
 
-    def field(self) -> Path:
-        """Where a trained field goes that can be loaded again."""
-        return self.out / "fields" / f"{self.key}.safetensors"
+    def picture(self, output: str) -> Path:
+        """Where the picture of that mesh goes."""
+        return self.out / "pictures" / f"{self.key}-{_slug(output)}.png"
+
+    def run(self) -> Path:
+        """Where a fit of ours goes: a run directory with ``field.safetensors`` in it."""
+        return self.out / "runs" / self.key
 
 
 @dataclass(frozen=True)
@@ -61,16 +65,18 @@ class Method(ABC):
         name: as on the command line and in `Cell.method`.
         source: where it comes from.
         differs: what differs from its source here.
-        optional: the extra of ours that it needs and that is not installed here, or "".
     """
 
     name: str
     source: str
     differs: str
-    optional: str = ""
+
+    def missing(self) -> str | None:
+        """What must be installed for it, in a few words; None if nothing is missing."""
+        return None
 
     def settings(self, cell: Cell) -> Mapping[str, Any]:
-        """What decides the result beside the cell itself; part of the key."""
+        """What decides the result beside the cell itself, as JSON; part of the key."""
         return {}
 
     @abstractmethod
@@ -80,3 +86,7 @@ class Method(ABC):
         Raises:
             InputError: the cloud cannot be read or used.
         """
+
+
+def _slug(name: str) -> str:
+    return name.lower().replace(" ", "-")

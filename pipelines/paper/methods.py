@@ -1,0 +1,29 @@
+"""All methods, in the order of the tables' rows."""
+
+from __future__ import annotations
+
+from ..config import closest
+from .method import Method
+from .ours import Ours
+from .peers import Poisson
+
+__all__ = ["METHODS", "method_named"]
+
+# The first ones are those of `names.METHODS`; a test holds the two together.
+METHODS: tuple[Method, ...] = (
+    Ours(),
+    Poisson(),
+    Poisson(trim=0.01),
+)
+
+
+def method_named(name: str) -> Method:
+    """The method that a cell asks for.
+
+    Raises:
+        ValueError: there is none.
+    """
+    for method in METHODS:
+        if method.name == name:
+            return method
+    raise ValueError(f"method {name!r}: there is none{closest(name, [method.name for method in METHODS])}")
