@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Literal, NamedTuple
 
 import torch
@@ -92,9 +92,11 @@ def descend(
     rate: Callable[[float], float],
     stage: str,
     progress: Report | None = None,
+    also: Sequence[tuple[Iterable[nn.Parameter], Callable[[float], float]]] = (),
     clip: float | None = None,
     betas: tuple[float, float] = (0.9, 0.999),
     eps: float = 1e-8,
+    amsgrad: bool = False,
     report_every: int = 20,
 ) -> None:
     """Minimise ``loss`` with Adam.
@@ -106,16 +108,21 @@ def descend(
         rate: learning rate for a schedule done to a fraction in [0, 1).
         stage: name for ``progress``.
         progress: told the loss every ``report_every`` steps and at the end.
+        also: more that is trained, with rates of their own.
         clip: largest norm of the whole gradient, or None.
         betas: of Adam.
         eps: of Adam.
+        amsgrad: of Adam: second moments never fall.
         report_every: steps between reports; reading the loss makes a GPU wait.
     """
-    trained = list(parameters)
-    adam = torch.optim.Adam(trained, lr=rate(0.0), betas=betas, eps=eps, fused=True)
+    groups = [(list(chosen), schedule) for chosen, schedule in ((parameters, rate), *also)]
+    adam = torch.optim.Adam(
+        [{"params": chosen} for chosen, _ in groups], betas=betas, eps=eps, amsgrad=amsgrad, fused=True
+    )
+    trained = [parameter for chosen, _ in groups for parameter in chosen]
     for step in range(steps):
-        for group in adam.param_groups:
-            group["lr"] = rate(step / steps)
+        for group, (_, schedule) in zip(adam.param_groups, groups, strict=True):
+            group["lr"] = schedule(step / steps)
         adam.zero_grad(set_to_none=True)
         total = loss(step)
         total.backward()
