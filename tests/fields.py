@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 
+import torch
 from mplicits.neural_fields import (
     Box,
     Capsule,
@@ -19,7 +20,7 @@ from mplicits.neural_fields import (
     Torus,
     Union,
 )
-from mplicits.neural_fields.baselines import BaconSDF, NeusSDF
+from mplicits.neural_fields.baselines import BaconSDF, BandLimited, BanfSDF, HashGridSDF, NeusSDF
 
 
 def small_multiscale(taper: float = 0.0) -> MultiscaleSDF:
@@ -46,6 +47,14 @@ def small_spacetime(taper: float = 0.0) -> SpaceTimeSDF:
     )
 
 
+def small_hash_grid() -> HashGridSDF:
+    """A dense level and a hashed one, with entries large enough to show, around a sphere."""
+    field = HashGridSDF(levels=2, table_size=512, coarsest=4, finest=16, width=16, radius=0.5)
+    for table in field.tables:
+        torch.nn.init.uniform_(table, -0.2, 0.2)
+    return field
+
+
 # Turns and travels, about an axis off the origin.
 SCREW = RigidMotion(axis=(1.0, 2.0, -1.0), angle=1.5, center=(0.1, -0.2, 0.0), velocity=(0.3, 0.0, -0.2))
 
@@ -61,6 +70,9 @@ FIELDS: dict[str, Callable[[], Field]] = {
     "siren-one-layer-4d": lambda: Siren(16, 1, omega=4.0, in_dim=4),
     "neus": lambda: NeusSDF(48, 4, num_features=3),
     "bacon": lambda: BaconSDF(12, bands=(1, 1, 2, 2), outputs=(3,)),
+    "hash-grid": small_hash_grid,
+    "band-limited": lambda: BandLimited(small_hash_grid(), 6),
+    "banf": lambda: BanfSDF([Torus(major=0.5, minor=0.2)], [12]),
     "multiscale": small_multiscale,
     "multiscale-tapered": lambda: small_multiscale(0.4),
     "multiscale-over-sphere": lambda: MultiscaleSDF(Sphere(radius=0.5), [Siren(16, 2, omega=5.0)], [0.1], taper=0.3),

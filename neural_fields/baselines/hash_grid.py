@@ -1,0 +1,158 @@
+"""Instant-NGP's multiresolution hash encoding with its small network (Müller et al. 2022), in plain PyTorch.
+
+Every level is a grid whose vertices own entries of a table: one each where the grid fits into the table (Sec. 3), or
+else the one that a spatial hash says (Eq. 4), which they share. Entries are interpolated, those of all levels joined,
+and a small network reads them.
+"""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+
+import torch
+from torch import Tensor, nn
+
+from ..field import Field, Jet
+from ._trilinear import Place, interpolate, interpolate_jet, locate, vertices
+
+__all__ = ["HashGridSDF", "grid_resolutions", "spatial_hash"]
+
+# The factors of Eq. 4; the first is 1 so that neighbours along x stay neighbours in memory.
+PRIMES = (1, 2_654_435_761, 805_459_861)
+INITIAL = 1e-4  # entries begin uniform in ±INITIAL (Sec. 4)
+
+
+def grid_resolutions(levels: int, coarsest: int, finest: int) -> list[int]:
+    """Cells along a side on each level, ``⌊N_min bˡ⌋`` with ``b = (N_max / N_min)^(1 / (L − 1))`` (Eqs. 2 and 3).
+
+    Example:
+        >>> grid_resolutions(4, 16, 128)
+        [16, 32, 64, 128]
+    """
+    growth = (finest / coarsest) ** (1 / max(1, levels - 1))
+    # A power that should be whole may come out a rounding error below.
+    return [math.floor(coarsest * growth**level * (1 + 1e-12)) for level in range(levels)]
+
+
+def spatial_hash(x: Tensor, y: Tensor, z: Tensor, size: int) -> Tensor:
+    """``(x π₁ ⊕ y π₂ ⊕ z π₃) mod T`` (Eq. 4) of whole coordinates that broadcast; ``size`` is T, a power of two."""
+    return (x * PRIMES[0] ^ y * PRIMES[1] ^ z * PRIMES[2]) & (size - 1)
+
+
+class HashGridSDF(Field):
+    """A signed distance read by a ReLU network from interpolated grids.
+
+    The field is continuous; its gradient jumps at the faces of cells and at the creases of the network. Outside the
+    cube features are those at the cube's nearest point.
+
+    Args:
+        levels: grids, L in the paper.
+        table_size: most entries of a level, T; a power of two.
+        features: numbers per entry, F.
+        coarsest: cells along a side of the first grid, N_min.
+        finest: cells along a side of the last grid, N_max.
+        width: neurons per hidden layer.
+        depth: hidden layers.
+        extent: half-edge of the cube that the grids cover.
+        radius: of a sphere whose distance is added, so that the field begins as one; None adds nothing, as published.
+
+    Raises:
+        ValueError: an argument is out of range.
+
+    Example:
+        >>> from mplicits.neural_fields.baselines import HashGridSDF
+        >>> sum(p.numel() for p in HashGridSDF(levels=3, finest=382).parameters())
+        2049153
+    """
+
+    def __init__(
+        self,
+        *,
+        levels: int = 16,
+        table_size: int = 1 << 19,
+        features: int = 2,
+        coarsest: int = 16,
+        finest: int = 2048,
+        width: int = 64,
+        depth: int = 2,
+        extent: float = 1.05,
+        radius: float | None = None,
+    ) -> None:
+        super().__init__()
+        self.in_dim, self.num_levels = 3, 1
+        for name, number in (("levels", levels), ("features", features), ("width", width), ("depth", depth)):
+            if number < 1:
+                raise ValueError(f"{name}={number}: expected at least 1")
+        if table_size < 1 or table_size & (table_size - 1):
+            raise ValueError(f"table_size={table_size}: expected a power of two")
+        if not 1 <= coarsest <= finest:
+            raise ValueError(f"coarsest={coarsest}, finest={finest}: expected 1 ≤ coarsest ≤ finest")
+        if not extent > 0:
+            raise ValueError(f"extent={extent}: expected > 0")
+        self.table_size, self.extent, self.radius = table_size, float(extent), radius
+        self.resolutions = grid_resolutions(levels, coarsest, finest)
+        self.register_buffer("deltas", torch.empty(0), persistent=False)
+        sizes = [min((resolution + 1) ** 3, table_size) for resolution in self.resolutions]
+        self.tables = nn.ParameterList(torch.empty(size, features).uniform_(-INITIAL, INITIAL) for size in sizes)
+        widths = [levels * features, *[width] * depth, 1]
+        self.layers = nn.ModuleList(nn.Linear(*pair) for pair in pairwise(widths))
+
+    def value(self, x: Tensor, *, level: int = -1) -> Tensor:
+        """See `Field.value`."""
+        self.resolve_level(level)
+        rows = self.check_points(x).reshape(-1, 3)
+        features = []
+        for resolution, table in zip(self.resolutions, self.tables, strict=True):
+            place = locate(rows, resolution, self.extent)
+            features.append(interpolate(self._entries(table, place, resolution), place.within))
+        output, _ = self._read(torch.cat(features, dim=1))
+        return (output + self._sphere(rows)[0]).reshape(x.shape[:-1])
+
+    def jet(self, x: Tensor, *, level: int = -1) -> Jet:
+        """See `Field.jet`; one sweep back through the network, then the slopes of the interpolation."""
+        self.resolve_level(level)
+        rows = self.check_points(x).reshape(-1, 3)
+        features, slopes = [], []
+        for resolution, table in zip(self.resolutions, self.tables, strict=True):
+            place = locate(rows, resolution, self.extent)
+            feature, slope = interpolate_jet(self._entries(table, place, resolution), place)
+            features.append(feature)
+            slopes.append(slope)
+        output, active = self._read(torch.cat(features, dim=1))
+        *hidden, last = self._linear()
+        g = last.weight.expand(len(rows), -1)
+        for layer, mask in zip(reversed(hidden), reversed(active), strict=True):
+            g = (g * mask) @ layer.weight
+        sphere, outward = self._sphere(rows)
+        gradient = (g[:, None] @ torch.cat(slopes, dim=1))[:, 0] + outward
+        return Jet((output + sphere).reshape(x.shape[:-1]), gradient.reshape(x.shape), x.new_empty(*x.shape[:-1], 0))
+
+    def _entries(self, table: Tensor, place: Place, resolution: int) -> Tensor:
+        """The table's entries at the vertices of cells, ``(N, 2, 2, 2, F)``."""
+        i, j, k = vertices(place.cell)
+        if (resolution + 1) ** 3 <= self.table_size:
+            index = (i * (resolution + 1) + j) * (resolution + 1) + k
+        else:
+            index = spatial_hash(i, j, k, self.table_size)
+        return nn.functional.embedding(index, table)
+
+    def _read(self, features: Tensor) -> tuple[Tensor, list[Tensor]]:
+        """The network's output ``(N,)``, and which neurons of each hidden layer are active ``(N, width)``."""
+        *hidden, last = self._linear()
+        h, active = features, []
+        for layer in hidden:
+            z = layer(h)
+            active.append((z > 0).to(z.dtype))
+            h = z.relu()
+        return last(h)[:, 0], active
+
+    def _linear(self) -> list[nn.Linear]:
+        return [layer for layer in self.layers if isinstance(layer, nn.Linear)]
+
+    def _sphere(self, x: Tensor) -> tuple[Tensor | float, Tensor | float]:
+        """Distance to the sphere that is added ``(N,)``, and its gradient ``(N, 3)``; both 0 where there is none."""
+        if self.radius is None:
+            return 0.0, 0.0
+        length = x.norm(dim=1)
+        return length - self.radius, x / length.clamp(min=torch.finfo(x.dtype).tiny)[:, None]
