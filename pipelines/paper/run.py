@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import json
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -105,7 +106,7 @@ def run_cell(cell: Cell, out: Path, *, device: str = "cpu", progress: Report | N
         "environment": environment(torch.device(device)),
     }
     write_record(out, key, record)
-    return record
+    return json.loads(json.dumps(record))  # as it will be read next time: tuples are lists
 
 
 def _failed(cell: Cell, method: Method, error: str) -> dict[str, Any]:

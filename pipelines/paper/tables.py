@@ -29,10 +29,14 @@ __all__ = [
     "Table",
     "TableSpec",
     "Value",
+    "by_shape",
+    "figure",
     "mean",
     "median",
     "of_output",
     "outputs_of",
+    "printed_name",
+    "ratio",
     "select",
     "shapes_of",
 ]
@@ -65,6 +69,7 @@ class Row:
         published: what the paper says in the same columns, or None where it says nothing.
         source: where the method comes from, in a few words.
         differs: what differs from its source here.
+        competes: whether it may be the best of a column.
     """
 
     name: str
@@ -72,6 +77,7 @@ class Row:
     published: tuple[Value, ...] | None = None
     source: str = ""
     differs: str = ""
+    competes: bool = True
 
 
 @dataclass(frozen=True)
@@ -116,6 +122,7 @@ class TableSpec:
             the harness's business.
         tables: the records of those cells, as many as there are → the tables.
         plots: the same → the plots.
+        sheets: whether there is a contact sheet of its meshes per shape.
     """
 
     name: str
@@ -124,6 +131,7 @@ class TableSpec:
     cells: Callable[[Sequence[Path], Preset], list[Cell]]
     tables: Callable[[Sequence[Record]], tuple[Table, ...]]
     plots: Callable[[Sequence[Record]], tuple[Plot, ...]] = lambda _: ()
+    sheets: bool = False
 
 
 def select(records: Iterable[Record], **wanted: Any) -> list[Record]:
@@ -147,6 +155,37 @@ def outputs_of(records: Iterable[Record]) -> list[str]:
 def of_output(records: Iterable[Record], name: str, figure: str) -> list[float | None]:
     """One figure of the surface called ``name`` in every record that has one; None where it was not found."""
     return [o.get(figure) for record in records for o in record["outputs"] if o["name"] == name]
+
+
+def figure(records: Sequence[Record], name: str) -> float | None:
+    """One figure of the finest surface of the first record; None where there is no record or no surface."""
+    outputs = records[0]["outputs"] if records else []
+    return outputs[-1].get(name) if outputs else None
+
+
+def by_shape(records: Iterable[Record], output: str, name: str) -> dict[str, float | None]:
+    """One figure of an output, by shape."""
+    return {
+        record["cell"]["shape"]: found.get(name)
+        for record in records
+        for found in record["outputs"]
+        if found["name"] == output
+    }
+
+
+def ratio(above: float | None, below: float | None) -> float | None:
+    """``above / below``; None where either is missing or the second is zero."""
+    return above / below if above is not None and below else None
+
+
+def printed_name(shape: str, names: Iterable[str]) -> str | None:
+    """Which of the paper's shapes a file is, by its name.
+
+    Example:
+        >>> printed_name("Armadillo_50k", ["lucy", "armadillo"])
+        'armadillo'
+    """
+    return next((name for name in names if name in shape.lower()), None)
 
 
 def mean(values: Iterable[float | None]) -> float | None:

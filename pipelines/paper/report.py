@@ -1,0 +1,186 @@
+"""Tables as Markdown, CSV and JSON, and the page of results that holds all of them."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from .tables import Column, Row, Table, Value
+
+__all__ = ["Section", "as_csv", "as_dict", "as_markdown", "as_page", "from_dict", "to_json"]
+
+NONE = "–"
+
+
+@dataclass(frozen=True)
+class Section:
+    """What the page says about one table of the paper.
+
+    Attributes:
+        name: as after ``--table``.
+        label: the paper's label.
+        summary: what it shows.
+        tables: the table, and those behind it.
+        plots: files, relative to the page, with their titles.
+        sheets: contact sheets, likewise.
+        failures: cells that failed, one line each.
+    """
+
+    name: str
+    label: str
+    summary: str
+    tables: tuple[Table, ...]
+    plots: tuple[tuple[str, str], ...] = ()
+    sheets: tuple[tuple[str, str], ...] = ()
+    failures: tuple[str, ...] = ()
+
+
+def as_markdown(table: Table) -> str:
+    """A table with the published figures in brackets beside ours, and the best of each column in bold."""
+    best = [_best(table, index) for index in range(len(table.columns))]
+    lines = [
+        "| " + " | ".join([table.head, *(column.name for column in table.columns)]) + " |",
+        "|" + "---|" + "---:|" * len(table.columns),
+    ]
+    for row in table.rows:
+        cells = [row.name]
+        for index, column in enumerate(table.columns):
+            text = _text(row.values[index], column)
+            if row.competes and best[index] is not None and row.values[index] == best[index]:
+                text = f"**{text}**"
+            if row.published is not None and row.published[index] is not None:
+                text += f" *({_text(row.published[index], column)})*"
+            cells.append(text)
+        lines.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
+    return "\n".join(lines)
+
+
+def _best(table: Table, index: int) -> Value:
+    """The value of a column to be set in bold; None where none is, or there is nothing to compare."""
+    choose = {"lowest": min, "highest": max, None: None}[table.columns[index].best]
+    values = [row.values[index] for row in table.rows if row.competes]
+    numbers = [value for value in values if isinstance(value, int | float)]
+    return choose(numbers) if choose is not None and len(numbers) > 1 else None
+
+
+def _text(value: Value, column: Column) -> str:
+    if value is None:
+        return NONE
+    return value if isinstance(value, str) else format(value, column.form)
+
+
+def as_csv(table: Table) -> str:
+    """One line per row: its name, ours and the published figure of every column, source, and what differs."""
+    file = io.StringIO()
+    writer = csv.writer(file, lineterminator="\n")
+    heads = [name for column in table.columns for name in (column.name, f"{column.name} (paper)")]
+    writer.writerow([table.head, *heads, "source", "differs"])
+    for row in table.rows:
+        published = row.published or (None,) * len(table.columns)
+        figures = [value for pair in zip(row.values, published, strict=True) for value in pair]
+        writer.writerow([row.name, *("" if value is None else value for value in figures), row.source, row.differs])
+    return file.getvalue()
+
+
+def as_dict(table: Table) -> dict[str, Any]:
+    """A table as JSON, from which `from_dict` makes it again."""
+    return {
+        "name": table.name,
+        "title": table.title,
+        "head": table.head,
+        "columns": [{"name": c.name, "form": c.form, "best": c.best} for c in table.columns],
+        "rows": [
+            {
+                "name": row.name,
+                "values": list(row.values),
+                "published": None if row.published is None else list(row.published),
+                "source": row.source,
+                "differs": row.differs,
+                "competes": row.competes,
+            }
+            for row in table.rows
+        ],
+        "notes": list(table.notes),
+    }
+
+
+def from_dict(pairs: Mapping[str, Any]) -> Table:
+    """The inverse of `as_dict`."""
+    rows = tuple(
+        Row(
+            row["name"],
+            tuple(row["values"]),
+            None if row["published"] is None else tuple(row["published"]),
+            row["source"],
+            row["differs"],
+            row["competes"],
+        )
+        for row in pairs["rows"]
+    )
+    columns = tuple(Column(**column) for column in pairs["columns"])
+    return Table(pairs["name"], pairs["title"], pairs["head"], columns, rows, tuple(pairs["notes"]))
+
+
+def as_page(
+    sections: Sequence[Section],
+    *,
+    command: str,
+    protocol: Sequence[str],
+    machine: str,
+    methods: Sequence[tuple[str, str, str]],
+) -> str:
+    """The page of results.
+
+    Args:
+        sections: in order.
+        command: that wrote it.
+        protocol: sentences.
+        machine: what it ran on.
+        methods: name, source and what differs, of every method that gave a figure.
+    """
+    parts = [
+        "# The paper's tables, measured here",
+        "Written by",
+        f"    {command}",
+        "In *(brackets)*: what the paper prints. In **bold**: the best of a column here.",
+        "## Protocol",
+        "\n".join(f"- {sentence}" for sentence in protocol),
+        f"Machine: {machine}.",
+        "## Methods",
+        "\n".join(
+            [
+                "| method | source | what differs here |",
+                "|---|---|---|",
+                *(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in row)} |" for row in methods),
+            ]
+        ),
+    ]
+    for section in sections:
+        parts += _section(section)
+    return "\n\n".join(parts) + "\n"
+
+
+def _section(section: Section) -> list[str]:
+    parts = [f"## {section.name}: {section.summary}", f"The paper's `{section.label}`."]
+    for table in section.tables:
+        parts += [f"### {table.title}", as_markdown(table) if table.rows else "No figures yet."]
+        if table.notes:
+            parts.append("\n".join(f"- {note}" for note in table.notes))
+    if section.plots:
+        file, title = section.plots[0]
+        parts.append(f"![{title}]({file})")
+    if section.plots[1:]:
+        parts.append("More plots: " + ", ".join(f"[{title}]({file})" for file, title in section.plots[1:]) + ".")
+    parts += [f"![{title}]({file})" for file, title in section.sheets]
+    if section.failures:
+        parts.append("Failed:\n\n" + "\n".join(f"- {line}" for line in section.failures))
+    return parts
+
+
+def to_json(tables: Sequence[Table]) -> str:
+    """Tables as the text of a JSON file."""
+    return json.dumps([as_dict(table) for table in tables], indent=2) + "\n"
