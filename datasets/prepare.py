@@ -11,6 +11,7 @@ from scipy.spatial import KDTree
 
 from ..neural_fields import InputError, Similarity
 from .orientation import estimate_normals, nearest, openness, orient_normals, outwardness
+from .outliers import inspect_points
 from .point_cloud import PointCloud, unit_rows
 from .reading import MIN_POINTS
 
@@ -29,8 +30,10 @@ class CleaningReport:
         dropped_nan: points with a coordinate that is not finite.
         dropped_duplicates: points at exactly the place of an earlier one.
         dropped_isolated: points far from all others.
+        dropped_outliers: other points that belong to no surface.
         repaired_normals: zero or NaN normals replaced by their neighbours' mean.
         dropped_normals: points whose normal could not be repaired.
+        turned_normals: normals turned round because their neighbours' point the other way.
         normals_source: "file", "mesh" (from the file's faces) or "estimated".
         flipped: whether all normals pointed inward and were turned round.
         pieces: connected pieces oriented one by one; 0 if normals were not estimated, or a sensor oriented them.
@@ -41,8 +44,10 @@ class CleaningReport:
     dropped_nan: int
     dropped_duplicates: int
     dropped_isolated: int
+    dropped_outliers: int
     repaired_normals: int
     dropped_normals: int
+    turned_normals: int
     normals_source: Literal["file", "mesh", "estimated"]
     flipped: bool
     pieces: int
@@ -59,11 +64,14 @@ class CleaningReport:
             "not finite": self.dropped_nan,
             "duplicate": self.dropped_duplicates,
             "isolated": self.dropped_isolated,
+            "outliers": self.dropped_outliers,
             "without a usable normal": self.dropped_normals,
         }
         dropped = ", ".join(f"{count:,} {what}" for what, count in counts.items() if count)
         if self.repaired_normals:
             parts.append(f"{self.repaired_normals:,} normals repaired")
+        if self.turned_normals:
+            parts.append(f"{self.turned_normals:,} normals turned round (--no-turn-normals keeps them)")
         return "; ".join([*parts, *([f"dropped {dropped}"] if dropped else [])])
 
 
@@ -96,6 +104,8 @@ def prepare_cloud(
     sensor_origin: tuple[float, float, float] | None = None,
     neighbors: int = 16,
     isolation: float | None = 30.0,
+    drop_outliers: bool = False,
+    turn_normals: bool = False,
 ) -> OrientedCloud:
     """Clean a cloud, give it oriented unit normals and move it into the unit sphere.
 
@@ -110,7 +120,11 @@ def prepare_cloud(
         neighbors: size of the neighbourhoods normals are estimated and repaired from; doubled for estimation,
             at most twice, while the cloud is too noisy for them to look flat.
         isolation: points whose eighth neighbour is this many times further away than the median point's are dropped:
-            a single stray point of a scan would get a bubble of surface to itself, and set the scale. None keeps them.
+            a single stray point of a scan would get a bubble of surface to itself, and set the scale. Those that
+            neighbours about as sparse support (see `inspect_points`) stay: they are a sparser part. None keeps all.
+        drop_outliers: whether other points that belong to no surface are dropped (see `inspect_points`).
+        turn_normals: whether single normals of the file that point the other way than their neighbours' are turned
+            round; with ``normals="file"`` none is.
 
     Raises:
         InputError: too few points are left, or ``normals="file"`` and there are none.
@@ -128,39 +142,52 @@ def prepare_cloud(
     finite = np.flatnonzero(np.isfinite(cloud.points).all(axis=1))
     distinct = finite[_first_of_each(cloud.points[finite])]
     _check_enough(len(distinct), cloud, "are left after dropping NaN and duplicates")
-    kept = distinct if isolation is None else distinct[~_isolated(cloud.points[distinct], isolation)]
-    dropped_isolated = len(distinct) - len(kept)
-    similarity = Similarity.to_unit_sphere(cloud.points[kept])
-    points = similarity.to_unit(cloud.points[kept])
 
-    given = unit_rows(cloud.normals[kept]) if cloud.normals is not None and normals != "estimate" else None
-    usable: NDArray[np.bool_] = np.zeros(len(points), bool)
+    given = unit_rows(cloud.normals[distinct]) if cloud.normals is not None and normals != "estimate" else None
+    usable: NDArray[np.bool_] = np.zeros(len(distinct), bool)
     if given is not None:
         usable = (given != 0).any(axis=1)
     if normals == "file" and not usable.any():
         raise InputError(f"{cloud.source}: normals: the file has none; use --normals estimate")
-    source: Literal["file", "mesh", "estimated"] = cloud.normals_source
-    repaired = pieces = 0
-    flipped = False
-    if given is not None and (normals == "file" or 2 * usable.sum() >= len(points)):
-        unit, decided = _repair(points, given, usable, neighbors)
+    kept, unit, repaired = distinct, None, 0
+    if given is not None and (normals == "file" or 2 * usable.sum() >= len(distinct)):
+        unit, decided = _repair(cloud.points[distinct], given, usable, neighbors)
         repaired = int(decided.sum() - usable.sum())
-        points, unit, kept = points[decided], unit[decided], kept[decided]
+        unit, kept = unit[decided], distinct[decided]
         _check_enough(len(kept), cloud, "have a usable normal; use --normals estimate")
+    dropped_normals = len(distinct) - len(kept)
+    found = inspect_points(
+        cloud.points[kept],
+        unit,
+        isolation=isolation,
+        outliers=drop_outliers,
+        flips=turn_normals and normals == "auto",
+    )
+    sound = ~(found.isolated | found.outliers)
+    kept = kept[sound]
+    _check_enough(len(kept), cloud, "are left after dropping outliers; keep them with --no-drop-outliers")
+    similarity = Similarity.to_unit_sphere(cloud.points[kept])
+    points = similarity.to_unit(cloud.points[kept])
+
+    source: Literal["file", "mesh", "estimated"] = cloud.normals_source
+    flipped, pieces = False, 0
+    if unit is not None:
+        unit = np.where(found.flipped[:, None], -unit, unit)[sound]
         flipped = normals == "auto" and _plainly_inward(points, unit)
         unit = -unit if flipped else unit
-        dropped_normals = int(len(decided) - decided.sum())
     else:
-        source, dropped_normals = "estimated", 0
+        source = "estimated"
         unit, pieces = _estimate(points, neighbors, similarity, sensor_origin)
     report = CleaningReport(
         read=len(cloud),
         kept=len(kept),
         dropped_nan=len(cloud) - len(finite),
         dropped_duplicates=len(finite) - len(distinct),
-        dropped_isolated=dropped_isolated,
+        dropped_isolated=int(found.isolated.sum()),
+        dropped_outliers=int(found.outliers.sum()),
         repaired_normals=repaired,
         dropped_normals=dropped_normals,
+        turned_normals=int(found.flipped.sum()),
         normals_source=source,
         flipped=flipped,
         pieces=pieces,
@@ -185,13 +212,6 @@ def _first_of_each(points: Float64) -> NDArray[np.int64]:
     return np.sort(order[first])
 
 
-def _isolated(points: Float64, factor: float, *, neighbors: int = 8) -> NDArray[np.bool_]:
-    """Which points have their ``neighbors``-th neighbour more than ``factor`` times the median further away."""
-    shifted = points - points.mean(axis=0)  # a tree over map coordinates would lose digits
-    found = np.asarray(KDTree(shifted).query(shifted, k=min(neighbors, len(points) - 1) + 1, workers=-1)[0])[:, -1]
-    return found > factor * np.median(found)
-
-
 def _repair(
     points: Float64, normals: Float64, usable: NDArray[np.bool_], neighbors: int, *, agreement: float = 0.5
 ) -> tuple[Float64, NDArray[np.bool_]]:
@@ -205,7 +225,8 @@ def _repair(
     missing = np.flatnonzero(~usable)
     if len(missing) == 0:
         return normals, usable
-    near = KDTree(points[usable]).query(points[missing], k=min(neighbors, int(usable.sum())), workers=-1)[1]
+    shifted = points - points.mean(axis=0)  # a tree over map coordinates would lose digits
+    near = KDTree(shifted[usable]).query(shifted[missing], k=min(neighbors, int(usable.sum())), workers=-1)[1]
     mean = normals[usable][near.reshape(len(missing), -1)].mean(axis=1)
     length = np.linalg.norm(mean, axis=1)
     clear = length > agreement
