@@ -14,6 +14,7 @@ from .bench_evolve_command import COMMAND as EVOLVE
 from .bench_reconstruct_command import COMMAND as RECONSTRUCT
 from .command import Command, add_json, check_output, positive, whole, write_json
 from .fit_settings import add_fit_settings, fit_settings
+from .paper.command import COMMAND as PAPER
 
 __all__ = ["BENCH_COMMANDS"]
 
@@ -192,5 +193,6 @@ BENCH_COMMANDS: Mapping[str, Command] = MappingProxyType(
         "bench normal-map": NORMAL_MAP,
         "bench reconstruct": RECONSTRUCT,
         "bench evolve": EVOLVE,
+        "bench paper": PAPER,
     }
 )

@@ -31,7 +31,7 @@ from .tables import (
 if TYPE_CHECKING:
     from .recipe import Preset
 
-__all__ = ["BANF_TABLE", "COMPARISON_TABLE", "NOISE_TABLE", "POISSON_TABLE", "missing_rows"]
+__all__ = ["BANF_TABLE", "COMPARISON_TABLE", "NOISE_TABLE", "POISSON_TABLE"]
 
 NOISE_LEVEL = 0.01  # of the bounding box's diagonal (paper, Tab. 3)
 CURVE = (0.005, 0.02)  # and what the noise curves have beside it, for these:
@@ -130,17 +130,6 @@ def _most(values: Iterable[float | None]) -> int | None:
     return max(numbers, default=None)
 
 
-def missing_rows(records: Sequence[Record], columns: int) -> list[Row]:
-    """One row for each method that gave nothing at all, with the reason."""
-    rows = []
-    for method in dict.fromkeys(record["cell"]["method"] for record in records):
-        own = select(records, method=method)
-        if not any(record["outputs"] for record in own):
-            why = str(own[0].get("error", "not run"))
-            rows.append(Row(method, (None,) * columns, None, own[0]["method"]["source"], why))
-    return rows
-
-
 def _reading(records: Sequence[Record]) -> list[str]:
     """What the mean Chamfer distances say, in a sentence; the fine level of ours against the best of the others."""
     means = {name: mean(of_output(records, name, "chamfer")) for name in outputs_of(records)}
@@ -183,13 +172,13 @@ def comparison_tables(records: Sequence[Record]) -> tuple[Table, ...]:
         if printed is not None:
             published = (*printed[:4], None, None, None, *printed[4:])
         rows.append(Row(name, values, published, *_source(records, name)))
-    rows += [*missing_rows(records, len(columns)), _floor_row(records, len(columns))]
+    rows.append(_floor_row(records, len(columns)))
     notes = (
         *_reading(records),
         FOUND,
         SHELL,
         "FPS: sphere tracing with 20 steps on the first level and 5 on each finer one, no normals, measured at a "
-        "smaller size and scaled by the number of pixels. The paper's ran on an RTX 5090, as its training and sampling.",
+        "smaller size and scaled by the number of pixels. The paper's seconds and FPS are of an RTX 5090.",
     )
     table = Table("comparison", "Surface reconstruction of clean clouds", "method", columns, tuple(rows), notes)
     return (table, *_per_shape("comparison", records))
@@ -203,7 +192,7 @@ def noise_tables(records: Sequence[Record]) -> tuple[Table, ...]:
         printed = NOISE.get(name)
         published = None if printed is None else (*printed, None, None, None)
         rows.append(Row(name, _quality(noisy, name), published, *_source(noisy, name)))
-    rows += [*missing_rows(noisy, len(QUALITY)), _floor_row(noisy, len(QUALITY))]
+    rows.append(_floor_row(noisy, len(QUALITY)))
     notes = (
         *_reading(noisy),
         "Points are moved along their normals by up to 1 % of the bounding box's diagonal; results are measured "
@@ -307,7 +296,6 @@ def poisson_tables(records: Sequence[Record]) -> tuple[Table, ...]:
             printed = POISSON.get((output, noise))
             published = None if printed is None else (*printed, None, None)
             rows.append(Row(f"{words}, {output}", values, published, *_source(some, output)))
-    rows += missing_rows(records, len(columns))
     clean, noisy = (mean(of_output(select(records, noise=n), "Ours fine", "chamfer")) for n in (0.0, NOISE_LEVEL))
     peers = [mean(of_output(select(records, noise=n), "Screened Poisson", "chamfer")) for n in (0.0, NOISE_LEVEL)]
     notes = [SHELL]
@@ -346,8 +334,7 @@ def banf_tables(records: Sequence[Record]) -> tuple[Table, ...]:
         "Chamfer distance of the finest level of each; `degr.` is that under 1 % noise over that on the clean cloud.",
         "The paper's BANF is a re-implementation as well: the authors' code has no reconstruction from points.",
     )
-    missing = missing_rows(records, len(columns))
-    return (Table("banf", "BANF", "shape", columns, (*rows, *missing), notes),)
+    return (Table("banf", "BANF", "shape", columns, tuple(rows), notes),)
 
 
 COMPARISON_TABLE = TableSpec(

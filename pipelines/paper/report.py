@@ -4,14 +4,23 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from .tables import Column, Row, Table, Value
 
-__all__ = ["Section", "as_csv", "as_dict", "as_markdown", "as_page", "from_dict", "to_json"]
+__all__ = [
+    "Section",
+    "as_csv",
+    "as_dict",
+    "as_markdown",
+    "as_page",
+    "from_dict",
+    "section_as_dict",
+    "section_from_dict",
+    "with_missing",
+]
 
 NONE = "–"
 
@@ -27,7 +36,8 @@ class Section:
         tables: the table, and those behind it.
         plots: files, relative to the page, with their titles.
         sheets: contact sheets, likewise.
-        failures: cells that failed, one line each.
+        methods: name, source and what differs, of every method behind the figures.
+        failures: cells that failed or were left out, one line each.
     """
 
     name: str
@@ -36,6 +46,7 @@ class Section:
     tables: tuple[Table, ...]
     plots: tuple[tuple[str, str], ...] = ()
     sheets: tuple[tuple[str, str], ...] = ()
+    methods: tuple[tuple[str, str, str], ...] = ()
     failures: tuple[str, ...] = ()
 
 
@@ -43,7 +54,7 @@ def as_markdown(table: Table) -> str:
     """A table with the published figures in brackets beside ours, and the best of each column in bold."""
     best = [_best(table, index) for index in range(len(table.columns))]
     lines = [
-        "| " + " | ".join([table.head, *(column.name for column in table.columns)]) + " |",
+        _line([table.head, *(column.name for column in table.columns)]),
         "|" + "---|" + "---:|" * len(table.columns),
     ]
     for row in table.rows:
@@ -55,7 +66,7 @@ def as_markdown(table: Table) -> str:
             if row.published is not None and row.published[index] is not None:
                 text += f" *({_text(row.published[index], column)})*"
             cells.append(text)
-        lines.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
+        lines.append(_line(cells))
     return "\n".join(lines)
 
 
@@ -125,14 +136,27 @@ def from_dict(pairs: Mapping[str, Any]) -> Table:
     return Table(pairs["name"], pairs["title"], pairs["head"], columns, rows, tuple(pairs["notes"]))
 
 
-def as_page(
-    sections: Sequence[Section],
-    *,
-    command: str,
-    protocol: Sequence[str],
-    machine: str,
-    methods: Sequence[tuple[str, str, str]],
-) -> str:
+def section_as_dict(section: Section) -> dict[str, Any]:
+    """A section as JSON, from which `section_from_dict` makes it again."""
+    return asdict(section) | {"tables": [as_dict(table) for table in section.tables]}
+
+
+def section_from_dict(pairs: Mapping[str, Any]) -> Section:
+    """The inverse of `section_as_dict`."""
+    lists = {name: tuple(map(tuple, pairs[name])) for name in ("plots", "sheets", "methods")}
+    texts = {name: pairs[name] for name in ("name", "label", "summary")}
+    tables = tuple(map(from_dict, pairs["tables"]))
+    return Section(**texts, tables=tables, failures=tuple(pairs["failures"]), **lists)
+
+
+def with_missing(table: Table, missing: Mapping[str, str]) -> Table:
+    """The table with one more row for each method that gave nothing at all, and the reason."""
+    empty = (None,) * len(table.columns)
+    rows = tuple(Row(f"{name}: {why}", empty, None, "", why, competes=False) for name, why in missing.items())
+    return replace(table, rows=table.rows + rows)
+
+
+def as_page(sections: Sequence[Section], *, command: str, protocol: Sequence[str], machine: str) -> str:
     """The page of results.
 
     Args:
@@ -140,8 +164,8 @@ def as_page(
         command: that wrote it.
         protocol: sentences.
         machine: what it ran on.
-        methods: name, source and what differs, of every method that gave a figure.
     """
+    methods = list(dict.fromkeys(method for section in sections for method in section.methods))
     parts = [
         "# The paper's tables, measured here",
         "Written by",
@@ -151,17 +175,15 @@ def as_page(
         "\n".join(f"- {sentence}" for sentence in protocol),
         f"Machine: {machine}.",
         "## Methods",
-        "\n".join(
-            [
-                "| method | source | what differs here |",
-                "|---|---|---|",
-                *(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in row)} |" for row in methods),
-            ]
-        ),
+        "\n".join(["| method | source | what differs here |", "|---|---|---|", *map(_line, methods)]),
     ]
     for section in sections:
         parts += _section(section)
     return "\n\n".join(parts) + "\n"
+
+
+def _line(cells: Sequence[str]) -> str:
+    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
 
 
 def _section(section: Section) -> list[str]:
@@ -177,10 +199,5 @@ def _section(section: Section) -> list[str]:
         parts.append("More plots: " + ", ".join(f"[{title}]({file})" for file, title in section.plots[1:]) + ".")
     parts += [f"![{title}]({file})" for file, title in section.sheets]
     if section.failures:
-        parts.append("Failed:\n\n" + "\n".join(f"- {line}" for line in section.failures))
+        parts.append("Not in these figures:\n\n" + "\n".join(f"- {line}" for line in section.failures))
     return parts
-
-
-def to_json(tables: Sequence[Table]) -> str:
-    """Tables as the text of a JSON file."""
-    return json.dumps([as_dict(table) for table in tables], indent=2) + "\n"

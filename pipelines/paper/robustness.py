@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from .cell import Cell, Record
-from .comparison import NOISE_LEVEL, missing_rows
+from .comparison import NOISE_LEVEL
 from .plots import Plot, Series
 from .protocol import fit_config
 from .published import DELTAS, OUTLIERS, UNDERTRAINED
@@ -73,14 +73,14 @@ def outlier_tables(records: Sequence[Record]) -> tuple[Table, ...]:
         "points. Results are measured against the clean surface.",
         "IoU is that of the volumes; the paper's is the overlap of surface voxels (`shell_iou` in the JSON files).",
     ]
-    strays = [record for record in select(records, method="ours", flipped=0.0) if record["outputs"]]
+    strays = select(records, method="ours", flipped=0.0)
     for fraction in CONTAMINATION:
         overlaps = {r["cell"]["shape"]: figure([r], "iou") for r in select(strays, outliers=fraction)}
         known = {shape: value for shape, value in overlaps.items() if value is not None}
         if known:
             worst = min(known, key=lambda shape: known[shape])
             notes.append(f"Lowest IoU of ours at {100 * fraction:g} %: {known[worst]:.3f}, of {worst}.")
-    table = Table("outliers", "Strays", "cloud", columns, (*rows, *missing_rows(records, len(columns))), tuple(notes))
+    table = Table("outliers", "Strays", "cloud", columns, tuple(rows), tuple(notes))
     return (table, _flipped_table(records))
 
 

@@ -9,22 +9,22 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 
 from ..fit import choose_device
 from ..fit_state import environment
-from ..jobs import Outcome, run_jobs
+from ..jobs import Outcome, check_jobs, run_jobs
 from .cell import Cell, Record
 from .method import Method, Workplace
 from .methods import method_named
+from .names import METHODS
 from .protocol import protocol_of
 from .recipe import Preset, Report
 from .store import read_record, write_record
 from .tables import TableSpec
 
-__all__ = ["Shape", "cell_key", "cells_of", "run_cell", "run_cells"]
+__all__ = ["Ran", "Shape", "cell_key", "cells_of", "run_cell", "run_cells"]
 
 Say = Callable[[str], None]
 
@@ -91,13 +91,14 @@ def run_cell(cell: Cell, out: Path, *, device: str = "cpu", progress: Report | N
     found = read_record(out, key)
     if found is not None:
         return found
+    head = {"cell": cell.as_dict(), "method": {"source": method.source, "differs": method.differs}}
     started = time.perf_counter()
     try:
         findings = method.run(cell, Workplace(out, key, device, progress))
     except Exception as error:
-        write_record(out, key, _failed(cell, method, " ".join(str(error).split()) or type(error).__name__))
+        write_record(out, key, head | {"error": " ".join(str(error).split()) or type(error).__name__})
         raise
-    record = _head(cell, method) | {
+    record = head | {
         "key": key,
         "outputs": [dict(output) for output in findings.outputs],
         "deltas": list(findings.deltas),
@@ -109,18 +110,22 @@ def run_cell(cell: Cell, out: Path, *, device: str = "cpu", progress: Report | N
     return json.loads(json.dumps(record))  # as it will be read next time: tuples are lists
 
 
-def _failed(cell: Cell, method: Method, error: str) -> dict[str, Any]:
-    """The record of a cell that found nothing, and why."""
-    return _head(cell, method) | {"error": error}
+@dataclass(frozen=True)
+class Ran:
+    """What became of the cells.
+
+    Attributes:
+        records: of those that are done.
+        failures: why the others failed.
+        lacking: methods that need something that is not installed, and what.
+    """
+
+    records: Mapping[Cell, Record]
+    failures: Mapping[Cell, str]
+    lacking: Mapping[str, str]
 
 
-def _head(cell: Cell, method: Method) -> dict[str, Any]:
-    return {"cell": cell.as_dict(), "method": {"source": method.source, "differs": method.differs}}
-
-
-def run_cells(
-    cells: Sequence[Cell], out: Path, *, jobs: int = 1, device: str = "cpu", say: Say
-) -> tuple[Mapping[Cell, Record], int]:
+def run_cells(cells: Sequence[Cell], out: Path, *, jobs: int = 1, device: str = "cpu", say: Say) -> Ran:
     """Run what has no record yet, one line each.
 
     Args:
@@ -130,44 +135,35 @@ def run_cells(
         device: a torch device, or "auto".
         say: told one line per cell.
 
-    Returns:
-        A record for every cell, for those that failed or lack an extra one without outputs but with an "error"; and
-        how many failed.
-
     Raises:
         InputError: no such device, or no Ray for more than one job.
         KeyboardInterrupt: Ctrl-C; finished cells are kept.
+        Interrupted: the same, during a fit of ours.
     """
     where = str(choose_device(device))
+    check_jobs(jobs)
     methods = {cell: method_named(cell.method) for cell in cells}
-    lacking = {cell: why for cell, method in methods.items() if (why := method.missing()) is not None}
-    records: dict[Cell, Record] = {
-        cell: _failed(cell, methods[cell], why) | {"outputs": [], "deltas": []} for cell, why in lacking.items()
-    }
-    for why in sorted({f"{cell.method}: {why}" for cell, why in lacking.items()}):
-        say(f"left out: {why}")
-    waiting: list[Cell] = []
-    for cell in cells:
-        if cell in lacking:
-            continue
-        record = read_record(out, cell_key(cell, methods[cell]))
-        if record is None:
-            waiting.append(cell)
-        else:
-            records[cell] = record
+    lacking = {method.name: why for method in methods.values() if (why := method.missing()) is not None}
+    for name, why in lacking.items():
+        say(f"left out: {name}, {why}")
+    possible = [cell for cell in cells if cell.method not in lacking]
+    found = {cell: read_record(out, cell_key(cell, methods[cell])) for cell in possible}
+    records = {cell: record for cell, record in found.items() if record is not None}
+    waiting = [cell for cell in possible if cell not in records]
     if records and waiting:
-        say(f"{len(cells) - len(waiting)} of {len(cells)} cells are there already")
+        say(f"{len(records)} of {len(possible)} cells are there already")
     counter = _Counter(len(waiting), jobs, say)
     work = functools.partial(run_cell, out=out, device=where)
-    failures = 0
-    for outcome in run_jobs(work, waiting, jobs=jobs, report=counter):
-        if outcome.value is None:
-            failures += 1
-            why = outcome.error or "failed"
-            records[outcome.item] = _failed(outcome.item, methods[outcome.item], why) | {"outputs": [], "deltas": []}
-        else:
-            records[outcome.item] = outcome.value
-    return {cell: records[cell] for cell in cells}, failures
+    failures: dict[Cell, str] = {}
+    # Variants of our own start from a fit that is a cell of the first group, and must not train it twice side by side.
+    for first in (True, False):
+        group = [cell for cell in waiting if (cell.method in METHODS) is first]
+        for outcome in run_jobs(work, group, jobs=jobs, report=counter):
+            if outcome.value is None:
+                failures[outcome.item] = outcome.error or "failed"
+            else:
+                records[outcome.item] = outcome.value
+    return Ran({cell: records[cell] for cell in cells if cell in records}, failures, lacking)
 
 
 class _Counter:

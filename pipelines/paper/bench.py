@@ -1,0 +1,193 @@
+"""``mplicits bench paper``: the cells that the tables need, then the tables, plots, sheets and the page of results."""
+
+from __future__ import annotations
+
+import json
+import platform
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from ..fit import choose_device
+from ..timing import sgemm_rate
+from .ablations import DELTA_FACTOR, LOSS_WEIGHTS
+from .cell import Cell
+from .comparison import BANF_TABLE, COMPARISON_TABLE, NOISE_TABLE, POISSON_TABLE
+from .isolation import ISOLATION
+from .names import METHODS, TABLES
+from .plots import to_svg
+from .protocol import protocol_of
+from .recipe import Preset
+from .report import Section, as_csv, as_page, section_as_dict, section_from_dict, with_missing
+from .robustness import DELTAS_TABLE, OUTLIERS_TABLE, UNDERTRAINED_TABLE
+from .run import Ran, Shape, cells_of, run_cells
+from .sheets import write_sheets
+from .speed_tables import MARCHING_CUBES, NORMALS
+from .store import make_folder, write_text
+from .tables import TableSpec
+
+__all__ = ["SPECS", "Bench", "bench_paper"]
+
+# In the order of `names.TABLES`; a test holds the two together.
+SPECS: tuple[TableSpec, ...] = (
+    COMPARISON_TABLE,
+    NOISE_TABLE,
+    POISSON_TABLE,
+    BANF_TABLE,
+    ISOLATION,
+    UNDERTRAINED_TABLE,
+    OUTLIERS_TABLE,
+    DELTAS_TABLE,
+    LOSS_WEIGHTS,
+    DELTA_FACTOR,
+    MARCHING_CUBES,
+    NORMALS,
+)
+
+PAGE = "results.md"
+
+
+@dataclass(frozen=True)
+class Bench:
+    """What is asked for.
+
+    Attributes:
+        shapes: see `find_shapes`.
+        tables: names of `SPECS`.
+        preset: how large and how long.
+        methods: those of `names.METHODS` that take part.
+        seed: of everything.
+        jobs: cells at a time.
+        device: a torch device, or "auto".
+        command: as it will stand on the page.
+    """
+
+    shapes: Sequence[Shape]
+    tables: Sequence[str]
+    preset: Preset
+    methods: Sequence[str] = METHODS
+    seed: int = 0
+    jobs: int = 1
+    device: str = "cpu"
+    command: str = "mplicits bench paper"
+
+
+def bench_paper(bench: Bench, out: Path, *, say: Callable[[str], None]) -> tuple[list[Section], int]:
+    """Run a bench and write what it found into a folder; what is there already is used.
+
+    The page holds the tables of earlier runs into the same folder too, if their preset and seed are the same.
+
+    Args:
+        bench: what is asked for.
+        out: the folder.
+        say: told one line per cell.
+
+    Returns:
+        The sections that were asked for, and how many cells failed.
+
+    Raises:
+        InputError: the folder cannot be written, or see `run_cells`.
+        KeyboardInterrupt: Ctrl-C; finished cells are kept.
+        Interrupted: the same, during a fit of ours.
+    """
+    make_folder(out)
+    skipped = [name for name in METHODS if name not in bench.methods]
+    plan = {
+        spec: cells_of(spec, bench.shapes, bench.preset, seed=bench.seed, skipped=skipped)
+        for spec in SPECS
+        if spec.name in bench.tables
+    }
+    cells = list(dict.fromkeys(cell for wanted in plan.values() for cell in wanted))
+    say(f"{len(plan)} tables, {len(bench.shapes)} shapes, {len(cells)} cells")
+    ran = run_cells(cells, out, jobs=bench.jobs, device=bench.device, say=say)
+    sections = [_section(spec, wanted, ran, out) for spec, wanted in plan.items()]
+    stamp = {"preset": bench.preset, "seed": bench.seed}
+    for section, wanted in zip(sections, plan.values(), strict=True):
+        for table in section.tables:
+            write_text(out / f"{table.name}.csv", as_csv(table))
+        records = [dict(ran.records[cell]) for cell in wanted if cell in ran.records]
+        pairs = stamp | {"section": section_as_dict(section), "records": records}
+        write_text(out / f"{section.name}.json", json.dumps(pairs, indent=2) + "\n")
+    page = as_page(_kept(out, stamp), command=bench.command, protocol=_protocol(bench), machine=_machine(bench.device))
+    write_text(out / PAGE, page)
+    return sections, len(ran.failures)
+
+
+def _section(spec: TableSpec, cells: Sequence[Cell], ran: Ran, out: Path) -> Section:
+    own = {cell: ran.records[cell] for cell in cells if cell in ran.records}
+    records = list(own.values())
+    failures = {cell.name: ran.failures[cell] for cell in cells if cell in ran.failures}
+    there = {cell.method for cell in own}
+    missing = {name: why for name, why in ran.lacking.items() if name in {cell.method for cell in cells}}
+    for cell in cells:
+        if cell.method not in there and cell in ran.failures:
+            missing.setdefault(cell.method, f"failed, {ran.failures[cell]}")
+    tables = spec.tables(records) if records else ()
+    if tables:
+        tables = (with_missing(tables[0], missing), *tables[1:])
+    plots = []
+    for plot in spec.plots(records) if records else ():
+        (out / "plots").mkdir(exist_ok=True)
+        file = f"plots/{plot.name}.svg"
+        write_text(out / file, to_svg(plot))
+        plots.append((file, plot.title))
+    sources = {record["cell"]["method"]: record["method"] for record in records}
+    return Section(
+        spec.name,
+        spec.label,
+        spec.summary,
+        tables,
+        tuple(plots),
+        write_sheets(spec.name, own, out) if spec.sheets else (),
+        tuple((name, about["source"], about["differs"]) for name, about in sources.items()),
+        tuple(f"{name}: {why}" for name, why in failures.items()),
+    )
+
+
+def _kept(out: Path, stamp: Mapping[str, Any]) -> list[Section]:
+    """Every section in the folder that was measured in the same way, in the order of the tables."""
+    sections = []
+    for name in TABLES:
+        file = out / f"{name}.json"
+        pairs = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
+        if stamp.items() <= pairs.items():
+            sections.append(section_from_dict(pairs["section"]))
+    return sections
+
+
+def _protocol(bench: Bench) -> list[str]:
+    names = ", ".join(shape.path.name for shape in bench.shapes)
+    measured = [
+        f"{shape.path.name} is measured against {shape.reference.name}."
+        for shape in bench.shapes
+        if shape.reference is not None
+    ]
+    return [
+        f"Preset `{bench.preset}`, seed {bench.seed}. Shapes: {names}.",
+        "The cloud is the mesh's vertices with their normals (of a scan, its points); all methods learn from it and "
+        "from nothing else. Only ours may judge points to be strays, because that is part of it.",
+        "Both shapes are moved by the similarity that puts the reference into the unit sphere. The Chamfer distance is "
+        "squared L2, the sum of both directions; what two samplings of the same surface score is the row `(sampling "
+        "floor)`.",
+        protocol_of(bench.preset).summary(),
+        *measured,
+    ]
+
+
+def _machine(device: str) -> str:
+    where = choose_device(device)
+    name = torch.cuda.get_device_name(where) if where.type == "cuda" else _processor()
+    rate = sgemm_rate(256, device=where) / 1e9
+    return (
+        f"{name}, {torch.get_num_threads()} threads, float32 matrices at {rate:.0f} GFLOP/s, torch {torch.__version__}"
+    )
+
+
+def _processor() -> str:
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text(encoding="utf-8").splitlines() if info.is_file() else []
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()
