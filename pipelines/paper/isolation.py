@@ -1,0 +1,305 @@
+"""The table isolation: residual levels without bands, bands without residual levels, and the method with both.
+
+All variants stand on the same coarse network, that of the finished fit, which itself is variant (a). Each is
+extracted in the way that is sound for it: (a) and (c) level by level inside their bands, (b) on the whole domain.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor, nn
+
+from ...neural_fields import Field, Jet, MultiscaleSDF, NoSurfaceError, extract_mesh
+from .base import Base, base_cell, base_of
+from .cell import Cell, Record
+from .judge import Judge
+from .levels import (
+    banded_sources,
+    delta_after,
+    device_of,
+    domain_sources,
+    generator_for,
+    on_its_own,
+    train_level,
+    up_to,
+    without_bands,
+)
+from .method import Findings, Method, Workplace
+from .ours import Ours
+from .protocol import protocol_of
+from .recipe import Report
+from .tables import Column, Row, Table, TableSpec, Value, mean, median, select, shapes_of
+
+if TYPE_CHECKING:
+    from .recipe import Preset
+
+__all__ = ["ISOLATION", "TAB_ISOLATION", "IndependentLevels", "Isolation", "isolation_tables", "steepness"]
+
+NOISE = 0.01
+# The table of that label: variant → mean CD, median CD, mean Hausdorff, mean IoU; with noise, then clean.
+TAB_ISOLATION: Mapping[str, tuple[tuple[float, ...], tuple[float, ...]]] = MappingProxyType(
+    {
+        "a": ((6.39e-5, 1.49e-5, 1.45e-3, 0.687), (3.87e-5, 1.38e-5, 5.86e-3, 0.653)),
+        "b": ((6.34e-5, 2.26e-5, 5.23e-3, 0.555), (4.26e-5, 2.36e-5, 6.75e-3, 0.655)),
+        "c": ((1.04e-4, 2.36e-5, 5.72e-3, 0.669), (3.47e-5, 1.62e-5, 4.01e-3, 0.749)),
+    }
+)
+# In the text below it: mean CD with noise, extracted without culling.
+CD_WITHOUT_CULLING: Mapping[str, float] = MappingProxyType({"a": 6.42e-5, "c": 2.8e-1})
+COMPONENTS: Mapping[str, str] = MappingProxyType({"a": "1 to 4", "c": "365 to 4,109"})
+VARIANTS: Mapping[str, str] = MappingProxyType(
+    {
+        "a": "(a) with residual, with bands (ours)",
+        "b": "(b) with residual, without bands",
+        "c": "(c) without residual, with bands",
+    }
+)
+UNCULLED = " without culling"
+FIGURES = (
+    Column("mean CD", ".2e", "lowest"),
+    Column("median CD", ".2e", "lowest"),
+    Column("mean Hausdorff", ".2e", "lowest"),
+    Column("mean shell IoU", ".3f", "highest"),
+    Column("mean IoU", ".3f", "highest"),
+    Column("mean components", ".1f", "lowest"),
+)
+LIPSCHITZ = 1.25  # as our own fields are extracted with: the eikonal term keeps |∇f| near 1
+
+
+class IndependentLevels(Field):
+    """Nested distances, each on its own: f_j is a network inside the band of f_{j−1}, and f_{j−1} elsewhere.
+
+    Args:
+        levels: coarse to fine; the first is defined everywhere.
+        deltas: half-width of the band around each level but the last.
+
+    Raises:
+        ValueError: the numbers of levels and deltas do not fit.
+    """
+
+    def __init__(self, levels: Sequence[Field], deltas: Sequence[float]) -> None:
+        super().__init__()
+        if len(deltas) != len(levels) - 1:
+            raise ValueError(f"deltas has {len(deltas)} entries for {len(levels)} levels; expected one less")
+        self.levels = nn.ModuleList(levels)
+        self.in_dim, self.num_levels = levels[0].in_dim, len(levels)
+        self.register_buffer("deltas", torch.tensor(deltas, dtype=torch.get_default_dtype()))
+
+    def value(self, x: Tensor, *, level: int = -1) -> Tensor:
+        """See `Field.value`."""
+        rows, first, finer = self._start(x, level)
+        f, inside = first.value(rows), torch.arange(len(rows), device=rows.device)
+        for own, delta in finer:
+            inside = inside[f[inside].abs() < delta]
+            f = f.index_copy(0, inside, own.value(rows[inside]))
+        return f.reshape(x.shape[:-1])
+
+    def jet(self, x: Tensor, *, level: int = -1) -> Jet:
+        """See `Field.jet`."""
+        rows, first, finer = self._start(x, level)
+        jet, inside = first.jet(rows), torch.arange(len(rows), device=rows.device)
+        for own, delta in finer:
+            inside = inside[jet.value[inside].abs() < delta]
+            parts = zip(jet, own.jet(rows[inside]), strict=True)
+            jet = Jet(*(before.index_copy(0, inside, here) for before, here in parts))
+        shape = x.shape[:-1]
+        return Jet(*(part.reshape(*shape, *part.shape[1:]) for part in jet))
+
+    def in_band(self, x: Tensor, *, level: int) -> Tensor:
+        """See `Field.in_band`."""
+        allowed = torch.ones(x.shape[:-1], dtype=torch.bool, device=x.device)
+        for coarser in range(self.resolve_level(level)):
+            # Outside the band of a level all finer ones equal it, so their own condition may be anything there.
+            allowed &= self.value(x, level=coarser).abs() < self.deltas[coarser]
+        return allowed
+
+    def with_level(self, own: Field, *, delta: float) -> IndependentLevels:
+        """This field with one more level inside ``|f_last| < delta``; the levels are shared, not copied."""
+        levels = [level for level in self.levels if isinstance(level, Field)]
+        return IndependentLevels([*levels, own], [*self.deltas.tolist(), delta]).to(self.deltas.device)
+
+    def _start(self, x: Tensor, level: int) -> tuple[Tensor, Field, Iterator[tuple[Field, Tensor]]]:
+        """Points as rows, the first level, and the finer ones with the bands they live in."""
+        first, *finer = [own for own in self.levels if isinstance(own, Field)][: self.resolve_level(level) + 1]
+        return self.check_points(x).reshape(-1, self.in_dim), first, zip(finer, self.deltas, strict=False)
+
+
+class Isolation(Method):
+    """One variant of the residual levels, trained on the coarse level of our fit; ``overrides``: variant, a, b or c.
+
+    Variant (a) is the fit itself, so its cell only extracts it once more, without culling.
+    """
+
+    name = "isolation"
+    source = "paper, supplement, table isolation"
+    differs = "the schedule, the weights and the samples are those of our fit"
+
+    def settings(self, cell: Cell) -> Mapping[str, Any]:
+        """See `Method.settings`."""
+        return Ours().settings(base_cell(cell))
+
+    def run(self, cell: Cell, work: Workplace) -> Findings:
+        """See `Method.run`; outputs "b", "c", "a without culling" and "c without culling"."""
+        variant = str(dict(cell.overrides)["variant"])
+        base, judge = base_of(cell, work), Judge(cell, work)
+        resolution = protocol_of(cell.preset).resolution
+        started = time.perf_counter()
+        if variant == "a":
+            field: Field = base.field
+            surfaces = [(variant + UNCULLED, without_bands(base.field), True, resolution // 2)]
+        elif variant == "b":
+            field = residuals_everywhere(base, work.progress)
+            surfaces = [(variant, field, True, resolution)]
+        else:
+            field = distances_in_bands(base, work.progress)
+            finest = field.levels[-1]
+            assert isinstance(finest, Field)
+            surfaces = [(variant, field, False, resolution), (variant + UNCULLED, finest, True, resolution // 2)]
+        seconds = time.perf_counter() - started
+        outputs = []
+        for name, surface, everywhere, cells in surfaces:
+            slope = steepness(surface) if everywhere else LIPSCHITZ
+            figures = _figures(judge, base, name, surface, slope, cells, seconds)
+            outputs.append({**figures, "lipschitz": slope, "resolution": cells})
+        deltas = () if variant == "b" else tuple(field.deltas.tolist())
+        return Findings(tuple(outputs), deltas=deltas)
+
+
+def _figures(
+    judge: Judge, base: Base, name: str, field: Field, lipschitz: float, cells: int, train_seconds: float
+) -> dict[str, Any]:
+    started = time.perf_counter()
+    try:
+        mesh = extract_mesh(field, resolution=cells, lipschitz=lipschitz)
+    except NoSurfaceError:
+        mesh = None
+    seconds = time.perf_counter() - started
+    parameters = sum(p.numel() for p in field.parameters())
+    return judge.mesh(
+        name, mesh, base.similarity, parameters=parameters, train_seconds=train_seconds, mesh_seconds=seconds
+    )
+
+
+def residuals_everywhere(base: Base, progress: Report | None = None) -> MultiscaleSDF:
+    """Variant (b): the residuals learn from distances on the whole domain, and are added everywhere."""
+    index, field = base.index(), up_to(base.field, 0)
+    for level in range(1, base.field.num_levels):
+        generator = generator_for(base.config, level)
+        sources = domain_sources(index, field, base.config, generator=generator)
+        network = train_level(
+            level, sources, base.config, generator=generator, progress=progress, stage=f"(b) level {level}"
+        )
+        field = field.with_level(network, delta=math.inf)
+    return field
+
+
+def distances_in_bands(base: Base, progress: Report | None = None) -> IndependentLevels:
+    """Variant (c): every level is a distance of its own, which learns inside the band of the one before it."""
+    index = base.index()
+    field = IndependentLevels([base.field.base], [])  # pyright: ignore[reportArgumentType]
+    for level in range(1, base.field.num_levels):
+        generator, delta = generator_for(base.config, level), delta_after(index, field, base.config)
+        sources = on_its_own(banded_sources(index, field, delta, base.config, generator=generator))
+        network = train_level(
+            level,
+            sources,
+            base.config,
+            generator=generator,
+            residual=False,
+            progress=progress,
+            stage=f"(c) level {level}",
+        )
+        field = field.with_level(network, delta=delta)
+    return field
+
+
+@torch.no_grad()
+def steepness(field: Field, *, count: int = 1 << 16, margin: float = 1.25, seed: int = 0) -> float:
+    """A bound on |∇f| in the mesher's box: its largest value at random points, times ``margin``; 1.25 at least."""
+    points = 1.02 * (2 * torch.rand(count, 3, generator=torch.Generator().manual_seed(seed)) - 1)
+    slopes = field.jet(points.to(device_of(field))).gradient.norm(dim=-1)
+    return max(LIPSCHITZ, margin * float(slopes.max()))
+
+
+def isolation_cells(shapes: Sequence[Path], preset: Preset) -> list[Cell]:
+    """The fits and the variants of each shape, clean and with noise."""
+    plain = [Cell(shape, Isolation.name, preset, noise=noise) for shape in shapes for noise in (0.0, NOISE)]
+    varied = [
+        Cell(cell.shape, cell.method, preset, noise=cell.noise, overrides=(("variant", variant),))
+        for cell in plain
+        for variant in VARIANTS
+    ]
+    return [*map(base_cell, plain), *varied]
+
+
+def isolation_tables(records: Sequence[Record]) -> tuple[Table, ...]:
+    """The paper's table, and what culling does to (a) and (c)."""
+    if not records:
+        return ()
+    rows = []
+    for variant, title in VARIANTS.items():
+        values: list[Value] = []
+        published: list[Value] = []
+        for noise, figures in zip((NOISE, 0.0), TAB_ISOLATION[variant], strict=True):
+            outputs = _outputs(records, variant, noise)
+            chamfers = [output.get("chamfer") for output in outputs]
+            values += [mean(chamfers), median(chamfers)]
+            values += [mean(o.get(what) for o in outputs) for what in ("hausdorff", "shell_iou", "iou", "components")]
+            published += [*figures, None, None]
+        rows.append(Row(title, tuple(values), tuple(published), source=Isolation.source))
+    columns = tuple(
+        Column(f"{figure.name}, {cloud}", figure.form, figure.best)
+        for cloud in ("1 % noise", "clean")
+        for figure in FIGURES
+    )
+    title = "Isolating the residual sum and the nested bands (tab:isolation)"
+    notes = (
+        f"{len(shapes_of(records))} shapes: {', '.join(shapes_of(records))}; the paper's figures are of ten others.",
+        "All variants share the coarse network, the schedule and the weights. (a) and (c) are extracted inside their "
+        "bands; (b) on the whole domain, culled only by the steepest slope measured there.",
+        "The paper's IoU is that of surface voxels, here shell IoU; IoU is of volumes. Hausdorff is squared.",
+    )
+    return Table("isolation", title, "variant", columns, tuple(rows), notes), _culling_table(records)
+
+
+def _culling_table(records: Sequence[Record]) -> Table:
+    rows = []
+    for variant in ("a", "c"):
+        for suffix in ("", UNCULLED):
+            outputs = _outputs(records, variant + suffix, NOISE)
+            parts = [output["components"] for output in outputs if output.get("components") is not None]
+            chamfer = CD_WITHOUT_CULLING[variant] if suffix else TAB_ISOLATION[variant][0][0]
+            span = f"{min(parts):,} to {max(parts):,}" if parts else None
+            published = (chamfer, COMPONENTS[variant] if suffix else None)
+            name = VARIANTS[variant] + (", extracted without culling" if suffix else "")
+            rows.append(Row(name, (mean(output.get("chamfer") for output in outputs), span), published))
+    columns = (Column("mean CD, 1 % noise", best="lowest"), Column("components"))
+    notes = (
+        "Without culling the finest level is asked everywhere: of (a) the sum of all levels, of (c) its last network. "
+        "Those meshes are extracted at half the resolution, since the whole lattice must be evaluated.",
+    )
+    return Table("isolation-culling", "What is left outside the bands", "variant", columns, tuple(rows), notes)
+
+
+def _outputs(records: Sequence[Record], name: str, noise: float) -> list[Mapping[str, Any]]:
+    """The surface called ``name`` in every record; (a) with culling is the finest level of the fit."""
+    if name == "a":
+        return [record["outputs"][-1] for record in select(records, method="ours", noise=noise) if record["outputs"]]
+    found = select(records, method=Isolation.name, noise=noise)
+    return [output for record in found for output in record["outputs"] if output["name"] == name]
+
+
+ISOLATION = TableSpec(
+    "isolation",
+    "Tab. isolation",
+    "the method without its bands, and without its residuals",
+    isolation_cells,
+    isolation_tables,
+)

@@ -1,0 +1,195 @@
+"""Single levels trained out of the usual order: what the ablations need of a fit, from the same pieces as the fit."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ...neural_fields import Field, InputError, MultiscaleSDF, Siren
+from ..cloud_distance import CloudDistance
+from ..fit_config import FitConfig
+from ..sampling import (
+    Samples,
+    band_samples,
+    delta_of,
+    distance_samples,
+    free_lengths,
+    offset_samples,
+    with_previous,
+)
+from ..training import LevelTrainer, Progress, Source, StopFlag
+from .recipe import Report
+
+__all__ = [
+    "Weights",
+    "banded_sources",
+    "delta_after",
+    "device_of",
+    "domain_sources",
+    "generator_for",
+    "on_its_own",
+    "train_level",
+    "up_to",
+    "without_bands",
+]
+
+# As in the fit, a residual starts at a tenth of the usual output scale.
+RESIDUAL_GAIN = 0.1
+
+
+@dataclass(frozen=True)
+class Weights:
+    """Weights of the three terms of Eq. 4, as they stand; None is what the fit would take.
+
+    Attributes:
+        data: of (f(x) − d)²; the fit's own is ``residual_data_weight`` over the mean square error of the level before.
+        normal: of 1 − cos(∇f, N).
+        eikonal: of (|∇f| − 1)².
+    """
+
+    data: float | None = None
+    normal: float | None = None
+    eikonal: float | None = None
+
+    def resolved(self, config: FitConfig, errors: Tensor) -> tuple[float, float, float]:
+        """Data, normal and eikonal weight, where the levels before miss the surface samples by ``errors`` ``(n,)``."""
+        data = config.residual_data_weight / max(float(errors.square().mean()), 1e-10)
+        given = (self.data, self.normal, self.eikonal)
+        usual = (data, config.normal_weight, config.eikonal_weight)
+        return tuple(u if g is None else g for g, u in zip(given, usual, strict=True))  # pyright: ignore[reportReturnType]
+
+
+def up_to(field: MultiscaleSDF, level: int) -> MultiscaleSDF:
+    """The levels of a field up to and with ``level``, shared, not copied."""
+    return MultiscaleSDF(field.base, list(field.residuals)[:level], field.deltas[:level])  # pyright: ignore[reportArgumentType]
+
+
+def without_bands(field: MultiscaleSDF) -> MultiscaleSDF:
+    """The plain sum of a field's levels, everywhere."""
+    deltas = torch.full_like(field.deltas, math.inf)
+    return MultiscaleSDF(field.base, list(field.residuals), deltas)  # pyright: ignore[reportArgumentType]
+
+
+@torch.no_grad()
+def delta_after(index: CloudDistance, previous: Field, config: FitConfig) -> float:
+    """Half-width of the band around the finest level of ``previous`` (Eq. 5)."""
+    points = torch.from_numpy(index.points).to(device_of(previous))
+    values = torch.cat([previous.value(part) for part in points.split(1 << 18)]).cpu()
+    return max(delta_of(values, epsilon=config.epsilon, quantile=config.quantile), 1e-6)
+
+
+def banded_sources(
+    index: CloudDistance,
+    previous: Field,
+    delta: float,
+    config: FitConfig,
+    *,
+    generator: torch.Generator,
+    weights: Weights | None = None,
+) -> list[Source]:
+    """What a level learns from inside the band around the one before, as in the fit (Sec. 3.2).
+
+    Raises:
+        InputError: one kind of samples is empty.
+    """
+    lengths = free_lengths(index, delta)
+    offset = offset_samples(index, lengths, config.samples, generator=generator)
+    band = band_samples(index, delta, config.samples, generator=generator)
+    kept = [
+        (name, with_previous(samples, previous, delta, device=device_of(previous)))
+        for name, samples in (("surface", _surface(index)), ("offset", offset), ("band", band))
+    ]
+    for name, samples in kept:
+        if not len(samples):
+            raise InputError(f"no {name} samples within {delta:.2g} of the level before; train it longer")
+    before = kept[0][1].value
+    assert before is not None
+    terms = (weights or Weights()).resolved(config, before)
+    return [Source(name, samples, config.batch // 3, *terms) for name, samples in kept]
+
+
+def domain_sources(
+    index: CloudDistance, previous: MultiscaleSDF, config: FitConfig, *, generator: torch.Generator
+) -> list[Source]:
+    """What a residual learns from on the whole domain: distances everywhere, as level 0 of the fit does."""
+    everywhere, device = without_bands(previous), device_of(previous)
+    spread = distance_samples(index, config.samples, generator=generator)
+    surface, domain = (with_previous(s, everywhere, math.inf, device=device) for s in (_surface(index), spread))
+    assert surface.value is not None
+    data, normal, eikonal = Weights().resolved(config, surface.value)
+    half = config.batch // 2
+    return [
+        Source("surface", surface, half, data, normal, eikonal),
+        Source("domain", domain, half, data * config.domain_weight, 0.0, eikonal),
+    ]
+
+
+def on_its_own(sources: Sequence[Source]) -> list[Source]:
+    """The same samples for a level that is no residual: what the levels before say is taken out."""
+    return [
+        dataclasses.replace(source, samples=dataclasses.replace(source.samples, value=None, gradient=None))
+        for source in sources
+    ]
+
+
+def train_level(
+    level: int,
+    sources: Sequence[Source],
+    config: FitConfig,
+    *,
+    generator: torch.Generator,
+    residual: bool = True,
+    progress: Report | None = None,
+    stage: str = "",
+) -> Siren:
+    """Train one new SIREN as level ``level`` of the fit would be, from the same start.
+
+    Args:
+        level: whose width, depth, frequency, steps and learning rate in ``config``.
+        sources: what it learns from.
+        config: settings of the fit.
+        generator: draws the batches.
+        residual: whether it starts small, as what is added to others does.
+        progress: told now and then.
+        stage: name for ``progress``.
+    """
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(config.seed * 1009 + level)
+        gain = RESIDUAL_GAIN if residual else 1.0
+        network = Siren(config.widths[level], config.depths[level], omega=config.omegas[level], output_gain=gain)
+    network = network.to(sources[0].samples.points.device)
+    trainer = LevelTrainer(
+        network,
+        sources,
+        steps=config.steps[level],
+        learning_rate=config.learning_rates[level],
+        seconds=None,
+        generator=generator,
+    )
+
+    def report(trainer: LevelTrainer) -> None:
+        if progress is not None:
+            progress(Progress(stage or f"level {level}", trainer.step, trainer.steps, trainer.fraction, trainer.losses))
+
+    trainer.run(StopFlag(), report=report, save=lambda _: None)
+    return network.requires_grad_(False)
+
+
+def device_of(field: Field) -> torch.device:
+    """Where a field's parameters are."""
+    return next(field.parameters(), field.deltas).device
+
+
+def generator_for(config: FitConfig, level: int) -> torch.Generator:
+    """The generator that the fit draws a level's samples and batches with."""
+    return torch.Generator().manual_seed(config.seed * 1009 + level)
+
+
+def _surface(index: CloudDistance) -> Samples:
+    points, normals = torch.from_numpy(index.points), torch.from_numpy(index.normals)
+    return Samples(points, distance=torch.zeros(len(points)), normal=normals)

@@ -1,0 +1,173 @@
+"""Exact signed distances to a triangle mesh, and how far a field is from them: the error of the paper's ablations."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from ...neural_fields import Field
+from ..surface import Surface, face_normals, merged, sample_surface
+
+__all__ = ["MeshDistance", "approximation_error", "barycentric_of_nearest", "near_surface"]
+
+Float64 = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+
+# Rows times candidates looked at together: about 100 MiB of temporaries.
+PAIRS_AT_ONCE = 1 << 19
+MOST_PIECES = 200_000
+
+
+class MeshDistance:
+    """Signed distance to a mesh, negative inside, exact to rounding.
+
+    Faces are found through a k-d tree of their centres, long faces cut into pieces for it; the search widens until no
+    face left out can be nearer. The sign is that of the angle-weighted pseudo-normal of the nearest face, edge or
+    vertex (Bærentzen and Aanæs, IEEE TVCG 2005), which is exact for a closed, consistently oriented mesh; near
+    a hole it is the side of the nearest face.
+
+    Args:
+        surface: a mesh; equal vertices are made one.
+
+    Raises:
+        ValueError: the surface has no faces of any area.
+    """
+
+    def __init__(self, surface: Surface) -> None:
+        whole = merged(surface)
+        normals, areas = face_normals(whole)
+        kept = areas > 0
+        if not kept.any():
+            raise ValueError("surface: has no faces to measure from")
+        whole, normals = Surface(whole.vertices, whole.faces[kept]), normals[kept]
+        self.corners: Float64 = whole.vertices[whole.faces]  # (F, 3, 3)
+        self.pseudo_normals = _pseudo_normals(whole, normals, self.corners)
+        centers, self.owner, self.radius = _pieces(self.corners, float(areas.sum()))
+        self.tree = KDTree(centers, balanced_tree=False)
+
+    def signed(self, points: Float64) -> Float64:
+        """Distances ``(M,)`` of points ``(M, 3)``."""
+        result = np.empty(len(points))
+        rows, count = np.arange(len(points)), min(16, len(self.owner))
+        while len(rows):
+            unsure = []
+            for part in np.array_split(rows, 1 + len(rows) * count // PAIRS_AT_ONCE):
+                reach, nearest = self.tree.query(points[part], k=count, workers=-1)
+                reach, nearest = np.reshape(reach, (len(part), -1)), np.reshape(nearest, (len(part), -1))
+                result[part] = self._nearest_of(points[part], self.owner[nearest])
+                # Every piece that was not looked at is at least this far away.
+                unsure.append(part[np.abs(result[part]) > reach[:, -1] - self.radius])
+            rows = np.concatenate(unsure) if count < len(self.owner) else rows[:0]
+            count = min(4 * count, len(self.owner))
+        return result
+
+    def _nearest_of(self, points: Float64, faces: Int64) -> Float64:
+        """Signed distance ``(M,)`` to the nearest of each point's own faces ``(M, k)``."""
+        corners = self.corners[faces]  # (M, k, 3, 3)
+        weights = barycentric_of_nearest(points[:, None], corners)
+        offset = points[:, None] - (weights[..., None] * corners).sum(axis=2)
+        distance = np.linalg.norm(offset, axis=2)
+        best = distance.argmin(axis=1)
+        row = np.arange(len(points))
+        feature = (weights[row, best] > 0) @ np.array([1, 2, 4])
+        side = (offset[row, best] * self.pseudo_normals[faces[row, best], feature]).sum(axis=1)
+        return np.where(side < 0, -distance[row, best], distance[row, best])
+
+
+def barycentric_of_nearest(points: Float64, corners: Float64) -> Float64:
+    """Weights ``(..., 3)`` of the corners ``(..., 3, 3)`` for the point of each triangle nearest to ``(..., 3)``.
+
+    A weight is exactly 0 where that point is on an edge, two are where it is a corner.
+    """
+    a, b, c = (corners[..., k, :] for k in range(3))
+    ab, ac, ap = b - a, c - a, points - a
+    bb, bc, cc = (ab * ab).sum(-1), (ab * ac).sum(-1), (ac * ac).sum(-1)
+    pb, pc = (ap * ab).sum(-1), (ap * ac).sum(-1)
+    determinant = np.maximum(bb * cc - bc * bc, 1e-300)
+    v, w = (cc * pb - bc * pc) / determinant, (bb * pc - bc * pb) / determinant
+    inside = (v > 0) & (w > 0) & (v + w < 1)
+    best = np.stack((1 - v - w, v, w), axis=-1)
+    least = np.where(inside, -1.0, np.inf)
+    for first, second in ((0, 1), (1, 2), (2, 0)):
+        start, along = corners[..., first, :], corners[..., second, :] - corners[..., first, :]
+        t = ((points - start) * along).sum(-1) / np.maximum((along * along).sum(-1), 1e-300)
+        t = t.clip(0, 1)
+        square = ((points - start - t[..., None] * along) ** 2).sum(-1)
+        nearer = square < least
+        best[nearer] = 0
+        best[nearer, first], best[nearer, second] = 1 - t[nearer], t[nearer]
+        least = np.where(nearer, square, least)
+    return best
+
+
+def _pseudo_normals(mesh: Surface, normals: Float64, corners: Float64) -> Float64:
+    """``(F, 8, 3)``: for each face and each set of its corners, as bits, the normal of the feature they span."""
+    faces, size = mesh.faces, len(mesh.vertices)
+    result = np.zeros((len(faces), 8, 3))
+    result[:, 7] = normals
+    ends = np.concatenate([faces[:, [k, (k + 1) % 3]] for k in range(3)])
+    _, edge = np.unique(ends.min(axis=1) * size + ends.max(axis=1), return_inverse=True)
+    total = _summed(edge.reshape(-1), np.tile(normals, (3, 1)))[edge.reshape(-1)].reshape(3, -1, 3)
+    for k in range(3):
+        result[:, (1 << k) | (1 << (k + 1) % 3)] = total[k]
+    angles = np.stack([_angle(corners, k) for k in range(3)], axis=1)  # (F, 3)
+    weighted = (angles[..., None] * normals[:, None]).reshape(-1, 3)
+    vertex = _summed(faces.reshape(-1), weighted, size)
+    for k in range(3):
+        result[:, 1 << k] = vertex[faces[:, k]]
+    return result
+
+
+def _summed(owner: Int64, vectors: Float64, size: int = 0) -> Float64:
+    """Sums ``(K, 3)`` of the vectors ``(N, 3)`` of each owner."""
+    sums = [np.bincount(owner, weights=vectors[:, i], minlength=size) for i in range(3)]
+    return np.stack(sums, axis=1).astype(np.float64)
+
+
+def _angle(corners: Float64, k: int) -> Float64:
+    """Angle ``(F,)`` of the triangles at corner k."""
+    u, v = (corners[:, (k + i) % 3] - corners[:, k] for i in (1, 2))
+    return np.arctan2(np.linalg.norm(np.cross(u, v), axis=1), (u * v).sum(axis=1))
+
+
+def _pieces(corners: Float64, area: float) -> tuple[Float64, Int64, float]:
+    """Centres ``(P, 3)`` of small pieces of the faces, the faces they belong to ``(P,)``, and their largest radius.
+
+    Faces much longer than is usual are halved across their longest edge until none is.
+    """
+    lengths = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2)  # (F, 3): edges ab, bc, ca
+    limit = max(float(np.median(lengths.max(axis=1))), (area / MOST_PIECES) ** 0.5)
+    owner = np.arange(len(corners))
+    done: list[tuple[Float64, Int64]] = []
+    while len(corners):
+        lengths = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2)
+        long = lengths.max(axis=1) > limit
+        done.append((corners[~long], owner[~long]))
+        corners, owner, edge = corners[long], owner[long], lengths[long].argmax(axis=1)
+        row = np.arange(len(corners))
+        first, second = edge, (edge + 1) % 3
+        middle = (corners[row, first] + corners[row, second]) / 2
+        halves = [corners.copy(), corners.copy()]
+        halves[0][row, second], halves[1][row, first] = middle, middle
+        corners, owner = np.concatenate(halves), np.tile(owner, 2)
+    pieces, owner = np.concatenate([p for p, _ in done]), np.concatenate([o for _, o in done])
+    centers = pieces.mean(axis=1)
+    return centers, owner, float(np.linalg.norm(pieces - centers[:, None], axis=2).max())
+
+
+def near_surface(surface: Surface, count: int, *, reach: float, seed: int = 0) -> Float64:
+    """Points ``(count, 3)`` uniform on a mesh, each moved along its face's normal by U(−reach, reach)."""
+    rng = np.random.default_rng(seed)
+    points, normals = sample_surface(surface, count, rng)
+    assert normals is not None
+    return points + rng.uniform(-reach, reach, (count, 1)) * normals
+
+
+@torch.no_grad()
+def approximation_error(field: Field, points: Float64, distances: Float64, *, level: int = -1) -> float:
+    """The mean of |f_level(x) − d(x)| over points ``(N, 3)`` with their exact distances ``(N,)``."""
+    rows = torch.from_numpy(points).float().to(next(field.parameters(), field.deltas).device)
+    values = torch.cat([field.value(part, level=level) for part in rows.split(1 << 18)])
+    return float((values.cpu().double() - torch.from_numpy(distances)).abs().mean())
