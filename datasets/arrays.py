@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..neural_fields import InputError
+from .cloud_stream import TableStream
 from .point_cloud import PointCloud, colors_from, normals_from
 from .text import table_to_cloud
 
-__all__ = ["read_npy", "read_npz"]
+__all__ = ["npy_stream", "read_npy", "read_npz"]
 
 _DAMAGE = (ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error)  # what numpy.load raises on bad files
 
@@ -30,6 +31,36 @@ def read_npy(path: Path) -> PointCloud:
     if not isinstance(array, np.ndarray):
         raise InputError(f"{path}: an NPZ archive under another name; rename it to .npz")
     return table_to_cloud(_numeric(array, "array", path), path, f"array of shape {array.shape}: ")
+
+
+def npy_stream(path: Path, *, sample: int = 100_000) -> TableStream | None:
+    """The rows of an array, to be read in pieces; None if that cannot be: only `read_npy` reads such a file.
+
+    Args:
+        path: an NPY file.
+        sample: so many rows, evenly chosen, tell whether six columns are points and normals or points and colours.
+
+    Raises:
+        InputError: see `read_npy`.
+    """
+    try:
+        array = np.lib.format.open_memmap(path, mode="r")
+    except _DAMAGE:
+        return None
+    if array.ndim != 2 or not array.flags.c_contiguous or len(array) == 0:
+        return None
+    _numeric(array, "array", path)
+    some = table_to_cloud(np.array(array[:: 1 + len(array) // sample]), path, f"array of shape {array.shape}: ")
+    first_color = None if some.colors is None else array.shape[1] - 3
+    return TableStream(
+        path,
+        offset=array.offset,
+        row=np.dtype((array.dtype, array.shape[1:])),
+        count=len(array),
+        points=slice(0, 3),
+        normals=None if some.normals is None else slice(3, 6),
+        colors=None if first_color is None else slice(first_color, first_color + 3),
+    )
 
 
 def read_npz(path: Path) -> PointCloud:

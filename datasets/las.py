@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..neural_fields import InputError
+from .cloud_stream import CloudStream, RawRows
 from .point_cloud import PointCloud, colors_from
 
-__all__ = ["read_las"]
+__all__ = ["LasStream", "read_las"]
 
 _NORMALS = (("NormalX", "NormalY", "NormalZ"), ("normal_x", "normal_y", "normal_z"), ("nx", "ny", "nz"))
 
@@ -21,24 +23,80 @@ def read_las(path: Path) -> PointCloud:
     Raises:
         InputError: laspy is not installed, or it cannot read the file.
     """
-    try:
-        import laspy
-    except ImportError as error:
-        raise InputError(f"{path}: LAS and LAZ need laspy; pip install mplicits[las]") from error
+    laspy = _laspy(path)
     try:
         las: Any = laspy.read(path)
         points = np.stack((las.x, las.y, las.z), axis=1).astype(np.float64)
     except OSError:
         raise
     except Exception as error:  # laspy lets through its own errors and those of its decompressors
-        raise InputError(f"{path}: not a readable LAS file ({_first_line(error)}); export it again") from error
+        raise _unreadable(path, error) from error
     names = set(las.point_format.dimension_names)
     colors = np.stack((las.red, las.green, las.blue), axis=1) if "red" in names else None
     # without colours, writers fill the columns with zeros
     colors = None if colors is None or not colors.any() else colors_from(colors)
-    triple = next((triple for triple in _NORMALS if names.issuperset(triple)), None)
+    triple = _normal_names(names)
     normals = None if triple is None else np.stack([las[name] for name in triple], axis=1).astype(np.float32)
     return PointCloud(points, normals, colors, str(path))
+
+
+class LasStream(CloudStream):
+    """A LAS or LAZ file, read in pieces.
+
+    Args:
+        path: the file.
+
+    Raises:
+        InputError: laspy is not installed, or it cannot read the file; also while pieces are read.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.source, self.laspy = path, str(path), _laspy(path)
+        try:
+            with self.laspy.open(path) as reader:
+                self.count = int(reader.header.point_count)
+                names = set(reader.header.point_format.dimension_names)
+        except OSError:
+            raise
+        except Exception as error:  # see `read_las`
+            raise _unreadable(path, error) from error
+        self.normals = _normal_names(names)
+        self.colored = "red" in names
+        # without colours, writers fill the columns with zeros
+        self.colored = self.colored and any(
+            piece.colors.any() for piece in self.pieces(1 << 20) if piece.colors is not None
+        )
+
+    def pieces(self, rows: int) -> Iterator[RawRows]:
+        """See `CloudStream.pieces`."""
+        try:
+            with self.laspy.open(self.path) as reader:
+                for part in reader.chunk_iterator(rows):
+                    yield RawRows(
+                        np.stack((part.x, part.y, part.z), axis=1).astype(np.float64),
+                        None if self.normals is None else np.stack([part[name] for name in self.normals], axis=1),
+                        np.stack((part.red, part.green, part.blue), axis=1) if self.colored else None,
+                    )
+        except OSError:
+            raise
+        except Exception as error:  # see `read_las`
+            raise _unreadable(self.path, error) from error
+
+
+def _laspy(path: Path) -> Any:
+    try:
+        import laspy
+    except ImportError as error:
+        raise InputError(f"{path}: LAS and LAZ need laspy; pip install mplicits[las]") from error
+    return laspy
+
+
+def _normal_names(names: set[str]) -> tuple[str, str, str] | None:
+    return next((triple for triple in _NORMALS if names.issuperset(triple)), None)
+
+
+def _unreadable(path: Path, error: Exception) -> InputError:
+    return InputError(f"{path}: not a readable LAS file ({_first_line(error)}); export it again")
 
 
 def _first_line(error: Exception) -> str:

@@ -17,10 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..neural_fields import InputError
+from .cloud_stream import TableStream
 from .meshes import triangulate, vertex_normals
 from .point_cloud import PointCloud, colors_from, normals_from
 
-__all__ = ["read_ply", "write_cloud_ply"]
+__all__ = ["ply_stream", "read_ply", "write_cloud_ply"]
 
 _KINDS = {
     **dict.fromkeys(("char", "int8"), "i1"),
@@ -33,6 +34,7 @@ _KINDS = {
     **dict.fromkeys(("double", "float64"), "f8"),
 }
 _ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
+_LONGEST_HEADER = 1 << 20
 _NORMALS = (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"))
 _COLORS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
 
@@ -88,6 +90,39 @@ def read_ply(path: Path) -> PointCloud:
     if vertex is None:
         raise InputError(f"{path}: vertex: the header declares no such element; export it as a point cloud")
     return _cloud(vertex, faces, path)
+
+
+def ply_stream(path: Path) -> TableStream | None:
+    """The vertices of a PLY file, to be read in pieces; None if that cannot be: only `read_ply` reads such a file.
+
+    The file must be binary, its vertices must come first and hold no lists, and their normals must stand with them if
+    there are faces.
+
+    Raises:
+        InputError: the header is not PLY, or the file ends too early.
+    """
+    with path.open("rb") as file:
+        head = file.read(_LONGEST_HEADER)
+    if b"end_header" not in head:
+        return None
+    encoding, elements, body = _parse_header(head, path)
+    vertex = next(iter(elements), None)
+    if (
+        encoding == "ascii"
+        or vertex is None
+        or vertex.name != "vertex"
+        or any(p.length_kind for p in vertex.properties)
+    ):
+        return None
+    names = {p.name for p in vertex.properties}
+    normals, colors = (next((t for t in triples if names.issuperset(t)), None) for triples in (_NORMALS, _COLORS))
+    has_faces = any(element.name == "face" for element in elements)
+    if len(names) < len(vertex.properties) or not names.issuperset("xyz") or (normals is None and has_faces):
+        return None
+    row = np.dtype([(p.name, _ORDERS[encoding] + p.kind) for p in vertex.properties])
+    return TableStream(
+        path, offset=body, row=row, count=vertex.count, points=("x", "y", "z"), normals=normals, colors=colors
+    )
 
 
 def write_cloud_ply(path: str | Path, cloud: PointCloud) -> None:

@@ -58,16 +58,20 @@ def normals_from(values: NDArray[Any]) -> NDArray[np.float32]:
     return (values / np.float64(scale)).astype(np.float32)
 
 
-def colors_from(values: NDArray[Any]) -> NDArray[np.float32]:
+def colors_from(values: NDArray[Any], *, brightest: float | None = None) -> NDArray[np.float32]:
     """Colours as files store them → float32 in [0, 1].
 
     Numbers up to 1 in a floating-point type are taken as they are, up to 255 as bytes, beyond that as
     16-bit numbers; an 8-bit type is always over 255. A colour that is not a number becomes black.
+
+    Args:
+        values: the numbers.
+        brightest: the largest of all, if these are only some.
     """
     if values.dtype == np.uint8:
         return (values / np.float32(255)).astype(np.float32)
     finite = np.nan_to_num(values.astype(np.float64), nan=0.0, posinf=0.0, neginf=0.0)
-    largest = finite.max(initial=0.0)
+    largest = finite.max(initial=0.0) if brightest is None else brightest
     integral = np.issubdtype(values.dtype, np.integer)
     scale = 1.0 if largest <= 1 and not integral else 255.0 if largest <= 255 else 65535.0
     return (finite / scale).clip(0, 1).astype(np.float32)

@@ -10,15 +10,16 @@ from types import MappingProxyType
 import numpy as np
 
 from ..neural_fields import InputError
-from .arrays import read_npy, read_npz
-from .las import read_las
+from .arrays import npy_stream, read_npy, read_npz
+from .cloud_stream import CloudStream
+from .las import LasStream, read_las
 from .meshes import read_off, read_stl
 from .obj import read_obj
-from .ply import read_ply
+from .ply import ply_stream, read_ply
 from .point_cloud import PointCloud
 from .text import read_text
 
-__all__ = ["MIN_POINTS", "READERS", "read_cloud"]
+__all__ = ["MIN_POINTS", "READERS", "check_cloud", "check_cloud_path", "open_stream", "read_cloud"]
 
 MIN_POINTS = 10
 """Fewer points than this are no surface."""
@@ -40,6 +41,11 @@ READERS: Mapping[str, Callable[[Path], PointCloud]] = MappingProxyType(
 )
 """What reads which extension."""
 
+STREAMS: Mapping[str, Callable[[Path], CloudStream | None]] = MappingProxyType(
+    {".ply": ply_stream, ".npy": npy_stream, ".las": LasStream, ".laz": LasStream}
+)
+"""What reads which extension in pieces."""
+
 
 def read_cloud(path: str | Path) -> PointCloud:
     """Read a point cloud; of a mesh, its vertices with area-weighted vertex normals.
@@ -56,6 +62,21 @@ def read_cloud(path: str | Path) -> PointCloud:
         ...
         mplicits.neural_fields.errors.InputError: scan.xyzz: no such file; check the path
     """
+    path = check_cloud_path(path)
+    try:
+        cloud = READERS[path.suffix.lower()](path)
+    except OSError as error:
+        raise _not_readable(path, error) from error
+    check_cloud(cloud)
+    return cloud
+
+
+def check_cloud_path(path: str | Path) -> Path:
+    """The path of a file that is there, is not empty and has an extension that is known.
+
+    Raises:
+        InputError: it is not.
+    """
     path = Path(path)
     if path.is_dir():
         raise InputError(f"{path}: is a directory; name the point-cloud file in it")
@@ -70,14 +91,34 @@ def read_cloud(path: str | Path) -> PointCloud:
     try:
         if path.stat().st_size == 0:
             raise InputError(f"{path}: the file is empty; export it again")
-        cloud = READERS[extension](path)
     except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error}); check its permissions") from error
-    _check_cloud(cloud)
-    return cloud
+        raise _not_readable(path, error) from error
+    return path
 
 
-def _check_cloud(cloud: PointCloud) -> None:
+def open_stream(path: str | Path) -> CloudStream | None:
+    """A file to be read in pieces: binary PLY, NPY, LAS and LAZ; None for all that only `read_cloud` reads.
+
+    Raises:
+        InputError: the file is missing, damaged or of an unknown kind.
+    """
+    path = check_cloud_path(path)
+    try:
+        return STREAMS[path.suffix.lower()](path) if path.suffix.lower() in STREAMS else None
+    except OSError as error:
+        raise _not_readable(path, error) from error
+
+
+def _not_readable(path: Path, error: OSError) -> InputError:
+    return InputError(f"{path}: cannot be read ({error.strerror or error}); check its permissions")
+
+
+def check_cloud(cloud: PointCloud) -> None:
+    """Refuse a cloud that is no surface.
+
+    Raises:
+        InputError: too few finite points, or all at one place.
+    """
     finite = cloud.points[np.isfinite(cloud.points).all(axis=1)]
     if len(finite) == 0:
         raise InputError(f"{cloud.source}: points: none with finite coordinates among {len(cloud)}; export it again")

@@ -1,0 +1,317 @@
+"""Clouds of many millions of points, in bounded memory: points of one voxel that face the same way become one.
+
+More points than a fit can look at are no reason to leave any out. Space is cut into voxels, and the points of a voxel
+with the same dominant normal direction (one of ±x, ±y, ±z) are replaced by their mean: what noise they have averages
+out, the two sides of a thin sheet and of a sharp edge stay apart, and where a scanner stood close, or scanned twice,
+weighs no more than elsewhere. A mean of points on a plane lies on that plane, so flat parts stay exactly where
+they are; a curved one moves by less than a tenth of the voxel squared times its curvature.
+
+The surface's own noise is wider than a voxel where points are many. So that its outskirts do not become
+points in their own right, voxels that follow each other along their normals' dominant axis count as one.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from .cloud_stream import CloudStream
+from .point_cloud import PointCloud, colors_from, normals_from, unit_rows
+
+__all__ = ["Merging", "merge_cloud"]
+
+Float64 = NDArray[np.float64]
+Keys = NDArray[np.int64]
+
+# Points read at once; they and all that is worked out from them take about 200 MiB.
+ROWS = 1 << 19
+# Points that the size of the voxels is estimated from.
+SAMPLE = 200_000
+# A key is three cell numbers of so many bits and one of seven directions, which fills an int64.
+BITS = 20
+# Voxels that may follow each other along a normal before the next counts as another surface.
+RUN = 16
+# The direction of a point without a normal.
+NOWHERE = 6
+
+
+@dataclass(frozen=True)
+class Merging:
+    """What merging did to a cloud.
+
+    Attributes:
+        read: points in the file.
+        kept: means that stand for them.
+        dropped_nan: points with a coordinate that is not finite.
+        dropped_isolated: points with next to none around them.
+        voxel: edge of the voxels, in input units.
+        seconds: how long it took, reading included.
+    """
+
+    read: int
+    kept: int
+    dropped_nan: int
+    dropped_isolated: int
+    voxel: float
+    seconds: float
+
+    def summary(self) -> str:
+        """One line for people."""
+        text = f"{self.read:,} points merged to {self.kept:,} in voxels of {self.voxel:.3g}"
+        counts = {"not finite": self.dropped_nan, "isolated": self.dropped_isolated}
+        dropped = ", ".join(f"{count:,} {what}" for what, count in counts.items() if count)
+        return f"{text}; dropped {dropped}" if dropped else text
+
+
+class _Frame(NamedTuple):
+    """Where a cloud lies, and what it stores.
+
+    Attributes:
+        low: ``(3,)`` lowest corner of the finite points.
+        extent: longest side of their box.
+        finite: how many there are.
+        sample: ``(M, 3)`` offsets of some of them, evenly chosen.
+        normals: whether there are any.
+        brightest: the largest colour number; None without colours.
+    """
+
+    low: Float64
+    extent: float
+    finite: int
+    sample: Float64
+    normals: bool
+    brightest: float | None
+
+
+class _Groups(NamedTuple):
+    """Sums over the points of a voxel that face one way.
+
+    Attributes:
+        keys: ``(n,)``, ascending: three cell numbers and a direction.
+        sums: ``(n, 7 or 10)``: how many, their offsets from the lowest corner, unit normals, colours if there are any.
+    """
+
+    keys: Keys
+    sums: Float64
+
+
+def merge_cloud(
+    stream: CloudStream, limit: int, *, isolation: float | None = 30.0, voxel: float | None = None
+) -> tuple[PointCloud, Merging] | None:
+    """At most ``limit`` points that stand for those of a stream, which is read twice.
+
+    Args:
+        stream: the cloud.
+        limit: how many points may be left.
+        isolation: drop points with less than 1 / ``isolation`` of the usual number of points in the 27 voxels around
+            them: alone in their voxels they would weigh as much as the many of others. None keeps them.
+        voxel: edge of the voxels, in input units, if they are to be smaller than ``limit`` suggests.
+
+    Returns:
+        The merged cloud and what was done; None if there are no two places among the points.
+
+    Raises:
+        ValueError: ``limit`` is not positive.
+    """
+    if limit < 1:
+        raise ValueError(f"limit={limit}: expected at least one")
+    started = time.monotonic()
+    frame = _survey(stream)
+    if not frame.extent > 0:
+        return None
+    groups, size = _grouped(stream, frame, voxel or _first_size(frame, limit), limit)
+    before = groups.sums[:, 0].sum()
+    groups = groups if isolation is None else _without_isolated(groups, isolation)
+    rows = _without_scraps(_along_normals(groups), size)
+    while len(rows) > limit:
+        groups, size = _coarser(groups), 2 * size
+        rows = _without_scraps(_along_normals(groups), size)
+    count = rows[:, :1]
+    cloud = PointCloud(
+        rows[:, 1:4] / count + frame.low,
+        unit_rows(rows[:, 4:7]).astype(np.float32) if frame.normals else None,
+        None if frame.brightest is None else (rows[:, 7:10] / count).clip(0, 1).astype(np.float32),
+        stream.source,
+    )
+    return cloud, Merging(
+        read=stream.count,
+        kept=len(cloud),
+        dropped_nan=stream.count - frame.finite,
+        dropped_isolated=round(float(before - count.sum())),
+        voxel=size,
+        seconds=round(time.monotonic() - started, 3),
+    )
+
+
+def _survey(stream: CloudStream) -> _Frame:
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    finite, normals, brightest = 0, False, None
+    stride = 1 + stream.count // SAMPLE
+    samples: list[Float64] = []
+    for piece in stream.pieces(ROWS):
+        points = piece.points.astype(np.float64)
+        points = points[np.isfinite(points).all(axis=1)]
+        if len(points):
+            low, high = np.minimum(low, points.min(axis=0)), np.maximum(high, points.max(axis=0))
+        finite, normals = finite + len(points), piece.normals is not None
+        samples.append(points[::stride].copy())
+        if piece.colors is not None:
+            brightest = max(brightest or 0.0, float(np.nan_to_num(piece.colors, posinf=0, neginf=0).max(initial=0)))
+    extent = float((high - low).max()) if finite else 0.0
+    return _Frame(low, extent, finite, np.concatenate(samples) - low, normals, brightest)
+
+
+def _first_size(frame: _Frame, limit: int, *, each: int = 20) -> float:
+    """Edge of the voxels of which a surface meets about half of ``limit``.
+
+    Cells with ``each`` points of the sample on average are all found, more or less; the number of cells that a surface
+    meets goes with one over their edge squared.
+    """
+    size, found = frame.extent, 1
+    while found * each < len(frame.sample) and size > frame.extent / 2**BITS:
+        size /= 2
+        found = len(np.unique(_cell_keys(frame.sample, size)))
+    return size * math.sqrt(found / (0.5 * limit))
+
+
+def _grouped(stream: CloudStream, frame: _Frame, size: float, limit: int) -> tuple[_Groups, float]:
+    """Sums of all points by voxel and direction, and the edge of the voxels, doubled whenever there are too many."""
+    size = max(size, frame.extent / ((1 << BITS) - 2))
+    groups = _Groups(np.empty(0, np.int64), np.empty((0, 7 if frame.brightest is None else 10)))
+    for offsets, normals, colors in _pieces(stream, frame):
+        keys = _cell_keys(offsets, size) << 3 | _directions(normals)
+        ones = np.ones((len(keys), 1))
+        fresh = _summed(keys, np.concatenate((ones, offsets, normals, colors), axis=1))
+        groups = _summed(np.concatenate((groups.keys, fresh.keys)), np.concatenate((groups.sums, fresh.sums)))
+        # Along the normals several of them will become one.
+        while len(groups.keys) > 4 * limit:
+            groups, size = _coarser(groups), 2 * size
+    return groups, size
+
+
+def _pieces(stream: CloudStream, frame: _Frame) -> Iterator[tuple[Float64, Float64, Float64]]:
+    """Offsets, unit normals (zero where unusable) and colours (of no columns without any) of the finite points."""
+    for piece in stream.pieces(ROWS):
+        points = piece.points.astype(np.float64)
+        finite = np.isfinite(points).all(axis=1)
+        count = int(finite.sum())
+        normals = np.zeros((count, 3)) if piece.normals is None else unit_rows(normals_from(piece.normals[finite]))
+        if piece.colors is None or frame.brightest is None:
+            colors = np.empty((count, 0))
+        else:
+            colors = colors_from(piece.colors[finite], brightest=frame.brightest).astype(np.float64)
+        yield points[finite] - frame.low, normals, colors
+
+
+def _cell_keys(offsets: Float64, size: float) -> Keys:
+    """One number per cell: three of ``BITS`` bits each."""
+    x, y, z = (np.floor(axis / size).astype(np.int64) for axis in offsets.T)
+    return (x << BITS | y) << BITS | z
+
+
+def _directions(normals: Float64) -> Keys:
+    """0 to 5 for normals closest to +x, −x, +y, −y, +z, −z; `NOWHERE` for a normal of no length: ``(n,)``."""
+    axis = np.abs(normals).argmax(axis=1)
+    along = np.take_along_axis(normals, axis[:, None], axis=1)[:, 0]
+    return np.where(along == 0, NOWHERE, 2 * axis + (along < 0))
+
+
+def _summed(keys: Keys, values: Float64) -> _Groups:
+    """Add up the rows with equal keys."""
+    order = np.argsort(keys, kind="stable")
+    ordered = keys[order]
+    starts = np.flatnonzero(_begins(ordered))
+    if len(starts) == 0:
+        return _Groups(ordered, values)
+    return _Groups(ordered[starts], np.add.reduceat(values[order], starts, axis=0))
+
+
+def _begins(ordered: Keys, step: int = 0) -> NDArray[np.bool_]:
+    """Where a number is not the one before it, or that and ``step``; true at the first."""
+    return np.concatenate(([True], ordered[1:] != ordered[:-1] + step))[: len(ordered)]
+
+
+def _cells(keys: Keys) -> tuple[Keys, Keys, Keys]:
+    mask = (1 << BITS) - 1
+    return keys >> (3 + 2 * BITS) & mask, keys >> (3 + BITS) & mask, keys >> 3 & mask
+
+
+def _coarser(groups: _Groups) -> _Groups:
+    """The same points in voxels of twice the edge."""
+    x, y, z = (cell >> 1 for cell in _cells(groups.keys))
+    return _summed(((x << BITS | y) << BITS | z) << 3 | groups.keys & 7, groups.sums)
+
+
+def _along_normals(groups: _Groups) -> Float64:
+    """Join voxels that follow each other along the axis that their points face → sums, as in `_Groups`."""
+    direction, cells = groups.keys & 7, _cells(groups.keys)
+    joined = [groups.sums[direction == NOWHERE]]
+    for axis in range(3):
+        rows = np.flatnonzero(direction >> 1 == axis)
+        if len(rows) == 0:
+            continue
+        along, (u, v) = cells[axis][rows], (cells[other][rows] for other in range(3) if other != axis)
+        # Numbers one apart are neighbours in one column, facing the same way; the last cell number is never used.
+        columns = ((u << BITS | v) << 1 | direction[rows] & 1) << BITS | along
+        order = np.argsort(columns, kind="stable")
+        first = _begins(columns[order], step=1)
+        place = np.arange(len(rows))
+        place -= np.maximum.accumulate(np.where(first, place, 0))
+        starts = np.flatnonzero(place % RUN == 0)
+        joined.append(np.add.reduceat(groups.sums[rows[order]], starts, axis=0))
+    return np.concatenate(joined)
+
+
+def _without_scraps(rows: Float64, size: float, *, share: float = 1 / 4, neighbors: int = 8) -> Float64:
+    """Give what is left over at the rims of noise, and between two directions, to what it is left over from.
+
+    The mean of a few points is no worse than those points, but among means of many it would count as one of them.
+    Nothing is dropped: rows with less than ``share`` of the points of one within two voxels that faces the same way
+    are added to it.
+    """
+    count = rows[:, 0]
+    few = count < share * np.median(count)
+    if not few.any() or few.all():
+        return rows
+    small, large = rows[few], rows[~few]
+    normals = unit_rows(large[:, 4:7])
+    tree = KDTree(large[:, 1:4] / large[:, :1])
+    found, near = tree.query(
+        small[:, 1:4] / small[:, :1], k=min(neighbors, len(large)), distance_upper_bound=2 * size, workers=-1
+    )
+    found, near = found.reshape(len(small), -1), near.reshape(len(small), -1)
+    near = np.where(np.isfinite(found), near, 0)
+    agrees = np.einsum("mkd,md->mk", normals[near], unit_rows(small[:, 4:7])) > 0.5
+    agrees |= (small[:, 4:7] == 0).all(axis=1)[:, None]
+    fits = np.isfinite(found) & agrees & (count[few][:, None] < share * large[near, 0])
+    given = fits.any(axis=1)
+    owner = near[given, fits[given].argmax(axis=1)]
+    for column in range(rows.shape[1]):
+        large[:, column] += np.bincount(owner, small[given, column], minlength=len(large))
+    return np.concatenate((large, small[~given]))
+
+
+def _without_isolated(groups: _Groups, factor: float) -> _Groups:
+    """Drop the voxels with too few points in and around them; see `merge_cloud`."""
+    voxels = _summed(groups.keys >> 3, groups.sums[:, :1])
+    counts = voxels.sums[:, 0]
+    # A surface crosses about nine of the 27 voxels around one of its points.
+    usual = 9 * float(np.median(counts))
+    few = np.flatnonzero(counts * factor < usual)
+    around = np.zeros(len(few))
+    for x in (-1, 0, 1):
+        for y in (-1, 0, 1):
+            for z in (-1, 0, 1):
+                shifted = voxels.keys[few] + (((x << BITS) + y) << BITS) + z
+                at = np.searchsorted(voxels.keys, shifted).clip(max=len(counts) - 1)
+                around += np.where(voxels.keys[at] == shifted, counts[at], 0)
+    isolated = voxels.keys[few[around * factor < usual]]
+    kept = ~np.isin(groups.keys >> 3, isolated)
+    return _Groups(groups.keys[kept], groups.sums[kept])
