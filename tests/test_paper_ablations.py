@@ -119,7 +119,7 @@ def test_sign_at_a_sharp_tip_is_that_of_all_faces_around_it() -> None:
     )
     directions = np.random.default_rng(1).normal(size=(500, 3)) * 0.1
     directions[:, 0] = np.abs(directions[:, 0]) + 0.3
-    assert (MeshDistance(tip).signed(directions + [1, 0, 0]) > 0).all()
+    assert (MeshDistance(tip).signed(np.add([1, 0, 0], directions)) > 0).all()
     assert MeshDistance(tip).signed(np.array([[0.5, 0.0, 0.0]]))[0] < 0
 
 
@@ -416,7 +416,7 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("spec", [LOSS_WEIGHTS, DELTA_FACTOR, ISOLATION, MARCHING_CUBES, NORMALS], ids=lambda s: s.name)
 def test_smoke(spec: Any, ball: Path, out: Path) -> None:
-    cells = spec.cells([ball], "smoke")
+    cells = [cell for cell in spec.cells([ball], "smoke") if not cell.noise]
     records = [run_cell(cell, out) for cell in cells]
     tables = spec.tables(records)
     assert tables
