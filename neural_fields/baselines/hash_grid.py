@@ -120,7 +120,7 @@ class HashGridSDF(Field):
             features.append(feature)
             slopes.append(slope)
         output, active = self._read(torch.cat(features, dim=1))
-        *hidden, last = self._linear()
+        *hidden, last = self.linear()
         g = last.weight.expand(len(rows), -1)
         for layer, mask in zip(reversed(hidden), reversed(active), strict=True):
             g = (g * mask) @ layer.weight
@@ -139,7 +139,7 @@ class HashGridSDF(Field):
 
     def _read(self, features: Tensor) -> tuple[Tensor, list[Tensor]]:
         """The network's output ``(N,)``, and which neurons of each hidden layer are active ``(N, width)``."""
-        *hidden, last = self._linear()
+        *hidden, last = self.linear()
         h, active = features, []
         for layer in hidden:
             z = layer(h)
@@ -147,7 +147,8 @@ class HashGridSDF(Field):
             h = z.relu()
         return last(h)[:, 0], active
 
-    def _linear(self) -> list[nn.Linear]:
+    def linear(self) -> list[nn.Linear]:
+        """The layers of the network, first to last."""
         return [layer for layer in self.layers if isinstance(layer, nn.Linear)]
 
     def _sphere(self, x: Tensor) -> tuple[Tensor | float, Tensor | float]:
