@@ -2,12 +2,30 @@
 
 import itertools
 import math
+from dataclasses import replace
 
 import pytest
 import torch
+from mplicits.datasets import OrientedCloud, prepare_cloud, sample_sphere
 from mplicits.neural_fields import Field, Jet, extract_mesh, sphere_trace
 from mplicits.neural_fields.baselines import BaconSDF, IdfSDF
 from mplicits.neural_fields.baselines.idf import attenuation
+from mplicits.pipelines.cloud_distance import CloudDistance
+from mplicits.pipelines.paper.recipe import Recipe, descend
+from mplicits.pipelines.paper.recipes_networks import (
+    BACON_PRESETS,
+    IDF_PRESETS,
+    SIREN_PRESETS,
+    BaconRecipe,
+    IdfRecipe,
+    SirenRecipe,
+    SirenWeights,
+    displaced,
+    hand_over,
+    laplacian_samples,
+    siren_loss,
+)
+from mplicits.pipelines.training import Progress
 
 # The contract, over the fields below in place of those of the common table, whose levels are nested in bands.
 from test_field_contract import (  # noqa: F401
@@ -179,3 +197,151 @@ def test_both_train_through_their_gradients() -> None:
         ((jet.gradient.norm(dim=1) - 1).square().mean() + jet.value.square().mean()).backward()
         missing = [name for name, p in field.named_parameters() if p.grad is None and not name.startswith("heads.0")]
         assert missing == []
+
+
+@pytest.fixture(scope="module")
+def sphere() -> OrientedCloud:
+    return prepare_cloud(sample_sphere(2000, radius=3.0))
+
+
+NAMES = ("siren", "bacon", "idf")
+RECIPES = (SirenRecipe(), BaconRecipe(), IdfRecipe())
+
+
+def with_steps(steps: int) -> tuple[Recipe, ...]:
+    """The same recipes cut short; after no step at all, what they start from."""
+    return (
+        SirenRecipe({"smoke": replace(SIREN_PRESETS["smoke"], steps=steps)}),
+        BaconRecipe({"smoke": replace(BACON_PRESETS["smoke"], steps=steps)}),
+        IdfRecipe({"smoke": replace(IDF_PRESETS["smoke"], steps=steps, sphere_steps=2)}),
+    )
+
+
+UNTRAINED, BRIEF = with_steps(0), with_steps(4)
+
+
+def error_near_the_sphere(recipe: Recipe, cloud: OrientedCloud) -> float:
+    """Mean error within 0.1 of the surface."""
+    output = recipe.train(cloud, "smoke", seed=1).outputs[-1]
+    x = torch.nn.functional.normalize(torch.randn(2000, 3), dim=1) * (0.9 + 0.2 * torch.rand(2000, 1))
+    return float((output.field.value(x, level=output.level) - (x.norm(dim=1) - 1)).abs().mean())
+
+
+@pytest.mark.parametrize(("recipe", "untrained"), list(zip(RECIPES, UNTRAINED, strict=True)), ids=NAMES)
+def test_recipe_finds_a_sphere(recipe: Recipe, untrained: Recipe, sphere: OrientedCloud) -> None:
+    after, before = error_near_the_sphere(recipe, sphere), error_near_the_sphere(untrained, sphere)
+    assert after < 0.02
+    assert after < before / 5
+
+
+@pytest.mark.parametrize("recipe", BRIEF, ids=NAMES)
+def test_recipe_reports_repeats_itself_and_leaves_no_trace(recipe: Recipe, sphere: OrientedCloud) -> None:
+    reports: list[Progress] = []
+    state = torch.get_rng_state()
+    trained = recipe.train(sphere, "smoke", seed=3, progress=reports.append)
+    assert torch.equal(torch.get_rng_state(), state)
+    assert reports[-1].step == reports[-1].steps == trained.steps
+    (output,) = trained.outputs
+    assert output.parameters <= sum(p.numel() for p in output.field.parameters())
+    assert not any(p.requires_grad for p in output.field.parameters())
+    x = 2 * torch.rand(100, 3) - 1
+    again, other = (recipe.train(sphere, "smoke", seed=seed).outputs[0].field for seed in (3, 4))
+    assert torch.equal(again.value(x), output.field.value(x))
+    assert not torch.equal(other.value(x), output.field.value(x))
+    assert recipe.source
+    assert recipe.differs
+
+
+def test_published_sizes_are_those_of_the_paper_preset() -> None:
+    siren, bacon, idf = SIREN_PRESETS["paper"], BACON_PRESETS["paper"], IDF_PRESETS["paper"]
+    assert (siren.width, siren.depth, siren.omega) == (256, 4, 30.0)
+    assert BaconSDF(bacon.width, bands=bacon.bands, outputs=bacon.outputs).harmonics() == 192
+    field = IdfSDF(idf.width, idf.depth, omegas=idf.omegas)
+    assert sum(p.numel() for p in field.parameters()) == (1_191_943 - 1) // 3
+
+
+def test_siren_loss_by_hand() -> None:
+    """Two points on the surface, one off it; a gradient at 60 degrees to the normal has a cosine of a half."""
+    value = torch.tensor([0.1, -0.3, 0.02])
+    gradient = torch.tensor([[2.0, 0.0, 0.0], [0.5, math.sqrt(0.75), 0.0], [0.0, 0.0, 1.5]])
+    normals = torch.tensor([[1.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+
+    def term(**weights: float) -> float:
+        zero = {"surface": 0.0, "normal": 0.0, "eikonal": 0.0, "off_surface": 0.0}
+        return float(siren_loss(value, gradient, normals, SirenWeights(**(zero | weights))))
+
+    assert term(surface=3.0) == pytest.approx(0.4)
+    assert term(normal=3.0) == pytest.approx(0.5)
+    assert term(eikonal=3.0) == pytest.approx(1.5)
+    assert term(off_surface=3.0) == pytest.approx(math.exp(-2.0))
+
+
+def test_laplacian_samples_have_their_spread_and_stay_in_the_period(sphere: OrientedCloud) -> None:
+    distances = CloudDistance(torch.from_numpy(sphere.points), torch.from_numpy(sphere.normals))
+    generator = torch.Generator().manual_seed(0)
+    points, distance = laplacian_samples(distances, 4000, scale=0.02, period=2.1, generator=generator)
+    assert float(points.abs().max()) <= 1.05
+    # Each coordinate is moved by 0.02 on average, and so is the distance, whose spread is that along a normal.
+    assert float(distance.abs().mean()) == pytest.approx(0.02, rel=0.1)
+    # The discs of 2,000 points lie 0.001 within the sphere.
+    assert float((distance - (points.norm(dim=1) - 1)).abs().median()) < 2e-3
+
+
+def test_schedule_of_idf_hands_over_from_base_to_displacement() -> None:
+    assert [hand_over(done) for done in (0.0, 0.2, 0.35, 0.5, 1.0)] == pytest.approx([1.0, 1.0, 0.5, 0.0, 0.0])
+
+
+def test_idf_trains_on_its_own_gradient_where_the_base_is_flat() -> None:
+    """With a base that is a plane and a reach without end, the terms that the training leaves out are zero."""
+    field = IdfSDF(8, 1, omegas=(1.0, 5.0), limit=0.1, reach=1e4).double()
+    with torch.no_grad():
+        for parameter in field.base.parameters():
+            parameter.zero_()
+        field.base.layers[0].weight[0, 0] = 1e-5
+        field.base.output.weight[0, 0] = 1e5
+    x = 2 * torch.rand(50, 3, dtype=torch.float64) - 1
+    base, jet = field.base.jet(x), field.jet(x)
+    value, gradient = displaced(field, x, base.value, base.gradient)
+    torch.testing.assert_close(value, jet.value, atol=1e-9, rtol=0)
+    torch.testing.assert_close(gradient, jet.gradient, atol=1e-6, rtol=0)
+    assert bool(((jet.gradient - base.gradient).abs() > 0.01).any())
+
+
+def test_descent_minimises_with_a_rate_for_each_group() -> None:
+    moved, slower, still = (torch.nn.Parameter(torch.zeros(1)) for _ in range(3))
+    reports: list[Progress] = []
+    descend(
+        [moved],
+        lambda step: ((moved - 1) ** 2 + (slower - 1) ** 2 + (still - 1) ** 2).sum(),
+        steps=50,
+        rate=lambda done: 0.1 * (1 - done),
+        stage="stage",
+        progress=reports.append,
+        also=[([slower], lambda done: 0.001), ([still], lambda done: 0.0)],
+        report_every=30,
+    )
+    assert moved.item() == pytest.approx(1.0, abs=0.05)
+    assert 0.03 < slower.item() < 0.06
+    assert still.item() == 0.0
+    assert [(report.stage, report.step, report.fraction) for report in reports] == [
+        ("stage", 30, 0.6),
+        ("stage", 50, 1),
+    ]
+
+
+def test_descent_clips_the_whole_gradient() -> None:
+    """Adam forgets a common factor but not one step: after a step of gradient 1e6, clipped, one of 1 still counts."""
+    scales, ends = (1e6, -1.0, -1.0, -1.0), []
+    for clip in (None, 1.0):
+        parameter = torch.nn.Parameter(torch.zeros(1))
+        descend(
+            [parameter],
+            lambda step, p=parameter: (scales[step] * p).sum(),
+            steps=4,
+            rate=lambda done: 0.1,
+            stage="",
+            clip=clip,
+        )
+        ends.append(parameter.item())
+    assert ends[0] < -0.2
+    assert ends[1] > -0.15
