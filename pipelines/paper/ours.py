@@ -45,7 +45,10 @@ class Ours(Method):
 
     name = "ours"
     source = "the paper, Sec. 3.2 and Eq. 4 and 5"
-    differs = "distances come from the cloud, not from a mesh; see docs/fit.md"
+    differs = (
+        "distances come from the cloud, not from a mesh; see docs/fit.md. The cpu preset is the preset fast of "
+        "`mplicits fit`, whose finest level is (256, 2), not (400, 2)"
+    )
 
     def settings(self, cell: Cell) -> Mapping[str, Any]:
         """All settings of the fit but the device."""
@@ -75,5 +78,5 @@ class Ours(Method):
                 zip(level_names(len(stages)), seconds, parameters, strict=True)
             )
         ]
-        details = {"cleaning": run.record["cleaning"]}
+        details = {"cleaning": run.record["cleaning"], "stages": stages}
         return Findings(tuple(outputs), tuple(run.record["deltas"]), details)

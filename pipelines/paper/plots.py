@@ -15,6 +15,7 @@ COLORS = ("#1b6ca8", "#d1495b", "#edae49", "#66a182", "#6f4a8e", "#8d6a4a", "#3a
 LEGEND_STEP, LEGEND_ROW = 158.0, 18.0
 LEGEND_COLUMNS = 4
 CHARACTER = 7.0  # about its width
+LONGEST = 12  # characters of a tilted label
 
 
 @dataclass(frozen=True)
@@ -65,13 +66,13 @@ def ticks(low: float, high: float) -> list[float]:
     """Powers of ten from below ``low`` to above ``high``, and 2 and 5 times them where they would be few.
 
     Example:
-        >>> ticks(2e-5, 3e-3)
-        [1e-05, 0.0001, 0.001, 0.01]
-        >>> ticks(2.5, 4.0)
-        [2.0, 5.0]
+        >>> ticks(2e-5, 3e-2)
+        [1e-05, 0.0001, 0.001, 0.01, 0.1]
+        >>> ticks(2.5, 40.0)
+        [2.0, 5.0, 10.0, 20.0, 50.0]
     """
     first, last = math.floor(math.log10(low)), math.ceil(math.log10(high))
-    steps = (1, 2, 5) if last - first < 2 else (1,)
+    steps = (1, 2, 5) if last - first < 3 else (1,)
     marks = [float(f"{step}e{power}") for power in range(first, last + 1) for step in steps]
     below = max((i for i, mark in enumerate(marks) if mark <= low), default=0)
     above = min((i for i, mark in enumerate(marks) if mark >= high), default=len(marks) - 1)
@@ -119,7 +120,7 @@ def to_svg(plot: Plot) -> str:
         if tilted:
             parts.append(
                 f'<text transform="translate({x + 4:.1f} {HEIGHT - BOTTOM + 14:g}) rotate(-35)" text-anchor="end" '
-                f'font-size="10">{html.escape(place)}</text>'
+                f'font-size="10">{html.escape(_short(place))}</text>'
             )
         else:
             parts.append(_text(x, HEIGHT - BOTTOM + 18, place, anchor="middle"))
@@ -149,6 +150,11 @@ def _series(plot: Plot, series: Series, color: str, marks: list[float]) -> list[
         for dot, place, value in zip(dots, plot.places, series.values, strict=True)
         if dot is not None
     ]
+
+
+def _short(name: str) -> str:
+    """A name that fits between the axis and the legend."""
+    return name if len(name) <= LONGEST else name[: LONGEST - 1] + "…"
 
 
 def _line(x0: float, y0: float, x1: float, y1: float, color: str, *, width: float = 1.0) -> str:

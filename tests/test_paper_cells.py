@@ -1,0 +1,308 @@
+"""Cells of the paper's tables: keys, damage, running each once, and going on after failures."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mplicits.datasets import PointCloud, read_cloud
+from mplicits.neural_fields import InputError, Similarity, Sphere, extract_mesh
+from mplicits.pipelines.mesh_files import write_mesh
+from mplicits.pipelines.paper import run as running
+from mplicits.pipelines.paper.cell import Cell
+from mplicits.pipelines.paper.judge import Judge
+from mplicits.pipelines.paper.method import Findings, Method
+from mplicits.pipelines.paper.ours import Ours, level_names
+from mplicits.pipelines.paper.peers import FromRecipe
+from mplicits.pipelines.paper.protocol import damaged_cloud, fit_config, flip_normals, oriented_cloud, protocol_of
+from mplicits.pipelines.paper.recipe import Output, Recipe, Trained
+from mplicits.pipelines.paper.run import Shape, cell_key, cells_of, run_cell, run_cells
+from mplicits.pipelines.paper.shapes import find_shapes
+from mplicits.pipelines.paper.store import make_folder, read_record, record_file
+from mplicits.pipelines.paper.tables import TableSpec
+
+PLACE = Similarity((5.0, 0.0, -1.0), 20.0)
+
+
+class Exact(Method):
+    """Knows the answer: the ball of the test's file, or of another radius."""
+
+    source, differs = "a test", "nothing"
+
+    def __init__(self, name="exact", radius=0.7):
+        self.name, self.radius, self.runs = name, radius, 0
+
+    def run(self, cell, work):
+        self.runs += 1
+        if self.radius is None:
+            raise RuntimeError("no\nluck")
+        judge = Judge(cell, work)
+        field = Sphere(radius=self.radius)
+        return Findings((judge.field("Exact", field, PLACE, parameters=1, train_seconds=2.0),), (0.25,))
+
+
+@pytest.fixture
+def ball(tmp_path: Path) -> Path:
+    path = tmp_path / "ball.ply"
+    write_mesh(path, extract_mesh(Sphere(radius=0.7), resolution=32), PLACE)
+    return path
+
+
+@pytest.fixture
+def out(tmp_path: Path) -> Path:
+    make_folder(tmp_path / "bench")
+    return tmp_path / "bench"
+
+
+@pytest.fixture
+def known(monkeypatch: pytest.MonkeyPatch):
+    """Replace the methods."""
+
+    def replace(*methods):
+        monkeypatch.setattr(running, "method_named", lambda name: {m.name: m for m in methods}[name])
+
+    return replace
+
+
+def test_keys_are_of_contents_and_settings(ball: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "elsewhere.ply"
+    copy.write_bytes(ball.read_bytes())
+    cell = Cell(ball, "ours", "smoke")
+    key = cell.key({"a": 1})
+    assert key == cell.key({"a": 1}) == Cell(copy, "ours", "smoke").key({"a": 1})
+    assert len(key) == 12
+    others = [
+        dataclasses.replace(cell, **change).key({"a": 1})
+        for change in (
+            {"method": "idf"},
+            {"preset": "cpu"},
+            {"seed": 1},
+            {"noise": 0.01},
+            {"outliers": 0.01},
+            {"flipped": 0.01},
+            {"overrides": (("steps", (1, 2)),)},
+            {"reference": copy},
+        )
+    ]
+    assert len({key, *others, cell.key({"a": 2})}) == len(others) + 2
+    copy.write_bytes(ball.read_bytes() + b"\n")
+    assert Cell(copy, "ours", "smoke").key({"a": 1}) != key
+
+
+def test_settings_of_ours_are_in_the_key_but_not_the_device(ball: Path) -> None:
+    ours = Ours()
+    plain = Cell(ball, "ours", "smoke")
+    settings = ours.settings(plain)["fit"]
+    assert settings["steps"] == fit_config("smoke").steps
+    assert "device" not in settings
+    changed = ours.settings(dataclasses.replace(plain, overrides=(("epsilon", 0.5),)))["fit"]
+    assert changed == settings | {"epsilon": 0.5}
+    assert cell_key(plain, ours) != cell_key(dataclasses.replace(plain, preset="cpu"), ours)
+
+
+def test_names() -> None:
+    assert Cell(Path("a/b.ply"), "idf", "cpu").name == "b, idf"
+    cell = Cell(Path("b.ply"), "ours", "cpu", noise=0.01, outliers=0.05, overrides=(("steps", (1, 2)),))
+    assert cell.name == "b + noise 0.01 + outliers 0.05, ours, steps=1 2"
+    assert level_names(2) == ["Ours coarse", "Ours fine"]
+    assert level_names(4) == ["Ours coarse", "Ours medium 1", "Ours medium 2", "Ours fine"]
+
+
+def test_flipped_normals_are_as_many_as_asked_for() -> None:
+    normals = np.tile(np.float32([0, 0, 1]), (200, 1))
+    cloud = PointCloud(np.random.default_rng(0).random((200, 3)), normals)
+    turned = flip_normals(cloud, 0.1, seed=3)
+    assert turned.normals is not None
+    assert (turned.normals[:, 2] == -1).sum() == 20
+    assert (turned.normals == flip_normals(cloud, 0.1, seed=3).normals).all()
+    assert (turned.normals != flip_normals(cloud, 0.1, seed=4).normals).any()
+    assert (normals[:, 2] == 1).all()
+    with pytest.raises(ValueError, match=r"fraction=1\.5"):
+        flip_normals(cloud, 1.5)
+
+
+def test_damage(ball: Path) -> None:
+    clean = read_cloud(ball)
+    count = len(clean)
+    cell = Cell(ball, "x", "smoke", noise=0.01, outliers=0.05, flipped=0.1)
+    cloud = damaged_cloud(cell)
+    assert len(cloud) == count + round(0.05 * count)
+    moved = np.linalg.norm(cloud.points[:count] - [5.0, 0.0, -1.0], axis=1) - 14
+    diagonal = 28 * 3**0.5
+    assert 0.9 * 0.01 * diagonal < abs(moved).max() < 0.01 * diagonal + 0.03
+    assert cloud.normals is not None
+    assert clean.normals is not None
+    against = (cloud.normals[:count] * clean.normals).sum(axis=1) < 0
+    assert against.sum() == round(0.1 * count)
+    # No stray is judged to be one before the others see it.
+    assert len(oriented_cloud(cell)) == len(cloud)
+
+
+def test_damage_needs_normals(tmp_path: Path) -> None:
+    np.savetxt(tmp_path / "cloud.xyz", np.random.default_rng(0).random((50, 3)))
+    with pytest.raises(InputError, match="has no normals for noise"):
+        damaged_cloud(Cell(tmp_path / "cloud.xyz", "x", "smoke", noise=0.01))
+
+
+def test_a_record_is_measured_kept_and_not_made_again(ball: Path, out: Path, known) -> None:
+    exact = Exact()
+    known(exact)
+    cell = Cell(ball, "exact", "smoke")
+    record = run_cell(cell, out)
+    key = record["key"]
+    assert json.loads(record_file(out, key).read_text()) == record == run_cell(cell, out)
+    assert exact.runs == 1
+    (output,) = record["outputs"]
+    assert record["deltas"] == [0.25]
+    assert output["chamfer"] < 1.5 * output["chamfer_floor"]
+    assert output["iou"] > 0.97
+    assert output["components"] == 1
+    assert output["rays_per_second"] > 0
+    assert (output["parameters"], output["train_seconds"]) == (1, 2.0)
+    vertices = read_cloud(out / "meshes" / f"{key}-exact.ply").points
+    assert abs(np.linalg.norm(vertices - [5.0, 0.0, -1.0], axis=1) - 14).max() < 0.02
+    assert (out / "pictures" / f"{key}-exact.png").stat().st_size > 1000
+
+
+def test_no_surface_is_a_result(ball: Path, out: Path, known) -> None:
+    known(Exact(radius=1.9))  # all of the box is inside
+    (output,) = run_cell(Cell(ball, "exact", "smoke"), out)["outputs"]
+    assert output["chamfer"] is None
+    assert "iou" not in output
+
+
+def test_a_failure_stops_nothing_and_is_tried_again(ball: Path, out: Path, known) -> None:
+    good, bad = Exact("good"), Exact("bad", radius=None)
+    known(good, bad)
+    cells = [Cell(ball, "bad", "smoke"), Cell(ball, "good", "smoke")]
+    lines: list[str] = []
+    ran = run_cells(cells, out, say=lines.append)
+    assert list(ran.records) == cells[1:]
+    assert ran.failures == {cells[0]: "RuntimeError: no luck"}
+    assert "[1/2] ball, bad: failed: RuntimeError: no luck; about" in lines[0]
+    assert lines[1].startswith("[2/2] ball, good: ")
+    assert "Chamfer" in lines[1]
+    key = cell_key(cells[0], bad)
+    assert json.loads(record_file(out, key).read_text())["error"] == "no luck"
+    assert read_record(out, key) is None
+
+    bad.radius = 0.7
+    again = run_cells(cells, out, say=lines.append)
+    assert (good.runs, bad.runs) == (1, 2)
+    assert list(again.records) == cells
+    assert not again.failures
+    assert lines[2] == "1 of 2 cells are there already"
+
+
+def test_a_damaged_record_is_made_again(ball: Path, out: Path, known) -> None:
+    exact = Exact()
+    known(exact)
+    cell = Cell(ball, "exact", "smoke")
+    record_file(out, cell_key(cell, exact)).write_text("{")
+    run_cell(cell, out)
+    assert exact.runs == 1
+
+
+def test_what_is_not_installed_is_left_out(ball: Path, out: Path, known) -> None:
+    class Absent(Exact):
+        def missing(self):
+            return "needs pip install something"
+
+    absent = Absent("absent")
+    known(absent)
+    lines: list[str] = []
+    ran = run_cells([Cell(ball, "absent", "smoke")], out, say=lines.append)
+    assert not ran.records
+    assert not ran.failures
+    assert ran.lacking == {"absent": "needs pip install something"}
+    assert lines == ["left out: absent, needs pip install something"]
+    assert absent.runs == 0
+
+
+def test_ctrl_c_keeps_what_is_finished(ball: Path, out: Path, known) -> None:
+    class Stopped(Exact):
+        def run(self, cell, work):
+            raise KeyboardInterrupt
+
+    good = Exact("good")
+    known(good, Stopped("stopped"))
+    cells = [Cell(ball, "good", "smoke"), Cell(ball, "stopped", "smoke")]
+    with pytest.raises(KeyboardInterrupt):
+        run_cells(cells, out, say=lambda _: None)
+    assert read_record(out, cell_key(cells[0], good)) is not None
+
+
+def test_recipes_learn_from_the_unit_sphere(ball: Path, out: Path, known) -> None:
+    class Known(Recipe):
+        name, source, differs = "known", "s", "d"
+
+        def train(self, cloud, preset, *, seed=0, device="cpu", progress=None):
+            radii = np.linalg.norm(cloud.points, axis=1)
+            assert abs(radii - 1).max() < 0.01
+            return Trained((Output("Known", Sphere(radius=0.999), -1, 4),), 3.0, 17)
+
+    known(FromRecipe(Known()))
+    record = run_cell(Cell(ball, "known", "smoke", seed=2), out)
+    (output,) = record["outputs"]
+    assert output["chamfer"] < 1.5 * output["chamfer_floor"]
+    assert record["details"] == {"steps": 17}
+    assert record["method"] == {"source": "s", "differs": "d"}
+
+
+def test_ours(ball: Path, out: Path) -> None:
+    cell = Cell(ball, "ours", "smoke", overrides=(("steps", (120, 20, 20)), ("samples", 5000)))
+    record = run_cell(cell, out)
+    assert [output["name"] for output in record["outputs"]] == ["Ours coarse", "Ours medium", "Ours fine"]
+    sizes = [output["parameters"] for output in record["outputs"]]
+    assert sizes[1] - sizes[0] == sizes[0]
+    seconds = [output["train_seconds"] for output in record["outputs"]]
+    assert 0 < seconds[0] < seconds[1] < seconds[2]
+    assert record["outputs"][2]["iou"] > 0.95
+    assert len(record["deltas"]) == 2
+    assert (out / "runs" / record["key"] / "field.safetensors").is_file()
+
+
+def test_cells_of_a_table(ball: Path) -> None:
+    def cells(shapes, preset):
+        return [Cell(shape, method, preset) for shape in shapes for method in ("a", "b", "a")]
+
+    spec = TableSpec("t", "l", "s", cells, lambda _: ())
+    other = ball.with_name("scan.npz")
+    planned = cells_of(spec, [Shape(ball), Shape(other, ball)], "smoke", seed=4, skipped=["b"])
+    assert planned == [Cell(ball, "a", "smoke", seed=4), Cell(other, "a", "smoke", seed=4, reference=ball)]
+
+
+def test_shapes(ball: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    with pytest.raises(InputError, match="holds no mesh"):
+        find_shapes([folder])
+    for name in ("b.ply", "a.ply"):
+        (folder / name).write_bytes(ball.read_bytes())
+    (folder / "notes.txt").write_text("not a mesh")
+    assert find_shapes([folder, ball]) == [Shape(folder / "a.ply"), Shape(folder / "b.ply"), Shape(ball)]
+    (tmp_path / "a.ply").write_bytes(ball.read_bytes())
+    with pytest.raises(InputError, match="has the same name"):
+        find_shapes([folder, tmp_path / "a.ply"])
+    with pytest.raises(InputError, match="no such file"):
+        find_shapes([tmp_path / "nothing.ply"])
+
+    scan = tmp_path / "scan.xyz"
+    np.savetxt(scan, np.random.default_rng(0).random((50, 3)))
+    with pytest.raises(InputError, match="give --reference MESH"):
+        find_shapes([scan])
+    with pytest.raises(InputError, match=r"--reference .*has no faces"):
+        find_shapes([scan], reference=scan)
+    with pytest.raises(InputError, match="leave it out"):
+        find_shapes([ball], reference=ball)
+    assert find_shapes([ball, scan], reference=ball) == [Shape(ball), Shape(scan, ball)]
+
+
+def test_presets_grow() -> None:
+    sizes = [protocol_of(preset) for preset in ("smoke", "cpu", "paper")]
+    for name in ("resolution", "samples"):
+        numbers = [getattr(size, name) for size in sizes]
+        assert numbers == sorted(set(numbers))
+    assert (sizes[2].resolution, sizes[2].samples, sizes[2].poisson_depth) == (512, 500_000, 10)
+    assert fit_config("paper").widths == (128, 256, 400)
