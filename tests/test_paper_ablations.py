@@ -402,6 +402,8 @@ def test_normals_rows() -> None:
 def test_tables_of_nothing() -> None:
     for spec in (LOSS_WEIGHTS, DELTA_FACTOR, ISOLATION, MARCHING_CUBES, NORMALS):
         assert spec.tables([]) == ()
+        failed = {**record(spec.name, []), "error": "out of memory"}
+        assert spec.tables([failed]) == ()
 
 
 # Smoke: every cell of every table
@@ -416,13 +418,14 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("spec", [LOSS_WEIGHTS, DELTA_FACTOR, ISOLATION, MARCHING_CUBES, NORMALS], ids=lambda s: s.name)
 def test_smoke(spec: Any, ball: Path, out: Path) -> None:
-    cells = [cell for cell in spec.cells([ball], "smoke") if not cell.noise]
+    # Clean clouds and one constraint, to be quick.
+    planned = [cell for cell in spec.cells([ball], "smoke") if not cell.noise]
+    cells = [cell for cell in planned if dict(cell.overrides).get("constraint", "sdf") == "sdf"]
     records = [run_cell(cell, out) for cell in cells]
     tables = spec.tables(records)
     assert tables
-    for table in tables:
-        for row in table.rows:
-            assert "paper only" in row.name or any(value is not None for value in row.values)
+    for row in tables[0].rows:
+        assert "paper only" in row.name or any(value is not None for value in row.values)
     if spec is ISOLATION:
         chamfers = [row.values[6] for row in tables[0].rows]
         assert all(isinstance(c, float) and c < 0.01 for c in chamfers)

@@ -242,7 +242,7 @@ def loss_weight_cells(shapes: Sequence[Path], preset: Preset) -> list[Cell]:
 
 def loss_weight_tables(records: Sequence[Record]) -> tuple[Table, ...]:
     """One table per constraint: weight → mean error of the medium and of the fine level."""
-    found = select(records, method=LossWeights.name)
+    found = [record for record in select(records, method=LossWeights.name) if record["outputs"]]
     tables = []
     for constraint, (title, _, label, published) in CONSTRAINTS.items():
         levels = [select(found, overrides={"constraint": constraint, "level": level}) for level in (1, 2)]
@@ -254,7 +254,7 @@ def loss_weight_tables(records: Sequence[Record]) -> tuple[Table, ...]:
         if not rows:
             continue
         without = tuple(mean(record["details"]["without"] for record in part) for part in levels)
-        rows.append(Row("level not trained at all", without))
+        rows.append(Row("level not trained at all", without, competes=False))
         tables.append(
             Table(
                 f"loss-weights-{constraint}",
@@ -280,7 +280,7 @@ def delta_factor_cells(shapes: Sequence[Path], preset: Preset) -> list[Cell]:
 
 def delta_factor_tables(records: Sequence[Record]) -> tuple[Table, ...]:
     """Factor 1 + ε → mean bands and mean errors of the medium and of the fine level."""
-    found = select(records, method=DeltaFactor.name)
+    found = [record for record in select(records, method=DeltaFactor.name) if record["outputs"]]
     rows = []
     for epsilon in sorted({record["cell"]["overrides"]["epsilon"] for record in found}):
         part = select(found, overrides={"epsilon": epsilon})

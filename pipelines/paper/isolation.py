@@ -241,6 +241,7 @@ def isolation_cells(shapes: Sequence[Path], preset: Preset) -> list[Cell]:
 
 def isolation_tables(records: Sequence[Record]) -> tuple[Table, ...]:
     """The paper's table, and what culling does to (a) and (c)."""
+    records = [record for record in records if record["outputs"]]
     if not records:
         return ()
     rows = []
@@ -291,7 +292,7 @@ def _culling_table(records: Sequence[Record]) -> Table:
 def _outputs(records: Sequence[Record], name: str, noise: float) -> list[Mapping[str, Any]]:
     """The surface called ``name`` in every record; (a) with culling is the finest level of the fit."""
     if name == "a":
-        return [record["outputs"][-1] for record in select(records, method="ours", noise=noise) if record["outputs"]]
+        return [record["outputs"][-1] for record in select(records, method="ours", noise=noise)]
     found = select(records, method=Isolation.name, noise=noise)
     return [output for record in found for output in record["outputs"] if output["name"] == name]
 

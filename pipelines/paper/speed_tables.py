@@ -166,7 +166,7 @@ def marching_cubes_cells(shapes: Sequence[Path], preset: Preset) -> list[Cell]:
 
 def marching_cubes_tables(records: Sequence[Record]) -> tuple[Table, ...]:
     """One row per shape, and the paper's own rows below."""
-    found = select(records, method=MarchingCubes.name)
+    found = [record for record in select(records, method=MarchingCubes.name) if record["outputs"]]
     if not found:
         return ()
     rows = []
@@ -179,7 +179,7 @@ def marching_cubes_tables(records: Sequence[Record]) -> tuple[Table, ...]:
         rows.append(Row(record["cell"]["shape"], values, _published_grid(record["cell"]["shape"])))
     named = {row.name.lower() for row in rows}
     rows += [
-        Row(f"{model} (paper only)", (None,) * 6, _published_grid(model))
+        Row(f"{model} (paper only)", (None,) * 6, _published_grid(model), competes=False)
         for model in TIME_MC
         if model.lower() not in named
     ]
@@ -223,7 +223,7 @@ def normals_cells(shapes: Sequence[Path], preset: Preset) -> list[Cell]:
 
 def normals_tables(records: Sequence[Record]) -> tuple[Table, ...]:
     """One row per network and number of points."""
-    found = select(records, method=Normals.name)
+    found = [record for record in select(records, method=Normals.name) if record["outputs"]]
     if not found:
         return ()
     rows = []
