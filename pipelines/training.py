@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from ..neural_fields import Siren
 from ..neural_fields.losses import data_loss, eikonal_loss, normal_loss
+from .distributed import agreed, average_gradients, my_share, whole_batch
 from .sampling import Samples
 
 __all__ = [
@@ -187,11 +188,13 @@ class LevelTrainer:
             save_every: seconds between checkpoints.
         """
         start, saved = time.monotonic() - self.elapsed, time.monotonic()
+        device = next(self.network.parameters()).device
+        stop, self.elapsed = agreed(flag.requested, self.elapsed, device)
         while self.fraction < 1:
-            if flag.requested:
+            if stop:
                 return False
             terms = self._step()
-            self.elapsed = time.monotonic() - start
+            stop, self.elapsed = agreed(flag.requested, time.monotonic() - start, device)
             if self.step % report_every == 0 or self.fraction >= 1:
                 self.losses = {name: float(term) for name, term in terms.items()}
                 report(self)
@@ -206,6 +209,7 @@ class LevelTrainer:
         terms, total = self._losses()
         self.adam.zero_grad(set_to_none=True)
         total.backward()
+        average_gradients(self.network.parameters())
         self.adam.step()
         self.step += 1
         return terms
@@ -233,8 +237,8 @@ class LevelTrainer:
         return terms, total
 
     def _draw(self, source: Source) -> Tensor:
-        index = torch.randint(len(source.samples), (source.batch,), generator=self.generator)
-        return index.to(source.samples.points.device)
+        index = torch.randint(len(source.samples), (whole_batch(source.batch),), generator=self.generator)
+        return my_share(index).to(source.samples.points.device)
 
     def state(self) -> dict[str, Tensor]:
         """All that `restore` needs to continue as if nothing had happened."""
