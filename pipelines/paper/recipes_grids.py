@@ -92,10 +92,10 @@ class InstantNgpRecipe(Recipe):
         "β = (0.9, 0.99), ε = 1e-15 and rate 1e-4, after a third of the steps times 0.33 every sixth of them"
     )
     differs = (
-        "Plain PyTorch; no moving average of the weights, no decay. Distances are the cloud's, as for every method here, and "
-        "steps off the surface no shorter than its spacing. The paper says how many parameters and levels, not which "
-        "grids: coarse has 3 (16 to 382 cells, 2,049,153 parameters), fine 16 (16 to 269 cells, 9,125,105). The cpu "
-        "preset has these sizes, a rate of 3e-3 and a few hundred steps of a few thousand points"
+        "Plain PyTorch; no moving average of the weights, no decay. Distances are the cloud's, as for every method "
+        "here, and steps off the surface no shorter than its spacing. The paper says how many parameters and levels, "
+        "not which grids: coarse has 3 (16 to 382 cells, 2,049,153 parameters), fine 16 (16 to 269 cells, 9,125,105). "
+        "The cpu preset has these sizes, a rate of 3e-3 and a few hundred steps of a few thousand points"
     )
 
     def __init__(
