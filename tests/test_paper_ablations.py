@@ -16,6 +16,7 @@ from mplicits.pipelines.paper.ablations import (
     DELTA_FACTOR,
     LOSS_WEIGHTS,
     delta_factor_tables,
+    error_plots,
     loss_weight_tables,
     short,
 )
@@ -331,6 +332,13 @@ def test_loss_weight_rows() -> None:
     assert table.rows[0].published == (0.0073, 0.0017)
     assert table.rows[1].published == (0.0081, 0.0013)
     assert "ball, cube" in table.notes[0]
+    (plot,) = LOSS_WEIGHTS.plots(records)
+    assert plot.places == ("0", "100")
+    assert [series.name for series in plot.series] == [
+        f"{level} level{whose}" for level in ("medium", "fine") for whose in ("", ", paper")
+    ]
+    assert plot.series[0].values == pytest.approx((0.2, 0.3))
+    assert plot.series[1].values == (0.0073, 0.0081)
 
 
 def test_delta_factor_rows() -> None:
@@ -342,6 +350,8 @@ def test_delta_factor_rows() -> None:
     assert [row.name for row in table.rows] == ["1.01", "1.3", "5"]
     assert table.rows[1].values == pytest.approx((0.02, 0.01, 0.05, 0.04))
     assert table.rows[1].published == (None, None, 0.0103, 0.0050)
+    (plot,) = error_plots([table])
+    assert [series.values for series in plot.series[:2]] == [(0.03, 0.05, 0.3), (0.0098, 0.0103, 0.0139)]
 
 
 def test_isolation_rows() -> None:

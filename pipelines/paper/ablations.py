@@ -22,8 +22,9 @@ from .levels import Weights, banded_sources, delta_after, generator_for, train_l
 from .mesh_distance import Float64, MeshDistance, approximation_error, near_surface
 from .method import Findings, Method, Workplace
 from .ours import Ours, our_config
+from .plots import Plot, Series
 from .recipe import Report
-from .tables import Column, Row, Table, TableSpec, mean, select, shapes_of
+from .tables import Column, Row, Table, TableSpec, Value, mean, select, shapes_of
 
 if TYPE_CHECKING:
     from .recipe import Preset
@@ -38,6 +39,7 @@ __all__ = [
     "DeltaFactor",
     "LossWeights",
     "delta_factor_tables",
+    "error_plots",
     "loss_weight_tables",
 ]
 
@@ -296,6 +298,27 @@ def delta_factor_tables(records: Sequence[Record]) -> tuple[Table, ...]:
     return (Table("delta-factor", title, "factor", columns, tuple(rows), notes=_notes(found)),)
 
 
+def error_plots(tables: Sequence[Table]) -> tuple[Plot, ...]:
+    """One plot per table: the errors over what was varied, with the paper's own."""
+    plots = []
+    for table in tables:
+        rows = [row for row in table.rows if row.competes]
+        series = []
+        for index, column in enumerate(table.columns):
+            if column.best is None:  # a band's width, no error
+                continue
+            ours = [row.values[index] for row in rows]
+            theirs = [None if row.published is None else row.published[index] for row in rows]
+            series += [_series(column.name, ours), _series(f"{column.name}, paper", theirs)]
+        places = tuple(row.name for row in rows)
+        plots.append(Plot(table.name, table.title, places, tuple(series), "mean |f − d|", lines=True))
+    return tuple(plots)
+
+
+def _series(name: str, values: Sequence[Value]) -> Series:
+    return Series(name, tuple(value if isinstance(value, int | float) else None for value in values))
+
+
 def _columns() -> tuple[Column, ...]:
     return tuple(Column(f"{name} level", ".5f", best="lowest") for name in LEVELS)
 
@@ -324,6 +347,7 @@ LOSS_WEIGHTS = TableSpec(
     "each term of the loss at weights from none to far too much, at the medium and at the fine level",
     loss_weight_cells,
     loss_weight_tables,
+    lambda records: error_plots(loss_weight_tables(records)),
 )
 DELTA_FACTOR = TableSpec(
     "delta-factor",
@@ -331,4 +355,5 @@ DELTA_FACTOR = TableSpec(
     "narrower and wider bands",
     delta_factor_cells,
     delta_factor_tables,
+    lambda records: error_plots(delta_factor_tables(records)),
 )
