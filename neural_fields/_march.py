@@ -14,7 +14,7 @@ from torch import Tensor
 
 from .field import Field
 
-__all__ = ["Expected", "Found", "Rays", "Rule", "march", "march_budget"]
+__all__ = ["Expected", "Found", "Near", "Rays", "Rule", "march", "march_budget"]
 
 # Steps at a gap of one `resolution`, before it doubles: few rays need as many, and none may need thousands.
 PATIENCE = 32
@@ -30,6 +30,8 @@ LEAST_FALL = 0.1
 FORESIGHT = 1.2
 # Values this many rounding errors from zero are zero: no step would bring them nearer.
 FLOOR = 8
+# The field falls steadily to a hit if the way there is at most this many times as long as its fall on it tells.
+STEADY = 1.5
 
 
 class Expected(NamedTuple):
@@ -38,10 +40,27 @@ class Expected(NamedTuple):
     Attributes:
         depth: ``(...,)`` of their hits, infinite for no idea.
         slope: ``(...,)`` how fast the field falls along the ray there, positive.
+        value: ``(...,)`` of the field where the ray begins, if that is known; infinite elsewhere. Where it is the fall
+            of an even slope, the ray looks at its hit at once.
     """
 
     depth: Tensor
     slope: Tensor
+    value: Tensor
+
+
+class Near(NamedTuple):
+    """Which part of each ray comes near the surface, ``(...,)`` each.
+
+    Attributes:
+        clear: the last depth that was looked at before it; infinite for rays that never come near.
+        value: there, infinite where the ray begins near the surface.
+        leave: the first depth that was looked at behind it, infinite if there is none.
+    """
+
+    clear: Tensor
+    value: Tensor
+    leave: Tensor
 
 
 class Found:
@@ -53,6 +72,8 @@ class Found:
         self.level = torch.zeros_like(depth, dtype=torch.int64)
         self.steps = torch.zeros_like(self.level)
         self.slope = torch.ones_like(self.depth)
+        unknown = torch.full_like(depth, torch.inf)
+        self.near = Near(unknown, unknown.clone(), unknown.clone())
 
     def record(self, index: Tensor, *, mask: Tensor, depth: Tensor, level: Tensor | int, steps: Tensor | int) -> None:
         self.mask[index], self.depth[index], self.level[index], self.steps[index] = mask, depth, level, steps
@@ -60,6 +81,15 @@ class Found:
     def record_slope(self, index: Tensor, slope: Tensor) -> None:
         """How fast the field fell along the rays at their last step."""
         self.slope[index] = slope
+
+    def record_near(self, rays: Rays, close: Tensor) -> None:
+        """Note where rays come near the surface and leave it again, before they take in what they see."""
+        clear, value, leave = (column[rays.ray] for column in self.near)
+        first = close & clear.isinf()
+        self.near.clear[rays.ray] = torch.where(first, rays.low, clear)
+        self.near.value[rays.ray] = torch.where(first, rays.low_value, value)
+        left = torch.where(clear.isfinite(), torch.minimum(leave, rays.depth), torch.inf)
+        self.near.leave[rays.ray] = torch.where(close, torch.inf, left)
 
 
 class Rays(NamedTuple):
@@ -127,8 +157,10 @@ class Rays(NamedTuple):
 
     def expecting(self, expected: Expected, rule: Rule) -> Rays:
         """The same rays, each looking first where its ball is to reach back to the start if all is as expected."""
-        depth, fall = expected.depth[self.ray], expected.slope[self.ray].clamp(LEAST_FALL, 1)
+        depth, fall, value = (column[self.ray] for column in expected)
         known = depth.isfinite() & (depth > self.depth) & (depth < self.far)
+        steady = known & value.isfinite() & (fall * (depth - self.depth) <= STEADY * value)
+        fall = fall.clamp(LEAST_FALL, 1)
         way = torch.where(known, depth - self.depth, 0)
         ahead = torch.zeros_like(way)
         for _ in range(len(rule.deltas) + 1):  # a ball outside a band is smaller by its δ, so its middle is further off
@@ -136,9 +168,11 @@ class Rays(NamedTuple):
             reach = way - rule.resolution + delta / rule.lipschitz
             ahead = (reach / (1 + fall / rule.lipschitz)).clamp(min=0)
         ahead = torch.minimum(FORESIGHT * ahead, way)
+        ahead = torch.where(steady, 0, ahead)
         return self._replace(
             depth=torch.where(known, depth - ahead, self.depth),
-            gap=torch.where(known & (ahead < way), rule.resolution, self.gap),
+            low_value=torch.where(steady, value, self.low_value),
+            gap=torch.where(known & (ahead < way) & ~steady, rule.resolution, self.gap),
             expected=torch.where(known, depth, torch.inf),
             fall=fall,
         )
@@ -170,8 +204,13 @@ class Rule(NamedTuple):
         return inside, torch.cat((self.deltas, self.deltas.new_zeros(1)))[inside]
 
 
-def march(field: Field, level: int, rays: Rays, found: Found, rule: Rule, max_steps: int) -> None:
-    """The adaptive mode: one evaluation of every ray under way, then see where each one stands."""
+def march(
+    field: Field, level: int, rays: Rays, found: Found, rule: Rule, max_steps: int, reach: float | None = None
+) -> None:
+    """The adaptive mode: one evaluation of every ray under way, then see where each one stands.
+
+    With a ``reach`` it is noted where each ray comes so near to the surface, and where it leaves it.
+    """
     for count in range(1, max_steps + 1):
         if not len(rays.ray):
             return
@@ -181,6 +220,8 @@ def march(field: Field, level: int, rays: Rays, found: Found, rule: Rule, max_st
         if count <= 2:  # a ray that looked ahead in vain is at its start now
             rays, value = _from_the_front(field, level, rays, value)
             rays = rays._replace(sign=torch.where(rays.is_fresh() & (value < 0), -1.0, rays.sign))
+        if reach is not None:
+            found.record_near(rays, (value * rays.sign < reach) | (rays.sign < 0))
         gap = rule.resolution * 2.0 ** ((count - 1) // PATIENCE)
         rays, stand = _look(rays, value * rays.sign, rule, gap)
         ended = stand.hit | stand.passed if count < max_steps else torch.ones_like(stand.hit)
@@ -196,7 +237,8 @@ def _from_the_start(field: Field, level: int, rays: Rays, value: Tensor, rule: R
     """Send rays that looked ahead, and are behind the surface there, back to their start; with the values there."""
     # Where the hit itself was looked at, half of all that found it are behind it by less than the tolerance.
     found = (value >= -rule.tolerance * rays.fall) & (rays.expected - rays.depth <= rule.resolution)
-    behind = ((rays.depth > rays.low) & (value < 0) & ~found).nonzero()[:, 0]
+    # A ray that knows the value at its start has the surface between the two.
+    behind = ((rays.depth > rays.low) & (value < 0) & ~found & rays.low_value.isinf()).nonzero()[:, 0]
     if not len(behind):
         return rays, value
     rays = rays._replace(depth=rays.depth.index_copy(0, behind, rays.low[behind]))

@@ -1,16 +1,18 @@
-"""Tracing surfaces that move: every frame says where the rays of the next one had better look first.
+"""Tracing surfaces that move: what one frame found out says what the next ones need not look for.
 
-Where a ray met the surface twice, its next depth is foretold, and the slope there with it. That lets it skip the way to
-the surface: `trace_expected` looks first at the point from which a ball would just reach back to where the ray began,
-then at the foretold depth itself, and most rays are done. Rays that missed had to get away from what they passed; the
-tiles of their pixels are marched from behind as well (`cone_ends`), so that they end sooner.
+**Key frames** are traced as from scratch, and note for every ray where it comes within ``reach`` of the surface. Until
+the surface may have moved that far, the frames in between
 
-**What holds.** Nothing is taken over from an older frame but where to look. Every ray still needs an unbroken chain of
-empty balls of this frame's field from its start to its hit, as in `sphere_trace`; a ray whose balls leave a gap, or
-that finds itself behind the surface, goes back to its start. So the hits are those of tracing from scratch, to its
-tolerance and its resolution, whatever has moved and however far: what comes into view in front of an old hit breaks the
-chain there. Nothing is assumed about the motion. One that cannot be foretold costs evaluations, up to a little more
-than from scratch.
+- leave out rays that came nowhere near it,
+- begin the others where they came near, and end those that passed where they left it again,
+- and look at once where a ray's hit is foretold to be, from its depths in the last two frames, if the key frame saw the
+  field fall evenly from there to the hit. One Newton step, or none, is then left to do.
+
+**What holds.** Key frames are those of `sphere_trace`, whatever has moved and however far; there only the place where
+a ray looks first is taken from older frames. Frames in between rest on the ``speed``, a bound on |∂f/∂t|: a point with
+f ≥ reach at the time of the key frame stays outside for ``reach / speed``. Two things they do not see before the next
+key frame: what grows out of the last stretch of an even fall, and a spike between two samples of a ray that were both
+clear of it. With ``reach=0`` every frame is a key frame, and nothing is assumed about the motion.
 """
 
 from __future__ import annotations
@@ -23,12 +25,20 @@ from torch import Tensor
 
 from .field import Field
 from .spacetime import SpaceTimeSDF, TimeSlice
-from .tracing import BOUNDING_RADIUS, Expected, Hits, cone_ends, cone_starts, trace_expected
+from .tracing import BOUNDING_RADIUS, Expected, Hits, Near, cone_ends, cone_starts, trace_expected
 
 __all__ = ["DynamicTracer", "moment", "trace_sequence"]
 
 # Networks are a little steeper than a distance here and there, and a cone that goes too far loses thin parts.
 CONE_LIPSCHITZ = 1.15
+# How near a ray comes before a key frame takes note, in resolutions. More makes key frames fewer, the others dearer.
+REACH = 12.0
+# The speed is measured at those of so many points that are this near, by a difference over so long a time, and taken
+# for larger.
+SPEED_POINTS = 16384
+SPEED_NEAR = 0.1
+SPEED_INTERVAL = 1e-3
+SPEED_MARGIN = 1.25
 
 
 def moment(field: Field, t: float) -> Field:
@@ -54,11 +64,27 @@ class _Frame(NamedTuple):
     slope: Tensor
 
 
+class _Key(NamedTuple):
+    """What is kept of a key frame.
+
+    Attributes:
+        time: when.
+        lasts: how long the surface takes to move by the reach.
+        near: where each ray came near the surface.
+        far: where to give up: where rays that missed had left it again.
+    """
+
+    time: float
+    lasts: float
+    near: Near
+    far: Tensor
+
+
 class DynamicTracer:
     """First intersections of the same rays with a surface that moves, frame after frame.
 
-    The hits are those of `sphere_trace` on the slice at each time (see the module for why). Times may come in any order
-    and at any distance; the nearer, the better is a frame foretold.
+    Times may come in any order and at any distance; the nearer, the more frames there are between two key frames (see
+    the module for what these are, and what holds).
 
     Args:
         field: four-dimensional.
@@ -70,9 +96,12 @@ class DynamicTracer:
         resolution: see `sphere_trace`.
         lipschitz: see `sphere_trace`.
         radius: see `sphere_trace`.
+        reach: how near to the surface is near; by default 12 resolutions. 0 makes every frame a key frame.
+        speed: bound on |∂f/∂t| near the surface; by default a quarter more than the largest one that is measured, for
+            every key frame, at points all around it.
 
     Raises:
-        ValueError: the field is not four-dimensional, or has no such level.
+        ValueError: the field is not four-dimensional, has no such level, or a number is negative.
 
     Example:
         >>> import torch
@@ -95,13 +124,20 @@ class DynamicTracer:
         resolution: float = 1e-4,
         lipschitz: float = 1.0,
         radius: float = BOUNDING_RADIUS,
+        reach: float | None = None,
+        speed: float | None = None,
     ) -> None:
         if field.in_dim != 4:
             raise ValueError(f"field.in_dim={field.in_dim}: expected a field of space-time, four-dimensional")
+        for name, number in (("reach", reach), ("speed", speed)):
+            if number is not None and number < 0:
+                raise ValueError(f"{name}={number}: expected ≥ 0")
         self.field, self.origins, self.directions = field, origins, directions
         self.level, self.radius = field.resolve_level(level), radius
         self.tolerance, self.resolution, self.lipschitz = tolerance, resolution, lipschitz
+        self.reach, self.speed = REACH * resolution if reach is None else reach, speed
         self._frames: list[_Frame] = []
+        self._key: _Key | None = None
 
     @torch.no_grad()
     def trace(self, t: float) -> Hits:
@@ -110,13 +146,34 @@ class DynamicTracer:
         Raises:
             ValueError: see `sphere_trace`.
         """
-        field = moment(self.field, t)
-        near, far = self._tiles(field)
-        hits, slope = trace_expected(
+        field, key = moment(self.field, t), self._key
+        if key is not None and abs(t - key.time) < key.lasts:
+            hits, slope, _ = self._trace(field, self._expected(t, key.near.value), key.near.clear, key.far, None)
+        else:
+            hits, slope = self._trace_key(field, t)
+        self._frames = [*self._frames[-1:], _Frame(t, torch.where(hits.mask, hits.depth, torch.inf), slope)]
+        return hits
+
+    def _trace_key(self, field: Field, t: float) -> tuple[Hits, Tensor]:
+        """A key frame."""
+        start, end = self._tiles(field)
+        unknown = torch.full_like(self.directions[..., 0], torch.inf)
+        hits, slope, near = self._trace(field, self._expected(t, unknown), start, end, self.reach)
+        lasts = 0.0
+        if self.reach:
+            speed = self._measured_speed(t) if self.speed is None else self.speed
+            lasts = self.reach / max(speed, torch.finfo(torch.float32).tiny)
+        self._key = _Key(t, lasts, near, torch.where(hits.mask, torch.inf, near.leave))
+        return hits, slope
+
+    def _trace(
+        self, field: Field, expected: Expected | None, near: Tensor | float, far: Tensor | float, reach: float | None
+    ) -> tuple[Hits, Tensor, Near]:
+        return trace_expected(
             field,
             self.origins,
             self.directions,
-            self._expected(t),
+            expected,
             level=self.level,
             near=near,
             far=far,
@@ -124,23 +181,34 @@ class DynamicTracer:
             tolerance=self.tolerance,
             resolution=self.resolution,
             lipschitz=self.lipschitz,
+            reach=reach,
         )
-        self._frames = [*self._frames[-1:], _Frame(t, torch.where(hits.mask, hits.depth, torch.inf), slope)]
-        return hits
+
+    def _measured_speed(self, t: float) -> float:
+        """How fast values change at this time near the surface; of a distance, that is how fast the surface moves."""
+        generator = torch.Generator().manual_seed(0)
+        points = torch.nn.functional.normalize(torch.randn(SPEED_POINTS, 3, generator=generator), dim=-1)
+        points = (self.radius * torch.rand(SPEED_POINTS, 1, generator=generator) ** (1 / 3) * points).to(
+            self.directions
+        )
+        before, after = (moment(self.field, t + sign * SPEED_INTERVAL / 2).value(points, level=0) for sign in (-1, 1))
+        rate = (after - before).abs() / SPEED_INTERVAL
+        close = before.abs() < max(SPEED_NEAR, 4 * self.reach)
+        return SPEED_MARGIN * float((rate[close] if close.any() else rate).max())
 
     def _tiles(self, field: Field) -> tuple[Tensor | float, Tensor | float]:
-        """Between which depths there may be something, as far as tiles can tell."""
+        """Between which depths something may be near, as far as tiles can tell."""
         if self.origins.shape != (3,) or self.directions.ndim != 3:
             return 0.0, torch.inf
         cones = {"level": self.level, "lipschitz": CONE_LIPSCHITZ * self.lipschitz, "radius": self.radius}
-        near = cone_starts(field, self.origins, self.directions, **cones)
+        near = cone_starts(field, self.origins, self.directions, clearance=self.reach, **cones)
         if not self._frames:
             return near, torch.inf
         passing = near.isfinite() & self._frames[-1].depth.isinf()
-        return near, cone_ends(field, self.origins, self.directions, passing, **cones)
+        return near, cone_ends(field, self.origins, self.directions, passing, clearance=self.reach, **cones)
 
-    def _expected(self, t: float) -> Expected | None:
-        """The last hits, moved on as they moved before."""
+    def _expected(self, t: float, value: Tensor) -> Expected | None:
+        """The last hits, moved on as they moved before; with what is known of the values where rays begin."""
         if not self._frames:
             return None
         last = self._frames[-1]
@@ -149,7 +217,7 @@ class DynamicTracer:
         if before.time != last.time:
             moved = depth + (depth - before.depth) * ((t - last.time) / (last.time - before.time))
             depth = torch.where(moved.isfinite(), moved, depth)
-        return Expected(depth, last.slope)
+        return Expected(depth, last.slope, value)
 
 
 def trace_sequence(
@@ -163,6 +231,8 @@ def trace_sequence(
     resolution: float = 1e-4,
     lipschitz: float = 1.0,
     radius: float = BOUNDING_RADIUS,
+    reach: float | None = None,
+    speed: float | None = None,
 ) -> Iterator[Hits]:
     """The hits of the same rays at one time after the other; see `DynamicTracer`."""
     tracer = DynamicTracer(
@@ -174,6 +244,8 @@ def trace_sequence(
         resolution=resolution,
         lipschitz=lipschitz,
         radius=radius,
+        reach=reach,
+        speed=speed,
     )
     for t in times:
         yield tracer.trace(t)

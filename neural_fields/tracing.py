@@ -17,10 +17,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ._march import Expected, Found, Rays, Rule, march, march_budget
+from ._march import Expected, Found, Near, Rays, Rule, march, march_budget
 from .field import Field
 
-__all__ = ["BOUNDING_RADIUS", "Expected", "Hits", "cone_ends", "cone_starts", "sphere_trace", "trace_expected"]
+__all__ = ["BOUNDING_RADIUS", "Expected", "Hits", "Near", "cone_ends", "cone_starts", "sphere_trace", "trace_expected"]
 
 # Fields live in the unit sphere; their surfaces may pass it by a little.
 BOUNDING_RADIUS = 1.05
@@ -107,8 +107,7 @@ def sphere_trace(
         raise ValueError(f"budget={list(budget)}: expected {level + 1} number(s) of steps, one for each level")
     rule = Rule(field.deltas[:level].to(directions), tolerance, resolution, lipschitz)
     ends = _Ends(near, far, radius)
-    hits, _ = _trace(field, origins, directions, level, ends, rule, None, max_steps, budget, capture)
-    return hits
+    return _trace(field, origins, directions, level, ends, rule, None, max_steps, budget, capture)[0]
 
 
 @torch.no_grad()
@@ -126,18 +125,21 @@ def trace_expected(
     lipschitz: float = 1.0,
     radius: float | None = BOUNDING_RADIUS,
     max_steps: int = 512,
-) -> tuple[Hits, Tensor]:
+    reach: float | None = None,
+) -> tuple[Hits, Tensor, Near]:
     """`sphere_trace` in the default mode, with an idea of where the hits will be.
 
     A ray that expects a hit looks first at a point so near to it that the ball there just reaches back to ``near``, if
     the field falls as it is said to, and steps from there as if it did. Where it does not, the ray finds a gap between
-    its balls, or itself behind the surface, and goes back. A wrong expectation costs steps, and changes nothing else.
+    its balls, or itself behind the surface, and goes back. A wrong depth or slope costs steps, and changes nothing
+    else. But a ``value`` of an expectation is believed: where it says that the field falls evenly from ``near`` to the
+    hit, nothing else is looked for in between.
 
     Args:
         field: see `sphere_trace`.
         origins: see there.
         directions: see there.
-        expected: depths and slopes ``(...,)`` of the hits; None for no idea.
+        expected: depths and slopes ``(...,)`` of the hits, and values at ``near``; None for no idea.
         level: see there.
         near: see there.
         far: see there.
@@ -146,9 +148,11 @@ def trace_expected(
         lipschitz: see there.
         radius: see there.
         max_steps: see there.
+        reach: note where rays come nearer than this to the surface; None does not.
 
     Returns:
-        The hits, and how fast the field fell along each ray at its last step ``(...,)``, to be expected the next time.
+        The hits, how fast the field fell along each ray at its last step ``(...,)``, to be expected the next time,
+        and where the ray came within ``reach`` of the surface.
 
     Raises:
         ValueError: see `sphere_trace`.
@@ -156,7 +160,8 @@ def trace_expected(
     level = field.resolve_level(level)
     _check(field, origins, directions, tolerance=tolerance, resolution=resolution, lipschitz=lipschitz)
     rule = Rule(field.deltas[:level].to(directions), tolerance, resolution, lipschitz)
-    return _trace(field, origins, directions, level, _Ends(near, far, radius), rule, expected, max_steps, None, 0.0)
+    ends = _Ends(near, far, radius)
+    return _trace(field, origins, directions, level, ends, rule, expected, max_steps, None, 0.0, reach)
 
 
 class _Ends(NamedTuple):
@@ -178,8 +183,9 @@ def _trace(
     max_steps: int,
     budget: Sequence[int] | None,
     capture: float,
-) -> tuple[Hits, Tensor]:
-    """The hits, and the slopes of the last steps; both modes."""
+    reach: float | None = None,
+) -> tuple[Hits, Tensor, Near]:
+    """The hits, the slopes of the last steps, and where rays came near the surface; both modes."""
     origins, directions = torch.broadcast_tensors(origins, directions)
     shape = directions.shape[:-1]
     starts, ends = (torch.as_tensor(x).to(directions).broadcast_to(shape).reshape(-1) for x in limits[:2])
@@ -194,7 +200,7 @@ def _trace(
         flat = Expected(*(part.to(directions).broadcast_to(shape).reshape(-1) for part in expected))
         rays = rays.expecting(flat, rule)
     if budget is None:
-        march(field, level, rays, found, rule, max_steps)
+        march(field, level, rays, found, rule, max_steps, reach)
     else:
         march_budget(field, rays, found, budget, rule.tolerance, capture)
     position = origins + found.depth[:, None] * directions
@@ -205,7 +211,7 @@ def _trace(
         found.level.reshape(shape),
         found.steps.reshape(shape),
     )
-    return hits, found.slope.reshape(shape)
+    return hits, found.slope.reshape(shape), Near(*(column.reshape(shape) for column in found.near))
 
 
 @torch.no_grad()
@@ -219,6 +225,7 @@ def cone_starts(
     lipschitz: float = 1.0,
     radius: float = BOUNDING_RADIUS,
     max_steps: int = 64,
+    clearance: float = 0.0,
 ) -> Tensor:
     """Depths up to which whole tiles of an image see nothing, by marching one cone for each tile on level 0.
 
@@ -235,6 +242,7 @@ def cone_starts(
         lipschitz: see `sphere_trace`.
         radius: see `sphere_trace`.
         max_steps: of each cone.
+        clearance: the tiles keep this far from the surface.
 
     Returns:
         ``(H, W)`` depths for ``near`` of `sphere_trace`; infinite where there is nothing to be seen.
@@ -248,7 +256,7 @@ def cone_starts(
     for tile in tiles:
         cones = _Cones.of(directions, tile)
         starts = depth[::tile, ::tile].reshape(-1)
-        free = _march_cones(field, origin, cones, starts, level, lipschitz, radius, max_steps)
+        free = _march_cones(field, origin, cones, starts, level, lipschitz, radius, max_steps, clearance)
         depth = free[cones.of_pixel]
     return depth
 
@@ -265,6 +273,7 @@ def cone_ends(
     lipschitz: float = 1.0,
     radius: float = BOUNDING_RADIUS,
     max_steps: int = 64,
+    clearance: float = 0.0,
 ) -> Tensor:
     """Depths from which on whole tiles of an image see nothing: `cone_starts` from the other side.
 
@@ -281,6 +290,7 @@ def cone_ends(
         lipschitz: see there.
         radius: see there.
         max_steps: see there.
+        clearance: see there.
 
     Returns:
         ``(H, W)`` depths for ``far`` of `sphere_trace`, infinite in tiles that were left out.
@@ -292,7 +302,7 @@ def cone_ends(
     _check_image(field, origin, directions, lipschitz)
     reach = origin.norm() + radius
     depth = torch.full_like(directions[..., 0], torch.inf)
-    delta = float(field.deltas[0]) if level else 0.0
+    delta = clearance + (float(field.deltas[0]) if level else 0.0)
     for tile in tiles:
         cones = _Cones.of(directions, tile)
         count = len(cones.axis)
@@ -322,10 +332,11 @@ def _march_cones(
     lipschitz: float,
     radius: float,
     max_steps: int,
+    clearance: float,
 ) -> Tensor:
     """How far each cone is empty; infinite where it leaves the ball of ``radius`` untouched."""
     axis, spread = cones.axis, cones.spread
-    delta = field.deltas[0].to(axis) if level else axis.new_zeros(())
+    delta = clearance + (field.deltas[0].to(axis) if level else axis.new_zeros(()))
     # A ray of the cone may be in the ball where its axis is not; spread · reach is the most that they are apart.
     reach = origin.norm() + radius
     entry, leave = _ball_crossing(origin.expand_as(axis), axis, radius + spread * reach)

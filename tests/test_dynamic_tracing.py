@@ -153,14 +153,15 @@ def test_wrong_expectations_change_nothing_but_the_cost():
     for low, high in ((0.0, 4.0), (1.5, 3.0)):
         depth = low + (high - low) * torch.rand(shape, dtype=torch.float64)
         depth[torch.rand(shape) < 0.2] = torch.inf
-        found, _ = trace_expected(torus, eye, directions, Expected(depth, torch.rand(shape).double()))
+        unknown = torch.full_like(depth, torch.inf)
+        found, *_ = trace_expected(torus, eye, directions, Expected(depth, torch.rand(shape).double(), unknown))
         assert torch.equal(found.mask, fresh.mask)
         assert float((found.depth - fresh.depth)[found.mask].abs().max()) < 2e-5
 
 
 def test_the_slope_of_a_hit_is_how_fast_the_field_falls():
     eye, directions = image(dtype=torch.float64)
-    found, slope = trace_expected(Sphere(radius=0.6).double(), eye, directions, None, tolerance=1e-4)
+    found, slope, _ = trace_expected(Sphere(radius=0.6).double(), eye, directions, None, tolerance=1e-4)
     exact = -(torch.nn.functional.normalize(found.position, dim=-1) * directions).sum(dim=-1)
     facing = found.mask & (exact > 0.3)
     assert float((slope - exact)[facing].abs().median()) < 0.02
@@ -197,6 +198,77 @@ def test_a_frame_costs_less_than_from_scratch():
     assert warm < 0.55 * field.points
 
 
+def test_near_is_where_rays_pass_within_reach():
+    eye, directions = image(64, dtype=torch.float64)
+    ball, reach = Sphere(radius=0.4).double(), 0.1
+    found, _, near = trace_expected(ball, eye, directions, None, reach=reach, tolerance=1e-6)
+    outer = sphere_depth(eye, directions, torch.zeros(3, dtype=torch.float64), 0.4 + reach)
+    passing = near.clear.isfinite() & ~found.mask
+    assert int(passing.sum()) > 50
+    assert int((found.mask | near.clear.isinf()).sum()) > 50
+    # Whoever notes something came within reach, and was clear of it where it says so.
+    assert bool((outer.isfinite() | near.clear.isinf()).all())
+    assert bool((near.clear <= outer)[near.clear.isfinite()].all())
+    noted = near.clear.isfinite() & near.value.isfinite()
+    where = eye + near.clear[..., None] * directions
+    torch.testing.assert_close(near.value[noted], ball.value(where)[noted])
+    assert float(near.value[noted].min()) >= reach
+    behind = eye + near.leave[..., None] * directions
+    left = passing & near.leave.isfinite()
+    assert int(left.sum()) > 20
+    assert float(ball.value(behind)[left].min()) >= reach
+    # A ray that passes well within reach cannot have strode over it.
+    along = -(eye * directions).sum(dim=-1)
+    closest = ball.value(eye + along[..., None] * directions)
+    assert bool(near.clear.isfinite()[closest < 0.5 * reach].all())
+
+
+def test_frames_in_between_leave_out_what_is_far_and_cost_little_where_it_is_near():
+    eye, directions = image(96)
+    field = Counted(Moving(Torus(major=0.5, minor=0.2), RigidMotion(axis=(1.0, 1.0, 0.0), angle=1.0)))
+    settings = {"tolerance": 2e-4, "resolution": 3e-3}
+    tracer = DynamicTracer(field, eye, directions, **settings)
+    costs, kinds = [], []
+    for k in range(12):
+        before, key = field.points, tracer._key
+        hits = tracer.trace(k / 160)
+        kinds.append(tracer._key is key)
+        costs.append(field.points - before)
+        fresh = sphere_trace(TimeSlice(field.inner, k / 160), eye, directions, **settings)
+        assert int((hits.mask != fresh.mask).sum()) <= 1
+        apart = (hits.depth - fresh.depth)[hits.mask & fresh.mask].abs()
+        assert float((apart < 6e-4).float().mean()) > 0.998
+    between = [cost for cost, between in zip(costs, kinds, strict=True) if between]
+    keys = [cost for cost, between in zip(costs[1:], kinds[1:], strict=True) if not between]
+    assert len(between) >= 8
+    assert len(keys) >= 1
+    assert max(between[1:]) < 0.4 * min(keys)
+    steady = hits.steps[hits.mask] == 1
+    assert float(steady.float().mean()) > 0.5
+
+
+@pytest.mark.parametrize("speed", [0.3, 1.5])
+def test_the_speed_is_measured_unless_it_is_given(speed):
+    eye, directions = image(16)
+    field = ball(0.4, (0.0, 0.0, 0.0), (0.0, speed, 0.0))
+    tracer = DynamicTracer(field, eye, directions, resolution=1e-2)
+    tracer.trace(0.0)
+    lasts = tracer._key.lasts
+    assert tracer.reach / (1.26 * speed) < lasts < tracer.reach / (1.1 * speed)
+    given = DynamicTracer(field, eye, directions, reach=0.05, speed=2.0)
+    given.trace(0.0)
+    assert given._key.lasts == pytest.approx(0.025)
+
+
+def test_without_reach_every_frame_is_a_key_frame():
+    eye, directions = image(dtype=torch.float64)
+    field = ball(0.4, (0.0, 0.0, 0.0), (0.0, 0.1, 0.0)).double()
+    tracer = DynamicTracer(field, eye, directions, reach=0.0)
+    keys = {tracer._key.time for t in TIMES[:4] if tracer.trace(t) is not None}
+    assert len(keys) == 4
+    assert assert_same(field, TIMES, tracer, eye, directions, tolerance=1e-5) > 1000
+
+
 def test_a_moment_is_the_slice():
     torch.manual_seed(0)
     x = 2 * torch.rand(100, 3) - 1
@@ -210,3 +282,5 @@ def test_bad_arguments_are_named():
         DynamicTracer(Sphere(), eye, directions)
     with pytest.raises(ValueError, match=r"tolerance=0"):
         DynamicTracer(ball(0.3, (0, 0, 0), (0, 0, 0)), eye, directions, tolerance=0.0).trace(0.0)
+    with pytest.raises(ValueError, match=r"reach=-1"):
+        DynamicTracer(ball(0.3, (0, 0, 0), (0, 0, 0)), eye, directions, reach=-1.0)
