@@ -11,7 +11,7 @@ from .config import input_error
 
 __all__ = ["COMMAND"]
 
-FILMS = (".mp4", ".gif")
+FILMS = (".mp4", ".gif", ".png")
 SHADINGS = ("lambert", "headlight", "normals", "matcap", "color")
 OF_FILMS = ("size", "up", "azimuth", "elevation", "zoom", "shading", "samples")
 
@@ -29,7 +29,7 @@ def _angle(text: str) -> float:
 def _arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("run", metavar="RUN", help="run directory or .safetensors file of `mplicits evolve`")
-    what = "an .mp4 or .gif film, a .glb of one mesh that moves, or a folder for one .ply a frame"
+    what = "an .mp4 or .gif film, a .png of all frames, a .glb of one mesh that moves, or a folder for one .ply a frame"
     add("-o", "--out", required=True, type=Path, metavar="OUT", help=what)
     add("--frames", type=whole(1, 100_000), default=48, metavar="N", help="times from 0 to 1 (48)")
     add("--fps", type=positive, default=24.0, metavar="F", help="frames per second (24)")
@@ -52,7 +52,7 @@ def _animate(arguments: argparse.Namespace) -> int:
     film = arguments.out.suffix.lower() in FILMS
     for name in OF_FILMS:
         if not film and getattr(arguments, name) is not None:
-            raise input_error(f"--{name}: goes with a film, .mp4 or .gif")
+            raise input_error(f"--{name}: goes with a film (.mp4, .gif) or a sheet (.png)")
     if film and arguments.resolution is not None:
         raise input_error("--resolution: goes with meshes; a film is traced in pixels (--size)")
     if arguments.size is not None and len(arguments.size) > 2:
@@ -89,6 +89,7 @@ COMMAND = Command(
     "write a surface that moves: a film, meshes, or one mesh that moves",
     """  mplicits animate runs/morph -o morph.mp4 --frames 96
   mplicits animate runs/morph -o morph.gif --size 320 --fps 12
+  mplicits animate runs/morph -o morph.png --frames 14 --size 240
   mplicits animate runs/turn -o turn.glb --colors runs/spot
   mplicits animate runs/morph -o meshes --frames 20 --resolution 256""",
     _arguments,

@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
 
+from .animate_command import COMMAND as ANIMATE
 from .bench_commands import BENCH_COMMANDS
 from .check_cameras_command import COMMAND as CHECK_CAMERAS
 from .command import Command, add_json, check_output, positive, whole
@@ -164,6 +165,7 @@ COMMANDS: Mapping[str, Command] = MappingProxyType(
         "texture": TEXTURE,
         "reconstruct": RECONSTRUCT,
         "evolve": EVOLVE,
+        "animate": ANIMATE,
         "render": RENDER,
         "slice": SLICE,
         "view": VIEW,

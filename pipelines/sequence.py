@@ -1,11 +1,11 @@
-"""A surface that moves, written down: a film, a folder of meshes, or one mesh that moves."""
+"""A surface that moves, written down: a film, a sheet of moments, a folder of meshes, or one mesh that moves."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..datasets import srgb_to_linear
 from ..datasets.cameras import Camera
-from ..neural_fields import Field, InputError, Similarity, TextureField, load_field
+from ..neural_fields import Field, InputError, Similarity, load_field
 from ..neural_fields.dynamic_tracing import DynamicTracer, moment
 from ..neural_fields.meshing import NoSurfaceError, extract_mesh
 from ..neural_fields.tracing import BOUNDING_RADIUS
@@ -23,6 +23,7 @@ from .animation import ANIMATIONS, write_animation
 from .fit import choose_device
 from .glb import Motion, write_glb
 from .mesh_files import glb_origin, write_mesh
+from .picture import contact_sheet, write_picture
 from .render import RESOLUTION, TOLERANCE, pixel_size, see_hits
 from .render_cameras import Orbit, orbit_cameras
 from .riding import RidingColors, borrowed_texture, start_texture
@@ -39,6 +40,8 @@ STRIP = 1 << 19  # rays that are worked on at a time: about a third of a gigabyt
 OUTLINE_RESOLUTION = 48
 OUTLINES = 9  # of the times from which the camera takes what it has to have in view
 WHITE = (1.0, 1.0, 1.0)
+SHEET = ".png"
+ACROSS = 7  # pictures in a row of a sheet
 
 
 @dataclass(frozen=True)
@@ -51,7 +54,7 @@ class SequenceOptions:
         size: width and height of a film.
         level: counted from 0; None is the finest.
         resolution: of meshes, in cells along the cube.
-        colors: a run that does not move, in the same coordinates, whose texture is the surface's at time 0; None is the
+        colors: a run that does not move, the first shape's, whose texture is the surface's at time 0; None is the
             run's own, if it has one.
         no_colors: leave colours out.
         orbit: where the camera of a film stands.
@@ -87,8 +90,9 @@ def check_sequence_path(path: str | Path) -> Path:
         InputError: it is a file of another kind, its folder does not exist, or it is a folder that is not empty.
     """
     path = Path(path)
-    if path.suffix and path.suffix.lower() not in (*ANIMATIONS, ".glb"):
-        raise InputError(f"{path}: write a film ({', '.join(ANIMATIONS)}), a .glb, or a folder of meshes")
+    if path.suffix and path.suffix.lower() not in (*ANIMATIONS, SHEET, ".glb"):
+        films = ", ".join(ANIMATIONS)
+        raise InputError(f"{path}: write a film ({films}), a sheet of moments ({SHEET}), a .glb, or a folder of meshes")
     if not path.absolute().parent.is_dir():
         raise InputError(f"{path}: the folder {path.absolute().parent} does not exist; make it first")
     if path.suffix and path.is_dir():
@@ -105,7 +109,8 @@ def animate_run(
 
     Args:
         run: run directory or .safetensors file, of a field of space-time.
-        out: an .mp4 or .gif film, traced; a .glb of one mesh that moves; or a folder, for a .ply per frame.
+        out: an .mp4 or .gif film, traced; a .png of all frames side by side; a .glb of one mesh that moves; or a
+            folder, for a .ply per frame.
         options: what, and how.
         progress: called with how many frames are done, and of how many.
 
@@ -124,29 +129,40 @@ def animate_run(
     level = field.num_levels - 1 if options.level is None else options.level
     if not 0 <= level < field.num_levels:
         raise InputError(f"--level {level}: {file} has levels 0 to {field.num_levels - 1}")
-    texture = _texture(file, field, similarity, options)
-    if options.shading == "color" and texture is None:
+    riding = _riding(file, field, similarity, level, options)
+    if options.shading == "color" and riding is None:
         raise InputError(f"--shading color: {file} has no texture; name a textured run with --colors RUN")
     if out.suffix.lower() in ANIMATIONS:
-        write_animation(out, film_frames(file, field, texture, level, options, progress), fps=options.fps)
+        write_animation(out, film_frames(file, field, riding, level, options, progress), fps=options.fps)
         return f"{options.frames} frames of {options.size[0]}×{options.size[1]}"
+    if out.suffix.lower() == SHEET:
+        frames = film_frames(file, field, riding, level, options, progress)
+        write_picture(
+            out, _sheet([(f"t = {time:.2f}", frame) for time, frame in zip(options.times, frames, strict=True)])
+        )
+        return f"{options.frames} moments of {options.size[0]}×{options.size[1]}"
     if out.suffix:
-        return _write_moving_mesh(out, file, field, texture, similarity, level, options, progress)
-    return _write_series(out, file, field, texture, similarity, level, options, progress)
+        return _write_moving_mesh(out, file, field, riding, similarity, level, options, progress)
+    return _write_series(out, file, field, riding, similarity, level, options, progress)
 
 
-def _texture(file: Path, field: Field, similarity: Similarity, options: SequenceOptions) -> TextureField | None:
+def _riding(
+    file: Path, field: Field, similarity: Similarity, level: int, options: SequenceOptions
+) -> RidingColors | None:
+    """The colours that ride along, if there are any."""
     if options.no_colors:
         return None
-    if options.colors is None:
-        return start_texture(file, field)
-    return borrowed_texture(options.colors, similarity).to(field.deltas.device)
+    if options.colors is not None:
+        texture, placed = borrowed_texture(options.colors, field, similarity)
+        return RidingColors(field, texture, placed=placed, level=level)
+    texture = start_texture(file, field)
+    return None if texture is None else RidingColors(field, texture, level=level)
 
 
 def film_frames(
     file: Path,
     field: Field,
-    texture: TextureField | None,
+    riding: RidingColors | None,
     level: int,
     options: SequenceOptions,
     progress: Tell | None = None,
@@ -160,7 +176,6 @@ def film_frames(
         height = min(rows, camera.height - first)
         strip = camera.strip(first, height).resized(camera.width * samples, height * samples)
         strips.append((strip, _tracer(field, strip, level)))
-    riding = None if texture is None else RidingColors(field, texture, level=level)
     lit = ShadeOptions(shadows=options.shadows, occlusion=options.shadows)
     for index, time in enumerate(options.times, start=1):
         still = moment(field, time)
@@ -177,6 +192,14 @@ def film_frames(
         if progress is not None:
             progress(index, options.frames)
         yield np.concatenate(parts)
+
+
+def _sheet(pictures: Sequence[tuple[str, Image]]) -> Image:
+    """Labelled pictures of one size in rows, the last one filled up with white."""
+    rows = [contact_sheet(pictures[first : first + ACROSS]) for first in range(0, len(pictures), ACROSS)]
+    width = rows[0].shape[1]
+    filled = [np.pad(row, ((0, 0), (0, width - row.shape[1]), (0, 0)), constant_values=255) for row in rows]
+    return np.concatenate(filled)
 
 
 def _tracer(field: Field, camera: Camera, level: int) -> DynamicTracer:
@@ -204,7 +227,7 @@ def _write_series(
     folder: Path,
     file: Path,
     field: Field,
-    texture: TextureField | None,
+    riding: RidingColors | None,
     similarity: Similarity,
     level: int,
     options: SequenceOptions,
@@ -213,7 +236,6 @@ def _write_series(
     """frame_0000.ply and so on; a frame without a surface has no file."""
     folder.mkdir(exist_ok=True)
     digits = max(4, len(str(options.frames - 1)))
-    riding = None if texture is None else RidingColors(field, texture, level=level)
     written = 0
     for index, time in enumerate(options.times):
         try:
@@ -238,7 +260,7 @@ def _write_moving_mesh(
     out: Path,
     file: Path,
     field: Field,
-    texture: TextureField | None,
+    riding: RidingColors | None,
     similarity: Similarity,
     level: int,
     options: SequenceOptions,
@@ -256,9 +278,9 @@ def _write_moving_mesh(
         {"POSITION": place - places[0], "NORMAL": (normals - tracked.normals[0]).astype("<f4")}
         for place, normals in zip(places[1:], tracked.normals[1:], strict=True)
     ]
-    if texture is not None:
+    if riding is not None:
         points = torch.from_numpy(tracked.vertices[0]).to(field.deltas)
-        colors = RidingColors(field, texture, level=level).at(0.0)(points).cpu().numpy()
+        colors = riding.at(0.0)(points).cpu().numpy()
         opaque = np.full((len(colors), 4), 65535, "<u2")  # linear by the standard; 8 bits would merge dark shades
         opaque[:, :3] = np.rint(srgb_to_linear(np.clip(colors, 0, 1)) * 65535)
         attributes["COLOR_0"] = opaque

@@ -35,7 +35,7 @@ from mplicits.neural_fields.dynamic_tracing import moment
 from mplicits.pipelines.animate_command import COMMAND
 from mplicits.pipelines.mesh import MeshOptions, mesh_run
 from mplicits.pipelines.render_run import RenderOptions, render_run
-from mplicits.pipelines.riding import RidingColors
+from mplicits.pipelines.riding import RidingColors, borrowed_texture
 from mplicits.pipelines.runs import load_still
 from mplicits.pipelines.sequence import SequenceOptions, animate_run, check_sequence_path, film_frames
 from mplicits.pipelines.surface import read_surface
@@ -193,6 +193,19 @@ def test_films_are_written(run, tmp_path):
     assert cv2.VideoCapture(str(tmp_path / "ball.mp4")).get(cv2.CAP_PROP_FRAME_COUNT) == 3
 
 
+def test_a_sheet_has_all_frames_with_their_times(run, tmp_path):
+    options = SequenceOptions(frames=9, size=(32, 24), samples=1)
+    assert animate_run(run, tmp_path / "ball.png", options) == "9 moments of 32×24"
+    sheet = iio.imread(tmp_path / "ball.png")
+    assert sheet.shape == (2 * (24 + 40), 7 * (32 + 12), 3)
+    field = load_field(run / "field.safetensors").field
+    texture = load_texture(run / "texture.safetensors", moment(field, 0.0))
+    frames = list(film_frames(run, field, RidingColors(field, texture), 0, options))
+    np.testing.assert_array_equal(sheet[40:64, 6:38], frames[0])
+    np.testing.assert_array_equal(sheet[104:128, 50:82], frames[8])
+    assert (sheet[64:, 2 * 44 :] == 255).all()
+
+
 # Folders of meshes
 
 
@@ -273,6 +286,31 @@ def test_colours_ride_along_with_a_rigid_motion(run):
     torch.testing.assert_close(riding.at(1.0)(there), texture.colors(there - DRIFT), atol=0.01, rtol=0)
 
 
+def test_colours_are_borrowed_from_a_run_in_other_units(run, tmp_path):
+    """The first shape's own run has its own unit sphere, and may be a little larger or smaller in it."""
+    field, place, _ = load_field(run / "field.safetensors")
+    own = Similarity((place.center[0] + 0.1 * place.scale, *place.center[1:]), 1.25 * place.scale)
+    start = travelling_ball().at(0.0)
+    first = start.base.layers[0]
+    with torch.no_grad():  # x = 1.25 x' + 0.1 e₁
+        first.bias += 0.1 * first.weight[:, 0]
+        first.weight *= 1.25
+    texture = TextureField(start, ColorSiren(16, 1, omega=4.0), delta=0.1).requires_grad_(False)
+    save_field(tmp_path / "field.safetensors", start, similarity=own)
+    save_texture(tmp_path / "texture.safetensors", texture)
+    borrowed, placed = borrowed_texture(tmp_path, field, place)
+    points = torch.from_numpy(extract_mesh(moment(field, 0.0), resolution=16).vertices).float()
+    same = torch.from_numpy(own.to_unit(place.to_input(points.numpy()))).float()
+    found = RidingColors(field, borrowed, placed=placed).at(0.0)(points)
+    torch.testing.assert_close(found, texture.colors(same), atol=1e-4, rtol=0)
+    with torch.no_grad():
+        first.weight *= 1.5
+    save_field(tmp_path / "field.safetensors", start, similarity=own)
+    save_texture(tmp_path / "texture.safetensors", TextureField(start, ColorSiren(16, 1), delta=0.1))
+    with pytest.raises(InputError, match=r"--colors .*: is not where the motion starts"):
+        borrowed_texture(tmp_path, field, place)
+
+
 def test_colours_ride_along_the_normals():
     """The points of a sphere that shrinks go straight inward."""
     field, start = ShrinkingSphere(radius=0.8, alpha=0.12), Sphere(radius=0.8)
@@ -290,7 +328,7 @@ def test_colours_ride_along_the_normals():
 
 def test_what_cannot_be_written_is_refused_first(run, still, tmp_path):
     for name, message in (
-        ("film.avi", r"film\.avi: write a film \(\.mp4, \.gif\), a \.glb, or a folder"),
+        ("film.avi", r"film\.avi: write a film \(\.mp4, \.gif\), a sheet of moments \(\.png\), a \.glb, or a folder"),
         ("none/film.mp4", r"the folder .*none does not exist"),
     ):
         with pytest.raises(InputError, match=message):
