@@ -7,12 +7,15 @@ import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TypeVar
 
 from ..command import Command, add_json, check_output, whole, write_json
 from ..config import closest, input_error
 from .names import METHODS, PRESETS, TABLES
 
 __all__ = ["COMMAND"]
+
+Name = TypeVar("Name", bound=str)
 
 
 def _arguments(parser: argparse.ArgumentParser) -> None:
@@ -81,7 +84,7 @@ def _words(given: Sequence[str]) -> list[str]:
     return [word for text in given for word in text.split(",") if word]
 
 
-def _known(flag: str, names: Sequence[str], known: Sequence[str], more: Sequence[str] = ()) -> tuple[str, ...]:
+def _known(flag: str, names: Sequence[str], known: Sequence[Name], more: Sequence[str] = ()) -> tuple[Name, ...]:
     """The names in their usual order, each once.
 
     Raises:

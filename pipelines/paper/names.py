@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from .recipe import Preset
+
 __all__ = ["METHODS", "PRESETS", "TABLES"]
 
-PRESETS = ("smoke", "cpu", "paper")
+PRESETS: tuple[Preset, ...] = ("smoke", "cpu", "paper")
 
 TABLES = (
     "comparison",

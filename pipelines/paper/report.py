@@ -143,10 +143,16 @@ def section_as_dict(section: Section) -> dict[str, Any]:
 
 def section_from_dict(pairs: Mapping[str, Any]) -> Section:
     """The inverse of `section_as_dict`."""
-    lists = {name: tuple(map(tuple, pairs[name])) for name in ("plots", "sheets", "methods")}
-    texts = {name: pairs[name] for name in ("name", "label", "summary")}
-    tables = tuple(map(from_dict, pairs["tables"]))
-    return Section(**texts, tables=tables, failures=tuple(pairs["failures"]), **lists)
+    return Section(
+        name=pairs["name"],
+        label=pairs["label"],
+        summary=pairs["summary"],
+        tables=tuple(map(from_dict, pairs["tables"])),
+        plots=tuple(map(tuple, pairs["plots"])),
+        sheets=tuple(map(tuple, pairs["sheets"])),
+        methods=tuple(map(tuple, pairs["methods"])),
+        failures=tuple(pairs["failures"]),
+    )
 
 
 def with_missing(table: Table, missing: Mapping[str, str]) -> Table:
