@@ -6,17 +6,20 @@ import argparse
 import sys
 import time
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from .command import Command
+from .command import Command, whole
 from .config import input_error
 from .fit_depth_flags import add_depth_flags, depth_input
 from .fit_settings import add_fit_settings, fit_settings, were_given
 from .texture_command import tell_texture
 
 if TYPE_CHECKING:
+    from .fit_config import FitConfig
     from .fit_depth import DepthInput
+    from .fit_jobs import FitOutcome
     from .fit_mesh import FitMesh
 
 __all__ = ["COMMAND"]
@@ -24,8 +27,11 @@ __all__ = ["COMMAND"]
 
 def _arguments(parser: argparse.ArgumentParser) -> None:
     what = "PLY, OBJ, STL, OFF, XYZ, TXT, CSV, NPY, NPZ, LAS or LAZ file; a depth map, or a folder of them"
-    parser.add_argument("cloud", metavar="CLOUD", help=what)
-    parser.add_argument("-o", "--out", required=True, type=Path, metavar="RUN", help="directory of the run")
+    parser.add_argument("clouds", nargs="+", metavar="CLOUD", help=f"{what}; several clouds get a run each, RUN/NAME")
+    parser.add_argument("-o", "--out", required=True, type=Path, metavar="RUN", help="directory of the run, or runs")
+    parser.add_argument(
+        "--jobs", type=whole(1), metavar="N", help="several clouds: so many at a time; above 1 needs mplicits[ray]"
+    )
     parser.add_argument(
         "--mesh",
         type=Path,
@@ -47,10 +53,21 @@ def _fit(arguments: argparse.Namespace) -> int:
     if arguments.no_colors and arguments.mesh is None:
         raise input_error("--no-colors: is about --mesh FILE; leave it out, or add that")
     config = None if arguments.resume else fit_settings(arguments)
+    if len(arguments.clouds) > 1 or arguments.jobs is not None:
+        return _fit_many(arguments, config)
+    arguments.cloud = arguments.clouds[0]
+    from .distributed import team
+
+    with team(device="auto" if config is None else config.device) as leads:
+        return _fit_one(arguments, config) if leads else _follow(arguments, config)
+
+
+def _fit_one(arguments: argparse.Namespace, config: FitConfig | None) -> int:
     from .fit import Interrupted, fit
     from .fit_depth import fit_depth, trim_suggestion
     from .fit_mesh import is_fitted
     from .info import describe
+    from .memory import peak_memory
     from .progress_bar import progress_bars
     from .runs import check_new_run
 
@@ -78,6 +95,9 @@ def _fit(arguments: argparse.Namespace) -> int:
         print(f"interrupted; {again}", file=sys.stderr)
         return 130
     print(describe(directory))
+    memory = peak_memory()
+    if memory is not None:
+        print(f"  peak memory  {memory / 2**20:,.0f} MiB")
     # A depth map shows one side of things; what the fit closes behind it is no part of them.
     trim = "" if depth is None else f" --trim-distance {trim_suggestion(directory):.2g}"
     if mesh is None:
@@ -100,6 +120,60 @@ def _fit(arguments: argparse.Namespace) -> int:
     facts += ["with colours"] * mesh.colored + ([trim.strip()] if trim else [])
     print(f"{mesh.out}: {', '.join(facts)}, in {time.monotonic() - started:.1f} s")
     return 0
+
+
+def _follow(arguments: argparse.Namespace, config: FitConfig | None) -> int:
+    """Help the process that does the rest; see `team`."""
+    from .fit import Interrupted, fit
+
+    if depth_input(arguments) is not None:
+        raise input_error(f"{arguments.cloud}: depth maps are fitted by one process; leave out torchrun")
+    try:
+        fit(arguments.cloud, config, out=arguments.out, resume=arguments.resume)
+    except Interrupted:
+        return 130
+    return 0
+
+
+def _fit_many(arguments: argparse.Namespace, config: FitConfig | None) -> int:
+    """A run for each cloud; a failed one leaves the others alone, and exit code 1."""
+    if arguments.mesh is not None:
+        raise input_error("--mesh: is for one cloud; leave it out, and mesh the runs afterwards")
+    for cloud in arguments.clouds:
+        if depth_input(argparse.Namespace(**{**vars(arguments), "cloud": cloud})) is not None:
+            raise input_error(f"{cloud}: holds depth maps; fit them on their own, without --jobs")
+    from .fit import Interrupted
+    from .fit_jobs import fit_many, format_fits, plan_fits
+    from .jobs import check_jobs
+    from .progress_bar import progress_bars
+
+    jobs = arguments.jobs or 1
+    check_jobs(jobs)
+    planned = plan_fits(arguments.clouds, arguments.out, config, resume=arguments.resume, force=arguments.force)
+    if arguments.force:
+        for job in planned:
+            _forget(job.directory)
+    try:
+        with nullcontext() if arguments.quiet or jobs > 1 else progress_bars() as show:
+            outcomes = fit_many(
+                planned,
+                arguments.out,
+                jobs=jobs,
+                progress=None if show is None else lambda name, step: show(replace(step, stage=f"{name} {step.stage}")),
+                report=None if arguments.quiet or jobs == 1 else _tell_outcome,
+            )
+    except (Interrupted, KeyboardInterrupt):
+        clouds = " ".join(arguments.clouds)
+        again = f"mplicits fit {clouds} -o {arguments.out} --jobs {jobs} --resume"
+        print(f"interrupted; to continue: {again}", file=sys.stderr)
+        return 130
+    print(format_fits(outcomes))
+    return int(any(outcome.error is not None for outcome in outcomes))
+
+
+def _tell_outcome(outcome: FitOutcome) -> None:
+    result = "fitted" if outcome.error is None else outcome.error
+    print(f"{outcome.item.cloud}: {result}, after {outcome.seconds:.1f} s", file=sys.stderr)
 
 
 def _planned(arguments: argparse.Namespace, depth: DepthInput | None) -> FitMesh | None:
@@ -129,10 +203,13 @@ COMMAND = Command(
   mplicits fit scan.ply -o runs/scan --mesh scan_mesh.ply
   mplicits fit scan.ply -o runs/quick --preset fast
   mplicits fit scan.ply -o runs/scan --resume
+  mplicits fit bunny.ply spot.ply sword.ply -o runs --jobs 2
+  torchrun --nproc-per-node 2 --no-python mplicits fit scan.ply -o runs/scan
   mplicits fit scan.xyz -o runs/mine --normals estimate --time-budget 120 --steps 2000 1000 1000
   mplicits fit depth.png --intrinsics camera.json --color color.png -o runs/room --mesh room.glb
   mplicits fit depth/ --intrinsics camera.json --color color/ --poses trajectory.log -o runs/room""",
     _arguments,
     _fit,
-    "Fit a multiscale SDF to a point cloud, or to depth maps. RUN will hold field.safetensors and run.json.",
+    "Fit a multiscale SDF to a point cloud, or to depth maps. RUN will hold field.safetensors and run.json. Of several "
+    "clouds, each gets a run in RUN, named as the cloud.",
 )

@@ -7,6 +7,7 @@ reports to nobody.
 from __future__ import annotations
 
 import importlib.util
+import logging
 import math
 import os
 import time
@@ -131,7 +132,7 @@ def _side_by_side(
         num_cpus=threads * jobs,
         include_dashboard=False,
         log_to_driver=False,
-        logging_level="error",
+        logging_level=logging.ERROR,
         object_store_memory=128 << 20,  # items and results are small
     )
     try:

@@ -1,0 +1,155 @@
+"""Many clouds with the same settings: a run for each, side by side where Ray is installed."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ..datasets.reading import check_cloud_path
+from ..neural_fields import InputError
+from .config import load_config
+from .fit import fit
+from .fit_config import FitConfig
+from .fit_mesh import is_fitted
+from .fit_state import STATE_FILE, read_record
+from .jobs import Outcome, check_jobs, run_jobs
+from .runs import check_new_run
+from .timing import format_table
+from .training import Progress
+
+__all__ = ["FitJob", "FitOutcome", "fit_many", "format_fits", "plan_fits"]
+
+# In the directory of all runs: the settings of those that are yet to begin.
+SETTINGS_FILE = "fits.json"
+
+FitOutcome = Outcome["FitJob", dict[str, Any]]
+
+
+@dataclass(frozen=True)
+class FitJob:
+    """One of the fits.
+
+    Attributes:
+        cloud: the file.
+        directory: its run.
+        config: settings; a run that is resumed has its own.
+        resume: whether to go on with what is there.
+    """
+
+    cloud: Path
+    directory: Path
+    config: FitConfig
+    resume: bool = False
+
+
+def plan_fits(
+    clouds: Sequence[str | Path], out: Path, config: FitConfig | None, *, resume: bool = False, force: bool = False
+) -> list[FitJob]:
+    """Check all there is to check before any work, and give every cloud its run directory ``out/<stem>``.
+
+    Args:
+        clouds: the files.
+        out: directory of all runs.
+        config: settings of all; None with ``resume``, which finds them in ``out``.
+        resume: go on with what was interrupted, begin what was not begun, leave alone what is finished.
+        force: overwrite runs that are there.
+
+    Raises:
+        InputError: a cloud is missing or of an unknown kind, two have one name, a run is there already, or there is
+            nothing to resume.
+    """
+    paths = [check_cloud_path(cloud) for cloud in clouds]
+    twice = [stem for stem, count in Counter(path.stem for path in paths).items() if count > 1]
+    if twice:
+        both = " and ".join(str(path) for path in paths if path.stem == twice[0])
+        raise InputError(f"{both}: would both be fitted into {out / twice[0]}; rename one")
+    check_new_run(out, resume=False, force=True)  # it may hold other runs
+    if resume:
+        config = _kept_settings(out)
+    assert config is not None
+    if out.is_dir():
+        for path in paths:
+            check_new_run(out / path.stem, resume=False, force=force or resume)
+    return [FitJob(path, out / path.stem, config, resume) for path in paths]
+
+
+def fit_many(
+    planned: Sequence[FitJob],
+    out: Path,
+    *,
+    jobs: int = 1,
+    progress: Callable[[str, Progress], None] | None = None,
+    report: Callable[[FitOutcome], None] | None = None,
+) -> list[FitOutcome]:
+    """Fit them all; one that fails does not stop the rest.
+
+    Args:
+        planned: by `plan_fits`.
+        out: directory of all runs; keeps their settings.
+        jobs: how many at a time; see `run_jobs`.
+        progress: told the name of a cloud and how far its fit is. With one job only: workers do not tell.
+        report: told what became of each, as it ends.
+
+    Returns:
+        What became of each: what its ``run.json`` holds, or why it failed.
+
+    Raises:
+        InputError: several jobs need Ray.
+        Interrupted: Ctrl-C, in a single process.
+        KeyboardInterrupt: Ctrl-C, with several workers.
+    """
+    check_jobs(jobs)
+    out.mkdir(exist_ok=True)
+    if planned:
+        _keep_settings(out, planned[0].config)
+    if jobs > 1 or progress is None:
+        return run_jobs(_fit, planned, jobs=jobs, report=report)
+    return run_jobs(lambda job: _fit(job, _named(progress, job.cloud.stem)), planned, report=report)
+
+
+def format_fits(outcomes: Sequence[FitOutcome]) -> str:
+    """A table, one line per cloud."""
+    rows = []
+    for outcome in outcomes:
+        name, record = outcome.item.cloud.stem, outcome.value
+        if record is None:
+            rows.append((name, "", "", "", f"failed: {outcome.error}"))
+            continue
+        rms = record["stages"][-1]["rms_at_points"]
+        kept = f"{record['cleaning']['kept']:,}"
+        rows.append((name, kept, f"{rms:.3g}", f"{record['training_seconds']:.1f} s", str(outcome.item.directory)))
+    return format_table(("cloud", "points", "rms at points", "time", "run"), rows)
+
+
+def _fit(job: FitJob, progress: Callable[[Progress], None] | None = None) -> dict[str, Any]:
+    """Fit one cloud, or what is left of it → what its ``run.json`` holds."""
+    if job.resume and is_fitted(job.directory):
+        return read_record(job.directory)
+    resume = job.resume and (job.directory / STATE_FILE).is_file()
+    return fit(job.cloud, job.config, out=job.directory, resume=resume, progress=progress).record
+
+
+def _named(progress: Callable[[str, Progress], None], name: str) -> Callable[[Progress], None]:
+    return lambda step: progress(name, step)
+
+
+def _keep_settings(out: Path, config: FitConfig) -> None:
+    partial = out / f".{SETTINGS_FILE}.{os.getpid()}.partial"
+    partial.write_text(json.dumps({"config": dataclasses.asdict(config)}, indent=2) + "\n", encoding="utf-8")
+    partial.replace(out / SETTINGS_FILE)
+
+
+def _kept_settings(out: Path) -> FitConfig:
+    path = out / SETTINGS_FILE
+    try:
+        return load_config(FitConfig, None, json.loads(path.read_text(encoding="utf-8"))["config"])
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file, so there is nothing to resume; leave out --resume") from None
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{path}: damaged ({error}); begin again without --resume") from error
