@@ -269,8 +269,12 @@ def test_cells_of_a_table(ball: Path) -> None:
 
     spec = TableSpec("t", "l", "s", cells, lambda _: ())
     other = ball.with_name("scan.npz")
-    planned = cells_of(spec, [Shape(ball), Shape(other, ball)], "smoke", seed=4, skipped=["b"])
-    assert planned == [Cell(ball, "a", "smoke", seed=4), Cell(other, "a", "smoke", seed=4, reference=ball)]
+    planned = cells_of(spec, [Shape(ball), Shape(other, ball)], "smoke", seed=4)
+    assert planned == [
+        Cell(shape, method, "smoke", seed=4, reference=reference)
+        for shape, reference in ((ball, None), (other, ball))
+        for method in ("a", "b")
+    ]
 
 
 def test_shapes(ball: Path, tmp_path: Path) -> None:

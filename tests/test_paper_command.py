@@ -96,6 +96,11 @@ def test_a_bench(ball: Path, tmp_path: Path, exact, capsys: pytest.CaptureFixtur
     assert page.index("## comparison:") < page.index("## deltas:")
     assert main([*command, "--table", "comparison", "deltas"]) == 0
     assert exact.runs == 3
+
+    # What a method that is not asked for has found stays.
+    assert main([*command[:-1], "ours", "--table", "comparison"]) == 0
+    assert exact.runs == 3
+    assert "| SIREN |" in (out / "results.md").read_text()
     capsys.readouterr()
 
 

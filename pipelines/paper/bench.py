@@ -14,7 +14,7 @@ import torch
 from ..fit import choose_device
 from ..timing import sgemm_rate
 from .ablations import DELTA_FACTOR, LOSS_WEIGHTS
-from .cell import Cell
+from .cell import Cell, Record
 from .comparison import BANF_TABLE, COMPARISON_TABLE, NOISE_TABLE, POISSON_TABLE
 from .isolation import ISOLATION
 from .names import METHODS, TABLES
@@ -23,7 +23,7 @@ from .protocol import protocol_of
 from .recipe import Preset
 from .report import Section, as_csv, as_page, section_as_dict, section_from_dict, with_missing
 from .robustness import DELTAS_TABLE, OUTLIERS_TABLE, UNDERTRAINED_TABLE
-from .run import Ran, Shape, cells_of, run_cells
+from .run import Ran, Shape, cells_of, kept_records, run_cells
 from .sheets import write_sheets
 from .speed_tables import MARCHING_CUBES, NORMALS
 from .store import make_folder, write_text
@@ -78,7 +78,7 @@ class Bench:
 def bench_paper(bench: Bench, out: Path, *, say: Callable[[str], None]) -> tuple[list[Section], int]:
     """Run a bench and write what it found into a folder; what is there already is used.
 
-    The page holds the tables of earlier runs into the same folder too, if their preset and seed are the same.
+    The page holds the tables of earlier runs into the same folder too, if shapes, preset and seed are the same.
 
     Args:
         bench: what is asked for.
@@ -94,30 +94,43 @@ def bench_paper(bench: Bench, out: Path, *, say: Callable[[str], None]) -> tuple
         Interrupted: the same, during a fit of ours.
     """
     make_folder(out)
+    # Variants of ours, which only ablations train, are not for --methods to choose.
     skipped = [name for name in METHODS if name not in bench.methods]
     plan = {
-        spec: cells_of(spec, bench.shapes, bench.preset, seed=bench.seed, skipped=skipped)
-        for spec in SPECS
-        if spec.name in bench.tables
+        spec: cells_of(spec, bench.shapes, bench.preset, seed=bench.seed) for spec in SPECS if spec.name in bench.tables
     }
     cells = list(dict.fromkeys(cell for wanted in plan.values() for cell in wanted))
-    say(f"{len(plan)} tables, {len(bench.shapes)} shapes, {len(cells)} cells")
-    ran = run_cells(cells, out, jobs=bench.jobs, device=bench.device, say=say)
-    sections = [_section(spec, wanted, ran, out) for spec, wanted in plan.items()]
-    stamp = {"preset": bench.preset, "seed": bench.seed}
+    asked = [cell for cell in cells if cell.method not in skipped]
+    say(f"{len(plan)} tables, {len(bench.shapes)} shapes, {len(asked)} cells")
+    ran = run_cells(asked, out, jobs=bench.jobs, device=bench.device, say=say)
+    # What other methods found earlier stays in the tables.
+    records = {**kept_records([cell for cell in cells if cell.method in skipped], out), **ran.records}
+    sections = [
+        _section(spec, {cell: records[cell] for cell in wanted if cell in records}, wanted, ran, out)
+        for spec, wanted in plan.items()
+    ]
+    stamp = {"preset": bench.preset, "seed": bench.seed, "shapes": [shape.path.name for shape in bench.shapes]}
     for section, wanted in zip(sections, plan.values(), strict=True):
         for table in section.tables:
             write_text(out / f"{table.name}.csv", as_csv(table))
-        records = [dict(ran.records[cell]) for cell in wanted if cell in ran.records]
-        pairs = stamp | {"section": section_as_dict(section), "records": records}
+        own = [dict(records[cell]) for cell in wanted if cell in records]
+        pairs = stamp | {"section": section_as_dict(section), "records": own}
         write_text(out / f"{section.name}.json", json.dumps(pairs, indent=2) + "\n")
     page = as_page(_kept(out, stamp), command=bench.command, protocol=_protocol(bench), machine=_machine(bench.device))
     write_text(out / PAGE, page)
     return sections, len(ran.failures)
 
 
-def _section(spec: TableSpec, cells: Sequence[Cell], ran: Ran, out: Path) -> Section:
-    own = {cell: ran.records[cell] for cell in cells if cell in ran.records}
+def _section(spec: TableSpec, own: Mapping[Cell, Record], cells: Sequence[Cell], ran: Ran, out: Path) -> Section:
+    """Tables, plots and sheets of one spec.
+
+    Args:
+        spec: the table.
+        own: records of those of its cells that are done.
+        cells: all of its cells.
+        ran: why the others are not.
+        out: folder of the bench.
+    """
     records = list(own.values())
     failures = {cell.name: ran.failures[cell] for cell in cells if cell in ran.failures}
     there = {cell.method for cell in own}
@@ -168,7 +181,8 @@ def _protocol(bench: Bench) -> list[str]:
     return [
         f"Preset `{bench.preset}`, seed {bench.seed}. Shapes: {names}.",
         "The cloud is the mesh's vertices with their normals (of a scan, its points); all methods learn from it and "
-        "from nothing else. Only ours may judge points to be strays, because that is part of it.",
+        "from nothing else. Only ours may judge points to be strays, and drops components that no points support, as "
+        "`mplicits fit` and `mplicits mesh` do: that is part of it. The JSON files count both.",
         "Both shapes are moved by the similarity that puts the reference into the unit sphere. The Chamfer distance is "
         "squared L2, the sum of both directions; what two samplings of the same surface score is the row `(sampling "
         "floor)`.",

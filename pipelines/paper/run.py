@@ -24,7 +24,7 @@ from .recipe import Preset, Report
 from .store import read_record, write_record
 from .tables import TableSpec
 
-__all__ = ["Ran", "Shape", "cell_key", "cells_of", "run_cell", "run_cells"]
+__all__ = ["Ran", "Shape", "cell_key", "cells_of", "kept_records", "run_cell", "run_cells"]
 
 Say = Callable[[str], None]
 
@@ -47,14 +47,7 @@ def cell_key(cell: Cell, method: Method) -> str:
     return cell.key({**protocol_of(cell.preset).as_dict(), **method.settings(cell)})
 
 
-def cells_of(
-    spec: TableSpec,
-    shapes: Sequence[Shape],
-    preset: Preset,
-    *,
-    seed: int = 0,
-    skipped: Sequence[str] = (),
-) -> list[Cell]:
+def cells_of(spec: TableSpec, shapes: Sequence[Shape], preset: Preset, *, seed: int = 0) -> list[Cell]:
     """The cells of a table, with seed and references, each once.
 
     Args:
@@ -62,12 +55,11 @@ def cells_of(
         shapes: the inputs.
         preset: how large and how long.
         seed: of everything.
-        skipped: methods that were not asked for; ablations' variants of ours are never left out by it.
     """
     references = {shape.path: shape.reference for shape in shapes}
     cells = spec.cells([shape.path for shape in shapes], preset)
     planned = [dataclasses.replace(cell, seed=seed, reference=references.get(cell.shape)) for cell in cells]
-    return list(dict.fromkeys(cell for cell in planned if cell.method not in skipped))
+    return list(dict.fromkeys(planned))
 
 
 def run_cell(cell: Cell, out: Path, *, device: str = "cpu", progress: Report | None = None) -> Record:
@@ -147,8 +139,7 @@ def run_cells(cells: Sequence[Cell], out: Path, *, jobs: int = 1, device: str = 
     for name, why in lacking.items():
         say(f"left out: {name}, {why}")
     possible = [cell for cell in cells if cell.method not in lacking]
-    found = {cell: read_record(out, cell_key(cell, methods[cell])) for cell in possible}
-    records = {cell: record for cell, record in found.items() if record is not None}
+    records = dict(kept_records(possible, out))
     waiting = [cell for cell in possible if cell not in records]
     if records and waiting:
         say(f"{len(records)} of {len(possible)} cells are there already")
@@ -164,6 +155,12 @@ def run_cells(cells: Sequence[Cell], out: Path, *, jobs: int = 1, device: str = 
             else:
                 records[outcome.item] = outcome.value
     return Ran({cell: records[cell] for cell in cells if cell in records}, failures, lacking)
+
+
+def kept_records(cells: Sequence[Cell], out: Path) -> Mapping[Cell, Record]:
+    """The records of those cells that are done."""
+    found = {cell: read_record(out, cell_key(cell, method_named(cell.method))) for cell in cells}
+    return {cell: record for cell, record in found.items() if record is not None}
 
 
 class _Counter:
