@@ -315,7 +315,9 @@ def test_loss_weight_rows() -> None:
     def at(shape: str, level: int, errors: dict[float, float]) -> dict[str, Any]:
         outputs = [{"name": f"{w:g}", "weight": w, "error": e} for w, e in errors.items()]
         cell = {"overrides": {"constraint": "normal", "level": level}}
-        return record("loss-weights", outputs, shape=shape, cell=cell, details={"without": 0.5 * level})
+        return record(
+            "loss-weights", outputs, shape=shape, cell=cell, details={"without": 0.5 * level, "fit": 0.1 * level}
+        )
 
     records = [
         record("ours", [{"name": "Ours fine", "chamfer": 1.0}]),
@@ -325,10 +327,12 @@ def test_loss_weight_rows() -> None:
     ]
     (table,) = loss_weight_tables(records)
     assert table.name == "loss-weights-normal"
-    assert [row.name for row in table.rows] == ["0", "100", "level not trained at all"]
+    names = ["0", "100", "level not trained at all", "the finished fit, its own weights"]
+    assert [row.name for row in table.rows] == names
     assert table.rows[0].values == pytest.approx((0.2, 0.01))
     assert table.rows[1].values == pytest.approx((0.3, 0.02))
     assert table.rows[2].values == pytest.approx((0.5, 1.0))
+    assert table.rows[3].values == pytest.approx((0.1, 0.2))
     assert table.rows[0].published == (0.0073, 0.0017)
     assert table.rows[1].published == (0.0081, 0.0013)
     assert "ball, cube" in table.notes[0]
@@ -361,13 +365,13 @@ def test_isolation_rows() -> None:
 
     noisy = {"noise": 0.01}
     records = [
-        record("ours", [figures("Ours coarse", 9.0, 9), figures("Ours fine", 1.0, 1)], cell=noisy),
-        record("ours", [figures("Ours fine", 3.0, 3)], shape="cube", cell=noisy),
-        record("ours", [figures("Ours fine", 0.25, 1)]),
+        record("ours", [figures("Ours coarse", 9.0, 9), figures("Ours fine", 9.0, 9)], cell=noisy),
+        record("isolation", [figures("a", 1.0, 1), figures("a without culling", 1.5, 1)], cell=noisy),
+        record("isolation", [figures("a", 3.0, 3)], shape="cube", cell=noisy),
+        record("isolation", [figures("a", 0.25, 1)]),
         record("isolation", [figures("b", 4.0, 2)], cell=noisy),
         record("isolation", [figures("b", None, 0)], shape="cube", cell=noisy),
         record("isolation", [figures("c", 5.0, 2), figures("c without culling", 50.0, 1234)], cell=noisy),
-        record("isolation", [figures("a without culling", 1.5, 1)], cell=noisy),
     ]
     table, culling = isolation_tables(records)
     a, b, c = table.rows

@@ -255,8 +255,9 @@ def loss_weight_tables(records: Sequence[Record]) -> tuple[Table, ...]:
         ]
         if not rows:
             continue
-        without = tuple(mean(record["details"]["without"] for record in part) for part in levels)
-        rows.append(Row("level not trained at all", without, competes=False))
+        for name, detail in (("level not trained at all", "without"), ("the finished fit, its own weights", "fit")):
+            errors = tuple(mean(record["details"][detail] for record in part) for part in levels)
+            rows.append(Row(name, errors, competes=False))
         tables.append(
             Table(
                 f"loss-weights-{constraint}",
