@@ -89,11 +89,12 @@ def inspect_points(
         isolated = _isolated(cloud, isolation)
         cloud.drop(isolated)
     enough = cloud.kept.sum() > 2 * NEIGHBORS  # for neighbourhoods that are no whole cloud
-    if outliers and enough:
-        stray = _outliers(cloud)
     if flips and enough and normals is not None:
         flipped = _flipped(cloud, normals)
-    return Verdict(isolated, stray, flipped)
+        cloud.normals = np.where(flipped[:, None], -normals, normals)
+    if outliers and enough:
+        stray = _outliers(cloud)
+    return Verdict(isolated, stray, flipped & cloud.kept)
 
 
 def agreement(points: Float64, normals: Float64, rows: Rows) -> tuple[Float64, Float64]:
@@ -101,8 +102,10 @@ def agreement(points: Float64, normals: Float64, rows: Rows) -> tuple[Float64, F
 
     Returns:
         The share of their neighbours that support them ``(m,)``, and their neighbours' mean normals ``(m, 3)``, of
-        length 1 where all agree.
+        length 1 where all agree. In a cloud too small for neighbourhoods every point agrees.
     """
+    if len(points) <= 2 * NEIGHBORS:
+        return np.ones(len(rows)), normals[rows]
     cloud = _Cloud(points, normals, rows)
     support = _by_blocks(rows, lambda part: _support(cloud, part, np.zeros(len(part), bool)))
     means = [normals[cloud.near[part]].mean(axis=1) for part in _blocks(rows)]
@@ -204,10 +207,11 @@ def _flipped(cloud: _Cloud, normals: Float64, *, rounds: int = 4) -> Mask:
         turned = np.where(flipped[:, None], -normals, normals)
         share = np.full(len(normals), 0.5)
         share[everyone] = _by_blocks(everyone, lambda part: _vote(cloud, turned, part, nobody)[0])  # noqa: B023
-        doubtful = np.flatnonzero(share < 0.4)
-        votes = [_vote(cloud, turned, part, share >= 0.6) for part in _blocks(doubtful)]
+        doubtful = np.flatnonzero(share <= 0.3)
+        votes = [_vote(cloud, turned, part, share >= 0.7) for part in _blocks(doubtful)]
         wrong = [
-            part[(alike <= 0.2) & (voters >= 3)] for part, (alike, voters) in zip(_blocks(doubtful), votes, strict=True)
+            part[(alike <= 0.2) & (voters >= 3) & (voters >= 0.4 * asked)]
+            for part, (alike, voters, asked) in zip(_blocks(doubtful), votes, strict=True)
         ]
         found = np.concatenate([np.empty(0, np.int64), *wrong])
         if len(found) == 0:
@@ -216,18 +220,25 @@ def _flipped(cloud: _Cloud, normals: Float64, *, rounds: int = 4) -> Mask:
     return flipped
 
 
-def _vote(cloud: _Cloud, normals: Float64, rows: Rows, trusted: Mask) -> tuple[Float64, NDArray[np.int64]]:
-    """The share of trusted neighbours in a point's plane with a normal like its own (0.5: nobody), and their count."""
+def _vote(
+    cloud: _Cloud, normals: Float64, rows: Rows, trusted: Mask
+) -> tuple[Float64, NDArray[np.int64], NDArray[np.int64]]:
+    """Of the neighbours in a point's plane: the share of the trusted that have a normal like its own, 0.5 for none.
+
+    Returns:
+        The share, how many are trusted, and how many there are, each ``(m,)``.
+    """
     near = cloud.near[rows]
     edge, length = cloud.edges(rows)
     own, theirs = normals[rows], normals[near]
     cosine = np.einsum("md,mkd->mk", own, theirs)
     level = np.abs(np.einsum("mkd,md->mk", edge, own)) <= 0.3 * length
     level &= np.abs(np.einsum("mkd,mkd->mk", edge, theirs)) <= 0.3 * length
-    level &= trusted[near] & (np.abs(cosine) > 0.5)
-    voters = level.sum(axis=1)
-    alike = (level & (cosine > 0)).sum(axis=1) / np.maximum(voters, 1)
-    return np.where(voters > 0, alike, 0.5), voters
+    level &= np.abs(cosine) > 0.5
+    votes = level & trusted[near]
+    voters = votes.sum(axis=1)
+    alike = (votes & (cosine > 0)).sum(axis=1) / np.maximum(voters, 1)
+    return np.where(voters > 0, alike, 0.5), voters, level.sum(axis=1)
 
 
 def _support(cloud: _Cloud, rows: Rows, lonely: Mask) -> Float64:
@@ -244,22 +255,30 @@ def _support(cloud: _Cloud, rows: Rows, lonely: Mask) -> Float64:
 
 
 def _off(cloud: _Cloud, rows: Rows) -> Mask:
-    """Whether the neighbours agree on a plane and a normal, and the point ``(m,)`` is beside the one or across both."""
+    """Whether three in four neighbours agree on a plane and a normal, and the point ``(m,)`` is off them."""
     edge, _ = cloud.edges(rows)
     theirs, reach = cloud.normals[cloud.near[rows]], cloud.reach[rows]
     if not cloud.signed:  # one sign for all, so that their mean means something
         theirs = theirs * np.sign(np.einsum("mkd,md->mk", theirs, theirs[:, 0]))[:, :, None]
     mean = theirs.mean(axis=1)
+    alike = np.einsum("mkd,md->mk", theirs, mean) > 0.7 * np.linalg.norm(mean, axis=1)[:, None]
+    count = np.maximum(alike.sum(axis=1), 1)
+    mean = (theirs * alike[:, :, None]).sum(axis=1) / count[:, None]
     length = np.linalg.norm(mean, axis=1)
     axis = mean / np.maximum(length, 1e-300)[:, None]
     height = np.einsum("mkd,md->mk", edge, axis)
-    thickness = height.std(axis=1)
-    agreed = (length > 0.9) & (thickness < 0.2 * reach) & cloud.flat[rows]
-    beside = np.abs(height.mean(axis=1)) > np.maximum(5 * thickness, 0.3 * reach)
-    # At the rim of a flat part a normal may be another: that of the edge.
-    surrounded = np.linalg.norm(edge.mean(axis=1), axis=1) < 0.5 * reach
-    across = np.abs((axis * cloud.normals[rows]).sum(axis=1)) < 0.3
-    return agreed & (beside | (across & surrounded))
+    level = (height * alike).sum(axis=1) / count
+    thickness = np.sqrt(((height - level[:, None]) ** 2 * alike).sum(axis=1) / count)
+    agreed = (alike.mean(axis=1) >= 0.75) & (length > 0.9) & (thickness < 0.2 * reach) & cloud.flat[rows]
+    beside = np.abs(level) > np.maximum(5 * thickness, 0.3 * reach)
+    # At the rim of a flat part, points may have another normal, and lie beside it: those of the edge.
+    middle = edge.mean(axis=1)
+    middle = middle - (middle * axis).sum(axis=1, keepdims=True) * axis
+    surrounded = np.linalg.norm(middle, axis=1) < 0.35 * reach
+    cosine = (axis * cloud.normals[rows]).sum(axis=1)
+    if cloud.signed:  # the other side of a thin part has the opposite normal, rightly
+        beside &= cosine > -0.8
+    return agreed & surrounded & (beside | (np.abs(cosine) < 0.3))
 
 
 def _stray_clusters(cloud: _Cloud, support: Float64) -> Mask:

@@ -14,11 +14,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..datasets import OrientedCloud, PointCloud, prepare_cloud, read_cloud
+from ..datasets import OrientedCloud, PointCloud, prepare_cloud
+from ..datasets.large_cloud import Merging
 from ..neural_fields import InputError, MultiscaleSDF, Similarity, Siren, save_field
 from .cloud_distance import CloudDistance
 from .config import load_config
+from .distributed import is_leader
 from .fit_config import FitConfig
+from .fit_review import review_points
 from .fit_state import (
     FIELD_FILE,
     STATE_FILE,
@@ -29,15 +32,19 @@ from .fit_state import (
     save_state,
     write_record,
 )
+from .memory import peak_memory
+from .merged_cloud import load_cloud
 from .sampling import (
+    Band,
     Samples,
+    band_of,
     band_samples,
-    delta_of,
     distance_samples,
     free_lengths,
     offset_samples,
     with_previous,
 )
+from .support import write_support
 from .training import LevelTrainer, Progress, Source, StopFlag, stop_on_signals
 
 __all__ = ["FitConfig", "Interrupted", "Run", "fit", "prepare"]
@@ -109,13 +116,15 @@ def fit(
         config = load_config(FitConfig, None, read_record(directory)["config"])
     config = config or FitConfig()
     device = choose_device(config.device)
-    raw = _as_cloud(cloud)
+    raw, merging = load_cloud(_as_cloud(cloud), limit=config.merge_above, isolation=config.isolation, cache=directory)
     oriented = prepare(raw, config)
     if directory is not None:
         directory.mkdir(parents=True, exist_ok=True)
-    fitting = _Fitting(oriented, raw.source, config, device, directory, progress)
+    fitting = _Fitting(oriented, raw.source, config, device, directory, progress, merging)
     if resume:
         fitting.restore()
+    if not is_leader():
+        fitting.directory = None  # of several processes one writes
     with stop_on_signals() as flag:
         return fitting.run(flag)
 
@@ -126,7 +135,14 @@ def prepare(cloud: PointCloud, config: FitConfig) -> OrientedCloud:
     Raises:
         InputError: see `prepare_cloud`.
     """
-    return prepare_cloud(cloud, normals=config.normals, sensor_origin=config.sensor_origin, isolation=config.isolation)
+    return prepare_cloud(
+        cloud,
+        normals=config.normals,
+        sensor_origin=config.sensor_origin,
+        isolation=config.isolation,
+        drop_outliers=config.drop_outliers,
+        turn_normals=config.turn_normals,
+    )
 
 
 def choose_device(name: str) -> torch.device:
@@ -146,11 +162,9 @@ def choose_device(name: str) -> torch.device:
     return device
 
 
-def _as_cloud(cloud: Cloud) -> PointCloud:
-    if isinstance(cloud, PointCloud):
+def _as_cloud(cloud: Cloud) -> PointCloud | str | Path:
+    if isinstance(cloud, PointCloud | str | Path):
         return cloud
-    if isinstance(cloud, str | Path):
-        return read_cloud(cloud)
     array = np.asarray(cloud)
     if array.ndim != 2 or array.shape[1] not in (3, 6):
         raise InputError(f"cloud: array of shape {array.shape}; expected (N, 3) points or (N, 6) points and normals")
@@ -169,22 +183,25 @@ class _Fitting:
         device: torch.device,
         directory: Path | None,
         progress: Callable[[Progress], None] | None,
+        merging: Merging | None = None,
     ) -> None:
         self.cloud, self.source, self.config = cloud, source, config
-        self.device, self.directory = device, directory
+        self.device, self.directory, self.merging = device, directory, merging
         self.progress = progress or (lambda _: None)
         self.fingerprint = fingerprint(cloud)
+        self.points, self.normals = torch.from_numpy(cloud.points), torch.from_numpy(cloud.normals)
+        self.index: CloudDistance | None = None  # of the points above
         self.frozen: MultiscaleSDF | None = None
         self.errors = torch.empty(0)  # of the last frozen level, at the input points
         self.stages: list[dict[str, Any]] = []
         self.trainer_state: dict[str, Tensor] = {}
 
     def run(self, flag: StopFlag) -> Run:
-        index = CloudDistance(torch.from_numpy(self.cloud.points), torch.from_numpy(self.cloud.normals))
         if self.directory is not None:
             write_record(self.directory, self.record(finished=False))
+            write_support(self.directory, self.points.numpy())
         for level in range(len(self.stages), self.config.num_levels):
-            self.train_level(level, index, flag)
+            self.train_level(level, flag)
         assert self.frozen is not None
         record = self.record(finished=True)
         if self.directory is not None:
@@ -195,7 +212,7 @@ class _Fitting:
             (self.directory / STATE_FILE).unlink(missing_ok=True)
         return Run(self.frozen.cpu(), self.cloud.similarity, self.directory, record)
 
-    def train_level(self, level: int, index: CloudDistance, flag: StopFlag) -> None:
+    def train_level(self, level: int, flag: StopFlag) -> None:
         """Make the samples of one level, train it, freeze it."""
         config, started = self.config, time.monotonic()
         generator = torch.Generator().manual_seed(config.seed * 1009 + level)
@@ -208,8 +225,10 @@ class _Fitting:
                 output_gain=RESIDUAL_GAIN if level else 1.0,
             ).to(self.device)
         self.progress(Progress(f"level {level}: samples", 0, config.steps[level], 0.0, {}))
-        delta = None if self.frozen is None else self.next_delta()
-        sources = self.sources(index, delta, generator)
+        band = None if self.frozen is None else self.next_band()
+        delta = None if band is None else band.delta
+        self.index = self.index or CloudDistance(self.points, self.normals)
+        sources = self.sources(self.index, delta, generator)
         sampling_seconds = time.monotonic() - started
         trainer = LevelTrainer(
             network,
@@ -231,18 +250,21 @@ class _Fitting:
             self.save(trainer, delta)
             raise Interrupted(self.directory)
         self.frozen = self.grown(network, delta).requires_grad_(False)
+        review = self.review() if level == 0 else None
         self.errors = self.values_at_cloud()
         self.stages.append(
             {
                 "level": level,
                 "parameters": sum(p.numel() for p in network.parameters()),
                 "delta": delta,
+                "band": None if band is None else dataclasses.asdict(band),
                 "samples": {source.name: len(source.samples) for source in sources},
                 "sampling_seconds": round(sampling_seconds, 3),
                 "training_seconds": round(trainer.elapsed, 3),
                 "steps": trainer.step,
                 "ended_by_time_budget": trainer.ended_early,
                 "losses": trainer.losses,
+                **({} if review is None else {"review": review}),
                 **self.surface_errors(),
             }
         )
@@ -282,18 +304,36 @@ class _Fitting:
         third, weights = config.batch // 3, (data, config.normal_weight, config.eikonal_weight)
         return [Source(name, samples, third, *weights) for name, samples in kept.items()]
 
-    def next_delta(self) -> float:
-        """Half-width of the band around the last frozen level (Eq. 5)."""
-        delta = delta_of(self.errors, epsilon=self.config.epsilon, quantile=self.config.quantile)
-        # A level that met every point exactly would leave its successor no band at all.
-        return max(delta, 1e-6)
+    def next_band(self) -> Band:
+        """The band around the last frozen level (Eq. 5)."""
+        return band_of(self.errors, epsilon=self.config.epsilon, quantile=self.config.quantile)
+
+    def review(self) -> dict[str, Any]:
+        """Take out of the data what level 0 shows to be wrong with it → counts for the record."""
+        config = self.config
+        assert self.frozen is not None
+        found = review_points(
+            self.points,
+            self.normals,
+            self.frozen,
+            device=self.device,
+            outliers=config.drop_outliers,
+            turn=config.turn_normals and config.normals == "auto",
+        )
+        if found.dropped.any() or found.turned.any():
+            kept, turned = torch.from_numpy(~found.dropped), torch.from_numpy(found.turned)
+            self.normals = torch.where(turned[:, None], -self.normals, self.normals)[kept]
+            self.points = self.points[kept]
+            self.index = None
+            if self.directory is not None:
+                write_support(self.directory, self.points.numpy())
+        return found.report()
 
     @torch.no_grad()
     def values_at_cloud(self) -> Tensor:
         """Values of the finest frozen level at the input points → ``(n,)`` on the CPU."""
         assert self.frozen is not None
-        points = torch.from_numpy(self.cloud.points)
-        return torch.cat([self.frozen.value(part.to(self.device)).cpu() for part in points.split(1 << 18)])
+        return torch.cat([self.frozen.value(part.to(self.device)).cpu() for part in self.points.split(1 << 18)])
 
     def surface_errors(self) -> dict[str, float]:
         """|f| at the input points, in input units: how closely the level passes by them."""
@@ -353,6 +393,7 @@ class _Fitting:
             self.frozen = MultiscaleSDF(levels[0], levels[1:], [1.0] * (len(levels) - 1)).to(self.device)
             self.frozen.load_state_dict(_with_prefix(tensors, "frozen."))
             self.frozen.requires_grad_(False)
+            self.review()  # again: it follows from the cloud and level 0
             self.errors = self.values_at_cloud()
         self.trainer_state = _with_prefix(tensors, "trainer.")
 
@@ -361,6 +402,7 @@ class _Fitting:
         return {
             "finished": finished,
             "cloud": self.source,
+            "merging": None if self.merging is None else dataclasses.asdict(self.merging),
             "cleaning": dataclasses.asdict(self.cloud.report),
             "similarity": dataclasses.asdict(self.cloud.similarity),
             "config": dataclasses.asdict(self.config),
@@ -368,6 +410,7 @@ class _Fitting:
             "parameters": sum(stage["parameters"] for stage in self.stages),
             "deltas": [stage["delta"] for stage in self.stages if stage["delta"] is not None],
             "training_seconds": round(sum(s["sampling_seconds"] + s["training_seconds"] for s in self.stages), 3),
+            "peak_memory": peak_memory(),
             "environment": environment(self.device),
         }
 

@@ -44,7 +44,16 @@ class FitConfig:
         None, "x y z of the sensor, in input units: estimated normals face it"
     )
     isolation: float | None = _setting(
-        30.0, "drop points whose 8th neighbour is this many times further away than is usual; none keeps them"
+        30.0, "drop lone points whose 8th neighbour is this many times further away than is usual; none keeps them"
+    )
+    merge_above: int | None = _setting(
+        1_000_000, "clouds of more points are merged, as they are read, to at most so many means of voxels; none: never"
+    )
+    drop_outliers: bool = _setting(
+        True, "drop points that belong to no surface, by their neighbours and after level 0 by how far it passes them"
+    )
+    turn_normals: bool = _setting(
+        True, "turn single normals round that point the other way than their neighbours' (not with --normals file)"
     )
     time_budget: float | None = _setting(None, "end training after about this many seconds, all levels together")
     seed: int = _setting(0, "random seed")
@@ -62,7 +71,7 @@ class FitConfig:
         for name in ("widths", "depths", "omegas", "steps", "learning_rates"):
             if min(getattr(self, name)) <= 0:
                 raise ValueError(f"{name}: {getattr(self, name)}; expected numbers > 0")
-        for name in ("batch", "samples", "epsilon", "time_budget"):
+        for name in ("batch", "samples", "epsilon", "time_budget", "merge_above"):
             number = getattr(self, name)
             if number is not None and number <= 0:
                 raise ValueError(f"{name}: {number}; expected > 0")

@@ -67,15 +67,18 @@ class FitMesh:
         config = dataclasses.replace(TextureConfig(), device=fitted["device"], seed=fitted["seed"])
         return texture_run(self.run, self.source, config, resume=resume, progress=progress)
 
-    def extract(self) -> Mesh:
+    def extract(self, say: Callable[[str], None] | None = None) -> Mesh:
         """Extract and write the mesh, as `mesh_run` does by default, trimmed where it shall be.
+
+        Args:
+            say: see `mesh_run`.
 
         Raises:
             InputError: see `mesh_run`.
         """
         trim = trim_suggestion(self.run) if self.trim else None
         options = MeshOptions(colors=self.colored, trim_distance=trim, cloud=self.source if self.trim else None)
-        return mesh_run(self.run, self.out, options)
+        return mesh_run(self.run, self.out, options, say=say)
 
 
 def plan_mesh(out: Path, run: Path, source: Path | DepthInput, *, colors: bool, resume: bool) -> FitMesh:

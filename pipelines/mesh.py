@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,9 +18,10 @@ from ..neural_fields import Field, InputError, Similarity, map_attribute
 from ..neural_fields.meshing import Mesh, NoSurfaceError, extract_mesh, map_normals
 from .bake import check_texture_size, textured_mesh
 from .mesh_files import check_mesh_path, write_mesh
-from .mesh_trim import in_region, keep_largest, trim_distance
+from .mesh_trim import drop_unsupported, in_region, keep_largest, trim_distance
 from .riding import Colors, colors_at
 from .runs import find_field, load_still
+from .support import Support, read_support
 from .textured_files import check_textured_path
 
 __all__ = ["MeshOptions", "mesh_run", "normals_near"]
@@ -38,6 +40,7 @@ class MeshOptions:
         texture: unwrap the mesh and bake colours and the normals of the finest level into images of so many texels
             along each side (.glb or .obj); None leaves the colours at the vertices.
         texture_faces: triangles to keep of a mesh that is unwrapped.
+        keep_unsupported: whether to keep components that no input points support.
         keep_largest: whether to keep only the component of largest area.
         trim_distance: drop faces further than this from the points, in input units.
         cloud: the points for that; by default the file that was fitted.
@@ -50,18 +53,22 @@ class MeshOptions:
     colors: bool = True
     texture: int | None = None
     texture_faces: int = 50_000
+    keep_unsupported: bool = False
     keep_largest: bool = False
     trim_distance: float | None = None
     cloud: str | Path | None = None
 
 
-def mesh_run(run: str | Path, out: str | Path, options: MeshOptions | None = None) -> Mesh:
+def mesh_run(
+    run: str | Path, out: str | Path, options: MeshOptions | None = None, *, say: Callable[[str], None] | None = None
+) -> Mesh:
     """Extract the surface of a run and write it in the coordinates of its input.
 
     Args:
         run: run directory or .safetensors file.
         out: the mesh file.
         options: how.
+        say: called with a line about what was removed, if anything was.
 
     Returns:
         The mesh as written, in unit-sphere coordinates.
@@ -82,6 +89,9 @@ def mesh_run(run: str | Path, out: str | Path, options: MeshOptions | None = Non
     for flag, number in (("--level", level), ("--normal-level", normal_level)):
         if not 0 <= number < field.num_levels:
             raise InputError(f"{flag} {number}: {file} has levels 0 to {field.num_levels - 1}")
+    support = None
+    if not options.keep_unsupported and options.time is None:
+        support = read_support(file, metadata.get("run", {}), level)
     points = None
     if options.trim_distance is not None:
         cloud = read_cloud(options.cloud or _fitted_cloud(file, metadata))
@@ -94,6 +104,8 @@ def mesh_run(run: str | Path, out: str | Path, options: MeshOptions | None = Non
         mesh = in_region(mesh)
         if mesh is None:
             raise InputError(f"{file}: no surface in the region of interest; train it longer (--steps)")
+    if support is not None:
+        mesh = _supported(mesh, support, say)
     if normal_level != level:
         mesh = map_normals(mesh, field, level=normal_level)
     if points is not None and options.trim_distance is not None:
@@ -108,6 +120,15 @@ def mesh_run(run: str | Path, out: str | Path, options: MeshOptions | None = Non
         mesh = dataclasses.replace(mesh, colors=_evaluated(colors, mesh.vertices))
     write_mesh(out, mesh, similarity)
     return mesh
+
+
+def _supported(mesh: Mesh, support: Support, say: Callable[[str], None] | None) -> Mesh:
+    """The mesh without its blobs; ``say`` hears how many there were."""
+    left = drop_unsupported(mesh, support.points, radius=support.radius)
+    if left.dropped and say is not None:
+        parts = f"{left.dropped:,} component{'s' * (left.dropped > 1)}"
+        say(f"removed {parts} that no points support ({left.area:.2g} of the area); --keep-unsupported keeps them")
+    return left.mesh
 
 
 def _evaluated(colors: Colors, points: NDArray[np.float64]) -> NDArray[np.float32]:

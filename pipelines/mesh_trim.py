@@ -1,8 +1,9 @@
-"""Parts of a mesh: the largest component, what lies near the input points, or in the region of interest."""
+"""Parts of a mesh: the largest component, what lies near or rests on the input points, the region of interest."""
 
 from __future__ import annotations
 
 import dataclasses
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,10 +11,25 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
+from ..datasets import spacing_of
 from ..neural_fields import InputError
 from ..neural_fields.meshing import Mesh
 
-__all__ = ["face_areas", "in_region", "keep_faces", "keep_largest", "trim_distance", "without_voids"]
+__all__ = [
+    "Supported",
+    "drop_unsupported",
+    "face_areas",
+    "in_region",
+    "keep_faces",
+    "keep_largest",
+    "support_radius",
+    "trim_distance",
+    "without_voids",
+]
+
+# Least share of a component's area near some point. A part that was measured has nearly all of it there, an open scan
+# that the fit closed behind still a third or so; a blob has none, or what a stray point or a neighbouring part touches.
+LEAST_SUPPORT = 0.05
 
 
 def face_areas(mesh: Mesh) -> NDArray[np.float64]:
@@ -41,6 +57,65 @@ def keep_largest(mesh: Mesh) -> Mesh:
     """Keep the connected component (through shared vertices) with the largest area."""
     component = _component_of_faces(mesh)
     return keep_faces(mesh, component == np.bincount(component, weights=face_areas(mesh)).argmax())
+
+
+class Supported(NamedTuple):
+    """What `drop_unsupported` leaves.
+
+    Attributes:
+        mesh: the components that rest on points.
+        dropped: how many others there were.
+        area: theirs, as a share of the whole.
+    """
+
+    mesh: Mesh
+    dropped: int
+    area: float
+
+
+def drop_unsupported(
+    mesh: Mesh, points: NDArray[np.floating], *, radius: float | None = None, least: float = LEAST_SUPPORT
+) -> Supported:
+    """Drop the connected components that no input points support: blobs, which nothing was measured of.
+
+    A component is kept if at least the share ``least`` of its area has its corners within ``radius`` of some point.
+    Where that keeps none, all stay: mesh and points do not belong together, and this is no judge of that.
+
+    Args:
+        mesh: with points and radius in the same coordinates.
+        points: ``(N, 3)``, without the outliers.
+        radius: see `support_radius`, which is taken for None.
+        least: in [0, 1].
+
+    Raises:
+        ValueError: ``radius`` is not positive, or there are no points.
+    """
+    if len(points) == 0:
+        raise ValueError("points: there are none to support anything")
+    reach = support_radius(points) if radius is None else radius
+    if not reach > 0:
+        raise ValueError(f"radius={reach}: expected > 0")
+    component = _component_of_faces(mesh)
+    number = np.unique(component, return_inverse=True)[1]
+    nearest = KDTree(points).query(mesh.vertices, distance_upper_bound=reach, workers=-1)[0]
+    share = np.isfinite(nearest)[mesh.faces].mean(axis=1)
+    areas = face_areas(mesh)
+    whole = np.bincount(number, weights=areas)
+    kept = np.bincount(number, weights=areas * share) >= least * whole
+    kept &= np.bincount(number, weights=share) > 0  # nothing of no area either
+    if kept.all() or not kept.any():
+        return Supported(mesh, 0, 0.0)
+    return Supported(keep_faces(mesh, kept[number]), int((~kept).sum()), float(whole[~kept].sum() / whole.sum()))
+
+
+def support_radius(points: NDArray[np.floating], *, error: float = 0.0) -> float:
+    """How near its points a measured surface passes: three times their spacing and the fit's error, square to that.
+
+    Args:
+        points: ``(N, 3)``.
+        error: root mean square distance of the surface at them.
+    """
+    return 3 * float(np.hypot(spacing_of(np.asarray(points, np.float64)), error))
 
 
 def without_voids(mesh: Mesh) -> Mesh:

@@ -17,13 +17,25 @@ from torch import Tensor
 from ..neural_fields import Field, Jet
 from .cloud_distance import CloudDistance
 
-__all__ = ["Samples", "band_samples", "delta_of", "distance_samples", "free_lengths", "offset_samples", "with_previous"]
+__all__ = [
+    "Band",
+    "Samples",
+    "band_of",
+    "band_samples",
+    "delta_of",
+    "distance_samples",
+    "free_lengths",
+    "offset_samples",
+    "with_previous",
+]
 
 # Half-edge of the cube in which level 0 learns distances: the mesher's box is [-1, 1]³, and a little more.
 DOMAIN = 1.05
 # Largest error over its 99th percentile: 1.0 for uniform noise, 1.6 for Gaussian, 2 to 3 for what a coarse level
 # misses of the fine parts of a clean cloud.
 STRAY = 4.0
+# The same over the 90th percentile, generous: a level may miss a thin part as a whole.
+TAIL = 20.0
 
 
 @dataclass(frozen=True)
@@ -58,12 +70,43 @@ class Samples:
         return Samples(*(None if part is None else part.to(device) for part in parts))  # pyright: ignore[reportArgumentType]
 
 
+@dataclass(frozen=True)
+class Band:
+    """The band around a level.
+
+    Attributes:
+        delta: its half-width.
+        rule: "quantile" where one was asked for, "maximum" over all points, or "maximum but for strays".
+        outside: input points that it does not hold.
+    """
+
+    delta: float
+    rule: str
+    outside: int
+
+
+def band_of(errors: Tensor, *, epsilon: float, quantile: float | None) -> Band:
+    """The band of `delta_of`, and what chose it.
+
+    Args:
+        errors: ``(n,)`` values f(x_j) at the input points.
+        epsilon: the ε of Eq. 5.
+        quantile: q in (0, 1], or None.
+    """
+    # A level that met every point exactly would leave its successor no band at all.
+    delta = max(delta_of(errors, epsilon=epsilon, quantile=quantile), 1e-6)
+    strays = float(errors.abs().max()) * (1 + epsilon) > delta
+    rule = "quantile" if quantile is not None else "maximum but for strays" if strays else "maximum"
+    return Band(delta, rule, int((errors.abs() >= delta).sum()))
+
+
 def delta_of(errors: Tensor, *, epsilon: float, quantile: float | None) -> float:
     """The half-width of a band, ``δ = (1 + ε) · Q_q(|f(x_j)|)``; the paper's Eq. 5 at ``quantile = 1``.
 
     The maximum of Eq. 5 is fragile: one stray point far from the surface widens the band to half the domain. With
-    ``quantile=None`` it is taken over the points with no more than ``STRAY`` times the 99th percentile, which all
-    points of a sound cloud are: their errors have a bounded distribution, strays do not.
+    ``quantile=None`` it is taken over the points with no more than ``STRAY`` times the 99th percentile and ``TAIL``
+    times the 90th, which all points of a sound cloud are: their errors have a bounded distribution, strays do not.
+    The second bound holds where more than one point in a hundred is a stray.
 
     Args:
         errors: ``(n,)`` values f(x_j) at the input points.
@@ -72,7 +115,7 @@ def delta_of(errors: Tensor, *, epsilon: float, quantile: float | None) -> float
     """
     ordered = errors.abs().flatten().sort().values
     if quantile is None:
-        usual = STRAY * ordered[math.ceil(0.99 * len(ordered)) - 1]
+        usual = min(q * ordered[math.ceil(share * len(ordered)) - 1] for q, share in ((STRAY, 0.99), (TAIL, 0.9)))
         return (1 + epsilon) * float(ordered[ordered <= usual][-1])
     return (1 + epsilon) * float(ordered[max(0, math.ceil(quantile * len(ordered)) - 1)])
 

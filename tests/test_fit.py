@@ -62,7 +62,7 @@ def test_bands_hold_the_points(fitted: Path) -> None:
 
 
 def test_the_run_directory(fitted: Path) -> None:
-    assert sorted(path.name for path in fitted.iterdir()) == ["field.safetensors", "run.json"]
+    assert sorted(path.name for path in fitted.iterdir()) == ["field.safetensors", "run.json", "support.safetensors"]
     record = json.loads((fitted / "run.json").read_text())
     assert record["finished"] is True
     assert record["cloud"] == "ball"

@@ -3,10 +3,12 @@ import pytest
 from mplicits.neural_fields import InputError, Sphere, Union
 from mplicits.neural_fields.meshing import Mesh, extract_mesh
 from mplicits.pipelines.mesh_trim import (
+    drop_unsupported,
     face_areas,
     in_region,
     keep_faces,
     keep_largest,
+    support_radius,
     trim_distance,
     without_voids,
 )
@@ -78,3 +80,45 @@ def test_the_region_is_the_unit_sphere():
     assert len(kept.faces) < len(mesh.faces)
     assert np.linalg.norm(kept.vertices, axis=1).max() < 0.6
     assert in_region(extract_mesh(corner, resolution=32)) is None
+
+
+def on_sphere(count, radius, center):
+    directions = np.random.default_rng(0).normal(size=(count, 3))
+    return center + radius * directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+def test_a_blob_without_points_goes_and_a_second_part_stays(two):
+    blob = extract_mesh(Sphere(radius=0.1, center=(0.3, 0.8, 0)), resolution=40)
+    count = len(two.vertices)
+    mesh = Mesh(np.concatenate((two.vertices, blob.vertices)), np.concatenate((two.faces, blob.faces + count)))
+    points = np.concatenate((on_sphere(300, 0.15, [-0.6, 0, 0]), on_sphere(2000, 0.4, [0.3, 0, 0])))
+    left = drop_unsupported(mesh, points)
+    assert left.dropped == 1
+    assert np.array_equal(left.mesh.vertices, two.vertices)
+    assert left.area == pytest.approx(face_areas(blob).sum() / face_areas(mesh).sum())
+    stray = np.concatenate((points, [[0.3, 0.9, 0.0]]))  # one point on a blob does not make it a part
+    assert drop_unsupported(mesh, stray, radius=0.02).dropped == 1
+    whole = drop_unsupported(two, points)
+    assert (whole.dropped, whole.mesh is two) == (0, True)
+
+
+def test_a_part_with_a_few_of_its_sides_measured_stays(two):
+    points = on_sphere(4000, 0.4, [0.3, 0, 0])
+    seen = points[points[:, 2] > 0.3]  # a cap of an eighth of the area
+    left = drop_unsupported(two, seen)
+    assert left.dropped == 1
+    assert len(left.mesh.faces) == len(keep_largest(two).faces)
+
+
+def test_points_that_belong_elsewhere_remove_nothing(two):
+    assert drop_unsupported(two, np.full((3, 3), 9.0) + np.eye(3)).mesh is two
+    with pytest.raises(ValueError, match="points"):
+        drop_unsupported(two, np.empty((0, 3)))
+    with pytest.raises(ValueError, match="radius"):
+        drop_unsupported(two, two.vertices, radius=0.0)
+
+
+def test_support_radius_holds_spacing_and_error():
+    grid = np.stack(np.meshgrid(*[np.arange(10.0)] * 2, [0.0]), axis=-1).reshape(-1, 3)
+    assert support_radius(grid) == pytest.approx(3.0)
+    assert support_radius(grid, error=2.0) == pytest.approx(3 * np.hypot(1.0, 2.0))

@@ -1,0 +1,141 @@
+"""What the coarse level tells of its points, and what a whole fit makes of strays."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from mplicits.datasets import PointCloud, add_outliers, sample_sphere
+from mplicits.neural_fields import InputError, MultiscaleSDF, Siren, Sphere
+from mplicits.neural_fields.meshing import Mesh, extract_mesh
+from mplicits.pipelines.fit import fit
+from mplicits.pipelines.fit_config import FitConfig
+from mplicits.pipelines.fit_review import review_points
+from mplicits.pipelines.mesh import MeshOptions, mesh_run
+from mplicits.pipelines.support import SUPPORT_FILE, read_support
+
+SMALL = FitConfig(
+    widths=(32, 48),
+    depths=(2, 2),
+    omegas=(10.0, 15.0),
+    steps=(150, 60),
+    learning_rates=(3e-3, 1e-3),
+    batch=1024,
+    samples=20_000,
+)
+CPU = torch.device("cpu")
+
+
+def tensors(cloud: PointCloud) -> tuple[torch.Tensor, torch.Tensor]:
+    assert cloud.normals is not None
+    return torch.from_numpy(cloud.points).float(), torch.from_numpy(cloud.normals)
+
+
+def test_residuals_find_strays_and_gradients_find_flipped_normals() -> None:
+    clean = sample_sphere(4000)
+    cloud = add_outliers(PointCloud(clean.points + 1e-3 * np.sin(9 * clean.points[:, :1]), clean.normals), 0.02)
+    points, normals = tensors(cloud)
+    normals = normals.clone()
+    normals[:200] *= -1
+    found = review_points(points, normals, Sphere(radius=0.5), device=CPU, outliers=True, turn=True)
+    assert not found.dropped[:4000].any()
+    assert found.dropped[4000:].sum() > 40  # those with normals unlike the sphere's gradient
+    assert found.turned[:200].all()
+    assert not found.turned[200:4000].any()
+    assert found.report()["turned_normals"] == found.turned.sum()
+    nothing = review_points(points, normals, Sphere(radius=0.5), device=CPU, outliers=False, turn=False)
+    assert not nothing.dropped.any()
+    assert not nothing.turned.any()
+
+
+def test_a_part_that_the_level_misses_is_no_outlier() -> None:
+    """A thin rod: far from the coarse surface, at right angles to its gradient, but of one mind."""
+    ball, rod = sample_sphere(4000), sample_sphere(400, radius=1.0, seed=1)
+    angle, height = np.random.default_rng(0).uniform(0, 1, (2, 400)) * [[2 * np.pi], [0.4]]
+    around = np.stack((np.cos(angle), np.sin(angle), np.zeros(400)), axis=1)
+    assert ball.normals is not None
+    points = np.concatenate((ball.points, 0.02 * around + np.stack((0 * height, 0 * height, 0.5 + height), axis=1)))
+    normals = np.concatenate((ball.normals, around)).astype(np.float32)
+    found = review_points(
+        torch.from_numpy(points).float(),
+        torch.from_numpy(normals),
+        Sphere(radius=0.5),
+        device=CPU,
+        outliers=True,
+        turn=True,
+    )
+    assert len(rod) == 400
+    assert found.dropped.sum() <= 4
+    assert not found.turned.any()
+
+
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    directory = tmp_path_factory.mktemp("run")
+    cloud = add_outliers(sample_sphere(3000), 0.05)
+    assert cloud.normals is not None
+    cloud.normals[:300] *= -1
+    fit(cloud, SMALL, out=directory)
+    return directory
+
+
+def test_strays_and_flipped_normals_do_not_show_in_the_fit(fitted: Path, tmp_path: Path) -> None:
+    record = json.loads((fitted / "run.json").read_text())
+    cleaning, stages = record["cleaning"], record["stages"]
+    assert cleaning["dropped_outliers"] + stages[0]["review"]["dropped_outliers"] > 100
+    assert cleaning["turned_normals"] > 280
+    assert stages[1]["band"]["delta"] == stages[1]["delta"] < 0.1
+    assert stages[1]["band"]["rule"] in ("maximum", "maximum but for strays")
+    assert stages[0]["band"] is None
+    mesh = mesh_run(fitted, tmp_path / "mesh.ply", MeshOptions(resolution=40))
+    assert abs(np.linalg.norm(mesh.vertices, axis=1) - 1).max() < 0.05
+
+
+def test_meshing_drops_what_no_points_support_and_says_so(
+    fitted: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    parts = [extract_mesh(Sphere(radius=radius), resolution=24) for radius in (0.98, 0.2)]
+    faces = np.concatenate((parts[0].faces, parts[1].faces + len(parts[0].vertices)))
+    both = Mesh(np.concatenate([part.vertices for part in parts]), faces)
+    monkeypatch.setattr("mplicits.pipelines.mesh.extract_mesh", lambda *_, **__: both)
+    said: list[str] = []
+    mesh = mesh_run(fitted, tmp_path / "a.ply", say=said.append)
+    assert len(mesh.faces) == len(parts[0].faces)
+    assert len(said) == 1
+    assert said[0].startswith("removed 1 component that no points support")
+    kept = mesh_run(fitted, tmp_path / "b.ply", MeshOptions(keep_unsupported=True), say=said.append)
+    assert kept is both
+    assert len(said) == 1
+
+
+def test_support_of_a_run(fitted: Path, tmp_path: Path) -> None:
+    record = json.loads((fitted / "run.json").read_text())
+    support = read_support(fitted / "field.safetensors", record, 1)
+    assert support is not None
+    radii = np.linalg.norm(support.points, axis=1)
+    assert np.quantile(abs(radii - 1), 0.95) < 1e-3
+    assert support.radius > 3 * record["stages"][1]["rms_at_points"] / record["similarity"]["scale"]
+    assert read_support(fitted / "field.safetensors", record, 2) is None  # still in training
+    assert read_support(fitted / "other.safetensors", record, 1) is None
+    assert read_support(tmp_path / "field.safetensors", record, 1) is None
+    (tmp_path / SUPPORT_FILE).write_bytes(b"junk")
+    with pytest.raises(InputError, match="damaged"):
+        read_support(tmp_path / "field.safetensors", record, 1)
+
+
+def test_everything_can_be_kept() -> None:
+    cloud = add_outliers(sample_sphere(2000), 0.05)
+    config = dataclasses.replace(SMALL, steps=(3, 3), drop_outliers=False, turn_normals=False, isolation=None)
+    run = fit(cloud, config)
+    assert run.record["cleaning"]["kept"] == 2100
+    assert run.record["stages"][0]["review"]["dropped_outliers"] == 0
+
+
+def test_level_zero_alone_judges() -> None:
+    field = MultiscaleSDF(Sphere(radius=0.5), [Siren(8, 1)], [0.05])
+    points, normals = tensors(sample_sphere(2000))
+    found = review_points(points, normals, field, device=CPU, outliers=True, turn=True)
+    assert not found.dropped.any()
+    assert not found.turned.any()
