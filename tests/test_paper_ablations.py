@@ -384,9 +384,9 @@ def test_isolation_rows() -> None:
     assert a.published[6:10] == (3.87e-5, 1.38e-5, 5.86e-3, 0.653)
     assert [row.values for row in culling.rows] == [
         (2.0, "1 to 3"),
-        (1.5, "1 to 1"),
-        (5.0, "2 to 2"),
-        (50.0, "1,234 to 1,234"),
+        (1.5, "1"),
+        (5.0, "2"),
+        (50.0, "1,234"),
     ]
     assert culling.rows[3].published == (2.8e-1, "365 to 4,109")
 

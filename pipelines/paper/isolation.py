@@ -281,7 +281,7 @@ def _culling_table(records: Sequence[Record]) -> Table:
             outputs = _outputs(records, variant + suffix, NOISE)
             parts = [output["components"] for output in outputs if output.get("components") is not None]
             chamfer = CD_WITHOUT_CULLING[variant] if suffix else TAB_ISOLATION[variant][0][0]
-            span = f"{min(parts):,} to {max(parts):,}" if parts else None
+            span = " to ".join(f"{count:,}" for count in sorted({min(parts), max(parts)})) if parts else None
             published = (chamfer, COMPONENTS[variant] if suffix else None)
             name = VARIANTS[variant] + (", extracted without culling" if suffix else "")
             rows.append(Row(name, (mean(output.get("chamfer") for output in outputs), span), published))
