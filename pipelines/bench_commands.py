@@ -12,6 +12,7 @@ from types import MappingProxyType
 from .bench_colour_commands import NORMAL_MAP, TEXTURE
 from .bench_evolve_command import COMMAND as EVOLVE
 from .bench_reconstruct_command import COMMAND as RECONSTRUCT
+from .bench_scale_command import COMMAND as SCALE
 from .command import Command, add_json, check_output, positive, whole, write_json
 from .fit_settings import add_fit_settings, fit_settings
 from .paper.command import COMMAND as PAPER
@@ -194,5 +195,6 @@ BENCH_COMMANDS: Mapping[str, Command] = MappingProxyType(
         "bench reconstruct": RECONSTRUCT,
         "bench evolve": EVOLVE,
         "bench paper": PAPER,
+        "bench scale": SCALE,
     }
 )
