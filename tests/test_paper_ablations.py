@@ -1,5 +1,6 @@
 """The paper's ablations: exact distances, variants that are what they say, rows from made-up records, smoke cells."""
 
+import dataclasses
 import math
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from mplicits.pipelines.paper.ablations import (
     loss_weight_tables,
     short,
 )
-from mplicits.pipelines.paper.base import Base
+from mplicits.pipelines.paper.base import Base, reviewed
 from mplicits.pipelines.paper.cell import Cell
 from mplicits.pipelines.paper.isolation import (
     ISOLATION,
@@ -241,6 +242,15 @@ def test_a_level_trained_with_the_fits_own_weights_is_the_fits_own_level(base: B
     again = previous.with_level(network, delta=delta)
     torch.testing.assert_close(again.value(x), base.field.value(x, level=1), atol=1e-5, rtol=0)
     assert float((again.value(x) - previous.value(x)).abs().max()) > 1e-4
+
+
+def test_residual_levels_see_the_cloud_that_level_0_has_judged(base: Base) -> None:
+    normals = base.cloud.normals.copy()
+    normals[::40] *= -1
+    flipped = dataclasses.replace(base.cloud, normals=normals)
+    np.testing.assert_array_equal(reviewed(flipped, up_to(base.field, 0), base.config).normals, base.cloud.normals)
+    trusting = dataclasses.replace(base.config, turn_normals=False)
+    np.testing.assert_array_equal(reviewed(flipped, up_to(base.field, 0), trusting).normals, normals)
 
 
 def test_weights_stand_where_they_are_given(base: Base) -> None:

@@ -6,20 +6,23 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 
 from ...datasets import OrientedCloud
-from ...neural_fields import MultiscaleSDF, Similarity, load_field
+from ...neural_fields import Field, MultiscaleSDF, Similarity, load_field
 from ..cloud_distance import CloudDistance
 from ..fit import prepare
 from ..fit_config import FitConfig
+from ..fit_review import review_points
 from ..runs import find_field
 from .cell import Cell
+from .levels import device_of, up_to
 from .method import Workplace
 from .ours import Ours, our_config
 from .protocol import damaged_cloud
 
-__all__ = ["Base", "base_cell", "base_of"]
+__all__ = ["Base", "base_cell", "base_of", "reviewed"]
 
 
 @dataclass(frozen=True)
@@ -30,7 +33,7 @@ class Base:
         field: all levels, frozen, on the device of the work.
         similarity: from input to unit-sphere coordinates.
         config: the settings it was fitted with.
-        cloud: what it learnt from.
+        cloud: what its residual levels learnt from.
     """
 
     field: MultiscaleSDF
@@ -62,4 +65,22 @@ def base_of(cell: Cell, work: Workplace, overrides: tuple[tuple[str, Any], ...] 
     saved = load_field(find_field(directory), device=work.device)
     assert isinstance(saved.field, MultiscaleSDF)
     config = our_config(wanted)
-    return Base(saved.field, saved.similarity, config, prepare(damaged_cloud(wanted), config))
+    cloud = reviewed(prepare(damaged_cloud(wanted), config), up_to(saved.field, 0), config)
+    return Base(saved.field, saved.similarity, config, cloud)
+
+
+def reviewed(cloud: OrientedCloud, coarse: Field, config: FitConfig) -> OrientedCloud:
+    """The cloud as the fit's residual levels see it, after ``coarse``, its level 0, has judged it."""
+    points, normals = torch.from_numpy(cloud.points), torch.from_numpy(cloud.normals)
+    found = review_points(
+        points,
+        normals,
+        coarse,
+        device=device_of(coarse),
+        outliers=config.drop_outliers,
+        turn=config.turn_normals and config.normals == "auto",
+    )
+    kept = ~found.dropped
+    turned = np.where(found.turned[:, None], -cloud.normals, cloud.normals)
+    colors = None if cloud.colors is None else cloud.colors[kept]
+    return dataclasses.replace(cloud, points=cloud.points[kept], normals=turned[kept], colors=colors)

@@ -15,8 +15,8 @@ from ..cloud_distance import CloudDistance
 from ..fit_config import FitConfig
 from ..sampling import (
     Samples,
+    band_of,
     band_samples,
-    delta_of,
     distance_samples,
     free_lengths,
     offset_samples,
@@ -80,7 +80,7 @@ def delta_after(index: CloudDistance, previous: Field, config: FitConfig) -> flo
     """Half-width of the band around the finest level of ``previous`` (Eq. 5)."""
     points = torch.from_numpy(index.points).to(device_of(previous))
     values = torch.cat([previous.value(part) for part in points.split(1 << 18)]).cpu()
-    return max(delta_of(values, epsilon=config.epsilon, quantile=config.quantile), 1e-6)
+    return band_of(values, epsilon=config.epsilon, quantile=config.quantile).delta
 
 
 def banded_sources(
