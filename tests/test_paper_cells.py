@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from mplicits.datasets import PointCloud, read_cloud
 from mplicits.neural_fields import InputError, Similarity, Sphere, extract_mesh
+from mplicits.pipelines.fit import Interrupted
 from mplicits.pipelines.mesh_files import write_mesh
 from mplicits.pipelines.paper import run as running
 from mplicits.pipelines.paper.cell import Cell
@@ -220,17 +221,19 @@ def test_what_is_not_installed_is_left_out(ball: Path, out: Path, known) -> None
     assert absent.runs == 0
 
 
-def test_ctrl_c_keeps_what_is_finished(ball: Path, out: Path, known) -> None:
+@pytest.mark.parametrize("reason", [KeyboardInterrupt(), Interrupted(None)])
+def test_ctrl_c_keeps_what_is_finished(ball: Path, out: Path, known, reason: BaseException) -> None:
     class Stopped(Exact):
         def run(self, cell, work):
-            raise KeyboardInterrupt
+            raise reason
 
-    good = Exact("good")
-    known(good, Stopped("stopped"))
+    good, stopped = Exact("good"), Stopped("stopped")
+    known(good, stopped)
     cells = [Cell(ball, "good", "smoke"), Cell(ball, "stopped", "smoke")]
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(type(reason)):
         run_cells(cells, out, say=lambda _: None)
     assert read_record(out, cell_key(cells[0], good)) is not None
+    assert not record_file(out, cell_key(cells[1], stopped)).exists()
 
 
 def test_recipes_learn_from_the_unit_sphere(ball: Path, out: Path, known) -> None:

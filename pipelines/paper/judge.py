@@ -14,7 +14,9 @@ from ...neural_fields import Field, InputError, Similarity, sphere_trace
 from ...neural_fields.meshing import Mesh, NoSurfaceError, extract_mesh
 from ..evaluate import evaluate_surfaces
 from ..mesh_files import write_mesh
+from ..mesh_trim import drop_unsupported
 from ..picture import picture_of, write_picture
+from ..support import Support
 from ..surface import Surface, from_mesh, read_surface
 from .cell import Cell
 from .method import Workplace
@@ -64,6 +66,7 @@ class Judge:
         parameters: int,
         train_seconds: float,
         lipschitz: float = STEEP,
+        support: Support | None = None,
     ) -> dict[str, Any]:
         """Extract a level, time a picture of it, and measure the mesh.
 
@@ -75,6 +78,7 @@ class Judge:
             parameters: trained numbers that it needs.
             train_seconds: until it was there.
             lipschitz: see `extract_mesh`.
+            support: the points of a fit of ours; components that rest on none of them are dropped, and counted.
         """
         field = field.to(self.work.device)
         started = time.perf_counter()
@@ -82,11 +86,15 @@ class Judge:
             mesh = extract_mesh(field, resolution=self.protocol.resolution, level=level, lipschitz=lipschitz)
         except NoSurfaceError:
             mesh = None
+        dropped = 0
+        if mesh is not None and support is not None:
+            mesh, dropped, _ = drop_unsupported(mesh, support.points, radius=support.radius)
         seconds = time.perf_counter() - started
         figures = self.mesh(
             name, mesh, similarity, parameters=parameters, train_seconds=train_seconds, mesh_seconds=seconds
         )
-        return figures | {"rays_per_second": None if mesh is None else self._rays_per_second(field, level)}
+        rays = None if mesh is None else self._rays_per_second(field, level)
+        return figures | {"dropped_components": dropped, "rays_per_second": rays}
 
     def mesh(
         self,

@@ -9,7 +9,8 @@ from typing import Any
 
 from ..fit import fit
 from ..fit_config import FitConfig
-from ..fit_state import STATE_FILE
+from ..fit_state import FIELD_FILE, STATE_FILE
+from ..support import read_support
 from .cell import Cell
 from .judge import Judge
 from .method import Findings, Method, Workplace
@@ -73,6 +74,7 @@ class Ours(Method):
                 parameters=count,
                 train_seconds=spent,
                 lipschitz=LIPSCHITZ,
+                support=read_support(directory / FIELD_FILE, run.record, level),
             )
             for level, (name, spent, count) in enumerate(
                 zip(level_names(len(stages)), seconds, parameters, strict=True)

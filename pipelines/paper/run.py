@@ -12,7 +12,7 @@ from pathlib import Path
 
 import torch
 
-from ..fit import choose_device
+from ..fit import Interrupted, choose_device
 from ..fit_state import environment
 from ..jobs import Outcome, check_jobs, run_jobs
 from .cell import Cell, Record
@@ -77,6 +77,7 @@ def run_cell(cell: Cell, out: Path, *, device: str = "cpu", progress: Report | N
     Raises:
         InputError: the cloud cannot be read or used. Whatever a method raises is kept as the record's "error", and
             such a cell is run again next time.
+        Interrupted: Ctrl-C during a fit of ours, which goes on there next time.
     """
     method = method_named(cell.method)
     key = cell_key(cell, method)
@@ -87,6 +88,8 @@ def run_cell(cell: Cell, out: Path, *, device: str = "cpu", progress: Report | N
     started = time.perf_counter()
     try:
         findings = method.run(cell, Workplace(out, key, device, progress))
+    except Interrupted:
+        raise
     except Exception as error:
         write_record(out, key, head | {"error": " ".join(str(error).split()) or type(error).__name__})
         raise
