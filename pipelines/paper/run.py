@@ -146,7 +146,7 @@ def run_cells(cells: Sequence[Cell], out: Path, *, jobs: int = 1, device: str = 
     waiting = [cell for cell in possible if cell not in records]
     if records and waiting:
         say(f"{len(records)} of {len(possible)} cells are there already")
-    counter = _Counter(len(waiting), jobs, say)
+    counter = _Counter(len(waiting), say)
     work = functools.partial(run_cell, out=out, device=where)
     failures: dict[Cell, str] = {}
     # Variants of our own start from a fit that is a cell of the first group, and must not train it twice side by side.
@@ -169,8 +169,8 @@ def kept_records(cells: Sequence[Cell], out: Path) -> Mapping[Cell, Record]:
 class _Counter:
     """One line per finished cell, with the time left at the mean pace so far."""
 
-    def __init__(self, total: int, jobs: int, say: Say) -> None:
-        self.total, self.jobs, self.say = total, jobs, say
+    def __init__(self, total: int, say: Say) -> None:
+        self.total, self.say = total, say
         self.done, self.started = 0, time.monotonic()
 
     def __call__(self, outcome: Outcome[Cell, Record]) -> None:
