@@ -1,4 +1,9 @@
-"""Colours that ride along with a surface that moves: a texture is asked where a point was at the start."""
+"""Colours that ride along with a surface that moves: a texture is asked where a point was at the start.
+
+Where it was is integrated back in time for the vertices of a coarse mesh of the moment. What lies between them moves by
+the affine map that fits the nearest ones best, and is then laid onto the surface of the start: displacements are
+smooth, colours need not be.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +13,8 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from ..neural_fields import (
@@ -35,7 +42,11 @@ __all__ = ["RIDE", "Colors", "RidingColors", "borrowed_texture", "colors_at", "s
 Colors = Callable[[Tensor], Tensor]
 # A fixed step: near a change of topology adaptive ones would shrink to nothing, for the sake of a few points.
 RIDE = Solver(method="rk4", step=0.05)
-ROWS = 1 << 16
+# The mesh whose vertices are carried, in cells along the box, and how many of them a point looks to.
+CARRIED = 48
+NEIGHBORS = 8
+# Neighbours lie nearly in a plane: across it the affine map is held back by this share of their spread.
+RIDGE = 1e-3
 # Whether a texture is that of the start is looked at on so coarse a mesh; its vertices may be this far off on average.
 CHECKED = 48
 ASTRAY = 0.03
@@ -101,21 +112,35 @@ class RidingColors:
         self._field, self._texture, self._level = field, texture, level
         self._placed = placed or Similarity.identity()
 
-    def at(self, time: float) -> Colors:
-        """The colours of points of the surface at a time."""
-        return lambda points: self._colors(points, time)
-
     @torch.no_grad()
-    def _colors(self, points: Tensor, time: float) -> Tensor:
-        if time == 0 or not len(points):
-            return self._of_start(points)
-        start = moment(self._field, 0.0)
+    def at(self, time: float) -> Colors:
+        """The colours of points of the surface at a time.
+
+        Raises:
+            InputError: the points cannot be followed back.
+        """
+        if time == 0:
+            return self._of_start
         try:
-            back = [flow(self._velocity, part, time, 0.0, solver=RIDE) for part in points.split(ROWS)]
+            mesh = extract_mesh(moment(self._field, time), resolution=CARRIED, level=self._level, normals=False)
+        except NoSurfaceError:
+            return self._of_start  # there is nothing to be coloured
+        vertices = torch.from_numpy(mesh.vertices).to(self._field.deltas)
+        try:
+            displacement = flow(self._velocity, vertices, time, 0.0, solver=RIDE) - vertices
         except IntegrationError as error:
             raise InputError(f"colours cannot ride along to time {time:.3g} ({error}); leave them out") from error
-        moved = [project_to_surface(start, part, level=self._level)[0] for part in back]
-        return self._of_start(torch.cat(moved))
+        between = _Between(mesh.vertices, displacement.double().cpu().numpy())
+        start = moment(self._field, 0.0)
+
+        @torch.no_grad()
+        def colors(points: Tensor) -> Tensor:
+            if not len(points):
+                return self._of_start(points)
+            moved = points + torch.from_numpy(between(points.double().cpu().numpy())).to(points)
+            return self._of_start(project_to_surface(start, moved, level=self._level)[0])
+
+        return colors
 
     def _of_start(self, points: Tensor) -> Tensor:
         """The colours of points of the surface at time 0."""
@@ -125,6 +150,27 @@ class RidingColors:
     @cached_property
     def _velocity(self) -> CarriedVelocity:
         return CarriedVelocity(self._field, level=self._level)
+
+
+class _Between:
+    """Displacements between the points ``(V, 3)`` at which they are known: weighted affine least squares."""
+
+    def __init__(self, points: NDArray[np.floating], displacement: NDArray[np.float64]) -> None:
+        self._tree, self._points, self._displacement = KDTree(points), np.asarray(points, np.float64), displacement
+
+    def __call__(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Displacements ``(N, 3)`` of points ``(N, 3)``."""
+        away, near = self._tree.query(x, k=min(NEIGHBORS, len(self._points)), workers=-1)
+        away, near = np.reshape(away, (len(x), -1)), np.reshape(near, (len(x), -1))
+        weights = 1 / (away**2 + 0.1 * away[:, -1:] ** 2 + 1e-20)
+        weights = (weights / weights.sum(axis=1, keepdims=True))[..., None]
+        places, shifts = self._points[near], self._displacement[near]
+        place, shift = (weights * places).sum(axis=1), (weights * shifts).sum(axis=1)
+        across = places - place[:, None]
+        spread = np.einsum("nki,nkj->nij", weights * across, across)
+        spread += (RIDGE * np.trace(spread, axis1=1, axis2=2) + 1e-20)[:, None, None] * np.eye(3)
+        slope = np.linalg.solve(spread, np.einsum("nki,nkj->nij", weights * across, shifts - shift[:, None]))
+        return shift + np.einsum("ni,nij->nj", x - place, slope)
 
 
 def colors_at(run: str | Path, field: Field, time: float | None) -> Colors | None:
