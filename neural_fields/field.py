@@ -51,7 +51,8 @@ class Field(nn.Module, ABC):
     Attributes:
         in_dim: dimension d of the domain, 3, or 4 for (x, y, z, t).
         num_levels: how many levels of detail the field has.
-        deltas: ``(num_levels - 1,)`` half-widths of the bands, in the field's own units.
+        deltas: ``(num_levels - 1,)`` half-widths of the bands, in the field's own units; infinite where there is no
+            band, because the next level is an alternative and not a refinement.
     """
 
     in_dim: int

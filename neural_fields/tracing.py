@@ -92,7 +92,8 @@ def sphere_trace(
         capture: the |f| that the fixed mode takes for a hit.
 
     Raises:
-        ValueError: shapes do not fit, the field is not three-dimensional, or a number is out of range.
+        ValueError: shapes do not fit, the field is not three-dimensional, a number is out of range, or a ``budget`` is
+            for a level without a band.
 
     Example:
         >>> import torch
@@ -105,6 +106,8 @@ def sphere_trace(
     _check(field, origins, directions, tolerance=tolerance, resolution=resolution, lipschitz=lipschitz)
     if budget is not None and len(budget) != level + 1:
         raise ValueError(f"budget={list(budget)}: expected {level + 1} number(s) of steps, one for each level")
+    if budget is not None and bool((field.deltas[:level].isinf().cpu() & (torch.tensor(budget[:level]) > 0)).any()):
+        raise ValueError(f"budget={list(budget)}: a level without a band leads to no other; give it 0 steps")
     rule = Rule(field.deltas[:level].to(directions), tolerance, resolution, lipschitz)
     ends = _Ends(near, far, radius)
     return _trace(field, origins, directions, level, ends, rule, None, max_steps, budget, capture)[0]

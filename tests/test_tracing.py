@@ -269,6 +269,15 @@ def test_the_papers_budget_converges_head_on_and_counts():
     assert int(hits.steps[2]) == 0
 
 
+def test_levels_without_bands_lead_nowhere():
+    field, origin = small_multiscale(), torch.tensor([0.0, 0.0, -2.0])
+    field.deltas.fill_(torch.inf)
+    direction = torch.tensor([0.0, 0.0, 1.0])
+    with pytest.raises(ValueError, match=r"budget=\[20, 5\]: a level without a band leads to no other"):
+        sphere_trace(field, origin, direction, level=1, budget=(20, 5))
+    assert int(sphere_trace(field, origin, direction, level=1, budget=(0, 20)).steps) <= 20
+
+
 def test_a_small_budget_leaves_holes_that_the_default_does_not():
     origins, directions = random_rays(1000, spread=0.75)
     expected = torus_depth(origins, directions, 0.5, 0.2).isfinite()

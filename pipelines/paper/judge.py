@@ -136,7 +136,11 @@ class Judge:
         size = self.protocol.image
         corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
         origin, directions = orbit(corners, width=size, height=size).rays(device=self.work.device)
-        budget = (FIRST_STEPS, *[MORE_STEPS] * field.resolve_level(level))
+        # Levels without bands are alternatives: the one that is wanted is then the first to be traced.
+        level = field.resolve_level(level)
+        leading = [index for index in range(level) if field.deltas[index].isfinite()]
+        budget = [FIRST_STEPS if index == min([*leading, level]) else MORE_STEPS for index in range(level + 1)]
+        budget = [steps if index in leading or index == level else 0 for index, steps in enumerate(budget)]
         started = time.perf_counter()
         hits = sphere_trace(field, origin, directions, level=level, budget=budget)
         hits.mask.any().item()  # a GPU works on after the call returns

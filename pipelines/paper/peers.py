@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import importlib
 import time
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -24,6 +26,10 @@ class FromRecipe(Method):
     def __init__(self, recipe: Recipe) -> None:
         self.recipe = recipe
         self.name, self.source, self.differs = recipe.name, recipe.source, recipe.differs
+
+    def settings(self, cell: Cell) -> Mapping[str, Any]:
+        """Size and schedule at the cell's preset."""
+        return {"recipe": repr(self.recipe.presets[cell.preset])}
 
     def run(self, cell: Cell, work: Workplace) -> Findings:
         """Train, then measure every output."""

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Sequence
-from typing import Literal, NamedTuple
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -57,11 +57,13 @@ class Recipe(ABC):
         name: as in the command, e.g. "idf".
         source: the paper, and what it says.
         differs: what differs here.
+        presets: size and schedule at each preset; what they print as tells two settings apart.
     """
 
     name: str
     source: str
     differs: str
+    presets: Mapping[Preset, Any]
 
     @abstractmethod
     def train(

@@ -103,7 +103,8 @@ class InstantNgpRecipe(Recipe):
         size: Literal["coarse", "fine"],
         presets: Mapping[tuple[str, Preset], NgpSettings] = NGP_PRESETS,
     ) -> None:
-        self.size, self.presets = size, presets
+        self.size = size
+        self.presets = {preset: settings for (one, preset), settings in presets.items() if one == size}
         self.name = f"ingp-{size}"
 
     def train(
@@ -116,7 +117,7 @@ class InstantNgpRecipe(Recipe):
         progress: Report | None = None,
     ) -> Trained:
         """See `Recipe.train`."""
-        started, settings = time.perf_counter(), self.presets[self.size, preset]
+        started, settings = time.perf_counter(), self.presets[preset]
         field = settings.grid.field(seed=seed).to(device)
         pools = SignedPools(
             cloud, settings.pool * 3 // 4, settings.pool // 4, settings.spread, seed=seed, device=device
