@@ -204,7 +204,6 @@ COMMAND = Command(
   mplicits fit scan.ply -o runs/quick --preset fast
   mplicits fit scan.ply -o runs/scan --resume
   mplicits fit bunny.ply spot.ply sword.ply -o runs --jobs 2
-  torchrun --nproc-per-node 2 --no-python mplicits fit scan.ply -o runs/scan
   mplicits fit scan.xyz -o runs/mine --normals estimate --time-budget 120 --steps 2000 1000 1000
   mplicits fit depth.png --intrinsics camera.json --color color.png -o runs/room --mesh room.glb
   mplicits fit depth/ --intrinsics camera.json --color color/ --poses trajectory.log -o runs/room""",
