@@ -36,6 +36,7 @@ def _mesh_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("run", metavar="RUN", help="run directory or .safetensors file")
     parser.add_argument("-o", "--out", required=True, type=Path, metavar="FILE", help=", ".join(MESH_FILES))
     parser.add_argument("--resolution", type=whole(8, 2048), default=256, metavar="N", help="cells per side (256)")
+    parser.add_argument("--time", type=float, metavar="T", help="the moment from 0 to 1, of a run that moves")
     parser.add_argument("--level", type=whole(0), metavar="L", help="0 is the coarsest (default: the finest)")
     parser.add_argument(
         "--normal-level", type=whole(0), metavar="L", help="normals of this level on the mesh (default: of its own)"
@@ -49,6 +50,9 @@ def _mesh_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--texture-faces", type=whole(4), default=50_000, metavar="N", help="triangles to keep with --texture (50000)"
+    )
+    parser.add_argument(
+        "--keep-unsupported", action="store_true", help="keep components that no input points support, too"
     )
     parser.add_argument("--keep-largest", action="store_true", help="keep only the component of largest area")
     parser.add_argument(
@@ -66,16 +70,18 @@ def _mesh(arguments: argparse.Namespace) -> int:
     started = time.monotonic()
     options = MeshOptions(
         resolution=arguments.resolution,
+        time=arguments.time,
         level=arguments.level,
         normal_level=arguments.normal_level,
         colors=not arguments.no_colors,
         texture=arguments.texture,
         texture_faces=arguments.texture_faces,
+        keep_unsupported=arguments.keep_unsupported,
         keep_largest=arguments.keep_largest,
         trim_distance=arguments.trim_distance,
         cloud=arguments.cloud,
     )
-    mesh = mesh_run(arguments.run, arguments.out, options)
+    mesh = mesh_run(arguments.run, arguments.out, options, say=print)
     seconds = time.monotonic() - started
     print(f"{arguments.out}: {len(mesh.vertices):,} vertices, {len(mesh.faces):,} faces, in {seconds:.1f} s")
     return 0

@@ -112,7 +112,7 @@ def _fit_one(arguments: argparse.Namespace, config: FitConfig | None) -> int:
             return 130
     started = time.monotonic()
     try:
-        made = mesh.extract()
+        made = mesh.extract(say=print)
     except KeyboardInterrupt:
         print(f"interrupted; fit and texture are finished; {again}", file=sys.stderr)
         return 130

@@ -73,7 +73,11 @@ def _describe_record(record: dict[str, Any]) -> Rows:
     rows: Rows = [("fitted to", str(record.get("cloud", "?")))]
     cleaning, environment = record.get("cleaning", {}), record.get("environment", {})
     if cleaning:
-        rows.append(("points", f"{cleaning['kept']:,} of {cleaning['read']:,}, normals {cleaning['normals_source']}"))
+        points = f"{cleaning['kept']:,} of {cleaning['read']:,}, normals {cleaning['normals_source']}"
+        for name, what in (("dropped_outliers", "strays dropped"), ("turned_normals", "normals turned round")):
+            if cleaning.get(name):
+                points += f", {cleaning[name]:,} {what}"
+        rows.append(("points", points))
     rows.append(("state", "finished" if record.get("finished") else "unfinished: --resume continues it"))
     if "training_seconds" in record:
         rows.append(("time", f"{record['training_seconds']:.1f} s"))
