@@ -3,6 +3,7 @@
 import dataclasses
 import json
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -236,9 +237,10 @@ def test_ctrl_c_keeps_what_is_finished(ball: Path, out: Path, known, reason: Bas
     assert not record_file(out, cell_key(cells[1], stopped)).exists()
 
 
-def test_recipes_learn_from_the_unit_sphere(ball: Path, out: Path, known) -> None:
+def test_recipes_learn_from_the_unit_sphere(ball: Path, out: Path, known, monkeypatch) -> None:
     class Known(Recipe):
         name, source, differs = "known", "s", "d"
+        presets: ClassVar = {"smoke": "tiny"}
 
         def train(self, cloud, preset, *, seed=0, device="cpu", progress=None):
             radii = np.linalg.norm(cloud.points, axis=1)
@@ -250,6 +252,11 @@ def test_recipes_learn_from_the_unit_sphere(ball: Path, out: Path, known) -> Non
     (output,) = record["outputs"]
     assert output["chamfer"] < 1.5 * output["chamfer_floor"]
     assert record["details"] == {"steps": 17}
+    # Another size or schedule makes another cell.
+    cell, method = Cell(ball, "known", "smoke", seed=2), FromRecipe(Known())
+    before = cell.key(method.settings(cell))
+    monkeypatch.setattr(Known, "presets", {"smoke": "larger"})
+    assert cell.key(method.settings(cell)) != before
     assert record["method"] == {"source": "s", "differs": "d"}
 
 

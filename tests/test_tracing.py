@@ -16,6 +16,7 @@ from mplicits.neural_fields import (
     cone_starts,
     sphere_trace,
 )
+from mplicits.neural_fields.baselines import BaconSDF
 from torch import Tensor
 
 THREE_D = {name: make for name, make in FIELDS.items() if make().in_dim == 3}
@@ -133,6 +134,10 @@ def nested(field: Field) -> Field:
                 assert isinstance(residual, Siren)
                 residual.output.weight.mul_(0.1)
                 residual.output.bias.mul_(0.1)
+    if isinstance(field, BaconSDF):  # an untrained product of sines is far steeper than any distance
+        with torch.no_grad():
+            for parameter in field.heads.parameters():
+                parameter.mul_(0.02)
     return field
 
 

@@ -35,6 +35,7 @@ __all__ = [
 
 F = TypeVar("F", bound=Field)
 
+SPHERE_RADIUS = 0.4  # of what a network begins as
 # Half-edge of the cube that points off the surface are drawn from: the mesher's box and a little more.
 CUBE = 1.05
 
@@ -84,23 +85,32 @@ def siren_loss(
 
 
 class _CloudBatches:
-    """Batches of half cloud points with their normals, half points of the cube: SIREN's and IDF's sampling."""
+    """Batches of cloud points with their normals and of points of the cube: SIREN's and IDF's sampling.
 
-    def __init__(self, cloud: OrientedCloud, batch: int, *, seed: int, device: str) -> None:
+    Args:
+        cloud: whose points are drawn.
+        batch: points in all.
+        share: of them, those in the cube.
+        seed: of what is drawn.
+        device: where the batches go.
+    """
+
+    def __init__(self, cloud: OrientedCloud, batch: int, share: float, *, seed: int, device: str) -> None:
         self.points, self.normals = torch.from_numpy(cloud.points), torch.from_numpy(cloud.normals)
-        self.half, self.device = batch // 2, device
+        self.off, self.device = round(share * batch), device
+        self.on = batch - self.off
         self.generator = torch.Generator().manual_seed(seed)
 
     def draw(self) -> tuple[Tensor, Tensor]:
-        """Points ``(2 M, 3)``, of which the first M are on the surface, and the normals ``(M, 3)`` there."""
-        chosen = torch.randint(len(self.points), (self.half,), generator=self.generator)
-        off = (2 * torch.rand(self.half, 3, generator=self.generator) - 1) * CUBE
+        """Points ``(N, 3)``, of which the first M are on the surface, and the normals ``(M, 3)`` there."""
+        chosen = torch.randint(len(self.points), (self.on,), generator=self.generator)
+        off = (2 * torch.rand(self.off, 3, generator=self.generator) - 1) * CUBE
         return torch.cat((self.points[chosen], off)).to(self.device), self.normals[chosen].to(self.device)
 
 
 @dataclass(frozen=True)
 class SirenSettings:
-    """Size and schedule of `SirenRecipe` at one preset; ``batch`` counts both halves."""
+    """Size and schedule of `SirenRecipe` at one preset; ``batch`` counts points on the surface and off it."""
 
     width: int
     depth: int
@@ -109,11 +119,14 @@ class SirenSettings:
     batch: int
     rate: float
     final: float  # last rate over the first; 1 keeps it
+    share: float = 0.5  # of a batch off the surface
+    sphere_steps: int = 0  # towards a sphere, before the training proper
+    sphere_rate: float = 5e-4  # at 3e-3 nothing is left of a sphere at ω₀ = 30, and the training finds no surface
 
 
 SIREN_PRESETS: Mapping[Preset, SirenSettings] = {
     "smoke": SirenSettings(48, 2, 15.0, 150, 256, 3e-3, 0.01),
-    "cpu": SirenSettings(128, 4, 30.0, 3000, 1024, 1e-3, 0.01),
+    "cpu": SirenSettings(128, 4, 30.0, 3000, 1024, 5e-4, 0.01, share=0.6, sphere_steps=200),
     "paper": SirenSettings(256, 4, 30.0, 100_000, 2800, 1e-4, 1.0),
 }
 
@@ -150,8 +163,15 @@ class SirenRecipe(Recipe):
     ) -> Trained:
         """See `Recipe.train`."""
         started, settings = time.perf_counter(), self.presets[preset]
-        field = _seeded(lambda: Siren(settings.width, settings.depth, omega=settings.omega), seed).to(device)
-        batches = _CloudBatches(cloud, settings.batch, seed=seed, device=device)
+
+        def begin() -> Siren:
+            field = Siren(settings.width, settings.depth, omega=settings.omega)
+            if settings.sphere_steps:
+                fit_sphere(field, SPHERE_RADIUS, steps=settings.sphere_steps, learning_rate=settings.sphere_rate)
+            return field
+
+        field = _seeded(begin, seed).to(device)
+        batches = _CloudBatches(cloud, settings.batch, settings.share, seed=seed, device=device)
 
         def loss(step: int) -> Tensor:
             points, normals = batches.draw()
@@ -280,7 +300,7 @@ def laplacian_samples(
 
 @dataclass(frozen=True)
 class IdfSettings:
-    """Size and schedule of `IdfRecipe` at one preset; ``batch`` counts both halves."""
+    """Size and schedule of `IdfRecipe` at one preset; ``batch`` counts points on the surface and off it."""
 
     width: int
     depth: int
@@ -290,11 +310,13 @@ class IdfSettings:
     batch: int
     rates: tuple[float, float]  # peaks, of the base and of the displacement
     betas: tuple[float, float]
+    share: float = 0.5  # of a batch off the surface
+    sphere_rate: float = 3e-3
 
 
 IDF_PRESETS: Mapping[Preset, IdfSettings] = {
     "smoke": IdfSettings(48, 2, (8.0, 15.0), 20, 200, 256, (3e-3, 1e-3), (0.9, 0.99)),
-    "cpu": IdfSettings(128, 4, (15.0, 60.0), 100, 1500, 1024, (1e-3, 1e-4), (0.9, 0.99)),
+    "cpu": IdfSettings(128, 4, (15.0, 60.0), 200, 1500, 1024, (1e-3, 1e-4), (0.9, 0.99), share=0.6, sphere_rate=5e-4),
     "paper": IdfSettings(256, 4, (15.0, 60.0), 25_000, 117_000, 8192, (1e-4, 1e-4), (0.1, 0.9)),
 }
 # Fractions of the schedule at which the base alone has been trained, and at which it is frozen.
@@ -339,11 +361,11 @@ class IdfRecipe(Recipe):
 
         def begin() -> IdfSDF:
             field = IdfSDF(settings.width, settings.depth, omegas=settings.omegas)
-            fit_sphere(field.base, 0.4, steps=settings.sphere_steps)
+            fit_sphere(field.base, SPHERE_RADIUS, steps=settings.sphere_steps, learning_rate=settings.sphere_rate)
             return field
 
         field = _seeded(begin, seed).to(device)
-        batches = _CloudBatches(cloud, settings.batch, seed=seed, device=device)
+        batches = _CloudBatches(cloud, settings.batch, settings.share, seed=seed, device=device)
 
         def loss(step: int) -> Tensor:
             done = step / settings.steps
