@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 
 import numpy as np
+import torch
 
 from ..datasets import OrientedCloud
 from .surface import Surface
@@ -41,7 +42,8 @@ def screened_poisson(cloud: OrientedCloud, *, depth: int = 10, trim: float = 0.0
     points, normals = cloud.points.astype(np.float64), cloud.normals.astype(np.float64)
     mesh = pymeshlab.Mesh(vertex_matrix=points, v_normals_matrix=normals)  # pyright: ignore[reportAttributeAccessIssue]
     meshes.add_mesh(mesh)
-    meshes.generate_surface_reconstruction_screened_poisson(depth=depth)
+    # Its threads wait for each other by spinning: more than there are cores for them, and they take ten times as long.
+    meshes.generate_surface_reconstruction_screened_poisson(depth=depth, threads=torch.get_num_threads())
     mesh = meshes.current_mesh()
     vertices = np.asarray(mesh.vertex_matrix(), np.float64)
     faces = np.asarray(mesh.face_matrix(), np.int64)
