@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 from mplicits.datasets import OrientedCloud, prepare_cloud, sample_sphere
-from mplicits.neural_fields import Field, Jet, extract_mesh, sphere_trace
+from mplicits.neural_fields import Field, Jet, Siren, extract_mesh, sphere_trace
 from mplicits.neural_fields.baselines import BaconSDF, IdfSDF
 from mplicits.neural_fields.baselines.idf import attenuation
 from mplicits.pipelines.cloud_distance import CloudDistance
@@ -20,6 +20,8 @@ from mplicits.pipelines.paper.recipes_networks import (
     IdfRecipe,
     SirenRecipe,
     SirenWeights,
+    _CloudBatches,
+    begin_as_sphere,
     displaced,
     hand_over,
     laplacian_samples,
@@ -274,6 +276,32 @@ def test_siren_loss_by_hand() -> None:
     assert term(normal=3.0) == pytest.approx(0.5)
     assert term(eikonal=3.0) == pytest.approx(1.5)
     assert term(off_surface=3.0) == pytest.approx(math.exp(-2.0))
+
+
+@pytest.mark.parametrize("omega", [SIREN_PRESETS["cpu"].omega, IDF_PRESETS["cpu"].omegas[0]])
+def test_sphere_start_reaches_into_the_corners_of_the_cube(omega: float) -> None:
+    torch.manual_seed(0)
+    network = Siren(128, 4, omega=omega)
+    begin_as_sphere(network, 200, batch=256)
+    x = 2.1 * torch.rand(20_000, 3) - 1.05
+    value, distance = network.value(x).detach(), x.norm(dim=1)
+    assert float((value - (distance - 0.4)).abs().mean()) < 0.02
+    assert bool((value[distance > 1] > 0.2).all())
+
+
+def test_no_step_towards_a_sphere_changes_nothing() -> None:
+    network = Siren(8, 1)
+    before = [parameter.clone() for parameter in network.parameters()]
+    begin_as_sphere(network, 0)
+    assert all(torch.equal(a, b) for a, b in zip(before, network.parameters(), strict=True))
+
+
+def test_batches_hold_the_share_of_points_off_the_surface(sphere: OrientedCloud) -> None:
+    points, normals = _CloudBatches(sphere, 200, 0.6, seed=0, device="cpu").draw()
+    assert (len(points), len(normals)) == (200, 80)
+    torch.testing.assert_close(points[:80].norm(dim=1), torch.ones(80), atol=2e-3, rtol=0)
+    torch.testing.assert_close(points[:80], normals, atol=0.05, rtol=0)
+    assert float(points[80:].norm(dim=1).std()) > 0.1
 
 
 def test_laplacian_samples_have_their_spread_and_stay_in_the_period(sphere: OrientedCloud) -> None:
