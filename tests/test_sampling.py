@@ -163,3 +163,16 @@ def test_signed_distance_of_a_torus_cloud() -> None:
     clear = expected.abs() > 0.01
     assert torch.equal(found.sign()[clear], expected.sign()[clear])
     assert (found - expected).abs().mean() < 1e-3
+
+
+def test_signs_on_both_sides_of_a_sheet_two_spacings_thick() -> None:
+    """A flat ellipsoid, 0.006 thick at most, of points 0.003 apart: neither side outvotes the other."""
+    axes = torch.tensor([0.3, 0.1, 0.003])
+    lattice, _ = sphere_points(12_000, 1.0)
+    points = lattice * axes
+    cloud = CloudDistance(points, torch.nn.functional.normalize(points / axes**2, dim=1))
+    assert 0.003 < cloud.spacing < 0.004
+    directions = torch.nn.functional.normalize(torch.randn(20_000, 3, generator=generator()), dim=1)
+    for scale, inside in ((0.3, True), (0.7, True), (1.5, False), (3.0, False)):
+        x = directions * axes * scale
+        assert ((cloud.signed(x) < 0) == inside).float().mean() > 0.995
