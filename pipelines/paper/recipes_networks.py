@@ -149,7 +149,7 @@ class SirenRecipe(Recipe):
     differs = (
         "points off the surface reach 5 % further out than the cube, as the mesher does; paper: 100,000 steps; "
         "cpu: (128, 4), 3,000 steps of 1,024 points in all, 60 % of them off the surface, rate falling from 5e-4 to "
-        "5e-6, after 200 steps towards a sphere in the whole cube, and with exp(−50 |f|); without all three, blobs stay"
+        "5e-6, after 200 steps towards a sphere in the whole cube, and with exp(−50 |f|), to keep blobs away"
     )
 
     def __init__(self, presets: Mapping[Preset, SirenSettings] = SIREN_PRESETS) -> None:
