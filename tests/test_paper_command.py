@@ -74,7 +74,7 @@ def test_a_bench(ball: Path, tmp_path: Path, exact, capsys: pytest.CaptureFixtur
     assert "| SIREN |" in printed
     assert "1 tables, 1 shapes, 2 cells" in said
     page = (out / "results.md").read_text()
-    assert f"mplicits bench paper {ball} -o {out} --table comparison --preset smoke" in page
+    assert f"mplicits bench paper {ball.name} -o {out.name} --table comparison --preset smoke" in page
     with (out / "comparison.csv").open() as file:
         rows = {row["method"]: row for row in csv.DictReader(file)}
     (section,) = json.loads(figures.read_text())

@@ -99,18 +99,23 @@ def _known(flag: str, names: Sequence[str], known: Sequence[Name], more: Sequenc
 
 
 def _command(arguments: argparse.Namespace) -> str:
-    """The command as it could be typed again."""
-    words = ["mplicits", "bench", "paper", *arguments.shapes, "-o", str(arguments.out)]
+    """The command as it could be typed again, beside the files: the page is for others, who have other folders."""
+    words = ["mplicits", "bench", "paper", *map(_nearby, arguments.shapes), "-o", _nearby(arguments.out)]
     words += ["--table", *arguments.table, "--preset", arguments.preset]
     if arguments.methods is not None:
         words += ["--methods", *arguments.methods]
     if arguments.reference is not None:
-        words += ["--reference", str(arguments.reference)]
+        words += ["--reference", _nearby(arguments.reference)]
     for name, usual in (("jobs", 1), ("seed", 0), ("device", "auto")):
         value = getattr(arguments, name)
         if value != usual:
             words += [f"--{name}", str(value)]
     return shlex.join(words)
+
+
+def _nearby(path: str | Path) -> str:
+    """A relative path as it is, and the name of an absolute one."""
+    return Path(path).name if Path(path).is_absolute() else str(path)
 
 
 COMMAND = Command(
