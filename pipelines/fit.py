@@ -40,7 +40,6 @@ from .sampling import (
     band_of,
     band_samples,
     distance_samples,
-    free_lengths,
     offset_samples,
     with_previous,
 )
@@ -283,7 +282,7 @@ class _Fitting:
                 Source("surface", surface.to(self.device), half, near, config.normal_weight, config.eikonal_weight),
                 Source("domain", domain, half, far, 0.0, config.eikonal_weight),
             ]
-        offset = offset_samples(index, free_lengths(index, delta), config.samples, generator=generator)
+        offset = offset_samples(index, delta, config.samples, generator=generator)
         band = band_samples(index, delta, config.samples, generator=generator)
         kept = {
             name: with_previous(samples, self.frozen, delta, device=self.device)

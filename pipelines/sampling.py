@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from ..neural_fields import Field, Jet
@@ -136,32 +137,46 @@ def distance_samples(cloud: CloudDistance, count: int, *, generator: torch.Gener
     return Samples(points, distance=cloud.signed(points))
 
 
-def free_lengths(cloud: CloudDistance, delta: float, *, steps: int = 8) -> Tensor:
-    """How far along ±normal each cloud point can be moved while it stays the closest: the paper's t_j ≤ δ.
+def free_lengths(
+    cloud: CloudDistance, delta: float, rows: NDArray[np.integer], inward: NDArray[np.bool_], *, steps: int = 8
+) -> Tensor:
+    """How far cloud points can be moved along ±normal while they stay the closest: the paper's t_j ≤ δ.
 
-    For each point and side the first t of ``steps`` decreasing ones for which the distance from x_j ± t N_j to the
-    cloud is t, up to the spacing of the cloud; 0 where none is.
+    For each the first t of ``steps`` decreasing ones for which the distance from x_j ± t N_j to the cloud is t, up to
+    the spacing of the cloud; 0 where none is.
+
+    Args:
+        cloud: the points.
+        delta: the largest t.
+        rows: ``(M,)`` which points.
+        inward: ``(M,)`` whether against the normal.
+        steps: how many t are tried.
 
     Returns:
-        ``(2, N)``: outward and inward lengths.
+        ``(M,)``.
     """
-    lengths = np.zeros((2, len(cloud.points)))
-    for side, sign in enumerate((1.0, -1.0)):
-        open_rows = np.arange(len(cloud.points))
-        for t in np.linspace(delta, delta / steps, steps):
-            moved = cloud.points[open_rows] + sign * t * cloud.normals[open_rows]
-            # A curved or noisy cloud has points a little nearer than t without another sheet being there.
-            clear = cloud.nearest(moved) >= 0.9 * t
-            lengths[side, open_rows[clear]] = t
-            open_rows = open_rows[~clear]
-    return torch.from_numpy(lengths.astype(np.float32))
+    lengths = np.zeros(len(rows), np.float32)
+    sign = np.where(inward, -1.0, 1.0)[:, None]
+    left = np.arange(len(rows))
+    for t in np.linspace(delta, delta / steps, steps):
+        moved = cloud.points[rows[left]] + sign[left] * t * cloud.normals[rows[left]]
+        # A curved or noisy cloud has points a little nearer than t without another sheet being there.
+        clear = cloud.nearest(moved) >= 0.9 * t
+        lengths[left[clear]] = t
+        left = left[~clear]
+    return torch.from_numpy(lengths)
 
 
-def offset_samples(cloud: CloudDistance, lengths: Tensor, count: int, *, generator: torch.Generator) -> Samples:
-    """Points x_j + t N_j with distance t and gradient N_j, t uniform in the free length on either side."""
+def offset_samples(cloud: CloudDistance, delta: float, count: int, *, generator: torch.Generator) -> Samples:
+    """Points x_j + t N_j with distance t and gradient N_j, t uniform in the free length on either side.
+
+    Lengths are found only for what is drawn: of a large cloud that is a small part.
+    """
     index = torch.randint(len(cloud.points), (count,), generator=generator)
     side = torch.randint(2, (count,), generator=generator)
-    t = lengths[side, index] * torch.rand(count, generator=generator) * (1 - 2.0 * side)
+    drawn, which = torch.unique(2 * index + side, return_inverse=True)
+    lengths = free_lengths(cloud, delta, (drawn // 2).numpy(), (drawn % 2 == 1).numpy())
+    t = lengths[which] * torch.rand(count, generator=generator) * (1 - 2.0 * side)
     normal = torch.from_numpy(cloud.normals)[index]
     return Samples(torch.from_numpy(cloud.points)[index] + t[:, None] * normal, distance=t, normal=normal)
 

@@ -111,14 +111,19 @@ def test_free_lengths_stop_halfway_to_the_next_sheet() -> None:
     inner, inner_normals = sphere_points(20_000, 0.5)
     outer, outer_normals = sphere_points(20_000, 0.6)
     cloud = CloudDistance(torch.cat((inner, outer)), torch.cat((-inner_normals, outer_normals)))
-    outward, inward = free_lengths(cloud, 0.08, steps=16)
+    rows = np.arange(40_000)
+    outward, inward = (free_lengths(cloud, 0.08, rows, np.full(40_000, side), steps=16) for side in (False, True))
+    some = np.array([39_999, 3, 3, 25_000])
+    ways = np.array([True, False, True, False])
+    expected = torch.stack((outward, inward))[ways.astype(int), some]
+    torch.testing.assert_close(free_lengths(cloud, 0.08, some, ways, steps=16), expected)
     assert inward.min() >= 0.04
     assert inward.max() <= 0.06  # the test of 0.9 t allows 0.0526
     assert (outward[20_000:] == 0.08).all()
 
 
 def test_offset_samples_have_the_distance_and_normal_they_claim(cloud: CloudDistance) -> None:
-    samples = offset_samples(cloud, free_lengths(cloud, 0.05), 5000, generator=generator())
+    samples = offset_samples(cloud, 0.05, 5000, generator=generator())
     assert samples.distance is not None
     assert samples.normal is not None
     jet = Sphere(radius=RADIUS).jet(samples.points)

@@ -18,7 +18,6 @@ from ..sampling import (
     band_of,
     band_samples,
     distance_samples,
-    free_lengths,
     offset_samples,
     with_previous,
 )
@@ -97,8 +96,7 @@ def banded_sources(
     Raises:
         InputError: one kind of samples is empty.
     """
-    lengths = free_lengths(index, delta)
-    offset = offset_samples(index, lengths, config.samples, generator=generator)
+    offset = offset_samples(index, delta, config.samples, generator=generator)
     band = band_samples(index, delta, config.samples, generator=generator)
     kept = [
         (name, with_previous(samples, previous, delta, device=device_of(previous)))
