@@ -317,6 +317,7 @@ def test_presets_grow() -> None:
     sizes = [protocol_of(preset) for preset in ("smoke", "cpu", "paper")]
     for name in ("resolution", "samples"):
         numbers = [getattr(size, name) for size in sizes]
-        assert numbers == sorted(set(numbers))
+        assert numbers == sorted(numbers)
+        assert numbers[0] < numbers[1]
     assert (sizes[2].resolution, sizes[2].samples, sizes[2].poisson_depth) == (512, 500_000, 10)
     assert fit_config("paper").widths == (128, 256, 400)
