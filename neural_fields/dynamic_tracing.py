@@ -17,7 +17,6 @@ clear of it. With ``reach=0`` every frame is a key frame, and nothing is assumed
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import torch
@@ -25,12 +24,10 @@ from torch import Tensor
 
 from .field import Field
 from .spacetime import SpaceTimeSDF, TimeSlice
-from .tracing import BOUNDING_RADIUS, Expected, Hits, Near, cone_ends, cone_starts, trace_expected
+from .tracing import BOUNDING_RADIUS, CONE_LIPSCHITZ, Expected, Hits, Near, cone_ends, cone_starts, trace_expected
 
-__all__ = ["DynamicTracer", "moment", "trace_sequence"]
+__all__ = ["DynamicTracer", "moment"]
 
-# Networks are a little steeper than a distance here and there, and a cone that goes too far loses thin parts.
-CONE_LIPSCHITZ = 1.15
 # How near a ray comes before a key frame takes note, in resolutions. More makes key frames fewer, the others dearer.
 REACH = 12.0
 # The speed is measured at those of so many points that are this near, by a difference over so long a time, and taken
@@ -218,34 +215,3 @@ class DynamicTracer:
             moved = depth + (depth - before.depth) * ((t - last.time) / (last.time - before.time))
             depth = torch.where(moved.isfinite(), moved, depth)
         return Expected(depth, last.slope, value)
-
-
-def trace_sequence(
-    field: Field,
-    times: Iterable[float],
-    origins: Tensor,
-    directions: Tensor,
-    *,
-    level: int = -1,
-    tolerance: float = 1e-5,
-    resolution: float = 1e-4,
-    lipschitz: float = 1.0,
-    radius: float = BOUNDING_RADIUS,
-    reach: float | None = None,
-    speed: float | None = None,
-) -> Iterator[Hits]:
-    """The hits of the same rays at one time after the other; see `DynamicTracer`."""
-    tracer = DynamicTracer(
-        field,
-        origins,
-        directions,
-        level=level,
-        tolerance=tolerance,
-        resolution=resolution,
-        lipschitz=lipschitz,
-        radius=radius,
-        reach=reach,
-        speed=speed,
-    )
-    for t in times:
-        yield tracer.trace(t)

@@ -24,6 +24,8 @@ __all__ = ["BOUNDING_RADIUS", "Expected", "Hits", "Near", "cone_ends", "cone_sta
 
 # Fields live in the unit sphere; their surfaces may pass it by a little.
 BOUNDING_RADIUS = 1.05
+# Networks are a little steeper than a distance here and there, and a cone that goes too far loses thin parts.
+CONE_LIPSCHITZ = 1.15
 
 
 class Hits(NamedTuple):

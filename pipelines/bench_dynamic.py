@@ -8,12 +8,13 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-import torch
 from skimage.measure import marching_cubes
 
 from ..datasets.cameras import Camera, orbit
 from ..neural_fields import Field, Hits, SpaceTimeSDF, extract_mesh, sphere_trace
 from ..neural_fields.dynamic_tracing import DynamicTracer, moment
+from ..neural_fields.meshing import DEFAULT_BOUNDS
+from .bench_mesh import evaluate_slabs
 from .counting import counted
 from .render import RESOLUTION, TOLERANCE, pixel_size, trace_hits
 from .timing import format_table
@@ -24,8 +25,6 @@ FIRST = 2  # frames that the dynamic tracer needs to know a motion; they are lef
 FRAMES_OF_MOTION = 96  # from t = 0 to t = 1: four seconds of a film
 START = 0.25
 OUTLINE_RESOLUTION = 64
-# Half the edge of the box that meshes are extracted from.
-BOX = 1.05
 
 # From a time to the hits, if that is what is made.
 Draw = Callable[[float], Hits | None]
@@ -114,7 +113,8 @@ def dynamic_table(
 
         return draw
 
-    fine, one = round(2 * BOX / pixel_size(camera)), times[FIRST : FIRST + 1]
+    edge = DEFAULT_BOUNDS[1][0] - DEFAULT_BOUNDS[0][0]
+    fine, one = round(edge / pixel_size(camera)), times[FIRST : FIRST + 1]
     figures = {
         "dynamic tracer": _run(dynamic, field, times[:FIRST], times[FIRST:]),
         "from scratch, tiles first": _run(tiles, field, (), times[FIRST:]),
@@ -165,12 +165,9 @@ def _camera(field: Field, times: Sequence[float], size: int) -> Camera:
 
 def _dense_mesh(field: Field, cells: int, level: int) -> None:
     """Marching cubes as in the paper: level 0 on every vertex, finer levels in their bands."""
-    axis = torch.linspace(-BOX, BOX, cells + 1)
-    slabs = []
-    for x in axis:
-        points = torch.cartesian_prod(x[None], axis, axis)
-        slabs.append(field.value(points, level=level).reshape(cells + 1, cells + 1))
-    marching_cubes(torch.stack(slabs).numpy(), 0.0, gradient_direction="descent")
+    values = np.empty((cells + 1,) * 3, np.float32)
+    evaluate_slabs(field, values, range(cells + 1), level=level)
+    marching_cubes(values, 0.0, gradient_direction="descent")
 
 
 def _run(

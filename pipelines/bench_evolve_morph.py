@@ -16,7 +16,7 @@ from .evolve_shapes import Placed, Placement
 from .fit import fit
 from .fit_config import FitConfig
 from .fit_state import FIELD_FILE, STATE_FILE
-from .surface import Surface, from_mesh, read_surface
+from .surface import from_mesh, read_reference
 from .timing import format_table
 from .training import Progress
 
@@ -83,7 +83,7 @@ def bench_morph(
     paths = [Path(first), Path(second)]
     if len({"morph", *(path.stem for path in paths)}) < 3:
         raise InputError(f"--meshes {first} {second}: their names are those of their runs; rename one")
-    references = [_reference(path) for path in paths]
+    references = [read_reference(path) for path in paths]
     runs = [directory / path.stem for path in paths]
     for path, run in zip(paths, runs, strict=True):
         interrupted = (run / STATE_FILE).is_file()
@@ -132,13 +132,6 @@ def format_morph(row: MorphRow) -> str:
     lines = [format_table(header, cells), f"trained in {row.seconds:.0f} s; the aim is a ratio below 1.5", ""]
     lines.append(format_table(("t", "volume", "components"), curve))
     return "\n".join([*lines, *(f"warning: {warning}" for warning in row.warnings)])
-
-
-def _reference(path: Path) -> Surface:
-    surface = read_surface(path)
-    if not len(surface.faces):
-        raise InputError(f"{path}: has no faces, so there is no surface to compare with; give a mesh")
-    return surface
 
 
 def _named(progress: Callable[[str, Progress], None], name: str) -> Callable[[Progress], None]:

@@ -9,14 +9,14 @@ from pathlib import Path
 from typing import Any
 
 from ..datasets import PointCloud, add_noise, orbit, read_cloud
-from ..neural_fields import InputError, Similarity
+from ..neural_fields import Similarity
 from ..neural_fields.meshing import NoSurfaceError, extract_mesh
 from .evaluate import Metrics, evaluate_surfaces
 from .fit import fit, prepare
 from .fit_config import FitConfig
 from .picture import contact_sheet, picture_of, write_picture
 from .poisson import has_poisson, screened_poisson
-from .surface import Surface, from_cloud, from_mesh, read_surface
+from .surface import Surface, from_cloud, from_mesh, read_reference
 from .timing import format_table
 from .training import Progress
 
@@ -77,7 +77,7 @@ def bench_fit(
     Raises:
         InputError: a file cannot be read, or holds no faces to compare with.
     """
-    references = [_reference(Path(shape)) for shape in shapes]
+    references = [read_reference(shape) for shape in shapes]
     rows: list[FitRow] = []
     for path, reference in zip(map(Path, shapes), references, strict=True):
         cloud = read_cloud(path)
@@ -125,13 +125,6 @@ def format_fit(rows: Sequence[FitRow]) -> str:
             )
         )
     return format_table(header, cells)
-
-
-def _reference(path: Path) -> Surface:
-    surface = read_surface(path)
-    if not len(surface.faces):
-        raise InputError(f"{path}: has no faces, so there is no surface to compare with; give a mesh")
-    return surface
 
 
 def _named(progress: Callable[[str, Progress], None], name: str) -> Callable[[Progress], None]:

@@ -24,7 +24,7 @@ from .counting import counted
 from .runs import find_field
 from .timing import format_table
 
-__all__ = ["MeshBench", "MeshRow", "bench_mesh", "format_bench_mesh"]
+__all__ = ["MeshBench", "MeshRow", "bench_mesh", "evaluate_slabs", "format_bench_mesh"]
 
 PAPER, DENSE = "level 0 on every vertex (paper)", "dense SIREN (256,4)"
 SAMPLED_SHARE = 1 / 32
@@ -183,7 +183,7 @@ def _paper(path: Path, resolution: int, keep: Path) -> MeshRow:
     field, levels = counted(load_field(path).field)
     start = time.perf_counter()
     values = np.empty((resolution + 1,) * 3, np.float32)
-    _evaluate_slabs(field, values, range(resolution + 1))
+    evaluate_slabs(field, values, range(resolution + 1))
     step = _step(resolution)
     vertices = marching_cubes(values, 0.0, spacing=(step, step, step))[0] + np.asarray(DEFAULT_BOUNDS[0])
     seconds = time.perf_counter() - start
@@ -196,21 +196,21 @@ def _dense(resolution: int, share: float) -> MeshRow:
     field = Siren(256, 4).requires_grad_(False)
     slabs = range(0, resolution + 1, round(1 / share))
     start = time.perf_counter()
-    _evaluate_slabs(field, np.empty((1, resolution + 1, resolution + 1), np.float32), slabs)
+    evaluate_slabs(field, np.empty((1, resolution + 1, resolution + 1), np.float32), slabs)
     done = len(slabs) / (resolution + 1)
     seconds = (time.perf_counter() - start) / done
     return MeshRow(DENSE, resolution, seconds, None, ((resolution + 1) ** 3,), 0, _peak(), done)
 
 
 @torch.inference_mode()
-def _evaluate_slabs(field: Field, values: NDArray[np.float32], slabs: Sequence[int]) -> None:
+def evaluate_slabs(field: Field, values: NDArray[np.float32], slabs: Sequence[int], *, level: int = -1) -> None:
     """Fill ``values`` with the field on some planes of constant x; with room for one plane only, overwrite it."""
     count = values.shape[1]
     axis = torch.arange(count) * _step(count - 1) + DEFAULT_BOUNDS[0][0]
     plane = torch.stack(torch.meshgrid(axis, axis, axis[:1], indexing="ij"), -1).reshape(-1, 3)[:, [2, 0, 1]]
     for slab in slabs:
         plane[:, 0] = axis[slab]
-        values[slab % len(values)] = field.value(plane).numpy().reshape(count, count)
+        values[slab % len(values)] = field.value(plane, level=level).numpy().reshape(count, count)
 
 
 def _step(resolution: int) -> float:

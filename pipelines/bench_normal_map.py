@@ -24,7 +24,7 @@ from .render import trace_view
 from .runs import find_field
 from .seen import Seen
 from .shading import ShadeOptions, compose, shade
-from .surface import Surface, from_mesh, read_surface
+from .surface import Surface, from_mesh, read_reference
 from .timing import format_table
 
 __all__ = ["NormalMapRow", "bench_normal_map", "format_normal_map"]
@@ -117,10 +117,7 @@ def bench_normal_map(
     field, similarity, _ = load_field(file, device=place)
     if field.num_levels < 2:
         raise InputError(f"{file}: has one level; normals are mapped from a finer level to a coarser one")
-    original = read_surface(reference)
-    if not len(original.faces):
-        raise InputError(f"{reference}: has no faces, so there is no surface to compare with; give a mesh")
-    original = original.moved(similarity)
+    original = read_reference(reference).moved(similarity)
     _check_place(field, original, f"{reference}", place)
     cameras = turntable(original.used_vertices(), views, width=size, height=size, up=up)
     say("the original")

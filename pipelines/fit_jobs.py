@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -17,7 +16,7 @@ from .config import load_config
 from .fit import fit
 from .fit_config import FitConfig
 from .fit_mesh import is_fitted
-from .fit_state import STATE_FILE, read_record
+from .fit_state import STATE_FILE, read_record, write_text
 from .jobs import Outcome, check_jobs, run_jobs
 from .runs import check_new_run
 from .timing import format_table
@@ -140,9 +139,7 @@ def _named(progress: Callable[[str, Progress], None], name: str) -> Callable[[Pr
 
 
 def _keep_settings(out: Path, config: FitConfig) -> None:
-    partial = out / f".{SETTINGS_FILE}.{os.getpid()}.partial"
-    partial.write_text(json.dumps({"config": dataclasses.asdict(config)}, indent=2) + "\n", encoding="utf-8")
-    partial.replace(out / SETTINGS_FILE)
+    write_text(out / SETTINGS_FILE, json.dumps({"config": dataclasses.asdict(config)}, indent=2) + "\n")
 
 
 def _kept_settings(out: Path) -> FitConfig:

@@ -32,6 +32,7 @@ __all__ = [
     "read_record",
     "save_state",
     "write_record",
+    "write_text",
 ]
 
 FIELD_FILE = "field.safetensors"
@@ -65,11 +66,16 @@ def environment(device: torch.device) -> dict[str, Any]:
     }
 
 
+def write_text(path: Path, text: str) -> None:
+    """Write a text file, whole or not at all, through a temporary one beside it; line ends stay as they are."""
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    partial.write_text(text, encoding="utf-8", newline="")
+    partial.replace(path)
+
+
 def write_record(directory: Path, record: Mapping[str, Any]) -> None:
     """Write ``run.json``, whole or not at all."""
-    partial = directory / f".{RECORD_FILE}.{os.getpid()}.partial"
-    partial.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
-    partial.replace(directory / RECORD_FILE)
+    write_text(directory / RECORD_FILE, json.dumps(record, indent=2) + "\n")
 
 
 def read_record(directory: Path) -> dict[str, Any]:

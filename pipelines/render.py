@@ -10,7 +10,7 @@ from torch.nn.functional import normalize
 
 from ..datasets.cameras import Camera
 from ..neural_fields import Field, Hits, TextureField, cone_starts, map_colors, sphere_trace
-from ..neural_fields.tracing import BOUNDING_RADIUS
+from ..neural_fields.tracing import BOUNDING_RADIUS, CONE_LIPSCHITZ
 from .seen import Seen
 
 __all__ = ["pixel_size", "see_hits", "trace_hits", "trace_view"]
@@ -19,8 +19,6 @@ __all__ = ["pixel_size", "see_hits", "trace_hits", "trace_view"]
 TOLERANCE = 0.1
 # Two crossings within this share of a pixel may be overlooked.
 RESOLUTION = 0.75
-# Networks are a little steeper than a distance here and there, and a cone that goes too far loses thin parts.
-CONE_LIPSCHITZ = 1.15
 # No Newton step is longer than this, in pixels: a hit on the jump at a gate's edge is right where it is.
 NEWTON_REACH = 2 * TOLERANCE
 # Below this slope along the ray a Newton step is not to be trusted: the surface may turn away before it arrives.

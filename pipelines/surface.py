@@ -27,6 +27,7 @@ __all__ = [
     "from_mesh",
     "is_closed",
     "merged",
+    "read_reference",
     "read_surface",
     "sample_surface",
 ]
@@ -76,6 +77,22 @@ def read_surface(path: str | Path) -> Surface:
         if mesh is not None:
             return mesh
     return from_cloud(read_cloud(path))
+
+
+def read_reference(path: str | Path, *, fix: str = "give a mesh") -> Surface:
+    """`read_surface` of something to compare with.
+
+    Args:
+        path: a mesh file.
+        fix: what the message advises where there are no faces.
+
+    Raises:
+        InputError: as `read_surface`, or there are no faces.
+    """
+    surface = read_surface(path)
+    if not len(surface.faces):
+        raise InputError(f"{path}: has no faces, so there is no surface to compare with; {fix}")
+    return surface
 
 
 def from_cloud(cloud: PointCloud) -> Surface:

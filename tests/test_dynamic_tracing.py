@@ -5,7 +5,7 @@ import torch
 from fields import SCREW, small_multiscale, small_spacetime
 from mplicits.datasets.cameras import look_at
 from mplicits.neural_fields import Field, Jet, Moving, RigidMotion, Sphere, TimeSlice, Torus, at_time, sphere_trace
-from mplicits.neural_fields.dynamic_tracing import DynamicTracer, moment, trace_sequence
+from mplicits.neural_fields.dynamic_tracing import DynamicTracer, moment
 from mplicits.neural_fields.tracing import Expected, cone_ends, trace_expected
 from torch import Tensor
 
@@ -76,8 +76,9 @@ def test_a_ball_that_turns_and_travels_is_met_where_it_is(tolerance):
     eye, directions = image(dtype=torch.float64)
     center = torch.tensor([-0.3, 0.1, 0.2], dtype=torch.float64)
     field = Moving(Sphere(radius=0.4, center=tuple(center.tolist())), SCREW).double()
-    hits = trace_sequence(field, TIMES, eye, directions, tolerance=tolerance)
-    for t, found in zip(TIMES, hits, strict=True):
+    tracer = DynamicTracer(field, eye, directions, tolerance=tolerance)
+    for t in TIMES:
+        found = tracer.trace(t)
         expected = sphere_depth(eye, directions, SCREW.forward(center, t), 0.4)
         assert torch.equal(found.mask, expected.isfinite())
         assert int(found.mask.sum()) > 100

@@ -17,7 +17,7 @@ from ..cloud_distance import CloudDistance
 from ..fit_config import FitConfig
 from .base import base_cell, base_of
 from .cell import Cell, Record
-from .judge import read_reference
+from .judge import reference_of
 from .levels import Weights, banded_sources, delta_after, generator_for, train_level, up_to
 from .mesh_distance import Float64, MeshDistance, approximation_error, near_surface
 from .method import Findings, Method, Workplace
@@ -165,7 +165,7 @@ class _Truth:
     """Points near the surface of a cell's shape, in the fit's coordinates, and their exact distances."""
 
     def __init__(self, cell: Cell, similarity: Similarity) -> None:
-        surface = read_reference(cell).moved(similarity)
+        surface = reference_of(cell).moved(similarity)
         self.points: Float64 = near_surface(surface, POINTS[cell.preset], reach=REACH, seed=cell.seed)
         self.distances: Float64 = MeshDistance(surface).signed(self.points)
 

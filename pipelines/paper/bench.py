@@ -12,6 +12,7 @@ from typing import Any
 import torch
 
 from ..fit import choose_device
+from ..fit_state import write_text
 from ..timing import sgemm_rate
 from .ablations import DELTA_FACTOR, LOSS_WEIGHTS
 from .cell import Cell, Record
@@ -26,7 +27,7 @@ from .robustness import DELTAS_TABLE, OUTLIERS_TABLE, UNDERTRAINED_TABLE
 from .run import Ran, Shape, cells_of, kept_records, run_cells
 from .sheets import write_sheets
 from .speed_tables import MARCHING_CUBES, NORMALS
-from .store import make_folder, write_text
+from .store import make_folder
 from .tables import TableSpec
 
 __all__ = ["SPECS", "Bench", "bench_paper"]

@@ -10,19 +10,19 @@ import numpy as np
 import torch
 
 from ...datasets import orbit
-from ...neural_fields import Field, InputError, Similarity, sphere_trace
+from ...neural_fields import Field, Similarity, sphere_trace
 from ...neural_fields.meshing import Mesh, NoSurfaceError, extract_mesh
 from ..evaluate import evaluate_surfaces
 from ..mesh_files import write_mesh
 from ..mesh_trim import drop_unsupported
 from ..picture import picture_of, write_picture
 from ..support import Support
-from ..surface import Surface, from_mesh, read_surface
+from ..surface import Surface, from_mesh, read_reference
 from .cell import Cell
 from .method import Workplace
 from .protocol import protocol_of
 
-__all__ = ["STEEP", "Judge", "read_reference"]
+__all__ = ["STEEP", "Judge", "reference_of"]
 
 # Bound on |∇f| for extracting fields whose slope nobody keeps near 1: what is culled by it is safely empty.
 STEEP = 2.0
@@ -30,30 +30,26 @@ STEEP = 2.0
 FIRST_STEPS, MORE_STEPS = 20, 5
 
 
-def read_reference(cell: Cell) -> Surface:
+def reference_of(cell: Cell) -> Surface:
     """The surface that a cell's results are measured against.
 
     Raises:
         InputError: it cannot be read, or has no faces.
     """
-    path = cell.reference or cell.shape
-    surface = read_surface(path)
-    if not len(surface.faces):
-        raise InputError(f"{path}: has no faces, so there is no surface to compare with; give --reference MESH")
-    return surface
+    return read_reference(cell.reference or cell.shape, fix="give --reference MESH")
 
 
 class Judge:
     """Measures the surfaces of one cell against its reference.
 
     Raises:
-        InputError: see `read_reference`.
+        InputError: see `reference_of`.
     """
 
     def __init__(self, cell: Cell, work: Workplace) -> None:
         self.work = work
         self.seed = cell.seed
-        self.reference = read_reference(cell)
+        self.reference = reference_of(cell)
         self.protocol = protocol_of(cell.preset)
 
     def field(
@@ -136,11 +132,11 @@ class Judge:
         size = self.protocol.image
         corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
         origin, directions = orbit(corners, width=size, height=size).rays(device=self.work.device)
-        # Levels without bands are alternatives: the one that is wanted is then the first to be traced.
+        # Levels without bands are alternatives: only the one that is wanted is traced.
         level = field.resolve_level(level)
-        leading = [index for index in range(level) if field.deltas[index].isfinite()]
-        budget = [FIRST_STEPS if index == min([*leading, level]) else MORE_STEPS for index in range(level + 1)]
-        budget = [steps if index in leading or index == level else 0 for index, steps in enumerate(budget)]
+        traced = [index for index in range(level) if field.deltas[index].isfinite()] + [level]
+        budget = [MORE_STEPS if index in traced else 0 for index in range(level + 1)]
+        budget[traced[0]] = FIRST_STEPS
         started = time.perf_counter()
         hits = sphere_trace(field, origin, directions, level=level, budget=budget)
         hits.mask.any().item()  # a GPU works on after the call returns

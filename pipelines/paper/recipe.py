@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -13,7 +14,9 @@ from ...datasets import OrientedCloud
 from ...neural_fields import Field
 from ..training import Progress
 
-__all__ = ["Output", "Preset", "Recipe", "Report", "Trained", "descend"]
+__all__ = ["Output", "Preset", "Recipe", "Report", "Trained", "cosine", "count", "descend", "finished", "seeded"]
+
+F = TypeVar("F", bound=Field)
 
 # smoke: seconds, for tests; cpu: 15 to 30 s of training on two cores, each method; paper: as published.
 Preset = Literal["smoke", "cpu", "paper"]
@@ -134,3 +137,25 @@ def descend(
         done = step + 1
         if progress is not None and (done % report_every == 0 or done == steps):
             progress(Progress(stage, done, steps, done / steps, {"loss": float(total.detach())}))
+
+
+def cosine(first: float, last: float, done: float) -> float:
+    """From ``first`` to ``last`` along half a cosine, at a fraction ``done`` in [0, 1]."""
+    return last + (first - last) * 0.5 * (1 + math.cos(math.pi * done))
+
+
+def seeded(make: Callable[[], F], seed: int) -> F:
+    """What ``make`` builds from torch's random numbers, without a trace in their state."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        return make()
+
+
+def finished(field: F) -> F:
+    """A trained field, frozen and on the CPU."""
+    return field.requires_grad_(False).cpu().eval()
+
+
+def count(*fields: nn.Module) -> int:
+    """Numbers that are trained."""
+    return sum(parameter.numel() for field in fields for parameter in field.parameters())

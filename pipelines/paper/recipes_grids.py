@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from ...datasets import OrientedCloud
 from ...neural_fields import Field
@@ -17,7 +17,7 @@ from ...neural_fields.baselines import BandLimited, BanfSDF, HashGridSDF
 from ...neural_fields.losses import data_loss, eikonal_loss
 from ..sampling import DOMAIN
 from .grid_training import SignedPools, differences, mape_loss, stencil
-from .recipe import Output, Preset, Recipe, Report, Trained, descend
+from .recipe import Output, Preset, Recipe, Report, Trained, cosine, count, descend, finished, seeded
 
 __all__ = ["BanfRecipe", "BanfSettings", "GridSettings", "InstantNgpRecipe", "NgpSettings"]
 
@@ -38,9 +38,8 @@ class GridSettings:
 
     def field(self, *, seed: int, radius: float | None = None) -> HashGridSDF:
         """An untrained field over the cube in which distances are learnt, without a trace in torch's random state."""
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed)
-            return HashGridSDF(
+        return seeded(
+            lambda: HashGridSDF(
                 levels=self.levels,
                 table_size=1 << self.table,
                 coarsest=self.coarsest,
@@ -49,7 +48,9 @@ class GridSettings:
                 depth=self.depth,
                 extent=DOMAIN,
                 radius=radius,
-            )
+            ),
+            seed,
+        )
 
 
 @dataclass(frozen=True)
@@ -138,7 +139,7 @@ class InstantNgpRecipe(Recipe):
             betas=(0.9, 0.99),
             eps=1e-15,
         )
-        outputs = (Output(title, field.requires_grad_(False).cpu(), -1, _count([field])),)
+        outputs = (Output(title, finished(field), -1, count(field)),)
         return Trained(outputs, time.perf_counter() - started, settings.steps)
 
 
@@ -243,7 +244,7 @@ class BanfRecipe(Recipe):
             before.append(part.requires_grad_(False))
         field = BanfSDF(networks, settings.resolutions, extent=DOMAIN).cpu()
         outputs = tuple(
-            Output(f"BANF {resolution}", field, level, _count(networks[: level + 1]))
+            Output(f"BANF {resolution}", field, level, count(*networks[: level + 1]))
             for level, resolution in enumerate(settings.resolutions)
         )
         return Trained(outputs, time.perf_counter() - started, sum(settings.steps))
@@ -277,7 +278,7 @@ def _train_level(
 
     def rate(done: float) -> float:
         rising = 1.0 if level else min(1.0, (done + 1e-3) / WARM_UP)
-        return settings.rate * rising * 0.5 * (1 + math.cos(math.pi * done))
+        return rising * cosine(settings.rate, 0.0, done)
 
     descend(
         part.parameters(),
@@ -307,7 +308,3 @@ def _silence(network: HashGridSDF) -> None:
     last = network.linear()[-1]
     last.weight.mul_(0.1)
     last.bias.zero_()
-
-
-def _count(fields: Sequence[nn.Module]) -> int:
-    return sum(parameter.numel() for field in fields for parameter in field.parameters())

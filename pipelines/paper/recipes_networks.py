@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TypeVar
 
 import torch
 from torch import Tensor, nn
 
 from ...datasets import OrientedCloud
-from ...neural_fields import Field, Siren
+from ...neural_fields import Siren
 from ...neural_fields.baselines import BaconSDF, IdfSDF
 from ...neural_fields.baselines.idf import attenuation
 from ..cloud_distance import CloudDistance
-from .recipe import Output, Preset, Recipe, Report, Trained, descend
+from .recipe import Output, Preset, Recipe, Report, Trained, cosine, count, descend, finished, seeded
 
 __all__ = [
     "BaconRecipe",
@@ -32,8 +30,6 @@ __all__ = [
     "laplacian_samples",
     "siren_loss",
 ]
-
-F = TypeVar("F", bound=Field)
 
 # What a network begins as, and the rate at which it gets there: at 3e-3 nothing is left of a sphere at ω₀ = 30, and
 # the training that follows finds no surface.
@@ -172,7 +168,7 @@ class SirenRecipe(Recipe):
             begin_as_sphere(field, settings.sphere_steps)
             return field
 
-        field = _seeded(begin, seed).to(device)
+        field = seeded(begin, seed).to(device)
         batches = _CloudBatches(cloud, settings.batch, settings.share, seed=seed, device=device)
 
         def loss(step: int) -> Tensor:
@@ -184,12 +180,12 @@ class SirenRecipe(Recipe):
             field.parameters(),
             loss,
             steps=settings.steps,
-            rate=lambda done: settings.rate * _cosine(1.0, settings.final, done),
+            rate=lambda done: settings.rate * cosine(1.0, settings.final, done),
             stage="SIREN",
             progress=progress,
             clip=1.0,
         )
-        outputs = (Output("SIREN", _finished(field), -1, _count(field)),)
+        outputs = (Output("SIREN", finished(field), -1, count(field)),)
         return Trained(outputs, time.perf_counter() - started, settings.steps)
 
 
@@ -253,7 +249,7 @@ class BaconRecipe(Recipe):
     ) -> Trained:
         """See `Recipe.train`."""
         started, settings = time.perf_counter(), self.presets[preset]
-        field = _seeded(lambda: BaconSDF(settings.width, bands=settings.bands, outputs=settings.outputs), seed).to(
+        field = seeded(lambda: BaconSDF(settings.width, bands=settings.bands, outputs=settings.outputs), seed).to(
             device
         )
         generator = torch.Generator().manual_seed(seed)
@@ -284,7 +280,7 @@ class BaconRecipe(Recipe):
             clip=1.0,
             amsgrad=True,
         )
-        outputs = (Output("BACON", _finished(field), -1, field.parameters_to(-1)),)
+        outputs = (Output("BACON", finished(field), -1, field.parameters_to(-1)),)
         return Trained(outputs, time.perf_counter() - started, settings.steps)
 
 
@@ -367,7 +363,7 @@ class IdfRecipe(Recipe):
             begin_as_sphere(field.base, settings.sphere_steps)
             return field
 
-        field = _seeded(begin, seed).to(device)
+        field = seeded(begin, seed).to(device)
         batches = _CloudBatches(cloud, settings.batch, settings.share, seed=seed, device=device)
 
         def loss(step: int) -> Tensor:
@@ -395,7 +391,7 @@ class IdfRecipe(Recipe):
             progress=progress,
             betas=settings.betas,
         )
-        outputs = (Output("IDF", _finished(field), -1, _count(field)),)
+        outputs = (Output("IDF", finished(field), -1, count(field)),)
         return Trained(outputs, time.perf_counter() - started, settings.steps)
 
 
@@ -416,14 +412,14 @@ def displaced(field: IdfSDF, x: Tensor, base: Tensor, slope: Tensor) -> tuple[Te
 
 def hand_over(done: float) -> float:
     """What is left of the base's weights and rate: 1, from `BASE_ALONE` falling as a cosine to 0 at `BASE_FROZEN`."""
-    return _cosine(1.0, 0.0, min(max((done - BASE_ALONE) / (BASE_FROZEN - BASE_ALONE), 0.0), 1.0))
+    return cosine(1.0, 0.0, min(max((done - BASE_ALONE) / (BASE_FROZEN - BASE_ALONE), 0.0), 1.0))
 
 
 def _rate_of_displacement(done: float) -> float:
     """Factor on the rate: rising as the base's falls, then falling to a tenth."""
     if done < BASE_FROZEN:
         return 1 - hand_over(done)
-    return _cosine(1.0, 0.1, (done - BASE_FROZEN) / (1 - BASE_FROZEN))
+    return cosine(1.0, 0.1, (done - BASE_FROZEN) / (1 - BASE_FROZEN))
 
 
 def begin_as_sphere(network: Siren, steps: int, *, batch: int = 1024) -> None:
@@ -444,26 +440,6 @@ def begin_as_sphere(network: Siren, steps: int, *, batch: int = 1024) -> None:
         network.parameters(),
         loss,
         steps=steps,
-        rate=lambda done: SPHERE_RATE * _cosine(1.0, 0.01, done),
+        rate=lambda done: SPHERE_RATE * cosine(1.0, 0.01, done),
         stage="sphere",
     )
-
-
-def _cosine(first: float, last: float, done: float) -> float:
-    """From ``first`` to ``last`` along half a cosine, at a fraction ``done`` in [0, 1]."""
-    return last + (first - last) * 0.5 * (1 + math.cos(math.pi * done))
-
-
-def _seeded(make: Callable[[], F], seed: int) -> F:
-    """What ``make`` builds from torch's random numbers, without a trace in their state."""
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        return make()
-
-
-def _finished(field: F) -> F:
-    return field.requires_grad_(False).cpu().eval()
-
-
-def _count(field: Field) -> int:
-    return sum(parameter.numel() for parameter in field.parameters())

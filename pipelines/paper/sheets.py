@@ -13,7 +13,7 @@ from ...datasets import orbit
 from ..picture import Image, contact_sheet, picture_of, write_picture
 from ..surface import from_cloud
 from .cell import Cell, Record
-from .judge import read_reference
+from .judge import reference_of
 from .method import Workplace
 from .protocol import damaged_cloud, protocol_of
 
@@ -60,7 +60,7 @@ def write_sheets(name: str, records: Mapping[Cell, Record], out: Path) -> tuple[
 
 def _tiles(records: Mapping[Cell, Record], out: Path) -> list[tuple[str, Image]]:
     first = next(iter(records))
-    size, reference = protocol_of(first.preset).tile, read_reference(first)
+    size, reference = protocol_of(first.preset).tile, reference_of(first)
     camera = orbit(reference.vertices, width=size, height=size)
     tiles = [("input", picture_of(from_cloud(damaged_cloud(first)), camera))]
     for record in records.values():

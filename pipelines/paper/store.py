@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from ...neural_fields import InputError
+from ..fit_state import write_text
 from .cell import Record
 
-__all__ = ["make_folder", "read_record", "record_file", "write_record", "write_text"]
+__all__ = ["make_folder", "read_record", "record_file", "write_record"]
 
 
 def make_folder(out: Path) -> None:
@@ -50,11 +51,3 @@ def read_record(out: Path, key: str) -> Record | None:
 def write_record(out: Path, key: str, record: Record) -> None:
     """Write a record, whole or not at all."""
     write_text(record_file(out, key), json.dumps(record, indent=2) + "\n")
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a text file through a temporary one beside it; line ends stay as they are."""
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    with partial.open("w", encoding="utf-8", newline="") as file:
-        file.write(text)
-    partial.replace(path)
