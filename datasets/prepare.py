@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from ..neural_fields import InputError, Similarity
+from .noise import noise_level, smooth_along_normals
 from .orientation import estimate_normals, nearest, openness, orient_normals, outwardness
 from .outliers import inspect_points
 from .point_cloud import PointCloud, unit_rows
@@ -37,6 +38,8 @@ class CleaningReport:
         normals_source: "file", "mesh" (from the file's faces) or "estimated".
         flipped: whether all normals pointed inward and were turned round.
         pieces: connected pieces oriented one by one; 0 if normals were not estimated, or a sensor oriented them.
+        smoothed_noise: standard deviation, in input units, of the noise along the normals that the points were moved
+            back by; 0 if they were left where they are.
     """
 
     read: int
@@ -51,6 +54,7 @@ class CleaningReport:
     normals_source: Literal["file", "mesh", "estimated"]
     flipped: bool
     pieces: int
+    smoothed_noise: float = 0.0
 
     def summary(self) -> str:
         """One line for people."""
@@ -72,6 +76,10 @@ class CleaningReport:
             parts.append(f"{self.repaired_normals:,} normals repaired")
         if self.turned_normals:
             parts.append(f"{self.turned_normals:,} normals turned round (--no-turn-normals keeps them)")
+        if self.smoothed_noise:
+            parts.append(
+                f"noise of about {self.smoothed_noise:.2g} along the normals smoothed (--no-smooth-noise keeps it)"
+            )
         return "; ".join([*parts, *([f"dropped {dropped}"] if dropped else [])])
 
 
@@ -96,6 +104,11 @@ class OrientedCloud:
     def __len__(self) -> int:
         return len(self.points)
 
+    @property
+    def noise(self) -> float:
+        """Standard deviation, in the unit sphere, of the noise that was smoothed off the points; 0 for none."""
+        return self.report.smoothed_noise / self.similarity.scale
+
 
 def prepare_cloud(
     cloud: PointCloud,
@@ -106,6 +119,7 @@ def prepare_cloud(
     isolation: float | None = 30.0,
     drop_outliers: bool = False,
     turn_normals: bool = False,
+    smooth_noise: bool = False,
 ) -> OrientedCloud:
     """Clean a cloud, give it oriented unit normals and move it into the unit sphere.
 
@@ -125,6 +139,8 @@ def prepare_cloud(
         drop_outliers: whether other points that belong to no surface are dropped (see `inspect_points`).
         turn_normals: whether single normals of the file that point the other way than their neighbours' are turned
             round; with ``normals="file"`` none is.
+        smooth_noise: whether points are moved along their normals to where their neighbours agree, if the noise is
+            wide enough for that to be told (see :mod:`.noise`).
 
     Raises:
         InputError: too few points are left, or ``normals="file"`` and there are none.
@@ -156,8 +172,11 @@ def prepare_cloud(
         unit, kept = unit[decided], distinct[decided]
         _check_enough(len(kept), cloud, "have a usable normal; use --normals estimate")
     dropped_normals = len(distinct) - len(kept)
+    places, noise = cloud.points[kept], 0.0
+    if unit is not None and smooth_noise:  # before the rest: noise mixes up the sides of thin parts
+        places, noise = _smoothed(places, unit, flips=turn_normals and normals == "auto")
     found = inspect_points(
-        cloud.points[kept],
+        places,
         unit,
         isolation=isolation,
         outliers=drop_outliers,
@@ -166,8 +185,8 @@ def prepare_cloud(
     sound = ~(found.isolated | found.outliers)
     kept = kept[sound]
     _check_enough(len(kept), cloud, "are left after dropping outliers; keep them with --no-drop-outliers")
-    similarity = Similarity.to_unit_sphere(cloud.points[kept])
-    points = similarity.to_unit(cloud.points[kept])
+    similarity = Similarity.to_unit_sphere(places[sound])
+    points = similarity.to_unit(places[sound])
 
     source: Literal["file", "mesh", "estimated"] = cloud.normals_source
     flipped, pieces = False, 0
@@ -178,6 +197,9 @@ def prepare_cloud(
     else:
         source = "estimated"
         unit, pieces = _estimate(points, neighbors, similarity, sensor_origin)
+        if smooth_noise:
+            points, noise = _smoothed(points, unit)
+            noise *= similarity.scale
     report = CleaningReport(
         read=len(cloud),
         kept=len(kept),
@@ -191,6 +213,7 @@ def prepare_cloud(
         normals_source=source,
         flipped=flipped,
         pieces=pieces,
+        smoothed_noise=noise,
     )
     colors = None if cloud.colors is None else cloud.colors[kept]
     return OrientedCloud(points.astype(np.float32), unit.astype(np.float32), colors, similarity, report)
@@ -210,6 +233,20 @@ def _first_of_each(points: Float64) -> NDArray[np.int64]:
     first = np.ones(len(points), bool)
     first[1:] = (ordered[1:] != ordered[:-1]).any(axis=1)
     return np.sort(order[first])
+
+
+def _smoothed(points: Float64, normals: Float64, *, flips: bool = False) -> tuple[Float64, float]:
+    """Points without the noise along their normals, and its standard deviation.
+
+    Where ``flips`` may be among the normals of a thin part, one side passes for noise about the other: what is no noise
+    once they are turned round is none.
+    """
+    middle = points.mean(axis=0)
+    level = noise_level(points - middle, normals)
+    if level and flips:
+        flipped = inspect_points(points, normals, outliers=False).flipped
+        level = noise_level(points - middle, np.where(flipped[:, None], -normals, normals))
+    return (smooth_along_normals(points - middle, normals, level) + middle if level else points), level
 
 
 def _repair(
