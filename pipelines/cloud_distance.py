@@ -3,7 +3,9 @@
 Magnitude: each point stands for a disc in its tangent plane, as wide as its neighbourhood is spaced; the distance
 to the nearest of a few discs has neither the bias of the distance to the nearest point (√(d² + h²) instead of d)
 nor the reach of an infinite tangent plane. Sign: away from the surface by the generalised winding number of
-the cloud, which closes the holes that scans have; close to it by the side of the nearest discs.
+the cloud, which closes the holes that scans have; close to it by the side of the nearest discs. Beside the edge of a
+blade, where all discs are seen edge-on, what smoothing has left of noise would decide: of a cloud that was noisy, the
+winding number is asked down to half the width of the noise.
 """
 
 from __future__ import annotations
@@ -33,12 +35,16 @@ class CloudDistance:
         neighbors: how many discs are compared at each query.
         cell: edge of the cells in which points are merged into dipoles for the winding number; dipoles
             are used only further than ``2 · cell`` from the surface, where their error is below 0.05.
+        noise: standard deviation of the noise that was smoothed off the points.
     """
 
-    def __init__(self, points: Tensor, normals: Tensor, *, neighbors: int = 6, cell: float = 0.05) -> None:
+    def __init__(
+        self, points: Tensor, normals: Tensor, *, neighbors: int = 6, cell: float = 0.05, noise: float = 0.0
+    ) -> None:
         self.points: Float32 = points.cpu().numpy()
         self.normals: Float32 = normals.cpu().numpy()
         self.tree = KDTree(self.points, compact_nodes=False, balanced_tree=False)
+        self.noise = noise
         self.neighbors, self.cell = min(neighbors, len(points)), cell
         count = min(8, len(points) - 1)
         reach = np.asarray(self.tree.query(self.points, k=count + 1, workers=-1)[0])[:, -1]
@@ -66,16 +72,23 @@ class CloudDistance:
         # Each disc votes with its side, the nearer and the more face-on the louder.
         side = np.sum(along / (distance**3 + 1e-12), axis=1)
         far = distance[:, 0] > 2 * self.cell
-        if far.any():
-            side[far] = 0.5 - self.winding_number(query[far])
+        near = ~far & (distance[:, 0] > 0.5 * self.noise) if self.noise else np.zeros_like(far)
+        for some, cell in ((far, self.cell), (near, self.cell / 2)):
+            if some.any():
+                side[some] = 0.5 - self.winding_number(query[some], cell=cell)
         return torch.from_numpy(np.where(side < 0, -magnitude, magnitude).astype(np.float32))
 
-    def winding_number(self, x: Float32, *, chunk: int = 1024) -> NDArray[np.float64]:
+    def winding_number(self, x: Float32, *, cell: float | None = None, chunk: int = 1024) -> NDArray[np.float64]:
         """Generalised winding number at ``(M, 3)`` points: about 1 inside, 0 outside, in between near holes.
 
         ``w(x) = Σ_i a_i ⟨p_i − x, n_i⟩ / (4π |p_i − x|³)`` over dipoles (Barill et al. 2018, first order).
+
+        Args:
+            x: the points.
+            cell: edge of the cells of one dipole each; None for that of the index.
+            chunk: points at a time.
         """
-        centers, moments = self._dipoles()
+        centers, moments = self._dipoles(cell or self.cell)
         offset = (centers * moments).sum(dim=1)
         squares = (centers**2).sum(dim=1)
         query = torch.from_numpy(np.ascontiguousarray(x, np.float32))
@@ -88,9 +101,9 @@ class CloudDistance:
             result[start : start + chunk] = flux.mul_(inverse).mul_(inverse).mul_(inverse).sum(dim=1)
         return (result / (4 * math.pi)).double().numpy()
 
-    def _dipoles(self) -> tuple[Tensor, Tensor]:
+    def _dipoles(self, cell: float) -> tuple[Tensor, Tensor]:
         """Area-weighted centres and area-weighted normal sums of the cloud's occupied cells."""
-        cells = np.floor(self.points / self.cell).astype(np.int64)
+        cells = np.floor(self.points / cell).astype(np.int64)
         _, owner = np.unique(cells @ np.array([1 << 40, 1 << 20, 1]), return_inverse=True)
         area = np.bincount(owner, self.areas)
         center = np.stack([np.bincount(owner, self.areas * self.points[:, i]) for i in range(3)], 1) / area[:, None]

@@ -32,19 +32,12 @@ from .fit_state import (
     save_state,
     write_record,
 )
+from .level_sources import banded_sources, first_sources
 from .memory import peak_memory
 from .merged_cloud import load_cloud
-from .sampling import (
-    Band,
-    Samples,
-    band_of,
-    band_samples,
-    distance_samples,
-    offset_samples,
-    with_previous,
-)
+from .sampling import Band, band_of
 from .support import write_support
-from .training import LevelTrainer, Progress, Source, StopFlag, stop_on_signals
+from .training import LevelTrainer, Progress, StopFlag, stop_on_signals
 
 __all__ = ["FitConfig", "Interrupted", "Run", "fit", "prepare"]
 
@@ -141,6 +134,7 @@ def prepare(cloud: PointCloud, config: FitConfig) -> OrientedCloud:
         isolation=config.isolation,
         drop_outliers=config.drop_outliers,
         turn_normals=config.turn_normals,
+        smooth_noise=config.smooth_noise,
     )
 
 
@@ -226,8 +220,11 @@ class _Fitting:
         self.progress(Progress(f"level {level}: samples", 0, config.steps[level], 0.0, {}))
         band = None if self.frozen is None else self.next_band()
         delta = None if band is None else band.delta
-        self.index = self.index or CloudDistance(self.points, self.normals)
-        sources = self.sources(self.index, delta, generator)
+        self.index = self.index or CloudDistance(self.points, self.normals, noise=self.cloud.noise)
+        if self.frozen is None or delta is None:
+            sources = first_sources(self.index, config, generator=generator, device=self.device)
+        else:
+            sources = banded_sources(self.index, self.frozen, delta, config, generator=generator, name=self.source)
         sampling_seconds = time.monotonic() - started
         trainer = LevelTrainer(
             network,
@@ -268,40 +265,6 @@ class _Fitting:
             }
         )
         self.save(None, None)
-
-    def sources(self, index: CloudDistance, delta: float | None, generator: torch.Generator) -> list[Source]:
-        """What a level learns from: Ω for level 0, the band around the frozen surface for the others."""
-        config = self.config
-        points, normals = torch.from_numpy(index.points), torch.from_numpy(index.normals)
-        surface = Samples(points, distance=torch.zeros(len(points)), normal=normals)
-        if self.frozen is None or delta is None:
-            domain = distance_samples(index, config.samples, generator=generator).to(self.device)
-            near, far = config.data_weight, config.data_weight * config.domain_weight
-            half = config.batch // 2
-            return [
-                Source("surface", surface.to(self.device), half, near, config.normal_weight, config.eikonal_weight),
-                Source("domain", domain, half, far, 0.0, config.eikonal_weight),
-            ]
-        offset = offset_samples(index, delta, config.samples, generator=generator)
-        band = band_samples(index, delta, config.samples, generator=generator)
-        kept = {
-            name: with_previous(samples, self.frozen, delta, device=self.device)
-            for name, samples in (("surface", surface), ("offset", offset), ("band", band))
-        }
-        for name, samples in kept.items():
-            if not len(samples):
-                raise InputError(
-                    f"{self.source}: no {name} samples within {delta:.2g} of the level before; train it longer "
-                    "(--steps) or widen the band (--epsilon)"
-                )
-        # Errors shrink from level to level, their squares twice as fast, and angles hardly: a fixed weight would
-        # leave the finest level to its normals alone, and noise to the distances. In units of the error before
-        # the balance stays what it was, on clean clouds and on noisy ones.
-        before = kept["surface"].value
-        assert before is not None
-        data = config.residual_data_weight / max(float(before.square().mean()), 1e-10)
-        third, weights = config.batch // 3, (data, config.normal_weight, config.eikonal_weight)
-        return [Source(name, samples, third, *weights) for name, samples in kept.items()]
 
     def next_band(self) -> Band:
         """The band around the last frozen level (Eq. 5)."""

@@ -29,7 +29,9 @@ class FitConfig:
     levels: int | None = _setting(None, "train only this many levels, coarse to fine")
     data_weight: float = _setting(1e4, "level 0's weight of (f(x) - d)^2 where the distance d is known (Eq. 4)")
     residual_data_weight: float = _setting(
-        1.0, "the other levels' weight of (f(x) - d)^2, in units of the mean square error of the level before"
+        1.0,
+        "the other levels' weight of (f(x) - d)^2, in units of the mean square error of the level before, or of the "
+        "variance of the noise that was smoothed off if that is larger",
     )
     normal_weight: float = _setting(300.0, "weight of 1 - cos(grad f, N) where the normal N is known (Eq. 4)")
     eikonal_weight: float = _setting(50.0, "weight of (|grad f| - 1)^2 (Eq. 4)")
@@ -54,6 +56,9 @@ class FitConfig:
     )
     turn_normals: bool = _setting(
         True, "turn single normals round that point the other way than their neighbours' (not with --normals file)"
+    )
+    smooth_noise: bool = _setting(
+        True, "move points along their normals to where their neighbours agree, if there is more noise than spacing"
     )
     time_budget: float | None = _setting(None, "end training after about this many seconds, all levels together")
     seed: int = _setting(0, "random seed")
@@ -89,6 +94,16 @@ class FitConfig:
     def num_levels(self) -> int:
         """How many levels are trained."""
         return len(self.widths) if self.levels is None else self.levels
+
+    def data_weight_after(self, mean_square: float, noise: float) -> float:
+        """Weight of (f(x) − d)² at a level whose predecessor misses the points by this mean square.
+
+        Errors shrink from level to level, their squares twice as fast, and angles hardly: a fixed weight would leave
+        the finest level to its normals alone, and noise to the distances. In units of the error before, the balance
+        stays what it was. Smoothed noise leaves waves behind, which the level before follows all too closely: its
+        error is taken for no smaller than that ``noise``.
+        """
+        return self.residual_data_weight / max(mean_square, noise**2, 1e-10)
 
     def share_of_time(self, level: int) -> float:
         """The part of a time budget left before ``level`` that this level may use, by the cost of its steps."""

@@ -8,7 +8,7 @@ evaluates the residual being trained and nothing else.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -25,6 +25,7 @@ __all__ = [
     "band_samples",
     "delta_of",
     "distance_samples",
+    "empty_samples",
     "free_lengths",
     "offset_samples",
     "with_previous",
@@ -37,6 +38,8 @@ DOMAIN = 1.05
 STRAY = 4.0
 # The same over the 90th percentile, generous: a level may miss a thin part as a whole.
 TAIL = 20.0
+# How far a winding number must be from one half to say in or out: it is off by less than 0.05 where it is asked.
+SURE = 0.4
 
 
 @dataclass(frozen=True)
@@ -127,14 +130,54 @@ def distance_samples(cloud: CloudDistance, count: int, *, generator: torch.Gener
     The near half is Gaussian around cloud points, with deviations from twice the point spacing to 0.1, so that
     the coarse level sees every scale that it can represent.
     """
+    points = _spread(cloud, count, generator)
+    return Samples(points, distance=cloud.signed(points))
+
+
+@torch.no_grad()
+def empty_samples(
+    cloud: CloudDistance, field: Field, delta: float, count: int, *, generator: torch.Generator, device: torch.device
+) -> Samples:
+    """Points of the band around ``field`` that are far from every point of the cloud, and surely in- or outside.
+
+    What a coarse level makes of a thin part may be a sheet of surface beside it, through places where it is wrong by
+    more than δ. They get the distance to the nearest point, up to ±2δ, which takes them out of the next level's band.
+    Where the winding number is in doubt, in the holes of a scan, there are none: there a surface may well be far from
+    all points.
+
+    Args:
+        cloud: the points.
+        field: the frozen levels.
+        delta: half-width of the band around the finest.
+        count: how many points are tried, spread as for level 0.
+        generator: draws them.
+        device: where the field is.
+
+    Returns:
+        Samples with distances, values and gradients, on ``device``; often none.
+    """
+    tried = with_previous(Samples(_spread(cloud, count, generator)), field, delta, device=device)
+    points = tried.points.cpu().numpy()
+    assert tried.value is not None
+    distance = cloud.nearest(points)
+    # Between its points a surface is about a spacing away from them.
+    far = np.flatnonzero(distance - tried.value.abs().cpu().numpy() > max(delta, 4 * cloud.spacing))
+    depth = cloud.winding_number(points[far], cell=cloud.cell / 2) - 0.5
+    sure = np.abs(depth) > SURE
+    found = tried.take(torch.from_numpy(far[sure]).to(device))
+    length = np.minimum(distance[far[sure]], 2 * delta)
+    signed = np.where(depth[sure] > 0, -length, length).astype(np.float32)
+    return replace(found, distance=torch.from_numpy(signed).to(device))
+
+
+def _spread(cloud: CloudDistance, count: int, generator: torch.Generator) -> Tensor:
     near_count = count // 2
     uniform = (2 * torch.rand(count - near_count, 3, generator=generator) - 1) * DOMAIN
     anchors = torch.from_numpy(cloud.points)[torch.randint(len(cloud.points), (near_count,), generator=generator)]
     least = min(2 * cloud.spacing, 0.1)
     deviation = least * (0.1 / least) ** torch.rand(near_count, 1, generator=generator)
     near = (anchors + deviation * torch.randn(near_count, 3, generator=generator)).clamp(-DOMAIN, DOMAIN)
-    points = torch.cat((uniform, near))
-    return Samples(points, distance=cloud.signed(points))
+    return torch.cat((uniform, near))
 
 
 def free_lengths(

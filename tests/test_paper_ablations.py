@@ -12,6 +12,7 @@ from mplicits.datasets import read_cloud
 from mplicits.neural_fields import Box, InputError, MultiscaleSDF, Similarity, Siren, Sphere, extract_mesh
 from mplicits.pipelines.cloud_distance import CloudDistance
 from mplicits.pipelines.fit import fit, prepare
+from mplicits.pipelines.level_sources import Weights, banded_sources
 from mplicits.pipelines.mesh_files import write_mesh
 from mplicits.pipelines.paper.ablations import (
     DELTA_FACTOR,
@@ -31,8 +32,6 @@ from mplicits.pipelines.paper.isolation import (
     steepness,
 )
 from mplicits.pipelines.paper.levels import (
-    Weights,
-    banded_sources,
     delta_after,
     domain_sources,
     generator_for,
@@ -255,9 +254,9 @@ def test_residual_levels_see_the_cloud_that_level_0_has_judged(base: Base) -> No
 
 def test_weights_stand_where_they_are_given(base: Base) -> None:
     errors = torch.full((4,), 0.01)
-    usual = Weights().resolved(base.config, errors)
+    usual = Weights().resolved(base.config, errors, 0.0)
     assert usual == pytest.approx((1e4, base.config.normal_weight, base.config.eikonal_weight))
-    assert Weights(data=0.0, eikonal=7.0).resolved(base.config, errors) == (0.0, base.config.normal_weight, 7.0)
+    assert Weights(data=0.0, eikonal=7.0).resolved(base.config, errors, 0.0) == (0.0, base.config.normal_weight, 7.0)
 
 
 def test_sources_of_the_variants(base: Base) -> None:

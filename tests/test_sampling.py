@@ -3,14 +3,18 @@
 import numpy as np
 import pytest
 import torch
-from mplicits.neural_fields import MultiscaleSDF, Siren, Sphere, Torus
+from mplicits.neural_fields import MultiscaleSDF, Siren, Sphere, Torus, Union
 from mplicits.pipelines.cloud_distance import CloudDistance
+from mplicits.pipelines.fit_config import FitConfig
+from mplicits.pipelines.level_sources import banded_sources
+from mplicits.pipelines.paper.levels import train_level
 from mplicits.pipelines.sampling import (
     Samples,
     band_of,
     band_samples,
     delta_of,
     distance_samples,
+    empty_samples,
     free_lengths,
     offset_samples,
     with_previous,
@@ -181,3 +185,51 @@ def test_signs_on_both_sides_of_a_sheet_two_spacings_thick() -> None:
     for scale, inside in ((0.3, True), (0.7, True), (1.5, False), (3.0, False)):
         x = directions * axes * scale
         assert ((cloud.signed(x) < 0) == inside).float().mean() > 0.995
+
+
+PHANTOM = Sphere(radius=0.1, center=(0.85, 0.0, 0.0))
+
+
+def empty(cloud: CloudDistance, field: Sphere | Union, delta: float = 0.05) -> Samples:
+    return empty_samples(cloud, field, delta, 40_000, generator=generator(), device=CPU)
+
+
+def test_a_sound_level_has_no_empty_places_in_its_band(cloud: CloudDistance) -> None:
+    assert len(empty(cloud, Sphere(radius=RADIUS))) == 0
+    assert len(empty(cloud, Sphere(radius=RADIUS + 0.02))) == 0
+    sparse = CloudDistance(*sphere_points(300))  # between its points the band is far from all of them
+    assert len(empty(sparse, Sphere(radius=RADIUS), delta=0.01)) == 0
+
+
+def test_empty_places_are_where_a_level_invents_a_surface(cloud: CloudDistance) -> None:
+    found = empty(cloud, Union(Sphere(radius=RADIUS), PHANTOM))
+    assert len(found) > 30
+    assert (PHANTOM.value(found.points).abs() < 0.05).all()
+    exact = found.points.norm(dim=1) - RADIUS
+    assert found.distance is not None
+    assert found.value is not None
+    assert torch.allclose(found.distance, exact.clamp(max=0.1), atol=5e-3)
+    assert (exact - found.value.abs() > 0.045).all()
+
+
+def test_a_hole_of_a_scan_is_no_empty_place() -> None:
+    points, normals = sphere_points(20_000)
+    seen = normals[:, 2] < 0.8
+    assert len(empty(CloudDistance(points[seen], normals[seen]), Sphere(radius=RADIUS))) == 0
+
+
+def test_the_next_level_takes_an_invented_surface_away(cloud: CloudDistance) -> None:
+    config = FitConfig(
+        widths=(8, 48), depths=(1, 1), omegas=(30.0, 20.0), steps=(1, 150), learning_rates=(1e-3, 2e-3), batch=1500
+    )
+    previous, delta = MultiscaleSDF(Union(Sphere(radius=RADIUS), PHANTOM), [], []), 0.05
+    sources = banded_sources(cloud, previous, delta, config, generator=generator())
+    assert [source.name for source in sources] == ["surface", "offset", "band", "empty"]
+    torch.manual_seed(0)
+    field = previous.with_level(train_level(1, sources, config, generator=generator()), delta=delta)
+    directions = torch.nn.functional.normalize(torch.randn(500, 3, generator=generator()), dim=1)
+    shell = torch.tensor([0.85, 0.0, 0.0]) + 0.1 * directions
+    outside = shell[shell.norm(dim=1) > RADIUS + 0.1]
+    assert previous.value(outside).abs().max() < 1e-5
+    assert field.value(outside).min() > 0.02
+    assert field.value(torch.from_numpy(cloud.points)).square().mean().sqrt() < 0.01

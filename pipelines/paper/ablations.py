@@ -15,10 +15,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from ...neural_fields import MultiscaleSDF, Similarity
 from ..cloud_distance import CloudDistance
 from ..fit_config import FitConfig
+from ..level_sources import Weights, banded_sources
 from .base import base_cell, base_of
 from .cell import Cell, Record
 from .judge import reference_of
-from .levels import Weights, banded_sources, delta_after, generator_for, train_level, up_to
+from .levels import delta_after, generator_for, train_level, up_to
 from .mesh_distance import Float64, MeshDistance, approximation_error, near_surface
 from .method import Findings, Method, Workplace
 from .ours import Ours, our_config

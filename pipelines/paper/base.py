@@ -15,9 +15,10 @@ from ..cloud_distance import CloudDistance
 from ..fit import prepare
 from ..fit_config import FitConfig
 from ..fit_review import review_points
+from ..level_sources import device_of
 from ..runs import find_field
 from .cell import Cell
-from .levels import device_of, up_to
+from .levels import up_to
 from .method import Workplace
 from .ours import Ours, our_config
 from .protocol import damaged_cloud
@@ -43,7 +44,8 @@ class Base:
 
     def index(self) -> CloudDistance:
         """Distances to the cloud."""
-        return CloudDistance(torch.from_numpy(self.cloud.points), torch.from_numpy(self.cloud.normals))
+        points, normals = torch.from_numpy(self.cloud.points), torch.from_numpy(self.cloud.normals)
+        return CloudDistance(points, normals, noise=self.cloud.noise)
 
 
 def base_cell(cell: Cell, overrides: tuple[tuple[str, Any], ...] = ()) -> Cell:

@@ -17,13 +17,12 @@ import torch
 from torch import Tensor, nn
 
 from ...neural_fields import Field, Jet, MultiscaleSDF, NoSurfaceError, extract_mesh
+from ..level_sources import banded_sources, device_of
 from .base import Base, base_cell, base_of
 from .cell import Cell, Record
 from .judge import Judge
 from .levels import (
-    banded_sources,
     delta_after,
-    device_of,
     domain_sources,
     generator_for,
     on_its_own,

@@ -5,30 +5,19 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
-from torch import Tensor
 
-from ...neural_fields import Field, InputError, MultiscaleSDF, Siren
+from ...neural_fields import Field, MultiscaleSDF, Siren
 from ..cloud_distance import CloudDistance
 from ..fit_config import FitConfig
-from ..sampling import (
-    Samples,
-    band_of,
-    band_samples,
-    distance_samples,
-    offset_samples,
-    with_previous,
-)
+from ..level_sources import Weights, device_of, surface_samples
+from ..sampling import band_of, distance_samples, with_previous
 from ..training import LevelTrainer, Progress, Source, StopFlag
 from .recipe import Report
 
 __all__ = [
-    "Weights",
-    "banded_sources",
     "delta_after",
-    "device_of",
     "domain_sources",
     "generator_for",
     "on_its_own",
@@ -39,28 +28,6 @@ __all__ = [
 
 # As in the fit, a residual starts at a tenth of the usual output scale.
 RESIDUAL_GAIN = 0.1
-
-
-@dataclass(frozen=True)
-class Weights:
-    """Weights of the three terms of Eq. 4, as they stand; None is what the fit would take.
-
-    Attributes:
-        data: of (f(x) − d)²; the fit's own is ``residual_data_weight`` over the mean square error of the level before.
-        normal: of 1 − cos(∇f, N).
-        eikonal: of (|∇f| − 1)².
-    """
-
-    data: float | None = None
-    normal: float | None = None
-    eikonal: float | None = None
-
-    def resolved(self, config: FitConfig, errors: Tensor) -> tuple[float, float, float]:
-        """Data, normal and eikonal weight, where the levels before miss the surface samples by ``errors`` ``(n,)``."""
-        data = config.residual_data_weight / max(float(errors.square().mean()), 1e-10)
-        given = (self.data, self.normal, self.eikonal)
-        usual = (data, config.normal_weight, config.eikonal_weight)
-        return tuple(u if g is None else g for g, u in zip(given, usual, strict=True))  # pyright: ignore[reportReturnType]
 
 
 def up_to(field: MultiscaleSDF, level: int) -> MultiscaleSDF:
@@ -82,44 +49,15 @@ def delta_after(index: CloudDistance, previous: Field, config: FitConfig) -> flo
     return band_of(values, epsilon=config.epsilon, quantile=config.quantile).delta
 
 
-def banded_sources(
-    index: CloudDistance,
-    previous: Field,
-    delta: float,
-    config: FitConfig,
-    *,
-    generator: torch.Generator,
-    weights: Weights | None = None,
-) -> list[Source]:
-    """What a level learns from inside the band around the one before, as in the fit (Sec. 3.2).
-
-    Raises:
-        InputError: one kind of samples is empty.
-    """
-    offset = offset_samples(index, delta, config.samples, generator=generator)
-    band = band_samples(index, delta, config.samples, generator=generator)
-    kept = [
-        (name, with_previous(samples, previous, delta, device=device_of(previous)))
-        for name, samples in (("surface", _surface(index)), ("offset", offset), ("band", band))
-    ]
-    for name, samples in kept:
-        if not len(samples):
-            raise InputError(f"no {name} samples within {delta:.2g} of the level before; train it longer")
-    before = kept[0][1].value
-    assert before is not None
-    terms = (weights or Weights()).resolved(config, before)
-    return [Source(name, samples, config.batch // 3, *terms) for name, samples in kept]
-
-
 def domain_sources(
     index: CloudDistance, previous: MultiscaleSDF, config: FitConfig, *, generator: torch.Generator
 ) -> list[Source]:
     """What a residual learns from on the whole domain: distances everywhere, as level 0 of the fit does."""
     everywhere, device = without_bands(previous), device_of(previous)
     spread = distance_samples(index, config.samples, generator=generator)
-    surface, domain = (with_previous(s, everywhere, math.inf, device=device) for s in (_surface(index), spread))
+    surface, domain = (with_previous(s, everywhere, math.inf, device=device) for s in (surface_samples(index), spread))
     assert surface.value is not None
-    data, normal, eikonal = Weights().resolved(config, surface.value)
+    data, normal, eikonal = Weights().resolved(config, surface.value, index.noise)
     half = config.batch // 2
     return [
         Source("surface", surface, half, data, normal, eikonal),
@@ -178,16 +116,6 @@ def train_level(
     return network.requires_grad_(False)
 
 
-def device_of(field: Field) -> torch.device:
-    """Where a field's parameters are."""
-    return next(field.parameters(), field.deltas).device
-
-
 def generator_for(config: FitConfig, level: int) -> torch.Generator:
     """The generator that the fit draws a level's samples and batches with."""
     return torch.Generator().manual_seed(config.seed * 1009 + level)
-
-
-def _surface(index: CloudDistance) -> Samples:
-    points, normals = torch.from_numpy(index.points), torch.from_numpy(index.normals)
-    return Samples(points, distance=torch.zeros(len(points)), normal=normals)

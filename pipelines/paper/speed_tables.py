@@ -12,9 +12,10 @@ import torch
 
 from ...neural_fields import Field, Siren, extract_mesh
 from ..bench_normals import bench_normals
+from ..level_sources import device_of
 from .base import base_cell, base_of
 from .cell import Cell, Record
-from .levels import device_of, without_bands
+from .levels import without_bands
 from .method import Findings, Method, Workplace
 from .ours import Ours
 from .protocol import protocol_of

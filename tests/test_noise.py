@@ -1,0 +1,169 @@
+"""Noise along the normals, on surfaces where it is known how much there is and where the points belong."""
+
+import numpy as np
+import pytest
+import torch
+from mplicits.datasets import PointCloud, add_noise, add_outliers, prepare_cloud, sample_sphere, sample_surface
+from mplicits.datasets.noise import noise_level, smooth_along_normals
+from mplicits.neural_fields import Box, Torus
+from mplicits.pipelines.cloud_distance import CloudDistance
+from mplicits.pipelines.fit import FitConfig, fit
+
+RNG = np.random.default_rng(0)
+
+
+def sphere(count: int, *, radius: float = 0.7) -> tuple[np.ndarray, np.ndarray]:
+    """Points ``(N, 3)`` of a sphere, exact in float64, and their normals."""
+    normals = RNG.normal(size=(count, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    return radius * normals, normals
+
+
+def plate(count: int, *, thickness: float) -> tuple[np.ndarray, np.ndarray]:
+    """The two sides of a square plate, without its edges; the upper one first."""
+    points = RNG.uniform(-0.7, 0.7, (count, 3))
+    side = np.where(np.arange(count) < count // 2, 1.0, -1.0)
+    points[:, 2] = side * thickness / 2
+    return points, side[:, None] * np.array([0.0, 0.0, 1.0])
+
+
+def rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.square(values).mean()))
+
+
+@pytest.mark.parametrize("radius", [0.7, 0.05])
+def test_on_a_sphere_there_is_no_noise_and_nothing_moves(radius):
+    """(n_i + n_j)·(p_j − p_i) is zero on any sphere, however few points it has."""
+    points, normals = sphere(3000, radius=radius)
+    assert noise_level(points, normals) == 0
+    assert np.abs(smooth_along_normals(points, normals, 0.02 * radius) - points).max() < 1e-15
+
+
+def test_the_sides_of_a_plate_thinner_than_its_spacing_are_no_noise():
+    points, normals = plate(4000, thickness=0.005)
+    assert noise_level(points, normals) == 0
+
+
+@pytest.mark.parametrize(("count", "amplitude"), [(8000, 0.02), (8000, 0.04), (60000, 0.02)])
+def test_the_level_is_measured(count, amplitude):
+    """Uniform noise of ±a has the standard deviation a/√3; within 20 %, for the layer is never seen as a whole."""
+    points, normals = sphere(count)
+    noisy = points + RNG.uniform(-amplitude, amplitude, (count, 1)) * normals
+    assert noise_level(noisy, normals) == pytest.approx(amplitude / np.sqrt(3), rel=0.2)
+
+
+@pytest.mark.parametrize(("count", "gain"), [(8000, 5), (60000, 7)])
+def test_points_come_back_to_the_sphere(count, gain):
+    points, normals = sphere(count)
+    noisy = points + RNG.uniform(-0.02, 0.02, (count, 1)) * normals
+    moved = smooth_along_normals(noisy, normals, noise_level(noisy, normals))
+    error = np.linalg.norm(moved, axis=1) - 0.7
+    assert rms(error) < 0.02 / np.sqrt(3) / gain
+    assert abs(error.mean()) < 5e-4  # it does not shrink
+    assert np.abs(np.cross(moved - noisy, normals)).max() < 1e-12  # nor does anything slide
+
+
+def test_the_sides_of_a_plate_thinner_than_the_noise_stay_apart():
+    """Half of the points have crossed over to the other side; their normals bring them back."""
+    points, normals = plate(30000, thickness=0.01)
+    noisy = points + RNG.uniform(-0.02, 0.02, (30000, 1)) * normals
+    assert (noisy[:15000, 2] < 0).mean() > 0.3
+    moved = smooth_along_normals(noisy, normals, noise_level(noisy, normals))
+    assert rms(moved[:, 2] - points[:, 2]) < 0.0025
+    assert (moved[:15000, 2] > 0).mean() > 0.99
+
+
+def test_a_crease_stays_sharp():
+    """Neighbours round the corner of a box are not asked: flat sides stay flat up to its edges."""
+    box = Box(half_size=(0.5, 0.4, 0.3))
+    cloud = sample_surface(box, 20000, shell=0.002)
+    noisy = add_noise(cloud, 0.01)
+    assert cloud.normals is not None
+    normals = cloud.normals.astype(np.float64)
+    moved = smooth_along_normals(noisy.points, normals, noise_level(noisy.points, normals))
+    off = ((moved - cloud.points) * normals).sum(axis=1)
+    corner = (0.5, 0.4, 0.3) - np.abs(cloud.points)
+    by_an_edge = (np.sort(corner, axis=1)[:, 1] < 0.02) & (np.abs(normals).max(axis=1) > 0.999)
+    assert by_an_edge.sum() > 500
+    assert rms(off[by_an_edge]) < 1.5 * rms(off[~by_an_edge]) < 0.003
+
+
+def test_it_does_not_depend_on_where_or_how_large_the_cloud_is():
+    points, normals = sphere(4000)
+    noisy = points + RNG.uniform(-0.03, 0.03, (4000, 1)) * normals
+    turn = np.linalg.qr(RNG.normal(size=(3, 3)))[0]
+    there, normals_there = 7 * noisy @ turn.T + 2, normals @ turn.T
+    level = noise_level(noisy, normals)
+    assert noise_level(there, normals_there) == pytest.approx(7 * level, rel=1e-9)
+    moved = smooth_along_normals(noisy, normals, level)
+    assert smooth_along_normals(there, normals_there, 7 * level) == pytest.approx(7 * moved @ turn.T + 2, abs=1e-9)
+
+
+def test_a_few_points_are_left_alone():
+    points, normals = sphere(12)
+    assert noise_level(points, normals) == 0
+    assert np.isfinite(smooth_along_normals(points, normals, 0.1)).all()
+
+
+@pytest.mark.parametrize("strays", [0.0, 0.05])
+def test_a_clean_cloud_is_prepared_as_without(strays):
+    cloud = add_outliers(sample_surface(Torus(), 6000), strays)
+    with_it, without = (prepare_cloud(cloud, smooth_noise=choice) for choice in (True, False))
+    assert with_it.report.smoothed_noise == 0
+    assert np.array_equal(with_it.points, without.points)
+
+
+def test_flipped_normals_of_a_thin_part_are_no_noise():
+    """Unless they are turned round, the far side passes for neighbours on a point's own side."""
+    points, normals = plate(8000, thickness=0.02)
+    flipped = RNG.permutation(8000)[:1600]
+    normals[flipped] *= -1
+    assert noise_level(points, normals) > 0
+    cloud = PointCloud(points, normals.astype(np.float32))
+    prepared = prepare_cloud(cloud, smooth_noise=True, turn_normals=True)
+    assert prepared.report.smoothed_noise == 0
+    assert prepared.report.turned_normals > 1000
+
+
+@pytest.mark.parametrize("given", [True, False])
+def test_a_noisy_cloud_is_smoothed_and_says_so(given):
+    clean = sample_sphere(20000)
+    noisy = add_noise(clean, 0.01)
+    cloud = PointCloud(noisy.points, noisy.normals if given else None)
+    prepared = prepare_cloud(cloud, smooth_noise=True)
+    diagonal = float(np.linalg.norm(np.ptp(clean.points, axis=0)))
+    assert prepared.report.smoothed_noise == pytest.approx(0.01 * diagonal / np.sqrt(3), rel=0.2 if given else 0.5)
+    assert "along the normals smoothed" in prepared.report.summary()
+    radius = np.linalg.norm(prepared.similarity.to_input(prepared.points), axis=1)
+    left = 0.01 * diagonal / np.sqrt(3) / (4 if given else 1.5)  # normals of noisy neighbourhoods are noisy too
+    assert rms(radius - 0.5) < left
+
+
+def test_beside_a_noisy_blade_is_outside():
+    """What is left of noise at its edges must not decide about all that lies beyond them."""
+    blade = sample_surface(Box(half_size=(0.7, 0.15, 0.01)), 12000, shell=0.002)
+    prepared = prepare_cloud(add_noise(blade, 0.01), smooth_noise=True)
+    points, normals = torch.from_numpy(prepared.points), torch.from_numpy(prepared.normals)
+    distance = CloudDistance(points, normals, noise=prepared.noise)
+    beyond = np.column_stack([RNG.uniform(-0.6, 0.6, 4000), RNG.uniform(0.18, 0.25, 4000), np.zeros(4000)])
+    query = torch.from_numpy(prepared.similarity.to_unit(beyond).astype(np.float32))
+    assert (distance.signed(query) < 0).float().mean() == 0
+    inside = np.column_stack([RNG.uniform(-0.6, 0.6, 4000), RNG.uniform(-0.1, 0.1, 4000), np.zeros(4000)])
+    query = torch.from_numpy(prepared.similarity.to_unit(inside).astype(np.float32))
+    assert (distance.signed(query) < 0).float().mean() > 0.97
+
+
+def test_distances_weigh_no_more_than_the_noise_allows():
+    config = FitConfig(residual_data_weight=2.0)
+    assert config.data_weight_after(1e-4, 0.0) == pytest.approx(2e4)
+    assert config.data_weight_after(1e-6, 0.0) == pytest.approx(2e6)
+    assert config.data_weight_after(1e-6, 0.01) == pytest.approx(2e4)
+
+
+def test_the_fit_of_a_noisy_cloud_says_what_was_smoothed_and_can_leave_it():
+    noisy = add_noise(sample_sphere(6000), 0.02)
+    small = {"widths": (16,), "depths": (2,), "omegas": (30.0,), "steps": (2,), "learning_rates": (1e-3,)}
+    small |= {"samples": 2000, "batch": 256}
+    smoothed = fit(noisy, FitConfig(**small)).record["cleaning"]["smoothed_noise"]
+    assert smoothed == pytest.approx(0.02, rel=0.25)  # ± 0.02 diagonals of √3
+    assert fit(noisy, FitConfig(**small, smooth_noise=False)).record["cleaning"]["smoothed_noise"] == 0
