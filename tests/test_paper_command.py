@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -84,9 +85,9 @@ def test_a_bench(ball: Path, tmp_path: Path, exact, capsys: pytest.CaptureFixtur
     kept = json.loads((out / "comparison.json").read_text())
     assert [record["outputs"][0]["name"] for record in kept["records"]] == ["Ours fine", "SIREN"]
     assert kept["records"][0]["outputs"][0]["chamfer"] == first["values"][0]
-    assert iio.imread(out / "sheets" / "comparison-ball.png").shape == (360, 4 * 332, 3)
+    assert iio.imread(out / "sheets" / "comparison-ball.jpg").shape == (360, 4 * 332, 3)
     assert (out / "plots" / "comparison-per-mesh-all.svg").read_text().startswith("<svg")
-    for link in ("sheets/comparison-ball.png", "plots/comparison-per-mesh-all.svg"):
+    for link in ("sheets/comparison-ball.jpg", "plots/comparison-per-mesh-all.svg"):
         assert f"]({link})" in page
 
     # Another table shares the cell; the page keeps the first, and a third run does nothing.
@@ -97,8 +98,13 @@ def test_a_bench(ball: Path, tmp_path: Path, exact, capsys: pytest.CaptureFixtur
     assert main([*command, "--table", "comparison", "deltas"]) == 0
     assert exact.runs == 3
 
-    # What a method that is not asked for has found stays.
-    assert main([*command[:-1], "ours", "--table", "comparison"]) == 0
+    # What a method that is not asked for has found stays; the page can be had elsewhere, with its pictures.
+    elsewhere = tmp_path / "docs" / "figures.md"
+    elsewhere.parent.mkdir()
+    assert main([*command[:-1], "ours", "--table", "comparison", "--page", str(elsewhere)]) == 0
+    links = re.findall(r"\]\(([^)]+)\)", elsewhere.read_text())
+    assert "figures/sheets/comparison-ball.jpg" in links
+    assert all((elsewhere.parent / link).is_file() for link in links)
     assert exact.runs == 3
     assert "| SIREN |" in (out / "results.md").read_text()
     capsys.readouterr()

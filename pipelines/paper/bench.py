@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import platform
+import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -64,6 +66,7 @@ class Bench:
         jobs: cells at a time.
         device: a torch device, or "auto".
         command: as it will stand on the page.
+        page: where else the page is written, its plots and sheets in a folder of that name beside it.
     """
 
     shapes: Sequence[Shape]
@@ -74,6 +77,7 @@ class Bench:
     jobs: int = 1
     device: str = "cpu"
     command: str = "mplicits bench paper"
+    page: Path | None = None
 
 
 def bench_paper(bench: Bench, out: Path, *, say: Callable[[str], None]) -> tuple[list[Section], int]:
@@ -117,9 +121,26 @@ def bench_paper(bench: Bench, out: Path, *, say: Callable[[str], None]) -> tuple
         own = [dict(records[cell]) for cell in wanted if cell in records]
         pairs = stamp | {"section": section_as_dict(section), "records": own}
         write_text(out / f"{section.name}.json", json.dumps(pairs, indent=2) + "\n")
-    page = as_page(_kept(out, stamp), command=bench.command, protocol=_protocol(bench), machine=_machine(bench.device))
-    write_text(out / PAGE, page)
+    there = _kept(out, stamp)
+    protocol, machine = _protocol(bench), _machine(bench.device)
+    write_text(out / PAGE, as_page(there, command=bench.command, protocol=protocol, machine=machine))
+    if bench.page is not None:
+        moved = [_copied(section, out, bench.page) for section in there]
+        write_text(bench.page, as_page(moved, command=bench.command, protocol=protocol, machine=machine))
     return sections, len(ran.failures)
+
+
+def _copied(section: Section, out: Path, page: Path) -> Section:
+    """The section with links to copies of its plots and sheets, in a folder beside a page elsewhere."""
+    for file, _ in (*section.plots, *section.sheets):
+        target = page.parent / page.stem / file
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(out / file, target)
+    plots, sheets = (
+        tuple((f"{page.stem}/{file}", title) for file, title in pictures)
+        for pictures in (section.plots, section.sheets)
+    )
+    return dataclasses.replace(section, plots=plots, sheets=sheets)
 
 
 def _section(spec: TableSpec, own: Mapping[Cell, Record], cells: Sequence[Cell], ran: Ran, out: Path) -> Section:

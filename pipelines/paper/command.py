@@ -38,11 +38,15 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--jobs", type=whole(1), default=1, metavar="N", help="cells at a time, through Ray (1)")
     parser.add_argument("--seed", type=whole(0), default=0, metavar="N", help="of everything random (0)")
     parser.add_argument("--device", default="auto", help="torch device (auto)")
+    parser.add_argument(
+        "--page", type=Path, metavar="FILE.md", help="also write the page there, plots and sheets in a folder beside it"
+    )
     add_json(parser)
 
 
 def _paper(arguments: argparse.Namespace) -> int:
     check_output(arguments.json, (".json",))
+    check_output(arguments.page, (".md",))
     asked = _words(arguments.table)
     tables = TABLES if "all" in asked else _known("--table", asked, TABLES, more=("all",))
     methods = METHODS if arguments.methods is None else _known("--methods", _words(arguments.methods), METHODS)
@@ -63,6 +67,7 @@ def _paper(arguments: argparse.Namespace) -> int:
         jobs=arguments.jobs,
         device=arguments.device,
         command=_command(arguments),
+        page=arguments.page,
     )
     try:
         sections, failures = bench_paper(bench, arguments.out, say=lambda text: print(text, file=sys.stderr))
@@ -106,6 +111,8 @@ def _command(arguments: argparse.Namespace) -> str:
         words += ["--methods", *arguments.methods]
     if arguments.reference is not None:
         words += ["--reference", _nearby(arguments.reference)]
+    if arguments.page is not None:
+        words += ["--page", _nearby(arguments.page)]
     for name, usual in (("jobs", 1), ("seed", 0), ("device", "auto")):
         value = getattr(arguments, name)
         if value != usual:

@@ -52,7 +52,7 @@ def write_sheets(name: str, records: Mapping[Cell, Record], out: Path) -> tuple[
             continue
         (out / "sheets").mkdir(exist_ok=True)
         damaged, *_ = cells[0].name.split(", ")
-        file = f"sheets/{name}-{damaged.replace(' + ', '-').replace(' ', '-')}.png"
+        file = f"sheets/{name}-{damaged.replace(' + ', '-').replace(' ', '-')}.jpg"
         write_picture(out / file, in_rows(_tiles({cell: records[cell] for cell in cells}, out)))
         written.append((file, f"{name}: {damaged}"))
     return tuple(written)
