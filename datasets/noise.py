@@ -56,11 +56,11 @@ def noise_level(points: Float64, normals: Float64, *, seed: int = 0) -> float:
         seed: of the points that are asked.
     """
     order = np.random.default_rng(seed).permutation(len(points))
-    if not _thickness(_nearest(points, normals, order[:ASKED], order, 8))[0] > THICK:
+    if not _thickness(_Layer(points, normals, order).around(order[:ASKED], 8))[0] > THICK:
         return 0.0
     level = 0.0
     while len(order) > 32:  # fewer and fewer points show wider and wider neighbourhoods, at the same cost
-        ratio, height = _thickness(_nearest(points, normals, order[:ASKED], order, 16))
+        ratio, height = _thickness(_Layer(points, normals, order).around(order[:ASKED], 16))
         level = height / 2**0.5  # of a difference of two
         if ratio < THIN:
             break
@@ -93,9 +93,9 @@ def smooth_along_normals(points: Float64, normals: Float64, level: float, *, rou
     share = VOTERS / (np.pi * (reach / spacing) ** 2)
     voters = order[: max(VOTERS, int(share * len(points)))]
     for layer in (LAYER * level, *(rounds - 1) * (LAYER_LEFT * level,)):
-        offset = np.empty(len(points))
+        offset, others = np.empty(len(points)), _Layer(moved, normals, voters)
         for rows in np.array_split(np.arange(len(points)), -(-len(points) // BLOCK)):
-            near = _nearest(moved, normals, rows, voters, VOTERS, within=float(np.hypot(reach, layer)))
+            near = others.around(rows, VOTERS, within=float(np.hypot(reach, layer)))
             beside = (near.distance**2 - near.height**2) / reach**2
             alike = (near.cosine - ALIKE) / (1 - ALIKE)
             seen = (beside < 1) & (np.abs(near.height) < layer) & (alike > 0)
@@ -105,19 +105,23 @@ def smooth_along_normals(points: Float64, normals: Float64, level: float, *, rou
     return moved
 
 
-def _nearest(
-    points: Float64, normals: Float64, rows: Rows, among: Rows, count: int, *, within: float = np.inf
-) -> _Neighbors:
-    """The nearest points of ``among`` to the points ``rows``, but not those themselves."""
-    tree = KDTree(points[among])
-    count = min(count, len(among) - 1)
-    distance, found = tree.query(points[rows], k=count + 1, distance_upper_bound=within, workers=-1)
-    there = (found < len(among)) & (among[np.minimum(found, len(among) - 1)] != rows[:, None])
-    near = among[np.where(there, found, 0)]
-    edge, own, theirs = points[near] - points[rows][:, None], normals[rows], normals[near]
-    height = 0.5 * (np.einsum("mkd,md->mk", edge, own) + np.einsum("mkd,mkd->mk", edge, theirs))
-    cosine = np.einsum("mkd,md->mk", theirs, own)
-    return _Neighbors(*(np.where(there, values, np.nan) for values in (distance, cosine, height)))
+class _Layer:
+    """The points ``among`` of a cloud, as its points see them."""
+
+    def __init__(self, points: Float64, normals: Float64, among: Rows) -> None:
+        self.points, self.normals, self.among = points, normals, among
+        self.tree = KDTree(points[among])
+
+    def around(self, rows: Rows, count: int, *, within: float = np.inf) -> _Neighbors:
+        """The ``count`` nearest to the points ``rows``, but not those themselves."""
+        count = min(count, len(self.among) - 1)
+        distance, found = self.tree.query(self.points[rows], k=count + 1, distance_upper_bound=within, workers=-1)
+        there = (found < len(self.among)) & (self.among[np.minimum(found, len(self.among) - 1)] != rows[:, None])
+        near = self.among[np.where(there, found, 0)]
+        edge, own, theirs = self.points[near] - self.points[rows][:, None], self.normals[rows], self.normals[near]
+        height = 0.5 * (np.einsum("mkd,md->mk", edge, own) + np.einsum("mkd,mkd->mk", edge, theirs))
+        cosine = np.einsum("mkd,md->mk", theirs, own)
+        return _Neighbors(*(np.where(there, values, np.nan) for values in (distance, cosine, height)))
 
 
 def _thickness(near: _Neighbors) -> tuple[float, float]:
@@ -134,5 +138,5 @@ def _thickness(near: _Neighbors) -> tuple[float, float]:
 
 def _spacing(points: Float64, normals: Float64, order: Rows) -> float:
     """The side of the square that a point has to itself, of the points seen along the normals."""
-    near = _nearest(points, normals, order[:ASKED], order, 16)
+    near = _Layer(points, normals, order).around(order[:ASKED], 16)
     return float(np.median(np.nanmax(near.distance, axis=1))) * np.sqrt(np.pi / near.distance.shape[1])
