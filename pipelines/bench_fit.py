@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
@@ -151,7 +152,7 @@ def _reconstructions(
             mesh = None
         results.append((f"level {level}", seconds, time.perf_counter() - started, mesh))
     if has_poisson():
-        oriented = prepare(cloud, config)
+        oriented = prepare(cloud, dataclasses.replace(config, smooth_noise=False))  # which is part of ours
         started = time.perf_counter()
         mesh = screened_poisson(oriented, depth=poisson_depth)
         results.append(("screened Poisson", time.perf_counter() - started, 0.0, _in_input(mesh, oriented.similarity)))
