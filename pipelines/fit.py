@@ -35,6 +35,7 @@ from .fit_state import (
 from .level_sources import banded_sources, first_sources
 from .memory import peak_memory
 from .merged_cloud import load_cloud
+from .runs import forget_run
 from .sampling import Band, band_of
 from .support import write_support
 from .training import LevelTrainer, Progress, StopFlag, stop_on_signals
@@ -89,7 +90,8 @@ def fit(
     Args:
         cloud: a file, a `PointCloud`, or an array ``(N, 3)`` or ``(N, 6)`` of points (and normals).
         config: settings; the defaults are those of the ``default`` preset.
-        out: run directory for the field, the checkpoints and ``run.json``; None writes nothing.
+        out: run directory for the field, the checkpoints and ``run.json``; None writes nothing. What another run left
+            there stays until the cloud has been read and found to be usable.
         resume: continue the interrupted run in ``out`` with its own settings; ``config`` is then ignored.
         progress: called now and then with how far the training is.
 
@@ -112,6 +114,8 @@ def fit(
     oriented = prepare(raw, config)
     if directory is not None:
         directory.mkdir(parents=True, exist_ok=True)
+        if not resume and is_leader():
+            forget_run(directory)
     fitting = _Fitting(oriented, raw.source, config, device, directory, progress, merging)
     if resume:
         fitting.restore()

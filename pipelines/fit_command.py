@@ -77,8 +77,6 @@ def _fit_one(arguments: argparse.Namespace, config: FitConfig | None) -> int:
     if not fitted:
         check_new_run(directory, resume=arguments.resume, force=arguments.force)
     mesh = _planned(arguments, depth)
-    if arguments.force:
-        _forget(directory)
     again = f"to continue: mplicits fit {arguments.cloud} -o {directory} --resume"
     if mesh is not None:
         again += f" --mesh {mesh.out}" + " --no-colors" * arguments.no_colors
@@ -150,9 +148,6 @@ def _fit_many(arguments: argparse.Namespace, config: FitConfig | None) -> int:
     jobs = arguments.jobs or 1
     check_jobs(jobs)
     planned = plan_fits(arguments.clouds, arguments.out, config, resume=arguments.resume, force=arguments.force)
-    if arguments.force:
-        for job in planned:
-            _forget(job.directory)
     try:
         with nullcontext() if arguments.quiet or jobs > 1 else progress_bars() as show:
             outcomes = fit_many(
@@ -184,17 +179,6 @@ def _planned(arguments: argparse.Namespace, depth: DepthInput | None) -> FitMesh
 
     source = Path(arguments.cloud) if depth is None else depth
     return plan_mesh(arguments.mesh, arguments.out, source, colors=not arguments.no_colors, resume=arguments.resume)
-
-
-def _forget(directory: Path) -> None:
-    """Remove what must not be resumed into the new run, nor colour it."""
-    from .fit_state import STATE_FILE
-    from .texture import TEXTURE_FILE
-    from .texture_state import texture_state_file
-
-    texture = directory / TEXTURE_FILE
-    for path in (directory / STATE_FILE, texture, texture_state_file(texture)):
-        path.unlink(missing_ok=True)
 
 
 COMMAND = Command(

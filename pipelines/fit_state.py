@@ -90,7 +90,7 @@ def read_record(directory: Path) -> dict[str, Any]:
         if not isinstance(record["config"], dict):
             raise TypeError("config is not a mapping")
     except FileNotFoundError:
-        raise InputError(f"{path}: no such file; expected a run directory written by `mplicits fit`") from None
+        raise InputError(f"{path}: no such file; expected a run of mplicits fit, evolve or reconstruct") from None
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(f"{path}: damaged ({error}); fit again into a new directory") from error
     return record

@@ -10,7 +10,7 @@ from ..neural_fields import InputError, SavedField, load_field
 from ..neural_fields.dynamic_tracing import moment
 from .fit_state import FIELD_FILE, RECORD_FILE, STATE_FILE
 
-__all__ = ["check_new_run", "find_field", "is_field", "load_still"]
+__all__ = ["check_new_run", "find_field", "forget_run", "is_field", "load_still"]
 
 
 def find_field(path: str | Path) -> Path:
@@ -26,7 +26,8 @@ def find_field(path: str | Path) -> Path:
             return field
         if (path / RECORD_FILE).is_file():
             raise InputError(
-                f"{path}: holds no {FIELD_FILE} yet; finish it with `mplicits fit CLOUD -o {path} --resume`"
+                f"{path}: holds no {FIELD_FILE} yet; finish it with --resume of the command that began it "
+                "(mplicits fit, evolve or reconstruct)"
             )
         raise InputError(f"{path}: not a run directory (no {FIELD_FILE}); make one with `mplicits fit CLOUD -o {path}`")
     if not path.exists():
@@ -88,3 +89,13 @@ def check_new_run(path: str | Path, *, resume: bool, force: bool) -> Path:
         hint = " --resume continues it," if (path / STATE_FILE).is_file() else ""
         raise InputError(f"{path}: exists and is not empty;{hint} --force overwrites it, or choose another -o")
     return path
+
+
+def forget_run(directory: Path) -> None:
+    """Remove what of an earlier run must not be resumed into a new one in its place, nor colour it."""
+    from .texture import TEXTURE_FILE
+    from .texture_state import texture_state_file
+
+    texture = directory / TEXTURE_FILE
+    for path in (directory / STATE_FILE, texture, texture_state_file(texture)):
+        path.unlink(missing_ok=True)

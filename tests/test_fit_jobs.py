@@ -114,3 +114,15 @@ def test_two_workers_fit_as_one_does(clouds: list[Path], tmp_path: Path, capsys:
     for name in ("ball", "ring"):
         alone, beside = (read_record(tmp_path / folder / name)["stages"][-1] for folder in ("one", "two"))
         assert beside["rms_at_points"] == pytest.approx(alone["rms_at_points"], rel=1e-3)
+
+
+def test_force_keeps_what_is_there_until_the_new_cloud_is_usable(clouds: list[Path], tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    assert run(clouds[0], "-o", out, "--quiet", *SMALL) == 0
+    (out / STATE_FILE).write_bytes(b"of an interrupted run")
+    broken = tmp_path / "broken.ply"
+    broken.write_text("ply\nformat ascii 1.0\nend_header\n")
+    assert run(broken, "-o", out, "--quiet", "--force", *SMALL) == 2
+    assert (out / STATE_FILE).read_bytes() == b"of an interrupted run"
+    assert run(clouds[1], "-o", out, "--quiet", "--force", *SMALL) == 0
+    assert not (out / STATE_FILE).exists()
