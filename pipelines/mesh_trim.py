@@ -30,6 +30,9 @@ __all__ = [
 # Least share of a component's area near some point. A part that was measured has nearly all of it there, an open scan
 # that the fit closed behind still a third or so; a blob has none, or what a stray point or a neighbouring part touches.
 LEAST_SUPPORT = 0.05
+# And fewest points that it must be the nearest component to, if it is as large as twice their share of the surface:
+# around one or two strays a fit may close a bubble as small as their spacing.
+FEWEST_POINTS = 3
 
 
 def face_areas(mesh: Mesh) -> NDArray[np.float64]:
@@ -78,8 +81,9 @@ def drop_unsupported(
 ) -> Supported:
     """Drop the connected components that no input points support: blobs, which nothing was measured of.
 
-    A component is kept if at least the share ``least`` of its area has its corners within ``radius`` of some point.
-    Where that keeps none, all stay: mesh and points do not belong together, and this is no judge of that.
+    A component is kept if at least the share ``least`` of its area has its corners within ``radius`` of some point, and
+    no less than three points are nearer to it than to others, or at least half of those that so large an area has
+    elsewhere. Where that keeps none, all stay: mesh and points do not belong together, and this is no judge of that.
 
     Args:
         mesh: with points and radius in the same coordinates.
@@ -103,6 +107,14 @@ def drop_unsupported(
     whole = np.bincount(number, weights=areas)
     kept = np.bincount(number, weights=areas * share) >= least * whole
     kept &= np.bincount(number, weights=share) > 0  # nothing of no area either
+    if kept.sum() > 1:
+        of_vertex = np.zeros(len(mesh.vertices), np.int64)
+        of_vertex[mesh.faces] = number[:, None]
+        used = np.unique(mesh.faces)
+        near, whose = KDTree(mesh.vertices[used]).query(points, distance_upper_bound=reach, workers=-1)
+        own = np.bincount(of_vertex[used[np.asarray(whose)[np.isfinite(near)]]], minlength=len(whole))
+        usual = whole / max(spacing_of(np.asarray(points, np.float64)), 1e-300) ** 2
+        kept &= own >= np.minimum(FEWEST_POINTS, usual / 2)
     if kept.all() or not kept.any():
         return Supported(mesh, 0, 0.0)
     return Supported(keep_faces(mesh, kept[number]), int((~kept).sum()), float(whole[~kept].sum() / whole.sum()))

@@ -98,6 +98,9 @@ def test_a_blob_without_points_goes_and_a_second_part_stays(two):
     assert left.area == pytest.approx(face_areas(blob).sum() / face_areas(mesh).sum())
     stray = np.concatenate((points, [[0.3, 0.9, 0.0]]))  # one point on a blob does not make it a part
     assert drop_unsupported(mesh, stray, radius=0.02).dropped == 1
+    assert drop_unsupported(mesh, stray).dropped == 1  # although all of it lies near that point
+    few = np.concatenate((points, on_sphere(12, 0.1, [0.3, 0.8, 0])))
+    assert drop_unsupported(mesh, few).dropped == 0
     whole = drop_unsupported(two, points)
     assert (whole.dropped, whole.mesh is two) == (0, True)
 

@@ -273,6 +273,18 @@ def test_ours(ball: Path, out: Path) -> None:
     assert (out / "runs" / record["key"] / "field.safetensors").is_file()
 
 
+def test_a_finished_fit_is_measured_again_but_not_trained(
+    ball: Path, out: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cell = Cell(ball, "ours", "smoke", overrides=(("steps", (120, 20, 20)), ("samples", 5000)))
+    first = run_cell(cell, out)
+    (out / "cells" / f"{first['key']}.json").unlink()
+    monkeypatch.delattr("mplicits.pipelines.paper.ours.fit")
+    again = run_cell(cell, out)
+    for one, other in zip(first["outputs"], again["outputs"], strict=True):
+        assert (one["chamfer"], one["train_seconds"]) == (other["chamfer"], other["train_seconds"])
+
+
 def test_cells_of_a_table(ball: Path) -> None:
     def cells(shapes, preset):
         return [Cell(shape, method, preset) for shape in shapes for method in ("a", "b", "a")]

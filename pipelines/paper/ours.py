@@ -5,11 +5,14 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from itertools import accumulate
+from pathlib import Path
 from typing import Any
 
-from ..fit import fit
+from ...neural_fields import MultiscaleSDF, load_field
+from ..fit import Run, fit
 from ..fit_config import FitConfig
-from ..fit_state import FIELD_FILE, STATE_FILE
+from ..fit_mesh import is_fitted
+from ..fit_state import FIELD_FILE, RECORD_FILE, STATE_FILE, read_record
 from ..support import read_support
 from .cell import Cell
 from .judge import Judge
@@ -56,12 +59,14 @@ class Ours(Method):
         return {"fit": {k: v for k, v in dataclasses.asdict(our_config(cell)).items() if k != "device"}}
 
     def run(self, cell: Cell, work: Workplace) -> Findings:
-        """Fit, and measure every level; a fit that was interrupted goes on."""
+        """Fit, and measure every level; an interrupted fit goes on, and a finished one is taken as it is."""
         judge, directory = Judge(cell, work), work.run()
         config = dataclasses.replace(our_config(cell), device=work.device)
-        resume = (directory / STATE_FILE).is_file()
         directory.parent.mkdir(exist_ok=True)
-        run = fit(damaged_cloud(cell), config, out=directory, resume=resume, progress=work.progress)
+        run = _finished(directory, work.device)
+        if run is None:
+            resume = (directory / STATE_FILE).is_file()
+            run = fit(damaged_cloud(cell), config, out=directory, resume=resume, progress=work.progress)
         stages = run.record["stages"]
         seconds = accumulate(stage["sampling_seconds"] + stage["training_seconds"] for stage in stages)
         parameters = accumulate(stage["parameters"] for stage in stages)
@@ -82,3 +87,12 @@ class Ours(Method):
         ]
         details = {"cleaning": run.record["cleaning"], "stages": stages}
         return Findings(tuple(outputs), tuple(run.record["deltas"]), details)
+
+
+def _finished(directory: Path, device: str) -> Run | None:
+    """The fit in a directory, if it was trained to its end: what is wrong with its meshes need not cost another one."""
+    if not (directory / RECORD_FILE).is_file() or not is_fitted(directory):
+        return None
+    saved = load_field(directory / FIELD_FILE, device=device)
+    assert isinstance(saved.field, MultiscaleSDF)
+    return Run(saved.field, saved.similarity, directory, read_record(directory))
