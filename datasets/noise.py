@@ -56,15 +56,17 @@ def noise_level(points: Float64, normals: Float64, *, seed: int = 0) -> float:
         seed: of the points that are asked.
     """
     order = np.random.default_rng(seed).permutation(len(points))
-    if not _thickness(_Layer(points, normals, order).around(order[:ASKED], 8))[0] > THICK:
+    layer = _Layer(points, normals, order)
+    if not _thickness(layer.around(order[:ASKED], 8))[0] > THICK:
         return 0.0
     level = 0.0
     while len(order) > 32:  # fewer and fewer points show wider and wider neighbourhoods, at the same cost
-        ratio, height = _thickness(_Layer(points, normals, order).around(order[:ASKED], 16))
+        ratio, height = _thickness(layer.around(order[:ASKED], 16))
         level = height / 2**0.5  # of a difference of two
         if ratio < THIN:
             break
         order = order[: len(order) // 2]
+        layer = _Layer(points, normals, order)
     return level
 
 

@@ -31,9 +31,8 @@ from .fit_state import (
     save_state,
     write_record,
 )
+from .runs import forget_run
 from .sampling import delta_of
-from .texture import TEXTURE_FILE
-from .texture_state import texture_state_file
 from .training import Progress, StopFlag, stop_on_signals
 
 __all__ = ["Evolution", "evolve", "train_evolution"]
@@ -113,7 +112,7 @@ def train_evolution(
     if resume:
         training.restore()
     elif out is not None:
-        _forget(out)
+        forget_run(out)
     with stop_on_signals() as flag:
         return training.run(flag)
 
@@ -315,13 +314,6 @@ class _Evolving:
             "training_seconds": round(seconds, 3),
             "environment": environment(self.device),
         }
-
-
-def _forget(directory: Path) -> None:
-    """Remove what is left of another run there."""
-    texture = directory / TEXTURE_FILE
-    for path in (directory / STATE_FILE, texture, texture_state_file(texture)):
-        path.unlink(missing_ok=True)
 
 
 def _levels(field: SpaceTimeSDF) -> list[torch.nn.Module]:

@@ -31,9 +31,9 @@ from .reconstruct_config import ReconstructConfig
 from .reconstruct_texture import scene_texture
 from .reconstruct_train import SceneTrainer
 from .reconstruct_views import ViewImage, comparison_sheet, held_out, measure, render_image
+from .runs import forget_run
 from .scene_model import SceneModel, build_scene
 from .texture import TEXTURE_FILE
-from .texture_state import texture_state_file
 from .training import Progress, stop_on_signals
 
 __all__ = ["HELD_OUT_FILE", "PREVIEW_FILE", "Reconstruction", "reconstruct"]
@@ -126,7 +126,7 @@ class _Reconstruction:
         if resume:
             self._restore()
         elif self.directory is not None:
-            _forget(self.directory)
+            forget_run(self.directory, HELD_OUT_FILE)
         if self.directory is not None:
             write_record(self.directory, self._record(finished=False))
         with stop_on_signals() as flag:
@@ -268,10 +268,3 @@ class _Reconstruction:
             "losses": trainer.losses,
             "environment": environment(self.device),
         }
-
-
-def _forget(directory: Path) -> None:
-    """Remove what is left of another run there, once the new data are known to be good."""
-    texture = directory / TEXTURE_FILE
-    for path in (directory / STATE_FILE, texture, texture_state_file(texture), directory / HELD_OUT_FILE):
-        path.unlink(missing_ok=True)

@@ -91,11 +91,16 @@ def check_new_run(path: str | Path, *, resume: bool, force: bool) -> Path:
     return path
 
 
-def forget_run(directory: Path) -> None:
-    """Remove what of an earlier run must not be resumed into a new one in its place, nor colour it."""
+def forget_run(directory: Path, *also: str) -> None:
+    """Remove what of an earlier run must not be resumed into a new one in its place, nor colour it.
+
+    Args:
+        directory: of the run, once the new data are known to be good.
+        also: names of other files that only this kind of run has.
+    """
     from .texture import TEXTURE_FILE
     from .texture_state import texture_state_file
 
     texture = directory / TEXTURE_FILE
-    for path in (directory / STATE_FILE, texture, texture_state_file(texture)):
+    for path in (directory / STATE_FILE, texture, texture_state_file(texture), *(directory / name for name in also)):
         path.unlink(missing_ok=True)

@@ -10,6 +10,7 @@ import torch
 
 from ...neural_fields import Field, MultiscaleSDF, Siren
 from ..cloud_distance import CloudDistance
+from ..fit import RESIDUAL_GAIN
 from ..fit_config import FitConfig
 from ..level_sources import Weights, device_of, surface_samples
 from ..sampling import band_of, distance_samples, with_previous
@@ -25,9 +26,6 @@ __all__ = [
     "up_to",
     "without_bands",
 ]
-
-# As in the fit, a residual starts at a tenth of the usual output scale.
-RESIDUAL_GAIN = 0.1
 
 
 def up_to(field: MultiscaleSDF, level: int) -> MultiscaleSDF:
