@@ -63,10 +63,20 @@ def test_noise_reaches_the_fit(ball: Path, monkeypatch: pytest.MonkeyPatch) -> N
 def test_screened_poisson_when_installed(ball: Path) -> None:
     pytest.importorskip("pymeshlab", reason="the extra mplicits[poisson] is not installed")
     rows = bench_fit([ball], SMALL, resolution=32, samples=5000, poisson_depth=6)
-    assert rows[-1].method == "screened Poisson"
+    assert [row.method for row in rows] == ["level 0", "level 1", "screened Poisson"]
     assert rows[-1].metrics is not None
     assert rows[-1].metrics.iou is not None
     assert rows[-1].metrics.iou > 0.95
+
+
+def test_screened_poisson_on_what_ours_has_smoothed(ball: Path) -> None:
+    pytest.importorskip("pymeshlab", reason="the extra mplicits[poisson] is not installed")
+    rows = bench_fit([ball], SMALL, noise=0.02, resolution=32, samples=5000, poisson_depth=6)
+    assert [row.method for row in rows[-2:]] == ["screened Poisson", "screened Poisson, smoothed"]
+    noisy, smoothed = (row.metrics for row in rows[-2:])
+    assert noisy is not None
+    assert smoothed is not None
+    assert smoothed.chamfer - smoothed.chamfer_floor < (noisy.chamfer - noisy.chamfer_floor) / 3
 
 
 def test_a_level_without_a_surface_is_a_row(monkeypatch: pytest.MonkeyPatch, ball: Path) -> None:

@@ -260,6 +260,16 @@ def test_recipes_learn_from_the_unit_sphere(ball: Path, out: Path, known, monkey
     assert record["method"] == {"source": "s", "differs": "d"}
 
 
+def test_poisson_on_what_ours_has_smoothed(ball: Path, out: Path) -> None:
+    pytest.importorskip("pymeshlab", reason="the extra mplicits[poisson] is not installed")
+
+    def error(name: str) -> float:
+        (output,) = run_cell(Cell(ball, name, "smoke", noise=0.02), out)["outputs"]
+        return output["chamfer"] - output["chamfer_floor"]
+
+    assert 0 < error("poisson-smoothed") < error("poisson") / 3
+
+
 def test_ours(ball: Path, out: Path) -> None:
     cell = Cell(ball, "ours", "smoke", overrides=(("steps", (120, 20, 20)), ("samples", 5000)))
     record = run_cell(cell, out)

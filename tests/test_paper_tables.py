@@ -140,13 +140,17 @@ def test_poisson() -> None:
         record("a", "ours", {"Ours coarse": 9e-5, "Ours fine": 2e-5}, noise=0.01),
         record("a", "poisson", {"Screened Poisson": 3e-5}),
         record("a", "poisson", {"Screened Poisson": 8e-5}, noise=0.01),
+        record("a", "poisson-smoothed", {"Screened Poisson (our smoothing)": 5e-5}, noise=0.01),
     ]
     (table,) = poisson_tables(records)
     rows = rows_of(table)
+    assert "clean, Screened Poisson (our smoothing)" not in rows
+    assert rows["1 % noise, Screened Poisson (our smoothing)"]["mean CD"] == 5e-5
     assert rows["clean, Screened Poisson"]["mean CD"] == 3e-5
     assert rows["1 % noise, Ours fine"]["mean CD"] == 2e-5
     assert table.rows[1].published == (3.87e-5, 0.653, None, None)
     assert "is 3.00 times that of Ours fine on clean clouds, and 4.00 times under noise" in table.notes[0]
+    assert "smoothed, screened Poisson is at 2.50 times ours" in table.notes[1]
 
 
 def test_banf() -> None:

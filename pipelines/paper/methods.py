@@ -25,6 +25,7 @@ METHODS: tuple[Method, ...] = (
     FromRecipe(BanfRecipe()),
     Poisson(),
     Poisson(trim=0.01),
+    Poisson(smoothed=True),
     Isolation(),
     LossWeights(),
     DeltaFactor(),

@@ -27,4 +27,15 @@ TABLES = (
 )
 
 # Of these --methods chooses; the variants of our own that ablations train come with their tables.
-METHODS = ("ours", "siren", "ingp-coarse", "ingp-fine", "idf", "bacon", "banf", "poisson", "poisson-trim")
+METHODS = (
+    "ours",
+    "siren",
+    "ingp-coarse",
+    "ingp-fine",
+    "idf",
+    "bacon",
+    "banf",
+    "poisson",
+    "poisson-trim",
+    "poisson-smoothed",
+)

@@ -9,12 +9,13 @@ from typing import Any
 
 import numpy as np
 
+from ...datasets import prepare_cloud
 from ...neural_fields.meshing import Mesh
 from ..poisson import has_poisson, screened_poisson
 from .cell import Cell
 from .judge import Judge
 from .method import Findings, Method, Workplace
-from .protocol import oriented_cloud, protocol_of
+from .protocol import damaged_cloud, oriented_cloud, protocol_of
 from .recipe import Recipe
 
 __all__ = ["FromRecipe", "Poisson"]
@@ -54,17 +55,22 @@ class Poisson(Method):
 
     Args:
         trim: this part of the vertices, those of least density, is cut away, with their faces; 0 cuts nothing.
+        smoothed: noise is smoothed off the cloud first, as our fit does, so that the rest of the two can be compared.
     """
 
     source = "Kazhdan and Hoppe 2013, octree depth 10"
 
-    def __init__(self, trim: float = 0.0) -> None:
-        self.trim = trim
-        self.name = "poisson-trim" if trim else "poisson"
-        self.label = f"Screened Poisson{f' ({trim:.0%} trim)' if trim else ''}"
+    def __init__(self, *, trim: float = 0.0, smoothed: bool = False) -> None:
+        self.trim, self.smoothed = trim, smoothed
+        self.name = f"poisson{'-trim' if trim else ''}{'-smoothed' if smoothed else ''}"
+        self.label = "Screened Poisson"
         self.differs = "MeshLab's implementation with its defaults; the paper's is Open3D's"
         if trim:
+            self.label += f" ({trim:.0%} trim)"
             self.differs += "; the trim follows Open3D's rule"
+        if smoothed:
+            self.label += " (our smoothing)"
+            self.differs += "; it gets the cloud from which ours has smoothed the noise, not the noisy one"
 
     def missing(self) -> str | None:
         """The extra, where it is not installed."""
@@ -72,7 +78,11 @@ class Poisson(Method):
 
     def run(self, cell: Cell, work: Workplace) -> Findings:
         """Reconstruct, and measure."""
-        judge, cloud = Judge(cell, work), oriented_cloud(cell)
+        judge = Judge(cell, work)
+        if self.smoothed:
+            cloud = prepare_cloud(damaged_cloud(cell), isolation=None, smooth_noise=True)
+        else:
+            cloud = oriented_cloud(cell)
         importlib.import_module("pymeshlab")  # so that loading it is not timed
         started = time.perf_counter()
         surface = screened_poisson(cloud, depth=protocol_of(cell.preset).poisson_depth, trim=self.trim)
