@@ -6,7 +6,6 @@ file whose properties are all doubles, so that one decoder serves all three enco
 
 from __future__ import annotations
 
-import os
 import re
 import warnings
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..neural_fields import InputError
+from ..neural_fields.files import write_whole
 from .cloud_stream import TableStream
 from .meshes import triangulate, vertex_normals
 from .point_cloud import PointCloud, colors_from, normals_from
@@ -127,7 +127,6 @@ def ply_stream(path: Path) -> TableStream | None:
 
 def write_cloud_ply(path: str | Path, cloud: PointCloud) -> None:
     """Write ``cloud`` as binary little-endian PLY with double coordinates; an existing file is replaced at the end."""
-    path = Path(path)
     fields = [(name, "<f8") for name in "xyz"]
     values = list(cloud.points.T)
     if cloud.normals is not None:
@@ -142,13 +141,7 @@ def write_cloud_ply(path: str | Path, cloud: PointCloud) -> None:
     types = {"<f8": "double", "<f4": "float", "u1": "uchar"}
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(cloud)}"]
     header += [f"property {types[kind]} {name}" for name, kind in fields]
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        temporary.write_bytes("\n".join([*header, "end_header\n"]).encode() + rows.tobytes())
-        temporary.replace(path)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise InputError(f"{path}: cannot be written ({error.strerror}); choose another place") from error
+    write_whole(path, "\n".join([*header, "end_header\n"]).encode() + rows.tobytes())
 
 
 def _cloud(vertex: _Columns, faces: NDArray[np.int64] | None, path: Path) -> PointCloud:

@@ -50,10 +50,11 @@ def find_image(folder: Path, name: str) -> Path:
 
 
 def list_images(folder: Path) -> list[Path]:
-    """The images of a folder in the order of their names; none where there is no such folder."""
+    """The images of a folder in the order of their names, but for hidden files; none where there is no such folder."""
     if not folder.is_dir():
         return []
-    return sorted(file for file in folder.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES)
+    found = sorted(file for file in folder.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES)
+    return [file for file in found if not file.name.startswith(".")]  # half-written ones, and macOS's
 
 
 def image_size(path: Path) -> tuple[int, int]:

@@ -19,6 +19,7 @@ from .baselines import NeusSDF
 from .color import ColorSiren, TextureField
 from .errors import InputError
 from .field import Field
+from .files import write_whole
 from .multiscale import MultiscaleSDF
 from .similarity import Similarity
 from .siren import Siren
@@ -153,13 +154,8 @@ def _digest(field: Field) -> str:
 
 def _write(path: Path, state: Mapping[str, Tensor], form: str, header: Mapping[str, Any]) -> None:
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in state.items()}
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        # Bytes, not save_file: that makes files nobody else may read, whatever the umask.
-        partial.write_bytes(save(tensors, metadata={form: json.dumps(header)}))
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
+    # Bytes, not save_file: that makes files nobody else may read, whatever the umask.
+    write_whole(path, save(tensors, metadata={form: json.dumps(header)}))
 
 
 @contextmanager

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..neural_fields import InputError
+from ..neural_fields.files import whole_file
 
 __all__ = ["ANIMATIONS", "write_animation"]
 
@@ -43,9 +44,8 @@ def write_animation(
         progress: called with the number of frames so far after each one.
 
     Raises:
-        InputError: another extension, or the folder does not exist.
+        InputError: another extension, the folder does not exist, or the file cannot be written.
         ValueError: there are no frames, one is no RGB image or of another size than the first, or ``fps`` is not > 0.
-        OSError: ffmpeg could not write the file.
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -55,16 +55,12 @@ def write_animation(
         raise InputError(f"{path}: the folder {path.absolute().parent} does not exist; make it first")
     if not 0 < fps < float("inf"):
         raise ValueError(f"{path}: fps={fps}; expected a number > 0")
-    partial = path.with_name(f".{path.stem}.partial{suffix}")
     checked = _checked(path, frames, progress)
-    try:
+    with whole_file(path) as partial:
         if suffix == ".mp4":
             _write_mp4(partial, checked, fps)
         else:
             _write_gif(partial, checked, fps)
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def _checked(path: Path, frames: Iterable[Image], progress: Callable[[int], None] | None) -> Iterator[Image]:
@@ -124,7 +120,7 @@ def _ffmpeg(arguments: Sequence[str | Path]) -> Iterator[IO[bytes]]:
     imageio's own writer leaves ffmpeg running when a frame cannot be made, and does not look at its exit code.
 
     Raises:
-        OSError: ffmpeg failed; the message names the file and gives its reason.
+        OSError: ffmpeg failed; the message gives its reason.
     """
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-v", "error", *map(str, arguments)]
     with tempfile.TemporaryFile() as log:
@@ -144,7 +140,7 @@ def _ffmpeg(arguments: Sequence[str | Path]) -> Iterator[IO[bytes]]:
         if code:
             log.seek(0)
             reason = " ".join(log.read().decode(errors="replace").split())[:200]
-            raise OSError(f"{arguments[-1]}: ffmpeg failed ({reason or code})")
+            raise OSError(f"ffmpeg failed: {reason or code}")
 
 
 def _even(frame: Image) -> Image:

@@ -86,9 +86,9 @@ def write_json(path: Path | None, data: Any) -> None:
     """Write figures through a temporary file beside the target; nothing without a path."""
     if path is None:
         return
-    partial = path.with_name(f".{path.name}.partial")
-    partial.write_text(json.dumps(data, indent=2) + "\n", encoding="utf-8")
-    partial.replace(path)
+    from ..neural_fields.files import write_whole  # here: its package loads torch
+
+    write_whole(path, json.dumps(data, indent=2) + "\n")
 
 
 @contextmanager

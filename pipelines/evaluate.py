@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from ..neural_fields import InputError, Similarity
+from ..neural_fields.files import write_whole
 from .surface import Surface, components, is_closed, read_surface, sample_surface
 from .volume_overlap import overlap
 
@@ -223,7 +224,4 @@ def format_metrics(metrics: Metrics) -> str:
 
 def write_metrics(path: str | Path, metrics: Metrics) -> None:
     """Write the figures as JSON, through a temporary file beside the target."""
-    path = Path(path)
-    partial = path.with_name(path.name + ".partial")
-    partial.write_text(json.dumps(dataclasses.asdict(metrics), indent=2) + "\n", encoding="utf-8")
-    partial.replace(path)
+    write_whole(path, json.dumps(dataclasses.asdict(metrics), indent=2) + "\n")

@@ -12,11 +12,12 @@ from typing import Any
 
 from ..datasets.reading import check_cloud_path
 from ..neural_fields import InputError
+from ..neural_fields.files import write_whole
 from .config import load_config
 from .fit import fit
 from .fit_config import FitConfig
 from .fit_mesh import is_fitted
-from .fit_state import STATE_FILE, read_record, write_text
+from .fit_state import STATE_FILE, read_record
 from .jobs import Outcome, check_jobs, run_jobs
 from .runs import check_new_run
 from .timing import format_table
@@ -139,7 +140,7 @@ def _named(progress: Callable[[str, Progress], None], name: str) -> Callable[[Pr
 
 
 def _keep_settings(out: Path, config: FitConfig) -> None:
-    write_text(out / SETTINGS_FILE, json.dumps({"config": dataclasses.asdict(config)}, indent=2) + "\n")
+    write_whole(out / SETTINGS_FILE, json.dumps({"config": dataclasses.asdict(config)}, indent=2) + "\n")
 
 
 def _kept_settings(out: Path) -> FitConfig:

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from ..datasets import OrientedCloud
 from ..neural_fields import InputError
+from ..neural_fields.files import write_whole
 
 __all__ = [
     "FIELD_FILE",
@@ -32,7 +33,6 @@ __all__ = [
     "read_record",
     "save_state",
     "write_record",
-    "write_text",
 ]
 
 FIELD_FILE = "field.safetensors"
@@ -66,16 +66,9 @@ def environment(device: torch.device) -> dict[str, Any]:
     }
 
 
-def write_text(path: Path, text: str) -> None:
-    """Write a text file, whole or not at all, through a temporary one beside it; line ends stay as they are."""
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    partial.write_text(text, encoding="utf-8", newline="")
-    partial.replace(path)
-
-
 def write_record(directory: Path, record: Mapping[str, Any]) -> None:
     """Write ``run.json``, whole or not at all."""
-    write_text(directory / RECORD_FILE, json.dumps(record, indent=2) + "\n")
+    write_whole(directory / RECORD_FILE, json.dumps(record, indent=2) + "\n")
 
 
 def read_record(directory: Path) -> dict[str, Any]:
@@ -100,10 +93,8 @@ def save_state(
     directory: Path, tensors: Mapping[str, Tensor], progress: Mapping[str, Any], *, name: str = STATE_FILE
 ) -> None:
     """Write the resume file, whole or not at all; ``progress`` is JSON."""
-    partial = directory / f".{name}.{os.getpid()}.partial"
     plain = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in tensors.items()}
-    partial.write_bytes(save(plain, metadata={"progress": json.dumps(dict(progress))}))
-    partial.replace(directory / name)
+    write_whole(directory / name, save(plain, metadata={"progress": json.dumps(dict(progress))}))
 
 
 def load_state(directory: Path, *, name: str = STATE_FILE) -> tuple[dict[str, Tensor], dict[str, Any]]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from ..datasets import PointCloud, read_cloud
 from ..datasets.cloud_stream import MemoryStream
 from ..datasets.large_cloud import Merging, merge_cloud
 from ..datasets.reading import check_cloud, open_stream
+from ..neural_fields.files import whole_file
 
 __all__ = ["MERGED_FILE", "load_cloud"]
 
@@ -79,10 +79,8 @@ def _keep(file: Path, about: dict[str, Any], cloud: PointCloud, merging: Merging
     file.parent.mkdir(parents=True, exist_ok=True)
     arrays = {"points": cloud.points, "normals": cloud.normals, "colors": cloud.colors}
     text = json.dumps({"about": about, "merging": dataclasses.asdict(merging), "source": cloud.source})
-    partial = file.with_name(f".{file.name}.{os.getpid()}.partial")
-    with partial.open("wb") as stream:
+    with whole_file(file) as partial, partial.open("wb") as stream:
         np.savez(stream, record=np.array(text), **{name: a for name, a in arrays.items() if a is not None})
-    partial.replace(file)
 
 
 def _kept(file: Path, about: dict[str, Any]) -> tuple[PointCloud, Merging] | None:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ..datasets import srgb_to_linear
 from ..neural_fields import InputError, Similarity
+from ..neural_fields.files import whole_file
 from ..neural_fields.meshing import Mesh
 from .glb import write_glb
 
@@ -70,14 +71,8 @@ def write_mesh(path: str | Path, mesh: Mesh, similarity: Similarity | None = Non
     """
     similarity = similarity or Similarity.identity()
     path = check_mesh_path(path, similarity)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
+    with whole_file(path) as partial:
         _WRITERS[path.suffix.lower()](partial, mesh, similarity)
-        partial.replace(path)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror}); choose another place") from error
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def _bytes(colors: NDArray[np.floating]) -> NDArray[np.uint8]:

@@ -18,6 +18,7 @@ from torch import Tensor
 from ..datasets.cameras import Camera
 from ..datasets.meshes import vertex_normals
 from ..neural_fields import InputError
+from ..neural_fields.files import write_whole
 from .raster import clip, cover
 from .seen import Seen
 from .surface import Surface
@@ -267,16 +268,11 @@ def check_picture_path(path: str | Path, *, transparent: bool = False) -> None:
 
 
 def write_picture(path: str | Path, image: Image) -> None:
-    """Write a PNG ``(H, W, 3 | 4)`` or a JPEG ``(H, W, 3)``, through a temporary file beside the target.
+    """Write a PNG ``(H, W, 3 | 4)`` or a JPEG ``(H, W, 3)``, whole or not at all.
 
     Raises:
-        InputError: as for `check_picture_path`.
+        InputError: as for `check_picture_path`, or the file cannot be written.
     """
     path = Path(path)
     check_picture_path(path, transparent=image.shape[2] == 4)
-    partial = path.with_name(f".{path.stem}.partial{path.suffix}")
-    try:
-        iio.imwrite(partial, image)
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
+    write_whole(path, iio.imwrite("<bytes>", image, extension=path.suffix.lower()))

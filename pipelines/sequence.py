@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +16,7 @@ from ..datasets import srgb_to_linear
 from ..datasets.cameras import Camera
 from ..neural_fields import Field, InputError, Similarity, load_field
 from ..neural_fields.dynamic_tracing import DynamicTracer, moment
+from ..neural_fields.files import whole_file
 from ..neural_fields.meshing import NoSurfaceError, extract_mesh
 from ..neural_fields.tracing import BOUNDING_RADIUS
 from .animation import ANIMATIONS, write_animation
@@ -286,13 +286,7 @@ def _write_moving_mesh(
         attributes["COLOR_0"] = opaque
     motion = Motion(np.arange(options.frames) / options.fps, targets)
     material = {"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.8}}
-    partial = out.with_name(f".{out.name}.{os.getpid()}.partial")
-    try:
+    with whole_file(out) as partial:
         write_glb(partial, tracked.faces, attributes, material=material, origin=origin, motion=motion)
-        partial.replace(out)
-    except OSError as error:
-        raise InputError(f"{out}: cannot be written ({error.strerror}); choose another place") from error
-    finally:
-        partial.unlink(missing_ok=True)
     size = math.ceil(out.stat().st_size / 1e6)
     return f"{len(places[0]):,} vertices in {options.frames} frames, {size} MB"

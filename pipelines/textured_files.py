@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..neural_fields import InputError, Similarity
+from ..neural_fields.files import whole_file
 from .glb import write_glb
 from .mesh_files import TEXT_ROWS, check_mesh_path, glb_origin, needs_doubles
 from .unwrap import Unwrapped, check_unwrap_tools
@@ -63,27 +64,19 @@ def write_textured(
     files = {name: path.with_name(f"{path.stem}_{name}.png") for name in images}
     library = path.with_suffix(".mtl")
     writers: dict[Path, Callable[[Path], object]] = {
-        files[name]: lambda file, image=image: file.write_bytes(_png(image)) for name, image in images.items()
+        path: lambda file: _write_obj(file, mesh, similarity, library.name),
+        library: lambda file: file.write_text(_mtl(files), encoding="utf-8"),
     }
-    writers[library] = lambda file: file.write_text(_mtl(files), encoding="utf-8")
-    writers[path] = lambda file: _write_obj(file, mesh, similarity, library.name)
+    for name, image in images.items():
+        writers[files[name]] = lambda file, image=image: file.write_bytes(_png(image))
     _write_together(writers)
 
 
 def _write_together(writers: Mapping[Path, Callable[[Path], object]]) -> None:
-    """Write temporary files beside their targets, and give them their names in order when all are there."""
-    partials = {path: path.with_name(f".{path.name}.{os.getpid()}.partial") for path in writers}
-    path = next(iter(writers))
-    try:
+    """Write temporary files; when all are there, they get their names, and last the first, which refers to them."""
+    with ExitStack() as stack:
         for path, write in writers.items():
-            write(partials[path])
-        for path, partial in partials.items():
-            partial.replace(path)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror}); choose another place") from error
-    finally:
-        for partial in partials.values():
-            partial.unlink(missing_ok=True)
+            write(stack.enter_context(whole_file(path)))
 
 
 def _png(image: Image) -> bytes:

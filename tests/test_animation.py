@@ -1,5 +1,6 @@
 """Animations, read back: as many frames, as long, as large and of the colours that were written."""
 
+import os
 from pathlib import Path
 
 import cv2
@@ -140,8 +141,8 @@ def test_an_interruption_leaves_the_older_file_and_nothing_else(tmp_path, suffix
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full on this machine")
 @pytest.mark.parametrize("suffix", [".mp4", ".gif"])
 def test_a_full_disk_is_an_error_with_its_reason(tmp_path, suffix):
-    (tmp_path / f".a.partial{suffix}").symlink_to("/dev/full")
-    with pytest.raises(OSError, match=r"ffmpeg failed \(.*No space left"):
+    (tmp_path / f".a.{os.getpid()}.partial{suffix}").symlink_to("/dev/full")
+    with pytest.raises(InputError, match=rf"a\{suffix}: cannot be written \(ffmpeg failed: .*No space left"):
         write_animation(tmp_path / f"a{suffix}", flat_frames(20))
     assert list(tmp_path.iterdir()) == []
 

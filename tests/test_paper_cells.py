@@ -314,7 +314,7 @@ def test_shapes(ball: Path, tmp_path: Path) -> None:
     folder.mkdir()
     with pytest.raises(InputError, match="holds no mesh"):
         find_shapes([folder])
-    for name in ("b.ply", "a.ply"):
+    for name in ("b.ply", "a.ply", "._a.ply"):
         (folder / name).write_bytes(ball.read_bytes())
     (folder / "notes.txt").write_text("not a mesh")
     assert find_shapes([folder, ball]) == [Shape(folder / "a.ply"), Shape(folder / "b.ply"), Shape(ball)]
@@ -328,7 +328,7 @@ def test_shapes(ball: Path, tmp_path: Path) -> None:
     np.savetxt(scan, np.random.default_rng(0).random((50, 3)))
     with pytest.raises(InputError, match="give --reference MESH"):
         find_shapes([scan])
-    with pytest.raises(InputError, match=r"--reference .*has no faces"):
+    with pytest.raises(InputError, match=r"has no faces.*give another --reference"):
         find_shapes([scan], reference=scan)
     with pytest.raises(InputError, match="leave it out"):
         find_shapes([ball], reference=ball)

@@ -13,8 +13,8 @@ from typing import Any
 
 import torch
 
+from ...neural_fields.files import write_whole
 from ..fit import choose_device
-from ..fit_state import write_text
 from ..timing import sgemm_rate
 from .ablations import DELTA_FACTOR, LOSS_WEIGHTS
 from .cell import Cell, Record
@@ -117,16 +117,16 @@ def bench_paper(bench: Bench, out: Path, *, say: Callable[[str], None]) -> tuple
     stamp = {"preset": bench.preset, "seed": bench.seed, "shapes": [shape.path.name for shape in bench.shapes]}
     for section, wanted in zip(sections, plan.values(), strict=True):
         for table in section.tables:
-            write_text(out / f"{table.name}.csv", as_csv(table))
+            write_whole(out / f"{table.name}.csv", as_csv(table))
         own = [dict(records[cell]) for cell in wanted if cell in records]
         pairs = stamp | {"section": section_as_dict(section), "records": own}
-        write_text(out / f"{section.name}.json", json.dumps(pairs, indent=2) + "\n")
+        write_whole(out / f"{section.name}.json", json.dumps(pairs, indent=2) + "\n")
     there = _kept(out, stamp)
     protocol, machine = _protocol(bench), _machine(bench.device)
-    write_text(out / PAGE, as_page(there, command=bench.command, protocol=protocol, machine=machine))
+    write_whole(out / PAGE, as_page(there, command=bench.command, protocol=protocol, machine=machine))
     if bench.page is not None:
         moved = [_copied(section, out, bench.page) for section in there]
-        write_text(bench.page, as_page(moved, command=bench.command, protocol=protocol, machine=machine))
+        write_whole(bench.page, as_page(moved, command=bench.command, protocol=protocol, machine=machine))
     return sections, len(ran.failures)
 
 
@@ -167,7 +167,7 @@ def _section(spec: TableSpec, own: Mapping[Cell, Record], cells: Sequence[Cell],
     for plot in spec.plots(records) if records else ():
         (out / "plots").mkdir(exist_ok=True)
         file = f"plots/{plot.name}.svg"
-        write_text(out / file, to_svg(plot))
+        write_whole(out / file, to_svg(plot))
         plots.append((file, plot.title))
     sources = {record["cell"]["method"]: record["method"] for record in records}
     return Section(

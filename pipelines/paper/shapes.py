@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ...neural_fields import InputError
-from ..surface import MESH_SUFFIXES, read_surface
+from ..surface import MESH_SUFFIXES, read_reference, read_surface
 from .run import Shape
 
 __all__ = ["find_shapes"]
@@ -29,8 +29,8 @@ def find_shapes(paths: Sequence[str | Path], *, reference: Path | None = None) -
         other = stems.setdefault(file.stem, file)
         if other is not file:
             raise InputError(f"{file}: {other} has the same name, which is how tables tell shapes apart; rename one")
-    if reference is not None and not len(read_surface(reference).faces):
-        raise InputError(f"--reference {reference}: has no faces; give a mesh")
+    if reference is not None:
+        read_reference(reference, fix="give another --reference")
     shapes = [_shape(file, reference) for file in files]
     if reference is not None and all(shape.reference is None for shape in shapes):
         raise InputError(f"--reference {reference}: every shape is a mesh, its own reference; leave it out")
@@ -40,7 +40,8 @@ def find_shapes(paths: Sequence[str | Path], *, reference: Path | None = None) -
 def _files(path: Path) -> list[Path]:
     if not path.is_dir():
         return [path]
-    found = sorted(file for file in path.iterdir() if file.suffix.lower() in MESH_SUFFIXES and file.is_file())
+    files = sorted(file for file in path.iterdir() if file.suffix.lower() in MESH_SUFFIXES and file.is_file())
+    found = [file for file in files if not file.name.startswith(".")]  # half-written ones, and macOS's
     if not found:
         raise InputError(f"{path}: holds no mesh ({', '.join(MESH_SUFFIXES)}); name files, or another folder")
     return found
