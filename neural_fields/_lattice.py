@@ -71,10 +71,10 @@ class Sampler:
     def __init__(self, field: Field, lattice: Lattice, batch: int, progress: Progress | None = None) -> None:
         self.field, self.lattice, self.batch, self.progress = field, lattice, batch, progress
         self.counts = [0] * field.num_levels
-        self._like = next(field.parameters(), field.deltas)
+        self._like = field.like
 
     def _points(self, positions: NDArray[np.float64]) -> torch.Tensor:
-        return torch.from_numpy(positions).to(device=self._like.device, dtype=self._like.dtype)
+        return torch.from_numpy(positions).to(self._like)
 
     @torch.inference_mode()
     def values(

@@ -66,7 +66,7 @@ class CarriedVelocity:
         generator = torch.Generator().manual_seed(seed)
         points = torch.nn.functional.normalize(torch.randn(samples, 3, generator=generator), dim=-1)
         points = points * torch.rand(samples, 1, generator=generator) ** (1 / 3)
-        parts = [self._whole(points.to(field.deltas), t) for t in torch.linspace(0, 1, nodes).tolist()]
+        parts = [self._whole(points.to(field.like), t) for t in torch.linspace(0, 1, nodes).tolist()]
         self.parts = torch.stack(parts)  # (nodes, 7)
 
     def __call__(self, x: Tensor, t: Tensor) -> Tensor:

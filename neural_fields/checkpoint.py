@@ -123,7 +123,7 @@ def load_texture(path: str | os.PathLike[str], geometry: Field) -> TextureField:
         InputError: there is no such file, it is damaged, no texture, or one of another geometry.
     """
     path = Path(path)
-    device = next(geometry.parameters(), geometry.deltas).device
+    device = geometry.like.device
     with _reading(path, TEXTURE_FORMAT, "a texture", "mplicits texture", device) as (header, tensors):
         if header["geometry"]["digest"] != _digest(geometry):
             raise InputError(f"{path}: the texture of another field than this one; run `mplicits texture` again")

@@ -108,6 +108,11 @@ class Field(nn.Module, ABC):
         result = SecondJet(*jet, hessian)
         return result if recorded else SecondJet(*(part.detach() for part in result))
 
+    @property
+    def like(self) -> Tensor:
+        """A tensor of this field's precision, where the field is: ``points.to(field.like)`` can be asked for."""
+        return next(self.parameters(), self.deltas)
+
     def in_band(self, x: Tensor, *, level: int) -> Tensor:
         """Whether ``level`` may be evaluated at ``x`` ``(..., d)`` → bool ``(...,)``.
 

@@ -165,8 +165,7 @@ def map_normals(mesh: Mesh, field: Field, *, level: int = -1, batch: int = 1 << 
     Raises:
         ValueError: there is no such level.
     """
-    like = next(field.parameters(), field.deltas)
-    points = torch.from_numpy(mesh.vertices).to(device=like.device, dtype=like.dtype)
+    points = torch.from_numpy(mesh.vertices).to(field.like)
     gradients = [field.jet(part, level=level).gradient for part in points.split(batch)]
     return replace(mesh, normals=normalize(torch.cat(gradients), dim=-1).float().cpu().numpy())
 

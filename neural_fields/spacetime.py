@@ -167,7 +167,7 @@ class SpaceTimeSDF(Field):
             if not isinstance(level, Siren):
                 raise ValueError(f"a level of the field is a {type(level).__name__}; expected a Siren")
             lifted.append(_lift(level, extra_width, time_gain))
-        return cls(_assembled(lifted, field.deltas, taper).to(next(field.parameters())))
+        return cls(_assembled(lifted, field.deltas, taper).to(field.like))
 
     def with_level(self, residual: Field, *, delta: float) -> SpaceTimeSDF:
         """This field with one more level inside ``|f_last| < delta``; see `MultiscaleSDF.with_level`."""

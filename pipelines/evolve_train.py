@@ -56,7 +56,7 @@ class EvolveTrainer:
     ) -> None:
         self.field, self.config, self.level, self.generator = field, config, level, generator
         self.steps, self.seconds = config.steps[level], seconds
-        self.law, device = problem.law, next(field.parameters()).device
+        self.law, device = problem.law, field.like.device
         self.known, self.bounds = problem.known.to(device), problem.bounds.to(device)
         # In a residual level the band is where anything can be learnt.
         self.width = config.near

@@ -13,7 +13,7 @@ from .fit_config import FitConfig
 from .sampling import Samples, band_samples, distance_samples, empty_samples, offset_samples, with_previous
 from .training import Source
 
-__all__ = ["Weights", "banded_sources", "device_of", "first_sources", "surface_samples"]
+__all__ = ["Weights", "banded_sources", "first_sources", "surface_samples"]
 
 # So few places that the level before gets wrong far from the cloud are not worth a share of the batch.
 FEWEST = 32
@@ -39,11 +39,6 @@ class Weights:
         given = (self.data, self.normal, self.eikonal)
         usual = (data, config.normal_weight, config.eikonal_weight)
         return tuple(u if g is None else g for g, u in zip(given, usual, strict=True))  # pyright: ignore[reportReturnType]
-
-
-def device_of(field: Field) -> torch.device:
-    """Where a field's parameters are."""
-    return next(field.parameters(), field.deltas).device
 
 
 def surface_samples(index: CloudDistance) -> Samples:
@@ -89,7 +84,7 @@ def banded_sources(
     Raises:
         InputError: one kind of samples is empty.
     """
-    device = device_of(previous)
+    device = previous.like.device
     offset = offset_samples(index, delta, config.samples, generator=generator)
     band = band_samples(index, delta, config.samples, generator=generator)
     kept = {

@@ -90,7 +90,7 @@ def borrowed_texture(run: str | Path, field: Field, similarity: Similarity) -> t
         start = extract_mesh(moment(field, 0.0), resolution=CHECKED, normals=False).vertices
     except NoSurfaceError:
         return texture, placed  # there is nothing to be coloured yet
-    points = torch.from_numpy(placed.to_unit(start)).to(field.deltas)
+    points = torch.from_numpy(placed.to_unit(start)).to(field.like)
     if float(geometry.value(points).abs().mean()) > ASTRAY:
         raise InputError(f"--colors {run}: is not where the motion starts; name the run of its first shape")
     return texture, placed
@@ -125,7 +125,7 @@ class RidingColors:
             mesh = extract_mesh(moment(self._field, time), resolution=CARRIED, level=self._level, normals=False)
         except NoSurfaceError:
             return self._of_start  # there is nothing to be coloured
-        vertices = torch.from_numpy(mesh.vertices).to(self._field.deltas)
+        vertices = torch.from_numpy(mesh.vertices).to(self._field.like)
         try:
             displacement = flow(self._velocity, vertices, time, 0.0, solver=RIDE) - vertices
         except IntegrationError as error:

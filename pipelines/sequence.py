@@ -243,7 +243,7 @@ def _write_series(
         except NoSurfaceError:
             continue
         if riding is not None:
-            points = torch.from_numpy(mesh.vertices).to(field.deltas)
+            points = torch.from_numpy(mesh.vertices).to(field.like)
             mesh = dataclasses.replace(mesh, colors=riding.at(time)(points).cpu().numpy())
         write_mesh(folder / f"frame_{index:0{digits}d}.ply", mesh, similarity)
         written += 1
@@ -279,7 +279,7 @@ def _write_moving_mesh(
         for place, normals in zip(places[1:], tracked.normals[1:], strict=True)
     ]
     if riding is not None:
-        points = torch.from_numpy(tracked.vertices[0]).to(field.deltas)
+        points = torch.from_numpy(tracked.vertices[0]).to(field.like)
         colors = riding.at(0.0)(points).cpu().numpy()
         opaque = np.full((len(colors), 4), 65535, "<u2")  # linear by the standard; 8 bits would merge dark shades
         opaque[:, :3] = np.rint(srgb_to_linear(np.clip(colors, 0, 1)) * 65535)

@@ -111,7 +111,7 @@ def slice_field(
     """
     points = slice_points(origin=origin, u=u, v=v, half_size=half_size, size=size)
     with torch.inference_mode():
-        return field.value(points.to(field.deltas), level=level)
+        return field.value(points.to(field.like), level=level)
 
 
 @dataclass(frozen=True)
@@ -145,7 +145,7 @@ def take_slice(
 ) -> Slice:
     """Evaluate every level up to ``level``, each one only in the band of the one before; see `slice_points`."""
     level = field.resolve_level(level)
-    points = slice_points(origin=origin, u=u, v=v, half_size=half_size, size=size).to(field.deltas)
+    points = slice_points(origin=origin, u=u, v=v, half_size=half_size, size=size).to(field.like)
     deltas = tuple(float(delta) for delta in field.deltas[: level + 1])
     with torch.inference_mode():
         value = field.value(points, level=0)

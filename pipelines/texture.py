@@ -102,7 +102,7 @@ def fit_texture(
     report = progress or (lambda _: None)
     report(Progress("texture: samples", 0, config.steps, 0.0, {}))
     generator = torch.Generator().manual_seed(config.seed)
-    home = next(geometry.parameters(), geometry.deltas).device
+    home = geometry.like.device
     geometry = geometry.to(device)
     samples = match_colors(cloud, geometry, similarity, level=level, delta=delta)
     band = band_directions(samples, geometry, config.samples // 2, level=level, delta=delta, generator=generator)

@@ -124,7 +124,7 @@ def match_colors(
             f"half are further off than {far:.3g} (input units); give the shape that was fitted, in the same "
             "coordinates, or widen the band (--delta)"
         )
-    like = next(geometry.parameters(), geometry.deltas)
+    like = geometry.like
     points = torch.from_numpy(unit[inside]).to(like)
     colors = torch.from_numpy(cloud.colors[finite][inside]).to(like)
     return ColorSamples(points, colors, len(cloud) - len(points))
@@ -133,7 +133,7 @@ def match_colors(
 def _distances(unit: NDArray[np.float64], geometry: Field, *, level: int) -> NDArray[np.float64]:
     """|f|, and beyond the cube in which fields are trained the way back into it as well → ``(N,)``."""
     clamped = unit.clip(-DOMAIN, DOMAIN)
-    points = torch.from_numpy(clamped).to(next(geometry.parameters(), geometry.deltas))
+    points = torch.from_numpy(clamped).to(geometry.like)
     values = torch.cat([geometry.value(part, level=level).abs() for part in points.split(BATCH)])
     return values.double().cpu().numpy() + np.linalg.norm(unit - clamped, axis=1)
 

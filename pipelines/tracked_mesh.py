@@ -79,7 +79,7 @@ def follow_mesh(
         raise InputError(f"{name}: no surface at time {times[0]:.3g} ({error})") from error
     shape = _topology(start, level)
     # The mesher's vertices are on the edges of its lattice, and as near to the surface as one step along them brings.
-    points = project_to_surface(start, torch.from_numpy(mesh.vertices).to(field.deltas), level=level)[0]
+    points = project_to_surface(start, torch.from_numpy(mesh.vertices).to(field.like), level=level)[0]
     cell = 2.0 / resolution
     faces = torch.from_numpy(mesh.faces).long().to(points.device)
     velocity = CarriedVelocity(field, level=level)

@@ -59,7 +59,7 @@ def probe(
     """
     start = torch.tensor(origin, dtype=torch.float64)
     ray = torch.nn.functional.normalize(torch.tensor(direction, dtype=torch.float64), dim=0)
-    start, ray = start.to(field.deltas), ray.to(field.deltas)
+    start, ray = start.to(field.like), ray.to(field.like)
     depth, on_plane = torch.inf, False
     if surface:
         hits = sphere_trace(field, start, ray, level=level)

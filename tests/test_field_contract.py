@@ -45,6 +45,12 @@ def test_jet_agrees_with_value_and_autograd(field: Field, dtype: torch.dtype, de
         torch.testing.assert_close(jet.gradient, gradient, rtol=0, atol=tolerance)
 
 
+def test_points_can_be_brought_to_a_field(field: Field, dtype: torch.dtype, device: torch.device) -> None:
+    assert (field.like.dtype, field.like.device.type) == (dtype, device.type)
+    half = torch.zeros(1, field.in_dim, dtype=torch.float16).to(field.like)
+    assert field.value(half).dtype == dtype
+
+
 def test_results_without_a_graph_are_the_same(field: Field, dtype: torch.dtype, device: torch.device) -> None:
     x = points(field, (300,), dtype=dtype, device=device)
     with_graph = field.jet(x.clone().requires_grad_())

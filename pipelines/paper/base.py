@@ -15,7 +15,6 @@ from ..cloud_distance import CloudDistance
 from ..fit import prepare
 from ..fit_config import FitConfig
 from ..fit_review import review_points
-from ..level_sources import device_of
 from ..runs import find_field
 from .cell import Cell
 from .levels import up_to
@@ -78,7 +77,7 @@ def reviewed(cloud: OrientedCloud, coarse: Field, config: FitConfig) -> Oriented
         points,
         normals,
         coarse,
-        device=device_of(coarse),
+        device=coarse.like.device,
         outliers=config.drop_outliers,
         turn=config.turn_normals and config.normals == "auto",
     )

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from ...neural_fields import Field, Jet, MultiscaleSDF, NoSurfaceError, extract_mesh
-from ..level_sources import banded_sources, device_of
+from ..level_sources import banded_sources
 from .base import Base, base_cell, base_of
 from .cell import Cell, Record
 from .judge import Judge
@@ -227,7 +227,7 @@ def distances_in_bands(base: Base, progress: Report | None = None) -> Independen
 def steepness(field: Field, *, count: int = 1 << 16, margin: float = 1.25, seed: int = 0) -> float:
     """A bound on |∇f| in the mesher's box: its largest value at random points, times ``margin``; 1.25 at least."""
     points = 1.02 * (2 * torch.rand(count, 3, generator=torch.Generator().manual_seed(seed)) - 1)
-    slopes = field.jet(points.to(device_of(field))).gradient.norm(dim=-1)
+    slopes = field.jet(points.to(field.like.device)).gradient.norm(dim=-1)
     return max(LIPSCHITZ, margin * float(slopes.max()))
 
 

@@ -12,7 +12,7 @@ from ...neural_fields import Field, MultiscaleSDF, Siren
 from ..cloud_distance import CloudDistance
 from ..fit import RESIDUAL_GAIN
 from ..fit_config import FitConfig
-from ..level_sources import Weights, device_of, surface_samples
+from ..level_sources import Weights, surface_samples
 from ..sampling import band_of, distance_samples, with_previous
 from ..training import LevelTrainer, Progress, Source, StopFlag
 from .recipe import Report
@@ -42,7 +42,7 @@ def without_bands(field: MultiscaleSDF) -> MultiscaleSDF:
 @torch.no_grad()
 def delta_after(index: CloudDistance, previous: Field, config: FitConfig) -> float:
     """Half-width of the band around the finest level of ``previous`` (Eq. 5)."""
-    points = torch.from_numpy(index.points).to(device_of(previous))
+    points = torch.from_numpy(index.points).to(previous.like.device)
     values = torch.cat([previous.value(part) for part in points.split(1 << 18)]).cpu()
     return band_of(values, epsilon=config.epsilon, quantile=config.quantile).delta
 
@@ -51,7 +51,7 @@ def domain_sources(
     index: CloudDistance, previous: MultiscaleSDF, config: FitConfig, *, generator: torch.Generator
 ) -> list[Source]:
     """What a residual learns from on the whole domain: distances everywhere, as level 0 of the fit does."""
-    everywhere, device = without_bands(previous), device_of(previous)
+    everywhere, device = without_bands(previous), previous.like.device
     spread = distance_samples(index, config.samples, generator=generator)
     surface, domain = (with_previous(s, everywhere, math.inf, device=device) for s in (surface_samples(index), spread))
     assert surface.value is not None

@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from ...neural_fields import Field
-from ..level_sources import device_of
 from ..surface import Surface, face_normals, merged, sample_surface
 
 __all__ = ["MeshDistance", "approximation_error", "barycentric_of_nearest", "near_surface"]
@@ -169,6 +168,6 @@ def near_surface(surface: Surface, count: int, *, reach: float, seed: int = 0) -
 @torch.no_grad()
 def approximation_error(field: Field, points: Float64, distances: Float64, *, level: int = -1) -> float:
     """The mean of |f_level(x) − d(x)| over points ``(N, 3)`` with their exact distances ``(N,)``."""
-    rows = torch.from_numpy(points).float().to(device_of(field))
+    rows = torch.from_numpy(points).float().to(field.like.device)
     values = torch.cat([field.value(part, level=level) for part in rows.split(1 << 18)])
     return float((values.cpu().double() - torch.from_numpy(distances)).abs().mean())

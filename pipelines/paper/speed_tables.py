@@ -12,7 +12,6 @@ import torch
 
 from ...neural_fields import Field, Siren, extract_mesh
 from ..bench_normals import bench_normals
-from ..level_sources import device_of
 from .base import base_cell, base_of
 from .cell import Cell, Record
 from .levels import without_bands
@@ -120,7 +119,7 @@ def grid_seconds(field: Field, resolution: int, *, every: int = 1) -> float:
         every: evaluate only every so many-th plane, and take the others to cost as much.
     """
     axis = torch.linspace(-1.02, 1.02, resolution + 1)
-    plane = torch.cartesian_prod(axis[:1], axis, axis).to(device_of(field))
+    plane = torch.cartesian_prod(axis[:1], axis, axis).to(field.like.device)
     field.value(plane)  # first calls are slower
     slabs = range(every // 2 if every <= resolution else 0, resolution + 1, every)
     started = time.perf_counter()
