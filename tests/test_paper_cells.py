@@ -18,7 +18,7 @@ from mplicits.pipelines.paper.method import Findings, Method
 from mplicits.pipelines.paper.ours import Ours, level_names
 from mplicits.pipelines.paper.peers import FromRecipe
 from mplicits.pipelines.paper.protocol import damaged_cloud, fit_config, flip_normals, oriented_cloud, protocol_of
-from mplicits.pipelines.paper.recipe import Output, Recipe, Trained
+from mplicits.pipelines.paper.recipe import Output, Recipe
 from mplicits.pipelines.paper.run import Shape, cell_key, cells_of, run_cell, run_cells
 from mplicits.pipelines.paper.shapes import find_shapes
 from mplicits.pipelines.paper.store import make_folder, read_record, record_file
@@ -242,10 +242,11 @@ def test_recipes_learn_from_the_unit_sphere(ball: Path, out: Path, known, monkey
         name, source, differs = "known", "s", "d"
         presets: ClassVar = {"smoke": "tiny"}
 
-        def train(self, cloud, preset, *, seed=0, device="cpu", progress=None):
+        def learn(self, cloud, settings, *, seed, device, progress):
+            assert settings == "tiny"
             radii = np.linalg.norm(cloud.points, axis=1)
             assert abs(radii - 1).max() < 0.01
-            return Trained((Output("Known", Sphere(radius=0.999), -1, 4),), 3.0, 17)
+            return (Output("Known", Sphere(radius=0.999), -1, 4),), 17
 
     known(FromRecipe(Known()))
     record = run_cell(Cell(ball, "known", "smoke", seed=2), out)

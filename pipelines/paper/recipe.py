@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, Literal, NamedTuple, TypeVar
+from typing import Generic, Literal, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -17,6 +18,7 @@ from ..training import Progress
 __all__ = ["Output", "Preset", "Recipe", "Report", "Trained", "cosine", "count", "descend", "finished", "seeded"]
 
 F = TypeVar("F", bound=Field)
+S = TypeVar("S")
 
 # smoke: seconds, for tests; cpu: 15 to 30 s of training on two cores, each method; paper: as published.
 Preset = Literal["smoke", "cpu", "paper"]
@@ -53,8 +55,8 @@ class Trained(NamedTuple):
     steps: int
 
 
-class Recipe(ABC):
-    """A method: its network, its losses, its schedule and its sampling.
+class Recipe(ABC, Generic[S]):
+    """A method: its network, its losses, its schedule and its sampling; S is what its settings are.
 
     Attributes:
         name: as in the command, e.g. "idf".
@@ -66,9 +68,8 @@ class Recipe(ABC):
     name: str
     source: str
     differs: str
-    presets: Mapping[Preset, Any]
+    presets: Mapping[Preset, S]
 
-    @abstractmethod
     def train(
         self,
         cloud: OrientedCloud,
@@ -87,6 +88,15 @@ class Recipe(ABC):
             device: a torch device.
             progress: called now and then with how far the training is.
         """
+        started = time.perf_counter()
+        outputs, steps = self.learn(cloud, self.presets[preset], seed=seed, device=device, progress=progress)
+        return Trained(outputs, time.perf_counter() - started, steps)
+
+    @abstractmethod
+    def learn(
+        self, cloud: OrientedCloud, settings: S, *, seed: int, device: str, progress: Report | None
+    ) -> tuple[tuple[Output, ...], int]:
+        """What `train` does with the settings of its preset → outputs and steps, as in `Trained`."""
 
 
 def descend(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -17,7 +16,7 @@ from ...neural_fields.baselines import BandLimited, BanfSDF, HashGridSDF
 from ...neural_fields.losses import data_loss, eikonal_loss
 from ..sampling import DOMAIN
 from .grid_training import SignedPools, differences, mape_loss, stencil
-from .recipe import Output, Preset, Recipe, Report, Trained, cosine, count, descend, finished, seeded
+from .recipe import Output, Preset, Recipe, Report, cosine, count, descend, finished, seeded
 
 __all__ = ["BanfRecipe", "BanfSettings", "GridSettings", "InstantNgpRecipe", "NgpSettings"]
 
@@ -79,7 +78,7 @@ NGP_PRESETS: Mapping[tuple[str, Preset], NgpSettings] = {
 }
 
 
-class InstantNgpRecipe(Recipe):
+class InstantNgpRecipe(Recipe[NgpSettings]):
     """One hash grid, trained on relative errors of distances.
 
     Args:
@@ -108,17 +107,10 @@ class InstantNgpRecipe(Recipe):
         self.presets = {preset: settings for (one, preset), settings in presets.items() if one == size}
         self.name = f"ingp-{size}"
 
-    def train(
-        self,
-        cloud: OrientedCloud,
-        preset: Preset,
-        *,
-        seed: int = 0,
-        device: str = "cpu",
-        progress: Report | None = None,
-    ) -> Trained:
-        """See `Recipe.train`."""
-        started, settings = time.perf_counter(), self.presets[preset]
+    def learn(
+        self, cloud: OrientedCloud, settings: NgpSettings, *, seed: int, device: str, progress: Report | None
+    ) -> tuple[tuple[Output, ...], int]:
+        """See `Recipe.learn`."""
         field = settings.grid.field(seed=seed).to(device)
         pools = SignedPools(
             cloud, settings.pool * 3 // 4, settings.pool // 4, settings.spread, seed=seed, device=device
@@ -139,8 +131,7 @@ class InstantNgpRecipe(Recipe):
             betas=(0.9, 0.99),
             eps=1e-15,
         )
-        outputs = (Output(title, finished(field), -1, count(field)),)
-        return Trained(outputs, time.perf_counter() - started, settings.steps)
+        return (Output(title, finished(field), -1, count(field)),), settings.steps
 
 
 @dataclass(frozen=True)
@@ -192,7 +183,7 @@ WARM_UP = 0.1
 SPARSE = 8
 
 
-class BanfRecipe(Recipe):
+class BanfRecipe(Recipe[BanfSettings]):
     """A cascade: every level learns what the frozen ones before it leave, asked at the vertices of its lattice only.
 
     Args:
@@ -217,17 +208,10 @@ class BanfRecipe(Recipe):
     def __init__(self, presets: Mapping[Preset, BanfSettings] = BANF_PRESETS) -> None:
         self.presets = presets
 
-    def train(
-        self,
-        cloud: OrientedCloud,
-        preset: Preset,
-        *,
-        seed: int = 0,
-        device: str = "cpu",
-        progress: Report | None = None,
-    ) -> Trained:
-        """See `Recipe.train`."""
-        started, settings = time.perf_counter(), self.presets[preset]
+    def learn(
+        self, cloud: OrientedCloud, settings: BanfSettings, *, seed: int, device: str, progress: Report | None
+    ) -> tuple[tuple[Output, ...], int]:
+        """See `Recipe.learn`."""
         # More than are wanted: they are drawn with replacement.
         pools = SignedPools(
             cloud, settings.pool * 2 // 3, settings.pool // 3, settings.spread, seed=seed, device=device
@@ -247,7 +231,7 @@ class BanfRecipe(Recipe):
             Output(f"BANF {resolution}", field, level, count(*networks[: level + 1]))
             for level, resolution in enumerate(settings.resolutions)
         )
-        return Trained(outputs, time.perf_counter() - started, sum(settings.steps))
+        return outputs, sum(settings.steps)
 
 
 def _train_level(

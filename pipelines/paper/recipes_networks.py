@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -14,7 +13,7 @@ from ...neural_fields import Siren
 from ...neural_fields.baselines import BaconSDF, IdfSDF
 from ...neural_fields.baselines.idf import attenuation
 from ..cloud_distance import CloudDistance
-from .recipe import Output, Preset, Recipe, Report, Trained, cosine, count, descend, finished, seeded
+from .recipe import Output, Preset, Recipe, Report, cosine, count, descend, finished, seeded
 
 __all__ = [
     "BaconRecipe",
@@ -129,7 +128,7 @@ SIREN_PRESETS: Mapping[Preset, SirenSettings] = {
 }
 
 
-class SirenRecipe(Recipe):
+class SirenRecipe(Recipe[SirenSettings]):
     """One SIREN for the whole domain, with SIREN's own loss.
 
     Args:
@@ -151,17 +150,10 @@ class SirenRecipe(Recipe):
     def __init__(self, presets: Mapping[Preset, SirenSettings] = SIREN_PRESETS) -> None:
         self.presets = presets
 
-    def train(
-        self,
-        cloud: OrientedCloud,
-        preset: Preset,
-        *,
-        seed: int = 0,
-        device: str = "cpu",
-        progress: Report | None = None,
-    ) -> Trained:
-        """See `Recipe.train`."""
-        started, settings = time.perf_counter(), self.presets[preset]
+    def learn(
+        self, cloud: OrientedCloud, settings: SirenSettings, *, seed: int, device: str, progress: Report | None
+    ) -> tuple[tuple[Output, ...], int]:
+        """See `Recipe.learn`."""
 
         def begin() -> Siren:
             field = Siren(settings.width, settings.depth, omega=settings.omega)
@@ -185,8 +177,7 @@ class SirenRecipe(Recipe):
             progress=progress,
             clip=1.0,
         )
-        outputs = (Output("SIREN", finished(field), -1, count(field)),)
-        return Trained(outputs, time.perf_counter() - started, settings.steps)
+        return (Output("SIREN", finished(field), -1, count(field)),), settings.steps
 
 
 @dataclass(frozen=True)
@@ -214,7 +205,7 @@ BACON_PRESETS: Mapping[Preset, BaconSettings] = {
 COARSE_NOISE, FINE_NOISE = 0.1, 0.001
 
 
-class BaconRecipe(Recipe):
+class BaconRecipe(Recipe[BaconSettings]):
     """BACON: a sum of squared errors of every output, at samples near the surface and further off.
 
     Args:
@@ -238,17 +229,10 @@ class BaconRecipe(Recipe):
     def __init__(self, presets: Mapping[Preset, BaconSettings] = BACON_PRESETS) -> None:
         self.presets = presets
 
-    def train(
-        self,
-        cloud: OrientedCloud,
-        preset: Preset,
-        *,
-        seed: int = 0,
-        device: str = "cpu",
-        progress: Report | None = None,
-    ) -> Trained:
-        """See `Recipe.train`."""
-        started, settings = time.perf_counter(), self.presets[preset]
+    def learn(
+        self, cloud: OrientedCloud, settings: BaconSettings, *, seed: int, device: str, progress: Report | None
+    ) -> tuple[tuple[Output, ...], int]:
+        """See `Recipe.learn`."""
         field = seeded(lambda: BaconSDF(settings.width, bands=settings.bands, outputs=settings.outputs), seed).to(
             device
         )
@@ -280,8 +264,7 @@ class BaconRecipe(Recipe):
             clip=1.0,
             amsgrad=True,
         )
-        outputs = (Output("BACON", finished(field), -1, field.parameters_to(-1)),)
-        return Trained(outputs, time.perf_counter() - started, settings.steps)
+        return (Output("BACON", finished(field), -1, field.parameters_to(-1)),), settings.steps
 
 
 def laplacian_samples(
@@ -321,7 +304,7 @@ IDF_PRESETS: Mapping[Preset, IdfSettings] = {
 BASE_ALONE, BASE_FROZEN = 0.2, 0.5
 
 
-class IdfRecipe(Recipe):
+class IdfRecipe(Recipe[IdfSettings]):
     """IDF: first the base, then base and displacement, then the displacement of a frozen base.
 
     Args:
@@ -346,17 +329,10 @@ class IdfRecipe(Recipe):
     def __init__(self, presets: Mapping[Preset, IdfSettings] = IDF_PRESETS) -> None:
         self.presets = presets
 
-    def train(
-        self,
-        cloud: OrientedCloud,
-        preset: Preset,
-        *,
-        seed: int = 0,
-        device: str = "cpu",
-        progress: Report | None = None,
-    ) -> Trained:
-        """See `Recipe.train`."""
-        started, settings = time.perf_counter(), self.presets[preset]
+    def learn(
+        self, cloud: OrientedCloud, settings: IdfSettings, *, seed: int, device: str, progress: Report | None
+    ) -> tuple[tuple[Output, ...], int]:
+        """See `Recipe.learn`."""
 
         def begin() -> IdfSDF:
             field = IdfSDF(settings.width, settings.depth, omegas=settings.omegas)
@@ -391,8 +367,7 @@ class IdfRecipe(Recipe):
             progress=progress,
             betas=settings.betas,
         )
-        outputs = (Output("IDF", finished(field), -1, count(field)),)
-        return Trained(outputs, time.perf_counter() - started, settings.steps)
+        return (Output("IDF", finished(field), -1, count(field)),), settings.steps
 
 
 def displaced(field: IdfSDF, x: Tensor, base: Tensor, slope: Tensor) -> tuple[Tensor, Tensor]:
