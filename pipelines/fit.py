@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 
 from ..datasets import OrientedCloud, PointCloud, prepare_cloud
 from ..datasets.large_cloud import Merging
@@ -44,6 +44,9 @@ __all__ = ["FitConfig", "Interrupted", "Run", "fit", "prepare"]
 
 # A residual starts at a tenth of the usual output scale, close to the level before it.
 RESIDUAL_GAIN = 0.1
+# A level whose error at the points is so many times that of the level before it is worse than none: set to zero, it is
+# that level. Where data contradict themselves, as the sides of a part do that is thinner than their noise, it happens.
+WORSE = 2.0
 
 Cloud = PointCloud | str | Path | NDArray[np.floating]
 
@@ -251,7 +254,12 @@ class _Fitting:
             raise Interrupted(self.directory)
         self.frozen = self.grown(network, delta).requires_grad_(False)
         review = self.review() if level == 0 else None
-        self.errors = self.values_at_cloud()
+        before, self.errors = self.errors, self.values_at_cloud()
+        silenced = level > 0 and _rms(self.errors) > WORSE * _rms(before)
+        if silenced:
+            nn.init.zeros_(network.output.weight)
+            nn.init.zeros_(network.output.bias)
+            self.errors = before
         self.stages.append(
             {
                 "level": level,
@@ -263,6 +271,7 @@ class _Fitting:
                 "training_seconds": round(trainer.elapsed, 3),
                 "steps": trainer.step,
                 "ended_by_time_budget": trainer.ended_early,
+                "silenced": silenced,
                 "losses": trainer.losses,
                 **({} if review is None else {"review": review}),
                 **self.surface_errors(),
@@ -303,11 +312,8 @@ class _Fitting:
 
     def surface_errors(self) -> dict[str, float]:
         """|f| at the input points, in input units: how closely the level passes by them."""
-        errors = self.errors.abs() * self.cloud.similarity.scale
-        return {
-            "rms_at_points": float(errors.square().mean().sqrt()),
-            "max_at_points": float(errors.max()),
-        }
+        scale = self.cloud.similarity.scale
+        return {"rms_at_points": _rms(self.errors) * scale, "max_at_points": float(self.errors.abs().max()) * scale}
 
     def seconds_for(self, level: int, sampling_seconds: float) -> float | None:
         """How long this level may train within the time budget."""
@@ -379,6 +385,10 @@ class _Fitting:
             "peak_memory": peak_memory(),
             "environment": environment(self.device),
         }
+
+
+def _rms(errors: Tensor) -> float:
+    return float(errors.square().mean().sqrt())
 
 
 def _with_prefix(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:

@@ -14,6 +14,8 @@ from mplicits.neural_fields import InputError, load_field
 from mplicits.neural_fields.meshing import extract_mesh
 from mplicits.pipelines.fit import Interrupted, choose_device, fit
 from mplicits.pipelines.fit_config import FitConfig
+from mplicits.pipelines.fit_state import read_record
+from mplicits.pipelines.info import describe
 from mplicits.pipelines.training import Progress
 
 SMALL = FitConfig(
@@ -98,6 +100,18 @@ def test_an_interrupted_run_resumes_to_the_same_result(
     assert not (tmp_path / "resume.safetensors").exists()
     resumed, whole = (load_field(d / "field.safetensors").field.state_dict() for d in (tmp_path, fitted))
     assert all(torch.equal(resumed[name], whole[name]) for name in whole)
+
+
+def test_a_level_that_is_worse_than_none_adds_nothing(fitted: Path, tmp_path: Path) -> None:
+    run = fit(sphere_cloud(), replace(SMALL, steps=(150, 5), learning_rates=(3e-3, 3.0)), out=tmp_path / "run")
+    first, second = run.record["stages"]
+    assert (first["silenced"], second["silenced"]) == (False, True)
+    assert second["rms_at_points"] == first["rms_at_points"]
+    x = 2 * torch.rand(2000, 3) - 1
+    assert torch.equal(run.field.value(x), run.field.value(x, level=0))
+    assert torch.equal(run.field.jet(x).gradient, run.field.jet(x, level=0).gradient)
+    assert "set to zero, for it was further" in describe(tmp_path / "run")
+    assert not any(stage["silenced"] for stage in read_record(fitted)["stages"])
 
 
 def test_signal_handlers_are_put_back() -> None:
