@@ -130,13 +130,13 @@ def evaluate_surfaces(
         back = np.abs((target_normals * normals[nearest_back]).sum(axis=1)).mean()
         consistency = float(there + back) / 2
 
-    notes = []
+    notes, closed = [], is_closed(mesh)
     floor = iou = None
     if is_cloud:
         notes.append("the reference is a point cloud: distances are to its points; no floor, no iou")
     else:
         floor = sum(chamfer(target, sample_surface(reference, samples, of_floor)[0]))
-        iou, iou_notes = _iou(mesh, reference, columns)
+        iou, iou_notes = _iou(mesh, reference, columns, closed=closed)
         notes.extend(iou_notes)
     precision, recall = float((forward < threshold).mean()), float((backward < threshold).mean())
     accuracy, completeness = float((forward**2).mean()), float((backward**2).mean())
@@ -153,7 +153,7 @@ def evaluate_surfaces(
         shell_iou=shell_iou(points, target, voxel=voxel),
         voxel=voxel,
         components=components(mesh),
-        closed=is_closed(mesh),
+        closed=closed,
         vertices=len(mesh.vertices),
         faces=len(mesh.faces),
         mean_distance=float(forward.mean() + backward.mean()) / 2 * similarity.scale,
@@ -187,10 +187,11 @@ def shell_iou(a: Float64, b: Float64, *, voxel: float = 0.01) -> float:
     return common / (len(keys[0]) + len(keys[1]) - common)
 
 
-def _iou(mesh: Surface, reference: Surface, columns: int) -> tuple[float | None, list[str]]:
+def _iou(mesh: Surface, reference: Surface, columns: int, *, closed: bool) -> tuple[float | None, list[str]]:
     """Volumetric IoU, with a note where it is approximate or cannot be had."""
     volumes = overlap(mesh, reference, columns=columns)
-    holes = [name for name, shape in (("the mesh", mesh), ("the reference", reference)) if not is_closed(shape)]
+    both = {"the mesh": closed, "the reference": is_closed(reference)}
+    holes = [name for name, whole in both.items() if not whole]
     if not volumes.union > 0 or volumes.broken > 0.1:
         share = f"{volumes.broken:.0%} of the columns enter and leave a different number of times"
         return None, [f"no iou: {' and '.join(holes) or 'a surface'} is not closed ({share})"]

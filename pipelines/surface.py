@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,6 @@ __all__ = [
     "from_cloud",
     "from_mesh",
     "is_closed",
-    "merged",
     "read_reference",
     "read_surface",
     "sample_surface",
@@ -57,6 +57,19 @@ class Surface:
     def used_vertices(self) -> Float64:
         """The vertices that a face uses; of a cloud, all."""
         return self.vertices[np.unique(self.faces)] if len(self.faces) else self.vertices
+
+    @cached_property
+    def merged(self) -> Surface:
+        """The surface with exactly equal vertices made one, and faces that collapse by it dropped; without normals."""
+        order = np.lexsort(self.vertices.T[::-1])
+        rows = self.vertices[order]
+        first = np.ones(len(rows), bool)
+        first[1:] = (rows[1:] != rows[:-1]).any(axis=1)
+        index = np.empty(len(rows), np.int64)
+        index[order] = np.cumsum(first) - 1
+        faces = index[self.faces]
+        whole = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+        return Surface(rows[first], faces[whole])
 
     def moved(self, similarity: Similarity) -> Surface:
         """The same surface in unit-sphere coordinates."""
@@ -190,17 +203,9 @@ def sample_surface(surface: Surface, count: int, rng: np.random.Generator) -> tu
     return np.asarray(points), normals[face]
 
 
-def merged(surface: Surface) -> Surface:
-    """The surface with exactly equal vertices made one, and faces that collapse by it dropped."""
-    vertices, index = np.unique(surface.vertices, axis=0, return_inverse=True)
-    faces = index.reshape(-1)[surface.faces]
-    whole = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
-    return Surface(vertices, faces[whole])
-
-
 def components(surface: Surface) -> int:
     """Connected components of the faces, through shared vertices, equal vertices merged."""
-    whole = merged(surface)
+    whole = surface.merged
     if not len(whole.faces):
         return 0
     a, b = whole.faces[:, [0, 1]].reshape(-1), whole.faces[:, [1, 2]].reshape(-1)
@@ -212,7 +217,7 @@ def components(surface: Surface) -> int:
 
 def is_closed(surface: Surface) -> bool:
     """Whether each edge is run through as often in one direction as in the other, equal vertices merged."""
-    whole = merged(surface)
+    whole = surface.merged
     if not len(whole.faces):
         return False
     a = whole.faces.reshape(-1)

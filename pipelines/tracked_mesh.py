@@ -14,7 +14,7 @@ from ..neural_fields import Field, InputError, IntegrationError, Solver, flow, p
 from ..neural_fields.carried import CarriedVelocity
 from ..neural_fields.dynamic_tracing import moment
 from ..neural_fields.meshing import NoSurfaceError, extract_mesh
-from .surface import components, from_mesh, merged
+from .surface import components, from_mesh
 
 __all__ = ["TrackedMesh", "follow_mesh"]
 
@@ -118,7 +118,7 @@ def _lost(name: str, time: float, reason: str) -> InputError:
 def _topology(field: Field, level: int) -> tuple[int, int]:
     """Pieces, and V − E + F; without a surface (0, 0)."""
     try:
-        surface = merged(from_mesh(extract_mesh(field, resolution=TOPOLOGY_RESOLUTION, level=level, normals=False)))
+        surface = from_mesh(extract_mesh(field, resolution=TOPOLOGY_RESOLUTION, level=level, normals=False)).merged
     except NoSurfaceError:
         return 0, 0
     sides = np.sort(surface.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)

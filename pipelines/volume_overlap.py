@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .raster import cover
-from .surface import Surface, merged
+from .surface import Surface
 
 __all__ = ["Overlap", "overlap"]
 
@@ -57,7 +57,7 @@ def overlap(first: Surface, second: Surface, *, columns: int = 512) -> Overlap:
         raise ValueError(f"columns={columns}: expected > 0")
     if not (len(first.faces) and len(second.faces)):
         raise ValueError("surfaces: both must have faces")
-    first, second = merged(first), merged(second)
+    first, second = first.merged, second.merged
     both = np.concatenate((first.vertices, second.vertices))
     low, high = both.min(axis=0), both.max(axis=0)
     step = float((high - low).max()) / columns

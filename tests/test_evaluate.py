@@ -16,7 +16,7 @@ from mplicits.pipelines.evaluate import (
     write_metrics,
 )
 from mplicits.pipelines.raster import cover
-from mplicits.pipelines.surface import Surface, components, is_closed, merged, read_surface, sample_surface
+from mplicits.pipelines.surface import Surface, components, is_closed, read_surface, sample_surface
 from mplicits.pipelines.volume_overlap import overlap
 
 
@@ -192,7 +192,7 @@ def test_components_and_closedness():
     soup = Surface(two.vertices[two.faces].reshape(-1, 3), np.arange(3 * len(two.faces)).reshape(-1, 3))
     assert components(soup) == 2
     assert is_closed(soup)
-    assert len(merged(soup).vertices) == 16
+    assert len(soup.merged.vertices) == 16
     flipped = Surface(two.vertices, np.concatenate((two.faces[:1, ::-1], two.faces[1:])))
     assert not is_closed(flipped)
 
