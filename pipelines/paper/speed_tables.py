@@ -77,7 +77,7 @@ EVERY: Mapping[Preset, int] = MappingProxyType({"smoke": 4, "cpu": 32, "paper": 
 SIDES: Mapping[Preset, tuple[int, ...]] = MappingProxyType(
     {"smoke": (16, 32), "cpu": (512, 1024), "paper": (512, 1024)}
 )
-REPEATS: Mapping[Preset, int] = MappingProxyType({"smoke": 1, "cpu": 1, "paper": 5})
+REPEATS: Mapping[Preset, int] = MappingProxyType({"smoke": 1, "cpu": 3, "paper": 5})
 WIDTH, DEPTHS = 256, (2, 3)
 
 
