@@ -276,7 +276,7 @@ def _notes(found: Sequence[Record]) -> tuple[str, ...]:
     preset: Preset = found[0]["cell"]["preset"]
     shapes = shapes_of(found)
     return (
-        f"Means over {len(shapes)} shapes ({', '.join(shapes)}); the paper's figures are of Lucy.",
+        f"Means over the shapes ({', '.join(shapes)}); the paper's figures are of Lucy.",
         f"The error is taken over {POINTS[preset]:,} points, uniform on the mesh and moved along its normal by up to "
         f"±{REACH:g}, against exact signed distances to the mesh; the paper does not say where it measures.",
         "Coarser levels come from one finished fit of the shape; only the level in question is trained again"

@@ -267,7 +267,7 @@ def isolation_tables(records: Sequence[Record]) -> tuple[Table, ...]:
     shapes = shapes_of(select(records, method=Isolation.name))
     title = "Isolating the residual sum and the nested bands (tab:isolation)"
     notes = (
-        f"{len(shapes)} shapes: {', '.join(shapes)}; the paper's figures are of ten others.",
+        f"Means over the shapes ({', '.join(shapes)}); the paper's figures are of ten others.",
         "All variants share the coarse network, the schedule and the weights. (a) and (c) are extracted inside their "
         "bands; (b) on the whole domain, culled only by the steepest slope measured there. No blobs are removed.",
         "The paper's IoU is that of surface voxels, here shell IoU; IoU is of volumes. Hausdorff is squared.",
