@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from imageio.v3 import imread
 from mplicits.datasets import read_cloud
 from mplicits.neural_fields import Box, InputError, MultiscaleSDF, Similarity, Siren, Sphere, extract_mesh
 from mplicits.pipelines.cloud_distance import CloudDistance
@@ -48,6 +49,7 @@ from mplicits.pipelines.paper.mesh_distance import (
 )
 from mplicits.pipelines.paper.protocol import fit_config
 from mplicits.pipelines.paper.run import run_cell
+from mplicits.pipelines.paper.sheets import write_sheets
 from mplicits.pipelines.paper.speed_tables import (
     MARCHING_CUBES,
     NORMALS,
@@ -453,6 +455,10 @@ def test_smoke(spec: Any, ball: Path, out: Path) -> None:
         chamfers = [row.values[6] for row in tables[0].rows]
         assert all(isinstance(c, float) and c < 0.01 for c in chamfers)
         assert all(row.values[0] is not None for row in tables[1].rows)  # with and without culling
+        sheets = write_sheets("isolation", dict(zip(cells, records, strict=True)), out)
+        assert [title for _, title in sheets] == ["isolation: ball", "isolation: ball + noise 0.01"]
+        clean, noisy = (imread(out / file).shape for file, _ in sheets)
+        assert noisy[0] > clean[0]  # a row more: what culling hides
     again = [run_cell(cell, out) for cell in cells]
     assert again == records
 

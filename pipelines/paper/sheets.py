@@ -13,6 +13,7 @@ from ...datasets import orbit
 from ..picture import Image, contact_sheet, picture_of, write_picture
 from ..surface import from_cloud
 from .cell import Cell, Record
+from .isolation import Isolation
 from .judge import reference_of
 from .method import Workplace
 from .protocol import damaged_cloud, protocol_of
@@ -36,7 +37,8 @@ def write_sheets(name: str, records: Mapping[Cell, Record], out: Path) -> tuple[
 
     Args:
         name: of the table.
-        records: of its cells; settings that were overridden are left out.
+        records: of its cells; those with overridden settings are left out, but for the variants of isolation, whose
+            names say which they are.
         out: folder of the bench.
 
     Returns:
@@ -44,7 +46,7 @@ def write_sheets(name: str, records: Mapping[Cell, Record], out: Path) -> tuple[
     """
     groups: dict[tuple[Path, float, float, float], list[Cell]] = {}
     for cell in records:
-        if not cell.overrides:
+        if not cell.overrides or cell.method == Isolation.name:
             groups.setdefault((cell.shape, cell.noise, cell.outliers, cell.flipped), []).append(cell)
     written = []
     for cells in groups.values():
