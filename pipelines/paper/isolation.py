@@ -306,4 +306,5 @@ ISOLATION = TableSpec(
     "the method without its bands, and without its residuals",
     isolation_cells,
     isolation_tables,
+    sheets=True,
 )
