@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from ..neural_fields import InputError
+from ..neural_fields.files import files_in
 from .cameras import Camera
 
 __all__ = ["IMAGE_SUFFIXES", "Shot", "find_image", "image_size", "intrinsics", "list_images"]
@@ -53,8 +54,7 @@ def list_images(folder: Path) -> list[Path]:
     """The images of a folder in the order of their names, but for hidden files; none where there is no such folder."""
     if not folder.is_dir():
         return []
-    found = sorted(file for file in folder.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES)
-    return [file for file in found if not file.name.startswith(".")]  # half-written ones, and macOS's
+    return files_in(folder, IMAGE_SUFFIXES)
 
 
 def image_size(path: Path) -> tuple[int, int]:

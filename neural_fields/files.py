@@ -1,15 +1,17 @@
-"""Files that are there whole or not at all."""
+"""Files that are written whole or not at all, and folders that are listed without what is being written."""
 
 from __future__ import annotations
 
+import json
 import os
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from .errors import InputError
 
-__all__ = ["whole_file", "write_whole"]
+__all__ = ["files_in", "whole_file", "write_json", "write_whole"]
 
 
 @contextmanager
@@ -46,3 +48,20 @@ def write_whole(path: str | Path, content: str | bytes) -> None:
     """
     with whole_file(path) as partial:
         partial.write_bytes(content.encode() if isinstance(content, str) else content)
+
+
+def write_json(path: str | Path, data: Any) -> None:
+    """Write data as JSON, indented by two, through `whole_file`.
+
+    Raises:
+        InputError: see `whole_file`.
+    """
+    write_whole(path, json.dumps(data, indent=2) + "\n")
+
+
+def files_in(folder: Path, suffixes: Collection[str]) -> list[Path]:
+    """What a folder holds with one of these extensions (lower case), by name; not half-written files, nor macOS's own.
+
+    Both of these have names that begin with a dot.
+    """
+    return sorted(file for file in folder.iterdir() if file.suffix.lower() in suffixes and file.name[0] != ".")

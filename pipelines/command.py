@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -86,9 +85,9 @@ def write_json(path: Path | None, data: Any) -> None:
     """Write figures through a temporary file beside the target; nothing without a path."""
     if path is None:
         return
-    from ..neural_fields.files import write_whole  # here: its package loads torch
+    from ..neural_fields import files  # here: it loads torch
 
-    write_whole(path, json.dumps(data, indent=2) + "\n")
+    files.write_json(path, data)
 
 
 @contextmanager

@@ -7,7 +7,6 @@ into the unit sphere; distances are between area-weighted uniform samples of the
 from __future__ import annotations
 
 import dataclasses
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from ..neural_fields import InputError, Similarity
-from ..neural_fields.files import write_whole
+from ..neural_fields.files import write_json
 from .surface import Surface, components, is_closed, read_surface, sample_surface
 from .volume_overlap import overlap
 
@@ -225,4 +224,4 @@ def format_metrics(metrics: Metrics) -> str:
 
 def write_metrics(path: str | Path, metrics: Metrics) -> None:
     """Write the figures as JSON, through a temporary file beside the target."""
-    write_whole(path, json.dumps(dataclasses.asdict(metrics), indent=2) + "\n")
+    write_json(path, dataclasses.asdict(metrics))

@@ -28,6 +28,7 @@ from ..datasets import (
 from ..datasets.depth_images import COLOR_SUFFIXES, DEPTH_SUFFIXES
 from ..datasets.depth_poses import PosedFrame
 from ..neural_fields import InputError
+from ..neural_fields.files import files_in
 from .fit import FitConfig, Run, choose_device, fit
 from .fit_state import read_record
 from .training import Progress
@@ -175,7 +176,7 @@ def _files(path: Path, suffixes: tuple[str, ...], what: str) -> list[Path]:
         raise InputError(f"{path}: no such file or folder; check the path")
     if not path.is_dir():
         return [path]
-    files = sorted(file for file in path.iterdir() if file.suffix.lower() in suffixes and file.name[0] != ".")
+    files = files_in(path, suffixes)
     if not files:
         raise InputError(f"{path}: no {what} in it; they end in {', '.join(suffixes)}")
     return files

@@ -12,7 +12,7 @@ from typing import Any
 
 from ..datasets.reading import check_cloud_path
 from ..neural_fields import InputError
-from ..neural_fields.files import write_whole
+from ..neural_fields.files import write_json
 from .config import load_config
 from .fit import fit
 from .fit_config import FitConfig
@@ -140,7 +140,7 @@ def _named(progress: Callable[[str, Progress], None], name: str) -> Callable[[Pr
 
 
 def _keep_settings(out: Path, config: FitConfig) -> None:
-    write_whole(out / SETTINGS_FILE, json.dumps({"config": dataclasses.asdict(config)}, indent=2) + "\n")
+    write_json(out / SETTINGS_FILE, {"config": dataclasses.asdict(config)})
 
 
 def _kept_settings(out: Path) -> FitConfig:

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from ..datasets import OrientedCloud
 from ..neural_fields import InputError
-from ..neural_fields.files import write_whole
+from ..neural_fields.files import write_json, write_whole
 
 __all__ = [
     "FIELD_FILE",
@@ -68,7 +68,7 @@ def environment(device: torch.device) -> dict[str, Any]:
 
 def write_record(directory: Path, record: Mapping[str, Any]) -> None:
     """Write ``run.json``, whole or not at all."""
-    write_whole(directory / RECORD_FILE, json.dumps(record, indent=2) + "\n")
+    write_json(directory / RECORD_FILE, record)
 
 
 def read_record(directory: Path) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 
-from ...neural_fields.files import write_whole
+from ...neural_fields.files import write_json, write_whole
 from ..fit import choose_device
 from ..timing import sgemm_rate
 from .ablations import DELTA_FACTOR, LOSS_WEIGHTS
@@ -120,7 +120,7 @@ def bench_paper(bench: Bench, out: Path, *, say: Callable[[str], None]) -> tuple
             write_whole(out / f"{table.name}.csv", as_csv(table))
         own = [dict(records[cell]) for cell in wanted if cell in records]
         pairs = stamp | {"section": section_as_dict(section), "records": own}
-        write_whole(out / f"{section.name}.json", json.dumps(pairs, indent=2) + "\n")
+        write_json(out / f"{section.name}.json", pairs)
     there = _kept(out, stamp)
     protocol, machine = _protocol(bench), _machine(bench.device)
     write_whole(out / PAGE, as_page(there, command=bench.command, protocol=protocol, machine=machine))

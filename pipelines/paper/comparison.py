@@ -299,7 +299,6 @@ def poisson_tables(records: Sequence[Record]) -> tuple[Table, ...]:
             printed = POISSON.get((output, noise))
             published = None if printed is None else (*printed, None, None)
             rows.append(Row(f"{words}, {output}", values, published, *_source(some, output)))
-    notes = [SHELL]
 
     def factor(output: str, noise: float) -> float | None:
         some = select(records, noise=noise)
@@ -307,14 +306,15 @@ def poisson_tables(records: Sequence[Record]) -> tuple[Table, ...]:
 
     clean, noisy = factor("Screened Poisson", 0.0), factor("Screened Poisson", NOISE_LEVEL)
     smoothed = factor("Screened Poisson (our smoothing)", NOISE_LEVEL)
-    if smoothed is not None:
-        notes.insert(0, f"Given the cloud that ours has smoothed, screened Poisson is at {smoothed:.2f} times ours.")
+    notes = []
     if clean is not None and noisy is not None:
-        notes.insert(
-            0,
+        notes.append(
             f"The mean Chamfer distance of screened Poisson without trim is {clean:.2f} times that of Ours fine "
-            f"on clean clouds, and {noisy:.2f} times under noise.",
+            f"on clean clouds, and {noisy:.2f} times under noise."
         )
+    if smoothed is not None:
+        notes.append(f"Given the cloud that ours has smoothed, screened Poisson is at {smoothed:.2f} times ours.")
+    notes.append(SHELL)
     return (Table("poisson", "Screened Poisson", "setting", columns, tuple(rows), tuple(notes)),)
 
 

@@ -9,13 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from ...datasets import prepare_cloud
 from ...neural_fields.meshing import Mesh
 from ..poisson import has_poisson, screened_poisson
 from .cell import Cell
 from .judge import Judge
 from .method import Findings, Method, Workplace
-from .protocol import damaged_cloud, oriented_cloud, protocol_of
+from .protocol import oriented_cloud, protocol_of
 from .recipe import Recipe
 
 __all__ = ["FromRecipe", "Poisson"]
@@ -78,11 +77,7 @@ class Poisson(Method):
 
     def run(self, cell: Cell, work: Workplace) -> Findings:
         """Reconstruct, and measure."""
-        judge = Judge(cell, work)
-        if self.smoothed:
-            cloud = prepare_cloud(damaged_cloud(cell), isolation=None, smooth_noise=True)
-        else:
-            cloud = oriented_cloud(cell)
+        judge, cloud = Judge(cell, work), oriented_cloud(cell, smooth_noise=self.smoothed)
         importlib.import_module("pymeshlab")  # so that loading it is not timed
         started = time.perf_counter()
         surface = screened_poisson(cloud, depth=protocol_of(cell.preset).poisson_depth, trim=self.trim)

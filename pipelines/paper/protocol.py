@@ -114,12 +114,16 @@ def flip_normals(cloud: PointCloud, fraction: float, *, seed: int = 0) -> PointC
     return replace(cloud, normals=normals)
 
 
-def oriented_cloud(cell: Cell) -> OrientedCloud:
+def oriented_cloud(cell: Cell, *, smooth_noise: bool = False) -> OrientedCloud:
     """What every method but ours learns from: the damaged cloud in the unit sphere, no point judged to be a stray.
 
     Ours reads the same damaged cloud, but what `fit` does to find strays is part of our method, not of the others'.
 
+    Args:
+        cell: whose cloud.
+        smooth_noise: whether noise is smoothed off as in ours, to see what that alone does for another method.
+
     Raises:
         InputError: see `damaged_cloud`.
     """
-    return prepare_cloud(damaged_cloud(cell), isolation=None)
+    return prepare_cloud(damaged_cloud(cell), isolation=None, smooth_noise=smooth_noise)

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ...neural_fields import InputError
+from ...neural_fields.files import files_in
 from ..surface import MESH_SUFFIXES, read_reference, read_surface
 from .run import Shape
 
@@ -40,8 +41,7 @@ def find_shapes(paths: Sequence[str | Path], *, reference: Path | None = None) -
 def _files(path: Path) -> list[Path]:
     if not path.is_dir():
         return [path]
-    files = sorted(file for file in path.iterdir() if file.suffix.lower() in MESH_SUFFIXES and file.is_file())
-    found = [file for file in files if not file.name.startswith(".")]  # half-written ones, and macOS's
+    found = [file for file in files_in(path, MESH_SUFFIXES) if file.is_file()]
     if not found:
         raise InputError(f"{path}: holds no mesh ({', '.join(MESH_SUFFIXES)}); name files, or another folder")
     return found

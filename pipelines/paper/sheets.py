@@ -13,7 +13,6 @@ from ...datasets import orbit
 from ..picture import Image, contact_sheet, picture_of, write_picture
 from ..surface import from_cloud
 from .cell import Cell, Record
-from .isolation import Isolation
 from .judge import reference_of
 from .method import Workplace
 from .protocol import damaged_cloud, protocol_of
@@ -37,8 +36,7 @@ def write_sheets(name: str, records: Mapping[Cell, Record], out: Path) -> tuple[
 
     Args:
         name: of the table.
-        records: of its cells; those with overridden settings are left out, but for the variants of isolation, whose
-            names say which they are.
+        records: of its cells; of one shape and damage, their outputs must have different names.
         out: folder of the bench.
 
     Returns:
@@ -46,8 +44,7 @@ def write_sheets(name: str, records: Mapping[Cell, Record], out: Path) -> tuple[
     """
     groups: dict[tuple[Path, float, float, float], list[Cell]] = {}
     for cell in records:
-        if not cell.overrides or cell.method == Isolation.name:
-            groups.setdefault((cell.shape, cell.noise, cell.outliers, cell.flipped), []).append(cell)
+        groups.setdefault((cell.shape, cell.noise, cell.outliers, cell.flipped), []).append(cell)
     written = []
     for cells in groups.values():
         if len(cells) < LEAST_METHODS:

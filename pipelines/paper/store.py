@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ...neural_fields import InputError
-from ...neural_fields.files import write_whole
+from ...neural_fields.files import write_json
 from .cell import Record
 
 __all__ = ["make_folder", "read_record", "record_file", "write_record"]
@@ -50,4 +50,4 @@ def read_record(out: Path, key: str) -> Record | None:
 
 def write_record(out: Path, key: str, record: Record) -> None:
     """Write a record, whole or not at all."""
-    write_whole(record_file(out, key), json.dumps(record, indent=2) + "\n")
+    write_json(record_file(out, key), record)
