@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
@@ -21,6 +20,7 @@ from skimage.measure import marching_cubes
 from ..neural_fields import Field, Siren, load_field, save_field
 from ..neural_fields.meshing import DEFAULT_BOUNDS, extract_mesh
 from .counting import counted
+from .memory import peak_memory
 from .runs import find_field
 from .timing import format_table
 
@@ -41,7 +41,8 @@ class MeshRow:
         normals: seconds more for analytic normals; None where there are none.
         evaluations: rows that the network of each level evaluated, without normals.
         vertices: of the mesh; 0 where only the evaluation was timed.
-        peak: most memory the process held at any time, Python and libraries included, in bytes.
+        peak: most memory the process held at any time, Python and libraries included, in bytes; None where the system
+            does not keep it.
         share: fraction of the lattice that was really evaluated.
     """
 
@@ -51,7 +52,7 @@ class MeshRow:
     normals: float | None
     evaluations: tuple[int, ...]
     vertices: int
-    peak: int
+    peak: int | None
     share: float = 1.0
 
 
@@ -151,7 +152,7 @@ def _cells(row: MeshRow) -> tuple[str, ...]:
         "" if row.normals is None else f"{row.normals:.2f}",
         " + ".join(f"{count / 1e6:.2f} M" for count in row.evaluations),
         f"{row.vertices:,}" if row.vertices else "",
-        f"{row.peak / 2**20:.0f} MiB",
+        "" if row.peak is None else f"{row.peak / 2**20:.0f} MiB",
     )
 
 
@@ -176,7 +177,7 @@ def _adaptive(path: Path, resolution: int, keep: Path | None) -> MeshRow:
     counts = tuple(level.values for level in levels)
     if keep is not None:
         np.save(keep, mesh.vertices)
-    return MeshRow("adaptive", resolution, seconds - normals, normals, counts, len(mesh.vertices), _peak())
+    return MeshRow("adaptive", resolution, seconds - normals, normals, counts, len(mesh.vertices), peak_memory())
 
 
 def _paper(path: Path, resolution: int, keep: Path) -> MeshRow:
@@ -188,7 +189,9 @@ def _paper(path: Path, resolution: int, keep: Path) -> MeshRow:
     vertices = marching_cubes(values, 0.0, spacing=(step, step, step))[0] + np.asarray(DEFAULT_BOUNDS[0])
     seconds = time.perf_counter() - start
     np.save(keep, vertices)
-    return MeshRow(PAPER, resolution, seconds, None, tuple(level.values for level in levels), len(vertices), _peak())
+    return MeshRow(
+        PAPER, resolution, seconds, None, tuple(level.values for level in levels), len(vertices), peak_memory()
+    )
 
 
 def _dense(resolution: int, share: float) -> MeshRow:
@@ -199,7 +202,7 @@ def _dense(resolution: int, share: float) -> MeshRow:
     evaluate_slabs(field, np.empty((1, resolution + 1, resolution + 1), np.float32), slabs)
     done = len(slabs) / (resolution + 1)
     seconds = (time.perf_counter() - start) / done
-    return MeshRow(DENSE, resolution, seconds, None, ((resolution + 1) ** 3,), 0, _peak(), done)
+    return MeshRow(DENSE, resolution, seconds, None, ((resolution + 1) ** 3,), 0, peak_memory(), done)
 
 
 @torch.inference_mode()
@@ -221,15 +224,3 @@ def _distances(ours: NDArray[np.float64], theirs: NDArray[np.float64]) -> tuple[
     """Mean and maximum over both sets of the distance to the nearest point of the other."""
     distances = np.concatenate((KDTree(theirs).query(ours)[0], KDTree(ours).query(theirs)[0]))
     return float(distances.mean()), float(distances.max())
-
-
-def _peak() -> int:
-    """The most memory this process has held, in bytes."""
-    status = Path("/proc/self/status")
-    if status.is_file():
-        # Not getrusage: on Linux its maximum survives exec, so a child would report its parent's memory.
-        line = next(line for line in status.read_text().splitlines() if line.startswith("VmHWM:"))
-        return 1024 * int(line.split()[1])
-    import resource
-
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)

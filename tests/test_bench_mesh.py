@@ -31,7 +31,7 @@ def test_rows_ratios_and_distance():
     assert ours.vertices == pytest.approx(paper.vertices, rel=0.01)
     assert bench.mean_distance < 0.02
     assert bench.max_distance < 0.5
-    assert all(2**27 < row.peak < 2**31 for row in bench.rows)
+    assert all(row.peak is None or 2**27 < row.peak < 2**31 for row in bench.rows)
     assert dense.share == pytest.approx(3 / 65)
     assert len(said) == 4
     text = format_bench_mesh(bench)
