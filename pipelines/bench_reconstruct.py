@@ -16,12 +16,12 @@ import numpy as np
 from ..datasets.posed_images import PosedImage
 from ..datasets.scenes import scene_mesh
 from ..neural_fields import InputError, NoSurfaceError
+from ..neural_fields.files import write_json
 from ..neural_fields.meshing import Mesh, extract_mesh
 from .bench_reconstruct_figures import common_sheet, row_of, surface_figures
 from .bench_reconstruct_row import EQUAL_TIME, MULTISCALE, NEUS, ReconstructRow, SurfaceFigures
 from .bench_reconstruct_scene import BenchScene
 from .bench_reconstruct_train import train_watched
-from .command import write_json
 from .fit import Interrupted, choose_device
 from .fit_state import digest_of, environment
 from .mesh_files import write_mesh

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..datasets import TexturedMesh, sample_textured
 from ..neural_fields import Field, InputError, Similarity, TextureField, load_field, load_texture
-from .command import write_json
+from ..neural_fields.files import write_json
 from .fit import choose_device, fit
 from .fit_config import FitConfig
 from .fit_state import FIELD_FILE, RECORD_FILE, STATE_FILE, read_record

@@ -47,6 +47,7 @@ from mplicits.pipelines.paper.mesh_distance import (
     barycentric_of_nearest,
     near_surface,
 )
+from mplicits.pipelines.paper.methods import CATALOGUE
 from mplicits.pipelines.paper.protocol import fit_config
 from mplicits.pipelines.paper.run import run_cell
 from mplicits.pipelines.paper.sheets import write_sheets
@@ -446,7 +447,7 @@ def test_smoke(spec: Any, ball: Path, out: Path) -> None:
     # Clean clouds but for what needs noise, and one constraint, to be quick.
     planned = [cell for cell in spec.cells([ball], "smoke") if spec is ISOLATION or not cell.noise]
     cells = [cell for cell in planned if dict(cell.overrides).get("constraint", "sdf") == "sdf"]
-    records = [run_cell(cell, out) for cell in cells]
+    records = [run_cell(cell, out, CATALOGUE) for cell in cells]
     tables = spec.tables(records)
     assert tables
     for row in tables[0].rows:
@@ -459,7 +460,7 @@ def test_smoke(spec: Any, ball: Path, out: Path) -> None:
         assert [title for _, title in sheets] == ["isolation: ball", "isolation: ball + noise 0.01"]
         clean, noisy = (imread(out / file).shape for file, _ in sheets)
         assert noisy[0] > clean[0]  # a row more: what culling hides
-    again = [run_cell(cell, out) for cell in cells]
+    again = [run_cell(cell, out, CATALOGUE) for cell in cells]
     assert again == records
 
 
@@ -470,4 +471,4 @@ def test_a_cloud_without_faces_has_no_exact_distances(tmp_path: Path, out: Path)
     np.savetxt(tmp_path / "cloud.xyz", np.concatenate((normals, normals), axis=1))
     cell = Cell(tmp_path / "cloud.xyz", "delta-factor", "smoke", overrides=(("epsilon", 0.3),))
     with pytest.raises(InputError, match="has no faces"):
-        run_cell(cell, out)
+        run_cell(cell, out, CATALOGUE)

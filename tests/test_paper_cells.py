@@ -11,15 +11,15 @@ from mplicits.datasets import PointCloud, read_cloud
 from mplicits.neural_fields import InputError, Similarity, Sphere, extract_mesh
 from mplicits.pipelines.fit import Interrupted
 from mplicits.pipelines.mesh_files import write_mesh
-from mplicits.pipelines.paper import run as running
 from mplicits.pipelines.paper.cell import Cell
 from mplicits.pipelines.paper.judge import Judge
-from mplicits.pipelines.paper.method import Findings, Method
+from mplicits.pipelines.paper.method import Catalogue, Findings, Method
+from mplicits.pipelines.paper.methods import CATALOGUE
 from mplicits.pipelines.paper.ours import Ours, level_names
 from mplicits.pipelines.paper.peers import FromRecipe
 from mplicits.pipelines.paper.protocol import damaged_cloud, fit_config, flip_normals, oriented_cloud, protocol_of
 from mplicits.pipelines.paper.recipe import Output, Recipe
-from mplicits.pipelines.paper.run import Shape, cell_key, cells_of, run_cell, run_cells
+from mplicits.pipelines.paper.run import Shape, cells_of, run_cell, run_cells
 from mplicits.pipelines.paper.shapes import find_shapes
 from mplicits.pipelines.paper.store import make_folder, read_record, record_file
 from mplicits.pipelines.paper.tables import TableSpec
@@ -57,16 +57,6 @@ def out(tmp_path: Path) -> Path:
     return tmp_path / "bench"
 
 
-@pytest.fixture
-def known(monkeypatch: pytest.MonkeyPatch):
-    """Replace the methods."""
-
-    def replace(*methods):
-        monkeypatch.setattr(running, "method_named", lambda name: {m.name: m for m in methods}[name])
-
-    return replace
-
-
 def test_keys_are_of_contents_and_settings(ball: Path, tmp_path: Path) -> None:
     copy = tmp_path / "elsewhere.ply"
     copy.write_bytes(ball.read_bytes())
@@ -100,7 +90,7 @@ def test_settings_of_ours_are_in_the_key_but_not_the_device(ball: Path) -> None:
     assert "device" not in settings
     changed = ours.settings(dataclasses.replace(plain, overrides=(("epsilon", 0.5),)))["fit"]
     assert changed == settings | {"epsilon": 0.5}
-    assert cell_key(plain, ours) != cell_key(dataclasses.replace(plain, preset="cpu"), ours)
+    assert CATALOGUE.key(plain) != CATALOGUE.key(dataclasses.replace(plain, preset="cpu"))
 
 
 def test_names() -> None:
@@ -147,13 +137,13 @@ def test_damage_needs_normals(tmp_path: Path) -> None:
         damaged_cloud(Cell(tmp_path / "cloud.xyz", "x", "smoke", noise=0.01))
 
 
-def test_a_record_is_measured_kept_and_not_made_again(ball: Path, out: Path, known) -> None:
+def test_a_record_is_measured_kept_and_not_made_again(ball: Path, out: Path) -> None:
     exact = Exact()
-    known(exact)
+    methods = Catalogue((exact,))
     cell = Cell(ball, "exact", "smoke")
-    record = run_cell(cell, out)
+    record = run_cell(cell, out, methods)
     key = record["key"]
-    assert json.loads(record_file(out, key).read_text()) == record == run_cell(cell, out)
+    assert json.loads(record_file(out, key).read_text()) == record == run_cell(cell, out, methods)
     assert exact.runs == 1
     (output,) = record["outputs"]
     assert record["deltas"] == [0.25]
@@ -167,54 +157,59 @@ def test_a_record_is_measured_kept_and_not_made_again(ball: Path, out: Path, kno
     assert (out / "pictures" / f"{key}-exact.png").stat().st_size > 1000
 
 
-def test_no_surface_is_a_result(ball: Path, out: Path, known) -> None:
-    known(Exact(radius=1.9))  # all of the box is inside
-    (output,) = run_cell(Cell(ball, "exact", "smoke"), out)["outputs"]
+def test_no_surface_is_a_result(ball: Path, out: Path) -> None:
+    methods = Catalogue((Exact(radius=1.9),))  # all of the box is inside
+    (output,) = run_cell(Cell(ball, "exact", "smoke"), out, methods)["outputs"]
     assert output["chamfer"] is None
     assert "iou" not in output
 
 
-def test_a_failure_stops_nothing_and_is_tried_again(ball: Path, out: Path, known) -> None:
+def test_a_failure_stops_nothing_and_is_tried_again(ball: Path, out: Path) -> None:
     good, bad = Exact("good"), Exact("bad", radius=None)
-    known(good, bad)
+    methods = Catalogue(
+        (
+            good,
+            bad,
+        )
+    )
     cells = [Cell(ball, "bad", "smoke"), Cell(ball, "good", "smoke")]
     lines: list[str] = []
-    ran = run_cells(cells, out, say=lines.append)
+    ran = run_cells(cells, out, methods, say=lines.append)
     assert list(ran.records) == cells[1:]
     assert ran.failures == {cells[0]: "RuntimeError: no luck"}
     assert "[1/2] ball, bad: failed: RuntimeError: no luck; about" in lines[0]
     assert lines[1].startswith("[2/2] ball, good: ")
     assert "Chamfer" in lines[1]
-    key = cell_key(cells[0], bad)
+    key = methods.key(cells[0])
     assert json.loads(record_file(out, key).read_text())["error"] == "no luck"
     assert read_record(out, key) is None
 
     bad.radius = 0.7
-    again = run_cells(cells, out, say=lines.append)
+    again = run_cells(cells, out, methods, say=lines.append)
     assert (good.runs, bad.runs) == (1, 2)
     assert list(again.records) == cells
     assert not again.failures
     assert lines[2] == "1 of 2 cells are there already"
 
 
-def test_a_damaged_record_is_made_again(ball: Path, out: Path, known) -> None:
+def test_a_damaged_record_is_made_again(ball: Path, out: Path) -> None:
     exact = Exact()
-    known(exact)
+    methods = Catalogue((exact,))
     cell = Cell(ball, "exact", "smoke")
-    record_file(out, cell_key(cell, exact)).write_text("{")
-    run_cell(cell, out)
+    record_file(out, methods.key(cell)).write_text("{")
+    run_cell(cell, out, methods)
     assert exact.runs == 1
 
 
-def test_what_is_not_installed_is_left_out(ball: Path, out: Path, known) -> None:
+def test_what_is_not_installed_is_left_out(ball: Path, out: Path) -> None:
     class Absent(Exact):
         def missing(self):
             return "needs pip install something"
 
     absent = Absent("absent")
-    known(absent)
+    methods = Catalogue((absent,))
     lines: list[str] = []
-    ran = run_cells([Cell(ball, "absent", "smoke")], out, say=lines.append)
+    ran = run_cells([Cell(ball, "absent", "smoke")], out, methods, say=lines.append)
     assert not ran.records
     assert not ran.failures
     assert ran.lacking == {"absent": "needs pip install something"}
@@ -223,21 +218,26 @@ def test_what_is_not_installed_is_left_out(ball: Path, out: Path, known) -> None
 
 
 @pytest.mark.parametrize("reason", [KeyboardInterrupt(), Interrupted(None)])
-def test_ctrl_c_keeps_what_is_finished(ball: Path, out: Path, known, reason: BaseException) -> None:
+def test_ctrl_c_keeps_what_is_finished(ball: Path, out: Path, reason: BaseException) -> None:
     class Stopped(Exact):
         def run(self, cell, work):
             raise reason
 
     good, stopped = Exact("good"), Stopped("stopped")
-    known(good, stopped)
+    methods = Catalogue(
+        (
+            good,
+            stopped,
+        )
+    )
     cells = [Cell(ball, "good", "smoke"), Cell(ball, "stopped", "smoke")]
     with pytest.raises(type(reason)):
-        run_cells(cells, out, say=lambda _: None)
-    assert read_record(out, cell_key(cells[0], good)) is not None
-    assert not record_file(out, cell_key(cells[1], stopped)).exists()
+        run_cells(cells, out, methods, say=lambda _: None)
+    assert read_record(out, methods.key(cells[0])) is not None
+    assert not record_file(out, methods.key(cells[1])).exists()
 
 
-def test_recipes_learn_from_the_unit_sphere(ball: Path, out: Path, known, monkeypatch) -> None:
+def test_recipes_learn_from_the_unit_sphere(ball: Path, out: Path, monkeypatch) -> None:
     class Known(Recipe):
         name, source, differs = "known", "s", "d"
         presets: ClassVar = {"smoke": "tiny"}
@@ -248,8 +248,8 @@ def test_recipes_learn_from_the_unit_sphere(ball: Path, out: Path, known, monkey
             assert abs(radii - 1).max() < 0.01
             return (Output("Known", Sphere(radius=0.999), -1, 4),), 17
 
-    known(FromRecipe(Known()))
-    record = run_cell(Cell(ball, "known", "smoke", seed=2), out)
+    methods = Catalogue((FromRecipe(Known()),))
+    record = run_cell(Cell(ball, "known", "smoke", seed=2), out, methods)
     (output,) = record["outputs"]
     assert output["chamfer"] < 1.5 * output["chamfer_floor"]
     assert record["details"] == {"steps": 17}
@@ -265,7 +265,7 @@ def test_poisson_on_what_ours_has_smoothed(ball: Path, out: Path) -> None:
     pytest.importorskip("pymeshlab", reason="the extra mplicits[poisson] is not installed")
 
     def error(name: str) -> float:
-        (output,) = run_cell(Cell(ball, name, "smoke", noise=0.02), out)["outputs"]
+        (output,) = run_cell(Cell(ball, name, "smoke", noise=0.02), out, CATALOGUE)["outputs"]
         return output["chamfer"] - output["chamfer_floor"]
 
     assert 0 < error("poisson-smoothed") < error("poisson") / 3
@@ -273,7 +273,7 @@ def test_poisson_on_what_ours_has_smoothed(ball: Path, out: Path) -> None:
 
 def test_ours(ball: Path, out: Path) -> None:
     cell = Cell(ball, "ours", "smoke", overrides=(("steps", (120, 20, 20)), ("samples", 5000)))
-    record = run_cell(cell, out)
+    record = run_cell(cell, out, CATALOGUE)
     assert [output["name"] for output in record["outputs"]] == ["Ours coarse", "Ours medium", "Ours fine"]
     sizes = [output["parameters"] for output in record["outputs"]]
     assert sizes[1] - sizes[0] == sizes[0]
@@ -288,10 +288,10 @@ def test_a_finished_fit_is_measured_again_but_not_trained(
     ball: Path, out: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     cell = Cell(ball, "ours", "smoke", overrides=(("steps", (120, 20, 20)), ("samples", 5000)))
-    first = run_cell(cell, out)
+    first = run_cell(cell, out, CATALOGUE)
     (out / "cells" / f"{first['key']}.json").unlink()
     monkeypatch.delattr("mplicits.pipelines.paper.ours.fit")
-    again = run_cell(cell, out)
+    again = run_cell(cell, out, CATALOGUE)
     for one, other in zip(first["outputs"], again["outputs"], strict=True):
         assert (one["chamfer"], one["train_seconds"]) == (other["chamfer"], other["train_seconds"])
 

@@ -10,11 +10,10 @@ from mplicits.neural_fields import Similarity, Sphere, extract_mesh
 from mplicits.pipelines.cli import main
 from mplicits.pipelines.mesh_files import write_mesh
 from mplicits.pipelines.paper import bench, names
-from mplicits.pipelines.paper import run as running
 from mplicits.pipelines.paper.bench import SPECS
 from mplicits.pipelines.paper.judge import Judge
-from mplicits.pipelines.paper.method import Findings, Method
-from mplicits.pipelines.paper.methods import METHODS, method_named
+from mplicits.pipelines.paper.method import Catalogue, Findings, Method
+from mplicits.pipelines.paper.methods import CATALOGUE, METHODS
 from mplicits.pipelines.picture import iio
 
 PLACE = Similarity((0.0, 0.0, 0.0), 2.0)
@@ -45,7 +44,7 @@ class Exact(Method):
 
 @pytest.fixture
 def exact(monkeypatch: pytest.MonkeyPatch) -> type[Exact]:
-    monkeypatch.setattr(running, "method_named", Exact)
+    monkeypatch.setattr(bench, "CATALOGUE", Catalogue([Exact(name) for name in names.METHODS]))
     monkeypatch.setattr(bench, "sgemm_rate", lambda *_, **__: 1e9)
     Exact.runs = 0
     return Exact
@@ -57,11 +56,11 @@ def test_names_are_those_that_exist() -> None:
     assert len({method.name for method in METHODS}) == len(METHODS)
     for spec in SPECS:
         for cell in spec.cells([Path("a.ply"), Path("b.ply")], "smoke"):
-            assert method_named(cell.method).source
+            assert CATALOGUE.named(cell.method).source
         assert isinstance(spec.tables([]), tuple)
         assert spec.plots([]) == ()
     with pytest.raises(ValueError, match="did you mean 'banf'"):
-        method_named("banff")
+        CATALOGUE.named("banff")
 
 
 def test_a_bench(ball: Path, tmp_path: Path, exact, capsys: pytest.CaptureFixture[str]) -> None:

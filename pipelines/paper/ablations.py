@@ -17,7 +17,7 @@ from ..cloud_distance import CloudDistance
 from ..fit_config import FitConfig
 from ..level_sources import Weights, banded_sources
 from .base import base_cell, base_of
-from .cell import Cell, Record
+from .cell import Cell, Record, Report
 from .judge import reference_of
 from .levels import delta_after, generator_for, train_level, up_to
 from .mesh_distance import Float64, MeshDistance, approximation_error, near_surface
@@ -25,11 +25,10 @@ from .method import Findings, Method, Workplace
 from .ours import Ours, our_config
 from .plots import Plot, Series
 from .published_ablations import ABL_DELTA, ABL_GRAD, ABL_NORMAL, ABL_SDF
-from .recipe import Report
 from .tables import Column, Row, Table, TableSpec, Value, mean, select, shapes_of
 
 if TYPE_CHECKING:
-    from .recipe import Preset
+    from .cell import Preset
 
 __all__ = [
     "DELTA_FACTOR",
@@ -76,6 +75,7 @@ class LossWeights(Method):
     """One constraint's weight at one level, the others as they are; ``overrides``: constraint, level."""
 
     name = "loss-weights"
+    depends = True
     source = "paper, supplement, tables abl-grad, abl-normal and abl-sdf"
     differs = (
         "normals by their cosine; the weights not varied are ours, that of the distances relative to the error before"
@@ -109,6 +109,7 @@ class DeltaFactor(Method):
     """Both residual levels in bands of another width; ``overrides``: epsilon, one less than the factor."""
 
     name = "delta-factor"
+    depends = True
     source = "paper, supplement, table abl-delta"
     differs = "δ is a robust maximum of |f| over the points (fit's own), not the plain one"
 

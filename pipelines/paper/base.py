@@ -58,12 +58,9 @@ def base_of(cell: Cell, work: Workplace, overrides: tuple[tuple[str, Any], ...] 
     Raises:
         InputError: the cloud cannot be read or used.
     """
-    from .run import cell_key, run_cell  # the list of methods, which `run` needs, names those that need this
-
     wanted = base_cell(cell, overrides)
-    run_cell(wanted, work.out, device=work.device, progress=work.progress)
-    directory = dataclasses.replace(work, key=cell_key(wanted, Ours())).run()
-    saved = load_field(find_field(directory), device=work.device)
+    assert work.first is not None
+    saved = load_field(find_field(work.first(wanted).run()), device=work.device)
     assert isinstance(saved.field, MultiscaleSDF)
     config = our_config(wanted)
     cloud = reviewed(prepare(damaged_cloud(wanted), config), up_to(saved.field, 0), config)

@@ -17,13 +17,13 @@ from ...neural_fields.files import write_json, write_whole
 from ..fit import choose_device
 from ..timing import sgemm_rate
 from .ablations import DELTA_FACTOR, LOSS_WEIGHTS
-from .cell import Cell, Record
+from .cell import Cell, Preset, Record
 from .comparison import BANF_TABLE, COMPARISON_TABLE, NOISE_TABLE, POISSON_TABLE
 from .isolation import ISOLATION
+from .methods import CATALOGUE
 from .names import METHODS, TABLES
 from .plots import to_svg
 from .protocol import protocol_of
-from .recipe import Preset
 from .report import Section, as_csv, as_page, section_as_dict, section_from_dict, with_missing
 from .robustness import DELTAS_TABLE, OUTLIERS_TABLE, UNDERTRAINED_TABLE
 from .run import Ran, Shape, cells_of, kept_records, run_cells
@@ -107,9 +107,9 @@ def bench_paper(bench: Bench, out: Path, *, say: Callable[[str], None]) -> tuple
     cells = list(dict.fromkeys(cell for wanted in plan.values() for cell in wanted))
     asked = [cell for cell in cells if cell.method not in skipped]
     say(f"{len(plan)} tables, {len(bench.shapes)} shapes, {len(asked)} cells")
-    ran = run_cells(asked, out, jobs=bench.jobs, device=bench.device, say=say)
+    ran = run_cells(asked, out, CATALOGUE, jobs=bench.jobs, device=bench.device, say=say)
     # What other methods found earlier stays in the tables.
-    records = {**kept_records([cell for cell in cells if cell.method in skipped], out), **ran.records}
+    records = {**kept_records([cell for cell in cells if cell.method in skipped], out, CATALOGUE), **ran.records}
     sections = [
         _section(spec, {cell: records[cell] for cell in wanted if cell in records}, wanted, ran, out)
         for spec, wanted in plan.items()

@@ -5,15 +5,19 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Literal
 
-if TYPE_CHECKING:
-    from .recipe import Preset
+from ..training import Progress
 
-__all__ = ["Cell", "Record"]
+__all__ = ["Cell", "Preset", "Record", "Report"]
+
+# smoke: seconds, for tests; cpu: 15 to 30 s of training on two cores, each method; paper: as published.
+Preset = Literal["smoke", "cpu", "paper"]
+# Told now and then how far a training is.
+Report = Callable[[Progress], None]
 
 # What a cell found, as it stands in its JSON file; see `mplicits.pipelines.paper.run.run_cell`.
 Record = Mapping[str, Any]

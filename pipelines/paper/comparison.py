@@ -29,7 +29,7 @@ from .tables import (
 )
 
 if TYPE_CHECKING:
-    from .recipe import Preset
+    from .cell import Preset
 
 __all__ = ["BANF_TABLE", "COMPARISON_TABLE", "NOISE_TABLE", "POISSON_TABLE"]
 

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from ...neural_fields import Field, Jet, MultiscaleSDF, NoSurfaceError, extract_mesh
 from ..level_sources import banded_sources
 from .base import Base, base_cell, base_of
-from .cell import Cell, Record
+from .cell import Cell, Record, Report
 from .judge import Judge
 from .levels import (
     delta_after,
@@ -33,11 +33,10 @@ from .levels import (
 from .method import Findings, Method, Workplace
 from .ours import Ours
 from .protocol import protocol_of
-from .recipe import Report
 from .tables import Column, Row, Table, TableSpec, Value, mean, median, select, shapes_of
 
 if TYPE_CHECKING:
-    from .recipe import Preset
+    from .cell import Preset
 
 __all__ = ["ISOLATION", "TAB_ISOLATION", "IndependentLevels", "Isolation", "isolation_tables", "steepness"]
 
@@ -144,6 +143,7 @@ class Isolation(Method):
     """
 
     name = "isolation"
+    depends = True
     source = "paper, supplement, table isolation"
     differs = "the schedule, the weights and the samples are those of our fit"
 

@@ -15,7 +15,7 @@ from ..fit_config import FitConfig
 from ..level_sources import Weights, surface_samples
 from ..sampling import band_of, distance_samples, with_previous
 from ..training import LevelTrainer, Progress, Source, StopFlag
-from .recipe import Report
+from .cell import Report
 
 __all__ = [
     "delta_after",

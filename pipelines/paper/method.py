@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from .cell import Cell
-from .recipe import Report
+from ..config import closest
+from .cell import Cell, Report
 
-__all__ = ["Findings", "Method", "Workplace"]
+__all__ = ["Catalogue", "Findings", "Method", "Workplace"]
 
 
 @dataclass(frozen=True)
@@ -23,12 +23,15 @@ class Workplace:
         key: of the cell; names of files begin with it.
         device: a torch device.
         progress: called now and then with how far the training is.
+        first: does another cell, unless it is done, before this one goes on from what it left → where it works; given
+            by `run_cell`.
     """
 
     out: Path
     key: str
     device: str = "cpu"
     progress: Report | None = None
+    first: Callable[[Cell], Workplace] | None = None
 
     def mesh(self, output: str) -> Path:
         """Where the mesh of an output goes, in input coordinates."""
@@ -65,11 +68,13 @@ class Method(ABC):
         name: as on the command line and in `Cell.method`.
         source: where it comes from.
         differs: what differs from its source here.
+        depends: whether it goes on from cells of methods that do not.
     """
 
     name: str
     source: str
     differs: str
+    depends: bool = False
 
     def missing(self) -> str | None:
         """What must be installed for it, in a few words; None if nothing is missing."""
@@ -86,6 +91,39 @@ class Method(ABC):
         Raises:
             InputError: the cloud cannot be read or used.
         """
+
+
+@dataclass(frozen=True)
+class Catalogue:
+    """The methods that a bench knows.
+
+    Attributes:
+        methods: all of them, in the order of the tables' rows.
+        protocol: what decides the figures of every method beside its own settings, for a cell; part of its key.
+    """
+
+    methods: Sequence[Method]
+    protocol: Callable[[Cell], Mapping[str, Any]] = lambda _: {}
+
+    def named(self, name: str) -> Method:
+        """The method that a cell asks for.
+
+        Raises:
+            ValueError: there is none.
+        """
+        for method in self.methods:
+            if method.name == name:
+                return method
+        raise ValueError(f"method {name!r}: there is none{closest(name, [method.name for method in self.methods])}")
+
+    def key(self, cell: Cell) -> str:
+        """The name under which a cell is stored: all that decides its figures.
+
+        Raises:
+            OSError: a file cannot be read.
+            ValueError: there is no such method.
+        """
+        return cell.key({**self.protocol(cell), **self.named(cell.method).settings(cell)})
 
 
 def _slug(name: str) -> str:

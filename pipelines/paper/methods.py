@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from ..config import closest
 from .ablations import DeltaFactor, LossWeights
 from .isolation import Isolation
-from .method import Method
+from .method import Catalogue, Method
 from .ours import Ours
 from .peers import FromRecipe, Poisson
+from .protocol import protocol_of
 from .recipes_grids import BanfRecipe, InstantNgpRecipe
 from .recipes_networks import BaconRecipe, IdfRecipe, SirenRecipe
 from .speed_tables import MarchingCubes, Normals
 
-__all__ = ["METHODS", "method_named"]
+__all__ = ["CATALOGUE", "METHODS"]
 
 # The first ones are those of `names.METHODS`; a test holds the two together.
 METHODS: tuple[Method, ...] = (
@@ -32,15 +32,4 @@ METHODS: tuple[Method, ...] = (
     MarchingCubes(),
     Normals(),
 )
-
-
-def method_named(name: str) -> Method:
-    """The method that a cell asks for.
-
-    Raises:
-        ValueError: there is none.
-    """
-    for method in METHODS:
-        if method.name == name:
-            return method
-    raise ValueError(f"method {name!r}: there is none{closest(name, [method.name for method in METHODS])}")
+CATALOGUE = Catalogue(METHODS, lambda cell: protocol_of(cell.preset).as_dict())

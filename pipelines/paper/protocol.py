@@ -18,7 +18,7 @@ from ..fit_config import FitConfig
 from .cell import Cell
 
 if TYPE_CHECKING:
-    from .recipe import Preset
+    from .cell import Preset
 
 __all__ = ["Protocol", "damaged_cloud", "fit_config", "flip_normals", "oriented_cloud", "protocol_of"]
 

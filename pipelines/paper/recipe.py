@@ -6,7 +6,7 @@ import math
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Generic, Literal, NamedTuple, TypeVar
+from typing import Generic, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -14,15 +14,12 @@ from torch import Tensor, nn
 from ...datasets import OrientedCloud
 from ...neural_fields import Field
 from ..training import Progress
+from .cell import Preset, Report
 
-__all__ = ["Output", "Preset", "Recipe", "Report", "Trained", "cosine", "count", "descend", "finished", "seeded"]
+__all__ = ["Output", "Recipe", "Trained", "cosine", "count", "descend", "finished", "seeded"]
 
 F = TypeVar("F", bound=Field)
 S = TypeVar("S")
-
-# smoke: seconds, for tests; cpu: 15 to 30 s of training on two cores, each method; paper: as published.
-Preset = Literal["smoke", "cpu", "paper"]
-Report = Callable[[Progress], None]
 
 
 class Output(NamedTuple):

@@ -15,8 +15,9 @@ from ...neural_fields import Field
 from ...neural_fields.baselines import BandLimited, BanfSDF, HashGridSDF
 from ...neural_fields.losses import data_loss, eikonal_loss
 from ..sampling import DOMAIN
+from .cell import Preset, Report
 from .grid_training import SignedPools, differences, mape_loss, stencil
-from .recipe import Output, Preset, Recipe, Report, cosine, count, descend, finished, seeded
+from .recipe import Output, Recipe, cosine, count, descend, finished, seeded
 
 __all__ = ["BanfRecipe", "BanfSettings", "GridSettings", "InstantNgpRecipe", "NgpSettings"]
 

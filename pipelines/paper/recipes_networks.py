@@ -13,7 +13,8 @@ from ...neural_fields import Siren
 from ...neural_fields.baselines import BaconSDF, IdfSDF
 from ...neural_fields.baselines.idf import attenuation
 from ..cloud_distance import CloudDistance
-from .recipe import Output, Preset, Recipe, Report, cosine, count, descend, finished, seeded
+from .cell import Preset, Report
+from .recipe import Output, Recipe, cosine, count, descend, finished, seeded
 
 __all__ = [
     "BaconRecipe",

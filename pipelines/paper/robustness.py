@@ -25,7 +25,7 @@ from .tables import (
 )
 
 if TYPE_CHECKING:
-    from .recipe import Preset
+    from .cell import Preset
 
 __all__ = ["DELTAS_TABLE", "OUTLIERS_TABLE", "UNDERTRAINED_TABLE"]
 

@@ -15,16 +15,12 @@ import torch
 from ..fit import Interrupted, choose_device
 from ..fit_state import environment
 from ..jobs import Outcome, check_jobs, run_jobs
-from .cell import Cell, Record
-from .method import Method, Workplace
-from .methods import method_named
-from .names import METHODS
-from .protocol import protocol_of
-from .recipe import Preset, Report
+from .cell import Cell, Preset, Record, Report
+from .method import Catalogue, Workplace
 from .store import read_record, write_record
 from .tables import TableSpec
 
-__all__ = ["Ran", "Shape", "cell_key", "cells_of", "kept_records", "run_cell", "run_cells"]
+__all__ = ["Ran", "Shape", "cells_of", "kept_records", "run_cell", "run_cells"]
 
 Say = Callable[[str], None]
 
@@ -42,11 +38,6 @@ class Shape:
     reference: Path | None = None
 
 
-def cell_key(cell: Cell, method: Method) -> str:
-    """The name under which a cell is stored: all that decides its figures."""
-    return cell.key({**protocol_of(cell.preset).as_dict(), **method.settings(cell)})
-
-
 def cells_of(spec: TableSpec, shapes: Sequence[Shape], preset: Preset, *, seed: int = 0) -> list[Cell]:
     """The cells of a table, with seed and references, each once.
 
@@ -62,12 +53,15 @@ def cells_of(spec: TableSpec, shapes: Sequence[Shape], preset: Preset, *, seed: 
     return list(dict.fromkeys(planned))
 
 
-def run_cell(cell: Cell, out: Path, *, device: str = "cpu", progress: Report | None = None) -> Record:
+def run_cell(
+    cell: Cell, out: Path, catalogue: Catalogue, *, device: str = "cpu", progress: Report | None = None
+) -> Record:
     """Do the work of a cell and keep its record; a cell that has one is not run again.
 
     Args:
         cell: what to do.
         out: folder of the bench (see `store.make_folder`).
+        catalogue: the methods.
         device: a torch device.
         progress: called now and then with how far the training is.
 
@@ -79,15 +73,19 @@ def run_cell(cell: Cell, out: Path, *, device: str = "cpu", progress: Report | N
             such a cell is run again next time.
         Interrupted: Ctrl-C during a fit of ours, which goes on there next time.
     """
-    method = method_named(cell.method)
-    key = cell_key(cell, method)
+    method, key = catalogue.named(cell.method), catalogue.key(cell)
     found = read_record(out, key)
     if found is not None:
         return found
     head = {"cell": cell.as_dict(), "method": {"source": method.source, "differs": method.differs}}
+
+    def first(other: Cell) -> Workplace:
+        run_cell(other, out, catalogue, device=device, progress=progress)
+        return Workplace(out, catalogue.key(other), device, progress, first)
+
     started = time.perf_counter()
     try:
-        findings = method.run(cell, Workplace(out, key, device, progress))
+        findings = method.run(cell, Workplace(out, key, device, progress, first))
     except Interrupted:
         raise
     except Exception as error:
@@ -120,12 +118,15 @@ class Ran:
     lacking: Mapping[str, str]
 
 
-def run_cells(cells: Sequence[Cell], out: Path, *, jobs: int = 1, device: str = "cpu", say: Say) -> Ran:
+def run_cells(
+    cells: Sequence[Cell], out: Path, catalogue: Catalogue, *, jobs: int = 1, device: str = "cpu", say: Say
+) -> Ran:
     """Run what has no record yet, one line each.
 
     Args:
         cells: each once.
         out: folder of the bench.
+        catalogue: the methods.
         jobs: how many at a time (see `run_jobs`).
         device: a torch device, or "auto".
         say: told one line per cell.
@@ -137,21 +138,21 @@ def run_cells(cells: Sequence[Cell], out: Path, *, jobs: int = 1, device: str = 
     """
     where = str(choose_device(device))
     check_jobs(jobs)
-    methods = {cell: method_named(cell.method) for cell in cells}
+    methods = {cell: catalogue.named(cell.method) for cell in cells}
     lacking = {method.name: why for method in methods.values() if (why := method.missing()) is not None}
     for name, why in lacking.items():
         say(f"left out: {name}, {why}")
     possible = [cell for cell in cells if cell.method not in lacking]
-    records = dict(kept_records(possible, out))
+    records = dict(kept_records(possible, out, catalogue))
     waiting = [cell for cell in possible if cell not in records]
     if records and waiting:
         say(f"{len(records)} of {len(possible)} cells are there already")
     counter = _Counter(len(waiting), say)
-    work = functools.partial(run_cell, out=out, device=where)
+    work = functools.partial(run_cell, out=out, catalogue=catalogue, device=where)
     failures: dict[Cell, str] = {}
-    # Variants of our own start from a fit that is a cell of the first group, and must not train it twice side by side.
-    for first in (True, False):
-        group = [cell for cell in waiting if (cell.method in METHODS) is first]
+    # What others go on from comes first, so that it is not trained twice side by side.
+    for depends in (False, True):
+        group = [cell for cell in waiting if methods[cell].depends is depends]
         for outcome in run_jobs(work, group, jobs=jobs, report=counter):
             if outcome.value is None:
                 failures[outcome.item] = outcome.error or "failed"
@@ -160,9 +161,9 @@ def run_cells(cells: Sequence[Cell], out: Path, *, jobs: int = 1, device: str = 
     return Ran({cell: records[cell] for cell in cells if cell in records}, failures, lacking)
 
 
-def kept_records(cells: Sequence[Cell], out: Path) -> Mapping[Cell, Record]:
+def kept_records(cells: Sequence[Cell], out: Path, catalogue: Catalogue) -> Mapping[Cell, Record]:
     """The records of those cells that are done."""
-    found = {cell: read_record(out, cell_key(cell, method_named(cell.method))) for cell in cells}
+    found = {cell: read_record(out, catalogue.key(cell)) for cell in cells}
     return {cell: record for cell, record in found.items() if record is not None}
 
 

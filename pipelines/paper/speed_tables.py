@@ -21,7 +21,7 @@ from .protocol import protocol_of
 from .tables import Column, Row, Table, TableSpec, Value, select
 
 if TYPE_CHECKING:
-    from .recipe import Preset
+    from .cell import Preset
 
 __all__ = [
     "MARCHING_CUBES",
@@ -85,6 +85,7 @@ class MarchingCubes(Method):
     """Seconds for a grid: one large SIREN, the multiscale field without and with its bands, and our own extraction."""
 
     name = "marching-cubes"
+    depends = True
     source = "paper, Tab. time_mc"
     differs = "evaluation of the grid only, but for our own extraction, which is timed with its triangles"
 

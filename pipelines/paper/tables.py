@@ -21,7 +21,7 @@ from .cell import Cell, Record
 from .plots import Plot
 
 if TYPE_CHECKING:
-    from .recipe import Preset
+    from .cell import Preset
 
 __all__ = [
     "Column",
