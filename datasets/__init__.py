@@ -15,11 +15,11 @@ from .prepare import CleaningReport, OrientedCloud, prepare_cloud
 from .reading import read_cloud
 from .region import region_from_cameras, region_from_masks, region_from_points
 from .rgbd import RgbdFrame, read_frame
-from .scanner import STATUE_PLACEMENT, simulate_scan, statue_scan
 from .scene_files import write_colmap, write_neus, write_transforms
-from .scenes import SCENES, Scene, render_scene, sample_scene, scene_mesh
-from .statue import Statue
-from .synthetic import add_noise, add_outliers, sample_sphere, sample_surface, sample_torus
+from .synthetic.samples import add_noise, add_outliers, sample_sphere, sample_surface, sample_torus
+from .synthetic.scanner import STATUE_PLACEMENT, simulate_scan, statue_scan
+from .synthetic.scenes import SCENES, Scene, render_scene, sample_scene, scene_mesh
+from .synthetic.statue import Statue
 from .textured import TexturedMesh, colors_at, read_textured, sample_textured
 from .voxels import spacing_of, thin
 

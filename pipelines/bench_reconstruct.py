@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ..datasets.posed_images import PosedImage
-from ..datasets.scenes import scene_mesh
+from ..datasets.synthetic.scenes import scene_mesh
 from ..neural_fields import InputError, NoSurfaceError
 from ..neural_fields.files import write_json
 from ..neural_fields.meshing import Mesh, extract_mesh

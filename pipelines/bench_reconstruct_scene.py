@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..datasets.posed_images import PosedImages, read_posed_images
-from ..datasets.scenes import SCENES, Scene, render_scene
+from ..datasets.synthetic.scenes import SCENES, Scene, render_scene
 from ..neural_fields import InputError
 from .config import closest
 

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from ..datasets.statue import Statue
+from ..datasets.synthetic.statue import Statue
 from ..neural_fields import InputError
 from ..neural_fields.meshing import NoSurfaceError, extract_mesh
 from .evaluate import evaluate_surfaces

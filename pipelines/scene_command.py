@@ -30,7 +30,7 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
 
 def _scene(arguments: argparse.Namespace) -> int:
     from ..datasets.scene_files import check_new_folder, write_colmap, write_neus, write_transforms
-    from ..datasets.scenes import SCENES, render_scene, scene_mesh
+    from ..datasets.synthetic.scenes import SCENES, render_scene, scene_mesh
     from .mesh_files import write_mesh
 
     folder = check_new_folder(arguments.out)

@@ -7,7 +7,7 @@ from pathlib import Path
 import imageio.v3 as iio
 import pytest
 import torch
-from mplicits.datasets.scenes import SCENES, render_scene
+from mplicits.datasets.synthetic.scenes import SCENES, render_scene
 from mplicits.neural_fields import InputError, Siren, Sphere, Union, extract_mesh
 from mplicits.neural_fields.baselines import NeusSDF
 from mplicits.neural_fields.radiance import Outside, ViewColor

@@ -6,7 +6,7 @@ from functools import partial
 import pytest
 import torch
 from mplicits.datasets.posed_images import PosedImages
-from mplicits.datasets.scenes import SCENES, render_scene
+from mplicits.datasets.synthetic.scenes import SCENES, render_scene
 from mplicits.neural_fields import MultiscaleSDF
 from mplicits.neural_fields.sphere_start import fit_sphere
 from mplicits.pipelines import scene_model

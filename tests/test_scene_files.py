@@ -14,7 +14,7 @@ from mplicits.datasets.cameras import Camera, look_at
 from mplicits.datasets.posed_cameras import read_cameras
 from mplicits.datasets.posed_images import PosedImage, PosedImages, read_posed_images
 from mplicits.datasets.scene_files import check_new_folder, write_colmap, write_neus, write_transforms
-from mplicits.datasets.scenes import SCENES, render_scene
+from mplicits.datasets.synthetic.scenes import SCENES, render_scene
 from mplicits.neural_fields import InputError, Similarity
 from scipy.spatial.transform import Rotation
 

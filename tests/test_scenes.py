@@ -7,7 +7,7 @@ import pytest
 import torch
 from mplicits.datasets.cameras import look_at
 from mplicits.datasets.color_space import linear_to_srgb, srgb_to_linear
-from mplicits.datasets.scenes import (
+from mplicits.datasets.synthetic.scenes import (
     AMBIENT,
     LAMP,
     SCENES,
@@ -96,7 +96,7 @@ def test_a_box_covers_a_square_with_even_edges():
 def test_strips_do_not_show(sphere, monkeypatch):
     camera = look_at((0, 1, 2.2), (0, 0, 0), fov=32, width=11, height=13)
     whole = render_view(sphere, camera)
-    monkeypatch.setattr("mplicits.datasets.scenes.RAYS_AT_ONCE", 500)
+    monkeypatch.setattr("mplicits.datasets.synthetic.scenes.RAYS_AT_ONCE", 500)
     for one, other in zip(whole, render_view(sphere, camera), strict=True):
         assert np.abs(one - other).max() < 1e-6
 

@@ -17,7 +17,7 @@ from mplicits.datasets import (
     simulate_scan,
     statue_scan,
 )
-from mplicits.datasets.closest import refine_closest
+from mplicits.datasets.synthetic.samples import refine_closest
 from mplicits.neural_fields import Box, Capsule, Sphere, Torus
 from scipy.spatial import KDTree
 from skimage import measure

@@ -8,11 +8,10 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from ..neural_fields import Field, Jet
+from ...neural_fields import Field, Jet
 from . import solids
-from .closest import distinct_starts, refine_closest
+from .samples import distinct_starts, refine_closest, sample_surface
 from .solids import Solid, Vector
-from .synthetic import sample_surface
 
 __all__ = ["Statue"]
 

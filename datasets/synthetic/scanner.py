@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ..neural_fields import Field, Similarity
-from .point_cloud import PointCloud, unit_rows
+from ...neural_fields import Field, Similarity
+from ..point_cloud import PointCloud, unit_rows
 from .statue import Statue
 
 __all__ = ["STATUE_PLACEMENT", "simulate_scan", "statue_scan"]
