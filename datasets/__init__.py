@@ -1,18 +1,18 @@
 """Files and sensors → tensors: point clouds, synthetic ones whose exact surface is known, and cameras."""
 
 from .cameras import Camera, look_at, orbit, turntable
+from .clouds.ply import write_cloud_ply
+from .clouds.point_cloud import PointCloud, spacing_of, thin
+from .clouds.prepare import CleaningReport, OrientedCloud, prepare_cloud
+from .clouds.reading import read_cloud
 from .color_space import linear_to_srgb, srgb_to_linear
 from .depth_camera import DepthCamera, read_intrinsics
 from .depth_cloud import DepthReport, DepthSettings, frame_cloud
 from .depth_fusion import fuse_frames
 from .depth_images import is_depth_file, read_color, read_depth
 from .depth_poses import read_poses, read_trajectory
-from .ply import write_cloud_ply
-from .point_cloud import PointCloud
 from .posed_cameras import read_cameras
 from .posed_images import PosedImage, PosedImages, read_posed_images
-from .prepare import CleaningReport, OrientedCloud, prepare_cloud
-from .reading import read_cloud
 from .region import region_from_cameras, region_from_masks, region_from_points
 from .rgbd import RgbdFrame, read_frame
 from .scene_files import write_colmap, write_neus, write_transforms
@@ -21,7 +21,6 @@ from .synthetic.scanner import STATUE_PLACEMENT, simulate_scan, statue_scan
 from .synthetic.scenes import SCENES, Scene, render_scene, sample_scene, scene_mesh
 from .synthetic.statue import Statue
 from .textured import TexturedMesh, colors_at, read_textured, sample_textured
-from .voxels import spacing_of, thin
 
 __all__ = [
     "SCENES",

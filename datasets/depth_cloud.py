@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..neural_fields import InputError
+from .clouds.point_cloud import PointCloud, colors_from
+from .clouds.reading import MIN_POINTS
 from .depth_cleaning import edge_pixels, grid_normals, measure_noise, smooth_depth, specks
-from .point_cloud import PointCloud, colors_from
-from .reading import MIN_POINTS
 from .rgbd import RgbdFrame
 
 __all__ = ["DepthReport", "DepthSettings", "frame_cloud"]

@@ -12,10 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..neural_fields import InputError
+from .clouds.point_cloud import PointCloud, select, spread, thin
 from .depth_cloud import DepthReport, DepthSettings, frame_cloud
-from .point_cloud import PointCloud
 from .rgbd import RgbdFrame
-from .voxels import select, spread, thin
 
 __all__ = ["fuse_frames"]
 

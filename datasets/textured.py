@@ -12,9 +12,9 @@ import numpy as np
 import trimesh
 
 from ..neural_fields import InputError
-from .meshes import weld
-from .ply import read_ply
-from .point_cloud import PointCloud
+from .clouds.meshes import weld
+from .clouds.ply import read_ply
+from .clouds.point_cloud import PointCloud
 from .textured_gltf import read_gltf
 from .textured_mesh import TexturedMesh, colors_at
 from .textured_obj import read_textured_obj

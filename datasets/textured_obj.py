@@ -14,10 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..neural_fields import InputError
-from .meshes import triangulate
-from .obj import _indices, _records
-from .point_cloud import colors_from
-from .text import numbers
+from .clouds.meshes import _indices, _records, triangulate
+from .clouds.point_cloud import colors_from
+from .clouds.tables import numbers
 from .textured_mesh import Paint, TexturedMesh, Wrap, decode_image, pack
 
 __all__ = ["read_textured_obj"]

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
-from ..datasets.point_cloud import unit_rows
+from ..datasets.clouds.point_cloud import unit_rows
 from ..neural_fields import InputError, Similarity
 from ..neural_fields.meshing import Mesh
 from .raster import cover

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from ..datasets import OrientedCloud, PointCloud, prepare_cloud
-from ..datasets.large_cloud import Merging
+from ..datasets.clouds.large import Merging
 from ..neural_fields import InputError, MultiscaleSDF, Similarity, Siren, save_field
 from .cloud_distance import CloudDistance
 from .config import load_config

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..datasets.reading import check_cloud_path
+from ..datasets.clouds.reading import check_cloud_path
 from ..neural_fields import InputError
 from ..neural_fields.files import write_json
 from .config import load_config

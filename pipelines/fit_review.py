@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..datasets.outliers import agreement
+from ..datasets.clouds.outliers import agreement
 from ..neural_fields import Field
 
 __all__ = ["Review", "review_points"]

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from ..datasets import PointCloud, read_cloud
-from ..datasets.cloud_stream import MemoryStream
-from ..datasets.large_cloud import Merging, merge_cloud
-from ..datasets.reading import check_cloud, open_stream
+from ..datasets.clouds.large import Merging, merge_cloud
+from ..datasets.clouds.reading import check_cloud, open_stream
+from ..datasets.clouds.stream import MemoryStream
 from ..neural_fields.files import whole_file
 
 __all__ = ["MERGED_FILE", "load_cloud"]

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..datasets.cameras import Camera
-from ..datasets.meshes import vertex_normals
+from ..datasets.clouds.meshes import vertex_normals
 from ..neural_fields import InputError
 from ..neural_fields.files import write_whole
 from .raster import clip, cover

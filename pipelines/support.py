@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ..datasets.voxels import voxel_representatives
+from ..datasets.clouds.point_cloud import voxel_representatives
 from ..neural_fields import InputError
 from .fit_state import FIELD_FILE, load_state, save_state
 from .mesh_trim import support_radius

@@ -14,7 +14,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from ..datasets import PointCloud, read_cloud
-from ..datasets.point_cloud import unit_rows
+from ..datasets.clouds.point_cloud import unit_rows
 from ..datasets.textured_gltf import read_gltf
 from ..neural_fields import InputError, Similarity
 from ..neural_fields.meshing import Mesh

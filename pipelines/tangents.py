@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..datasets.point_cloud import unit_rows
+from ..datasets.clouds.point_cloud import unit_rows
 
 __all__ = ["from_frame", "to_frame", "vertex_tangents"]
 

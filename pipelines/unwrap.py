@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..datasets.meshes import vertex_normals
+from ..datasets.clouds.meshes import vertex_normals
 from ..neural_fields import InputError
 from .tangents import vertex_tangents
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mplicits.datasets import PointCloud
-from mplicits.datasets.ply import write_cloud_ply
+from mplicits.datasets.clouds.ply import write_cloud_ply
 from mplicits.neural_fields import InputError, Siren, Sphere, extract_mesh, save_field
 from mplicits.neural_fields.files import whole_file, write_whole
 from mplicits.pipelines.command import write_json

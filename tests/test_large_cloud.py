@@ -2,13 +2,13 @@
 
 from pathlib import Path
 
-import mplicits.datasets.large_cloud as large_cloud
+import mplicits.datasets.clouds.large as large_cloud
 import numpy as np
 import pytest
 from mplicits.datasets import PointCloud, read_cloud, write_cloud_ply
-from mplicits.datasets.cloud_stream import MemoryStream
-from mplicits.datasets.large_cloud import Merging, merge_cloud
-from mplicits.datasets.reading import open_stream
+from mplicits.datasets.clouds.large import Merging, merge_cloud
+from mplicits.datasets.clouds.reading import open_stream
+from mplicits.datasets.clouds.stream import MemoryStream
 from mplicits.neural_fields import InputError
 from mplicits.pipelines.merged_cloud import MERGED_FILE, load_cloud
 

@@ -12,7 +12,7 @@ from mplicits.datasets import (
     sample_surface,
     sample_torus,
 )
-from mplicits.datasets.outliers import agreement, inspect_points
+from mplicits.datasets.clouds.outliers import agreement, inspect_points
 from mplicits.neural_fields import Box, Torus
 
 

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from ...neural_fields import Field, Similarity
-from ..point_cloud import PointCloud, unit_rows
+from ..clouds.point_cloud import PointCloud, unit_rows
 
 __all__ = [
     "add_noise",

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from ...neural_fields import Field, Similarity
-from ..point_cloud import PointCloud, unit_rows
+from ..clouds.point_cloud import PointCloud, unit_rows
 from .statue import Statue
 
 __all__ = ["STATUE_PLACEMENT", "simulate_scan", "statue_scan"]

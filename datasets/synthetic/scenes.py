@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from ...neural_fields import Box, Capsule, Field, Similarity, Sphere, Torus, Union, sphere_trace
 from ...neural_fields.meshing import Mesh, extract_mesh
 from ..cameras import UP_AXES, Camera, look_at
+from ..clouds.orientation import fibonacci_directions
+from ..clouds.point_cloud import PointCloud
 from ..color_space import linear_to_srgb, srgb_to_linear
-from ..orientation import fibonacci_directions
-from ..point_cloud import PointCloud
 from ..posed_images import PosedImage, PosedImages
 from .samples import sample_surface
 from .statue import Statue

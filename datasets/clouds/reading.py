@@ -9,15 +9,13 @@ from types import MappingProxyType
 
 import numpy as np
 
-from ..neural_fields import InputError
-from .arrays import npy_stream, read_npy, read_npz
-from .cloud_stream import CloudStream
+from ...neural_fields import InputError
 from .las import LasStream, read_las
-from .meshes import read_off, read_stl
-from .obj import read_obj
+from .meshes import read_obj, read_off, read_stl
 from .ply import ply_stream, read_ply
 from .point_cloud import PointCloud
-from .text import read_text
+from .stream import CloudStream
+from .tables import npy_stream, read_npy, read_npz, read_text
 
 __all__ = ["MIN_POINTS", "READERS", "check_cloud", "check_cloud_path", "open_stream", "read_cloud"]
 

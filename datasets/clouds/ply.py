@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..neural_fields import InputError
-from ..neural_fields.files import write_whole
-from .cloud_stream import TableStream
+from ...neural_fields import InputError
+from ...neural_fields.files import write_whole
 from .meshes import triangulate, vertex_normals
 from .point_cloud import PointCloud, colors_from, normals_from
+from .stream import TableStream
 
 __all__ = ["ply_stream", "read_ply", "write_cloud_ply"]
 

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..neural_fields import InputError
+from ...neural_fields import InputError
 from .point_cloud import PointCloud
 
 __all__ = ["CloudStream", "MemoryStream", "RawRows", "TableStream"]

@@ -22,8 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from .cloud_stream import CloudStream
 from .point_cloud import PointCloud, colors_from, normals_from, unit_rows
+from .stream import CloudStream
 
 __all__ = ["Merging", "merge_cloud"]
 

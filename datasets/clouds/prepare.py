@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from ..neural_fields import InputError, Similarity
+from ...neural_fields import InputError, Similarity
 from .noise import noise_level, smooth_along_normals
 from .orientation import estimate_normals, nearest, openness, orient_normals, outwardness
 from .outliers import inspect_points

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from ..neural_fields import InputError
-from .cloud_stream import CloudStream, RawRows
+from ...neural_fields import InputError
 from .point_cloud import PointCloud, colors_from
+from .stream import CloudStream, RawRows
 
 __all__ = ["LasStream", "read_las"]
 

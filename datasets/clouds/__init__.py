@@ -1,0 +1,1 @@
+"""Point clouds: files → oriented points in the unit sphere, cleaned of strays and noise."""
