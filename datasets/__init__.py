@@ -11,16 +11,16 @@ from .depth_cloud import DepthReport, DepthSettings, frame_cloud
 from .depth_fusion import fuse_frames
 from .depth_images import is_depth_file, read_color, read_depth
 from .depth_poses import read_poses, read_trajectory
-from .posed_cameras import read_cameras
-from .posed_images import PosedImage, PosedImages, read_posed_images
-from .region import region_from_cameras, region_from_masks, region_from_points
 from .rgbd import RgbdFrame, read_frame
-from .scene_files import write_colmap, write_neus, write_transforms
 from .synthetic.samples import add_noise, add_outliers, sample_sphere, sample_surface, sample_torus
 from .synthetic.scanner import STATUE_PLACEMENT, simulate_scan, statue_scan
 from .synthetic.scenes import SCENES, Scene, render_scene, sample_scene, scene_mesh
 from .synthetic.statue import Statue
 from .textured import TexturedMesh, colors_at, read_textured, sample_textured
+from .views.images import PosedImage, PosedImages, read_posed_images
+from .views.reading import read_cameras
+from .views.region import region_from_cameras, region_from_masks, region_from_points
+from .views.writing import write_colmap, write_neus, write_transforms
 
 __all__ = [
     "SCENES",

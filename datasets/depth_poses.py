@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ..neural_fields import InputError
 from .depth_camera import DepthCamera
-from .posed_cameras import read_cameras
+from .views.reading import read_cameras
 
 __all__ = ["PosedFrame", "read_poses", "read_trajectory"]
 

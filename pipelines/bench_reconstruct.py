@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from ..datasets.posed_images import PosedImage
 from ..datasets.synthetic.scenes import scene_mesh
+from ..datasets.views.images import PosedImage
 from ..neural_fields import InputError, NoSurfaceError
 from ..neural_fields.files import write_json
 from ..neural_fields.meshing import Mesh, extract_mesh

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import nn
 
-from ..datasets.posed_images import PosedImage
+from ..datasets.views.images import PosedImage
 from ..neural_fields.baselines import NeusSDF
 from ..neural_fields.meshing import Mesh
 from .bench_reconstruct_row import EQUAL_TIME, ReconstructRow, SurfaceFigures

@@ -6,8 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..datasets.posed_images import PosedImages, read_posed_images
 from ..datasets.synthetic.scenes import SCENES, Scene, render_scene
+from ..datasets.views.images import PosedImages, read_posed_images
 from ..neural_fields import InputError
 from .config import closest
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ..datasets import read_cameras, srgb_to_linear
 from ..datasets.cameras import Camera
 from ..datasets.clouds.orientation import fibonacci_directions
-from ..datasets.posed_images import PosedImage, PosedImages, read_posed_images
+from ..datasets.views.images import PosedImage, PosedImages, read_posed_images
 from ..neural_fields import InputError, Similarity
 from .frustums import camera_mesh
 from .mesh_files import write_mesh

@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 
 from ..datasets.cameras import Camera
-from ..datasets.posed_images import PosedImages
+from ..datasets.views.images import PosedImages
 from ..neural_fields.meshing import Mesh
 from .colormap import COLOR_MAPS, map_colors
 

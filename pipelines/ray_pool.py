@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..datasets.posed_images import PosedImage
+from ..datasets.views.images import PosedImage
 from ..neural_fields import InputError, Similarity
 from ..neural_fields.volume import sphere_span
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from ..datasets.posed_images import PosedImage, PosedImages, read_posed_images
+from ..datasets.views.images import PosedImage, PosedImages, read_posed_images
 from ..neural_fields import InputError, NoSurfaceError, TextureField, save_field, save_texture
 from .config import load_config
 from .fit import Interrupted, choose_device

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ..datasets import PointCloud
-from ..datasets.posed_images import PosedImages
+from ..datasets.views.images import PosedImages
 from ..neural_fields import Jet, NoSurfaceError, extract_mesh
 from .mesh_trim import in_region
 from .reconstruct_config import ReconstructConfig

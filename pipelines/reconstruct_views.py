@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..datasets.posed_images import PosedImage
+from ..datasets.views.images import PosedImage
 from ..neural_fields import Similarity
 from ..neural_fields.volume import sphere_span
 from ..neural_fields.volume_renderer import Sampling

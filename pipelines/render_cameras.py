@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..datasets.cameras import Camera, turntable
-from ..datasets.posed_cameras import read_cameras
+from ..datasets.views.reading import read_cameras
 from ..neural_fields import InputError, Similarity
 
 __all__ = ["Orbit", "choose_frame", "orbit_cameras", "posed_cameras"]

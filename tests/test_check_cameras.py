@@ -9,9 +9,9 @@ import pytest
 import torch
 import trimesh
 from mplicits.datasets.cameras import Camera, look_at
-from mplicits.datasets.posed_images import PosedImage
-from mplicits.datasets.scene_files import write_colmap, write_neus, write_transforms
 from mplicits.datasets.synthetic.scenes import SCENES, render_scene
+from mplicits.datasets.views.images import PosedImage
+from mplicits.datasets.views.writing import write_colmap, write_neus, write_transforms
 from mplicits.neural_fields import Similarity
 from mplicits.pipelines.check_cameras import check_cameras, check_files
 from mplicits.pipelines.cli import main

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from mplicits.datasets import Camera, look_at, read_cameras
-from mplicits.datasets.colmap import MODELS, read_colmap, read_colmap_points
+from mplicits.datasets.views.colmap import MODELS, read_colmap, read_colmap_points
 from mplicits.neural_fields import InputError
 from scipy.spatial.transform import Rotation
 

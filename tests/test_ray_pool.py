@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 from mplicits.datasets import look_at
-from mplicits.datasets.posed_images import PosedImage
+from mplicits.datasets.views.images import PosedImage
 from mplicits.neural_fields import InputError, Similarity
 from mplicits.neural_fields.volume import sphere_span
 from mplicits.pipelines.ray_pool import RayPool, camera_rays

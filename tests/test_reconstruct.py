@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 import torch
 from mplicits.datasets import read_cloud
-from mplicits.datasets.posed_images import PosedImages
-from mplicits.datasets.scene_files import write_neus, write_transforms
 from mplicits.datasets.synthetic.scenes import SCENES, render_scene, sample_scene
+from mplicits.datasets.views.images import PosedImages
+from mplicits.datasets.views.writing import write_neus, write_transforms
 from mplicits.neural_fields import InputError, Similarity, extract_mesh, load_field, load_texture
 from mplicits.pipelines import reconstruct_texture
 from mplicits.pipelines.cli import main

@@ -5,8 +5,8 @@ from functools import partial
 
 import pytest
 import torch
-from mplicits.datasets.posed_images import PosedImages
 from mplicits.datasets.synthetic.scenes import SCENES, render_scene
+from mplicits.datasets.views.images import PosedImages
 from mplicits.neural_fields import MultiscaleSDF
 from mplicits.neural_fields.sphere_start import fit_sphere
 from mplicits.pipelines import scene_model

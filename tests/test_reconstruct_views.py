@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 from mplicits.datasets import look_at
-from mplicits.datasets.posed_images import PosedImage
 from mplicits.datasets.synthetic.scenes import SCENES, render_scene, render_view, scene_cameras
+from mplicits.datasets.views.images import PosedImage
 from mplicits.neural_fields import Jet, Similarity
 from mplicits.neural_fields.volume_renderer import Sampling
 from mplicits.pipelines.reconstruct_views import (

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from mplicits.datasets import Camera, look_at
-from mplicits.datasets.region import region_from_cameras, region_from_masks, region_from_points
+from mplicits.datasets.views.region import region_from_cameras, region_from_masks, region_from_points
 
 CENTER = np.array([500_000.0, 20.0, -7.0])
 

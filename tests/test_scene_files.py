@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 import torch
 from mplicits.datasets.cameras import Camera, look_at
-from mplicits.datasets.posed_cameras import read_cameras
-from mplicits.datasets.posed_images import PosedImage, PosedImages, read_posed_images
-from mplicits.datasets.scene_files import check_new_folder, write_colmap, write_neus, write_transforms
 from mplicits.datasets.synthetic.scenes import SCENES, render_scene
+from mplicits.datasets.views.images import PosedImage, PosedImages, read_posed_images
+from mplicits.datasets.views.reading import read_cameras
+from mplicits.datasets.views.writing import check_new_folder, write_colmap, write_neus, write_transforms
 from mplicits.neural_fields import InputError, Similarity
 from scipy.spatial.transform import Rotation
 
@@ -214,7 +214,7 @@ def test_nothing_is_overwritten_and_nothing_is_left_behind(tmp_path, photographs
     def full_disk(*_arguments):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("mplicits.datasets.scene_files._write_png", full_disk)
+    monkeypatch.setattr("mplicits.datasets.views.writing._write_png", full_disk)
     with pytest.raises(InputError, match=r"new: cannot be written \(No space left on device\)"):
         write_colmap(tmp_path / "new", photographs)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["empty", "file", "full"]

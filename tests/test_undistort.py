@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 from mplicits.datasets import Camera, look_at
-from mplicits.datasets.undistort import undistort, undistorted_camera
+from mplicits.datasets.views.pictures import undistort, undistorted_camera
 
 WIDTH, HEIGHT = 160, 120
 LENSES = {

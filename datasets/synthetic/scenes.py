@@ -21,7 +21,7 @@ from ..cameras import UP_AXES, Camera, look_at
 from ..clouds.orientation import fibonacci_directions
 from ..clouds.point_cloud import PointCloud
 from ..color_space import linear_to_srgb, srgb_to_linear
-from ..posed_images import PosedImage, PosedImages
+from ..views.images import PosedImage, PosedImages
 from .samples import sample_surface
 from .statue import Statue
 

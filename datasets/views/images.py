@@ -10,15 +10,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..neural_fields import InputError, Similarity
-from .cameras import Camera
+from ...neural_fields import InputError, Similarity
+from ..cameras import Camera
 from .colmap import read_colmap_points
-from .neus_cameras import read_neus_sphere
-from .pictures import read_mask, read_picture, resample, shrink
-from .posed_cameras import find_source, read_shots
+from .neus import read_neus_sphere
+from .pictures import read_mask, read_picture, resample, shrink, undistort, undistorted_camera
+from .reading import find_source, read_shots
 from .region import region_from_cameras, region_from_masks, region_from_points
 from .shots import Shot
-from .undistort import undistort, undistorted_camera
 
 __all__ = ["PosedImage", "PosedImages", "read_posed_images"]
 

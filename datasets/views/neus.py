@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ..neural_fields import InputError, Similarity
-from .cameras import Camera
+from ...neural_fields import InputError, Similarity
+from ..cameras import Camera
 from .shots import Shot, image_size, intrinsics, list_images
 
 __all__ = ["read_neus", "read_neus_sphere"]

@@ -16,8 +16,8 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from ..neural_fields import InputError
-from .cameras import Camera
+from ...neural_fields import InputError
+from ..cameras import Camera
 from .shots import IMAGE_SUFFIXES, Shot, intrinsics
 
 __all__ = ["find_model", "read_colmap", "read_colmap_points"]

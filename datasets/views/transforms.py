@@ -12,8 +12,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ..neural_fields import InputError
-from .cameras import Camera
+from ...neural_fields import InputError
+from ..cameras import Camera
 from .shots import Shot, find_image, image_size, intrinsics
 
 __all__ = ["read_transforms"]

@@ -8,9 +8,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from ..neural_fields import InputError
-from ..neural_fields.files import files_in
-from .cameras import Camera
+from ...neural_fields import InputError
+from ...neural_fields.files import files_in
+from ..cameras import Camera
 
 __all__ = ["IMAGE_SUFFIXES", "Shot", "find_image", "image_size", "intrinsics", "list_images"]
 

@@ -20,9 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from ..neural_fields import InputError
-from .cameras import Camera
-from .posed_images import PosedImage, PosedImages
+from ...neural_fields import InputError
+from ..cameras import Camera
+from .images import PosedImage, PosedImages
 
 __all__ = ["check_new_folder", "write_colmap", "write_neus", "write_transforms"]
 

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ..neural_fields import InputError
-from .cameras import Camera
+from ...neural_fields import InputError
+from ..cameras import Camera
 from .colmap import find_model, read_colmap
-from .neus_cameras import read_neus
+from .neus import read_neus
 from .shots import Shot
-from .transforms_json import read_transforms
+from .transforms import read_transforms
 
 __all__ = ["find_source", "read_cameras", "read_shots"]
 

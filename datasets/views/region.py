@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ..neural_fields import Similarity
-from .cameras import Camera
+from ...neural_fields import Similarity
+from ..cameras import Camera
 
 __all__ = ["region_from_cameras", "region_from_masks", "region_from_points"]
 

@@ -1,0 +1,1 @@
+"""Posed photographs: files → pictures, their cameras, and where the object is."""
