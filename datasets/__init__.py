@@ -6,12 +6,10 @@ from .clouds.point_cloud import PointCloud, spacing_of, thin
 from .clouds.prepare import CleaningReport, OrientedCloud, prepare_cloud
 from .clouds.reading import read_cloud
 from .color_space import linear_to_srgb, srgb_to_linear
-from .depth_camera import DepthCamera, read_intrinsics
-from .depth_cloud import DepthReport, DepthSettings, frame_cloud
-from .depth_fusion import fuse_frames
-from .depth_images import is_depth_file, read_color, read_depth
-from .depth_poses import read_poses, read_trajectory
-from .rgbd import RgbdFrame, read_frame
+from .depth.camera import DepthCamera, read_intrinsics
+from .depth.cloud import DepthReport, DepthSettings, frame_cloud, fuse_frames
+from .depth.frame import RgbdFrame, read_frame, read_poses, read_trajectory
+from .depth.images import is_depth_file, read_color, read_depth
 from .synthetic.samples import add_noise, add_outliers, sample_sphere, sample_surface, sample_torus
 from .synthetic.scanner import STATUE_PLACEMENT, simulate_scan, statue_scan
 from .synthetic.scenes import SCENES, Scene, render_scene, sample_scene, scene_mesh

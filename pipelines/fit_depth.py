@@ -25,8 +25,8 @@ from ..datasets import (
     spacing_of,
     write_cloud_ply,
 )
-from ..datasets.depth_images import COLOR_SUFFIXES, DEPTH_SUFFIXES
-from ..datasets.depth_poses import PosedFrame
+from ..datasets.depth.frame import PosedFrame
+from ..datasets.depth.images import COLOR_SUFFIXES, DEPTH_SUFFIXES
 from ..neural_fields import InputError
 from ..neural_fields.files import files_in
 from .fit import FitConfig, Run, choose_device, fit

@@ -66,7 +66,7 @@ def depth_input(arguments: argparse.Namespace) -> DepthInput | None:
     given = [flag for flag, value in flags.items() if value]
     path = Path(arguments.cloud)
     from ..datasets import DepthSettings, is_depth_file
-    from ..datasets.depth_images import DEPTH_SUFFIXES
+    from ..datasets.depth.images import DEPTH_SUFFIXES
 
     named_so = path.suffix.lower() in DEPTH_SUFFIXES or path.is_dir()
     if given and not named_so:

@@ -15,7 +15,7 @@ from mplicits.datasets import (
     read_poses,
     read_trajectory,
 )
-from mplicits.datasets.depth_images import fit_color
+from mplicits.datasets.depth.images import fit_color
 from mplicits.neural_fields import InputError
 
 OURS = {"width": 8, "height": 6, "fx": 10.0, "fy": 11.0, "cx": 3.5, "cy": 2.25}

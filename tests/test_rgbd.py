@@ -12,7 +12,6 @@ from mplicits.datasets import (
     DepthSettings,
     PointCloud,
     RgbdFrame,
-    depth_fusion,
     frame_cloud,
     fuse_frames,
     look_at,
@@ -20,7 +19,8 @@ from mplicits.datasets import (
     read_frame,
     thin,
 )
-from mplicits.datasets.depth_cleaning import measure_noise
+from mplicits.datasets.depth import cloud as depth_fusion
+from mplicits.datasets.depth.cleaning import measure_noise
 from mplicits.neural_fields import InputError
 from mplicits.pipelines import fit_depth as fit_depth_module
 from mplicits.pipelines.cli import main

@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..neural_fields import InputError
-from .color_space import linear_to_srgb, srgb_to_linear
+from ...neural_fields import InputError
+from ..color_space import linear_to_srgb, srgb_to_linear
 
 __all__ = ["DEPTH_SCALE", "DEPTH_SUFFIXES", "fit_color", "is_depth_file", "read_color", "read_depth"]
 

@@ -14,8 +14,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..neural_fields import InputError
-from .cameras import Camera, pinhole_intrinsics
+from ...neural_fields import InputError
+from ..cameras import Camera, pinhole_intrinsics
 
 __all__ = ["DepthCamera", "read_intrinsics"]
 

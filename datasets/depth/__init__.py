@@ -1,0 +1,1 @@
+"""Depth maps: files of depth sensors → oriented, coloured clouds."""
