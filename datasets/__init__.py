@@ -14,7 +14,7 @@ from .synthetic.samples import add_noise, add_outliers, sample_sphere, sample_su
 from .synthetic.scanner import STATUE_PLACEMENT, simulate_scan, statue_scan
 from .synthetic.scenes import SCENES, Scene, render_scene, sample_scene, scene_mesh
 from .synthetic.statue import Statue
-from .textured import TexturedMesh, colors_at, read_textured, sample_textured
+from .textured.reading import TexturedMesh, colors_at, read_textured, sample_textured
 from .views.images import PosedImage, PosedImages, read_posed_images
 from .views.reading import read_cameras
 from .views.region import region_from_cameras, region_from_masks, region_from_points

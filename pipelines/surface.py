@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import connected_components
 
 from ..datasets import PointCloud, read_cloud
 from ..datasets.clouds.point_cloud import unit_rows
-from ..datasets.textured_gltf import read_gltf
+from ..datasets.textured.gltf import read_gltf
 from ..neural_fields import InputError, Similarity
 from ..neural_fields.meshing import Mesh
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..datasets import PointCloud, read_cloud
-from ..datasets.textured import TEXTURED_READERS, read_textured, sample_textured
+from ..datasets.textured.reading import TEXTURED_READERS, read_textured, sample_textured
 from ..neural_fields import Field, InputError, Similarity
 from .sampling import DOMAIN
 

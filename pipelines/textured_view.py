@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from ..datasets.cameras import Camera
 from ..datasets.clouds.meshes import vertex_normals
-from ..datasets.textured import TexturedMesh, colors_at
+from ..datasets.textured.reading import TexturedMesh, colors_at
 from .picture import nearest_faces, rows_seen
 from .seen import Seen
 

@@ -17,7 +17,7 @@ from mplicits.datasets import (
     srgb_to_linear,
     write_cloud_ply,
 )
-from mplicits.datasets.textured_mesh import Paint, decode_image, lookup, pack
+from mplicits.datasets.textured.mesh import Paint, decode_image, lookup, pack
 from mplicits.neural_fields import InputError
 from mplicits.neural_fields.meshing import Mesh
 from mplicits.pipelines.mesh_files import write_mesh

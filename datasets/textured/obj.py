@@ -13,11 +13,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..neural_fields import InputError
-from .clouds.meshes import _indices, _records, triangulate
-from .clouds.point_cloud import colors_from
-from .clouds.tables import numbers
-from .textured_mesh import Paint, TexturedMesh, Wrap, decode_image, pack
+from ...neural_fields import InputError
+from ..clouds.meshes import _indices, _records, triangulate
+from ..clouds.point_cloud import colors_from
+from ..clouds.tables import numbers
+from .mesh import Paint, TexturedMesh, Wrap, decode_image, pack
 
 __all__ = ["read_textured_obj"]
 

@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from ..neural_fields import InputError
-from .clouds.meshes import weld
-from .clouds.ply import read_ply
-from .clouds.point_cloud import PointCloud
-from .textured_gltf import read_gltf
-from .textured_mesh import TexturedMesh, colors_at
-from .textured_obj import read_textured_obj
+from ...neural_fields import InputError
+from ..clouds.meshes import weld
+from ..clouds.ply import read_ply
+from ..clouds.point_cloud import PointCloud
+from .gltf import read_gltf
+from .mesh import TexturedMesh, colors_at
+from .obj import read_textured_obj
 
 __all__ = ["TEXTURED_READERS", "TexturedMesh", "colors_at", "read_textured", "sample_textured"]
 

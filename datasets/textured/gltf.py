@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from ..neural_fields import InputError
-from .color_space import linear_to_srgb, srgb_to_linear
-from .textured_mesh import Paint, TexturedMesh, Wrap, decode_image, pack
+from ...neural_fields import InputError
+from ..color_space import linear_to_srgb, srgb_to_linear
+from .mesh import Paint, TexturedMesh, Wrap, decode_image, pack
 
 __all__ = ["read_gltf"]
 

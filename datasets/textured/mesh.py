@@ -11,8 +11,8 @@ import imageio.v3 as iio
 import numpy as np
 from numpy.typing import NDArray
 
-from .clouds.point_cloud import colors_from
-from .color_space import linear_to_srgb, srgb_to_linear
+from ..clouds.point_cloud import colors_from
+from ..color_space import linear_to_srgb, srgb_to_linear
 
 __all__ = ["Paint", "Parts", "TexturedMesh", "colors_at", "decode_image", "lookup", "pack"]
 

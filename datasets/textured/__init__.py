@@ -1,0 +1,1 @@
+"""Meshes with colours: files → triangles, textures, and coloured points on them."""
