@@ -6,8 +6,9 @@ import argparse
 import time
 from pathlib import Path
 
-from .command import Command, counter_bar, positive, whole
-from .config import input_error
+from .command import Command, positive, whole
+from .run.config import input_error
+from .run.progress import counter_bar
 
 __all__ = ["COMMAND"]
 

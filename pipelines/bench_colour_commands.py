@@ -8,9 +8,8 @@ import sys
 from pathlib import Path
 
 from .command import Command, add_json, check_output, positive, whole, write_json
-from .config import add_config_flags, given_flags, load_config, preset_names
-from .fit_config import FitConfig
-from .texture_config import TextureConfig
+from .run.config import add_config_flags, given_flags, load_config, preset_names
+from .run.settings import FitConfig, TextureConfig
 
 __all__ = ["NORMAL_MAP", "TEXTURE"]
 
@@ -64,8 +63,8 @@ def _texture(arguments: argparse.Namespace) -> int:
     )
     full = load_config(FitConfig, arguments.fit_preset, shared) if arguments.full else None
     from .bench_texture import bench_texture, format_texture
-    from .fit import Interrupted
-    from .progress_bar import progress_bars
+    from .run.progress import progress_bars
+    from .run.trainer import Interrupted
 
     try:
         with progress_bars() as report:

@@ -58,7 +58,7 @@ def _mesh_arguments(parser: argparse.ArgumentParser) -> None:
 def _mesh(arguments: argparse.Namespace) -> int:
     check_output(arguments.json, (".json",))
     from .bench_mesh import bench_mesh, format_bench_mesh
-    from .timing import sgemm_rate
+    from .run.machine import sgemm_rate
 
     bench = bench_mesh(
         arguments.run,
@@ -88,8 +88,8 @@ def _fit(arguments: argparse.Namespace) -> int:
     check_output(arguments.json, (".json",))
     config = fit_settings(arguments)
     from .bench_fit import bench_fit, format_fit
-    from .fit import Interrupted
-    from .progress_bar import progress_bars
+    from .run.progress import progress_bars
+    from .run.trainer import Interrupted
 
     if arguments.pictures is not None:
         arguments.pictures.mkdir(parents=True, exist_ok=True)
@@ -130,9 +130,9 @@ def _render(arguments: argparse.Namespace) -> int:
     check_output(arguments.json, (".json",))
     config = fit_settings(arguments)
     from .bench_render import bench_render, format_render
-    from .fit import Interrupted, choose_device
-    from .progress_bar import progress_bars
-    from .timing import sgemm_rate
+    from .run.machine import choose_device, sgemm_rate
+    from .run.progress import progress_bars
+    from .run.trainer import Interrupted
 
     device = choose_device(config.device)
     try:

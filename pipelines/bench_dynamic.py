@@ -17,7 +17,7 @@ from ..neural_fields.meshing import DEFAULT_BOUNDS
 from .bench_mesh import evaluate_slabs
 from .counting import counted
 from .render import RESOLUTION, TOLERANCE, pixel_size, trace_hits
-from .timing import format_table
+from .run.machine import format_table
 
 __all__ = ["DynamicRow", "dynamic_table", "format_dynamic"]
 

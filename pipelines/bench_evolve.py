@@ -26,10 +26,10 @@ from ..neural_fields import (
 )
 from .evolve import evolve
 from .evolve_checks import slope_figures
-from .evolve_config import EvolveConfig
+from .run.machine import format_table
+from .run.settings import EvolveConfig
+from .run.trainer import Progress
 from .surface import components, from_mesh
-from .timing import format_table
-from .training import Progress
 
 __all__ = ["CASES", "ExactCase", "ExactRow", "bench_exact", "format_exact", "measure_exact"]
 

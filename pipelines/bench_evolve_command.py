@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from .command import Command, add_json, check_output, whole, write_json
-from .config import add_config_flags, given_flags, input_error, load_config, preset_names
-from .evolve_config import EvolveConfig
+from .run.config import add_config_flags, given_flags, input_error, load_config, preset_names
+from .run.settings import EvolveConfig
 
 __all__ = ["COMMAND"]
 
@@ -65,9 +65,9 @@ def _evolve(arguments: argparse.Namespace) -> int:
     from .bench_dynamic import dynamic_table, format_dynamic
     from .bench_evolve import bench_exact, format_exact
     from .bench_evolve_morph import bench_morph, format_morph
-    from .fit import Interrupted
-    from .progress_bar import progress_bars
-    from .runs import find_field
+    from .run.folder import find_field
+    from .run.progress import progress_bars
+    from .run.trainer import Interrupted
 
     traced = load_field(find_field(arguments.trace)).field if arguments.trace else None
     if traced is not None and traced.in_dim != 4:

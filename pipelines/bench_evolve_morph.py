@@ -11,14 +11,13 @@ from typing import Any
 from ..neural_fields import InputError, extract_mesh, load_field
 from .evaluate import evaluate_surfaces
 from .evolve import evolve
-from .evolve_config import EvolveConfig
 from .evolve_shapes import Placed, Placement
 from .fit import fit
-from .fit_config import FitConfig
-from .fit_state import FIELD_FILE, STATE_FILE
+from .run.folder import FIELD_FILE, STATE_FILE
+from .run.machine import format_table
+from .run.settings import EvolveConfig, FitConfig
+from .run.trainer import Progress
 from .surface import from_mesh, read_reference
-from .timing import format_table
-from .training import Progress
 
 __all__ = ["MorphRow", "bench_morph", "format_morph"]
 

@@ -20,9 +20,8 @@ from skimage.measure import marching_cubes
 from ..neural_fields import Field, Siren, load_field, save_field
 from ..neural_fields.meshing import DEFAULT_BOUNDS, extract_mesh
 from .counting import counted
-from .memory import peak_memory
-from .runs import find_field
-from .timing import format_table
+from .run.folder import find_field
+from .run.machine import format_table, peak_memory
 
 __all__ = ["MeshBench", "MeshRow", "bench_mesh", "evaluate_slabs", "format_bench_mesh"]
 

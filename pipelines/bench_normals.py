@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ..neural_fields import Siren
-from .timing import best_seconds, format_table, sgemm_rate
+from .run.machine import best_seconds, format_table, sgemm_rate
 
 __all__ = ["NormalsRow", "bench_normals", "format_normals", "printed_jet", "tangent_jet"]
 

@@ -22,18 +22,18 @@ from .bench_reconstruct_figures import common_sheet, row_of, surface_figures
 from .bench_reconstruct_row import EQUAL_TIME, MULTISCALE, NEUS, ReconstructRow, SurfaceFigures
 from .bench_reconstruct_scene import BenchScene
 from .bench_reconstruct_train import train_watched
-from .fit import Interrupted, choose_device
-from .fit_state import digest_of, environment
 from .mesh_files import write_mesh
 from .mesh_trim import in_region
 from .picture import write_picture
 from .ray_pool import RayPool
-from .reconstruct_config import ReconstructConfig
 from .reconstruct_train import SceneTrainer
 from .reconstruct_views import ViewImage, comparison_sheet, held_out, render_image
+from .run.folder import digest_of
+from .run.machine import choose_device, environment
+from .run.settings import ReconstructConfig
+from .run.trainer import Interrupted, Progress, stop_on_signals
 from .scene_model import SceneModel, build_scene
 from .surface import Surface, from_mesh
-from .training import Progress, stop_on_signals
 
 __all__ = ["BenchOptions", "bench_reconstruct"]
 

@@ -6,9 +6,10 @@ import argparse
 import sys
 from pathlib import Path
 
-from .command import Command, add_json, check_output, counter_bar, positive, whole, write_json
-from .config import add_config_flags, given_flags, input_error, load_config, preset_names
-from .reconstruct_config import ReconstructConfig
+from .command import Command, add_json, check_output, positive, whole, write_json
+from .run.config import add_config_flags, given_flags, input_error, load_config, preset_names
+from .run.progress import counter_bar
+from .run.settings import ReconstructConfig
 
 __all__ = ["COMMAND"]
 
@@ -59,9 +60,9 @@ def _reconstruct(arguments: argparse.Namespace) -> int:
     from .bench_reconstruct_row import ReconstructRow
     from .bench_reconstruct_scene import read_scene
     from .bench_reconstruct_table import format_reconstruct
-    from .fit import Interrupted, choose_device
-    from .progress_bar import progress_bars
-    from .timing import sgemm_rate
+    from .run.machine import choose_device, sgemm_rate
+    from .run.progress import progress_bars
+    from .run.trainer import Interrupted
 
     device = choose_device(config.device)
     options = BenchOptions(

@@ -19,8 +19,8 @@ from .bench_reconstruct_train import Watched
 from .evaluate import Metrics, evaluate_surfaces
 from .mesh_trim import keep_largest
 from .picture import contact_sheet
-from .reconstruct_config import ReconstructConfig
 from .reconstruct_views import ViewImage, measure
+from .run.settings import ReconstructConfig
 from .surface import Surface, from_mesh
 
 __all__ = ["common_sheet", "row_of", "surface_figures"]

@@ -9,7 +9,7 @@ from pathlib import Path
 from ..datasets.synthetic.scenes import SCENES, Scene, render_scene
 from ..datasets.views.images import PosedImages, read_posed_images
 from ..neural_fields import InputError
-from .config import closest
+from .run.config import closest
 
 __all__ = ["BenchScene", "read_scene"]
 

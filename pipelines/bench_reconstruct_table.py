@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 from .bench_reconstruct_row import EQUAL_TIME, MULTISCALE, NEUS, ReconstructRow
-from .timing import format_table
+from .run.machine import format_table
 
 __all__ = ["Comparison", "comparisons", "format_reconstruct"]
 

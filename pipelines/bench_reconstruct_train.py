@@ -29,10 +29,10 @@ from ..neural_fields import Field, Jet
 from ..neural_fields.radiance import Outside, ViewColor
 from .counting import Counted, counted
 from .ray_pool import RayPool
-from .reconstruct_config import ReconstructConfig
 from .reconstruct_train import SceneTrainer
+from .run.settings import ReconstructConfig
+from .run.trainer import StopFlag
 from .scene_model import SceneModel
-from .training import StopFlag
 
 __all__ = ["Watched", "color_flops", "jet_flops", "outside_flops", "product_counter", "train_watched", "value_flops"]
 

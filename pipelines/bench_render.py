@@ -19,12 +19,12 @@ from ..neural_fields.tracing import BOUNDING_RADIUS
 from .bench_render_truth import Agreement, Truth
 from .counting import counted
 from .fit import fit
-from .fit_config import FitConfig
-from .fit_state import FIELD_FILE, STATE_FILE
 from .render import trace_view
+from .run.folder import FIELD_FILE, STATE_FILE
+from .run.machine import format_table
+from .run.settings import FitConfig
+from .run.trainer import Progress
 from .seen import Seen
-from .timing import format_table
-from .training import Progress
 
 __all__ = ["NETWORKS", "RenderRow", "bench_render", "fit_networks", "format_render"]
 

@@ -21,11 +21,10 @@ from ..neural_fields import InputError
 from ..neural_fields.meshing import NoSurfaceError, extract_mesh
 from .evaluate import evaluate_surfaces
 from .fit import fit
-from .fit_config import FitConfig
-from .memory import peak_memory
 from .merged_cloud import load_cloud
+from .run.machine import format_table, peak_memory
+from .run.settings import FitConfig
 from .surface import Surface, from_mesh, read_surface, sample_surface
-from .timing import format_table
 
 __all__ = ["ScaleRow", "bench_scale", "format_scale", "write_noisy_cloud"]
 

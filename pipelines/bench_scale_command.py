@@ -37,7 +37,7 @@ def _run(arguments: argparse.Namespace) -> int:
     check_output(arguments.json, (".json",))
     config = fit_settings(arguments)
     from .bench_scale import bench_scale, format_scale
-    from .fit import Interrupted
+    from .run.trainer import Interrupted
 
     try:
         with tempfile.TemporaryDirectory(dir=arguments.folder) as folder:

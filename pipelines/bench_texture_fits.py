@@ -14,12 +14,12 @@ import numpy as np
 from ..datasets import TexturedMesh, sample_textured
 from ..neural_fields import Field, InputError, Similarity, TextureField, load_field, load_texture
 from ..neural_fields.files import write_json
-from .fit import choose_device, fit
-from .fit_config import FitConfig
-from .fit_state import FIELD_FILE, RECORD_FILE, STATE_FILE, read_record
-from .texture import TEXTURE_FILE, texture_run
-from .texture_config import TextureConfig
-from .training import Progress
+from .fit import fit
+from .run.folder import FIELD_FILE, RECORD_FILE, STATE_FILE, TEXTURE_FILE, read_record
+from .run.machine import choose_device
+from .run.settings import FitConfig, TextureConfig
+from .run.trainer import Progress
+from .texture import texture_run
 
 __all__ = ["Fitted", "Report", "check_kept", "fitted_texture"]
 

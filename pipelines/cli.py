@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from typing import NoReturn
 
 from .commands import COMMANDS, Command
-from .config import closest
+from .run.config import closest
 
 __all__ = ["main"]
 

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from .config import input_error
+from .run.config import input_error
 
-__all__ = ["Command", "add_json", "check_output", "counter_bar", "positive", "whole", "write_json"]
+__all__ = ["Command", "add_json", "check_output", "positive", "whole", "write_json"]
 
 
 @dataclass(frozen=True)
@@ -88,18 +87,3 @@ def write_json(path: Path | None, data: Any) -> None:
     from ..neural_fields import files  # here: it loads torch
 
     files.write_json(path, data)
-
-
-@contextmanager
-def counter_bar(title: str) -> Iterator[Callable[[int, int], None] | None]:
-    """A progress bar with the time left on stderr, to be told ``(done, total)``; None where that is no terminal."""
-    from rich.console import Console
-    from rich.progress import Progress
-
-    console = Console(stderr=True)
-    if not console.is_terminal:
-        yield None
-        return
-    with Progress(console=console, transient=True) as bar:
-        task = bar.add_task(title)
-        yield lambda done, total: bar.update(task, completed=done, total=total)

@@ -15,16 +15,16 @@ from scipy.spatial import KDTree
 from ..datasets import STATUE_PLACEMENT, Camera, PointCloud, Statue, orbit, read_cloud, statue_scan, write_cloud_ply
 from ..neural_fields import Field, InputError, Similarity
 from ..neural_fields.meshing import Mesh, NoSurfaceError, extract_mesh
-from .config import load_config
 from .fit import Run, fit
-from .fit_config import FitConfig
 from .mesh_files import write_mesh
 from .picture import contact_sheet, picture_of, write_picture
-from .progress_bar import progress_bars
 from .render import trace_view
+from .run.config import load_config
+from .run.machine import format_table
+from .run.progress import progress_bars
+from .run.settings import FitConfig
 from .shading import ShadeOptions, compose, shade
 from .surface import from_cloud, from_mesh
-from .timing import format_table
 
 __all__ = ["demo", "distances_to_surface", "draw_levels", "spread_colors"]
 

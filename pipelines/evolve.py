@@ -14,26 +14,17 @@ import torch
 from torch import Tensor
 
 from ..neural_fields import InputError, MultiscaleSDF, Similarity, Siren, SpaceTimeSDF, save_field
-from .config import load_config
 from .evolve_checks import check_evolution
-from .evolve_config import EvolveConfig
 from .evolve_problem import Problem, build_problem
 from .evolve_shapes import Shape, read_shape
 from .evolve_train import EvolveTrainer, learn_start
-from .fit import RESIDUAL_GAIN, Interrupted, choose_device
-from .fit_state import (
-    FIELD_FILE,
-    STATE_FILE,
-    digest_of,
-    environment,
-    load_state,
-    read_record,
-    save_state,
-    write_record,
-)
-from .runs import forget_run
+from .fit import RESIDUAL_GAIN
+from .run.config import load_config
+from .run.folder import FIELD_FILE, STATE_FILE, digest_of, forget_run, load_state, read_record, save_state, write_record
+from .run.machine import choose_device, environment
+from .run.settings import EvolveConfig
+from .run.trainer import Interrupted, Progress, StopFlag, stop_on_signals
 from .sampling import delta_of
-from .training import Progress, StopFlag, stop_on_signals
 
 __all__ = ["Evolution", "evolve", "train_evolution"]
 
@@ -75,7 +66,7 @@ def evolve(
         Interrupted: Ctrl-C or SIGTERM; ``out`` then holds a checkpoint and a usable field.
 
     Example:
-        >>> from mplicits.pipelines.evolve_config import EvolveConfig
+        >>> from mplicits.pipelines.run.settings import EvolveConfig
         >>> run = evolve(EvolveConfig(shapes=("runs/spot", "runs/bob")), out="runs/morph")  # doctest: +SKIP
         >>> run.record["checks"]["warnings"]  # doctest: +SKIP
     """

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from .command import Command
-from .config import add_config_flags, given_flags, input_error, load_config, preset_names
-from .evolve_config import EvolveConfig
+from .run.config import add_config_flags, given_flags, input_error, load_config, preset_names
+from .run.settings import EvolveConfig
 
 __all__ = ["COMMAND"]
 
@@ -35,9 +35,9 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
 def _evolve(arguments: argparse.Namespace) -> int:
     config = _settings(arguments)
     from .evolve import evolve
-    from .fit import Interrupted
-    from .progress_bar import progress_bars
-    from .runs import check_new_run
+    from .run.folder import check_new_run
+    from .run.progress import progress_bars
+    from .run.trainer import Interrupted
 
     directory = check_new_run(arguments.out, resume=arguments.resume, force=arguments.force)
     try:

@@ -26,9 +26,9 @@ from ..neural_fields import (
     transport,
 )
 from ..neural_fields.evolution import VectorField
-from .evolve_config import EvolveConfig
 from .evolve_samples import Bounds, Carried, Known, around, joined, known_at, no_bounds, signs, uniform
 from .evolve_shapes import Placement, Shape, aligned, into_unit_sphere
+from .run.settings import EvolveConfig
 
 __all__ = ["End", "Problem", "between", "build_problem", "morph_law", "velocity_field"]
 

@@ -29,7 +29,7 @@ from ..neural_fields import (
     load_field,
     project_to_surface,
 )
-from .runs import find_field
+from .run.folder import find_field
 from .surface import Surface, from_mesh, sample_surface
 
 __all__ = ["Placed", "Placement", "Shape", "aligned", "into_unit_sphere", "read_shape"]

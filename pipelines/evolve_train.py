@@ -10,11 +10,11 @@ from torch import Tensor
 
 from ..neural_fields import Field, Jet, Siren, SpaceTimeSDF, key_loss, law_loss, spacetime_jet
 from ..neural_fields.losses import eikonal_loss
-from .evolve_config import EvolveConfig
 from .evolve_problem import Problem
 from .evolve_samples import Known, uniform
+from .run.settings import EvolveConfig
+from .run.trainer import Progress, StopFlag, pack_training, set_rate, unpack_training
 from .sampling import DOMAIN
-from .training import Progress, StopFlag, pack_training, set_rate, unpack_training
 
 __all__ = ["EvolveTrainer", "band_points", "learn_start", "uniform_spacetime"]
 

@@ -18,29 +18,29 @@ from ..datasets import OrientedCloud, PointCloud, prepare_cloud
 from ..datasets.clouds.large import Merging
 from ..neural_fields import InputError, MultiscaleSDF, Similarity, Siren, save_field
 from .cloud_distance import CloudDistance
-from .config import load_config
-from .distributed import is_leader
-from .fit_config import FitConfig
+from .fit_level import LevelTrainer
 from .fit_review import review_points
-from .fit_state import (
+from .level_sources import banded_sources, first_sources
+from .merged_cloud import load_cloud
+from .run.config import load_config
+from .run.folder import (
     FIELD_FILE,
     STATE_FILE,
-    environment,
     fingerprint,
+    forget_run,
     load_state,
     read_record,
     save_state,
     write_record,
 )
-from .level_sources import banded_sources, first_sources
-from .memory import peak_memory
-from .merged_cloud import load_cloud
-from .runs import forget_run
+from .run.machine import choose_device, environment, peak_memory
+from .run.settings import FitConfig
+from .run.team import is_leader
+from .run.trainer import Interrupted, Progress, StopFlag, stop_on_signals
 from .sampling import Band, band_of
 from .support import write_support
-from .training import LevelTrainer, Progress, StopFlag, stop_on_signals
 
-__all__ = ["FitConfig", "Interrupted", "Run", "fit", "prepare"]
+__all__ = ["FitConfig", "Run", "fit", "prepare"]
 
 # A residual starts at a tenth of the usual output scale, close to the level before it.
 RESIDUAL_GAIN = 0.1
@@ -49,18 +49,6 @@ RESIDUAL_GAIN = 0.1
 WORSE = 2.0
 
 Cloud = PointCloud | str | Path | NDArray[np.floating]
-
-
-class Interrupted(Exception):  # noqa: N818  what happened is no error
-    """Training was asked to stop, and a usable checkpoint was written.
-
-    Attributes:
-        directory: the run directory, for ``--resume``; None if the fit had none.
-    """
-
-    def __init__(self, directory: Path | None) -> None:
-        super().__init__("interrupted" if directory is None else f"interrupted; checkpoint in {directory}")
-        self.directory = directory
 
 
 @dataclass(frozen=True)
@@ -143,23 +131,6 @@ def prepare(cloud: PointCloud, config: FitConfig) -> OrientedCloud:
         turn_normals=config.turn_normals,
         smooth_noise=config.smooth_noise,
     )
-
-
-def choose_device(name: str) -> torch.device:
-    """``auto`` is CUDA where there is a working GPU, the CPU elsewhere.
-
-    Raises:
-        InputError: no such device here.
-    """
-    if name == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    try:
-        device = torch.device(name)
-        torch.empty(1, device=device)
-    except (RuntimeError, AssertionError) as error:
-        reason = str(error).splitlines()[0]
-        raise InputError(f"--device {name}: not usable here ({reason}); use auto or cpu") from error
-    return device
 
 
 def _as_cloud(cloud: Cloud) -> PointCloud | str | Path:

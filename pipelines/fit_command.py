@@ -11,16 +11,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from .command import Command, whole
-from .config import input_error
 from .fit_depth_flags import add_depth_flags, depth_input
 from .fit_settings import add_fit_settings, fit_settings, were_given
+from .run.config import input_error
 from .texture_command import tell_texture
 
 if TYPE_CHECKING:
-    from .fit_config import FitConfig
     from .fit_depth import DepthInput
     from .fit_jobs import FitOutcome
     from .fit_mesh import FitMesh
+    from .run.settings import FitConfig
 
 __all__ = ["COMMAND"]
 
@@ -56,20 +56,20 @@ def _fit(arguments: argparse.Namespace) -> int:
     if len(arguments.clouds) > 1 or arguments.jobs is not None:
         return _fit_many(arguments, config)
     arguments.cloud = arguments.clouds[0]
-    from .distributed import team
+    from .run.team import team
 
     with team(device="auto" if config is None else config.device) as leads:
         return _fit_one(arguments, config) if leads else _follow(arguments, config)
 
 
 def _fit_one(arguments: argparse.Namespace, config: FitConfig | None) -> int:
-    from .fit import Interrupted, fit
+    from .fit import fit
     from .fit_depth import fit_depth, trim_suggestion
-    from .fit_mesh import is_fitted
     from .info import describe
-    from .memory import peak_memory
-    from .progress_bar import progress_bars
-    from .runs import check_new_run
+    from .run.folder import check_new_run, is_fitted
+    from .run.machine import peak_memory
+    from .run.progress import progress_bars
+    from .run.trainer import Interrupted
 
     directory, depth = arguments.out, depth_input(arguments)
     # A run that was interrupted after its fit goes on there.
@@ -102,7 +102,7 @@ def _fit_one(arguments: argparse.Namespace, config: FitConfig | None) -> int:
         print(f"next: mplicits mesh {directory} -o {directory / 'mesh.ply'}{trim}")
         return 0
     if texture is not None:
-        from .texture import TEXTURE_FILE
+        from .run.folder import TEXTURE_FILE
 
         tell_texture(directory / TEXTURE_FILE, texture)
         if not texture.record["finished"]:
@@ -122,7 +122,8 @@ def _fit_one(arguments: argparse.Namespace, config: FitConfig | None) -> int:
 
 def _follow(arguments: argparse.Namespace, config: FitConfig | None) -> int:
     """Help the process that does the rest; see `team`."""
-    from .fit import Interrupted, fit
+    from .fit import fit
+    from .run.trainer import Interrupted
 
     if depth_input(arguments) is not None:
         raise input_error(f"{arguments.cloud}: depth maps are fitted by one process; leave out torchrun")
@@ -140,10 +141,10 @@ def _fit_many(arguments: argparse.Namespace, config: FitConfig | None) -> int:
     for cloud in arguments.clouds:
         if depth_input(argparse.Namespace(**{**vars(arguments), "cloud": cloud})) is not None:
             raise input_error(f"{cloud}: holds depth maps; fit them on their own, without --jobs")
-    from .fit import Interrupted
     from .fit_jobs import fit_many, format_fits, plan_fits
-    from .jobs import check_jobs
-    from .progress_bar import progress_bars
+    from .run.jobs import check_jobs
+    from .run.progress import progress_bars
+    from .run.trainer import Interrupted
 
     jobs = arguments.jobs or 1
     check_jobs(jobs)

@@ -29,13 +29,13 @@ from ..datasets.depth.frame import PosedFrame
 from ..datasets.depth.images import COLOR_SUFFIXES, DEPTH_SUFFIXES
 from ..neural_fields import InputError
 from ..neural_fields.files import files_in
-from .fit import FitConfig, Run, choose_device, fit
-from .fit_state import read_record
-from .training import Progress
+from .fit import FitConfig, Run, fit
+from .run.folder import CLOUD_FILE, kept_cloud, read_record
+from .run.machine import choose_device
+from .run.trainer import Progress
 
-__all__ = ["CLOUD_FILE", "DepthInput", "depth_cloud", "fit_depth", "kept_cloud", "trim_suggestion"]
+__all__ = ["DepthInput", "depth_cloud", "fit_depth", "trim_suggestion"]
 
-CLOUD_FILE = "cloud.ply"
 """The cloud of a run that was fitted to depth maps; `mesh --trim-distance` and `texture` read it."""
 
 
@@ -146,18 +146,6 @@ def fit_depth(
     kept = out / CLOUD_FILE
     write_cloud_ply(kept, cloud)
     return fit(kept, config, out=out, progress=progress)
-
-
-def kept_cloud(run: Path) -> Path:
-    """The file of the cloud that was made of the depth maps of a run.
-
-    Raises:
-        InputError: the run was not fitted to depth maps.
-    """
-    kept = run / CLOUD_FILE
-    if not kept.is_file():
-        raise InputError(f"{run}: holds no {CLOUD_FILE}, so it was not fitted to depth maps; name its own cloud")
-    return kept
 
 
 def trim_suggestion(run: Path) -> float:

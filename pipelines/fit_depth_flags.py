@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from .command import positive, whole
-from .config import input_error
+from .run.config import input_error
 
 if TYPE_CHECKING:
     from .fit_depth import DepthInput

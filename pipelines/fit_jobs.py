@@ -13,15 +13,13 @@ from typing import Any
 from ..datasets.clouds.reading import check_cloud_path
 from ..neural_fields import InputError
 from ..neural_fields.files import write_json
-from .config import load_config
 from .fit import fit
-from .fit_config import FitConfig
-from .fit_mesh import is_fitted
-from .fit_state import STATE_FILE, read_record
-from .jobs import Outcome, check_jobs, run_jobs
-from .runs import check_new_run
-from .timing import format_table
-from .training import Progress
+from .run.config import load_config
+from .run.folder import STATE_FILE, check_new_run, is_fitted, read_record
+from .run.jobs import Outcome, check_jobs, run_jobs
+from .run.machine import format_table
+from .run.settings import FitConfig
+from .run.trainer import Progress
 
 __all__ = ["FitJob", "FitOutcome", "fit_many", "format_fits", "plan_fits"]
 

@@ -12,17 +12,16 @@ import numpy as np
 from ..datasets import read_cloud
 from ..neural_fields import InputError, Similarity
 from ..neural_fields.meshing import Mesh
-from .fit_depth import CLOUD_FILE, DepthInput, kept_cloud, trim_suggestion
-from .fit_state import FIELD_FILE, STATE_FILE, read_record
+from .fit_depth import DepthInput, trim_suggestion
 from .mesh import MeshOptions, mesh_run
 from .mesh_files import check_mesh_path
-from .texture import TEXTURE_FILE, FittedTexture, texture_run
-from .texture_config import TextureConfig
+from .run.folder import CLOUD_FILE, TEXTURE_FILE, kept_cloud, read_record, texture_state_file
+from .run.settings import TextureConfig
+from .run.trainer import Progress
+from .texture import FittedTexture, texture_run
 from .texture_samples import has_colors
-from .texture_state import texture_state_file
-from .training import Progress
 
-__all__ = ["FitMesh", "is_fitted", "plan_mesh"]
+__all__ = ["FitMesh", "plan_mesh"]
 
 COLORLESS = ".stl"
 
@@ -111,8 +110,3 @@ def plan_mesh(out: Path, run: Path, source: Path | DepthInput, *, colors: bool, 
     except InputError as error:
         raise InputError(f"{error} (or leave the colours out: --no-colors)") from error
     return FitMesh(out, run, cloud, colored, trim=depth)
-
-
-def is_fitted(run: Path) -> bool:
-    """Whether the fit in a directory was trained to its end."""
-    return (run / FIELD_FILE).is_file() and not (run / STATE_FILE).is_file() and bool(read_record(run)["finished"])

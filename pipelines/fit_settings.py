@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from .config import add_config_flags, given_flags, load_config, preset_names
-from .fit_config import FitConfig
+from .run.config import add_config_flags, given_flags, load_config, preset_names
+from .run.settings import FitConfig
 
 __all__ = ["add_fit_settings", "fit_settings", "were_given"]
 

@@ -9,9 +9,8 @@ from torch import Tensor
 
 from ..neural_fields import Field, InputError
 from .cloud_distance import CloudDistance
-from .fit_config import FitConfig
-from .sampling import Samples, band_samples, distance_samples, empty_samples, offset_samples, with_previous
-from .training import Source
+from .run.settings import FitConfig
+from .sampling import Samples, Source, band_samples, distance_samples, empty_samples, offset_samples, with_previous
 
 __all__ = ["Weights", "banded_sources", "first_sources", "surface_samples"]
 

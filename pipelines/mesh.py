@@ -20,7 +20,7 @@ from .bake import check_texture_size, textured_mesh
 from .mesh_files import check_mesh_path, write_mesh
 from .mesh_trim import drop_unsupported, in_region, keep_largest, trim_distance
 from .riding import Colors, colors_at
-from .runs import find_field, load_still
+from .run.folder import find_field, load_still
 from .support import Support, read_support
 from .textured_files import check_textured_path
 

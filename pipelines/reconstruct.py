@@ -13,28 +13,27 @@ import torch
 
 from ..datasets.views.images import PosedImage, PosedImages, read_posed_images
 from ..neural_fields import InputError, NoSurfaceError, TextureField, save_field, save_texture
-from .config import load_config
-from .fit import Interrupted, choose_device
-from .fit_state import (
+from .picture import write_picture
+from .ray_pool import RayPool
+from .reconstruct_texture import scene_texture
+from .reconstruct_train import SceneTrainer
+from .reconstruct_views import ViewImage, comparison_sheet, held_out, measure, render_image
+from .run.config import load_config
+from .run.folder import (
     FIELD_FILE,
     STATE_FILE,
+    TEXTURE_FILE,
     digest_of,
-    environment,
+    forget_run,
     load_state,
     read_record,
     save_state,
     write_record,
 )
-from .picture import write_picture
-from .ray_pool import RayPool
-from .reconstruct_config import ReconstructConfig
-from .reconstruct_texture import scene_texture
-from .reconstruct_train import SceneTrainer
-from .reconstruct_views import ViewImage, comparison_sheet, held_out, measure, render_image
-from .runs import forget_run
+from .run.machine import choose_device, environment
+from .run.settings import ReconstructConfig
+from .run.trainer import Interrupted, Progress, stop_on_signals
 from .scene_model import SceneModel, build_scene
-from .texture import TEXTURE_FILE
-from .training import Progress, stop_on_signals
 
 __all__ = ["HELD_OUT_FILE", "PREVIEW_FILE", "Reconstruction", "reconstruct"]
 

@@ -8,8 +8,8 @@ from contextlib import nullcontext
 from pathlib import Path
 
 from .command import Command
-from .config import add_config_flags, given_flags, input_error, load_config, preset_names
-from .reconstruct_config import ReconstructConfig
+from .run.config import add_config_flags, given_flags, input_error, load_config, preset_names
+from .run.settings import ReconstructConfig
 
 __all__ = ["COMMAND"]
 
@@ -40,11 +40,11 @@ def _reconstruct(arguments: argparse.Namespace) -> int:
     config = (
         None if arguments.resume else load_config(ReconstructConfig, preset or "default", flags, thing="reconstruct")
     )
-    from .fit import Interrupted
     from .mesh import mesh_run
-    from .progress_bar import progress_bars
     from .reconstruct import HELD_OUT_FILE, reconstruct
-    from .runs import check_new_run
+    from .run.folder import check_new_run
+    from .run.progress import progress_bars
+    from .run.trainer import Interrupted
 
     directory = check_new_run(arguments.out, resume=arguments.resume, force=arguments.force)
     try:

@@ -12,12 +12,11 @@ from ..datasets import PointCloud
 from ..datasets.views.images import PosedImages
 from ..neural_fields import Jet, NoSurfaceError, extract_mesh
 from .mesh_trim import in_region
-from .reconstruct_config import ReconstructConfig
+from .run.settings import ReconstructConfig, TextureConfig
+from .run.trainer import Progress
 from .scene_model import SceneModel
 from .surface import from_mesh, sample_surface
 from .texture import FittedTexture, fit_texture
-from .texture_config import TextureConfig
-from .training import Progress
 
 __all__ = ["scene_texture", "surface_colors"]
 

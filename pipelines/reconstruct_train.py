@@ -11,9 +11,9 @@ from torch import Tensor
 from ..neural_fields.losses import eikonal_loss
 from ..neural_fields.volume_renderer import Sampling
 from .ray_pool import RayPool
-from .reconstruct_config import ReconstructConfig
+from .run.settings import ReconstructConfig
+from .run.trainer import StopFlag, set_rate
 from .scene_model import SceneModel
-from .training import StopFlag, set_rate
 
 __all__ = ["SceneTrainer"]
 

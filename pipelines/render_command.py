@@ -8,9 +8,10 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from .command import Command, check_output, counter_bar, positive, whole
-from .config import add_config_flags, given_flags, input_error, load_config
-from .shading_names import SHADINGS, ShadeOptions
+from .command import Command, check_output, positive, whole
+from .run.config import add_config_flags, given_flags, input_error, load_config
+from .run.progress import counter_bar
+from .run.settings import SHADINGS, ShadeOptions
 
 __all__ = ["COMMAND"]
 

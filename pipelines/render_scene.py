@@ -21,7 +21,7 @@ from .cloud_distance import CloudDistance
 from .picture import cloud_view, mesh_view
 from .render import trace_view
 from .riding import colors_at
-from .runs import find_field, is_field, load_still
+from .run.folder import find_field, is_field, load_still
 from .seen import Seen
 from .surface import read_surface, sample_surface
 

@@ -33,7 +33,7 @@ from ..neural_fields.attributes import project_to_surface
 from ..neural_fields.carried import CarriedVelocity
 from ..neural_fields.dynamic_tracing import moment
 from ..neural_fields.meshing import NoSurfaceError
-from .runs import find_field
+from .run.folder import find_field
 from .texture import texture_of
 
 __all__ = ["RIDE", "Colors", "RidingColors", "borrowed_texture", "colors_at", "start_texture"]

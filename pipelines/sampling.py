@@ -21,6 +21,7 @@ from .cloud_distance import CloudDistance
 __all__ = [
     "Band",
     "Samples",
+    "Source",
     "band_of",
     "band_samples",
     "delta_of",
@@ -242,3 +243,15 @@ def with_previous(samples: Samples, field: Field, delta: float, *, device: torch
     moved = samples.to(device)
     full = Samples(points, moved.distance, moved.normal, jet.value, jet.gradient)
     return full.take(kept.nonzero()[:, 0])
+
+
+@dataclass(frozen=True)
+class Source:
+    """Samples, how many of them go into each batch, and the weights of their terms."""
+
+    name: str
+    samples: Samples
+    batch: int
+    data: float
+    normal: float
+    eikonal: float

@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from .command import Command, counter_bar, whole
+from .command import Command, whole
+from .run.progress import counter_bar
 
 __all__ = ["COMMAND"]
 

@@ -10,7 +10,7 @@ from ..neural_fields.baselines import NeusSDF
 from ..neural_fields.radiance import Outside, ViewColor
 from ..neural_fields.sphere_start import fit_sphere
 from ..neural_fields.volume_renderer import Rendered, Sampling, render_volume
-from .reconstruct_config import ReconstructConfig
+from .run.settings import ReconstructConfig
 
 __all__ = ["SceneModel", "build_scene"]
 

@@ -20,14 +20,14 @@ from ..neural_fields.files import whole_file
 from ..neural_fields.meshing import NoSurfaceError, extract_mesh
 from ..neural_fields.tracing import BOUNDING_RADIUS
 from .animation import ANIMATIONS, write_animation
-from .fit import choose_device
 from .glb import Motion, write_glb
 from .mesh_files import glb_origin, write_mesh
 from .picture import contact_sheet, write_picture
 from .render import RESOLUTION, TOLERANCE, pixel_size, see_hits
 from .render_cameras import Orbit, orbit_cameras
 from .riding import RidingColors, borrowed_texture, start_texture
-from .runs import find_field
+from .run.folder import find_field
+from .run.machine import choose_device
 from .shading import ShadeOptions, compose, downsample, shade
 from .tracked_mesh import follow_mesh
 

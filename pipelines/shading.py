@@ -16,8 +16,8 @@ from ..neural_fields import Field
 from .colormap import COLOR_MAPS, map_colors
 from .curvature import mean_curvature
 from .matcap import load_matcap, sample_matcap
+from .run.settings import SHADINGS, ShadeOptions
 from .seen import Seen
-from .shading_names import SHADINGS, ShadeOptions
 from .visibility import ambient_occlusion, soft_shadow
 
 __all__ = ["SHADINGS", "ShadeOptions", "compose", "downsample", "measure", "shade", "value_limits"]

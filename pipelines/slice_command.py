@@ -8,8 +8,9 @@ import time
 from contextlib import nullcontext
 from pathlib import Path
 
-from .command import Command, check_output, counter_bar, positive, whole
-from .config import input_error
+from .command import Command, check_output, positive, whole
+from .run.config import input_error
+from .run.progress import counter_bar
 
 __all__ = ["COMMAND"]
 

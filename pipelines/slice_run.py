@@ -15,7 +15,7 @@ from ..neural_fields import Field, InputError, Similarity, load_field
 from ..neural_fields.meshing import NoSurfaceError, extract_mesh
 from .animation import ANIMATIONS, write_animation
 from .picture import write_picture
-from .runs import find_field
+from .run.folder import find_field
 from .slice import draw_slice, plane_axes, round_step, take_slice
 from .slice_legend import with_legend
 

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from ..datasets.clouds.point_cloud import voxel_representatives
 from ..neural_fields import InputError
-from .fit_state import FIELD_FILE, load_state, save_state
 from .mesh_trim import support_radius
+from .run.folder import FIELD_FILE, load_state, save_state
 
 __all__ = ["SUPPORT_FILE", "Support", "read_support", "write_support"]
 

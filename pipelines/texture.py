@@ -25,17 +25,22 @@ from ..neural_fields import (
 )
 from ..neural_fields.dynamic_tracing import moment
 from ..neural_fields.losses import color_loss, tangential_loss
-from .fit import choose_device
-from .fit_state import RECORD_FILE, environment, read_record, write_record
-from .runs import find_field
-from .texture_config import TextureConfig
+from .run.folder import (
+    RECORD_FILE,
+    TEXTURE_FILE,
+    TextureState,
+    find_field,
+    read_record,
+    texture_state_file,
+    write_record,
+)
+from .run.machine import choose_device, environment
+from .run.settings import TextureConfig
+from .run.trainer import Progress, StopFlag, pack_training, set_rate, stop_on_signals, unpack_training
 from .texture_samples import BandSamples, ColorSamples, band_directions, match_colors, read_colors
-from .texture_state import TextureState, texture_state_file
-from .training import Progress, StopFlag, pack_training, set_rate, stop_on_signals, unpack_training
 
-__all__ = ["TEXTURE_FILE", "FittedTexture", "default_delta", "fit_texture", "texture_of", "texture_run"]
+__all__ = ["FittedTexture", "default_delta", "fit_texture", "texture_of", "texture_run"]
 
-TEXTURE_FILE = "texture.safetensors"
 # A band at least this wide (in units of the field) holds decimated meshes, and the surfaces of small networks.
 LEAST_DELTA = 0.02
 # The default for a field of one level, which has no band of its own that says how near it is to its points.

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from .command import Command, check_output, whole
-from .config import add_config_flags, given_flags, input_error, load_config, preset_names
-from .texture_config import TextureConfig
+from .run.config import add_config_flags, given_flags, input_error, load_config, preset_names
+from .run.settings import TextureConfig
 
 if TYPE_CHECKING:
     from .texture import FittedTexture
@@ -46,15 +46,15 @@ def _texture(arguments: argparse.Namespace) -> int:
         raise input_error("--resume: continues with its own settings; leave out --preset, --level and the rest")
     config = load_config(TextureConfig, preset or "default", flags, thing="texture")
     check_output(arguments.out, (".safetensors",))
-    from .runs import find_field
-    from .texture import TEXTURE_FILE, texture_run
+    from .run.folder import TEXTURE_FILE, find_field
+    from .texture import texture_run
 
     field = find_field(arguments.run)
     target = arguments.out or field.with_name(TEXTURE_FILE)
     if target.exists() and target.samefile(field):
         raise input_error(f"{target}: is the field itself; name another -o")
     _check_state(target, resume=arguments.resume, force=arguments.force)
-    from .progress_bar import progress_bars
+    from .run.progress import progress_bars
 
     with nullcontext() if arguments.quiet else progress_bars() as report:
         fitted = texture_run(
@@ -80,7 +80,7 @@ def _texture(arguments: argparse.Namespace) -> int:
 
 def _check_state(target: Path, *, resume: bool, force: bool) -> None:
     """Refuse what would lose a texture or a training, or resume where there is nothing to resume."""
-    from .texture_state import texture_state_file
+    from .run.folder import texture_state_file
 
     state = texture_state_file(target)
     if resume and not state.is_file():

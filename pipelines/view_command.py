@@ -28,7 +28,7 @@ def _port(text: str) -> int | None:
 
 
 def _view(arguments: argparse.Namespace) -> int:
-    from .fit import choose_device
+    from .run.machine import choose_device
     from .viewer import Viewer, open_run
 
     shown = open_run(arguments.run, side=arguments.size, device=choose_device(arguments.device))

@@ -17,7 +17,7 @@ import torch
 from ..datasets.cameras import UP_AXES
 from ..neural_fields import Field, InputError, Similarity, TextureField, load_field
 from .riding import start_texture
-from .runs import find_field
+from .run.folder import find_field
 from .viewer_camera import first_eye
 from .viewer_client import Client, Shown
 from .viewer_draw import Painter

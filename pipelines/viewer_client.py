@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..neural_fields import Field, InputError, Similarity
-from .shading_names import SHADINGS
+from .run.settings import SHADINGS
 from .viewer_camera import image_size, viser_camera
 from .viewer_controls import Controls
 from .viewer_draw import Painter

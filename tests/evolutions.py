@@ -8,7 +8,7 @@ import torch
 from mplicits.neural_fields import Similarity, Siren, Sphere, save_field
 from mplicits.pipelines import evolve_checks, evolve_problem
 from mplicits.pipelines.cli import main
-from mplicits.pipelines.evolve_config import EvolveConfig
+from mplicits.pipelines.run.settings import EvolveConfig
 
 BRIEF = EvolveConfig(
     kind="transport",

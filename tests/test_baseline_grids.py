@@ -19,7 +19,7 @@ from mplicits.pipelines.paper.recipes_grids import (
     GridSettings,
     InstantNgpRecipe,
 )
-from mplicits.pipelines.training import Progress
+from mplicits.pipelines.run.trainer import Progress
 from scipy.interpolate import RegularGridInterpolator
 
 # The contract, over a cascade in place of the fields of the common table, whose levels are nested in bands.

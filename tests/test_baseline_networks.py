@@ -27,7 +27,7 @@ from mplicits.pipelines.paper.recipes_networks import (
     laplacian_samples,
     siren_loss,
 )
-from mplicits.pipelines.training import Progress
+from mplicits.pipelines.run.trainer import Progress
 
 # The contract, over the fields below in place of those of the common table, whose levels are nested in bands.
 from test_field_contract import (  # noqa: F401

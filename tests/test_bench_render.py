@@ -9,8 +9,8 @@ from mplicits.neural_fields import InputError, Plane, Sphere, load_field
 from mplicits.pipelines.bench_render import NETWORKS, RenderRow, bench_render, format_render, naive_view
 from mplicits.pipelines.bench_render_truth import Truth
 from mplicits.pipelines.cli import main
-from mplicits.pipelines.fit_config import FitConfig
 from mplicits.pipelines.render import trace_view
+from mplicits.pipelines.run.settings import FitConfig
 
 SMALL = {
     "400x4": ((24, 2, 8.0, 300, 5e-3),),

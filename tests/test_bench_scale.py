@@ -6,7 +6,7 @@ import numpy as np
 import trimesh
 from mplicits.datasets import read_cloud
 from mplicits.pipelines.bench_scale import ScaleRow, bench_scale, format_scale, write_noisy_cloud
-from mplicits.pipelines.fit_config import FitConfig
+from mplicits.pipelines.run.settings import FitConfig
 from mplicits.pipelines.surface import read_surface
 
 

@@ -7,8 +7,8 @@ from typing import Literal
 
 import pytest
 from mplicits.neural_fields import InputError
-from mplicits.pipelines.config import add_config_flags, given_flags, load_config, preset_names
-from mplicits.pipelines.fit_config import FitConfig
+from mplicits.pipelines.run.config import add_config_flags, given_flags, load_config, preset_names
+from mplicits.pipelines.run.settings import FitConfig
 
 
 @dataclass(frozen=True)

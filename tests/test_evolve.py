@@ -26,14 +26,13 @@ from mplicits.neural_fields import (
     load_field,
 )
 from mplicits.pipelines.cli import main
-from mplicits.pipelines.config import load_config, preset_names
 from mplicits.pipelines.evolve import evolve
 from mplicits.pipelines.evolve_checks import check_evolution, slope_figures
-from mplicits.pipelines.evolve_config import EvolveConfig
 from mplicits.pipelines.evolve_problem import End
 from mplicits.pipelines.evolve_train import band_points
-from mplicits.pipelines.fit import Interrupted
-from mplicits.pipelines.training import Progress
+from mplicits.pipelines.run.config import load_config, preset_names
+from mplicits.pipelines.run.settings import EvolveConfig
+from mplicits.pipelines.run.trainer import Interrupted, Progress
 from torch import Tensor
 
 TRAVEL = RigidMotion(velocity=(0.4, 0.0, 0.0))

@@ -23,9 +23,9 @@ from mplicits.neural_fields import (
     spacetime_jet,
 )
 from mplicits.pipelines import evolve_problem
-from mplicits.pipelines.evolve_config import EvolveConfig
 from mplicits.pipelines.evolve_problem import between, build_problem, velocity_field
 from mplicits.pipelines.evolve_shapes import Placed, Placement, Shape, aligned, into_unit_sphere, read_shape
+from mplicits.pipelines.run.settings import EvolveConfig
 from mplicits.pipelines.surface import from_mesh
 
 CONFIG = EvolveConfig(samples=2000)

@@ -11,9 +11,9 @@ from mplicits.datasets.clouds.ply import write_cloud_ply
 from mplicits.neural_fields import InputError, Siren, Sphere, extract_mesh, save_field
 from mplicits.neural_fields.files import whole_file, write_whole
 from mplicits.pipelines.command import write_json
-from mplicits.pipelines.fit_state import save_state
 from mplicits.pipelines.mesh_files import write_mesh
 from mplicits.pipelines.picture import write_picture
+from mplicits.pipelines.run.folder import save_state
 
 WRITERS: dict[str, Callable[[Path], None]] = {
     "cloud.ply": lambda path: write_cloud_ply(path, PointCloud(np.ones((5, 3)))),

@@ -12,11 +12,12 @@ import torch
 from mplicits.datasets import PointCloud
 from mplicits.neural_fields import InputError, load_field
 from mplicits.neural_fields.meshing import extract_mesh
-from mplicits.pipelines.fit import Interrupted, choose_device, fit
-from mplicits.pipelines.fit_config import FitConfig
-from mplicits.pipelines.fit_state import read_record
+from mplicits.pipelines.fit import fit
 from mplicits.pipelines.info import describe
-from mplicits.pipelines.training import Progress
+from mplicits.pipelines.run.folder import read_record
+from mplicits.pipelines.run.machine import choose_device
+from mplicits.pipelines.run.settings import FitConfig
+from mplicits.pipelines.run.trainer import Interrupted, Progress
 
 SMALL = FitConfig(
     widths=(32, 48),

@@ -10,13 +10,11 @@ import torch
 from mplicits.datasets import sample_sphere, sample_torus, write_cloud_ply
 from mplicits.neural_fields import load_field
 from mplicits.pipelines.cli import main
-from mplicits.pipelines.config import load_config
-from mplicits.pipelines.fit import Interrupted
-from mplicits.pipelines.fit_config import FitConfig
 from mplicits.pipelines.fit_jobs import fit_many, plan_fits
-from mplicits.pipelines.fit_state import STATE_FILE, read_record
-from mplicits.pipelines.runs import find_field
-from mplicits.pipelines.training import Progress
+from mplicits.pipelines.run.config import load_config
+from mplicits.pipelines.run.folder import STATE_FILE, find_field, read_record
+from mplicits.pipelines.run.settings import FitConfig
+from mplicits.pipelines.run.trainer import Interrupted, Progress
 
 SMALL = (
     *("--widths", "16", "--depths", "1", "--omegas", "15", "--steps", "30", "--learning-rates", "1e-2"),

@@ -14,9 +14,9 @@ from mplicits.datasets import DepthCamera, PointCloud, read_cloud, write_cloud_p
 from mplicits.pipelines import fit_mesh
 from mplicits.pipelines.cli import main
 from mplicits.pipelines.mesh import MeshOptions
-from mplicits.pipelines.progress_bar import _Lines
+from mplicits.pipelines.run.progress import _Lines
+from mplicits.pipelines.run.settings import TextureConfig
 from mplicits.pipelines.surface import Surface, read_surface
-from mplicits.pipelines.texture_config import TextureConfig
 from scipy.spatial import KDTree
 
 CENTER = np.array([3.0, -1.0, 10.0])

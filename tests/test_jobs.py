@@ -6,8 +6,8 @@ import os
 import pytest
 import torch
 from mplicits.neural_fields import InputError
-from mplicits.pipelines.fit import Interrupted
-from mplicits.pipelines.jobs import Outcome, run_jobs
+from mplicits.pipelines.run.jobs import Outcome, run_jobs
+from mplicits.pipelines.run.trainer import Interrupted
 
 needs_ray = pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="Ray is an extra")
 

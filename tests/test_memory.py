@@ -5,7 +5,7 @@ import sys
 
 import numpy as np
 import pytest
-from mplicits.pipelines.memory import peak_memory
+from mplicits.pipelines.run.machine import peak_memory
 
 CHILD = """
 import importlib.util, sys

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from mplicits.datasets import PointCloud, read_cloud
 from mplicits.neural_fields import InputError, Similarity, Sphere, extract_mesh
-from mplicits.pipelines.fit import Interrupted
 from mplicits.pipelines.mesh_files import write_mesh
 from mplicits.pipelines.paper.cell import Cell
 from mplicits.pipelines.paper.judge import Judge
@@ -23,6 +22,7 @@ from mplicits.pipelines.paper.run import Shape, cells_of, run_cell, run_cells
 from mplicits.pipelines.paper.shapes import find_shapes
 from mplicits.pipelines.paper.store import make_folder, read_record, record_file
 from mplicits.pipelines.paper.tables import TableSpec
+from mplicits.pipelines.run.trainer import Interrupted
 
 PLACE = Similarity((5.0, 0.0, -1.0), 20.0)
 

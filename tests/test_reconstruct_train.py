@@ -11,10 +11,10 @@ from mplicits.neural_fields import MultiscaleSDF
 from mplicits.neural_fields.sphere_start import fit_sphere
 from mplicits.pipelines import scene_model
 from mplicits.pipelines.ray_pool import RayPool
-from mplicits.pipelines.reconstruct_config import ReconstructConfig
 from mplicits.pipelines.reconstruct_train import SceneTrainer
+from mplicits.pipelines.run.settings import ReconstructConfig
+from mplicits.pipelines.run.trainer import StopFlag
 from mplicits.pipelines.scene_model import build_scene
-from mplicits.pipelines.training import StopFlag
 from torch import Tensor
 
 TINY = ReconstructConfig(

@@ -24,8 +24,9 @@ from mplicits.datasets.depth.cleaning import measure_noise
 from mplicits.neural_fields import InputError
 from mplicits.pipelines import fit_depth as fit_depth_module
 from mplicits.pipelines.cli import main
-from mplicits.pipelines.fit import FitConfig, Interrupted
+from mplicits.pipelines.fit import FitConfig
 from mplicits.pipelines.fit_depth import DepthInput, fit_depth
+from mplicits.pipelines.run.trainer import Interrupted
 
 LENS = DepthCamera(96, 72, 90.0, 92.0, 46.5, 36.5)
 EXACT = DepthSettings(smoothing=0)

@@ -5,9 +5,9 @@ import pytest
 import torch
 from mplicits.neural_fields import MultiscaleSDF, Siren, Sphere, Torus, Union
 from mplicits.pipelines.cloud_distance import CloudDistance
-from mplicits.pipelines.fit_config import FitConfig
 from mplicits.pipelines.level_sources import banded_sources
 from mplicits.pipelines.paper.levels import train_level
+from mplicits.pipelines.run.settings import FitConfig
 from mplicits.pipelines.sampling import (
     Samples,
     band_of,

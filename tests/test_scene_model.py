@@ -9,7 +9,7 @@ from mplicits.neural_fields import MultiscaleSDF, Sphere, ViewColor
 from mplicits.neural_fields.baselines import NeusSDF
 from mplicits.neural_fields.volume_renderer import Sampling
 from mplicits.pipelines import scene_model
-from mplicits.pipelines.reconstruct_config import ReconstructConfig
+from mplicits.pipelines.run.settings import ReconstructConfig
 from mplicits.pipelines.scene_model import SceneModel, build_scene
 
 SMALL = ReconstructConfig(

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ...neural_fields import MultiscaleSDF, Similarity
 from ..cloud_distance import CloudDistance
-from ..fit_config import FitConfig
 from ..level_sources import Weights, banded_sources
+from ..run.settings import FitConfig
 from .base import base_cell, base_of
 from .cell import Cell, Record, Report
 from .judge import reference_of

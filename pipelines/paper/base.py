@@ -13,9 +13,9 @@ from ...datasets import OrientedCloud
 from ...neural_fields import Field, MultiscaleSDF, Similarity, load_field
 from ..cloud_distance import CloudDistance
 from ..fit import prepare
-from ..fit_config import FitConfig
 from ..fit_review import review_points
-from ..runs import find_field
+from ..run.folder import find_field
+from ..run.settings import FitConfig
 from .cell import Cell
 from .levels import up_to
 from .method import Workplace

@@ -14,8 +14,7 @@ from typing import Any
 import torch
 
 from ...neural_fields.files import write_json, write_whole
-from ..fit import choose_device
-from ..timing import sgemm_rate
+from ..run.machine import choose_device, sgemm_rate
 from .ablations import DELTA_FACTOR, LOSS_WEIGHTS
 from .cell import Cell, Preset, Record
 from .comparison import BANF_TABLE, COMPARISON_TABLE, NOISE_TABLE, POISSON_TABLE

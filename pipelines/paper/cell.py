@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from ..training import Progress
+from ..run.trainer import Progress
 
 __all__ = ["Cell", "Preset", "Record", "Report"]
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from ..command import Command, add_json, check_output, whole, write_json
-from ..config import closest, input_error
+from ..run.config import closest, input_error
 from .names import METHODS, PRESETS, TABLES
 
 __all__ = ["COMMAND"]
@@ -51,7 +51,7 @@ def _paper(arguments: argparse.Namespace) -> int:
     tables = TABLES if "all" in asked else _known("--table", asked, TABLES, more=("all",))
     methods = METHODS if arguments.methods is None else _known("--methods", _words(arguments.methods), METHODS)
     (preset,) = _known("--preset", [arguments.preset], PRESETS)
-    from ..fit import Interrupted
+    from ..run.trainer import Interrupted
     from .bench import PAGE, Bench, bench_paper
     from .report import as_markdown, section_as_dict
     from .shapes import find_shapes

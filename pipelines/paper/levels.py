@@ -11,10 +11,11 @@ import torch
 from ...neural_fields import Field, MultiscaleSDF, Siren
 from ..cloud_distance import CloudDistance
 from ..fit import RESIDUAL_GAIN
-from ..fit_config import FitConfig
+from ..fit_level import LevelTrainer
 from ..level_sources import Weights, surface_samples
-from ..sampling import band_of, distance_samples, with_previous
-from ..training import LevelTrainer, Progress, Source, StopFlag
+from ..run.settings import FitConfig
+from ..run.trainer import Progress, StopFlag
+from ..sampling import Source, band_of, distance_samples, with_previous
 from .cell import Report
 
 __all__ = [

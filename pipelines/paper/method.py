@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ..config import closest
+from ..run.config import closest
 from .cell import Cell, Report
 
 __all__ = ["Catalogue", "Findings", "Method", "Workplace"]

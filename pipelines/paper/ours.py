@@ -10,9 +10,8 @@ from typing import Any
 
 from ...neural_fields import MultiscaleSDF, load_field
 from ..fit import Run, fit
-from ..fit_config import FitConfig
-from ..fit_mesh import is_fitted
-from ..fit_state import FIELD_FILE, RECORD_FILE, STATE_FILE, read_record
+from ..run.folder import FIELD_FILE, RECORD_FILE, STATE_FILE, is_fitted, read_record
+from ..run.settings import FitConfig
 from ..support import read_support
 from .cell import Cell
 from .judge import Judge

@@ -13,8 +13,8 @@ import numpy as np
 
 from ...datasets import OrientedCloud, PointCloud, add_noise, add_outliers, prepare_cloud, read_cloud
 from ...neural_fields import InputError
-from ..config import load_config
-from ..fit_config import FitConfig
+from ..run.config import load_config
+from ..run.settings import FitConfig
 from .cell import Cell
 
 if TYPE_CHECKING:

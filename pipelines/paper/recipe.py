@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from ...datasets import OrientedCloud
 from ...neural_fields import Field
-from ..training import Progress
+from ..run.trainer import Progress
 from .cell import Preset, Report
 
 __all__ = ["Output", "Recipe", "Trained", "cosine", "count", "descend", "finished", "seeded"]

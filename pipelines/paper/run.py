@@ -12,9 +12,9 @@ from pathlib import Path
 
 import torch
 
-from ..fit import Interrupted, choose_device
-from ..fit_state import environment
-from ..jobs import Outcome, check_jobs, run_jobs
+from ..run.jobs import Outcome, check_jobs, run_jobs
+from ..run.machine import choose_device, environment
+from ..run.trainer import Interrupted
 from .cell import Cell, Preset, Record, Report
 from .method import Catalogue, Workplace
 from .store import read_record, write_record

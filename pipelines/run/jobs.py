@@ -17,8 +17,8 @@ from typing import Any, Generic, TypeVar
 
 import torch
 
-from ..neural_fields import InputError
-from .fit import Interrupted
+from ...neural_fields import InputError
+from .trainer import Interrupted
 
 __all__ = ["Outcome", "check_jobs", "run_jobs"]
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Protocol
 
@@ -12,9 +12,9 @@ from rich.progress import BarColumn, TaskID, TaskProgressColumn, TextColumn, Tim
 from rich.progress import Progress as Bars
 from rich.text import Text
 
-from .training import Progress
+from .trainer import Progress
 
-__all__ = ["progress_bars"]
+__all__ = ["counter_bar", "progress_bars"]
 
 
 class Report(Protocol):
@@ -75,3 +75,18 @@ class _Lines:
 
 def _text(progress: Progress) -> str:
     return "  ".join(f"{name} {value:.1e}" for name, value in progress.losses.items())
+
+
+@contextmanager
+def counter_bar(title: str) -> Iterator[Callable[[int, int], None] | None]:
+    """A progress bar with the time left on stderr, to be told ``(done, total)``; None where that is no terminal."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield None
+        return
+    with Progress(console=console, transient=True) as bar:
+        task = bar.add_task(title)
+        yield lambda done, total: bar.update(task, completed=done, total=total)

@@ -224,6 +224,6 @@ def _flag(name: str) -> str:
 
 def input_error(message: str) -> Exception:
     """An ``InputError``, imported late: its package loads torch, and ``mplicits --help`` must not wait for that."""
-    from ..neural_fields.errors import InputError
+    from ...neural_fields.errors import InputError
 
     return InputError(message)

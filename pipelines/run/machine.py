@@ -1,0 +1,109 @@
+"""What every benchmark needs: best-of-n times, the machine's matrix rate, and a table.
+
+The most memory that this process has held.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import platform
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from ...neural_fields import InputError
+
+__all__ = ["best_seconds", "environment", "format_table", "peak_memory", "sgemm_rate"]
+
+
+def best_seconds(work: Callable[[], object], *, repeats: int = 5) -> float:
+    """Least wall-clock seconds of ``repeats`` calls after one warm-up call.
+
+    The minimum, because other processes can only ever make a run slower.
+    """
+    work()
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        work()
+        if torch.cuda.is_available():
+            torch.cuda.synchronize()
+        times.append(time.perf_counter() - start)
+    return min(times)
+
+
+@torch.inference_mode()
+def sgemm_rate(width: int = 512, *, rows: int = 2048, device: torch.device | str = "cpu", repeats: int = 20) -> float:
+    """Measured float32 matrix-product rate ``(rows, width) @ (width, width)``, in FLOP/s: the limit of any SIREN."""
+    a = torch.randn(rows, width, device=device)
+    b = torch.randn(width, width, device=device)
+    out = torch.empty(rows, width, device=device)
+    return 2 * rows * width * width / best_seconds(lambda: torch.mm(a, b, out=out), repeats=repeats)
+
+
+def format_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Text in aligned columns, the first to the left and the others to the right."""
+    widths = [max(len(row[i]) for row in [header, *rows]) for i in range(len(header))]
+    lines = []
+    for row in [header, ["-" * width for width in widths], *rows]:
+        cells = [
+            cell.ljust(w) if i == 0 else cell.rjust(w) for i, (cell, w) in enumerate(zip(row, widths, strict=True))
+        ]
+        lines.append("  ".join(cells).rstrip())
+    return "\n".join(lines)
+
+
+# Linux keeps the high-water mark of a process here. Not getrusage: its maximum survives exec, so that a child would
+# report what its parent held when it was born.
+STATUS = Path("/proc/self/status")
+
+
+def peak_memory() -> int | None:
+    """Largest resident set of this process so far, in bytes; None where the system does not keep it (Windows)."""
+    try:
+        status = STATUS.read_text(encoding="ascii")
+    except OSError:
+        status = ""
+    for line in status.splitlines():
+        if line.startswith("VmHWM:"):
+            return 1024 * int(line.split()[1])
+    try:
+        import resource
+    except ImportError:
+        return None
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+
+
+def choose_device(name: str) -> torch.device:
+    """``auto`` is CUDA where there is a working GPU, the CPU elsewhere.
+
+    Raises:
+        InputError: no such device here.
+    """
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        device = torch.device(name)
+        torch.empty(1, device=device)
+    except (RuntimeError, AssertionError) as error:
+        reason = str(error).splitlines()[0]
+        raise InputError(f"--device {name}: not usable here ({reason}); use auto or cpu") from error
+    return device
+
+
+def environment(device: torch.device) -> dict[str, Any]:
+    """What the figures of a run depend on: versions, threads, machine."""
+    names = ("mplicits", "torch", "numpy", "scipy", "scikit-image", "safetensors")
+    return {
+        "versions": {name: importlib.metadata.version(name) for name in names},
+        "python": platform.python_version(),
+        "machine": f"{platform.system()} {platform.machine()}",
+        "cpu_count": os.cpu_count(),
+        "threads": torch.get_num_threads(),
+        "device": torch.cuda.get_device_name(device) if device.type == "cuda" else str(device),
+    }
