@@ -13,7 +13,7 @@ from scipy.ndimage import distance_transform_edt
 from ..datasets.clouds.point_cloud import unit_rows
 from ..neural_fields import InputError, Similarity
 from ..neural_fields.meshing import Mesh
-from .raster import cover
+from .surface.raster import cover
 from .tangents import to_frame
 from .textured_files import check_textured_path, write_textured
 from .unwrap import Unwrapped, decimate, unwrap

@@ -29,7 +29,7 @@ from .evolve_checks import slope_figures
 from .run.machine import format_table
 from .run.settings import EvolveConfig
 from .run.trainer import Progress
-from .surface import components, from_mesh
+from .surface.surface import components, from_mesh
 
 __all__ = ["CASES", "ExactCase", "ExactRow", "bench_exact", "format_exact", "measure_exact"]
 

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from ..neural_fields import InputError, extract_mesh, load_field
-from .evaluate import evaluate_surfaces
 from .evolve import evolve
 from .evolve_shapes import Placed, Placement
 from .fit import fit
@@ -17,7 +16,8 @@ from .run.folder import FIELD_FILE, STATE_FILE
 from .run.machine import format_table
 from .run.settings import EvolveConfig, FitConfig
 from .run.trainer import Progress
-from .surface import from_mesh, read_reference
+from .surface.measure import evaluate_surfaces
+from .surface.surface import from_mesh, read_reference
 
 __all__ = ["MorphRow", "bench_morph", "format_morph"]
 

@@ -12,14 +12,14 @@ from typing import Any
 from ..datasets import PointCloud, add_noise, orbit, read_cloud
 from ..neural_fields import Similarity
 from ..neural_fields.meshing import NoSurfaceError, extract_mesh
-from .evaluate import Metrics, evaluate_surfaces
 from .fit import fit, prepare
 from .picture import contact_sheet, picture_of, write_picture
 from .poisson import has_poisson, screened_poisson
 from .run.machine import format_table
 from .run.settings import FitConfig
 from .run.trainer import Progress
-from .surface import Surface, from_cloud, from_mesh, read_reference
+from .surface.measure import Metrics, evaluate_surfaces
+from .surface.surface import Surface, from_cloud, from_mesh, read_reference
 
 __all__ = ["FitRow", "bench_fit", "format_fit"]
 

@@ -24,7 +24,7 @@ from .run.folder import find_field
 from .run.machine import choose_device, format_table
 from .seen import Seen
 from .shading import ShadeOptions, compose, shade
-from .surface import Surface, from_mesh, read_reference
+from .surface.surface import Surface, from_mesh, read_reference
 
 __all__ = ["NormalMapRow", "bench_normal_map", "format_normal_map"]
 

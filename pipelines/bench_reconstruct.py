@@ -23,7 +23,6 @@ from .bench_reconstruct_row import EQUAL_TIME, MULTISCALE, NEUS, ReconstructRow,
 from .bench_reconstruct_scene import BenchScene
 from .bench_reconstruct_train import train_watched
 from .mesh_files import write_mesh
-from .mesh_trim import in_region
 from .picture import write_picture
 from .ray_pool import RayPool
 from .reconstruct_train import SceneTrainer
@@ -33,7 +32,8 @@ from .run.machine import choose_device, environment
 from .run.settings import ReconstructConfig
 from .run.trainer import Interrupted, Progress, stop_on_signals
 from .scene_model import SceneModel, build_scene
-from .surface import Surface, from_mesh
+from .surface.surface import Surface, from_mesh
+from .surface.trim import in_region
 
 __all__ = ["BenchOptions", "bench_reconstruct"]
 

@@ -16,12 +16,12 @@ from ..neural_fields.meshing import Mesh
 from .bench_reconstruct_row import EQUAL_TIME, ReconstructRow, SurfaceFigures
 from .bench_reconstruct_scene import BenchScene
 from .bench_reconstruct_train import Watched
-from .evaluate import Metrics, evaluate_surfaces
-from .mesh_trim import keep_largest
 from .picture import contact_sheet
 from .reconstruct_views import ViewImage, measure
 from .run.settings import ReconstructConfig
-from .surface import Surface, from_mesh
+from .surface.measure import Metrics, evaluate_surfaces
+from .surface.surface import Surface, from_mesh
+from .surface.trim import keep_largest
 
 __all__ = ["common_sheet", "row_of", "surface_figures"]
 

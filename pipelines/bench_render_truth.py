@@ -16,7 +16,7 @@ from ..neural_fields.meshing import Mesh, NoSurfaceError, extract_mesh
 from .picture import mesh_view
 from .seen import Seen
 from .shading import shade
-from .surface import Surface, from_mesh
+from .surface.surface import Surface, from_mesh
 
 __all__ = ["Agreement", "Truth"]
 

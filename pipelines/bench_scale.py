@@ -19,12 +19,12 @@ import numpy as np
 from ..datasets.synthetic.statue import Statue
 from ..neural_fields import InputError
 from ..neural_fields.meshing import NoSurfaceError, extract_mesh
-from .evaluate import evaluate_surfaces
 from .fit import fit
 from .merged_cloud import load_cloud
 from .run.machine import format_table, peak_memory
 from .run.settings import FitConfig
-from .surface import Surface, from_mesh, read_surface, sample_surface
+from .surface.measure import evaluate_surfaces
+from .surface.surface import Surface, from_mesh, read_surface, sample_surface
 
 __all__ = ["ScaleRow", "bench_scale", "format_scale", "write_noisy_cloud"]
 

@@ -22,7 +22,7 @@ from .picture import contact_sheet, mesh_view, write_picture
 from .render import trace_view
 from .run.machine import format_table
 from .run.settings import FitConfig, TextureConfig
-from .surface import Surface, from_mesh
+from .surface.surface import Surface, from_mesh
 from .textured_view import textured_view
 
 __all__ = ["PAPER_MSE", "TextureRow", "bench_texture", "format_texture"]

@@ -97,7 +97,7 @@ def _evaluate_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _evaluate(arguments: argparse.Namespace) -> int:
     check_output(arguments.json, (".json",))
-    from .evaluate import evaluate_files, format_metrics, write_metrics
+    from .surface.measure import evaluate_files, format_metrics, write_metrics
 
     metrics = evaluate_files(arguments.mesh, arguments.reference, samples=arguments.samples, seed=arguments.seed)
     print(format_metrics(metrics))

@@ -24,7 +24,7 @@ from .run.machine import format_table
 from .run.progress import progress_bars
 from .run.settings import FitConfig
 from .shading import ShadeOptions, compose, shade
-from .surface import from_cloud, from_mesh
+from .surface.surface import from_cloud, from_mesh
 
 __all__ = ["demo", "distances_to_surface", "draw_levels", "spread_colors"]
 

@@ -11,10 +11,10 @@ import torch
 from torch import Tensor
 
 from ..neural_fields import Field, NoSurfaceError, TimeSlice, extract_mesh
-from .evaluate import chamfer
 from .evolve_problem import End
 from .evolve_train import band_points
-from .surface import Surface, components, from_mesh, sample_surface
+from .surface.measure import chamfer
+from .surface.surface import Surface, components, from_mesh, sample_surface
 
 __all__ = ["Frame", "check_evolution", "check_frames", "end_figures", "slope_figures", "volume", "warnings"]
 

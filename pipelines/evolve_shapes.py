@@ -30,7 +30,7 @@ from ..neural_fields import (
     project_to_surface,
 )
 from .run.folder import find_field
-from .surface import Surface, from_mesh, sample_surface
+from .surface.surface import Surface, from_mesh, sample_surface
 
 __all__ = ["Placed", "Placement", "Shape", "aligned", "into_unit_sphere", "read_shape"]
 

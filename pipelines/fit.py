@@ -38,7 +38,7 @@ from .run.settings import FitConfig
 from .run.team import is_leader
 from .run.trainer import Interrupted, Progress, StopFlag, stop_on_signals
 from .sampling import Band, band_of
-from .support import write_support
+from .surface.trim import write_support
 
 __all__ = ["FitConfig", "Run", "fit", "prepare"]
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..neural_fields import MultiscaleSDF, Siren, load_field
 from .run.folder import RECORD_FILE, find_field, is_field
-from .surface import Surface, components, is_closed, read_surface
+from .surface.surface import Surface, components, is_closed, read_surface
 
 __all__ = ["describe"]
 

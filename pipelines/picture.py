@@ -19,9 +19,9 @@ from ..datasets.cameras import Camera
 from ..datasets.clouds.meshes import vertex_normals
 from ..neural_fields import InputError
 from ..neural_fields.files import write_whole
-from .raster import clip, cover
 from .seen import Seen
-from .surface import Surface
+from .surface.raster import clip, cover
+from .surface.surface import Surface
 
 __all__ = [
     "check_picture_path",

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from ..datasets import OrientedCloud
-from .surface import Surface
+from .surface.surface import Surface
 
 __all__ = ["has_poisson", "screened_poisson"]
 

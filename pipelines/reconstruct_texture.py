@@ -11,11 +11,11 @@ from torch import Tensor
 from ..datasets import PointCloud
 from ..datasets.views.images import PosedImages
 from ..neural_fields import Jet, NoSurfaceError, extract_mesh
-from .mesh_trim import in_region
 from .run.settings import ReconstructConfig, TextureConfig
 from .run.trainer import Progress
 from .scene_model import SceneModel
-from .surface import from_mesh, sample_surface
+from .surface.surface import from_mesh, sample_surface
+from .surface.trim import in_region
 from .texture import FittedTexture, fit_texture
 
 __all__ = ["scene_texture", "surface_colors"]

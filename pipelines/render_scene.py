@@ -23,7 +23,7 @@ from .render import trace_view
 from .riding import colors_at
 from .run.folder import find_field, is_field, load_still
 from .seen import Seen
-from .surface import read_surface, sample_surface
+from .surface.surface import read_surface, sample_surface
 
 __all__ = ["Look", "Scene", "open_scene", "reference_distance"]
 

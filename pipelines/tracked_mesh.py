@@ -14,7 +14,7 @@ from ..neural_fields import Field, InputError, IntegrationError, Solver, flow, p
 from ..neural_fields.carried import CarriedVelocity
 from ..neural_fields.dynamic_tracing import moment
 from ..neural_fields.meshing import NoSurfaceError, extract_mesh
-from .surface import components, from_mesh
+from .surface.surface import components, from_mesh
 
 __all__ = ["TrackedMesh", "follow_mesh"]
 

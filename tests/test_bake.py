@@ -11,8 +11,8 @@ from mplicits.neural_fields.meshing import Mesh, extract_mesh
 from mplicits.pipelines import unwrap as unwrap_module
 from mplicits.pipelines.bake import bake, check_texture_size, textured_mesh
 from mplicits.pipelines.mesh import normals_near
-from mplicits.pipelines.raster import cover
-from mplicits.pipelines.surface import Surface, is_closed, read_surface
+from mplicits.pipelines.surface.raster import cover
+from mplicits.pipelines.surface.surface import Surface, is_closed, read_surface
 from mplicits.pipelines.tangents import from_frame, to_frame, vertex_tangents
 from mplicits.pipelines.textured_files import check_textured_path
 from mplicits.pipelines.unwrap import decimate, unwrap

@@ -7,7 +7,7 @@ import trimesh
 from mplicits.datasets import read_cloud
 from mplicits.pipelines.bench_scale import ScaleRow, bench_scale, format_scale, write_noisy_cloud
 from mplicits.pipelines.run.settings import FitConfig
-from mplicits.pipelines.surface import read_surface
+from mplicits.pipelines.surface.surface import read_surface
 
 
 def test_clouds_have_the_noise_that_was_asked_for(tmp_path: Path) -> None:

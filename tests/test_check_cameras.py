@@ -17,7 +17,7 @@ from mplicits.pipelines.check_cameras import check_cameras, check_files
 from mplicits.pipelines.cli import main
 from mplicits.pipelines.frustums import camera_mesh, frustum_size
 from mplicits.pipelines.scene_command import SCENE_NAMES
-from mplicits.pipelines.surface import read_surface
+from mplicits.pipelines.surface.surface import read_surface
 
 WRITERS = {"neus": write_neus, "transforms": write_transforms, "colmap": write_colmap}
 

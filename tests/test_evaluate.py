@@ -7,17 +7,17 @@ import numpy as np
 import pytest
 import trimesh
 from mplicits.neural_fields import InputError, Similarity
-from mplicits.pipelines.evaluate import (
+from mplicits.pipelines.surface.measure import (
     chamfer,
     evaluate_files,
     evaluate_surfaces,
     format_metrics,
+    overlap,
     shell_iou,
     write_metrics,
 )
-from mplicits.pipelines.raster import cover
-from mplicits.pipelines.surface import Surface, components, is_closed, read_surface, sample_surface
-from mplicits.pipelines.volume_overlap import overlap
+from mplicits.pipelines.surface.raster import cover
+from mplicits.pipelines.surface.surface import Surface, components, is_closed, read_surface, sample_surface
 
 
 def surface(mesh: trimesh.Trimesh) -> Surface:

@@ -26,7 +26,7 @@ from mplicits.pipelines import evolve_problem
 from mplicits.pipelines.evolve_problem import between, build_problem, velocity_field
 from mplicits.pipelines.evolve_shapes import Placed, Placement, Shape, aligned, into_unit_sphere, read_shape
 from mplicits.pipelines.run.settings import EvolveConfig
-from mplicits.pipelines.surface import from_mesh
+from mplicits.pipelines.surface.surface import from_mesh
 
 CONFIG = EvolveConfig(samples=2000)
 TURN = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]

@@ -16,7 +16,7 @@ from mplicits.pipelines.cli import main
 from mplicits.pipelines.mesh import MeshOptions
 from mplicits.pipelines.run.progress import _Lines
 from mplicits.pipelines.run.settings import TextureConfig
-from mplicits.pipelines.surface import Surface, read_surface
+from mplicits.pipelines.surface.surface import Surface, read_surface
 from scipy.spatial import KDTree
 
 CENTER = np.array([3.0, -1.0, 10.0])

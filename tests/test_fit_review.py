@@ -14,7 +14,7 @@ from mplicits.pipelines.fit import fit
 from mplicits.pipelines.fit_review import review_points
 from mplicits.pipelines.mesh import MeshOptions, mesh_run
 from mplicits.pipelines.run.settings import FitConfig
-from mplicits.pipelines.support import SUPPORT_FILE, read_support
+from mplicits.pipelines.surface.trim import SUPPORT_FILE, read_support
 
 SMALL = FitConfig(
     widths=(32, 48),

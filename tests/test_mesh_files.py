@@ -9,7 +9,7 @@ from mplicits.datasets import linear_to_srgb, read_cloud
 from mplicits.neural_fields import InputError, Similarity, Sphere
 from mplicits.neural_fields.meshing import Mesh, extract_mesh
 from mplicits.pipelines.mesh_files import check_mesh_path, needs_doubles, write_mesh
-from mplicits.pipelines.surface import read_surface
+from mplicits.pipelines.surface.surface import read_surface
 
 NEAR = Similarity((1.0, -2.0, 3.0), 2.5)
 UTM = Similarity((512_345.678, 5_403_210.987, 312.5), 40.0)

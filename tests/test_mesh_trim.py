@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from mplicits.neural_fields import InputError, Sphere, Union
 from mplicits.neural_fields.meshing import Mesh, extract_mesh
-from mplicits.pipelines.mesh_trim import (
+from mplicits.pipelines.surface.trim import (
     drop_unsupported,
     face_areas,
     in_region,

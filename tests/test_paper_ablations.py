@@ -41,12 +41,6 @@ from mplicits.pipelines.paper.levels import (
     up_to,
     without_bands,
 )
-from mplicits.pipelines.paper.mesh_distance import (
-    MeshDistance,
-    approximation_error,
-    barycentric_of_nearest,
-    near_surface,
-)
 from mplicits.pipelines.paper.methods import CATALOGUE
 from mplicits.pipelines.paper.protocol import fit_config
 from mplicits.pipelines.paper.run import run_cell
@@ -59,7 +53,8 @@ from mplicits.pipelines.paper.speed_tables import (
     normals_tables,
 )
 from mplicits.pipelines.paper.store import make_folder
-from mplicits.pipelines.surface import Surface, from_mesh
+from mplicits.pipelines.surface.distance import MeshDistance, approximation_error, barycentric_of_nearest, near_surface
+from mplicits.pipelines.surface.surface import Surface, from_mesh
 
 HALF = np.array([0.5, 0.3, 0.4])
 # Two triangles a side, outward.

@@ -17,8 +17,8 @@ from mplicits.pipelines.picture import (
     picture_of,
     write_picture,
 )
-from mplicits.pipelines.raster import clip
-from mplicits.pipelines.surface import Surface
+from mplicits.pipelines.surface.raster import clip
+from mplicits.pipelines.surface.surface import Surface
 
 NO_FACES = np.empty((0, 3), np.int64)
 SQUARE = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])

@@ -19,12 +19,12 @@ from mplicits.datasets.views.writing import write_neus, write_transforms
 from mplicits.neural_fields import InputError, Similarity, extract_mesh, load_field, load_texture
 from mplicits.pipelines import reconstruct_texture
 from mplicits.pipelines.cli import main
-from mplicits.pipelines.evaluate import chamfer
 from mplicits.pipelines.mesh import MeshOptions, mesh_run
 from mplicits.pipelines.reconstruct import Reconstruction, reconstruct
 from mplicits.pipelines.run.config import load_config
 from mplicits.pipelines.run.settings import ReconstructConfig, TextureConfig
 from mplicits.pipelines.run.trainer import Interrupted, Progress
+from mplicits.pipelines.surface.measure import chamfer
 from torch import Tensor
 
 WORLD = Similarity(center=(120.0, -30.0, 8.0), scale=5.0)

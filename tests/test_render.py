@@ -25,7 +25,7 @@ from mplicits.pipelines.render_cameras import choose_frame
 from mplicits.pipelines.render_run import RenderOptions, render_run
 from mplicits.pipelines.render_scene import open_scene, reference_distance
 from mplicits.pipelines.shading import SHADINGS
-from mplicits.pipelines.surface import from_mesh
+from mplicits.pipelines.surface.surface import from_mesh
 from torch.nn.functional import normalize
 
 CENTER = (0.1, 0.05, -0.1)

@@ -21,7 +21,7 @@ from mplicits.datasets.textured.mesh import Paint, decode_image, lookup, pack
 from mplicits.neural_fields import InputError
 from mplicits.neural_fields.meshing import Mesh
 from mplicits.pipelines.mesh_files import write_mesh
-from mplicits.pipelines.surface import read_surface
+from mplicits.pipelines.surface.surface import read_surface
 
 # A unit square in z = 0 of two triangles, corners counter-clockwise from the origin; u = x and v = y.
 SQUARE = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)], np.float64)

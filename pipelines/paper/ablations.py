@@ -16,11 +16,11 @@ from ...neural_fields import MultiscaleSDF, Similarity
 from ..cloud_distance import CloudDistance
 from ..level_sources import Weights, banded_sources
 from ..run.settings import FitConfig
+from ..surface.distance import Float64, MeshDistance, approximation_error, near_surface
 from .base import base_cell, base_of
 from .cell import Cell, Record, Report
 from .judge import reference_of
 from .levels import delta_after, generator_for, train_level, up_to
-from .mesh_distance import Float64, MeshDistance, approximation_error, near_surface
 from .method import Findings, Method, Workplace
 from .ours import Ours, our_config
 from .plots import Plot, Series

@@ -12,12 +12,11 @@ import torch
 from ...datasets import orbit
 from ...neural_fields import Field, Similarity, sphere_trace
 from ...neural_fields.meshing import Mesh, NoSurfaceError, extract_mesh
-from ..evaluate import evaluate_surfaces
 from ..mesh_files import write_mesh
-from ..mesh_trim import drop_unsupported
 from ..picture import picture_of, write_picture
-from ..support import Support
-from ..surface import Surface, from_mesh, read_reference
+from ..surface.measure import evaluate_surfaces
+from ..surface.surface import Surface, from_mesh, read_reference
+from ..surface.trim import Support, drop_unsupported
 from .cell import Cell
 from .method import Workplace
 from .protocol import protocol_of

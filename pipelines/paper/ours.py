@@ -12,7 +12,7 @@ from ...neural_fields import MultiscaleSDF, load_field
 from ..fit import Run, fit
 from ..run.folder import FIELD_FILE, RECORD_FILE, STATE_FILE, is_fitted, read_record
 from ..run.settings import FitConfig
-from ..support import read_support
+from ..surface.trim import read_support
 from .cell import Cell
 from .judge import Judge
 from .method import Findings, Method, Workplace

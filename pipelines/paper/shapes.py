@@ -7,7 +7,7 @@ from pathlib import Path
 
 from ...neural_fields import InputError
 from ...neural_fields.files import files_in
-from ..surface import MESH_SUFFIXES, read_reference, read_surface
+from ..surface.surface import MESH_SUFFIXES, read_reference, read_surface
 from .run import Shape
 
 __all__ = ["find_shapes"]

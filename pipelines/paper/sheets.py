@@ -11,7 +11,7 @@ import numpy as np
 
 from ...datasets import orbit
 from ..picture import Image, contact_sheet, picture_of, write_picture
-from ..surface import from_cloud
+from ..surface.surface import from_cloud
 from .cell import Cell, Record
 from .judge import reference_of
 from .method import Workplace

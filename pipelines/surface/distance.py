@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from ...neural_fields import Field
-from ..surface import Surface, face_normals, sample_surface
+from .surface import Surface, face_normals, sample_surface
 
 __all__ = ["MeshDistance", "approximation_error", "barycentric_of_nearest", "near_surface"]
 

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from ..datasets import PointCloud, read_cloud
-from ..datasets.clouds.point_cloud import unit_rows
-from ..datasets.textured.gltf import read_gltf
-from ..neural_fields import InputError, Similarity
-from ..neural_fields.meshing import Mesh
+from ...datasets import PointCloud, read_cloud
+from ...datasets.clouds.point_cloud import unit_rows
+from ...datasets.textured.gltf import read_gltf
+from ...neural_fields import InputError, Similarity
+from ...neural_fields.meshing import Mesh
 
 __all__ = [
     "MESH_SUFFIXES",

@@ -1,0 +1,1 @@
+"""Triangle surfaces: reading, measuring and trimming them."""
