@@ -11,7 +11,7 @@ from typing import Any
 from ..neural_fields import InputError, extract_mesh, load_field
 from .evolve import evolve
 from .evolve_shapes import Placed, Placement
-from .fit import fit
+from .fit.train import fit
 from .run.folder import FIELD_FILE, STATE_FILE
 from .run.machine import format_table
 from .run.settings import EvolveConfig, FitConfig

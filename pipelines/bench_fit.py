@@ -12,7 +12,7 @@ from typing import Any
 from ..datasets import PointCloud, add_noise, orbit, read_cloud
 from ..neural_fields import Similarity
 from ..neural_fields.meshing import NoSurfaceError, extract_mesh
-from .fit import fit, prepare
+from .fit.train import fit, prepare
 from .picture import contact_sheet, picture_of, write_picture
 from .poisson import has_poisson, screened_poisson
 from .run.machine import format_table

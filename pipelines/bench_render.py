@@ -18,7 +18,7 @@ from ..neural_fields import Field, MultiscaleSDF, Siren, load_field
 from ..neural_fields.tracing import BOUNDING_RADIUS
 from .bench_render_truth import Agreement, Truth
 from .counting import counted
-from .fit import fit
+from .fit.train import fit
 from .render import trace_view
 from .run.folder import FIELD_FILE, STATE_FILE
 from .run.machine import format_table

@@ -19,8 +19,8 @@ import numpy as np
 from ..datasets.synthetic.statue import Statue
 from ..neural_fields import InputError
 from ..neural_fields.meshing import NoSurfaceError, extract_mesh
-from .fit import fit
-from .merged_cloud import load_cloud
+from .fit.cloud import load_cloud
+from .fit.train import fit
 from .run.machine import format_table, peak_memory
 from .run.settings import FitConfig
 from .surface.measure import evaluate_surfaces

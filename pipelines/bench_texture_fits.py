@@ -14,7 +14,7 @@ import numpy as np
 from ..datasets import TexturedMesh, sample_textured
 from ..neural_fields import Field, InputError, Similarity, TextureField, load_field, load_texture
 from ..neural_fields.files import write_json
-from .fit import fit
+from .fit.train import fit
 from .run.folder import FIELD_FILE, RECORD_FILE, STATE_FILE, TEXTURE_FILE, read_record
 from .run.machine import choose_device
 from .run.settings import FitConfig, TextureConfig

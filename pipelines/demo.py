@@ -15,7 +15,7 @@ from scipy.spatial import KDTree
 from ..datasets import STATUE_PLACEMENT, Camera, PointCloud, Statue, orbit, read_cloud, statue_scan, write_cloud_ply
 from ..neural_fields import Field, InputError, Similarity
 from ..neural_fields.meshing import Mesh, NoSurfaceError, extract_mesh
-from .fit import Run, fit
+from .fit.train import Run, fit
 from .mesh_files import write_mesh
 from .picture import contact_sheet, picture_of, write_picture
 from .render import trace_view

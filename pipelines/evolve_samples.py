@@ -12,7 +12,7 @@ from torch import Tensor
 from ..neural_fields import Field, at_time, flow
 from ..neural_fields.evolution import VectorField
 from .evolve_shapes import Shape
-from .sampling import DOMAIN
+from .fit.samples import DOMAIN
 
 __all__ = ["Bounds", "Carried", "Known", "around", "joined", "known_at", "no_bounds", "signs", "uniform"]
 

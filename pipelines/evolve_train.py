@@ -12,9 +12,9 @@ from ..neural_fields import Field, Jet, Siren, SpaceTimeSDF, key_loss, law_loss,
 from ..neural_fields.losses import eikonal_loss
 from .evolve_problem import Problem
 from .evolve_samples import Known, uniform
+from .fit.samples import DOMAIN
 from .run.settings import EvolveConfig
 from .run.trainer import Progress, StopFlag, pack_training, set_rate, unpack_training
-from .sampling import DOMAIN
 
 __all__ = ["EvolveTrainer", "band_points", "learn_start", "uniform_spacetime"]
 

@@ -17,8 +17,8 @@ from .run.config import input_error
 from .texture_command import tell_texture
 
 if TYPE_CHECKING:
-    from .fit_depth import DepthInput
-    from .fit_jobs import FitOutcome
+    from .fit.depth import DepthInput
+    from .fit.many import FitOutcome
     from .fit_mesh import FitMesh
     from .run.settings import FitConfig
 
@@ -63,8 +63,8 @@ def _fit(arguments: argparse.Namespace) -> int:
 
 
 def _fit_one(arguments: argparse.Namespace, config: FitConfig | None) -> int:
-    from .fit import fit
-    from .fit_depth import fit_depth, trim_suggestion
+    from .fit.depth import fit_depth, trim_suggestion
+    from .fit.train import fit
     from .info import describe
     from .run.folder import check_new_run, is_fitted
     from .run.machine import peak_memory
@@ -122,7 +122,7 @@ def _fit_one(arguments: argparse.Namespace, config: FitConfig | None) -> int:
 
 def _follow(arguments: argparse.Namespace, config: FitConfig | None) -> int:
     """Help the process that does the rest; see `team`."""
-    from .fit import fit
+    from .fit.train import fit
     from .run.trainer import Interrupted
 
     if depth_input(arguments) is not None:
@@ -141,7 +141,7 @@ def _fit_many(arguments: argparse.Namespace, config: FitConfig | None) -> int:
     for cloud in arguments.clouds:
         if depth_input(argparse.Namespace(**{**vars(arguments), "cloud": cloud})) is not None:
             raise input_error(f"{cloud}: holds depth maps; fit them on their own, without --jobs")
-    from .fit_jobs import fit_many, format_fits, plan_fits
+    from .fit.many import fit_many, format_fits, plan_fits
     from .run.jobs import check_jobs
     from .run.progress import progress_bars
     from .run.trainer import Interrupted

@@ -10,7 +10,7 @@ from .command import positive, whole
 from .run.config import input_error
 
 if TYPE_CHECKING:
-    from .fit_depth import DepthInput
+    from .fit.depth import DepthInput
 
 __all__ = ["add_depth_flags", "depth_input"]
 
@@ -77,7 +77,7 @@ def depth_input(arguments: argparse.Namespace) -> DepthInput | None:
         return None
     if arguments.fov is not None and arguments.intrinsics:
         raise input_error("--fov: does not go with --intrinsics; leave out one of them")
-    from .fit_depth import DepthInput
+    from .fit.depth import DepthInput
 
     return DepthInput(
         depth=path,

@@ -12,7 +12,7 @@ import numpy as np
 from ..datasets import read_cloud
 from ..neural_fields import InputError, Similarity
 from ..neural_fields.meshing import Mesh
-from .fit_depth import DepthInput, trim_suggestion
+from .fit.depth import DepthInput, trim_suggestion
 from .mesh import MeshOptions, mesh_run
 from .mesh_files import check_mesh_path
 from .run.folder import CLOUD_FILE, TEXTURE_FILE, kept_cloud, read_record, texture_state_file

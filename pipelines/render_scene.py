@@ -17,7 +17,7 @@ from ..datasets.cameras import Camera
 from ..neural_fields import Field, InputError, Similarity
 from ..neural_fields.meshing import NoSurfaceError, extract_mesh
 from ..neural_fields.tracing import BOUNDING_RADIUS
-from .cloud_distance import CloudDistance
+from .fit.cloud import CloudDistance
 from .picture import cloud_view, mesh_view
 from .render import trace_view
 from .riding import colors_at

@@ -14,7 +14,7 @@ from torch import Tensor
 from ..datasets import PointCloud, read_cloud
 from ..datasets.textured.reading import TEXTURED_READERS, read_textured, sample_textured
 from ..neural_fields import Field, InputError, Similarity
-from .sampling import DOMAIN
+from .fit.samples import DOMAIN
 
 __all__ = ["BandSamples", "ColorSamples", "band_directions", "has_colors", "match_colors", "read_colors"]
 

@@ -10,7 +10,7 @@ from mplicits.datasets import OrientedCloud, prepare_cloud, sample_sphere
 from mplicits.neural_fields import Field, Jet, Siren, extract_mesh, sphere_trace
 from mplicits.neural_fields.baselines import BaconSDF, IdfSDF
 from mplicits.neural_fields.baselines.idf import attenuation
-from mplicits.pipelines.cloud_distance import CloudDistance
+from mplicits.pipelines.fit.cloud import CloudDistance
 from mplicits.pipelines.paper.recipe import Recipe, descend
 from mplicits.pipelines.paper.recipes_networks import (
     BACON_PRESETS,

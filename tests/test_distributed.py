@@ -8,10 +8,10 @@ import pytest
 import torch
 import torch.multiprocessing as multiprocessing
 from mplicits.neural_fields import Siren
-from mplicits.pipelines.fit_level import LevelTrainer
+from mplicits.pipelines.fit.level import LevelTrainer
+from mplicits.pipelines.fit.samples import Samples, Source
 from mplicits.pipelines.run.team import agreed, average_gradients, is_leader, my_share, team, whole_batch
 from mplicits.pipelines.run.trainer import StopFlag
-from mplicits.pipelines.sampling import Samples, Source
 
 STEPS = 12
 

@@ -12,7 +12,7 @@ import torch
 from mplicits.datasets import PointCloud
 from mplicits.neural_fields import InputError, load_field
 from mplicits.neural_fields.meshing import extract_mesh
-from mplicits.pipelines.fit import fit
+from mplicits.pipelines.fit.train import fit
 from mplicits.pipelines.info import describe
 from mplicits.pipelines.run.folder import read_record
 from mplicits.pipelines.run.machine import choose_device

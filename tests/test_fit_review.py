@@ -10,8 +10,7 @@ import torch
 from mplicits.datasets import PointCloud, add_outliers, sample_sphere
 from mplicits.neural_fields import InputError, MultiscaleSDF, Siren, Sphere
 from mplicits.neural_fields.meshing import Mesh, extract_mesh
-from mplicits.pipelines.fit import fit
-from mplicits.pipelines.fit_review import review_points
+from mplicits.pipelines.fit.train import fit, review_points
 from mplicits.pipelines.mesh import MeshOptions, mesh_run
 from mplicits.pipelines.run.settings import FitConfig
 from mplicits.pipelines.surface.trim import SUPPORT_FILE, read_support

@@ -6,8 +6,8 @@ import torch
 from mplicits.datasets import PointCloud, add_noise, add_outliers, prepare_cloud, sample_sphere, sample_surface
 from mplicits.datasets.clouds.noise import noise_level, smooth_along_normals
 from mplicits.neural_fields import Box, Torus
-from mplicits.pipelines.cloud_distance import CloudDistance
-from mplicits.pipelines.fit import FitConfig, fit
+from mplicits.pipelines.fit.cloud import CloudDistance
+from mplicits.pipelines.fit.train import FitConfig, fit
 
 RNG = np.random.default_rng(0)
 

@@ -11,9 +11,9 @@ import torch
 from imageio.v3 import imread
 from mplicits.datasets import read_cloud
 from mplicits.neural_fields import Box, InputError, MultiscaleSDF, Similarity, Siren, Sphere, extract_mesh
-from mplicits.pipelines.cloud_distance import CloudDistance
-from mplicits.pipelines.fit import fit, prepare
-from mplicits.pipelines.level_sources import Weights, banded_sources
+from mplicits.pipelines.fit.cloud import CloudDistance
+from mplicits.pipelines.fit.samples import Weights, banded_sources
+from mplicits.pipelines.fit.train import fit, prepare
 from mplicits.pipelines.mesh_files import write_mesh
 from mplicits.pipelines.paper.ablations import (
     DELTA_FACTOR,

@@ -22,10 +22,10 @@ from mplicits.datasets import (
 from mplicits.datasets.depth import cloud as depth_fusion
 from mplicits.datasets.depth.cleaning import measure_noise
 from mplicits.neural_fields import InputError
-from mplicits.pipelines import fit_depth as fit_depth_module
 from mplicits.pipelines.cli import main
-from mplicits.pipelines.fit import FitConfig
-from mplicits.pipelines.fit_depth import DepthInput, fit_depth
+from mplicits.pipelines.fit import depth as fit_depth_module
+from mplicits.pipelines.fit.depth import DepthInput, fit_depth
+from mplicits.pipelines.fit.train import FitConfig
 from mplicits.pipelines.run.trainer import Interrupted
 
 LENS = DepthCamera(96, 72, 90.0, 92.0, 46.5, 36.5)

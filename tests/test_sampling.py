@@ -4,14 +4,12 @@ import numpy as np
 import pytest
 import torch
 from mplicits.neural_fields import MultiscaleSDF, Siren, Sphere, Torus, Union
-from mplicits.pipelines.cloud_distance import CloudDistance
-from mplicits.pipelines.level_sources import banded_sources
-from mplicits.pipelines.paper.levels import train_level
-from mplicits.pipelines.run.settings import FitConfig
-from mplicits.pipelines.sampling import (
+from mplicits.pipelines.fit.cloud import CloudDistance
+from mplicits.pipelines.fit.samples import (
     Samples,
     band_of,
     band_samples,
+    banded_sources,
     delta_of,
     distance_samples,
     empty_samples,
@@ -19,6 +17,8 @@ from mplicits.pipelines.sampling import (
     offset_samples,
     with_previous,
 )
+from mplicits.pipelines.paper.levels import train_level
+from mplicits.pipelines.run.settings import FitConfig
 from torch import Tensor
 
 RADIUS = 0.6

@@ -13,8 +13,8 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ...neural_fields import MultiscaleSDF, Similarity
-from ..cloud_distance import CloudDistance
-from ..level_sources import Weights, banded_sources
+from ..fit.cloud import CloudDistance
+from ..fit.samples import Weights, banded_sources
 from ..run.settings import FitConfig
 from ..surface.distance import Float64, MeshDistance, approximation_error, near_surface
 from .base import base_cell, base_of

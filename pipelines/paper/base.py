@@ -11,9 +11,8 @@ import torch
 
 from ...datasets import OrientedCloud
 from ...neural_fields import Field, MultiscaleSDF, Similarity, load_field
-from ..cloud_distance import CloudDistance
-from ..fit import prepare
-from ..fit_review import review_points
+from ..fit.cloud import CloudDistance
+from ..fit.train import prepare, review_points
 from ..run.folder import find_field
 from ..run.settings import FitConfig
 from .cell import Cell

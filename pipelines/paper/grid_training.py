@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 
 from ...datasets import OrientedCloud
-from ..cloud_distance import CloudDistance
-from ..sampling import DOMAIN
+from ..fit.cloud import CloudDistance
+from ..fit.samples import DOMAIN
 
 __all__ = ["SignedPools", "differences", "mape_loss", "stencil"]
 

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from ...neural_fields import Field, Jet, MultiscaleSDF, NoSurfaceError, extract_mesh
-from ..level_sources import banded_sources
+from ..fit.samples import banded_sources
 from .base import Base, base_cell, base_of
 from .cell import Cell, Record, Report
 from .judge import Judge

@@ -9,13 +9,12 @@ from collections.abc import Sequence
 import torch
 
 from ...neural_fields import Field, MultiscaleSDF, Siren
-from ..cloud_distance import CloudDistance
-from ..fit import RESIDUAL_GAIN
-from ..fit_level import LevelTrainer
-from ..level_sources import Weights, surface_samples
+from ..fit.cloud import CloudDistance
+from ..fit.level import LevelTrainer
+from ..fit.samples import Source, Weights, band_of, distance_samples, surface_samples, with_previous
+from ..fit.train import RESIDUAL_GAIN
 from ..run.settings import FitConfig
 from ..run.trainer import Progress, StopFlag
-from ..sampling import Source, band_of, distance_samples, with_previous
 from .cell import Report
 
 __all__ = [

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ...neural_fields import MultiscaleSDF, load_field
-from ..fit import Run, fit
+from ..fit.train import Run, fit
 from ..run.folder import FIELD_FILE, RECORD_FILE, STATE_FILE, is_fitted, read_record
 from ..run.settings import FitConfig
 from ..surface.trim import read_support

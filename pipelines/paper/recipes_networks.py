@@ -12,7 +12,7 @@ from ...datasets import OrientedCloud
 from ...neural_fields import Siren
 from ...neural_fields.baselines import BaconSDF, IdfSDF
 from ...neural_fields.baselines.idf import attenuation
-from ..cloud_distance import CloudDistance
+from ..fit.cloud import CloudDistance
 from .cell import Preset, Report
 from .recipe import Output, Recipe, cosine, count, descend, finished, seeded
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..datasets import (
+from ...datasets import (
     DepthCamera,
     DepthReport,
     DepthSettings,
@@ -25,14 +25,14 @@ from ..datasets import (
     spacing_of,
     write_cloud_ply,
 )
-from ..datasets.depth.frame import PosedFrame
-from ..datasets.depth.images import COLOR_SUFFIXES, DEPTH_SUFFIXES
-from ..neural_fields import InputError
-from ..neural_fields.files import files_in
-from .fit import FitConfig, Run, fit
-from .run.folder import CLOUD_FILE, kept_cloud, read_record
-from .run.machine import choose_device
-from .run.trainer import Progress
+from ...datasets.depth.frame import PosedFrame
+from ...datasets.depth.images import COLOR_SUFFIXES, DEPTH_SUFFIXES
+from ...neural_fields import InputError
+from ...neural_fields.files import files_in
+from ..run.folder import CLOUD_FILE, kept_cloud, read_record
+from ..run.machine import choose_device
+from ..run.trainer import Progress
+from .train import FitConfig, Run, fit
 
 __all__ = ["DepthInput", "depth_cloud", "fit_depth", "trim_suggestion"]
 

@@ -8,11 +8,11 @@ from collections.abc import Callable, Mapping, Sequence
 import torch
 from torch import Tensor
 
-from ..neural_fields import Siren
-from ..neural_fields.losses import data_loss, eikonal_loss, normal_loss
-from .run.team import agreed, average_gradients, my_share, whole_batch
-from .run.trainer import StopFlag, pack_training, set_rate, unpack_training
-from .sampling import Source
+from ...neural_fields import Siren
+from ...neural_fields.losses import data_loss, eikonal_loss, normal_loss
+from ..run.team import agreed, average_gradients, my_share, whole_batch
+from ..run.trainer import StopFlag, pack_training, set_rate, unpack_training
+from .samples import Source
 
 __all__ = ["LevelTrainer"]
 

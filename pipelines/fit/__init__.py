@@ -1,0 +1,1 @@
+"""``fit``: from oriented point clouds to a multiscale SDF."""
