@@ -19,7 +19,7 @@ from .run.folder import FIELD_FILE, RECORD_FILE, STATE_FILE, TEXTURE_FILE, read_
 from .run.machine import choose_device
 from .run.settings import FitConfig, TextureConfig
 from .run.trainer import Progress
-from .texture import texture_run
+from .texture.train import texture_run
 
 __all__ = ["Fitted", "Report", "check_kept", "fitted_texture"]
 

@@ -18,8 +18,8 @@ from .mesh_files import check_mesh_path
 from .run.folder import CLOUD_FILE, TEXTURE_FILE, kept_cloud, read_record, texture_state_file
 from .run.settings import TextureConfig
 from .run.trainer import Progress
-from .texture import FittedTexture, texture_run
-from .texture_samples import has_colors
+from .texture.samples import has_colors
+from .texture.train import FittedTexture, texture_run
 
 __all__ = ["FitMesh", "plan_mesh"]
 

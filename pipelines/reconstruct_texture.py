@@ -16,7 +16,7 @@ from .run.trainer import Progress
 from .scene_model import SceneModel
 from .surface.surface import from_mesh, sample_surface
 from .surface.trim import in_region
-from .texture import FittedTexture, fit_texture
+from .texture.train import FittedTexture, fit_texture
 
 __all__ = ["scene_texture", "surface_colors"]
 

@@ -20,10 +20,10 @@ from ..neural_fields.tracing import BOUNDING_RADIUS
 from .fit.cloud import CloudDistance
 from .picture import cloud_view, mesh_view
 from .render import trace_view
-from .riding import colors_at
 from .run.folder import find_field, is_field, load_still
 from .seen import Seen
 from .surface.surface import read_surface, sample_surface
+from .texture.riding import colors_at
 
 __all__ = ["Look", "Scene", "open_scene", "reference_distance"]
 

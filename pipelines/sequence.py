@@ -25,10 +25,10 @@ from .mesh_files import glb_origin, write_mesh
 from .picture import contact_sheet, write_picture
 from .render import RESOLUTION, TOLERANCE, pixel_size, see_hits
 from .render_cameras import Orbit, orbit_cameras
-from .riding import RidingColors, borrowed_texture, start_texture
 from .run.folder import find_field
 from .run.machine import choose_device
 from .shading import ShadeOptions, compose, downsample, shade
+from .texture.riding import RidingColors, borrowed_texture, start_texture
 from .tracked_mesh import follow_mesh
 
 __all__ = ["SequenceOptions", "animate_run", "check_sequence_path", "film_frames"]

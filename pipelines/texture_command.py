@@ -13,7 +13,7 @@ from .run.config import add_config_flags, given_flags, input_error, load_config,
 from .run.settings import TextureConfig
 
 if TYPE_CHECKING:
-    from .texture import FittedTexture
+    from .texture.train import FittedTexture
 
 __all__ = ["COMMAND", "tell_texture"]
 
@@ -47,7 +47,7 @@ def _texture(arguments: argparse.Namespace) -> int:
     config = load_config(TextureConfig, preset or "default", flags, thing="texture")
     check_output(arguments.out, (".safetensors",))
     from .run.folder import TEXTURE_FILE, find_field
-    from .texture import texture_run
+    from .texture.train import texture_run
 
     field = find_field(arguments.run)
     target = arguments.out or field.with_name(TEXTURE_FILE)

@@ -16,8 +16,8 @@ import torch
 
 from ..datasets.cameras import UP_AXES
 from ..neural_fields import Field, InputError, Similarity, TextureField, load_field
-from .riding import start_texture
 from .run.folder import find_field
+from .texture.riding import start_texture
 from .viewer_camera import first_eye
 from .viewer_client import Client, Shown
 from .viewer_draw import Painter

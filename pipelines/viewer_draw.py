@@ -18,9 +18,9 @@ from ..datasets.cameras import Camera, look_at
 from ..neural_fields import Field, TextureField, map_colors
 from .matcap import load_matcap
 from .render import trace_view
-from .riding import Colors, RidingColors
 from .seen import Seen
 from .shading import ShadeOptions, compose, measure, shade
+from .texture.riding import Colors, RidingColors
 from .viewer_camera import merge_strips, strips, z_buffer
 from .viewer_frames import Look
 from .viewer_time import Moments

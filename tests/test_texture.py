@@ -23,15 +23,15 @@ from mplicits.neural_fields import (
     map_colors,
     save_field,
 )
-from mplicits.pipelines import texture as texture_module
 from mplicits.pipelines.run.config import load_config
 from mplicits.pipelines.run.folder import TEXTURE_FILE, texture_state_file
 from mplicits.pipelines.run.progress import _Lines
 from mplicits.pipelines.run.settings import TextureConfig
 from mplicits.pipelines.run.trainer import Progress
-from mplicits.pipelines.texture import default_delta, fit_texture, texture_of, texture_run
+from mplicits.pipelines.texture import train as texture_module
+from mplicits.pipelines.texture.samples import read_colors
+from mplicits.pipelines.texture.train import default_delta, fit_texture, texture_of, texture_run
 from mplicits.pipelines.texture_command import COMMAND
-from mplicits.pipelines.texture_samples import read_colors
 from numpy.typing import NDArray
 
 SMALL = TextureConfig(

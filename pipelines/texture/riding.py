@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from ..neural_fields import (
+from ...neural_fields import (
     Field,
     InputError,
     IntegrationError,
@@ -29,12 +29,12 @@ from ..neural_fields import (
     load_field,
     map_colors,
 )
-from ..neural_fields.attributes import project_to_surface
-from ..neural_fields.carried import CarriedVelocity
-from ..neural_fields.dynamic_tracing import moment
-from ..neural_fields.meshing import NoSurfaceError
-from .run.folder import find_field
-from .texture import texture_of
+from ...neural_fields.attributes import project_to_surface
+from ...neural_fields.carried import CarriedVelocity
+from ...neural_fields.dynamic_tracing import moment
+from ...neural_fields.meshing import NoSurfaceError
+from ..run.folder import find_field
+from .train import texture_of
 
 __all__ = ["RIDE", "Colors", "RidingColors", "borrowed_texture", "colors_at", "start_texture"]
 

@@ -11,10 +11,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..datasets import PointCloud, read_cloud
-from ..datasets.textured.reading import TEXTURED_READERS, read_textured, sample_textured
-from ..neural_fields import Field, InputError, Similarity
-from .fit.samples import DOMAIN
+from ...datasets import PointCloud, read_cloud
+from ...datasets.textured.reading import TEXTURED_READERS, read_textured, sample_textured
+from ...neural_fields import Field, InputError, Similarity
+from ..fit.samples import DOMAIN
 
 __all__ = ["BandSamples", "ColorSamples", "band_directions", "has_colors", "match_colors", "read_colors"]
 

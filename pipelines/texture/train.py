@@ -12,8 +12,8 @@ from typing import Any
 
 import torch
 
-from ..datasets import PointCloud
-from ..neural_fields import (
+from ...datasets import PointCloud
+from ...neural_fields import (
     ColorSiren,
     Field,
     InputError,
@@ -23,9 +23,9 @@ from ..neural_fields import (
     load_texture,
     save_texture,
 )
-from ..neural_fields.dynamic_tracing import moment
-from ..neural_fields.losses import color_loss, tangential_loss
-from .run.folder import (
+from ...neural_fields.dynamic_tracing import moment
+from ...neural_fields.losses import color_loss, tangential_loss
+from ..run.folder import (
     RECORD_FILE,
     TEXTURE_FILE,
     TextureState,
@@ -34,10 +34,10 @@ from .run.folder import (
     texture_state_file,
     write_record,
 )
-from .run.machine import choose_device, environment
-from .run.settings import TextureConfig
-from .run.trainer import Progress, StopFlag, pack_training, set_rate, stop_on_signals, unpack_training
-from .texture_samples import BandSamples, ColorSamples, band_directions, match_colors, read_colors
+from ..run.machine import choose_device, environment
+from ..run.settings import TextureConfig
+from ..run.trainer import Progress, StopFlag, pack_training, set_rate, stop_on_signals, unpack_training
+from .samples import BandSamples, ColorSamples, band_directions, match_colors, read_colors
 
 __all__ = ["FittedTexture", "default_delta", "fit_texture", "texture_of", "texture_run"]
 

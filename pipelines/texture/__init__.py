@@ -1,0 +1,1 @@
+"""``texture``: colours around a fitted surface."""
