@@ -22,7 +22,7 @@ from .bench_reconstruct_figures import common_sheet, row_of, surface_figures
 from .bench_reconstruct_row import EQUAL_TIME, MULTISCALE, NEUS, ReconstructRow, SurfaceFigures
 from .bench_reconstruct_scene import BenchScene
 from .bench_reconstruct_train import train_watched
-from .mesh_files import write_mesh
+from .mesh.files import write_mesh
 from .picture import write_picture
 from .ray_pool import RayPool
 from .reconstruct_train import SceneTrainer

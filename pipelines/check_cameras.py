@@ -22,7 +22,7 @@ from ..datasets.clouds.orientation import fibonacci_directions
 from ..datasets.views.images import PosedImage, PosedImages, read_posed_images
 from ..neural_fields import InputError, Similarity
 from .frustums import camera_mesh
-from .mesh_files import write_mesh
+from .mesh.files import write_mesh
 
 __all__ = ["CameraCheck", "check_cameras", "check_files", "format_check"]
 

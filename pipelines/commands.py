@@ -65,7 +65,7 @@ def _mesh_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _mesh(arguments: argparse.Namespace) -> int:
-    from .mesh import MeshOptions, mesh_run
+    from .mesh.extract import MeshOptions, mesh_run
 
     started = time.monotonic()
     options = MeshOptions(

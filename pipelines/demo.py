@@ -16,7 +16,7 @@ from ..datasets import STATUE_PLACEMENT, Camera, PointCloud, Statue, orbit, read
 from ..neural_fields import Field, InputError, Similarity
 from ..neural_fields.meshing import Mesh, NoSurfaceError, extract_mesh
 from .fit.train import Run, fit
-from .mesh_files import write_mesh
+from .mesh.files import write_mesh
 from .picture import contact_sheet, picture_of, write_picture
 from .render import trace_view
 from .run.config import load_config

@@ -13,8 +13,8 @@ from ..datasets import read_cloud
 from ..neural_fields import InputError, Similarity
 from ..neural_fields.meshing import Mesh
 from .fit.depth import DepthInput, trim_suggestion
-from .mesh import MeshOptions, mesh_run
-from .mesh_files import check_mesh_path
+from .mesh.extract import MeshOptions, mesh_run
+from .mesh.files import check_mesh_path
 from .run.folder import CLOUD_FILE, TEXTURE_FILE, kept_cloud, read_record, texture_state_file
 from .run.settings import TextureConfig
 from .run.trainer import Progress

@@ -32,7 +32,7 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
 def _scene(arguments: argparse.Namespace) -> int:
     from ..datasets.synthetic.scenes import SCENES, render_scene, scene_mesh
     from ..datasets.views.writing import check_new_folder, write_colmap, write_neus, write_transforms
-    from .mesh_files import write_mesh
+    from .mesh.files import write_mesh
 
     folder = check_new_folder(arguments.out)
     scene = SCENES[arguments.name]()

@@ -20,8 +20,7 @@ from ..neural_fields.files import whole_file
 from ..neural_fields.meshing import NoSurfaceError, extract_mesh
 from ..neural_fields.tracing import BOUNDING_RADIUS
 from .animation import ANIMATIONS, write_animation
-from .glb import Motion, write_glb
-from .mesh_files import glb_origin, write_mesh
+from .mesh.files import Motion, glb_origin, write_glb, write_mesh
 from .picture import contact_sheet, write_picture
 from .render import RESOLUTION, TOLERANCE, pixel_size, see_hits
 from .render_cameras import Orbit, orbit_cameras

@@ -8,14 +8,13 @@ import trimesh
 from mplicits.datasets import read_textured, sample_textured
 from mplicits.neural_fields import InputError, MultiscaleSDF, Plane, Similarity, Sphere
 from mplicits.neural_fields.meshing import Mesh, extract_mesh
-from mplicits.pipelines import unwrap as unwrap_module
-from mplicits.pipelines.bake import bake, check_texture_size, textured_mesh
-from mplicits.pipelines.mesh import normals_near
+from mplicits.pipelines.mesh import atlas as unwrap_module
+from mplicits.pipelines.mesh.atlas import decimate, from_frame, to_frame, unwrap, vertex_tangents
+from mplicits.pipelines.mesh.bake import bake, check_texture_size, textured_mesh
+from mplicits.pipelines.mesh.extract import normals_near
+from mplicits.pipelines.mesh.files import check_textured_path
 from mplicits.pipelines.surface.raster import cover
 from mplicits.pipelines.surface.surface import Surface, is_closed, read_surface
-from mplicits.pipelines.tangents import from_frame, to_frame, vertex_tangents
-from mplicits.pipelines.textured_files import check_textured_path
-from mplicits.pipelines.unwrap import decimate, unwrap
 
 pytest.importorskip("xatlas", reason="the extra mplicits[texture] is not installed")
 

@@ -7,7 +7,7 @@ import pytest
 from mplicits.neural_fields import InputError, Similarity, Sphere, extract_mesh
 from mplicits.pipelines import bench_fit as module
 from mplicits.pipelines.bench_fit import bench_fit, format_fit
-from mplicits.pipelines.mesh_files import write_mesh
+from mplicits.pipelines.mesh.files import write_mesh
 from mplicits.pipelines.run.settings import FitConfig
 
 SMALL = FitConfig(

@@ -23,7 +23,7 @@ from mplicits.neural_fields.checkpoint import SavedField
 from mplicits.pipelines import bench_normal_map as module
 from mplicits.pipelines.bench_normal_map import bench_normal_map, format_normal_map
 from mplicits.pipelines.cli import main
-from mplicits.pipelines.mesh_files import write_mesh
+from mplicits.pipelines.mesh.files import write_mesh
 
 RADIUS = 0.6
 PLACE = Similarity((400.0, -20.0, 3.0), 25.0)

@@ -13,7 +13,7 @@ import trimesh
 from mplicits.datasets import DepthCamera, PointCloud, read_cloud, write_cloud_ply
 from mplicits.pipelines import fit_mesh
 from mplicits.pipelines.cli import main
-from mplicits.pipelines.mesh import MeshOptions
+from mplicits.pipelines.mesh.extract import MeshOptions
 from mplicits.pipelines.run.progress import _Lines
 from mplicits.pipelines.run.settings import TextureConfig
 from mplicits.pipelines.surface.surface import Surface, read_surface

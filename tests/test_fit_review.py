@@ -11,7 +11,7 @@ from mplicits.datasets import PointCloud, add_outliers, sample_sphere
 from mplicits.neural_fields import InputError, MultiscaleSDF, Siren, Sphere
 from mplicits.neural_fields.meshing import Mesh, extract_mesh
 from mplicits.pipelines.fit.train import fit, review_points
-from mplicits.pipelines.mesh import MeshOptions, mesh_run
+from mplicits.pipelines.mesh.extract import MeshOptions, mesh_run
 from mplicits.pipelines.run.settings import FitConfig
 from mplicits.pipelines.surface.trim import SUPPORT_FILE, read_support
 
@@ -98,7 +98,7 @@ def test_meshing_drops_what_no_points_support_and_says_so(
     parts = [extract_mesh(Sphere(radius=radius), resolution=24) for radius in (0.98, 0.2)]
     faces = np.concatenate((parts[0].faces, parts[1].faces + len(parts[0].vertices)))
     both = Mesh(np.concatenate([part.vertices for part in parts]), faces)
-    monkeypatch.setattr("mplicits.pipelines.mesh.extract_mesh", lambda *_, **__: both)
+    monkeypatch.setattr("mplicits.pipelines.mesh.extract.extract_mesh", lambda *_, **__: both)
     said: list[str] = []
     mesh = mesh_run(fitted, tmp_path / "a.ply", say=said.append)
     assert len(mesh.faces) == len(parts[0].faces)

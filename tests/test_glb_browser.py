@@ -18,8 +18,8 @@ import trimesh
 from browser import CHROMEDRIVER, CHROMIUM, FLAGS
 from mplicits.neural_fields import Similarity
 from mplicits.neural_fields.meshing import Mesh
-from mplicits.pipelines.bake import textured_mesh
-from mplicits.pipelines.mesh_files import write_mesh
+from mplicits.pipelines.mesh.bake import textured_mesh
+from mplicits.pipelines.mesh.files import write_mesh
 
 pytest.importorskip("xatlas", reason="the extra mplicits[texture] is not installed")
 pytest.importorskip("selenium")

@@ -8,7 +8,7 @@ import trimesh
 from mplicits.datasets import linear_to_srgb, read_cloud
 from mplicits.neural_fields import InputError, Similarity, Sphere
 from mplicits.neural_fields.meshing import Mesh, extract_mesh
-from mplicits.pipelines.mesh_files import check_mesh_path, needs_doubles, write_mesh
+from mplicits.pipelines.mesh.files import check_mesh_path, needs_doubles, write_mesh
 from mplicits.pipelines.surface.surface import read_surface
 
 NEAR = Similarity((1.0, -2.0, 3.0), 2.5)

@@ -14,7 +14,7 @@ from mplicits.neural_fields import Box, InputError, MultiscaleSDF, Similarity, S
 from mplicits.pipelines.fit.cloud import CloudDistance
 from mplicits.pipelines.fit.samples import Weights, banded_sources
 from mplicits.pipelines.fit.train import fit, prepare
-from mplicits.pipelines.mesh_files import write_mesh
+from mplicits.pipelines.mesh.files import write_mesh
 from mplicits.pipelines.paper.ablations import (
     DELTA_FACTOR,
     LOSS_WEIGHTS,

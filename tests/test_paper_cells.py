@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from mplicits.datasets import PointCloud, read_cloud
 from mplicits.neural_fields import InputError, Similarity, Sphere, extract_mesh
-from mplicits.pipelines.mesh_files import write_mesh
+from mplicits.pipelines.mesh.files import write_mesh
 from mplicits.pipelines.paper.cell import Cell
 from mplicits.pipelines.paper.judge import Judge
 from mplicits.pipelines.paper.method import Catalogue, Findings, Method

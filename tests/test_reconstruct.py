@@ -19,7 +19,7 @@ from mplicits.datasets.views.writing import write_neus, write_transforms
 from mplicits.neural_fields import InputError, Similarity, extract_mesh, load_field, load_texture
 from mplicits.pipelines import reconstruct_texture
 from mplicits.pipelines.cli import main
-from mplicits.pipelines.mesh import MeshOptions, mesh_run
+from mplicits.pipelines.mesh.extract import MeshOptions, mesh_run
 from mplicits.pipelines.reconstruct import Reconstruction, reconstruct
 from mplicits.pipelines.run.config import load_config
 from mplicits.pipelines.run.settings import ReconstructConfig, TextureConfig

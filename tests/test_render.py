@@ -18,7 +18,7 @@ from mplicits.neural_fields.meshing import extract_mesh
 from mplicits.pipelines import render_run as render_run_module
 from mplicits.pipelines.cli import main
 from mplicits.pipelines.legend import with_color_bar
-from mplicits.pipelines.mesh_files import write_mesh
+from mplicits.pipelines.mesh.files import write_mesh
 from mplicits.pipelines.picture import mesh_view
 from mplicits.pipelines.render import pixel_size, trace_view
 from mplicits.pipelines.render_cameras import choose_frame

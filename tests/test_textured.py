@@ -20,7 +20,7 @@ from mplicits.datasets import (
 from mplicits.datasets.textured.mesh import Paint, decode_image, lookup, pack
 from mplicits.neural_fields import InputError
 from mplicits.neural_fields.meshing import Mesh
-from mplicits.pipelines.mesh_files import write_mesh
+from mplicits.pipelines.mesh.files import write_mesh
 from mplicits.pipelines.surface.surface import read_surface
 
 # A unit square in z = 0 of two triangles, corners counter-clockwise from the origin; u = x and v = y.

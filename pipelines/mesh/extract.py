@@ -13,15 +13,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ..datasets import read_cloud
-from ..neural_fields import Field, InputError, Similarity, map_attribute
-from ..neural_fields.meshing import Mesh, NoSurfaceError, extract_mesh, map_normals
+from ...datasets import read_cloud
+from ...neural_fields import Field, InputError, Similarity, map_attribute
+from ...neural_fields.meshing import Mesh, NoSurfaceError, extract_mesh, map_normals
+from ..run.folder import find_field, load_still
+from ..surface.trim import Support, drop_unsupported, in_region, keep_largest, read_support, trim_distance
+from ..texture.riding import Colors, colors_at
 from .bake import check_texture_size, textured_mesh
-from .mesh_files import check_mesh_path, write_mesh
-from .run.folder import find_field, load_still
-from .surface.trim import Support, drop_unsupported, in_region, keep_largest, read_support, trim_distance
-from .texture.riding import Colors, colors_at
-from .textured_files import check_textured_path
+from .files import check_mesh_path, check_textured_path, write_mesh
 
 __all__ = ["MeshOptions", "mesh_run", "normals_near"]
 

@@ -10,13 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
-from ..datasets.clouds.point_cloud import unit_rows
-from ..neural_fields import InputError, Similarity
-from ..neural_fields.meshing import Mesh
-from .surface.raster import cover
-from .tangents import to_frame
-from .textured_files import check_textured_path, write_textured
-from .unwrap import Unwrapped, decimate, unwrap
+from ...datasets.clouds.point_cloud import unit_rows
+from ...neural_fields import InputError, Similarity
+from ...neural_fields.meshing import Mesh
+from ..surface.raster import cover
+from .atlas import Unwrapped, decimate, to_frame, unwrap
+from .files import check_textured_path, write_textured
 
 __all__ = ["Baked", "bake", "check_texture_size", "textured_mesh"]
 

@@ -1,0 +1,1 @@
+"""``mesh``: from a fitted field to mesh files, with colours and baked textures."""
