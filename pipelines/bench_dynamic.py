@@ -16,7 +16,7 @@ from ..neural_fields.dynamic_tracing import DynamicTracer, moment
 from ..neural_fields.meshing import DEFAULT_BOUNDS
 from .bench_mesh import evaluate_slabs
 from .counting import counted
-from .render import RESOLUTION, TOLERANCE, pixel_size, trace_hits
+from .render.trace import RESOLUTION, TOLERANCE, pixel_size, trace_hits
 from .run.machine import format_table
 
 __all__ = ["DynamicRow", "dynamic_table", "format_dynamic"]

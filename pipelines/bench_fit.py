@@ -13,8 +13,8 @@ from ..datasets import PointCloud, add_noise, orbit, read_cloud
 from ..neural_fields import Similarity
 from ..neural_fields.meshing import NoSurfaceError, extract_mesh
 from .fit.train import fit, prepare
-from .picture import contact_sheet, picture_of, write_picture
 from .poisson import has_poisson, screened_poisson
+from .render.rasterise import contact_sheet, picture_of, write_picture
 from .run.machine import format_table
 from .run.settings import FitConfig
 from .run.trainer import Progress

@@ -23,10 +23,10 @@ from .bench_reconstruct_row import EQUAL_TIME, MULTISCALE, NEUS, ReconstructRow,
 from .bench_reconstruct_scene import BenchScene
 from .bench_reconstruct_train import train_watched
 from .mesh.files import write_mesh
-from .picture import write_picture
 from .ray_pool import RayPool
 from .reconstruct_train import SceneTrainer
 from .reconstruct_views import ViewImage, comparison_sheet, held_out, render_image
+from .render.rasterise import write_picture
 from .run.folder import digest_of
 from .run.machine import choose_device, environment
 from .run.settings import ReconstructConfig

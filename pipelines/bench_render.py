@@ -19,12 +19,11 @@ from ..neural_fields.tracing import BOUNDING_RADIUS
 from .bench_render_truth import Agreement, Truth
 from .counting import counted
 from .fit.train import fit
-from .render import trace_view
+from .render.trace import Seen, trace_view
 from .run.folder import FIELD_FILE, STATE_FILE
 from .run.machine import format_table
 from .run.settings import FitConfig
 from .run.trainer import Progress
-from .seen import Seen
 
 __all__ = ["NETWORKS", "RenderRow", "bench_render", "fit_networks", "format_render"]
 

@@ -13,9 +13,9 @@ from torch import Tensor
 from ..datasets.cameras import Camera
 from ..neural_fields import Field, InputError, cone_starts, sphere_trace
 from ..neural_fields.meshing import Mesh, NoSurfaceError, extract_mesh
-from .picture import mesh_view
-from .seen import Seen
-from .shading import shade
+from .render.rasterise import mesh_view
+from .render.shade import shade
+from .render.trace import Seen
 from .surface.surface import Surface, from_mesh
 
 __all__ = ["Agreement", "Truth"]

@@ -17,13 +17,12 @@ from ..datasets import Camera, TexturedMesh, read_textured, turntable
 from ..neural_fields import InputError, map_colors
 from ..neural_fields.meshing import NoSurfaceError, extract_mesh
 from .bench_texture_fits import Fitted, Report, check_kept, fitted_texture
-from .image_error import Drawing, ImageError, draw, image_error, psnr
-from .picture import contact_sheet, mesh_view, write_picture
-from .render import trace_view
+from .render.compare import Drawing, ImageError, draw, image_error, psnr
+from .render.rasterise import contact_sheet, mesh_view, textured_view, write_picture
+from .render.trace import trace_view
 from .run.machine import format_table
 from .run.settings import FitConfig, TextureConfig
 from .surface.surface import Surface, from_mesh
-from .textured_view import textured_view
 
 __all__ = ["PAPER_MSE", "TextureRow", "bench_texture", "format_texture"]
 

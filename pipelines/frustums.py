@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ..datasets.cameras import Camera
 from ..datasets.views.images import PosedImages
 from ..neural_fields.meshing import Mesh
-from .colormap import COLOR_MAPS, map_colors
+from .render.shade import COLOR_MAPS, map_colors
 
 __all__ = ["camera_mesh", "frustum_size"]
 

@@ -13,11 +13,11 @@ import torch
 
 from ..datasets.views.images import PosedImage, PosedImages, read_posed_images
 from ..neural_fields import InputError, NoSurfaceError, TextureField, save_field, save_texture
-from .picture import write_picture
 from .ray_pool import RayPool
 from .reconstruct_texture import scene_texture
 from .reconstruct_train import SceneTrainer
 from .reconstruct_views import ViewImage, comparison_sheet, held_out, measure, render_image
+from .render.rasterise import write_picture
 from .run.config import load_config
 from .run.folder import (
     FIELD_FILE,

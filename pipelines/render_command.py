@@ -89,8 +89,8 @@ def _render(arguments: argparse.Namespace) -> int:
     lit = not arguments.fast
     shade = load_config(ShadeOptions, overrides={"shadows": lit, "occlusion": lit, **given}, thing="render")
 
-    from .render_cameras import Orbit
-    from .render_run import RenderOptions, render_run
+    from .render.draw import RenderOptions, render_run
+    from .render.scene import Orbit
 
     chosen = {name: value for name in ORBIT_FLAGS if (value := getattr(arguments, name)) is not None}
     options = RenderOptions(

@@ -19,14 +19,14 @@ from ..neural_fields.dynamic_tracing import DynamicTracer, moment
 from ..neural_fields.files import whole_file
 from ..neural_fields.meshing import NoSurfaceError, extract_mesh
 from ..neural_fields.tracing import BOUNDING_RADIUS
-from .animation import ANIMATIONS, write_animation
 from .mesh.files import Motion, glb_origin, write_glb, write_mesh
-from .picture import contact_sheet, write_picture
-from .render import RESOLUTION, TOLERANCE, pixel_size, see_hits
-from .render_cameras import Orbit, orbit_cameras
+from .render.film import ANIMATIONS, write_animation
+from .render.rasterise import contact_sheet, write_picture
+from .render.scene import Orbit, orbit_cameras
+from .render.shade import ShadeOptions, compose, downsample, shade
+from .render.trace import RESOLUTION, TOLERANCE, pixel_size, see_hits
 from .run.folder import find_field
 from .run.machine import choose_device
-from .shading import ShadeOptions, compose, downsample, shade
 from .texture.riding import RidingColors, borrowed_texture, start_texture
 from .tracked_mesh import follow_mesh
 

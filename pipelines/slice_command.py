@@ -88,7 +88,7 @@ def _slice(arguments: argparse.Namespace) -> int:
     if len(arguments.size) > 2:
         raise input_error(f"--size: got {len(arguments.size)} numbers; expected a width, or a width and a height")
 
-    from .slice_run import SliceOptions, slice_run
+    from .render.slicing import SliceOptions, slice_run
 
     number, percent = arguments.at or (None, False)
     options = SliceOptions(

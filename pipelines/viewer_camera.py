@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from ..datasets.cameras import Camera, orbit, pinhole_intrinsics
-from .seen import Seen
+from .render.trace import Seen
 
 __all__ = ["first_eye", "image_size", "merge_strips", "strips", "viser_camera", "z_buffer"]
 

@@ -16,10 +16,9 @@ from torch import Tensor
 
 from ..datasets.cameras import Camera, look_at
 from ..neural_fields import Field, TextureField, map_colors
-from .matcap import load_matcap
-from .render import trace_view
-from .seen import Seen
-from .shading import ShadeOptions, compose, measure, shade
+from .render.light import load_matcap
+from .render.shade import ShadeOptions, compose, measure, shade
+from .render.trace import Seen, trace_view
 from .texture.riding import Colors, RidingColors
 from .viewer_camera import merge_strips, strips, z_buffer
 from .viewer_frames import Look

@@ -16,7 +16,7 @@ from torch import Tensor
 from ..datasets import read_cloud
 from ..neural_fields import Field, InputError, Jet, Similarity
 from ..neural_fields.meshing import Mesh, NoSurfaceError, extract_mesh
-from .slice import draw_slice, plane_axes, round_step, take_slice
+from .render.slice import draw_slice, plane_axes, round_step, take_slice
 from .viewer_frames import Superseded
 from .viewer_time import KEPT, Moments
 

@@ -8,7 +8,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 from mplicits.neural_fields import InputError
-from mplicits.pipelines.animation import write_animation
+from mplicits.pipelines.render.film import write_animation
 
 CODES = (cv2.CAP_PROP_FOURCC, cv2.CAP_PROP_CODEC_PIXEL_FORMAT)
 

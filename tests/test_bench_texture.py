@@ -15,10 +15,10 @@ from mplicits.neural_fields import InputError
 from mplicits.pipelines import bench_colour_commands, bench_texture_fits
 from mplicits.pipelines.bench_texture import PAPER_MSE, TextureRow, bench_texture, format_texture
 from mplicits.pipelines.cli import main
-from mplicits.pipelines.image_error import Drawing, ImageError, draw, image_error, psnr
+from mplicits.pipelines.render.compare import Drawing, ImageError, draw, image_error, psnr
+from mplicits.pipelines.render.rasterise import textured_view
+from mplicits.pipelines.render.trace import Seen
 from mplicits.pipelines.run.settings import FitConfig, TextureConfig
-from mplicits.pipelines.seen import Seen
-from mplicits.pipelines.textured_view import textured_view
 
 CORNERS = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
 TRIANGLES = np.array([[0, 1, 2], [0, 2, 3]])

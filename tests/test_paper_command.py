@@ -14,7 +14,7 @@ from mplicits.pipelines.paper.bench import SPECS
 from mplicits.pipelines.paper.judge import Judge
 from mplicits.pipelines.paper.method import Catalogue, Findings, Method
 from mplicits.pipelines.paper.methods import CATALOGUE, METHODS
-from mplicits.pipelines.picture import iio
+from mplicits.pipelines.render.rasterise import iio
 
 PLACE = Similarity((0.0, 0.0, 0.0), 2.0)
 

@@ -7,7 +7,7 @@ import torch
 import trimesh
 from mplicits.datasets import Camera, look_at, orbit
 from mplicits.neural_fields import InputError
-from mplicits.pipelines.picture import (
+from mplicits.pipelines.render.rasterise import (
     BACK,
     CLAY,
     check_picture_path,

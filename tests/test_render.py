@@ -15,16 +15,15 @@ from mplicits.datasets import PointCloud, look_at, orbit, write_cloud_ply
 from mplicits.datasets.cameras import Camera
 from mplicits.neural_fields import InputError, MultiscaleSDF, Similarity, Siren, Sphere, Torus, save_field
 from mplicits.neural_fields.meshing import extract_mesh
-from mplicits.pipelines import render_run as render_run_module
 from mplicits.pipelines.cli import main
-from mplicits.pipelines.legend import with_color_bar
 from mplicits.pipelines.mesh.files import write_mesh
-from mplicits.pipelines.picture import mesh_view
-from mplicits.pipelines.render import pixel_size, trace_view
-from mplicits.pipelines.render_cameras import choose_frame
-from mplicits.pipelines.render_run import RenderOptions, render_run
-from mplicits.pipelines.render_scene import open_scene, reference_distance
-from mplicits.pipelines.shading import SHADINGS
+from mplicits.pipelines.render import draw as render_run_module
+from mplicits.pipelines.render.draw import RenderOptions, render_run
+from mplicits.pipelines.render.legend import with_color_bar
+from mplicits.pipelines.render.rasterise import mesh_view
+from mplicits.pipelines.render.scene import choose_frame, open_scene, reference_distance
+from mplicits.pipelines.render.shade import SHADINGS
+from mplicits.pipelines.render.trace import pixel_size, trace_view
 from mplicits.pipelines.surface.surface import from_mesh
 from torch.nn.functional import normalize
 

@@ -34,7 +34,7 @@ from mplicits.neural_fields import (
 from mplicits.neural_fields.dynamic_tracing import moment
 from mplicits.pipelines.animate_command import COMMAND
 from mplicits.pipelines.mesh.extract import MeshOptions, mesh_run
-from mplicits.pipelines.render_run import RenderOptions, render_run
+from mplicits.pipelines.render.draw import RenderOptions, render_run
 from mplicits.pipelines.run.folder import load_still
 from mplicits.pipelines.sequence import SequenceOptions, animate_run, check_sequence_path, film_frames
 from mplicits.pipelines.surface.surface import read_surface

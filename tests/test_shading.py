@@ -11,18 +11,19 @@ import torch
 from fields import FIELDS
 from mplicits.datasets.cameras import Camera, look_at
 from mplicits.neural_fields import Field, InputError, Plane, Siren, Sphere, Union
-from mplicits.pipelines.colormap import COLOR_MAPS, map_colors
-from mplicits.pipelines.matcap import MATCAPS, load_matcap, sample_matcap
-from mplicits.pipelines.seen import Seen
-from mplicits.pipelines.shading import (
+from mplicits.pipelines.render.light import MATCAPS, load_matcap, sample_matcap
+from mplicits.pipelines.render.shade import (
+    COLOR_MAPS,
     SHADINGS,
     ShadeOptions,
     compose,
     downsample,
+    map_colors,
     measure,
     shade,
     value_limits,
 )
+from mplicits.pipelines.render.trace import Seen
 from scipy.spatial import KDTree
 
 RADIUS, SIZE = 0.5, 48

@@ -22,7 +22,8 @@ from mplicits.neural_fields import (
     Union,
     save_field,
 )
-from mplicits.pipelines.slice import (
+from mplicits.pipelines.render.legend import with_legend
+from mplicits.pipelines.render.slice import (
     FINEST,
     INSIDE,
     LINE,
@@ -37,9 +38,8 @@ from mplicits.pipelines.slice import (
     slice_points,
     take_slice,
 )
+from mplicits.pipelines.render.slicing import SliceOptions, slice_run
 from mplicits.pipelines.slice_command import COMMAND
-from mplicits.pipelines.slice_legend import with_legend
-from mplicits.pipelines.slice_run import SliceOptions, slice_run
 
 ACROSS_Z = {"origin": (0.0, 0.0, 0.0), "u": (1.0, 0.0, 0.0), "v": (0.0, 1.0, 0.0)}
 INK = np.array(FINEST) * 255

@@ -26,7 +26,7 @@ from mplicits.neural_fields import (
     save_field,
 )
 from mplicits.neural_fields.analytic import Plane
-from mplicits.pipelines.render import trace_view
+from mplicits.pipelines.render.trace import trace_view
 from mplicits.pipelines.viewer import free_port, open_run, show_field
 from mplicits.pipelines.viewer_camera import first_eye, image_size, merge_strips, strips, viser_camera, z_buffer
 from mplicits.pipelines.viewer_draw import Painter

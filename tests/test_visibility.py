@@ -3,8 +3,7 @@
 import pytest
 import torch
 from mplicits.neural_fields import Box, Field, MultiscaleSDF, Plane, Siren, Sphere, Torus, Union
-from mplicits.pipelines.curvature import mean_curvature
-from mplicits.pipelines.visibility import ambient_occlusion, soft_shadow
+from mplicits.pipelines.render.light import ambient_occlusion, mean_curvature, soft_shadow
 
 UP = torch.tensor([0.0, 0.0, 1.0])
 HEIGHT, RADIUS = 0.6, 0.2

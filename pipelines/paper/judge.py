@@ -13,7 +13,7 @@ from ...datasets import orbit
 from ...neural_fields import Field, Similarity, sphere_trace
 from ...neural_fields.meshing import Mesh, NoSurfaceError, extract_mesh
 from ..mesh.files import write_mesh
-from ..picture import picture_of, write_picture
+from ..render.rasterise import picture_of, write_picture
 from ..surface.measure import evaluate_surfaces
 from ..surface.surface import Surface, from_mesh, read_reference
 from ..surface.trim import Support, drop_unsupported

@@ -10,7 +10,7 @@ import imageio.v3 as iio
 import numpy as np
 
 from ...datasets import orbit
-from ..picture import Image, contact_sheet, picture_of, write_picture
+from ..render.rasterise import Image, contact_sheet, picture_of, write_picture
 from ..surface.surface import from_cloud
 from .cell import Cell, Record
 from .judge import reference_of

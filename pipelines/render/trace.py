@@ -1,19 +1,22 @@
-"""From a field and a camera to what every pixel sees: the coarse-to-fine trace, then one jet for each pixel."""
+"""From a field and a camera to what every pixel sees: the coarse-to-fine trace, then one jet for each pixel.
+
+What the pixels of an image see of a surface, whether it was traced in a field or rasterised from a mesh.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from ..datasets.cameras import Camera
-from ..neural_fields import Field, Hits, TextureField, cone_starts, map_colors, sphere_trace
-from ..neural_fields.tracing import BOUNDING_RADIUS, CONE_LIPSCHITZ
-from .seen import Seen
+from ...datasets.cameras import Camera
+from ...neural_fields import Field, Hits, TextureField, cone_starts, map_colors, sphere_trace
+from ...neural_fields.tracing import BOUNDING_RADIUS, CONE_LIPSCHITZ
 
-__all__ = ["pixel_size", "see_hits", "trace_hits", "trace_view"]
+__all__ = ["Seen", "pixel_size", "see_hits", "trace_hits", "trace_view"]
 
 # A trace ends within this share of a pixel; the jet's Newton step, which costs nothing, then leaves about its square.
 TOLERANCE = 0.1
@@ -118,3 +121,26 @@ def pixel_size(camera: Camera) -> float:
     """Width of a pixel at the near side of the ball that holds the surface, in the field's units."""
     distance = max(float(camera.eye.norm()) - BOUNDING_RADIUS, NEAREST)
     return distance / max(float(camera.intrinsics[0, 0]), float(camera.intrinsics[1, 1]))
+
+
+@dataclass(frozen=True)
+class Seen:
+    """One row for each pixel that sees the surface; nothing is kept, or shaded, for the others.
+
+    Attributes:
+        size: width and height of the image.
+        pixel: ``(P,)`` int64, row-major: ``y * width + x``.
+        depth: ``(P,)`` distance from the eye along the pixel's ray.
+        position: ``(P, 3)`` the point seen.
+        normal: ``(P, 3)`` unit outward normal there.
+        direction: ``(P, 3)`` unit direction of the ray, away from the eye.
+        color: ``(P, 3)`` the surface's own colour in [0, 1], where it has one.
+    """
+
+    size: tuple[int, int]
+    pixel: Tensor
+    depth: Tensor
+    position: Tensor
+    normal: Tensor
+    direction: Tensor
+    color: Tensor | None = None

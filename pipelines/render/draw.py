@@ -13,17 +13,16 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..datasets.cameras import Camera
-from ..neural_fields import InputError
-from .animation import ANIMATIONS, write_animation
+from ...datasets.cameras import Camera
+from ...neural_fields import InputError
+from ..run.machine import choose_device
+from .film import ANIMATIONS, write_animation
 from .legend import with_color_bar
-from .matcap import load_matcap
-from .picture import check_picture_path, contact_sheet, write_picture
-from .render_cameras import Orbit, orbit_cameras, posed_cameras
-from .render_scene import Look, Scene, open_scene, reference_distance
-from .run.machine import choose_device
-from .seen import Seen
-from .shading import ShadeOptions, compose, downsample, measure, shade, value_limits
+from .light import load_matcap
+from .rasterise import check_picture_path, contact_sheet, write_picture
+from .scene import Look, Orbit, Scene, open_scene, orbit_cameras, posed_cameras, reference_distance
+from .shade import ShadeOptions, compose, downsample, measure, shade, value_limits
+from .trace import Seen
 
 __all__ = ["RenderOptions", "render_run"]
 

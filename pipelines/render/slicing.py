@@ -11,13 +11,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..neural_fields import Field, InputError, Similarity, load_field
-from ..neural_fields.meshing import NoSurfaceError, extract_mesh
-from .animation import ANIMATIONS, write_animation
-from .picture import write_picture
-from .run.folder import find_field
+from ...neural_fields import Field, InputError, Similarity, load_field
+from ...neural_fields.meshing import NoSurfaceError, extract_mesh
+from ..run.folder import find_field
+from .film import ANIMATIONS, write_animation
+from .legend import with_legend
+from .rasterise import write_picture
 from .slice import draw_slice, plane_axes, round_step, take_slice
-from .slice_legend import with_legend
 
 __all__ = ["SliceOptions", "slice_run"]
 

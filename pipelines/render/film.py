@@ -14,8 +14,8 @@ import imageio_ffmpeg
 import numpy as np
 from numpy.typing import NDArray
 
-from ..neural_fields import InputError
-from ..neural_fields.files import whole_file
+from ...neural_fields import InputError
+from ...neural_fields.files import whole_file
 
 __all__ = ["ANIMATIONS", "write_animation"]
 

@@ -11,8 +11,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..datasets.color_space import linear_to_srgb, srgb_to_linear
-from .seen import Seen
+from ...datasets.color_space import linear_to_srgb, srgb_to_linear
+from .trace import Seen
 
 __all__ = ["Drawing", "ImageError", "draw", "image_error", "psnr"]
 

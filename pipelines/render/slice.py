@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..neural_fields import Field
+from ...neural_fields import Field
 
 __all__ = [
     "Slice",
@@ -105,7 +105,7 @@ def slice_field(
 
     Example:
         >>> from mplicits.neural_fields import Sphere
-        >>> from mplicits.pipelines.slice import slice_field
+        >>> from mplicits.pipelines.render.slice import slice_field
         >>> slice_field(Sphere(radius=1), origin=(0, 0, 0), u=(1, 0, 0), v=(0, 1, 0), half_size=2, size=(4, 1))
         tensor([[5., 1., 1., 5.]])
     """

@@ -1,0 +1,1 @@
+"""``render`` and ``slice``: pictures of fields, meshes and clouds."""
