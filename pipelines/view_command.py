@@ -29,7 +29,7 @@ def _port(text: str) -> int | None:
 
 def _view(arguments: argparse.Namespace) -> int:
     from .run.machine import choose_device
-    from .viewer import Viewer, open_run
+    from .viewer.server import Viewer, open_run
 
     shown = open_run(arguments.run, side=arguments.size, device=choose_device(arguments.device))
     with Viewer(shown, host=arguments.host, port=arguments.port, up=arguments.up) as viewer:

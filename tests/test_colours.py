@@ -74,7 +74,7 @@ def test_render_shows_colours_and_the_viewer_offers_them(run, tmp_path):
         image = iio.imread(out).astype(float)
         assert np.ptp(image, axis=2).max() > 20  # not grey
     pytest.importorskip("viser")
-    from mplicits.pipelines.viewer import open_run
+    from mplicits.pipelines.viewer.server import open_run
 
     assert "color" in open_run(directory).shadings
 

@@ -27,13 +27,20 @@ from mplicits.neural_fields import (
 )
 from mplicits.neural_fields.analytic import Plane
 from mplicits.pipelines.render.trace import trace_view
-from mplicits.pipelines.viewer import free_port, open_run, show_field
-from mplicits.pipelines.viewer_camera import first_eye, image_size, merge_strips, strips, viser_camera, z_buffer
-from mplicits.pipelines.viewer_draw import Painter
-from mplicits.pipelines.viewer_frames import FrameScheduler, Look, View, halvings_in_time
-from mplicits.pipelines.viewer_probe import describe_reading, probe
-from mplicits.pipelines.viewer_shapes import OffsetField, Shapes, slice_image
-from mplicits.pipelines.viewer_time import Moments
+from mplicits.pipelines.viewer.camera import (
+    describe_reading,
+    first_eye,
+    image_size,
+    merge_strips,
+    probe,
+    strips,
+    viser_camera,
+    z_buffer,
+)
+from mplicits.pipelines.viewer.frames import FrameScheduler, Look, View, halvings_in_time
+from mplicits.pipelines.viewer.paint import Moments, Painter
+from mplicits.pipelines.viewer.scene import OffsetField, Shapes, slice_image
+from mplicits.pipelines.viewer.server import free_port, open_run, show_field
 from scipy.spatial.transform import Rotation
 
 LOOK = Look(level=0, normal_level=0, shading="normals")
@@ -365,7 +372,7 @@ def test_ports_are_found_or_refused_in_a_line():
 
 
 def test_a_missing_viser_is_an_error_with_its_cure(monkeypatch):
-    from mplicits.pipelines.viewer import Viewer
+    from mplicits.pipelines.viewer.server import Viewer
 
     monkeypatch.setitem(sys.modules, "viser", None)
     with pytest.raises(InputError, match=r"pip install mplicits\[view\]"):

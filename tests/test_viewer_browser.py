@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from browser import CHROMEDRIVER, CHROMIUM, FLAGS
 from mplicits.neural_fields import MultiscaleSDF, Similarity, Siren, Sphere
-from mplicits.pipelines.viewer import Viewer, show_field
+from mplicits.pipelines.viewer.server import Viewer, show_field
 
 pytest.importorskip("viser")
 pytest.importorskip("selenium")

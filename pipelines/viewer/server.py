@@ -14,15 +14,15 @@ from typing import Any
 
 import torch
 
-from ..datasets.cameras import UP_AXES
-from ..neural_fields import Field, InputError, Similarity, TextureField, load_field
-from .run.folder import find_field
-from .texture.riding import start_texture
-from .viewer_camera import first_eye
-from .viewer_client import Client, Shown
-from .viewer_draw import Painter
-from .viewer_frames import Frame, FrameScheduler
-from .viewer_shapes import Shapes
+from ...datasets.cameras import UP_AXES
+from ...neural_fields import Field, InputError, Similarity, TextureField, load_field
+from ..run.folder import find_field
+from ..texture.riding import start_texture
+from .camera import first_eye
+from .client import Client, Shown
+from .frames import Frame, FrameScheduler
+from .paint import Painter
+from .scene import Shapes
 
 __all__ = ["FIRST_PORT", "Viewer", "free_port", "open_run", "show_field"]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from .viewer_frames import Look
+from .frames import Look
 
 __all__ = ["SURFACES", "Controls"]
 

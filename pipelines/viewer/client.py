@@ -10,15 +10,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..neural_fields import Field, InputError, Similarity
-from .run.settings import SHADINGS
-from .viewer_camera import image_size, viser_camera
-from .viewer_controls import Controls
-from .viewer_draw import Painter
-from .viewer_frames import Frame, FrameScheduler, Superseded, View
-from .viewer_probe import describe_reading, probe
-from .viewer_scene import Scene
-from .viewer_shapes import Shapes
+from ...neural_fields import Field, InputError, Similarity
+from ..run.settings import SHADINGS
+from .camera import describe_reading, image_size, probe, viser_camera
+from .controls import Controls
+from .frames import Frame, FrameScheduler, Superseded, View
+from .paint import Painter
+from .scene import Scene, Shapes
 
 __all__ = ["Client", "Shown"]
 

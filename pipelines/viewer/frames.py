@@ -12,7 +12,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ..datasets.cameras import Camera
+from ...datasets.cameras import Camera
 
 __all__ = ["Frame", "FrameScheduler", "Look", "Superseded", "View", "halvings_in_time"]
 

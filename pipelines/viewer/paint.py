@@ -1,9 +1,14 @@
-"""The traced image of a field, in pieces small enough to stop between them."""
+"""The traced image of a field, in pieces small enough to stop between them.
+
+The moments of a field that moves, as the viewer asks for them.
+"""
 
 from __future__ import annotations
 
 import math
+import threading
 import time
+from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cached_property
@@ -14,17 +19,17 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from ..datasets.cameras import Camera, look_at
-from ..neural_fields import Field, TextureField, map_colors
-from .render.light import load_matcap
-from .render.shade import ShadeOptions, compose, measure, shade
-from .render.trace import Seen, trace_view
-from .texture.riding import Colors, RidingColors
-from .viewer_camera import merge_strips, strips, z_buffer
-from .viewer_frames import Look
-from .viewer_time import Moments
+from ...datasets.cameras import Camera, look_at
+from ...neural_fields import Field, TextureField, map_colors
+from ...neural_fields.dynamic_tracing import moment
+from ..render.light import load_matcap
+from ..render.shade import ShadeOptions, compose, measure, shade
+from ..render.trace import Seen, trace_view
+from ..texture.riding import Colors, RidingColors
+from .camera import merge_strips, strips, z_buffer
+from .frames import Look
 
-__all__ = ["Painter"]
+__all__ = ["Moments", "Painter"]
 
 WHITE = (1.0, 1.0, 1.0)
 # Seconds between two looks at whether anybody still waits, and pixels drawn between them: at first, and at most and
@@ -156,3 +161,32 @@ def _pieces(seen: Seen, next_block: Callable[[], int]) -> Iterator[Seen]:
             color=None if seen.color is None else seen.color[part],
         )
         first = part.stop
+
+
+# Moments are small, but each has the meshes that were made of it.
+KEPT = 16
+
+
+class Moments:
+    """Three-dimensional fields by time; of a field that does not move there is one.
+
+    Args:
+        field: three- or four-dimensional.
+    """
+
+    def __init__(self, field: Field) -> None:
+        self.field, self.moves = field, field.in_dim == 4
+        self._kept: OrderedDict[float, Field] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def at(self, time: float) -> Field:
+        """The field at a time."""
+        if not self.moves:
+            return self.field
+        with self._lock:
+            if time not in self._kept:
+                self._kept[time] = moment(self.field, time)
+            self._kept.move_to_end(time)
+            while len(self._kept) > KEPT:
+                self._kept.popitem(last=False)
+            return self._kept[time]

@@ -1,0 +1,1 @@
+"""``view``: a field in the browser."""
