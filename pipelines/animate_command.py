@@ -61,8 +61,8 @@ def _animate(arguments: argparse.Namespace) -> int:
     if arguments.no_colors and arguments.colors is not None:
         raise input_error("--colors: --no-colors leaves them out; leave one of the two out")
 
+    from .evolve.animate import SequenceOptions, animate_run
     from .render.scene import Orbit
-    from .sequence import SequenceOptions, animate_run
 
     chosen = {name: getattr(arguments, name) for name in ("resolution", "shading", "samples")}
     orbit = {name: getattr(arguments, name) for name in ("up", "azimuth", "elevation", "zoom")}

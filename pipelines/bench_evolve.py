@@ -24,8 +24,8 @@ from ..neural_fields import (
     at_time,
     extract_mesh,
 )
-from .evolve import evolve
-from .evolve_checks import slope_figures
+from .evolve.checks import slope_figures
+from .evolve.train import evolve
 from .run.machine import format_table
 from .run.settings import EvolveConfig
 from .run.trainer import Progress

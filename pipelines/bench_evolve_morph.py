@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from ..neural_fields import InputError, extract_mesh, load_field
-from .evolve import evolve
-from .evolve_shapes import Placed, Placement
+from .evolve.shapes import Placed, Placement
+from .evolve.train import evolve
 from .fit.train import fit
 from .run.folder import FIELD_FILE, STATE_FILE
 from .run.machine import format_table

@@ -34,7 +34,7 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
 
 def _evolve(arguments: argparse.Namespace) -> int:
     config = _settings(arguments)
-    from .evolve import evolve
+    from .evolve.train import evolve
     from .run.folder import check_new_run
     from .run.progress import progress_bars
     from .run.trainer import Interrupted

@@ -6,8 +6,9 @@ from pathlib import Path
 import pytest
 import torch
 from mplicits.neural_fields import Similarity, Siren, Sphere, save_field
-from mplicits.pipelines import evolve_checks, evolve_problem
 from mplicits.pipelines.cli import main
+from mplicits.pipelines.evolve import checks as evolve_checks
+from mplicits.pipelines.evolve import problem as evolve_problem
 from mplicits.pipelines.run.settings import EvolveConfig
 
 BRIEF = EvolveConfig(

@@ -26,10 +26,10 @@ from mplicits.neural_fields import (
     load_field,
 )
 from mplicits.pipelines.cli import main
-from mplicits.pipelines.evolve import evolve
-from mplicits.pipelines.evolve_checks import check_evolution, slope_figures
-from mplicits.pipelines.evolve_problem import End
-from mplicits.pipelines.evolve_train import band_points
+from mplicits.pipelines.evolve.checks import check_evolution, slope_figures
+from mplicits.pipelines.evolve.problem import End
+from mplicits.pipelines.evolve.samples import band_points
+from mplicits.pipelines.evolve.train import evolve
 from mplicits.pipelines.run.config import load_config, preset_names
 from mplicits.pipelines.run.settings import EvolveConfig
 from mplicits.pipelines.run.trainer import Interrupted, Progress

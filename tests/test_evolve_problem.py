@@ -22,9 +22,9 @@ from mplicits.neural_fields import (
     save_field,
     spacetime_jet,
 )
-from mplicits.pipelines import evolve_problem
-from mplicits.pipelines.evolve_problem import between, build_problem, velocity_field
-from mplicits.pipelines.evolve_shapes import Placed, Placement, Shape, aligned, into_unit_sphere, read_shape
+from mplicits.pipelines.evolve import problem as evolve_problem
+from mplicits.pipelines.evolve.problem import between, build_problem, velocity_field
+from mplicits.pipelines.evolve.shapes import Placed, Placement, Shape, aligned, into_unit_sphere, read_shape
 from mplicits.pipelines.run.settings import EvolveConfig
 from mplicits.pipelines.surface.surface import from_mesh
 

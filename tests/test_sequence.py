@@ -33,13 +33,13 @@ from mplicits.neural_fields import (
 )
 from mplicits.neural_fields.dynamic_tracing import moment
 from mplicits.pipelines.animate_command import COMMAND
+from mplicits.pipelines.evolve.animate import SequenceOptions, animate_run, check_sequence_path, film_frames
+from mplicits.pipelines.evolve.follow import follow_mesh
 from mplicits.pipelines.mesh.extract import MeshOptions, mesh_run
 from mplicits.pipelines.render.draw import RenderOptions, render_run
 from mplicits.pipelines.run.folder import load_still
-from mplicits.pipelines.sequence import SequenceOptions, animate_run, check_sequence_path, film_frames
 from mplicits.pipelines.surface.surface import read_surface
 from mplicits.pipelines.texture.riding import RidingColors, borrowed_texture
-from mplicits.pipelines.tracked_mesh import follow_mesh
 from torch import Tensor
 
 RADIUS, DRIFT = 0.3, torch.tensor([0.5, 0.0, 0.0])

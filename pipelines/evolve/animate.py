@@ -12,23 +12,23 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ..datasets import srgb_to_linear
-from ..datasets.cameras import Camera
-from ..neural_fields import Field, InputError, Similarity, load_field
-from ..neural_fields.dynamic_tracing import DynamicTracer, moment
-from ..neural_fields.files import whole_file
-from ..neural_fields.meshing import NoSurfaceError, extract_mesh
-from ..neural_fields.tracing import BOUNDING_RADIUS
-from .mesh.files import Motion, glb_origin, write_glb, write_mesh
-from .render.film import ANIMATIONS, write_animation
-from .render.rasterise import contact_sheet, write_picture
-from .render.scene import Orbit, orbit_cameras
-from .render.shade import ShadeOptions, compose, downsample, shade
-from .render.trace import RESOLUTION, TOLERANCE, pixel_size, see_hits
-from .run.folder import find_field
-from .run.machine import choose_device
-from .texture.riding import RidingColors, borrowed_texture, start_texture
-from .tracked_mesh import follow_mesh
+from ...datasets import srgb_to_linear
+from ...datasets.cameras import Camera
+from ...neural_fields import Field, InputError, Similarity, load_field
+from ...neural_fields.dynamic_tracing import DynamicTracer, moment
+from ...neural_fields.files import whole_file
+from ...neural_fields.meshing import NoSurfaceError, extract_mesh
+from ...neural_fields.tracing import BOUNDING_RADIUS
+from ..mesh.files import Motion, glb_origin, write_glb, write_mesh
+from ..render.film import ANIMATIONS, write_animation
+from ..render.rasterise import contact_sheet, write_picture
+from ..render.scene import Orbit, orbit_cameras
+from ..render.shade import ShadeOptions, compose, downsample, shade
+from ..render.trace import RESOLUTION, TOLERANCE, pixel_size, see_hits
+from ..run.folder import find_field
+from ..run.machine import choose_device
+from ..texture.riding import RidingColors, borrowed_texture, start_texture
+from .follow import follow_mesh
 
 __all__ = ["SequenceOptions", "animate_run", "check_sequence_path", "film_frames"]
 

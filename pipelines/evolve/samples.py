@@ -9,12 +9,24 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ..neural_fields import Field, at_time, flow
-from ..neural_fields.evolution import VectorField
-from .evolve_shapes import Shape
-from .fit.samples import DOMAIN
+from ...neural_fields import Field, at_time, flow
+from ...neural_fields.evolution import VectorField
+from ..fit.samples import DOMAIN
+from .shapes import Shape
 
-__all__ = ["Bounds", "Carried", "Known", "around", "joined", "known_at", "no_bounds", "signs", "uniform"]
+__all__ = [
+    "Bounds",
+    "Carried",
+    "Known",
+    "around",
+    "band_points",
+    "joined",
+    "known_at",
+    "no_bounds",
+    "signs",
+    "uniform",
+    "uniform_spacetime",
+]
 
 FLOW_ROWS = 8192  # characteristics that are differentiated at a time
 
@@ -153,3 +165,49 @@ def joined(parts: Sequence[Known]) -> Known:
 def no_bounds() -> Bounds:
     """No samples."""
     return Bounds(torch.empty(0, 4), torch.empty(0), torch.empty(0))
+
+
+CANDIDATES = 6  # points tried for one that is near the surface
+
+
+def uniform_spacetime(count: int, generator: torch.Generator) -> Tensor:
+    """Points ``(count, 4)`` anywhere in the cube, at any time."""
+    x = uniform(count, generator)
+    return torch.cat((x, torch.rand(count, 1, generator=generator)), dim=1)
+
+
+@torch.no_grad()
+def band_points(
+    field: Field, count: int, width: float, generator: torch.Generator, *, level: int = -1, reach: float = 0.1
+) -> Tensor:
+    """Points ``(n, 4)``, about ``count`` of them, spread evenly over ``|f| < width``.
+
+    Points anywhere, of which those near the surface are moved along ∇f to a value of their own; of a residual
+    level only those in its band are kept.
+
+    Args:
+        field: four-dimensional.
+        count: about how many.
+        width: half-width of the band.
+        generator: CPU generator.
+        level: whose surface.
+        reach: how near, |f| of the coarsest level, a point must be to be moved.
+    """
+    level, device = field.resolve_level(level), field.deltas.device
+    points = uniform_spacetime(CANDIDATES * count, generator).to(device)
+    value = torch.cat([field.value(part, level=0) for part in points.split(1 << 17)])
+    points = points[value.abs() < max(reach, width)][:count]
+    value, gradient, _ = field.jet(points, level=level)
+    slope = gradient[:, :3].square().sum(dim=1).clamp(min=0.25)
+    goal = width * (2 * torch.rand(len(points), generator=generator).to(device) - 1)
+    x = points[:, :3] + ((goal - value) / slope)[:, None] * gradient[:, :3]
+    inside = x.abs().amax(dim=1) < DOMAIN
+    points = torch.cat((x, points[:, 3:]), dim=1)[inside]
+    return points[_inside(field, points, level)] if level else points
+
+
+@torch.no_grad()
+def _inside(field: Field, points: Tensor, level: int) -> Tensor:
+    """Indices of the points at which a level may be evaluated."""
+    parts = [field.in_band(part, level=level) for part in points.split(1 << 17)]
+    return torch.cat(parts).nonzero()[:, 0] if parts else torch.empty(0, dtype=torch.long)

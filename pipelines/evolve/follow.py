@@ -10,11 +10,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..neural_fields import Field, InputError, IntegrationError, Solver, flow, project_to_surface
-from ..neural_fields.carried import CarriedVelocity
-from ..neural_fields.dynamic_tracing import moment
-from ..neural_fields.meshing import NoSurfaceError, extract_mesh
-from .surface.surface import components, from_mesh
+from ...neural_fields import Field, InputError, IntegrationError, Solver, flow, project_to_surface
+from ...neural_fields.carried import CarriedVelocity
+from ...neural_fields.dynamic_tracing import moment
+from ...neural_fields.meshing import NoSurfaceError, extract_mesh
+from ..surface.surface import components, from_mesh
 
 __all__ = ["TrackedMesh", "follow_mesh"]
 

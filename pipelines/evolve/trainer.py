@@ -8,19 +8,17 @@ from collections.abc import Callable, Mapping
 import torch
 from torch import Tensor
 
-from ..neural_fields import Field, Jet, Siren, SpaceTimeSDF, key_loss, law_loss, spacetime_jet
-from ..neural_fields.losses import eikonal_loss
-from .evolve_problem import Problem
-from .evolve_samples import Known, uniform
-from .fit.samples import DOMAIN
-from .run.settings import EvolveConfig
-from .run.trainer import Progress, StopFlag, pack_training, set_rate, unpack_training
+from ...neural_fields import Jet, Siren, SpaceTimeSDF, key_loss, law_loss, spacetime_jet
+from ...neural_fields.losses import eikonal_loss
+from ..run.settings import EvolveConfig
+from ..run.trainer import Progress, StopFlag, pack_training, set_rate, unpack_training
+from .problem import Problem
+from .samples import Known, _inside, band_points, uniform_spacetime
 
-__all__ = ["EvolveTrainer", "band_points", "learn_start", "uniform_spacetime"]
+__all__ = ["EvolveTrainer", "learn_start"]
 
 REFRESH = 25  # steps after which the points near the surface are drawn anew, since it has moved
 POOL_STEPS = 6  # batches that a pool near the surface holds
-CANDIDATES = 6  # points tried for one that is near the surface
 # Norm of the gradient by the weights. Second derivatives have spikes, and a single one, at the peak of the learning
 # rate, would throw the field so far from any distance that it does not come back.
 LONGEST_GRADIENT = 1.0
@@ -172,42 +170,6 @@ class EvolveTrainer:
         self.pool = state["pool"].to(self.pool)
 
 
-def uniform_spacetime(count: int, generator: torch.Generator) -> Tensor:
-    """Points ``(count, 4)`` anywhere in the cube, at any time."""
-    x = uniform(count, generator)
-    return torch.cat((x, torch.rand(count, 1, generator=generator)), dim=1)
-
-
-@torch.no_grad()
-def band_points(
-    field: Field, count: int, width: float, generator: torch.Generator, *, level: int = -1, reach: float = 0.1
-) -> Tensor:
-    """Points ``(n, 4)``, about ``count`` of them, spread evenly over ``|f| < width``.
-
-    Points anywhere, of which those near the surface are moved along ∇f to a value of their own; of a residual
-    level only those in its band are kept.
-
-    Args:
-        field: four-dimensional.
-        count: about how many.
-        width: half-width of the band.
-        generator: CPU generator.
-        level: whose surface.
-        reach: how near, |f| of the coarsest level, a point must be to be moved.
-    """
-    level, device = field.resolve_level(level), field.deltas.device
-    points = uniform_spacetime(CANDIDATES * count, generator).to(device)
-    value = torch.cat([field.value(part, level=0) for part in points.split(1 << 17)])
-    points = points[value.abs() < max(reach, width)][:count]
-    value, gradient, _ = field.jet(points, level=level)
-    slope = gradient[:, :3].square().sum(dim=1).clamp(min=0.25)
-    goal = width * (2 * torch.rand(len(points), generator=generator).to(device) - 1)
-    x = points[:, :3] + ((goal - value) / slope)[:, None] * gradient[:, :3]
-    inside = x.abs().amax(dim=1) < DOMAIN
-    points = torch.cat((x, points[:, 3:]), dim=1)[inside]
-    return points[_inside(field, points, level)] if level else points
-
-
 def learn_start(
     known: Known, config: EvolveConfig, generator: torch.Generator, report: Callable[[Progress], None]
 ) -> SpaceTimeSDF:
@@ -234,10 +196,3 @@ def learn_start(
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
         return SpaceTimeSDF.from_static(siren)
-
-
-@torch.no_grad()
-def _inside(field: Field, points: Tensor, level: int) -> Tensor:
-    """Indices of the points at which a level may be evaluated."""
-    parts = [field.in_band(part, level=level) for part in points.split(1 << 17)]
-    return torch.cat(parts).nonzero()[:, 0] if parts else torch.empty(0, dtype=torch.long)

@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..neural_fields import (
+from ...neural_fields import (
     Box,
     Capsule,
     Field,
@@ -29,8 +29,8 @@ from ..neural_fields import (
     load_field,
     project_to_surface,
 )
-from .run.folder import find_field
-from .surface.surface import Surface, from_mesh, sample_surface
+from ..run.folder import find_field
+from ..surface.surface import Surface, from_mesh, sample_surface
 
 __all__ = ["Placed", "Placement", "Shape", "aligned", "into_unit_sphere", "read_shape"]
 

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..neural_fields import (
+from ...neural_fields import (
     Field,
     InputError,
     IntegrationError,
@@ -25,10 +25,10 @@ from ..neural_fields import (
     trajectories,
     transport,
 )
-from ..neural_fields.evolution import VectorField
-from .evolve_samples import Bounds, Carried, Known, around, joined, known_at, no_bounds, signs, uniform
-from .evolve_shapes import Placement, Shape, aligned, into_unit_sphere
-from .run.settings import EvolveConfig
+from ...neural_fields.evolution import VectorField
+from ..run.settings import EvolveConfig
+from .samples import Bounds, Carried, Known, around, joined, known_at, no_bounds, signs, uniform
+from .shapes import Placement, Shape, aligned, into_unit_sphere
 
 __all__ = ["End", "Problem", "between", "build_problem", "morph_law", "velocity_field"]
 

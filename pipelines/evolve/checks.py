@@ -10,11 +10,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..neural_fields import Field, NoSurfaceError, TimeSlice, extract_mesh
-from .evolve_problem import End
-from .evolve_train import band_points
-from .surface.measure import chamfer
-from .surface.surface import Surface, components, from_mesh, sample_surface
+from ...neural_fields import Field, NoSurfaceError, TimeSlice, extract_mesh
+from ..surface.measure import chamfer
+from ..surface.surface import Surface, components, from_mesh, sample_surface
+from .problem import End
+from .samples import band_points
 
 __all__ = ["Frame", "check_evolution", "check_frames", "end_figures", "slope_figures", "volume", "warnings"]
 

@@ -13,18 +13,27 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..neural_fields import InputError, MultiscaleSDF, Similarity, Siren, SpaceTimeSDF, save_field
-from .evolve_checks import check_evolution
-from .evolve_problem import Problem, build_problem
-from .evolve_shapes import Shape, read_shape
-from .evolve_train import EvolveTrainer, learn_start
-from .fit.samples import delta_of
-from .fit.train import RESIDUAL_GAIN
-from .run.config import load_config
-from .run.folder import FIELD_FILE, STATE_FILE, digest_of, forget_run, load_state, read_record, save_state, write_record
-from .run.machine import choose_device, environment
-from .run.settings import EvolveConfig
-from .run.trainer import Interrupted, Progress, StopFlag, stop_on_signals
+from ...neural_fields import InputError, MultiscaleSDF, Similarity, Siren, SpaceTimeSDF, save_field
+from ..fit.samples import delta_of
+from ..fit.train import RESIDUAL_GAIN
+from ..run.config import load_config
+from ..run.folder import (
+    FIELD_FILE,
+    STATE_FILE,
+    digest_of,
+    forget_run,
+    load_state,
+    read_record,
+    save_state,
+    write_record,
+)
+from ..run.machine import choose_device, environment
+from ..run.settings import EvolveConfig
+from ..run.trainer import Interrupted, Progress, StopFlag, stop_on_signals
+from .checks import check_evolution
+from .problem import Problem, build_problem
+from .shapes import Shape, read_shape
+from .trainer import EvolveTrainer, learn_start
 
 __all__ = ["Evolution", "evolve", "train_evolution"]
 

@@ -1,0 +1,1 @@
+"""``evolve`` and ``animate``: surfaces that move."""
