@@ -23,15 +23,14 @@ from .bench_reconstruct_row import EQUAL_TIME, MULTISCALE, NEUS, ReconstructRow,
 from .bench_reconstruct_scene import BenchScene
 from .bench_reconstruct_train import train_watched
 from .mesh.files import write_mesh
-from .ray_pool import RayPool
-from .reconstruct_train import SceneTrainer
-from .reconstruct_views import ViewImage, comparison_sheet, held_out, render_image
+from .reconstruct.model import RayPool, SceneModel, build_scene
+from .reconstruct.trainer import SceneTrainer
+from .reconstruct.views import ViewImage, comparison_sheet, held_out, render_image
 from .render.rasterise import write_picture
 from .run.folder import digest_of
 from .run.machine import choose_device, environment
 from .run.settings import ReconstructConfig
 from .run.trainer import Interrupted, Progress, stop_on_signals
-from .scene_model import SceneModel, build_scene
 from .surface.surface import Surface, from_mesh
 from .surface.trim import in_region
 

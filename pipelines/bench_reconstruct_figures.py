@@ -16,7 +16,7 @@ from ..neural_fields.meshing import Mesh
 from .bench_reconstruct_row import EQUAL_TIME, ReconstructRow, SurfaceFigures
 from .bench_reconstruct_scene import BenchScene
 from .bench_reconstruct_train import Watched
-from .reconstruct_views import ViewImage, measure
+from .reconstruct.views import ViewImage, measure
 from .render.rasterise import contact_sheet
 from .run.settings import ReconstructConfig
 from .surface.measure import Metrics, evaluate_surfaces

@@ -28,11 +28,10 @@ from torch.utils.flop_counter import FlopCounterMode
 from ..neural_fields import Field, Jet
 from ..neural_fields.radiance import Outside, ViewColor
 from .counting import Counted, counted
-from .ray_pool import RayPool
-from .reconstruct_train import SceneTrainer
+from .reconstruct.model import RayPool, SceneModel
+from .reconstruct.trainer import SceneTrainer
 from .run.settings import ReconstructConfig
 from .run.trainer import StopFlag
-from .scene_model import SceneModel
 
 __all__ = ["Watched", "color_flops", "jet_flops", "outside_flops", "product_counter", "train_watched", "value_flops"]
 

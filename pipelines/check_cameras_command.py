@@ -23,7 +23,7 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
 def _check_cameras(arguments: argparse.Namespace) -> int:
     check_output(arguments.out, (".glb", ".ply"))
     check_output(arguments.json, (".json",))
-    from .check_cameras import check_files
+    from .reconstruct.check import check_files
 
     _, check, text = check_files(arguments.data, arguments.out)
     print(text)

@@ -41,7 +41,7 @@ def _reconstruct(arguments: argparse.Namespace) -> int:
         None if arguments.resume else load_config(ReconstructConfig, preset or "default", flags, thing="reconstruct")
     )
     from .mesh.extract import mesh_run
-    from .reconstruct import HELD_OUT_FILE, reconstruct
+    from .reconstruct.train import HELD_OUT_FILE, reconstruct
     from .run.folder import check_new_run
     from .run.progress import progress_bars
     from .run.trainer import Interrupted

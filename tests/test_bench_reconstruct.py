@@ -26,11 +26,10 @@ from mplicits.pipelines.bench_reconstruct_train import (
     value_flops,
 )
 from mplicits.pipelines.cli import main
-from mplicits.pipelines.ray_pool import RayPool
-from mplicits.pipelines.reconstruct_train import SceneTrainer
+from mplicits.pipelines.reconstruct.model import RayPool, build_scene
+from mplicits.pipelines.reconstruct.trainer import SceneTrainer
 from mplicits.pipelines.run.settings import ReconstructConfig
 from mplicits.pipelines.run.trainer import StopFlag
-from mplicits.pipelines.scene_model import build_scene
 from mplicits.pipelines.surface.surface import from_mesh
 from mplicits.pipelines.surface.trim import in_region
 

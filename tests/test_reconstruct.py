@@ -17,10 +17,10 @@ from mplicits.datasets.synthetic.scenes import SCENES, render_scene, sample_scen
 from mplicits.datasets.views.images import PosedImages
 from mplicits.datasets.views.writing import write_neus, write_transforms
 from mplicits.neural_fields import InputError, Similarity, extract_mesh, load_field, load_texture
-from mplicits.pipelines import reconstruct_texture
 from mplicits.pipelines.cli import main
 from mplicits.pipelines.mesh.extract import MeshOptions, mesh_run
-from mplicits.pipelines.reconstruct import Reconstruction, reconstruct
+from mplicits.pipelines.reconstruct import train as reconstruct_texture
+from mplicits.pipelines.reconstruct.train import Reconstruction, reconstruct
 from mplicits.pipelines.run.config import load_config
 from mplicits.pipelines.run.settings import ReconstructConfig, TextureConfig
 from mplicits.pipelines.run.trainer import Interrupted, Progress
@@ -340,7 +340,7 @@ def test_the_command_says_how_to_go_on(
     def interrupted(*_: object, **__: object) -> None:
         raise Interrupted(stopped)
 
-    monkeypatch.setattr("mplicits.pipelines.reconstruct.reconstruct", interrupted)
+    monkeypatch.setattr("mplicits.pipelines.reconstruct.train.reconstruct", interrupted)
     assert main(["reconstruct", str(data), "-o", str(stopped), "--resume", "--quiet"]) == 130
     assert f"to continue: mplicits reconstruct {data} -o {stopped} --resume" in capsys.readouterr().err
 

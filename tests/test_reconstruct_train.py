@@ -9,12 +9,11 @@ from mplicits.datasets.synthetic.scenes import SCENES, render_scene
 from mplicits.datasets.views.images import PosedImages
 from mplicits.neural_fields import MultiscaleSDF
 from mplicits.neural_fields.sphere_start import fit_sphere
-from mplicits.pipelines import scene_model
-from mplicits.pipelines.ray_pool import RayPool
-from mplicits.pipelines.reconstruct_train import SceneTrainer
+from mplicits.pipelines.reconstruct import model as scene_model
+from mplicits.pipelines.reconstruct.model import RayPool, build_scene
+from mplicits.pipelines.reconstruct.trainer import SceneTrainer
 from mplicits.pipelines.run.settings import ReconstructConfig
 from mplicits.pipelines.run.trainer import StopFlag
-from mplicits.pipelines.scene_model import build_scene
 from torch import Tensor
 
 TINY = ReconstructConfig(

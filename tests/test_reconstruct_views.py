@@ -11,15 +11,8 @@ from mplicits.datasets.synthetic.scenes import SCENES, render_scene, render_view
 from mplicits.datasets.views.images import PosedImage
 from mplicits.neural_fields import Jet, Similarity
 from mplicits.neural_fields.volume_renderer import Sampling
-from mplicits.pipelines.reconstruct_views import (
-    ViewImage,
-    comparison_sheet,
-    held_out,
-    measure,
-    render_image,
-    target_of,
-)
-from mplicits.pipelines.scene_model import SceneModel
+from mplicits.pipelines.reconstruct.model import SceneModel
+from mplicits.pipelines.reconstruct.views import ViewImage, comparison_sheet, held_out, measure, render_image, target_of
 from torch import Tensor, nn
 
 WHITE = torch.ones(3)

@@ -8,9 +8,9 @@ import torch
 from mplicits.neural_fields import MultiscaleSDF, Sphere, ViewColor
 from mplicits.neural_fields.baselines import NeusSDF
 from mplicits.neural_fields.volume_renderer import Sampling
-from mplicits.pipelines import scene_model
+from mplicits.pipelines.reconstruct import model as scene_model
+from mplicits.pipelines.reconstruct.model import SceneModel, build_scene
 from mplicits.pipelines.run.settings import ReconstructConfig
-from mplicits.pipelines.scene_model import SceneModel, build_scene
 
 SMALL = ReconstructConfig(
     widths=(24, 16), depths=(2, 1), omegas=(10.0, 15.0), starts=(0.0, 0.5), features=4, color_width=16, color_depth=1

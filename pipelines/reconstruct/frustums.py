@@ -14,10 +14,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ..datasets.cameras import Camera
-from ..datasets.views.images import PosedImages
-from ..neural_fields.meshing import Mesh
-from .render.shade import COLOR_MAPS, map_colors
+from ...datasets.cameras import Camera
+from ...datasets.views.images import PosedImages
+from ...neural_fields.meshing import Mesh
+from ..render.shade import COLOR_MAPS, map_colors
 
 __all__ = ["camera_mesh", "frustum_size"]
 

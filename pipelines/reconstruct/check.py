@@ -16,13 +16,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ..datasets import read_cameras, srgb_to_linear
-from ..datasets.cameras import Camera
-from ..datasets.clouds.orientation import fibonacci_directions
-from ..datasets.views.images import PosedImage, PosedImages, read_posed_images
-from ..neural_fields import InputError, Similarity
+from ...datasets import read_cameras, srgb_to_linear
+from ...datasets.cameras import Camera
+from ...datasets.clouds.orientation import fibonacci_directions
+from ...datasets.views.images import PosedImage, PosedImages, read_posed_images
+from ...neural_fields import InputError, Similarity
+from ..mesh.files import write_mesh
 from .frustums import camera_mesh
-from .mesh.files import write_mesh
 
 __all__ = ["CameraCheck", "check_cameras", "check_files", "format_check"]
 

@@ -10,12 +10,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..datasets.views.images import PosedImage
-from ..neural_fields import Similarity
-from ..neural_fields.volume import sphere_span
-from ..neural_fields.volume_renderer import Sampling
-from .ray_pool import camera_rays
-from .scene_model import SceneModel
+from ...datasets.views.images import PosedImage
+from ...neural_fields import Similarity
+from ...neural_fields.volume import sphere_span
+from ...neural_fields.volume_renderer import Sampling
+from .model import SceneModel, camera_rays
 
 __all__ = ["ViewImage", "comparison_sheet", "held_out", "measure", "render_image", "target_of"]
 

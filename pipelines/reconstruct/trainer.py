@@ -8,12 +8,11 @@ from collections.abc import Callable, Mapping
 import torch
 from torch import Tensor
 
-from ..neural_fields.losses import eikonal_loss
-from ..neural_fields.volume_renderer import Sampling
-from .ray_pool import RayPool
-from .run.settings import ReconstructConfig
-from .run.trainer import StopFlag, set_rate
-from .scene_model import SceneModel
+from ...neural_fields.losses import eikonal_loss
+from ...neural_fields.volume_renderer import Sampling
+from ..run.settings import ReconstructConfig
+from ..run.trainer import StopFlag, set_rate
+from .model import RayPool, SceneModel
 
 __all__ = ["SceneTrainer"]
 

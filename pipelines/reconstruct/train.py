@@ -1,4 +1,7 @@
-"""``reconstruct``: from posed photographs to a surface with colours, by volume rendering (NeuS) of a multiscale SDF."""
+"""``reconstruct``: from posed photographs to a surface with colours, by volume rendering (NeuS) of a multiscale SDF.
+
+From colours that depend on the view to the texture of a surface, which every other command can use.
+"""
 
 from __future__ import annotations
 
@@ -10,16 +13,14 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
-from ..datasets.views.images import PosedImage, PosedImages, read_posed_images
-from ..neural_fields import InputError, NoSurfaceError, TextureField, save_field, save_texture
-from .ray_pool import RayPool
-from .reconstruct_texture import scene_texture
-from .reconstruct_train import SceneTrainer
-from .reconstruct_views import ViewImage, comparison_sheet, held_out, measure, render_image
-from .render.rasterise import write_picture
-from .run.config import load_config
-from .run.folder import (
+from ...datasets import PointCloud
+from ...datasets.views.images import PosedImage, PosedImages, read_posed_images
+from ...neural_fields import InputError, Jet, NoSurfaceError, TextureField, extract_mesh, save_field, save_texture
+from ..render.rasterise import write_picture
+from ..run.config import load_config
+from ..run.folder import (
     FIELD_FILE,
     STATE_FILE,
     TEXTURE_FILE,
@@ -30,12 +31,17 @@ from .run.folder import (
     save_state,
     write_record,
 )
-from .run.machine import choose_device, environment
-from .run.settings import ReconstructConfig
-from .run.trainer import Interrupted, Progress, stop_on_signals
-from .scene_model import SceneModel, build_scene
+from ..run.machine import choose_device, environment
+from ..run.settings import ReconstructConfig, TextureConfig
+from ..run.trainer import Interrupted, Progress, stop_on_signals
+from ..surface.surface import from_mesh, sample_surface
+from ..surface.trim import in_region
+from ..texture.train import FittedTexture, fit_texture
+from .model import RayPool, SceneModel, build_scene
+from .trainer import SceneTrainer
+from .views import ViewImage, comparison_sheet, held_out, measure, render_image
 
-__all__ = ["HELD_OUT_FILE", "PREVIEW_FILE", "Reconstruction", "reconstruct"]
+__all__ = ["HELD_OUT_FILE", "PREVIEW_FILE", "Reconstruction", "reconstruct", "scene_texture", "surface_colors"]
 
 HELD_OUT_FILE = "held_out.png"
 PREVIEW_FILE = "preview.png"
@@ -267,3 +273,46 @@ class _Reconstruction:
             "losses": trainer.losses,
             "environment": environment(self.device),
         }
+
+
+RESOLUTION = 128  # of the mesh whose points are coloured: finer than the texture's band is wide
+SAMPLES = 100_000
+BATCH = 1 << 15
+
+
+@torch.no_grad()
+def surface_colors(model: SceneModel, points: Tensor) -> Tensor:
+    """Colours ``(N, 3)`` of points ``(N, 3)`` near the surface, each seen along its normal, from outside."""
+    parts = []
+    for part in points.split(BATCH):
+        jet: Jet = model.geometry.jet(part)
+        parts.append(model.color(part, -torch.nn.functional.normalize(jet.gradient, dim=-1), jet))
+    return torch.cat(parts)
+
+
+def scene_texture(
+    model: SceneModel,
+    images: PosedImages,
+    config: ReconstructConfig,
+    *,
+    progress: Callable[[Progress], None] | None = None,
+) -> FittedTexture:
+    """Train a `TextureField` on the head-on colours of a scene's surface.
+
+    Args:
+        model: trained, on the CPU.
+        images: of it; for the coordinates and the name.
+        config: the reconstruction's; ``texture_steps``, seed and device are used.
+        progress: see `fit_texture`.
+
+    Raises:
+        NoSurfaceError: the geometry has no surface.
+    """
+    mesh = in_region(extract_mesh(model.geometry, resolution=RESOLUTION))
+    if mesh is None:
+        raise NoSurfaceError("all of it is outside the region of interest")
+    points, _ = sample_surface(from_mesh(mesh), SAMPLES, np.random.default_rng(config.seed))
+    colors = surface_colors(model, torch.from_numpy(points).float()).numpy()
+    cloud = PointCloud(images.similarity.to_input(points), colors=colors, source=str(images.source))
+    settings = TextureConfig(steps=config.texture_steps, samples=SAMPLES, seed=config.seed, device=config.device)
+    return fit_texture(model.geometry, cloud, settings, similarity=images.similarity, progress=progress)

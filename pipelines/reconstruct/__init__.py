@@ -1,0 +1,1 @@
+"""``reconstruct``: from posed photographs to a surface with colours."""

@@ -1,0 +1,200 @@
+"""What ``reconstruct`` learns: geometry, colour by direction, the surface's uncertainty, and what is behind.
+
+All pixels of some pictures, and rays drawn from them at random.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from ...datasets.views.images import PosedImage
+from ...neural_fields import Field, InputError, Jet, MultiscaleSDF, Similarity, Siren
+from ...neural_fields.baselines import NeusSDF
+from ...neural_fields.radiance import Outside, ViewColor
+from ...neural_fields.sphere_start import fit_sphere
+from ...neural_fields.volume import sphere_span
+from ...neural_fields.volume_renderer import Rendered, Sampling, render_volume
+from ..run.settings import ReconstructConfig
+
+__all__ = ["RayPool", "Rays", "SceneModel", "build_scene", "camera_rays"]
+
+# s = exp(10 v): one learning rate serves this number and the networks (NeuS begins at v = 0.3, s = 20).
+SHARPENING = 10.0
+FIRST_VARIANCE = 0.3
+
+
+class SceneModel(nn.Module):
+    """Everything that a pixel's colour depends on, in unit-sphere coordinates.
+
+    Args:
+        geometry: f.
+        color: colour of its surface.
+        outside: what is outside the unit sphere; None if nothing is.
+        background: ``(3,)`` behind everything.
+    """
+
+    def __init__(self, geometry: Field, color: ViewColor, outside: Outside | None, background: Tensor) -> None:
+        super().__init__()
+        self.geometry, self.color, self.outside = geometry, color, outside
+        self.variance = nn.Parameter(torch.tensor(FIRST_VARIANCE))
+        self.register_buffer("background", background)
+        self.background: Tensor
+
+    @property
+    def inv_std(self) -> Tensor:
+        """S of NeuS, a 0-d tensor."""
+        return (SHARPENING * self.variance).exp().clamp(max=1e6)
+
+    def widen(self, band: float, least: float) -> None:
+        """Make all bands ``band`` / s wide, but at least ``least``: as wide as the surface is unsure."""
+        if len(self.geometry.deltas):
+            self.geometry.deltas.fill_(max(band / float(self.inv_std.detach()), least))
+
+    def render(
+        self,
+        origins: Tensor,
+        directions: Tensor,
+        sampling: Sampling,
+        *,
+        cos_anneal: float = 1.0,
+        level: int = -1,
+        least_weight: float = 0.0,
+        generator: torch.Generator | None = None,
+    ) -> Rendered:
+        """`render_volume` of this scene, with colours in half precision on a GPU."""
+
+        def color(x: Tensor, direction: Tensor, jet: Jet) -> Tensor:
+            with torch.autocast(x.device.type, torch.bfloat16, enabled=x.device.type == "cuda"):
+                return self.color(x, direction, jet).float()
+
+        return render_volume(
+            self.geometry,
+            color,
+            origins,
+            directions,
+            inv_std=self.inv_std,
+            sampling=sampling,
+            cos_anneal=cos_anneal,
+            level=level,
+            background=self.background,
+            outside=self.outside,
+            least_weight=least_weight,
+            generator=generator,
+        )
+
+
+def build_scene(config: ReconstructConfig, *, has_masks: bool) -> SceneModel:
+    """An untrained scene: a sphere of unknown colour."""
+    background = config.background
+    if background == "auto":
+        background = "white" if has_masks else "outside"
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(config.seed)
+        if config.geometry == "neus":
+            geometry: Field = NeusSDF(radius=config.radius)
+            features = 256
+        else:
+            features = config.features
+            geometry = MultiscaleSDF.from_widths(
+                list(zip(config.widths, config.depths, strict=True)),
+                omegas=config.omegas,
+                deltas=[config.radius] * (len(config.widths) - 1),
+                taper=config.taper,
+                num_features=features,
+                residual_gain=0.01,
+            )
+            base = geometry.base
+            assert isinstance(base, Siren)
+            fit_sphere(base, config.radius)
+        color = ViewColor(
+            features,
+            width=config.color_width,
+            depth=config.color_depth,
+            point_frequencies=config.color_frequencies,
+        )
+        outside = Outside() if background == "outside" else None
+    return SceneModel(geometry, color, outside, torch.full((3,), float(background == "white")))
+
+
+class Rays(NamedTuple):
+    """Rays in unit-sphere coordinates, and what the pictures say about them.
+
+    Attributes:
+        origins: ``(R, 3)``.
+        directions: ``(R, 3)`` unit vectors.
+        color: ``(R, 3)`` display RGB in [0, 1].
+        mask: ``(R,)`` how much of the pixel is object; 1 everywhere if nobody said.
+    """
+
+    origins: Tensor
+    directions: Tensor
+    color: Tensor
+    mask: Tensor
+
+
+def camera_rays(view: PosedImage, similarity: Similarity) -> tuple[Tensor, Tensor]:
+    """Origins and unit directions, both ``(H · W, 3)`` float32, of a picture's pixels in unit-sphere coordinates."""
+    eye, directions = view.camera.moved(similarity).rays()
+    return eye.expand(directions.shape[:2].numel(), 3), directions.reshape(-1, 3)
+
+
+class RayPool:
+    """The pixels whose rays meet the unit sphere.
+
+    Directions are worked out when rays are drawn, from the pixel's number: of all pixels only the colours are kept.
+
+    Args:
+        views: the pictures.
+        similarity: from world to unit-sphere coordinates.
+        device: where the rays are wanted.
+
+    Raises:
+        InputError: no ray of any picture meets the region of interest.
+    """
+
+    def __init__(self, views: Sequence[PosedImage], similarity: Similarity, device: torch.device) -> None:
+        self.device, self.has_masks = device, all(view.mask is not None for view in views)
+        cameras = [view.camera.moved(similarity) for view in views]
+        self.eyes = torch.stack([camera.eye for camera in cameras]).float().to(device)
+        self.axes = torch.stack([camera.world_from_camera[:3, :3] for camera in cameras]).float().to(device)
+        lens = [camera.intrinsics[[0, 1, 0, 1], [0, 1, 2, 2]] for camera in cameras]
+        self.lens = torch.stack(lens).float().to(device)  # (V, 4): fx, fy, cx, cy
+        self.widths = torch.tensor([camera.width for camera in cameras], device=device)
+        colors, masks, pixels, owners = [], [], [], []
+        for index, view in enumerate(views):
+            near, far = sphere_span(*camera_rays(view, similarity))
+            kept = (far > near).nonzero()[:, 0]
+            pixels.append(kept.int())
+            owners.append(torch.full_like(kept, index, dtype=torch.int16))
+            # Eight bits hold what pictures hold; a pool of float32 would be four times as large.
+            colors.append(_bytes(view.color.reshape(-1, 3))[kept])
+            if self.has_masks and view.mask is not None:
+                masks.append(_bytes(view.mask.reshape(-1))[kept])
+        self.colors, self.pixels = torch.cat(colors).to(device), torch.cat(pixels).to(device)
+        self.owners = torch.cat(owners).to(device)
+        self.masks = torch.cat(masks).to(device) if masks else None
+        if not len(self.pixels):
+            raise InputError("no pixel of any picture sees the region of interest; see `mplicits check-cameras`")
+
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+    def draw(self, count: int, generator: torch.Generator) -> Rays:
+        """``count`` rays at random, with replacement."""
+        rows = torch.randint(len(self), (count,), generator=generator).to(self.device)
+        view, pixel = self.owners[rows].long(), self.pixels[rows].long()
+        fx, fy, cx, cy = self.lens[view].unbind(dim=1)
+        x, y = pixel % self.widths[view], pixel // self.widths[view]
+        seen = torch.stack(((x - cx) / fx, (y - cy) / fy, torch.ones_like(fx)), dim=1)
+        directions = torch.nn.functional.normalize(torch.einsum("rij,rj->ri", self.axes[view], seen), dim=1)
+        mask = torch.ones(count, device=self.device) if self.masks is None else self.masks[rows] / 255
+        return Rays(self.eyes[view], directions, self.colors[rows] / 255, mask)
+
+
+def _bytes(numbers: np.ndarray) -> Tensor:
+    return torch.from_numpy(np.rint(np.clip(numbers, 0, 1) * 255).astype(np.uint8))
