@@ -62,7 +62,7 @@ def _texture(arguments: argparse.Namespace) -> int:
         **shared,
     )
     full = load_config(FitConfig, arguments.fit_preset, shared) if arguments.full else None
-    from .bench_texture import bench_texture, format_texture
+    from .bench.texture import bench_texture, format_texture
     from .run.progress import progress_bars
     from .run.trainer import Interrupted
 
@@ -108,7 +108,7 @@ def _normal_map_arguments(parser: argparse.ArgumentParser) -> None:
 def _normal_map(arguments: argparse.Namespace) -> int:
     check_output(arguments.json, (".json",))
     check_output(arguments.out, (".png", ".jpg", ".jpeg"))
-    from .bench_normal_map import bench_normal_map, format_normal_map
+    from .bench.normal_map import bench_normal_map, format_normal_map
 
     rows = bench_normal_map(
         arguments.run,

@@ -30,7 +30,7 @@ def _normals_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _normals(arguments: argparse.Namespace) -> int:
     check_output(arguments.json, (".json",))
-    from .bench_normals import bench_normals, format_normals
+    from .bench.speed import bench_normals, format_normals
 
     rows = bench_normals(
         points=arguments.points, repeats=arguments.repeats, device=arguments.device, seed=arguments.seed
@@ -57,7 +57,7 @@ def _mesh_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _mesh(arguments: argparse.Namespace) -> int:
     check_output(arguments.json, (".json",))
-    from .bench_mesh import bench_mesh, format_bench_mesh
+    from .bench.speed import bench_mesh, format_bench_mesh
     from .run.machine import sgemm_rate
 
     bench = bench_mesh(
@@ -87,7 +87,7 @@ def _fit_arguments(parser: argparse.ArgumentParser) -> None:
 def _fit(arguments: argparse.Namespace) -> int:
     check_output(arguments.json, (".json",))
     config = fit_settings(arguments)
-    from .bench_fit import bench_fit, format_fit
+    from .bench.fits import bench_fit, format_fit
     from .run.progress import progress_bars
     from .run.trainer import Interrupted
 
@@ -129,7 +129,7 @@ def _render_arguments(parser: argparse.ArgumentParser) -> None:
 def _render(arguments: argparse.Namespace) -> int:
     check_output(arguments.json, (".json",))
     config = fit_settings(arguments)
-    from .bench_render import bench_render, format_render
+    from .bench.render import bench_render, format_render
     from .run.machine import choose_device, sgemm_rate
     from .run.progress import progress_bars
     from .run.trainer import Interrupted

@@ -62,9 +62,8 @@ def _evolve(arguments: argparse.Namespace) -> int:
     given = load_config(EvolveConfig, preset or own, flags, thing="evolve")
     exact = load_config(EvolveConfig, "exact", thing="evolve") if arguments.meshes else given
     from ..neural_fields import load_field
-    from .bench_dynamic import dynamic_table, format_dynamic
-    from .bench_evolve import bench_exact, format_exact
-    from .bench_evolve_morph import bench_morph, format_morph
+    from .bench.dynamic import dynamic_table, format_dynamic
+    from .bench.evolve import bench_exact, bench_morph, format_exact, format_morph
     from .run.folder import find_field
     from .run.progress import progress_bars
     from .run.trainer import Interrupted

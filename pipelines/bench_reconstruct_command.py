@@ -56,10 +56,8 @@ def _reconstruct(arguments: argparse.Namespace) -> int:
     )
     if config.time_budget is not None:
         raise input_error("--time-budget: rows are compared after as many steps; leave it out, and give --steps")
-    from .bench_reconstruct import BenchOptions, bench_reconstruct
-    from .bench_reconstruct_row import ReconstructRow
-    from .bench_reconstruct_scene import read_scene
-    from .bench_reconstruct_table import format_reconstruct
+    from .bench.reconstruct import BenchOptions, bench_reconstruct, read_scene
+    from .bench.reconstruct_rows import ReconstructRow, format_reconstruct
     from .run.machine import choose_device, sgemm_rate
     from .run.progress import progress_bars
     from .run.trainer import Interrupted

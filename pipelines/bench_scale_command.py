@@ -36,7 +36,7 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
 def _run(arguments: argparse.Namespace) -> int:
     check_output(arguments.json, (".json",))
     config = fit_settings(arguments)
-    from .bench_scale import bench_scale, format_scale
+    from .bench.fits import bench_scale, format_scale
     from .run.trainer import Interrupted
 
     try:

@@ -9,7 +9,7 @@ from hosts import Heads, NeuSHost, OldHeads, Separate, points, ray_samples, rays
 from mplicits.neural_fields import InstantNSRGeometry, MultiscaleSDF, NerfstudioField, NeuSGeometry, Siren, Sphere
 from mplicits.neural_fields.radiance import ViewColor
 from mplicits.neural_fields.volume import transmittance_weights
-from mplicits.pipelines.counting import Counted, counted
+from mplicits.pipelines.bench.speed import Counted, counted
 from torch import Tensor, nn
 from torch.nn.functional import normalize, relu
 

@@ -10,9 +10,8 @@ import torch
 import trimesh
 from evolutions import QUICK, ball, fails, few_points
 from mplicits.neural_fields import Field, Jet
-from mplicits.pipelines import bench_evolve
-from mplicits.pipelines.bench_evolve import CASES, bench_exact, format_exact, measure_exact
-from mplicits.pipelines.bench_evolve_morph import bench_morph, format_morph
+from mplicits.pipelines.bench import evolve as bench_evolve
+from mplicits.pipelines.bench.evolve import CASES, bench_exact, bench_morph, format_exact, format_morph, measure_exact
 from torch import Tensor
 
 

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mplicits.neural_fields import InputError, Similarity, Sphere, extract_mesh
-from mplicits.pipelines import bench_fit as module
-from mplicits.pipelines.bench_fit import bench_fit, format_fit
+from mplicits.pipelines.bench import fits as module
+from mplicits.pipelines.bench.fits import bench_fit, format_fit
 from mplicits.pipelines.mesh.files import write_mesh
 from mplicits.pipelines.run.settings import FitConfig
 

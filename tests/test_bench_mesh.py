@@ -1,7 +1,7 @@
 import pytest
 import torch
 from mplicits.neural_fields import InputError, MultiscaleSDF, Siren
-from mplicits.pipelines.bench_mesh import MeshBench, MeshRow, bench_mesh, format_bench_mesh
+from mplicits.pipelines.bench.speed import MeshBench, MeshRow, bench_mesh, format_bench_mesh
 
 
 def sphere_like():

@@ -20,8 +20,8 @@ from mplicits.neural_fields import (
     save_field,
 )
 from mplicits.neural_fields.checkpoint import SavedField
-from mplicits.pipelines import bench_normal_map as module
-from mplicits.pipelines.bench_normal_map import bench_normal_map, format_normal_map
+from mplicits.pipelines.bench import normal_map as module
+from mplicits.pipelines.bench.normal_map import bench_normal_map, format_normal_map
 from mplicits.pipelines.cli import main
 from mplicits.pipelines.mesh.files import write_mesh
 

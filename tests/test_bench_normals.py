@@ -5,7 +5,7 @@ from collections.abc import Callable
 import pytest
 import torch
 from mplicits.neural_fields import Siren
-from mplicits.pipelines.bench_normals import bench_normals, format_normals, printed_jet, tangent_jet
+from mplicits.pipelines.bench.speed import bench_normals, format_normals, printed_jet, tangent_jet
 from torch import Tensor
 
 

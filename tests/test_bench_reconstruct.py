@@ -11,19 +11,29 @@ from mplicits.datasets.synthetic.scenes import SCENES, render_scene
 from mplicits.neural_fields import InputError, Siren, Sphere, Union, extract_mesh
 from mplicits.neural_fields.baselines import NeusSDF
 from mplicits.neural_fields.radiance import Outside, ViewColor
-from mplicits.pipelines import bench_reconstruct as module
-from mplicits.pipelines.bench_reconstruct import BenchOptions, bench_reconstruct
-from mplicits.pipelines.bench_reconstruct_figures import surface_figures
-from mplicits.pipelines.bench_reconstruct_row import EQUAL_TIME, MULTISCALE, NEUS, ReconstructRow
-from mplicits.pipelines.bench_reconstruct_scene import BenchScene, read_scene
-from mplicits.pipelines.bench_reconstruct_table import comparisons, format_reconstruct
-from mplicits.pipelines.bench_reconstruct_train import (
+from mplicits.pipelines.bench import reconstruct as module
+from mplicits.pipelines.bench.flops import (
     color_flops,
     jet_flops,
     outside_flops,
     product_counter,
     train_watched,
     value_flops,
+)
+from mplicits.pipelines.bench.reconstruct import (
+    BenchOptions,
+    BenchScene,
+    bench_reconstruct,
+    read_scene,
+    surface_figures,
+)
+from mplicits.pipelines.bench.reconstruct_rows import (
+    EQUAL_TIME,
+    MULTISCALE,
+    NEUS,
+    ReconstructRow,
+    comparisons,
+    format_reconstruct,
 )
 from mplicits.pipelines.cli import main
 from mplicits.pipelines.reconstruct.model import RayPool, build_scene

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 from mplicits.datasets import read_cloud
-from mplicits.pipelines.bench_scale import ScaleRow, bench_scale, format_scale, write_noisy_cloud
+from mplicits.pipelines.bench.fits import ScaleRow, bench_scale, format_scale, write_noisy_cloud
 from mplicits.pipelines.run.settings import FitConfig
 from mplicits.pipelines.surface.surface import read_surface
 

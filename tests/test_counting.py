@@ -1,6 +1,6 @@
 import torch
 from fields import FIELDS, small_multiscale
-from mplicits.pipelines.counting import counted
+from mplicits.pipelines.bench.speed import counted
 
 
 def test_counters_do_not_change_the_field_and_count_only_the_bands():

@@ -11,6 +11,8 @@ import torch
 from imageio.v3 import imread
 from mplicits.datasets import read_cloud
 from mplicits.neural_fields import Box, InputError, MultiscaleSDF, Similarity, Siren, Sphere, extract_mesh
+from mplicits.pipelines.bench.cells import Cell, make_folder
+from mplicits.pipelines.bench.run import run_cell
 from mplicits.pipelines.fit.cloud import CloudDistance
 from mplicits.pipelines.fit.samples import Weights, banded_sources
 from mplicits.pipelines.fit.train import fit, prepare
@@ -24,7 +26,6 @@ from mplicits.pipelines.paper.ablations import (
     short,
 )
 from mplicits.pipelines.paper.base import Base, reviewed
-from mplicits.pipelines.paper.cell import Cell
 from mplicits.pipelines.paper.isolation import (
     ISOLATION,
     IndependentLevels,
@@ -43,7 +44,6 @@ from mplicits.pipelines.paper.levels import (
 )
 from mplicits.pipelines.paper.methods import CATALOGUE
 from mplicits.pipelines.paper.protocol import fit_config
-from mplicits.pipelines.paper.run import run_cell
 from mplicits.pipelines.paper.sheets import write_sheets
 from mplicits.pipelines.paper.speed_tables import (
     MARCHING_CUBES,
@@ -52,7 +52,6 @@ from mplicits.pipelines.paper.speed_tables import (
     marching_cubes_tables,
     normals_tables,
 )
-from mplicits.pipelines.paper.store import make_folder
 from mplicits.pipelines.surface.distance import MeshDistance, approximation_error, barycentric_of_nearest, near_surface
 from mplicits.pipelines.surface.surface import Surface, from_mesh
 

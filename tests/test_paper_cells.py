@@ -9,19 +9,17 @@ import numpy as np
 import pytest
 from mplicits.datasets import PointCloud, read_cloud
 from mplicits.neural_fields import InputError, Similarity, Sphere, extract_mesh
+from mplicits.pipelines.bench.cells import Catalogue, Cell, Findings, Method, make_folder, read_record, record_file
+from mplicits.pipelines.bench.run import Shape, cells_of, run_cell, run_cells
+from mplicits.pipelines.bench.tables import TableSpec
 from mplicits.pipelines.mesh.files import write_mesh
-from mplicits.pipelines.paper.cell import Cell
 from mplicits.pipelines.paper.judge import Judge
-from mplicits.pipelines.paper.method import Catalogue, Findings, Method
 from mplicits.pipelines.paper.methods import CATALOGUE
 from mplicits.pipelines.paper.ours import Ours, level_names
 from mplicits.pipelines.paper.peers import FromRecipe
 from mplicits.pipelines.paper.protocol import damaged_cloud, fit_config, flip_normals, oriented_cloud, protocol_of
 from mplicits.pipelines.paper.recipe import Output, Recipe
-from mplicits.pipelines.paper.run import Shape, cells_of, run_cell, run_cells
 from mplicits.pipelines.paper.shapes import find_shapes
-from mplicits.pipelines.paper.store import make_folder, read_record, record_file
-from mplicits.pipelines.paper.tables import TableSpec
 from mplicits.pipelines.run.trainer import Interrupted
 
 PLACE = Similarity((5.0, 0.0, -1.0), 20.0)

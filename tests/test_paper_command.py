@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 from mplicits.neural_fields import Similarity, Sphere, extract_mesh
+from mplicits.pipelines.bench.cells import Catalogue, Findings, Method
 from mplicits.pipelines.cli import main
 from mplicits.pipelines.mesh.files import write_mesh
 from mplicits.pipelines.paper import bench, names
 from mplicits.pipelines.paper.bench import SPECS
 from mplicits.pipelines.paper.judge import Judge
-from mplicits.pipelines.paper.method import Catalogue, Findings, Method
 from mplicits.pipelines.paper.methods import CATALOGUE, METHODS
 from mplicits.pipelines.render.rasterise import iio
 

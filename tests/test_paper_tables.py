@@ -10,16 +10,8 @@ import re
 
 import mplicits.pipelines.paper
 import pytest
-from mplicits.pipelines.paper.comparison import (
-    banf_tables,
-    comparison_tables,
-    noise_plots,
-    noise_tables,
-    poisson_tables,
-)
-from mplicits.pipelines.paper.plots import Plot, Series, across, ticks, to_svg, up
-from mplicits.pipelines.paper.published import BANF, COMPARISON, NOISE
-from mplicits.pipelines.paper.report import (
+from mplicits.pipelines.bench.plots import Plot, Series, across, ticks, to_svg, up
+from mplicits.pipelines.bench.report import (
     Section,
     as_csv,
     as_dict,
@@ -30,6 +22,15 @@ from mplicits.pipelines.paper.report import (
     section_from_dict,
     with_missing,
 )
+from mplicits.pipelines.bench.tables import Column, Row, Table, mean, median, printed_name, ratio, select
+from mplicits.pipelines.paper.comparison import (
+    banf_tables,
+    comparison_tables,
+    noise_plots,
+    noise_tables,
+    poisson_tables,
+)
+from mplicits.pipelines.paper.published import BANF, COMPARISON, NOISE
 from mplicits.pipelines.paper.robustness import (
     delta_tables,
     outlier_plots,
@@ -37,7 +38,6 @@ from mplicits.pipelines.paper.robustness import (
     shortened,
     undertrained_tables,
 )
-from mplicits.pipelines.paper.tables import Column, Row, Table, mean, median, printed_name, ratio, select
 
 
 def record(shape, method, chamfers, *, iou=0.9, deltas=(), **cell):

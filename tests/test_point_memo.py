@@ -11,7 +11,7 @@ import torch
 from fields import small_multiscale
 from hosts import points
 from mplicits.neural_fields import Field, Jet, NeuSGeometry, Siren
-from mplicits.pipelines.counting import Counted
+from mplicits.pipelines.bench.speed import Counted
 from torch import Tensor
 
 

@@ -6,7 +6,7 @@ from fields import FIELDS
 from mplicits.neural_fields import Field, Jet, MultiscaleSDF, Sampling, Siren, Sphere, ViewColor, render_volume
 from mplicits.neural_fields.volume import sphere_span
 from mplicits.neural_fields.volume_renderer import sample_depths
-from mplicits.pipelines.counting import counted
+from mplicits.pipelines.bench.speed import counted
 from torch import Tensor
 
 

@@ -13,22 +13,21 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ...neural_fields import MultiscaleSDF, Similarity
+from ..bench.cells import Cell, Findings, Method, Record, Report, Workplace
+from ..bench.plots import Plot, Series
+from ..bench.tables import Column, Row, Table, TableSpec, Value, mean, select, shapes_of
 from ..fit.cloud import CloudDistance
 from ..fit.samples import Weights, banded_sources
 from ..run.settings import FitConfig
 from ..surface.distance import Float64, MeshDistance, approximation_error, near_surface
 from .base import base_cell, base_of
-from .cell import Cell, Record, Report
 from .judge import reference_of
 from .levels import delta_after, generator_for, train_level, up_to
-from .method import Findings, Method, Workplace
 from .ours import Ours, our_config
-from .plots import Plot, Series
 from .published_ablations import ABL_DELTA, ABL_GRAD, ABL_NORMAL, ABL_SDF
-from .tables import Column, Row, Table, TableSpec, Value, mean, select, shapes_of
 
 if TYPE_CHECKING:
-    from .cell import Preset
+    from ..bench.cells import Preset
 
 __all__ = [
     "DELTA_FACTOR",

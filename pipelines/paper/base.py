@@ -11,13 +11,12 @@ import torch
 
 from ...datasets import OrientedCloud
 from ...neural_fields import Field, MultiscaleSDF, Similarity, load_field
+from ..bench.cells import Cell, Workplace
 from ..fit.cloud import CloudDistance
 from ..fit.train import prepare, review_points
 from ..run.folder import find_field
 from ..run.settings import FitConfig
-from .cell import Cell
 from .levels import up_to
-from .method import Workplace
 from .ours import Ours, our_config
 from .protocol import damaged_cloud
 

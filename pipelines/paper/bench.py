@@ -14,22 +14,21 @@ from typing import Any
 import torch
 
 from ...neural_fields.files import write_json, write_whole
+from ..bench.cells import Cell, Preset, Record, make_folder
+from ..bench.plots import to_svg
+from ..bench.report import Section, as_csv, as_page, section_as_dict, section_from_dict, with_missing
+from ..bench.run import Ran, Shape, cells_of, kept_records, run_cells
+from ..bench.tables import TableSpec
 from ..run.machine import choose_device, sgemm_rate
 from .ablations import DELTA_FACTOR, LOSS_WEIGHTS
-from .cell import Cell, Preset, Record
 from .comparison import BANF_TABLE, COMPARISON_TABLE, NOISE_TABLE, POISSON_TABLE
 from .isolation import ISOLATION
 from .methods import CATALOGUE
 from .names import METHODS, TABLES
-from .plots import to_svg
 from .protocol import protocol_of
-from .report import Section, as_csv, as_page, section_as_dict, section_from_dict, with_missing
 from .robustness import DELTAS_TABLE, OUTLIERS_TABLE, UNDERTRAINED_TABLE
-from .run import Ran, Shape, cells_of, kept_records, run_cells
 from .sheets import write_sheets
 from .speed_tables import MARCHING_CUBES, NORMALS
-from .store import make_folder
-from .tables import TableSpec
 
 __all__ = ["SPECS", "Bench", "bench_paper"]
 

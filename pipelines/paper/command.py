@@ -51,11 +51,11 @@ def _paper(arguments: argparse.Namespace) -> int:
     tables = TABLES if "all" in asked else _known("--table", asked, TABLES, more=("all",))
     methods = METHODS if arguments.methods is None else _known("--methods", _words(arguments.methods), METHODS)
     (preset,) = _known("--preset", [arguments.preset], PRESETS)
+    from ..bench.cells import make_folder
+    from ..bench.report import as_markdown, section_as_dict
     from ..run.trainer import Interrupted
     from .bench import PAGE, Bench, bench_paper
-    from .report import as_markdown, section_as_dict
     from .shapes import find_shapes
-    from .store import make_folder
 
     make_folder(arguments.out)
     bench = Bench(

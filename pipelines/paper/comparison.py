@@ -6,11 +6,9 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from .cell import Cell, Record
-from .names import METHODS
-from .plots import Plot, Series
-from .published import BANF, COMPARISON, NOISE, POISSON
-from .tables import (
+from ..bench.cells import Cell, Record
+from ..bench.plots import Plot, Series
+from ..bench.tables import (
     Column,
     Row,
     Table,
@@ -27,9 +25,11 @@ from .tables import (
     select,
     shapes_of,
 )
+from .names import METHODS
+from .published import BANF, COMPARISON, NOISE, POISSON
 
 if TYPE_CHECKING:
-    from .cell import Preset
+    from ..bench.cells import Preset
 
 __all__ = ["BANF_TABLE", "COMPARISON_TABLE", "NOISE_TABLE", "POISSON_TABLE"]
 

@@ -17,9 +17,10 @@ import torch
 from torch import Tensor, nn
 
 from ...neural_fields import Field, Jet, MultiscaleSDF, NoSurfaceError, extract_mesh
+from ..bench.cells import Cell, Findings, Method, Record, Report, Workplace
+from ..bench.tables import Column, Row, Table, TableSpec, Value, mean, median, select, shapes_of
 from ..fit.samples import banded_sources
 from .base import Base, base_cell, base_of
-from .cell import Cell, Record, Report
 from .judge import Judge
 from .levels import (
     delta_after,
@@ -30,13 +31,11 @@ from .levels import (
     up_to,
     without_bands,
 )
-from .method import Findings, Method, Workplace
 from .ours import Ours
 from .protocol import protocol_of
-from .tables import Column, Row, Table, TableSpec, Value, mean, median, select, shapes_of
 
 if TYPE_CHECKING:
-    from .cell import Preset
+    from ..bench.cells import Preset
 
 __all__ = ["ISOLATION", "TAB_ISOLATION", "IndependentLevels", "Isolation", "isolation_tables", "steepness"]
 

@@ -12,13 +12,12 @@ import torch
 from ...datasets import orbit
 from ...neural_fields import Field, Similarity, sphere_trace
 from ...neural_fields.meshing import Mesh, NoSurfaceError, extract_mesh
+from ..bench.cells import Cell, Workplace
 from ..mesh.files import write_mesh
 from ..render.rasterise import picture_of, write_picture
 from ..surface.measure import evaluate_surfaces
 from ..surface.surface import Surface, from_mesh, read_reference
 from ..surface.trim import Support, drop_unsupported
-from .cell import Cell
-from .method import Workplace
 from .protocol import protocol_of
 
 __all__ = ["STEEP", "Judge", "reference_of"]

@@ -9,13 +9,13 @@ from collections.abc import Sequence
 import torch
 
 from ...neural_fields import Field, MultiscaleSDF, Siren
+from ..bench.cells import Report
 from ..fit.cloud import CloudDistance
 from ..fit.level import LevelTrainer
 from ..fit.samples import Source, Weights, band_of, distance_samples, surface_samples, with_previous
 from ..fit.train import RESIDUAL_GAIN
 from ..run.settings import FitConfig
 from ..run.trainer import Progress, StopFlag
-from .cell import Report
 
 __all__ = [
     "delta_after",

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from ..bench.cells import Catalogue, Method
 from .ablations import DeltaFactor, LossWeights
 from .isolation import Isolation
-from .method import Catalogue, Method
 from .ours import Ours
 from .peers import FromRecipe, Poisson
 from .protocol import protocol_of

@@ -9,13 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from ...neural_fields import MultiscaleSDF, load_field
+from ..bench.cells import Cell, Findings, Method, Workplace
 from ..fit.train import Run, fit
 from ..run.folder import FIELD_FILE, RECORD_FILE, STATE_FILE, is_fitted, read_record
 from ..run.settings import FitConfig
 from ..surface.trim import read_support
-from .cell import Cell
 from .judge import Judge
-from .method import Findings, Method, Workplace
 from .protocol import damaged_cloud, fit_config
 
 __all__ = ["Ours", "level_names", "our_config"]

@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 
 from ...neural_fields.meshing import Mesh
-from ..poisson import has_poisson, screened_poisson
-from .cell import Cell
+from ..bench.cells import Cell, Findings, Method, Workplace
+from ..bench.fits import has_poisson, screened_poisson
 from .judge import Judge
-from .method import Findings, Method, Workplace
 from .protocol import oriented_cloud, protocol_of
 from .recipe import Recipe
 

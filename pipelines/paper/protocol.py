@@ -13,12 +13,12 @@ import numpy as np
 
 from ...datasets import OrientedCloud, PointCloud, add_noise, add_outliers, prepare_cloud, read_cloud
 from ...neural_fields import InputError
+from ..bench.cells import Cell
 from ..run.config import load_config
 from ..run.settings import FitConfig
-from .cell import Cell
 
 if TYPE_CHECKING:
-    from .cell import Preset
+    from ..bench.cells import Preset
 
 __all__ = ["Protocol", "damaged_cloud", "fit_config", "flip_normals", "oriented_cloud", "protocol_of"]
 

@@ -13,8 +13,8 @@ from torch import Tensor, nn
 
 from ...datasets import OrientedCloud
 from ...neural_fields import Field
+from ..bench.cells import Preset, Report
 from ..run.trainer import Progress
-from .cell import Preset, Report
 
 __all__ = ["Output", "Recipe", "Trained", "cosine", "count", "descend", "finished", "seeded"]
 

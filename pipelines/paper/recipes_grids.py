@@ -14,8 +14,8 @@ from ...datasets import OrientedCloud
 from ...neural_fields import Field
 from ...neural_fields.baselines import BandLimited, BanfSDF, HashGridSDF
 from ...neural_fields.losses import data_loss, eikonal_loss
+from ..bench.cells import Preset, Report
 from ..fit.samples import DOMAIN
-from .cell import Preset, Report
 from .grid_training import SignedPools, differences, mape_loss, stencil
 from .recipe import Output, Recipe, cosine, count, descend, finished, seeded
 

@@ -6,26 +6,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .cell import Cell, Record
+from ..bench.cells import Cell, Record
+from ..bench.plots import Plot, Series
+from ..bench.tables import Column, Row, Table, TableSpec, Value, figure, printed_name, ratio, select, shapes_of
 from .comparison import NOISE_LEVEL
-from .plots import Plot, Series
 from .protocol import fit_config
 from .published import DELTAS, OUTLIERS, UNDERTRAINED
-from .tables import (
-    Column,
-    Row,
-    Table,
-    TableSpec,
-    Value,
-    figure,
-    printed_name,
-    ratio,
-    select,
-    shapes_of,
-)
 
 if TYPE_CHECKING:
-    from .cell import Preset
+    from ..bench.cells import Preset
 
 __all__ = ["DELTAS_TABLE", "OUTLIERS_TABLE", "UNDERTRAINED_TABLE"]
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from ...neural_fields import InputError
 from ...neural_fields.files import files_in
+from ..bench.run import Shape
 from ..surface.surface import MESH_SUFFIXES, read_reference, read_surface
-from .run import Shape
 
 __all__ = ["find_shapes"]
 

@@ -10,11 +10,10 @@ import imageio.v3 as iio
 import numpy as np
 
 from ...datasets import orbit
+from ..bench.cells import Cell, Record, Workplace
 from ..render.rasterise import Image, contact_sheet, picture_of, write_picture
 from ..surface.surface import from_cloud
-from .cell import Cell, Record
 from .judge import reference_of
-from .method import Workplace
 from .protocol import damaged_cloud, protocol_of
 
 __all__ = ["in_rows", "write_sheets"]

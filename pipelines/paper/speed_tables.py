@@ -11,17 +11,16 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from ...neural_fields import Field, Siren, extract_mesh
-from ..bench_normals import bench_normals
+from ..bench.cells import Cell, Findings, Method, Record, Workplace
+from ..bench.speed import bench_normals
+from ..bench.tables import Column, Row, Table, TableSpec, Value, select
 from .base import base_cell, base_of
-from .cell import Cell, Record
 from .levels import without_bands
-from .method import Findings, Method, Workplace
 from .ours import Ours
 from .protocol import protocol_of
-from .tables import Column, Row, Table, TableSpec, Value, select
 
 if TYPE_CHECKING:
-    from .cell import Preset
+    from ..bench.cells import Preset
 
 __all__ = [
     "MARCHING_CUBES",

@@ -25,13 +25,13 @@ import torch
 from torch import Tensor, nn
 from torch.utils.flop_counter import FlopCounterMode
 
-from ..neural_fields import Field, Jet
-from ..neural_fields.radiance import Outside, ViewColor
-from .counting import Counted, counted
-from .reconstruct.model import RayPool, SceneModel
-from .reconstruct.trainer import SceneTrainer
-from .run.settings import ReconstructConfig
-from .run.trainer import StopFlag
+from ...neural_fields import Field, Jet
+from ...neural_fields.radiance import Outside, ViewColor
+from ..reconstruct.model import RayPool, SceneModel
+from ..reconstruct.trainer import SceneTrainer
+from ..run.settings import ReconstructConfig
+from ..run.trainer import StopFlag
+from .speed import Counted, counted
 
 __all__ = ["Watched", "color_flops", "jet_flops", "outside_flops", "product_counter", "train_watched", "value_flops"]
 

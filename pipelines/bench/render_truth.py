@@ -10,13 +10,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..datasets.cameras import Camera
-from ..neural_fields import Field, InputError, cone_starts, sphere_trace
-from ..neural_fields.meshing import Mesh, NoSurfaceError, extract_mesh
-from .render.rasterise import mesh_view
-from .render.shade import shade
-from .render.trace import Seen
-from .surface.surface import Surface, from_mesh
+from ...datasets.cameras import Camera
+from ...neural_fields import Field, InputError, cone_starts, sphere_trace
+from ...neural_fields.meshing import Mesh, NoSurfaceError, extract_mesh
+from ..render.rasterise import mesh_view
+from ..render.shade import shade
+from ..render.trace import Seen
+from ..surface.surface import Surface, from_mesh
 
 __all__ = ["Agreement", "Truth"]
 

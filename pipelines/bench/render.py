@@ -12,18 +12,18 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..datasets import orbit, read_cloud
-from ..datasets.cameras import Camera
-from ..neural_fields import Field, MultiscaleSDF, Siren, load_field
-from ..neural_fields.tracing import BOUNDING_RADIUS
-from .bench_render_truth import Agreement, Truth
-from .counting import counted
-from .fit.train import fit
-from .render.trace import Seen, trace_view
-from .run.folder import FIELD_FILE, STATE_FILE
-from .run.machine import format_table
-from .run.settings import FitConfig
-from .run.trainer import Progress
+from ...datasets import orbit, read_cloud
+from ...datasets.cameras import Camera
+from ...neural_fields import Field, MultiscaleSDF, Siren, load_field
+from ...neural_fields.tracing import BOUNDING_RADIUS
+from ..fit.train import fit
+from ..render.trace import Seen, trace_view
+from ..run.folder import FIELD_FILE, STATE_FILE
+from ..run.machine import format_table
+from ..run.settings import FitConfig
+from ..run.trainer import Progress
+from .render_truth import Agreement, Truth
+from .speed import counted
 
 __all__ = ["NETWORKS", "RenderRow", "bench_render", "fit_networks", "format_render"]
 

@@ -15,9 +15,7 @@ import torch
 from ..run.jobs import Outcome, check_jobs, run_jobs
 from ..run.machine import choose_device, environment
 from ..run.trainer import Interrupted
-from .cell import Cell, Preset, Record, Report
-from .method import Catalogue, Workplace
-from .store import read_record, write_record
+from .cells import Catalogue, Cell, Preset, Record, Report, Workplace, read_record, write_record
 from .tables import TableSpec
 
 __all__ = ["Ran", "Shape", "cells_of", "kept_records", "run_cell", "run_cells"]
@@ -66,7 +64,7 @@ def run_cell(
         progress: called now and then with how far the training is.
 
     Returns:
-        See `mplicits.pipelines.paper.tables`.
+        See `mplicits.pipelines.bench.tables`.
 
     Raises:
         InputError: the cloud cannot be read or used. Whatever a method raises is kept as the record's "error", and

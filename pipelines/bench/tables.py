@@ -17,11 +17,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from .cell import Cell, Record
+from .cells import Cell, Record
 from .plots import Plot
 
 if TYPE_CHECKING:
-    from .cell import Preset
+    from .cells import Preset
 
 __all__ = [
     "Column",

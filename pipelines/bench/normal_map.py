@@ -14,16 +14,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..datasets import Camera, turntable
-from ..neural_fields import Field, InputError, MultiscaleSDF, load_field
-from ..neural_fields.meshing import NoSurfaceError, extract_mesh, map_normals
-from .render.compare import ImageError, draw, image_error, psnr
-from .render.rasterise import check_picture_path, contact_sheet, mesh_view, write_picture
-from .render.shade import ShadeOptions, compose, shade
-from .render.trace import Seen, trace_view
-from .run.folder import find_field
-from .run.machine import choose_device, format_table
-from .surface.surface import Surface, from_mesh, read_reference
+from ...datasets import Camera, turntable
+from ...neural_fields import Field, InputError, MultiscaleSDF, load_field
+from ...neural_fields.meshing import NoSurfaceError, extract_mesh, map_normals
+from ..render.compare import ImageError, draw, image_error, psnr
+from ..render.rasterise import check_picture_path, contact_sheet, mesh_view, write_picture
+from ..render.shade import ShadeOptions, compose, shade
+from ..render.trace import Seen, trace_view
+from ..run.folder import find_field
+from ..run.machine import choose_device, format_table
+from ..surface.surface import Surface, from_mesh, read_reference
 
 __all__ = ["NormalMapRow", "bench_normal_map", "format_normal_map"]
 

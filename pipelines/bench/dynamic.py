@@ -10,14 +10,13 @@ from typing import Any
 import numpy as np
 from skimage.measure import marching_cubes
 
-from ..datasets.cameras import Camera, orbit
-from ..neural_fields import Field, Hits, SpaceTimeSDF, extract_mesh, sphere_trace
-from ..neural_fields.dynamic_tracing import DynamicTracer, moment
-from ..neural_fields.meshing import DEFAULT_BOUNDS
-from .bench_mesh import evaluate_slabs
-from .counting import counted
-from .render.trace import RESOLUTION, TOLERANCE, pixel_size, trace_hits
-from .run.machine import format_table
+from ...datasets.cameras import Camera, orbit
+from ...neural_fields import Field, Hits, SpaceTimeSDF, extract_mesh, sphere_trace
+from ...neural_fields.dynamic_tracing import DynamicTracer, moment
+from ...neural_fields.meshing import DEFAULT_BOUNDS
+from ..render.trace import RESOLUTION, TOLERANCE, pixel_size, trace_hits
+from ..run.machine import format_table
+from .speed import counted, evaluate_slabs
 
 __all__ = ["DynamicRow", "dynamic_table", "format_dynamic"]
 

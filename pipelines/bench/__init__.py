@@ -1,0 +1,1 @@
+"""``bench …``: what things cost and how near they come, beside peers in the same run."""
