@@ -10,15 +10,8 @@ from mplicits.datasets import prepare_cloud, sample_sphere
 from mplicits.neural_fields import Field, Jet, Plane, Siren, Sphere, Torus, extract_mesh, sphere_trace
 from mplicits.neural_fields.baselines import BandLimited, BanfSDF, HashGridSDF
 from mplicits.neural_fields.baselines.hash_grid import grid_resolutions, spatial_hash
-from mplicits.pipelines.paper.grid_training import SignedPools, differences, mape_loss, stencil
-from mplicits.pipelines.paper.recipe import Recipe
-from mplicits.pipelines.paper.recipes_grids import (
-    NGP_COARSE,
-    NGP_FINE,
-    BanfRecipe,
-    GridSettings,
-    InstantNgpRecipe,
-)
+from mplicits.pipelines.paper.grids import NGP_COARSE, NGP_FINE, BanfRecipe, GridSettings, InstantNgpRecipe
+from mplicits.pipelines.paper.recipe import Recipe, SignedPools, differences, mape_loss, stencil
 from mplicits.pipelines.run.trainer import Progress
 from scipy.interpolate import RegularGridInterpolator
 

@@ -11,8 +11,7 @@ from mplicits.neural_fields import Field, Jet, Siren, extract_mesh, sphere_trace
 from mplicits.neural_fields.baselines import BaconSDF, IdfSDF
 from mplicits.neural_fields.baselines.idf import attenuation
 from mplicits.pipelines.fit.cloud import CloudDistance
-from mplicits.pipelines.paper.recipe import Recipe, descend
-from mplicits.pipelines.paper.recipes_networks import (
+from mplicits.pipelines.paper.networks import (
     BACON_PRESETS,
     IDF_PRESETS,
     SIREN_PRESETS,
@@ -27,6 +26,7 @@ from mplicits.pipelines.paper.recipes_networks import (
     laplacian_samples,
     siren_loss,
 )
+from mplicits.pipelines.paper.recipe import Recipe, descend
 from mplicits.pipelines.run.trainer import Progress
 
 # The contract, over the fields below in place of those of the common table, whose levels are nested in bands.

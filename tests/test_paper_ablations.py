@@ -25,7 +25,17 @@ from mplicits.pipelines.paper.ablations import (
     loss_weight_tables,
     short,
 )
-from mplicits.pipelines.paper.base import Base, reviewed
+from mplicits.pipelines.paper.base import (
+    Base,
+    delta_after,
+    domain_sources,
+    generator_for,
+    on_its_own,
+    reviewed,
+    train_level,
+    up_to,
+    without_bands,
+)
 from mplicits.pipelines.paper.isolation import (
     ISOLATION,
     IndependentLevels,
@@ -33,25 +43,10 @@ from mplicits.pipelines.paper.isolation import (
     residuals_everywhere,
     steepness,
 )
-from mplicits.pipelines.paper.levels import (
-    delta_after,
-    domain_sources,
-    generator_for,
-    on_its_own,
-    train_level,
-    up_to,
-    without_bands,
-)
+from mplicits.pipelines.paper.judge import fit_config
 from mplicits.pipelines.paper.methods import CATALOGUE
-from mplicits.pipelines.paper.protocol import fit_config
 from mplicits.pipelines.paper.sheets import write_sheets
-from mplicits.pipelines.paper.speed_tables import (
-    MARCHING_CUBES,
-    NORMALS,
-    grid_seconds,
-    marching_cubes_tables,
-    normals_tables,
-)
+from mplicits.pipelines.paper.speed import MARCHING_CUBES, NORMALS, grid_seconds, marching_cubes_tables, normals_tables
 from mplicits.pipelines.surface.distance import MeshDistance, approximation_error, barycentric_of_nearest, near_surface
 from mplicits.pipelines.surface.surface import Surface, from_mesh
 

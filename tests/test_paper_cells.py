@@ -13,13 +13,11 @@ from mplicits.pipelines.bench.cells import Catalogue, Cell, Findings, Method, ma
 from mplicits.pipelines.bench.run import Shape, cells_of, run_cell, run_cells
 from mplicits.pipelines.bench.tables import TableSpec
 from mplicits.pipelines.mesh.files import write_mesh
-from mplicits.pipelines.paper.judge import Judge
+from mplicits.pipelines.paper.bench import find_shapes
+from mplicits.pipelines.paper.judge import Judge, damaged_cloud, fit_config, flip_normals, oriented_cloud, protocol_of
 from mplicits.pipelines.paper.methods import CATALOGUE
-from mplicits.pipelines.paper.ours import Ours, level_names
-from mplicits.pipelines.paper.peers import FromRecipe
-from mplicits.pipelines.paper.protocol import damaged_cloud, fit_config, flip_normals, oriented_cloud, protocol_of
+from mplicits.pipelines.paper.ours import FromRecipe, Ours, level_names
 from mplicits.pipelines.paper.recipe import Output, Recipe
-from mplicits.pipelines.paper.shapes import find_shapes
 from mplicits.pipelines.run.trainer import Interrupted
 
 PLACE = Similarity((5.0, 0.0, -1.0), 20.0)

@@ -17,7 +17,7 @@ from mplicits.pipelines.fit.samples import (
     offset_samples,
     with_previous,
 )
-from mplicits.pipelines.paper.levels import train_level
+from mplicits.pipelines.paper.base import train_level
 from mplicits.pipelines.run.settings import FitConfig
 from torch import Tensor
 

@@ -20,11 +20,10 @@ from ..fit.cloud import CloudDistance
 from ..fit.samples import Weights, banded_sources
 from ..run.settings import FitConfig
 from ..surface.distance import Float64, MeshDistance, approximation_error, near_surface
-from .base import base_cell, base_of
+from .base import base_cell, base_of, delta_after, generator_for, train_level, up_to
 from .judge import reference_of
-from .levels import delta_after, generator_for, train_level, up_to
 from .ours import Ours, our_config
-from .published_ablations import ABL_DELTA, ABL_GRAD, ABL_NORMAL, ABL_SDF
+from .published import ABL_DELTA, ABL_GRAD, ABL_NORMAL, ABL_SDF
 
 if TYPE_CHECKING:
     from ..bench.cells import Preset

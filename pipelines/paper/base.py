@@ -1,8 +1,13 @@
-"""The finished fit that the variants of a table start from: a cell of our own method, shared with every other table."""
+"""The finished fit that the variants of a table start from: a cell of our own method, shared with every other table.
+
+Single levels trained out of the usual order: what the ablations need of a fit, from the same pieces as the fit.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,17 +15,31 @@ import numpy as np
 import torch
 
 from ...datasets import OrientedCloud
-from ...neural_fields import Field, MultiscaleSDF, Similarity, load_field
-from ..bench.cells import Cell, Workplace
+from ...neural_fields import Field, MultiscaleSDF, Similarity, Siren, load_field
+from ..bench.cells import Cell, Report, Workplace
 from ..fit.cloud import CloudDistance
-from ..fit.train import prepare, review_points
+from ..fit.level import LevelTrainer
+from ..fit.samples import Source, Weights, band_of, distance_samples, surface_samples, with_previous
+from ..fit.train import RESIDUAL_GAIN, prepare, review_points
 from ..run.folder import find_field
 from ..run.settings import FitConfig
-from .levels import up_to
+from ..run.trainer import Progress, StopFlag
+from .judge import damaged_cloud
 from .ours import Ours, our_config
-from .protocol import damaged_cloud
 
-__all__ = ["Base", "base_cell", "base_of", "reviewed"]
+__all__ = [
+    "Base",
+    "base_cell",
+    "base_of",
+    "delta_after",
+    "domain_sources",
+    "generator_for",
+    "on_its_own",
+    "reviewed",
+    "train_level",
+    "up_to",
+    "without_bands",
+]
 
 
 @dataclass(frozen=True)
@@ -80,3 +99,94 @@ def reviewed(cloud: OrientedCloud, coarse: Field, config: FitConfig) -> Oriented
     turned = np.where(found.turned[:, None], -cloud.normals, cloud.normals)
     colors = None if cloud.colors is None else cloud.colors[kept]
     return dataclasses.replace(cloud, points=cloud.points[kept], normals=turned[kept], colors=colors)
+
+
+def up_to(field: MultiscaleSDF, level: int) -> MultiscaleSDF:
+    """The levels of a field up to and with ``level``, shared, not copied."""
+    return MultiscaleSDF(field.base, list(field.residuals)[:level], field.deltas[:level])  # pyright: ignore[reportArgumentType]
+
+
+def without_bands(field: MultiscaleSDF) -> MultiscaleSDF:
+    """The plain sum of a field's levels, everywhere."""
+    deltas = torch.full_like(field.deltas, math.inf)
+    return MultiscaleSDF(field.base, list(field.residuals), deltas)  # pyright: ignore[reportArgumentType]
+
+
+@torch.no_grad()
+def delta_after(index: CloudDistance, previous: Field, config: FitConfig) -> float:
+    """Half-width of the band around the finest level of ``previous`` (Eq. 5)."""
+    points = torch.from_numpy(index.points).to(previous.like.device)
+    values = torch.cat([previous.value(part) for part in points.split(1 << 18)]).cpu()
+    return band_of(values, epsilon=config.epsilon, quantile=config.quantile).delta
+
+
+def domain_sources(
+    index: CloudDistance, previous: MultiscaleSDF, config: FitConfig, *, generator: torch.Generator
+) -> list[Source]:
+    """What a residual learns from on the whole domain: distances everywhere, as level 0 of the fit does."""
+    everywhere, device = without_bands(previous), previous.like.device
+    spread = distance_samples(index, config.samples, generator=generator)
+    surface, domain = (with_previous(s, everywhere, math.inf, device=device) for s in (surface_samples(index), spread))
+    assert surface.value is not None
+    data, normal, eikonal = Weights().resolved(config, surface.value, index.noise)
+    half = config.batch // 2
+    return [
+        Source("surface", surface, half, data, normal, eikonal),
+        Source("domain", domain, half, data * config.domain_weight, 0.0, eikonal),
+    ]
+
+
+def on_its_own(sources: Sequence[Source]) -> list[Source]:
+    """The same samples for a level that is no residual: what the levels before say is taken out."""
+    return [
+        dataclasses.replace(source, samples=dataclasses.replace(source.samples, value=None, gradient=None))
+        for source in sources
+    ]
+
+
+def train_level(
+    level: int,
+    sources: Sequence[Source],
+    config: FitConfig,
+    *,
+    generator: torch.Generator,
+    residual: bool = True,
+    progress: Report | None = None,
+    stage: str = "",
+) -> Siren:
+    """Train one new SIREN as level ``level`` of the fit would be, from the same start.
+
+    Args:
+        level: whose width, depth, frequency, steps and learning rate in ``config``.
+        sources: what it learns from.
+        config: settings of the fit.
+        generator: draws the batches.
+        residual: whether it starts small, as what is added to others does.
+        progress: told now and then.
+        stage: name for ``progress``.
+    """
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(config.seed * 1009 + level)
+        gain = RESIDUAL_GAIN if residual else 1.0
+        network = Siren(config.widths[level], config.depths[level], omega=config.omegas[level], output_gain=gain)
+    network = network.to(sources[0].samples.points.device)
+    trainer = LevelTrainer(
+        network,
+        sources,
+        steps=config.steps[level],
+        learning_rate=config.learning_rates[level],
+        seconds=None,
+        generator=generator,
+    )
+
+    def report(trainer: LevelTrainer) -> None:
+        if progress is not None:
+            progress(Progress(stage or f"level {level}", trainer.step, trainer.steps, trainer.fraction, trainer.losses))
+
+    trainer.run(StopFlag(), report=report, save=lambda _: None)
+    return network.requires_grad_(False)
+
+
+def generator_for(config: FitConfig, level: int) -> torch.Generator:
+    """The generator that the fit draws a level's samples and batches with."""
+    return torch.Generator().manual_seed(config.seed * 1009 + level)

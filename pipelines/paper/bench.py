@@ -1,4 +1,7 @@
-"""``mplicits bench paper``: the cells that the tables need, then the tables, plots, sheets and the page of results."""
+"""``mplicits bench paper``: the cells that the tables need, then the tables, plots, sheets and the page of results.
+
+Which shapes a bench is about: files, and folders full of them, checked before any work.
+"""
 
 from __future__ import annotations
 
@@ -13,24 +16,26 @@ from typing import Any
 
 import torch
 
-from ...neural_fields.files import write_json, write_whole
+from ...neural_fields import InputError
+from ...neural_fields.files import files_in, write_json, write_whole
 from ..bench.cells import Cell, Preset, Record, make_folder
 from ..bench.plots import to_svg
 from ..bench.report import Section, as_csv, as_page, section_as_dict, section_from_dict, with_missing
 from ..bench.run import Ran, Shape, cells_of, kept_records, run_cells
 from ..bench.tables import TableSpec
 from ..run.machine import choose_device, sgemm_rate
+from ..surface.surface import MESH_SUFFIXES, read_reference, read_surface
 from .ablations import DELTA_FACTOR, LOSS_WEIGHTS
 from .comparison import BANF_TABLE, COMPARISON_TABLE, NOISE_TABLE, POISSON_TABLE
 from .isolation import ISOLATION
+from .judge import protocol_of
 from .methods import CATALOGUE
 from .names import METHODS, TABLES
-from .protocol import protocol_of
 from .robustness import DELTAS_TABLE, OUTLIERS_TABLE, UNDERTRAINED_TABLE
 from .sheets import write_sheets
-from .speed_tables import MARCHING_CUBES, NORMALS
+from .speed import MARCHING_CUBES, NORMALS
 
-__all__ = ["SPECS", "Bench", "bench_paper"]
+__all__ = ["SPECS", "Bench", "bench_paper", "find_shapes"]
 
 # In the order of `names.TABLES`; a test holds the two together.
 SPECS: tuple[TableSpec, ...] = (
@@ -225,3 +230,45 @@ def _processor() -> str:
     lines = info.read_text(encoding="utf-8").splitlines() if info.is_file() else []
     names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
     return names[0] if names else platform.processor() or platform.machine()
+
+
+def find_shapes(paths: Sequence[str | Path], *, reference: Path | None = None) -> list[Shape]:
+    """The shapes that files and folders name.
+
+    Args:
+        paths: mesh files, folders (of which every mesh counts), or clouds if there is a reference.
+        reference: the mesh that those without faces are measured against.
+
+    Raises:
+        InputError: there is no such file, a folder holds no mesh, a file holds no faces and there is no reference,
+            or two files have the same name but for their folders and extensions.
+    """
+    files = [file for path in map(Path, paths) for file in _files(path)]
+    stems: dict[str, Path] = {}
+    for file in files:
+        other = stems.setdefault(file.stem, file)
+        if other is not file:
+            raise InputError(f"{file}: {other} has the same name, which is how tables tell shapes apart; rename one")
+    if reference is not None:
+        read_reference(reference, fix="give another --reference")
+    shapes = [_shape(file, reference) for file in files]
+    if reference is not None and all(shape.reference is None for shape in shapes):
+        raise InputError(f"--reference {reference}: every shape is a mesh, its own reference; leave it out")
+    return shapes
+
+
+def _files(path: Path) -> list[Path]:
+    if not path.is_dir():
+        return [path]
+    found = [file for file in files_in(path, MESH_SUFFIXES) if file.is_file()]
+    if not found:
+        raise InputError(f"{path}: holds no mesh ({', '.join(MESH_SUFFIXES)}); name files, or another folder")
+    return found
+
+
+def _shape(file: Path, reference: Path | None) -> Shape:
+    if len(read_surface(file).faces):
+        return Shape(file)
+    if reference is None:
+        raise InputError(f"{file}: has no faces, so there is no surface to compare with; give --reference MESH")
+    return Shape(file, reference)

@@ -54,8 +54,7 @@ def _paper(arguments: argparse.Namespace) -> int:
     from ..bench.cells import make_folder
     from ..bench.report import as_markdown, section_as_dict
     from ..run.trainer import Interrupted
-    from .bench import PAGE, Bench, bench_paper
-    from .shapes import find_shapes
+    from .bench import PAGE, Bench, bench_paper, find_shapes
 
     make_folder(arguments.out)
     bench = Bench(

@@ -20,9 +20,10 @@ from ...neural_fields import Field, Jet, MultiscaleSDF, NoSurfaceError, extract_
 from ..bench.cells import Cell, Findings, Method, Record, Report, Workplace
 from ..bench.tables import Column, Row, Table, TableSpec, Value, mean, median, select, shapes_of
 from ..fit.samples import banded_sources
-from .base import Base, base_cell, base_of
-from .judge import Judge
-from .levels import (
+from .base import (
+    Base,
+    base_cell,
+    base_of,
     delta_after,
     domain_sources,
     generator_for,
@@ -31,8 +32,8 @@ from .levels import (
     up_to,
     without_bands,
 )
+from .judge import Judge, protocol_of
 from .ours import Ours
-from .protocol import protocol_of
 
 if TYPE_CHECKING:
     from ..bench.cells import Preset

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from ..bench.cells import Catalogue, Method
 from .ablations import DeltaFactor, LossWeights
+from .grids import BanfRecipe, InstantNgpRecipe
 from .isolation import Isolation
-from .ours import Ours
-from .peers import FromRecipe, Poisson
-from .protocol import protocol_of
-from .recipes_grids import BanfRecipe, InstantNgpRecipe
-from .recipes_networks import BaconRecipe, IdfRecipe, SirenRecipe
-from .speed_tables import MarchingCubes, Normals
+from .judge import protocol_of
+from .networks import BaconRecipe, IdfRecipe, SirenRecipe
+from .ours import FromRecipe, Ours, Poisson
+from .speed import MarchingCubes, Normals
 
 __all__ = ["CATALOGUE", "METHODS"]
 

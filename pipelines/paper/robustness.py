@@ -10,7 +10,7 @@ from ..bench.cells import Cell, Record
 from ..bench.plots import Plot, Series
 from ..bench.tables import Column, Row, Table, TableSpec, Value, figure, printed_name, ratio, select, shapes_of
 from .comparison import NOISE_LEVEL
-from .protocol import fit_config
+from .judge import fit_config
 from .published import DELTAS, OUTLIERS, UNDERTRAINED
 
 if TYPE_CHECKING:

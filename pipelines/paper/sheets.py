@@ -13,8 +13,7 @@ from ...datasets import orbit
 from ..bench.cells import Cell, Record, Workplace
 from ..render.rasterise import Image, contact_sheet, picture_of, write_picture
 from ..surface.surface import from_cloud
-from .judge import reference_of
-from .protocol import damaged_cloud, protocol_of
+from .judge import damaged_cloud, protocol_of, reference_of
 
 __all__ = ["in_rows", "write_sheets"]
 

@@ -16,8 +16,19 @@ from ...neural_fields.baselines import BandLimited, BanfSDF, HashGridSDF
 from ...neural_fields.losses import data_loss, eikonal_loss
 from ..bench.cells import Preset, Report
 from ..fit.samples import DOMAIN
-from .grid_training import SignedPools, differences, mape_loss, stencil
-from .recipe import Output, Recipe, cosine, count, descend, finished, seeded
+from .recipe import (
+    Output,
+    Recipe,
+    SignedPools,
+    cosine,
+    count,
+    descend,
+    differences,
+    finished,
+    mape_loss,
+    seeded,
+    stencil,
+)
 
 __all__ = ["BanfRecipe", "BanfSettings", "GridSettings", "InstantNgpRecipe", "NgpSettings"]
 

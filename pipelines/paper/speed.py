@@ -14,10 +14,9 @@ from ...neural_fields import Field, Siren, extract_mesh
 from ..bench.cells import Cell, Findings, Method, Record, Workplace
 from ..bench.speed import bench_normals
 from ..bench.tables import Column, Row, Table, TableSpec, Value, select
-from .base import base_cell, base_of
-from .levels import without_bands
+from .base import base_cell, base_of, without_bands
+from .judge import protocol_of
 from .ours import Ours
-from .protocol import protocol_of
 
 if TYPE_CHECKING:
     from ..bench.cells import Preset
