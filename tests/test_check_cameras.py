@@ -13,10 +13,10 @@ from mplicits.datasets.synthetic.scenes import SCENES, render_scene
 from mplicits.datasets.views.images import PosedImage
 from mplicits.datasets.views.writing import write_colmap, write_neus, write_transforms
 from mplicits.neural_fields import Similarity
-from mplicits.pipelines.cli import main
+from mplicits.pipelines.cli.main import main
+from mplicits.pipelines.cli.views import SCENE_NAMES
 from mplicits.pipelines.reconstruct.check import check_cameras, check_files
 from mplicits.pipelines.reconstruct.frustums import camera_mesh, frustum_size
-from mplicits.pipelines.scene_command import SCENE_NAMES
 from mplicits.pipelines.surface.surface import read_surface
 
 WRITERS = {"neus": write_neus, "transforms": write_transforms, "colmap": write_colmap}

@@ -11,8 +11,8 @@ import mplicits.datasets
 import mplicits.neural_fields
 import mplicits.pipelines
 import pytest
-from mplicits.pipelines import cli
-from mplicits.pipelines.commands import COMMANDS
+from mplicits.pipelines.cli import main as cli
+from mplicits.pipelines.cli.commands import COMMANDS
 
 ROOT = Path(__file__).parent.parent
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]

@@ -12,8 +12,8 @@ import torch
 from mplicits.datasets import PointCloud
 from mplicits.neural_fields import InputError, load_field
 from mplicits.neural_fields.meshing import extract_mesh
+from mplicits.pipelines.cli.info import describe
 from mplicits.pipelines.fit.train import fit
-from mplicits.pipelines.info import describe
 from mplicits.pipelines.run.folder import read_record
 from mplicits.pipelines.run.machine import choose_device
 from mplicits.pipelines.run.settings import FitConfig

@@ -32,7 +32,7 @@ from mplicits.neural_fields import (
     save_texture,
 )
 from mplicits.neural_fields.dynamic_tracing import moment
-from mplicits.pipelines.animate_command import COMMAND
+from mplicits.pipelines.cli.draw import ANIMATE as COMMAND
 from mplicits.pipelines.evolve.animate import SequenceOptions, animate_run, check_sequence_path, film_frames
 from mplicits.pipelines.evolve.follow import follow_mesh
 from mplicits.pipelines.mesh.extract import MeshOptions, mesh_run

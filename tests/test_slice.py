@@ -22,6 +22,7 @@ from mplicits.neural_fields import (
     Union,
     save_field,
 )
+from mplicits.pipelines.cli.draw import SLICE as COMMAND
 from mplicits.pipelines.render.legend import with_legend
 from mplicits.pipelines.render.slice import (
     FINEST,
@@ -39,7 +40,6 @@ from mplicits.pipelines.render.slice import (
     take_slice,
 )
 from mplicits.pipelines.render.slicing import SliceOptions, slice_run
-from mplicits.pipelines.slice_command import COMMAND
 
 ACROSS_Z = {"origin": (0.0, 0.0, 0.0), "u": (1.0, 0.0, 0.0), "v": (0.0, 1.0, 0.0)}
 INK = np.array(FINEST) * 255

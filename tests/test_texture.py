@@ -23,6 +23,7 @@ from mplicits.neural_fields import (
     map_colors,
     save_field,
 )
+from mplicits.pipelines.cli.train import TEXTURE as COMMAND
 from mplicits.pipelines.run.config import load_config
 from mplicits.pipelines.run.folder import TEXTURE_FILE, texture_state_file
 from mplicits.pipelines.run.progress import _Lines
@@ -31,7 +32,6 @@ from mplicits.pipelines.run.trainer import Progress
 from mplicits.pipelines.texture import train as texture_module
 from mplicits.pipelines.texture.samples import read_colors
 from mplicits.pipelines.texture.train import default_delta, fit_texture, texture_of, texture_run
-from mplicits.pipelines.texture_command import COMMAND
 from numpy.typing import NDArray
 
 SMALL = TextureConfig(

@@ -410,7 +410,7 @@ def test_ctrl_c_ends_the_command_cleanly(tmp_path):
     save_field(tmp_path / "small.safetensors", Siren(8, 1))
     program = (
         "import argparse, sys\n"
-        "from mplicits.pipelines.view_command import COMMAND\n"
+        "from mplicits.pipelines.cli.draw import COMMAND\n"
         "parser = argparse.ArgumentParser()\n"
         "COMMAND.add_arguments(parser)\n"
         "sys.exit(COMMAND.run(parser.parse_args()))\n"

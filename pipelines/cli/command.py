@@ -1,4 +1,7 @@
-"""What a command of the command line is, and the checks that several of them share."""
+"""What a command of the command line is, and the checks that several of them share.
+
+The settings of a fit on the command line: a preset or a file, and a flag for every field.
+"""
 
 from __future__ import annotations
 
@@ -8,9 +11,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from .run.config import input_error
+from ..run.config import add_config_flags, given_flags, input_error, load_config, preset_names
+from ..run.settings import FitConfig
 
-__all__ = ["Command", "add_json", "check_output", "positive", "whole", "write_json"]
+__all__ = [
+    "Command",
+    "add_fit_settings",
+    "add_json",
+    "check_output",
+    "fit_settings",
+    "positive",
+    "were_given",
+    "whole",
+    "write_json",
+]
 
 
 @dataclass(frozen=True)
@@ -84,6 +98,29 @@ def write_json(path: Path | None, data: Any) -> None:
     """Write figures through a temporary file beside the target; nothing without a path."""
     if path is None:
         return
-    from ..neural_fields import files  # here: it loads torch
+    from ...neural_fields import files
 
     files.write_json(path, data)
+
+
+def add_fit_settings(parser: argparse.ArgumentParser) -> None:
+    """Add ``--preset``, ``--config`` and one flag per field of `FitConfig`."""
+    source = parser.add_mutually_exclusive_group()
+    source.add_argument("--preset", metavar="NAME", help=f"one of {', '.join(preset_names('fit'))} (default: default)")
+    source.add_argument("--config", type=Path, metavar="FILE", help="a YAML file of settings")
+    add_config_flags(parser, FitConfig)
+
+
+def fit_settings(arguments: argparse.Namespace) -> FitConfig:
+    """What the arguments say.
+
+    Raises:
+        InputError: see `load_config`.
+    """
+    source = arguments.config or arguments.preset or "default"
+    return load_config(FitConfig, source, given_flags(arguments, FitConfig), thing="fit")
+
+
+def were_given(arguments: argparse.Namespace) -> bool:
+    """Whether any setting was given."""
+    return bool(arguments.config or arguments.preset or given_flags(arguments, FitConfig))

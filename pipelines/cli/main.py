@@ -14,8 +14,8 @@ import sys
 from collections.abc import Sequence
 from typing import NoReturn
 
+from ..run.config import closest
 from .commands import COMMANDS, Command
-from .run.config import closest
 
 __all__ = ["main"]
 
@@ -92,7 +92,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
     except ValueError as error:
-        from ..neural_fields import InputError
+        from ...neural_fields import InputError
 
         if not isinstance(error, InputError):
             raise

@@ -13,7 +13,7 @@ from typing import Literal
 
 import torch
 
-from .run.machine import sgemm_rate
+from ..run.machine import sgemm_rate
 
 __all__ = ["Finding", "examine", "format_findings"]
 

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from ..neural_fields import MultiscaleSDF, Siren, load_field
-from .run.folder import RECORD_FILE, find_field, is_field
-from .surface.surface import Surface, components, is_closed, read_surface
+from ...neural_fields import MultiscaleSDF, Siren, load_field
+from ..run.folder import RECORD_FILE, find_field, is_field
+from ..surface.surface import Surface, components, is_closed, read_surface
 
 __all__ = ["describe"]
 

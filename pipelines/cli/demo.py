@@ -12,19 +12,19 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from ..datasets import STATUE_PLACEMENT, Camera, PointCloud, Statue, orbit, read_cloud, statue_scan, write_cloud_ply
-from ..neural_fields import Field, InputError, Similarity
-from ..neural_fields.meshing import Mesh, NoSurfaceError, extract_mesh
-from .fit.train import Run, fit
-from .mesh.files import write_mesh
-from .render.rasterise import contact_sheet, picture_of, write_picture
-from .render.shade import ShadeOptions, compose, shade
-from .render.trace import trace_view
-from .run.config import load_config
-from .run.machine import format_table
-from .run.progress import progress_bars
-from .run.settings import FitConfig
-from .surface.surface import from_cloud, from_mesh
+from ...datasets import STATUE_PLACEMENT, Camera, PointCloud, Statue, orbit, read_cloud, statue_scan, write_cloud_ply
+from ...neural_fields import Field, InputError, Similarity
+from ...neural_fields.meshing import Mesh, NoSurfaceError, extract_mesh
+from ..fit.train import Run, fit
+from ..mesh.files import write_mesh
+from ..render.rasterise import contact_sheet, picture_of, write_picture
+from ..render.shade import ShadeOptions, compose, shade
+from ..render.trace import trace_view
+from ..run.config import load_config
+from ..run.machine import format_table
+from ..run.progress import progress_bars
+from ..run.settings import FitConfig
+from ..surface.surface import from_cloud, from_mesh
 
 __all__ = ["demo", "distances_to_surface", "draw_levels", "spread_colors"]
 

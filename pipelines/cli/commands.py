@@ -12,19 +12,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
 
-from .animate_command import COMMAND as ANIMATE
-from .bench_commands import BENCH_COMMANDS
-from .check_cameras_command import COMMAND as CHECK_CAMERAS
-from .command import Command, add_json, check_output, positive, whole
-from .evolve_command import COMMAND as EVOLVE
-from .fit_command import COMMAND as FIT
-from .fit_settings import add_fit_settings, fit_settings, were_given
-from .reconstruct_command import COMMAND as RECONSTRUCT
-from .render_command import COMMAND as RENDER
-from .scene_command import COMMAND as SCENE
-from .slice_command import COMMAND as SLICE
-from .texture_command import COMMAND as TEXTURE
-from .view_command import COMMAND as VIEW
+from .bench import BENCH_COMMANDS
+from .command import Command, add_fit_settings, add_json, check_output, fit_settings, positive, were_given, whole
+from .draw import ANIMATE, RENDER, SLICE, VIEW
+from .fit import COMMAND as FIT
+from .train import EVOLVE, RECONSTRUCT, TEXTURE
+from .views import CHECK_CAMERAS, SCENE
 
 __all__ = ["COMMANDS", "Command"]
 
@@ -65,7 +58,7 @@ def _mesh_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _mesh(arguments: argparse.Namespace) -> int:
-    from .mesh.extract import MeshOptions, mesh_run
+    from ..mesh.extract import MeshOptions, mesh_run
 
     started = time.monotonic()
     options = MeshOptions(
@@ -97,7 +90,7 @@ def _evaluate_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _evaluate(arguments: argparse.Namespace) -> int:
     check_output(arguments.json, (".json",))
-    from .surface.measure import evaluate_files, format_metrics, write_metrics
+    from ..surface.measure import evaluate_files, format_metrics, write_metrics
 
     metrics = evaluate_files(arguments.mesh, arguments.reference, samples=arguments.samples, seed=arguments.seed)
     print(format_metrics(metrics))
@@ -133,7 +126,7 @@ def _sample_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _sample(arguments: argparse.Namespace) -> int:
     check_output(arguments.out, (".ply",))
-    from ..datasets import statue_scan, write_cloud_ply
+    from ...datasets import statue_scan, write_cloud_ply
 
     cloud = statue_scan(seed=arguments.seed)
     write_cloud_ply(arguments.out, cloud)

@@ -1,21 +1,62 @@
-"""``mplicits scene``: exact posed images, to try things on."""
+"""``mplicits check-cameras``: its arguments, and where figures and warnings go.
+
+``mplicits scene``: exact posed images, to try things on.
+"""
 
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 
-from .command import Command, whole
-from .run.progress import counter_bar
+from ..run.progress import counter_bar
+from .command import Command, add_json, check_output, whole, write_json
 
-__all__ = ["COMMAND"]
+__all__ = ["CHECK_CAMERAS", "SCENE"]
+
+
+def _check_arguments(parser: argparse.ArgumentParser) -> None:
+    what = (
+        "folder or file: cameras_sphere.npz with image/ and mask/, transforms.json, or COLMAP's sparse/0 with images/"
+    )
+    parser.add_argument("data", metavar="DATA", help=what)
+    parser.add_argument("-o", "--out", type=Path, metavar="FILE", help=".glb or .ply: the cameras, to look at")
+    add_json(parser)
+
+
+def _check_cameras(arguments: argparse.Namespace) -> int:
+    check_output(arguments.out, (".glb", ".ply"))
+    check_output(arguments.json, (".json",))
+    from ..reconstruct.check import check_files
+
+    _, check, text = check_files(arguments.data, arguments.out)
+    print(text)
+    if arguments.out is not None:
+        print(f"{arguments.out}: frustums from violet (first) to yellow (last), the region's sphere, the world's axes")
+    for warning in check.warnings:
+        print(f"warning: {warning}", file=sys.stderr)
+    write_json(arguments.json, check.record())
+    return 0
+
+
+CHECK_CAMERAS = Command(
+    "look at the cameras of posed photographs, and check them",
+    """  mplicits check-cameras photos
+  mplicits check-cameras photos/transforms.json -o cameras.glb
+  mplicits check-cameras dtu_scan24 -o cameras.ply --json cameras.json""",
+    _check_arguments,
+    _check_cameras,
+    "Print where the cameras of a data set stand and what they see of the region of interest, warn of what is usually "
+    "wrong (conventions, regions, masks), and write the cameras as a mesh in world coordinates.",
+)
+
 
 SCENE_NAMES = ("painted-sphere", "striped-torus", "figure", "statue")
 FORMATS = ("neus", "transforms", "colmap", "colmap-text")
 TRUTH = "surface.ply"
 
 
-def _arguments(parser: argparse.ArgumentParser) -> None:
+def _scene_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("name", metavar="NAME", choices=SCENE_NAMES, help=", ".join(SCENE_NAMES))
     parser.add_argument("-o", "--out", required=True, type=Path, metavar="DIR", help="a folder that is not there yet")
     what = "neus (cameras_sphere.npz), transforms (.json of nerfstudio), colmap or colmap-text (neus)"
@@ -30,9 +71,9 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _scene(arguments: argparse.Namespace) -> int:
-    from ..datasets.synthetic.scenes import SCENES, render_scene, scene_mesh
-    from ..datasets.views.writing import check_new_folder, write_colmap, write_neus, write_transforms
-    from .mesh.files import write_mesh
+    from ...datasets.synthetic.scenes import SCENES, render_scene, scene_mesh
+    from ...datasets.views.writing import check_new_folder, write_colmap, write_neus, write_transforms
+    from ..mesh.files import write_mesh
 
     folder = check_new_folder(arguments.out)
     scene = SCENES[arguments.name]()
@@ -58,12 +99,12 @@ def _scene(arguments: argparse.Namespace) -> int:
     return 0
 
 
-COMMAND = Command(
+SCENE = Command(
     "write posed images of an exact synthetic scene",
     """  mplicits scene painted-sphere -o sphere
   mplicits scene figure -o figure --format transforms --views 40 --size 200
   mplicits scene statue -o statue --format colmap --shaded""",
-    _arguments,
+    _scene_arguments,
     _scene,
     "Draw a shape whose surface and colours are known in closed form from cameras all around it, and write images, "
     "masks and cameras as a data set, with the true surface beside them.",

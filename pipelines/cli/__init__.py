@@ -1,0 +1,1 @@
+"""The command line. Its files load what a command needs when it runs; none loads torch on import."""

@@ -1,0 +1,389 @@
+"""``mplicits fit``: its arguments, and the checks before any work.
+
+The flags of ``mplicits fit`` that are about depth maps.
+
+``mplicits fit --mesh``: after the fit, the texture of its own colours, and the mesh with them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import sys
+import time
+from collections.abc import Callable
+from contextlib import nullcontext
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ...datasets import read_cloud
+from ...neural_fields import InputError, Similarity
+from ...neural_fields.meshing import Mesh
+from ..fit.depth import DepthInput, trim_suggestion
+from ..mesh.extract import MeshOptions, mesh_run
+from ..mesh.files import check_mesh_path
+from ..run.config import input_error
+from ..run.folder import CLOUD_FILE, TEXTURE_FILE, kept_cloud, read_record, texture_state_file
+from ..run.settings import TextureConfig
+from ..run.trainer import Progress
+from ..texture.samples import has_colors
+from ..texture.train import FittedTexture, texture_run
+from .command import Command, add_fit_settings, fit_settings, positive, were_given, whole
+from .train import tell_texture
+
+__all__ = ["COMMAND", "FitMesh", "add_depth_flags", "depth_input", "plan_mesh"]
+
+if TYPE_CHECKING:
+    from ..fit.depth import DepthInput
+    from ..fit.many import FitOutcome
+    from ..run.settings import FitConfig
+
+
+def _arguments(parser: argparse.ArgumentParser) -> None:
+    what = "PLY, OBJ, STL, OFF, XYZ, TXT, CSV, NPY, NPZ, LAS or LAZ file; a depth map, or a folder of them"
+    parser.add_argument("clouds", nargs="+", metavar="CLOUD", help=f"{what}; several clouds get a run each, RUN/NAME")
+    parser.add_argument("-o", "--out", required=True, type=Path, metavar="RUN", help="directory of the run, or runs")
+    parser.add_argument(
+        "--jobs", type=whole(1), metavar="N", help="several clouds: so many at a time; above 1 needs mplicits[ray]"
+    )
+    parser.add_argument(
+        "--mesh",
+        type=Path,
+        metavar="FILE",
+        help="then learn the colours, if there are any, and write the mesh (.ply, .obj, .stl, .glb)",
+    )
+    parser.add_argument("--no-colors", action="store_true", help="leave the colours out of --mesh")
+    begin = parser.add_mutually_exclusive_group()
+    begin.add_argument("--resume", action="store_true", help="continue the interrupted run in RUN, with its settings")
+    begin.add_argument("--force", action="store_true", help="overwrite the run in RUN")
+    parser.add_argument("--quiet", action="store_true", help="no progress bars")
+    add_fit_settings(parser)
+    add_depth_flags(parser)
+
+
+def _fit(arguments: argparse.Namespace) -> int:
+    if arguments.resume and were_given(arguments):
+        raise input_error("--resume: continues with the run's own settings; leave out --preset, --config and the rest")
+    if arguments.no_colors and arguments.mesh is None:
+        raise input_error("--no-colors: is about --mesh FILE; leave it out, or add that")
+    config = None if arguments.resume else fit_settings(arguments)
+    if len(arguments.clouds) > 1 or arguments.jobs is not None:
+        return _fit_many(arguments, config)
+    arguments.cloud = arguments.clouds[0]
+    from ..run.team import team
+
+    with team(device="auto" if config is None else config.device) as leads:
+        return _fit_one(arguments, config) if leads else _follow(arguments, config)
+
+
+def _fit_one(arguments: argparse.Namespace, config: FitConfig | None) -> int:
+    from ..fit.depth import fit_depth, trim_suggestion
+    from ..fit.train import fit
+    from ..run.folder import check_new_run, is_fitted
+    from ..run.machine import peak_memory
+    from ..run.progress import progress_bars
+    from ..run.trainer import Interrupted
+    from .info import describe
+
+    directory, depth = arguments.out, depth_input(arguments)
+    # A run that was interrupted after its fit goes on there.
+    fitted = arguments.resume and arguments.mesh is not None and is_fitted(directory)
+    if not fitted:
+        check_new_run(directory, resume=arguments.resume, force=arguments.force)
+    mesh = _planned(arguments, depth)
+    again = f"to continue: mplicits fit {arguments.cloud} -o {directory} --resume"
+    if mesh is not None:
+        again += f" --mesh {mesh.out}" + " --no-colors" * arguments.no_colors
+    texture = None
+    try:
+        with nullcontext() if arguments.quiet else progress_bars() as report:
+            if not fitted and depth is None:
+                fit(arguments.cloud, config, out=directory, resume=arguments.resume, progress=report)
+            elif not fitted and depth is not None:
+                fit_depth(depth, config, out=directory, resume=arguments.resume, progress=report, say=print)
+            if mesh is not None:
+                texture = mesh.texture(refit=not fitted, progress=report)
+    except Interrupted:
+        print(f"interrupted; {again}", file=sys.stderr)
+        return 130
+    print(describe(directory))
+    memory = peak_memory()
+    if memory is not None:
+        print(f"  peak memory  {memory / 2**20:,.0f} MiB")
+    # A depth map shows one side of things; what the fit closes behind it is no part of them.
+    trim = "" if depth is None else f" --trim-distance {trim_suggestion(directory):.2g}"
+    if mesh is None:
+        print(f"next: mplicits mesh {directory} -o {directory / 'mesh.ply'}{trim}")
+        return 0
+    if texture is not None:
+        from ..run.folder import TEXTURE_FILE
+
+        tell_texture(directory / TEXTURE_FILE, texture)
+        if not texture.record["finished"]:
+            print(f"interrupted; the texture holds what was learnt so far; {again}", file=sys.stderr)
+            return 130
+    started = time.monotonic()
+    try:
+        made = mesh.extract(say=print)
+    except KeyboardInterrupt:
+        print(f"interrupted; fit and texture are finished; {again}", file=sys.stderr)
+        return 130
+    facts = [f"{len(made.vertices):,} vertices", f"{len(made.faces):,} faces"]
+    facts += ["with colours"] * mesh.colored + ([trim.strip()] if trim else [])
+    print(f"{mesh.out}: {', '.join(facts)}, in {time.monotonic() - started:.1f} s")
+    return 0
+
+
+def _follow(arguments: argparse.Namespace, config: FitConfig | None) -> int:
+    """Help the process that does the rest; see `team`."""
+    from ..fit.train import fit
+    from ..run.trainer import Interrupted
+
+    if depth_input(arguments) is not None:
+        raise input_error(f"{arguments.cloud}: depth maps are fitted by one process; leave out torchrun")
+    try:
+        fit(arguments.cloud, config, out=arguments.out, resume=arguments.resume)
+    except Interrupted:
+        return 130
+    return 0
+
+
+def _fit_many(arguments: argparse.Namespace, config: FitConfig | None) -> int:
+    """A run for each cloud; a failed one leaves the others alone, and exit code 1."""
+    if arguments.mesh is not None:
+        raise input_error("--mesh: is for one cloud; leave it out, and mesh the runs afterwards")
+    for cloud in arguments.clouds:
+        if depth_input(argparse.Namespace(**{**vars(arguments), "cloud": cloud})) is not None:
+            raise input_error(f"{cloud}: holds depth maps; fit them on their own, without --jobs")
+    from ..fit.many import fit_many, format_fits, plan_fits
+    from ..run.jobs import check_jobs
+    from ..run.progress import progress_bars
+    from ..run.trainer import Interrupted
+
+    jobs = arguments.jobs or 1
+    check_jobs(jobs)
+    planned = plan_fits(arguments.clouds, arguments.out, config, resume=arguments.resume, force=arguments.force)
+    try:
+        with nullcontext() if arguments.quiet or jobs > 1 else progress_bars() as show:
+            outcomes = fit_many(
+                planned,
+                arguments.out,
+                jobs=jobs,
+                progress=None if show is None else lambda name, step: show(replace(step, stage=f"{name} {step.stage}")),
+                report=None if arguments.quiet or jobs == 1 else _tell_outcome,
+            )
+    except (Interrupted, KeyboardInterrupt):
+        clouds = " ".join(arguments.clouds)
+        again = f"mplicits fit {clouds} -o {arguments.out} --jobs {jobs} --resume"
+        print(f"interrupted; to continue: {again}", file=sys.stderr)
+        return 130
+    print(format_fits(outcomes))
+    return int(any(outcome.error is not None for outcome in outcomes))
+
+
+def _tell_outcome(outcome: FitOutcome) -> None:
+    result = "fitted" if outcome.error is None else outcome.error
+    print(f"{outcome.item.cloud}: {result}, after {outcome.seconds:.1f} s", file=sys.stderr)
+
+
+def _planned(arguments: argparse.Namespace, depth: DepthInput | None) -> FitMesh | None:
+    """The mesh that shall follow, checked; None if there is to be none."""
+    if arguments.mesh is None:
+        return None
+
+    source = Path(arguments.cloud) if depth is None else depth
+    return plan_mesh(arguments.mesh, arguments.out, source, colors=not arguments.no_colors, resume=arguments.resume)
+
+
+COMMAND = Command(
+    "fit a multiscale SDF to a point cloud or depth maps",
+    """  mplicits fit scan.ply -o runs/scan
+  mplicits fit scan.ply -o runs/scan --mesh scan_mesh.ply
+  mplicits fit scan.ply -o runs/quick --preset fast
+  mplicits fit scan.ply -o runs/scan --resume
+  mplicits fit bunny.ply spot.ply sword.ply -o runs --jobs 2
+  mplicits fit scan.xyz -o runs/mine --normals estimate --time-budget 120 --steps 2000 1000 1000
+  mplicits fit depth.png --intrinsics camera.json --color color.png -o runs/room --mesh room.glb
+  mplicits fit depth/ --intrinsics camera.json --color color/ --poses trajectory.log -o runs/room""",
+    _arguments,
+    _fit,
+    "Fit a multiscale SDF to a point cloud, or to depth maps. RUN will hold field.safetensors and run.json. Of several "
+    "clouds, each gets a run in RUN, named as the cloud.",
+)
+
+
+if TYPE_CHECKING:
+    from ..fit.depth import DepthInput
+
+
+def add_depth_flags(parser: argparse.ArgumentParser) -> None:
+    """Add them, in a group of their own."""
+    add = parser.add_argument_group("depth maps (PNG, TIFF, NPY or NPZ, or a folder of them)").add_argument
+    add(
+        "--intrinsics",
+        nargs="+",
+        metavar="FILE|NUMBER",
+        help="camera JSON (ours, or Open3D's), or four numbers in pixels: FX FY CX CY",
+    )
+    add("--fov", type=positive, metavar="DEGREES", help="vertical angle of view, if no more is known")
+    add("--color", type=Path, metavar="FILE|DIR", help="the picture, or a folder of one per depth map")
+    add("--resize-color", action="store_true", help="scale pictures to the size of the depth maps")
+    add("--poses", type=Path, metavar="FILE", help="of several depth maps: Open3D's trajectory.log, or transforms.json")
+    add(
+        "--depth-scale",
+        type=positive,
+        metavar="N",
+        help="numbers per unit (integers: as the camera says, or 1000; else 1)",
+    )
+    add("--inverse-depth", action="store_true", help="the numbers are disparities: z = scale / number")
+    add("--max-depth", type=positive, metavar="Z", help="drop what is further away than this")
+    add("--max-points", type=whole(1), metavar="N", help="thin the cloud to as many (200000)")
+    add(
+        "--smooth-depth",
+        type=whole(0, 16),
+        metavar="PIXELS",
+        help="radius of smoothing (as the noise asks for; 0: none)",
+    )
+
+
+def depth_input(arguments: argparse.Namespace) -> DepthInput | None:
+    """What the arguments say of depth maps; None if CLOUD is a cloud.
+
+    Raises:
+        InputError: there are flags of depth maps, but CLOUD is none.
+    """
+    flags = {
+        "--intrinsics": arguments.intrinsics,
+        "--fov": arguments.fov,
+        "--color": arguments.color,
+        "--resize-color": arguments.resize_color,
+        "--poses": arguments.poses,
+        "--depth-scale": arguments.depth_scale,
+        "--inverse-depth": arguments.inverse_depth,
+        "--max-depth": arguments.max_depth,
+        "--max-points": arguments.max_points,
+        "--smooth-depth": arguments.smooth_depth is not None,
+    }
+    given = [flag for flag, value in flags.items() if value]
+    path = Path(arguments.cloud)
+    from ...datasets import DepthSettings, is_depth_file
+    from ...datasets.depth.images import DEPTH_SUFFIXES
+
+    named_so = path.suffix.lower() in DEPTH_SUFFIXES or path.is_dir()
+    if given and not named_so:
+        known = ", ".join(DEPTH_SUFFIXES)
+        raise input_error(f"{path}: {given[0]} is for depth maps ({known}, or a folder of them), not for clouds")
+    inside = path.is_dir() and any(is_depth_file(file) for file in path.iterdir())
+    if not given and not inside and not (path.suffix and is_depth_file(path)):
+        return None
+    if arguments.fov is not None and arguments.intrinsics:
+        raise input_error("--fov: does not go with --intrinsics; leave out one of them")
+    from ..fit.depth import DepthInput
+
+    return DepthInput(
+        depth=path,
+        intrinsics=tuple(arguments.intrinsics or ()),
+        fov=arguments.fov,
+        color=arguments.color,
+        poses=arguments.poses,
+        scale=arguments.depth_scale,
+        inverse=arguments.inverse_depth,
+        resize_color=arguments.resize_color,
+        settings=DepthSettings(
+            max_depth=arguments.max_depth,
+            smoothing=arguments.smooth_depth,
+            **({} if arguments.max_points is None else {"max_points": arguments.max_points}),
+        ),
+    )
+
+
+COLORLESS = ".stl"
+
+
+@dataclass(frozen=True)
+class FitMesh:
+    """The mesh that a fit shall end with.
+
+    Attributes:
+        out: the mesh file.
+        run: directory of the run.
+        source: what holds the colours, a cloud or a mesh in the coordinates of the fit.
+        colored: whether there are colours, and they are wanted.
+        trim: whether what the fit closes behind a depth map is cut off.
+    """
+
+    out: Path
+    run: Path
+    source: Path
+    colored: bool
+    trim: bool
+
+    def texture(self, *, refit: bool, progress: Callable[[Progress], None] | None = None) -> FittedTexture | None:
+        """Train the texture with the default settings, on the device and with the seed of the fit.
+
+        Args:
+            refit: whether the field is new; a texture of it that is there already is kept otherwise, and one whose
+                training was interrupted is trained to its end.
+            progress: see `fit_texture`.
+
+        Returns:
+            The texture; None if there are no colours, or it was trained before.
+
+        Raises:
+            InputError: see `texture_run`.
+        """
+        texture = self.run / TEXTURE_FILE
+        resume = not refit and texture_state_file(texture).is_file()
+        if not self.colored or (not refit and not resume and texture.is_file()):
+            return None
+        fitted = read_record(self.run)["config"]
+        config = dataclasses.replace(TextureConfig(), device=fitted["device"], seed=fitted["seed"])
+        return texture_run(self.run, self.source, config, resume=resume, progress=progress)
+
+    def extract(self, say: Callable[[str], None] | None = None) -> Mesh:
+        """Extract and write the mesh, as `mesh_run` does by default, trimmed where it shall be.
+
+        Args:
+            say: see `mesh_run`.
+
+        Raises:
+            InputError: see `mesh_run`.
+        """
+        trim = trim_suggestion(self.run) if self.trim else None
+        options = MeshOptions(colors=self.colored, trim_distance=trim, cloud=self.source if self.trim else None)
+        return mesh_run(self.run, self.out, options, say=say)
+
+
+def plan_mesh(out: Path, run: Path, source: Path | DepthInput, *, colors: bool, resume: bool) -> FitMesh:
+    """Check, before the fit, all that its mesh will need.
+
+    Args:
+        out: the mesh file; it may lie in the run's directory, which need not be there yet.
+        run: directory of the run.
+        source: what is fitted.
+        colors: whether colours are wanted.
+        resume: whether the run was begun before; depth maps are then not read again.
+
+    Raises:
+        InputError: ``out`` cannot be written or is the cloud itself, or the cloud or its texture cannot be read.
+    """
+    depth = isinstance(source, DepthInput)
+    cloud = run / CLOUD_FILE if depth else source
+    new_folder = out.absolute().parent == run.absolute() and not run.exists()
+    check_mesh_path(out, new_folder=new_folder)
+    if out.absolute().resolve() == cloud.absolute().resolve():
+        raise InputError(f"--mesh {out}: is the cloud that is fitted; name another file")
+    colors = colors and out.suffix.lower() != COLORLESS
+    if depth and not resume:
+        return FitMesh(out, run, cloud, colors and source.color is not None, trim=True)
+    points = read_cloud(kept_cloud(run) if depth else cloud).points
+    finite = points[np.isfinite(points).all(axis=1)]
+    check_mesh_path(out, Similarity.to_unit_sphere(finite), new_folder=new_folder)
+    try:
+        colored = colors and has_colors(cloud)
+    except InputError as error:
+        raise InputError(f"{error} (or leave the colours out: --no-colors)") from error
+    return FitMesh(out, run, cloud, colored, trim=depth)

@@ -1,0 +1,294 @@
+"""``mplicits texture``: its arguments, and the checks before any work.
+
+``mplicits reconstruct``: its arguments, and the checks before any work.
+
+``mplicits evolve``: its arguments, and the checks before any work.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from contextlib import nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ..run.config import add_config_flags, given_flags, input_error, load_config, preset_names
+from ..run.settings import EvolveConfig, ReconstructConfig, TextureConfig
+from .command import Command, check_output, whole
+
+__all__ = ["EVOLVE", "RECONSTRUCT", "TEXTURE", "tell_texture"]
+
+if TYPE_CHECKING:
+    from ..texture.train import FittedTexture
+
+
+def _texture_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("run", metavar="RUN", help="run directory or .safetensors file")
+    parser.add_argument(
+        "source",
+        metavar="CLOUD|MESH",
+        help="points with colours (PLY, NPZ, LAS, ...), or a mesh with a texture or vertex colours (OBJ, GLB, PLY)",
+    )
+    parser.add_argument(
+        "-o", "--out", type=Path, metavar="FILE", help=".safetensors (default: texture.safetensors beside the field)"
+    )
+    parser.add_argument("--level", type=whole(0), metavar="L", help="0 is the coarsest (default: the finest)")
+    begin = parser.add_mutually_exclusive_group()
+    begin.add_argument("--resume", action="store_true", help="continue an interrupted training, with its settings")
+    begin.add_argument("--force", action="store_true", help="replace a texture that is there already")
+    parser.add_argument("--quiet", action="store_true", help="no progress bars")
+    source = parser.add_mutually_exclusive_group()
+    names = ", ".join(preset_names("texture"))
+    source.add_argument("--preset", metavar="NAME", help=f"one of {names} (default: default)")
+    source.add_argument("--config", type=Path, metavar="FILE", help="a YAML file of settings")
+    add_config_flags(parser, TextureConfig)
+
+
+def _texture(arguments: argparse.Namespace) -> int:
+    preset, flags = arguments.config or arguments.preset, given_flags(arguments, TextureConfig)
+    if arguments.resume and (preset or flags or arguments.level is not None):
+        raise input_error("--resume: continues with its own settings; leave out --preset, --level and the rest")
+    config = load_config(TextureConfig, preset or "default", flags, thing="texture")
+    check_output(arguments.out, (".safetensors",))
+    from ..run.folder import TEXTURE_FILE, find_field
+    from ..texture.train import texture_run
+
+    field = find_field(arguments.run)
+    target = arguments.out or field.with_name(TEXTURE_FILE)
+    if target.exists() and target.samefile(field):
+        raise input_error(f"{target}: is the field itself; name another -o")
+    _check_state(target, resume=arguments.resume, force=arguments.force)
+    from ..run.progress import progress_bars
+
+    with nullcontext() if arguments.quiet else progress_bars() as report:
+        fitted = texture_run(
+            arguments.run,
+            arguments.source,
+            config,
+            out=arguments.out,
+            level=arguments.level,
+            resume=arguments.resume,
+            progress=report,
+        )
+    tell_texture(target, fitted)
+    if not fitted.record["finished"]:
+        where = "" if arguments.out is None else f" -o {arguments.out}"
+        print(
+            f"interrupted; the texture holds what was learnt so far; to continue: mplicits texture {arguments.run} "
+            f"{arguments.source}{where} --resume",
+            file=sys.stderr,
+        )
+        return 130
+    return 0
+
+
+def _check_state(target: Path, *, resume: bool, force: bool) -> None:
+    """Refuse what would lose a texture or a training, or resume where there is nothing to resume."""
+    from ..run.folder import texture_state_file
+
+    state = texture_state_file(target)
+    if resume and not state.is_file():
+        reason = "is finished" if target.exists() else "was not begun"
+        raise input_error(f"{target}: {reason}, so there is nothing to resume; leave out --resume")
+    if (target.exists() or state.is_file()) and not (resume or force):
+        found = f"{target}: exists;" if target.exists() else f"{state}: an interrupted training;"
+        hint = " --resume continues it," if state.is_file() else ""
+        raise input_error(f"{found}{hint} --force replaces it, or choose another -o")
+
+
+def tell_texture(target: Path, fitted: FittedTexture) -> None:
+    """Print what has been trained, and warn of points that were left out."""
+    record, config = fitted.record, fitted.record["config"]
+    if record["left_out"]:
+        everything = record["points"] + record["left_out"]
+        print(
+            f"warning: {record['left_out']:,} of {everything:,} points lie outside the band (--delta), left out",
+            file=sys.stderr,
+        )
+    seconds = record["sampling_seconds"] + record["training_seconds"]
+    print(
+        f"{target}: ({config['width']}, {config['depth']}), {record['parameters']:,} parameters, "
+        f"{record['steps']:,} steps in {seconds:.1f} s; {record['psnr_at_points']:.1f} dB at the points"
+    )
+
+
+TEXTURE = Command(
+    "train the colours of a fit from a coloured cloud or a textured mesh",
+    """  mplicits texture runs/scan scan.ply
+  mplicits texture runs/spot spot.obj
+  mplicits texture runs/spot spot.glb --preset fast --force
+  mplicits texture runs/scan scan.ply --resume
+  mplicits texture runs/scan scan.ply -o other.safetensors --omega 40 --time-budget 30""",
+    _texture_arguments,
+    _texture,
+    "Train a texture field in the band around the surface of a run. It is written to texture.safetensors in RUN. "
+    "The colours must be in the coordinates of the points that were fitted.",
+)
+
+
+MESH_FILE = "mesh.ply"
+
+
+def _reconstruct_arguments(parser: argparse.ArgumentParser) -> None:
+    what = (
+        "directory of NeuS/DTU (cameras_sphere.npz), nerfstudio or Blender (transforms.json), or COLMAP; or that file"
+    )
+    parser.add_argument("data", metavar="DATA", help=what)
+    parser.add_argument("-o", "--out", required=True, type=Path, metavar="RUN", help="directory of the run")
+    begin = parser.add_mutually_exclusive_group()
+    begin.add_argument("--resume", action="store_true", help="continue the interrupted run in RUN, with its settings")
+    begin.add_argument("--force", action="store_true", help="overwrite the run in RUN")
+    parser.add_argument("--quiet", action="store_true", help="no progress bars")
+    source = parser.add_mutually_exclusive_group()
+    names = ", ".join(preset_names("reconstruct"))
+    source.add_argument("--preset", metavar="NAME", help=f"one of {names} (default: default)")
+    source.add_argument("--config", type=Path, metavar="FILE", help="a YAML file of settings")
+    add_config_flags(parser, ReconstructConfig)
+
+
+def _reconstruct(arguments: argparse.Namespace) -> int:
+    flags, preset = given_flags(arguments, ReconstructConfig), arguments.config or arguments.preset
+    if arguments.resume and (flags or preset):
+        raise input_error("--resume: continues with the run's own settings; leave out --preset, --config and the rest")
+    config = (
+        None if arguments.resume else load_config(ReconstructConfig, preset or "default", flags, thing="reconstruct")
+    )
+    from ..mesh.extract import mesh_run
+    from ..reconstruct.train import HELD_OUT_FILE, reconstruct
+    from ..run.folder import check_new_run
+    from ..run.progress import progress_bars
+    from ..run.trainer import Interrupted
+
+    directory = check_new_run(arguments.out, resume=arguments.resume, force=arguments.force)
+    try:
+        with nullcontext() if arguments.quiet else progress_bars() as report:
+            run = reconstruct(arguments.data, config, out=directory, resume=arguments.resume, progress=report)
+    except Interrupted:
+        print(
+            f"interrupted; to continue: mplicits reconstruct {arguments.data} -o {directory} --resume", file=sys.stderr
+        )
+        return 130
+    mesh = mesh_run(directory, directory / MESH_FILE)
+    views, held_out = run.record["views"], run.record["held_out"]
+    print(
+        f"{run.record['data']}: {views['trained']} views, {run.record['steps']:,} steps in "
+        f"{run.record['training_seconds']:.0f} s"
+    )
+    if held_out:
+        print(
+            f"{views['held_out']} held-out views: PSNR {held_out['psnr']:.2f} dB, SSIM {held_out['ssim']:.3f} "
+            f"({directory / HELD_OUT_FILE})"
+        )
+    print(f"{directory / MESH_FILE}: {len(mesh.vertices):,} vertices, {len(mesh.faces):,} faces")
+    print(f"next: mplicits view {directory}")
+    return 0
+
+
+RECONSTRUCT = Command(
+    "train a surface and its colours on posed photographs",
+    """  mplicits reconstruct data/dtu_scan24 -o runs/scan24 --preset fast
+  mplicits reconstruct fox/transforms.json -o runs/fox --width 200 --time-budget 1800
+  mplicits reconstruct colmap_project -o runs/statue --geometry neus""",
+    _reconstruct_arguments,
+    _reconstruct,
+    "Train a surface and its colours on posed photographs. RUN then holds the field, its texture, a coloured mesh in "
+    "world coordinates and pictures of the views that were held out.",
+)
+
+
+CONFIG_SUFFIXES = (".yaml", ".yml")
+
+
+def _evolve_arguments(parser: argparse.ArgumentParser) -> None:
+    what = "runs or .safetensors files of `mplicits fit`, exact shapes such as sphere:0.4@0.2,0,0, or one YAML file"
+    parser.add_argument("inputs", nargs="*", metavar="SHAPE|CONFIG", help=what)
+    parser.add_argument("-o", "--out", required=True, type=Path, metavar="RUN", help="directory of the run")
+    begin = parser.add_mutually_exclusive_group()
+    begin.add_argument("--resume", action="store_true", help="continue the interrupted run in RUN, with its settings")
+    begin.add_argument("--force", action="store_true", help="overwrite the run in RUN")
+    parser.add_argument("--quiet", action="store_true", help="no progress bars")
+    source = parser.add_mutually_exclusive_group()
+    names = ", ".join(preset_names("evolve"))
+    source.add_argument("--preset", metavar="NAME", help=f"one of {names} (default: default)")
+    source.add_argument("--config", type=Path, metavar="FILE", help="a YAML file of settings")
+    add_config_flags(parser, EvolveConfig)
+
+
+def _evolve(arguments: argparse.Namespace) -> int:
+    config = _settings(arguments)
+    from ..evolve.train import evolve
+    from ..run.folder import check_new_run
+    from ..run.progress import progress_bars
+    from ..run.trainer import Interrupted
+
+    directory = check_new_run(arguments.out, resume=arguments.resume, force=arguments.force)
+    try:
+        with nullcontext() if arguments.quiet else progress_bars() as report:
+            run = evolve(config, out=directory, resume=arguments.resume, progress=report)
+    except Interrupted:
+        print(f"interrupted; to continue: mplicits evolve -o {directory} --resume", file=sys.stderr)
+        return 130
+    _tell(run.record)
+    print(f"{directory}: field.safetensors, run.json")
+    return 0
+
+
+def _settings(arguments: argparse.Namespace) -> EvolveConfig:
+    """What the arguments say; of a resumed run its own settings are read later."""
+    flags, preset = given_flags(arguments, EvolveConfig), arguments.config or arguments.preset
+    if arguments.resume:
+        if flags or preset or arguments.inputs:
+            raise input_error("--resume: continues with the run's own shapes and settings; leave out all others")
+        return EvolveConfig()
+    inputs = arguments.inputs
+    if inputs and inputs[0].lower().endswith(CONFIG_SUFFIXES):
+        if len(inputs) > 1 or preset:
+            raise input_error(f"{inputs[0]}: holds all settings; leave out other inputs, --preset and --config")
+        preset, inputs = Path(inputs[0]), []
+    if inputs and "shapes" in flags:
+        raise input_error("--shapes: the shapes are given already; leave it out")
+    if inputs:
+        flags["shapes"] = inputs
+    config = load_config(EvolveConfig, preset or "default", flags, thing="evolve")
+    if not config.shapes:
+        raise input_error("no shapes to evolve; give runs of `mplicits fit`, or a CONFIG.yaml with shapes: [...]")
+    return config
+
+
+def _tell(record: dict[str, Any]) -> None:
+    """A few lines on what came out."""
+    checks = record["checks"]
+    steps = sum(stage["steps"] for stage in record["stages"])
+    print(f"{record['kind']} of {', '.join(record['shapes'])}: {steps:,} steps in {record['training_seconds']:.0f} s")
+    for end in checks["ends"]:
+        ratio = "no surface" if end["ratio"] is None else f"Chamfer {end['chamfer']:.2e}, {end['ratio']:.2f} floors"
+        print(f"  t = {end['time']:g}, {end['name']}: mean |f| {end['mean_value']:.1e}, {ratio}")
+    frames, slopes = checks["frames"], checks["slopes"]
+    counts, volumes = ([frame[name] for frame in frames] for name in ("components", "volume"))
+    print(f"  {len(frames)} frames: volume {min(volumes):.3g} to {max(volumes):.3g}, components {_runs(counts)}")
+    if slopes["mean"] is not None:
+        print(f"  |∇f| {slopes['mean']:.3f}, from {slopes['low']:.3f} to {slopes['high']:.3f} at nine of ten points")
+    for line in checks["warnings"]:
+        print(f"warning: {line}")
+
+
+def _runs(counts: list[int]) -> str:
+    """``2 → 1 → 3``: the numbers, repetitions left out."""
+    kept = [count for index, count in enumerate(counts) if index == 0 or count != counts[index - 1]]
+    return " → ".join(map(str, kept))
+
+
+EVOLVE = Command(
+    "train one surface that moves: morphs, motions, smoothing",
+    """  mplicits evolve runs/spot runs/bob -o runs/morph
+  mplicits evolve runs/a runs/b runs/c --times 0 0.3 1 --align pca -o runs/morph3
+  mplicits evolve runs/spot --kind smooth --alpha 0.01 -o runs/smooth
+  mplicits evolve runs/spot --kind transport --angle 3.14 --velocity 0.3 0 0 -o runs/turn
+  mplicits evolve scene.yaml -o runs/scene
+  mplicits evolve -o runs/morph --resume""",
+    _evolve_arguments,
+    _evolve,
+    "Train a field of space and time: a morph between two or more fits, a transport by rigid motions or twists, or "
+    "smoothing by mean curvature. RUN will hold field.safetensors and run.json, which says how well the ends are met.",
+)
