@@ -20,7 +20,7 @@ from ..run.settings import FitConfig, TextureConfig
 from .bench_runs import EVOLVE, PAPER, RECONSTRUCT
 from .command import Command, add_fit_settings, add_json, check_output, fit_settings, positive, whole, write_json
 
-__all__ = ["BENCH_COMMANDS", "COMMAND", "NORMAL_MAP", "TEXTURE"]
+__all__ = ["BENCH_COMMANDS"]
 
 
 def _normals_arguments(parser: argparse.ArgumentParser) -> None:
@@ -160,47 +160,6 @@ def _render(arguments: argparse.Namespace) -> int:
     print(f"this machine multiplies float32 matrices at {rate / 1e9:.0f} GFLOP/s on {device}")
     write_json(arguments.json, [row.as_dict() for row in rows])
     return 0
-
-
-BENCH_COMMANDS: Mapping[str, Command] = MappingProxyType(
-    {
-        "bench normals": Command(
-            "what a gradient costs: jet, tangents, autograd",
-            "  mplicits bench normals\n  mplicits bench normals --points 65536 --json normals.json",
-            _normals_arguments,
-            _normals,
-        ),
-        "bench mesh": Command(
-            "what extraction costs: adaptive, the paper's, dense",
-            "  mplicits bench mesh runs/scan\n  mplicits bench mesh runs/scan --resolutions 128 256 --reference 256",
-            _mesh_arguments,
-            _mesh,
-        ),
-        "bench fit": Command(
-            "how near fits come: ours per level, screened Poisson",
-            """  mplicits bench fit armadillo.ply --time-budget 180
-  mplicits bench fit armadillo.ply bunny.ply --noise 0.01 --preset fast --pictures pictures""",
-            _fit_arguments,
-            _fit,
-            "Fit the vertices of each mesh and measure the result against the mesh; Poisson needs mplicits[poisson].",
-        ),
-        "bench render": Command(
-            "what a picture costs: the rows of the paper's Tab. 4",
-            """  mplicits bench render armadillo.ply -o bench_render
-  mplicits bench render armadillo.ply eiffel.ply -o bench_render --views 1 --no-naive --json render.json""",
-            _render_arguments,
-            _render,
-            "Fit the networks of the paper's Tab. 4 to each shape, trace pictures of them in several ways, and judge "
-            "the pictures by converged traces and by a raycast of fine meshes.",
-        ),
-        "bench texture": TEXTURE,
-        "bench normal-map": NORMAL_MAP,
-        "bench reconstruct": RECONSTRUCT,
-        "bench evolve": EVOLVE,
-        "bench paper": PAPER,
-        "bench scale": SCALE,
-    }
-)
 
 
 # The paper's (64,1), with a frequency and a schedule at which it is a closed surface that looks like the shape.
@@ -385,11 +344,51 @@ def _run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-COMMAND = Command(
+SCALE = Command(
     "what millions of points cost, and what they gain",
     """  mplicits bench scale --preset fast
   mplicits bench scale armadillo.ply --points 100000 10000000 --json scale.json""",
     _arguments,
     _run,
     "Draw clouds of several sizes from one shape, fit and mesh each in a process of its own, and compare.",
+)
+
+BENCH_COMMANDS: Mapping[str, Command] = MappingProxyType(
+    {
+        "bench normals": Command(
+            "what a gradient costs: jet, tangents, autograd",
+            "  mplicits bench normals\n  mplicits bench normals --points 65536 --json normals.json",
+            _normals_arguments,
+            _normals,
+        ),
+        "bench mesh": Command(
+            "what extraction costs: adaptive, the paper's, dense",
+            "  mplicits bench mesh runs/scan\n  mplicits bench mesh runs/scan --resolutions 128 256 --reference 256",
+            _mesh_arguments,
+            _mesh,
+        ),
+        "bench fit": Command(
+            "how near fits come: ours per level, screened Poisson",
+            """  mplicits bench fit armadillo.ply --time-budget 180
+  mplicits bench fit armadillo.ply bunny.ply --noise 0.01 --preset fast --pictures pictures""",
+            _fit_arguments,
+            _fit,
+            "Fit the vertices of each mesh and measure the result against the mesh; Poisson needs mplicits[poisson].",
+        ),
+        "bench render": Command(
+            "what a picture costs: the rows of the paper's Tab. 4",
+            """  mplicits bench render armadillo.ply -o bench_render
+  mplicits bench render armadillo.ply eiffel.ply -o bench_render --views 1 --no-naive --json render.json""",
+            _render_arguments,
+            _render,
+            "Fit the networks of the paper's Tab. 4 to each shape, trace pictures of them in several ways, and judge "
+            "the pictures by converged traces and by a raycast of fine meshes.",
+        ),
+        "bench texture": TEXTURE,
+        "bench normal-map": NORMAL_MAP,
+        "bench reconstruct": RECONSTRUCT,
+        "bench evolve": EVOLVE,
+        "bench paper": PAPER,
+        "bench scale": SCALE,
+    }
 )

@@ -288,7 +288,7 @@ SLICE = Command(
 
 
 MOVING = (".mp4", ".gif", ".png")
-SHADINGS = ("lambert", "headlight", "normals", "matcap", "color")
+ANIMATED_SHADINGS = ("lambert", "headlight", "normals", "matcap", "color")
 OF_FILMS = ("size", "up", "azimuth", "elevation", "zoom", "shading", "samples")
 
 
@@ -318,7 +318,7 @@ def _animate_arguments(parser: argparse.ArgumentParser) -> None:
     add("--azimuth", type=_angle, metavar="A", help="film: degrees around the up axis from the front (30)")
     add("--elevation", type=_angle, metavar="E", help="film: degrees above the horizon (15)")
     add("--zoom", type=positive, metavar="Z", help="film: magnification of the middle (1)")
-    add("--shading", choices=SHADINGS, help="film: how it is shaded (lambert)")
+    add("--shading", choices=ANIMATED_SHADINGS, help="film: how it is shaded (lambert)")
     add("--shadows", action="store_true", help="film: shadows and occlusion, for twice the time or more")
     add("--samples", type=whole(1, 8), metavar="N", help="film: rays per pixel and direction (2)")
     add("--device", default="auto", help="where to evaluate the field: auto, cpu, cuda, … (auto)")
