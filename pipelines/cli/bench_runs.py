@@ -17,7 +17,6 @@ from typing import Any, TypeVar
 
 from ..paper.names import METHODS, PRESETS, TABLES
 from ..run.config import add_config_flags, closest, given_flags, input_error, load_config, preset_names
-from ..run.progress import counter_bar
 from ..run.settings import EvolveConfig, ReconstructConfig
 from .command import Command, add_json, check_output, positive, whole, write_json
 
@@ -69,7 +68,7 @@ def _reconstruct(arguments: argparse.Namespace) -> int:
     from ..bench.reconstruct import BenchOptions, bench_reconstruct, read_scene
     from ..bench.reconstruct_rows import ReconstructRow, format_reconstruct
     from ..run.machine import choose_device, sgemm_rate
-    from ..run.progress import progress_bars
+    from ..run.progress import counter_bar, progress_bars
     from ..run.trainer import Interrupted
 
     device = choose_device(config.device)

@@ -19,7 +19,6 @@ from contextlib import nullcontext
 from pathlib import Path
 
 from ..run.config import add_config_flags, given_flags, input_error, load_config
-from ..run.progress import counter_bar
 from ..run.settings import SHADINGS, ShadeOptions
 from .command import Command, check_output, positive, whole
 
@@ -123,6 +122,8 @@ def _render(arguments: argparse.Namespace) -> int:
         device=arguments.device,
     )
     started = time.monotonic()
+    from ..run.progress import counter_bar
+
     with counter_bar("render") as progress:
         drawn = render_run(arguments.source, arguments.out, options, progress=progress)
     print(f"{arguments.out}: {drawn}, in {time.monotonic() - started:.1f} s")
@@ -262,6 +263,8 @@ def _slice(arguments: argparse.Namespace) -> int:
         fps=arguments.fps,
     )
     started = time.monotonic()
+    from ..run.progress import counter_bar
+
     with counter_bar("slices") if film else nullcontext() as bar:
         progress = None if bar is None else lambda done: bar(done, arguments.frames)
         drawn = slice_run(arguments.run, arguments.out, options, progress=progress)
@@ -355,6 +358,8 @@ def _animate(arguments: argparse.Namespace) -> int:
         **{name: value for name, value in chosen.items() if value is not None},
     )
     started = time.monotonic()
+    from ..run.progress import counter_bar
+
     with counter_bar("animate") as progress:
         written = animate_run(arguments.run, arguments.out, options, progress=progress)
     print(f"{arguments.out}: {written}, in {time.monotonic() - started:.1f} s")

@@ -9,7 +9,6 @@ import argparse
 import sys
 from pathlib import Path
 
-from ..run.progress import counter_bar
 from .command import Command, add_json, check_output, whole, write_json
 
 __all__ = ["CHECK_CAMERAS", "SCENE"]
@@ -77,6 +76,8 @@ def _scene(arguments: argparse.Namespace) -> int:
 
     folder = check_new_folder(arguments.out)
     scene = SCENES[arguments.name]()
+    from ..run.progress import counter_bar
+
     with counter_bar("render") as progress:
         images = render_scene(
             scene,

@@ -80,13 +80,10 @@ def _text(progress: Progress) -> str:
 @contextmanager
 def counter_bar(title: str) -> Iterator[Callable[[int, int], None] | None]:
     """A progress bar with the time left on stderr, to be told ``(done, total)``; None where that is no terminal."""
-    from rich.console import Console
-    from rich.progress import Progress
-
     console = Console(stderr=True)
     if not console.is_terminal:
         yield None
         return
-    with Progress(console=console, transient=True) as bar:
+    with Bars(console=console, transient=True) as bar:
         task = bar.add_task(title)
         yield lambda done, total: bar.update(task, completed=done, total=total)

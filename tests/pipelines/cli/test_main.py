@@ -355,7 +355,7 @@ def test_doctor_finds_nothing_wrong_here(capsys):
 
 def test_doctor_knows_all_extras(monkeypatch, tmp_path):
     """As installers write them into the metadata, from pyproject.toml."""
-    project = tomllib.loads((Path(__file__).parent.parent / "pyproject.toml").read_text())["project"]
+    project = tomllib.loads((Path(__file__).parents[3] / "pyproject.toml").read_text())["project"]
     extras = project["optional-dependencies"]
     lines = [f'{line}; extra == "{extra}"' for extra, wanted in extras.items() for line in wanted]
     monkeypatch.setattr(doctor.importlib.metadata, "requires", lambda name: [*project["dependencies"], *lines])

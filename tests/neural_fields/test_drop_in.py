@@ -14,7 +14,7 @@ from hosts import Heads, points, ray_samples
 from mplicits import neural_fields
 from torch import nn
 
-DOCUMENT = Path(__file__).parent.parent / "docs" / "drop-in.md"
+DOCUMENT = Path(__file__).parents[2] / "docs" / "drop-in.md"
 TOKEN = re.compile(r"`[\w/]*\.(py|conf|yaml)`|^```diff\n(.*?)^```", re.MULTILINE | re.DOTALL)
 
 

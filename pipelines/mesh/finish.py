@@ -1,0 +1,112 @@
+"""``mplicits fit --mesh``: after the fit, the texture of its own colours, and the mesh with them."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ...datasets import read_cloud
+from ...neural_fields import InputError, Similarity
+from ...neural_fields.meshing import Mesh
+from ..fit.depth import DepthInput, trim_suggestion
+from ..run.folder import CLOUD_FILE, TEXTURE_FILE, kept_cloud, read_record, texture_state_file
+from ..run.settings import TextureConfig
+from ..run.trainer import Progress
+from ..texture.samples import has_colors
+from ..texture.train import FittedTexture, texture_run
+from .extract import MeshOptions, mesh_run
+from .files import check_mesh_path
+
+__all__ = ["FitMesh", "plan_mesh"]
+
+COLORLESS = ".stl"
+
+
+@dataclass(frozen=True)
+class FitMesh:
+    """The mesh that a fit shall end with.
+
+    Attributes:
+        out: the mesh file.
+        run: directory of the run.
+        source: what holds the colours, a cloud or a mesh in the coordinates of the fit.
+        colored: whether there are colours, and they are wanted.
+        trim: whether what the fit closes behind a depth map is cut off.
+    """
+
+    out: Path
+    run: Path
+    source: Path
+    colored: bool
+    trim: bool
+
+    def texture(self, *, refit: bool, progress: Callable[[Progress], None] | None = None) -> FittedTexture | None:
+        """Train the texture with the default settings, on the device and with the seed of the fit.
+
+        Args:
+            refit: whether the field is new; a texture of it that is there already is kept otherwise, and one whose
+                training was interrupted is trained to its end.
+            progress: see `fit_texture`.
+
+        Returns:
+            The texture; None if there are no colours, or it was trained before.
+
+        Raises:
+            InputError: see `texture_run`.
+        """
+        texture = self.run / TEXTURE_FILE
+        resume = not refit and texture_state_file(texture).is_file()
+        if not self.colored or (not refit and not resume and texture.is_file()):
+            return None
+        fitted = read_record(self.run)["config"]
+        config = dataclasses.replace(TextureConfig(), device=fitted["device"], seed=fitted["seed"])
+        return texture_run(self.run, self.source, config, resume=resume, progress=progress)
+
+    def extract(self, say: Callable[[str], None] | None = None) -> Mesh:
+        """Extract and write the mesh, as `mesh_run` does by default, trimmed where it shall be.
+
+        Args:
+            say: see `mesh_run`.
+
+        Raises:
+            InputError: see `mesh_run`.
+        """
+        trim = trim_suggestion(self.run) if self.trim else None
+        options = MeshOptions(colors=self.colored, trim_distance=trim, cloud=self.source if self.trim else None)
+        return mesh_run(self.run, self.out, options, say=say)
+
+
+def plan_mesh(out: Path, run: Path, source: Path | DepthInput, *, colors: bool, resume: bool) -> FitMesh:
+    """Check, before the fit, all that its mesh will need.
+
+    Args:
+        out: the mesh file; it may lie in the run's directory, which need not be there yet.
+        run: directory of the run.
+        source: what is fitted.
+        colors: whether colours are wanted.
+        resume: whether the run was begun before; depth maps are then not read again.
+
+    Raises:
+        InputError: ``out`` cannot be written or is the cloud itself, or the cloud or its texture cannot be read.
+    """
+    depth = isinstance(source, DepthInput)
+    cloud = run / CLOUD_FILE if depth else source
+    new_folder = out.absolute().parent == run.absolute() and not run.exists()
+    check_mesh_path(out, new_folder=new_folder)
+    if out.absolute().resolve() == cloud.absolute().resolve():
+        raise InputError(f"--mesh {out}: is the cloud that is fitted; name another file")
+    colors = colors and out.suffix.lower() != COLORLESS
+    if depth and not resume:
+        return FitMesh(out, run, cloud, colors and source.color is not None, trim=True)
+    points = read_cloud(kept_cloud(run) if depth else cloud).points
+    finite = points[np.isfinite(points).all(axis=1)]
+    check_mesh_path(out, Similarity.to_unit_sphere(finite), new_folder=new_folder)
+    try:
+        colored = colors and has_colors(cloud)
+    except InputError as error:
+        raise InputError(f"{error} (or leave the colours out: --no-colors)") from error
+    return FitMesh(out, run, cloud, colored, trim=depth)
