@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 from mplicits.neural_fields import Similarity, Siren, Sphere, save_field
-from mplicits.pipelines.cli.main import main
+from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.evolve import checks as evolve_checks
 from mplicits.pipelines.evolve import problem as evolve_problem
 from mplicits.pipelines.run.settings import EvolveConfig

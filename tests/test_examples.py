@@ -11,7 +11,7 @@ import mplicits.datasets
 import mplicits.neural_fields
 import mplicits.pipelines
 import pytest
-from mplicits.pipelines.cli import main as cli
+from mplicits.pipelines.cli import entry as cli
 from mplicits.pipelines.cli.commands import COMMANDS
 
 ROOT = Path(__file__).parent.parent

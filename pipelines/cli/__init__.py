@@ -1,5 +1,5 @@
 """The command line. Its files load what a command needs when it runs; none loads torch on import."""
 
-from .main import main
+from .entry import main
 
 __all__ = ["main"]

@@ -22,7 +22,7 @@ from mplicits.datasets import (
 from mplicits.datasets.depth import cloud as depth_fusion
 from mplicits.datasets.depth.cleaning import measure_noise
 from mplicits.neural_fields import InputError
-from mplicits.pipelines.cli.main import main
+from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.fit import depth as fit_depth_module
 from mplicits.pipelines.fit.depth import DepthInput, fit_depth
 from mplicits.pipelines.fit.train import FitConfig

@@ -22,7 +22,7 @@ from mplicits.neural_fields import (
 from mplicits.neural_fields.checkpoint import SavedField
 from mplicits.pipelines.bench import normal_map as module
 from mplicits.pipelines.bench.normal_map import bench_normal_map, format_normal_map
-from mplicits.pipelines.cli.main import main
+from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.mesh.files import write_mesh
 
 RADIUS = 0.6

@@ -35,7 +35,7 @@ from mplicits.pipelines.bench.reconstruct_rows import (
     comparisons,
     format_reconstruct,
 )
-from mplicits.pipelines.cli.main import main
+from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.reconstruct.model import RayPool, build_scene
 from mplicits.pipelines.reconstruct.trainer import SceneTrainer
 from mplicits.pipelines.run.settings import ReconstructConfig

@@ -8,7 +8,7 @@ from mplicits.datasets import look_at, sample_sphere, write_cloud_ply
 from mplicits.neural_fields import InputError, Plane, Sphere, load_field
 from mplicits.pipelines.bench.render import NETWORKS, RenderRow, bench_render, format_render, naive_view
 from mplicits.pipelines.bench.render_truth import Truth
-from mplicits.pipelines.cli.main import main
+from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.render.trace import trace_view
 from mplicits.pipelines.run.settings import FitConfig
 

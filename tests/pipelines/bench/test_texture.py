@@ -15,7 +15,7 @@ from mplicits.neural_fields import InputError
 from mplicits.pipelines.bench import texture as bench_texture_fits
 from mplicits.pipelines.bench.texture import PAPER_MSE, TextureRow, bench_texture, format_texture
 from mplicits.pipelines.cli import bench as bench_colour_commands
-from mplicits.pipelines.cli.main import main
+from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.render.compare import Drawing, ImageError, draw, image_error, psnr
 from mplicits.pipelines.render.rasterise import textured_view
 from mplicits.pipelines.render.trace import Seen

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 import trimesh
 from mplicits.datasets import DepthCamera, PointCloud, read_cloud, write_cloud_ply
-from mplicits.pipelines.cli import fit as fit_mesh
-from mplicits.pipelines.cli.main import main
+from mplicits.pipelines.cli.entry import main
+from mplicits.pipelines.mesh import finish as fit_mesh
 from mplicits.pipelines.mesh.extract import MeshOptions
 from mplicits.pipelines.run.progress import _Lines
 from mplicits.pipelines.run.settings import TextureConfig

@@ -25,7 +25,7 @@ from mplicits.neural_fields import (
     at_time,
     load_field,
 )
-from mplicits.pipelines.cli.main import main
+from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.evolve.checks import check_evolution, slope_figures
 from mplicits.pipelines.evolve.problem import End
 from mplicits.pipelines.evolve.samples import band_points

@@ -9,7 +9,7 @@ import pytest
 import torch
 from mplicits.datasets import sample_sphere, sample_torus, write_cloud_ply
 from mplicits.neural_fields import load_field
-from mplicits.pipelines.cli.main import main
+from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.fit.many import fit_many, plan_fits
 from mplicits.pipelines.run.config import load_config
 from mplicits.pipelines.run.folder import STATE_FILE, find_field, read_record

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from mplicits.neural_fields import Similarity, Sphere, extract_mesh
 from mplicits.pipelines.bench.cells import Catalogue, Findings, Method
-from mplicits.pipelines.cli.main import main
+from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.mesh.files import write_mesh
 from mplicits.pipelines.paper import bench, names
 from mplicits.pipelines.paper.bench import SPECS

@@ -13,7 +13,7 @@ from mplicits.datasets.synthetic.scenes import SCENES, render_scene
 from mplicits.datasets.views.images import PosedImage
 from mplicits.datasets.views.writing import write_colmap, write_neus, write_transforms
 from mplicits.neural_fields import Similarity
-from mplicits.pipelines.cli.main import main
+from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.cli.views import SCENE_NAMES
 from mplicits.pipelines.reconstruct.check import check_cameras, check_files
 from mplicits.pipelines.reconstruct.frustums import camera_mesh, frustum_size

@@ -17,7 +17,7 @@ from mplicits.datasets.synthetic.scenes import SCENES, render_scene, sample_scen
 from mplicits.datasets.views.images import PosedImages
 from mplicits.datasets.views.writing import write_neus, write_transforms
 from mplicits.neural_fields import InputError, Similarity, extract_mesh, load_field, load_texture
-from mplicits.pipelines.cli.main import main
+from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.mesh.extract import MeshOptions, mesh_run
 from mplicits.pipelines.reconstruct import train as reconstruct_texture
 from mplicits.pipelines.reconstruct.train import Reconstruction, reconstruct

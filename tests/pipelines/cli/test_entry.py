@@ -16,7 +16,7 @@ from mplicits.datasets import sample_sphere
 from mplicits.neural_fields import MultiscaleSDF, Similarity, save_field
 from mplicits.pipelines.cli import doctor
 from mplicits.pipelines.cli.commands import COMMANDS
-from mplicits.pipelines.cli.main import main
+from mplicits.pipelines.cli.entry import main
 
 SMALL = ["--widths", "16", "16", "--depths", "1", "1", "--omegas", "5", "8", "--steps", "300", "100"]
 SMALL += ["--learning-rates", "5e-3", "1e-3", "--batch", "256", "--samples", "2000", "--quiet"]
@@ -73,7 +73,7 @@ def test_help_names_every_command(capsys):
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_help_of_each_command_has_examples_that_parse(capsys, name):
-    from mplicits.pipelines.cli.main import _Parser
+    from mplicits.pipelines.cli.entry import _Parser
 
     assert main([*name.split(), "--help"]) == 0
     assert "examples:" in capsys.readouterr().out
@@ -91,7 +91,7 @@ def test_help_of_each_command_has_examples_that_parse(capsys, name):
 
 def test_neither_help_nor_mistakes_wait_for_torch():
     program = (
-        "import sys; from mplicits.pipelines.cli.main import main; "
+        "import sys; from mplicits.pipelines.cli.entry import main; "
         "main(['--help']); main(['fit', '--help']); main(['fti']); main(['fit', 'a', '--ouput', 'b']); "
         "sys.exit('torch' in sys.modules)"
     )
@@ -191,7 +191,7 @@ def test_ctrl_c_leaves_a_run_that_resume_finishes(cloud, tmp_path):
     out = tmp_path / "run"
     slow = [word for word in SMALL if word != "--quiet"]
     slow[slow.index("300")] = "100000"
-    program = "import sys; from mplicits.pipelines.cli.main import main; sys.exit(main(sys.argv[1:]))"
+    program = "import sys; from mplicits.pipelines.cli.entry import main; sys.exit(main(sys.argv[1:]))"
     arguments = [sys.executable, "-c", program, "fit", str(cloud), "-o", str(out)]
     process = subprocess.Popen(
         [*arguments, *slow, "--time-budget", "3"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
@@ -301,7 +301,7 @@ def test_ctrl_c_and_a_closed_pipe_end_quietly(monkeypatch, capsys):
 
 
 def test_output_into_a_closed_pipe_is_no_traceback(box):
-    program = f"import sys; from mplicits.pipelines.cli.main import main; sys.exit(main(['info', {str(box)!r}]))"
+    program = f"import sys; from mplicits.pipelines.cli.entry import main; sys.exit(main(['info', {str(box)!r}]))"
     process = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     assert process.stdout is not None
     assert process.stderr is not None
