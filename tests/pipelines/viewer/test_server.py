@@ -410,10 +410,10 @@ def test_ctrl_c_ends_the_command_cleanly(tmp_path):
     save_field(tmp_path / "small.safetensors", Siren(8, 1))
     program = (
         "import argparse, sys\n"
-        "from mplicits.pipelines.cli.draw import COMMAND\n"
+        "from mplicits.pipelines.cli.draw import VIEW\n"
         "parser = argparse.ArgumentParser()\n"
-        "COMMAND.add_arguments(parser)\n"
-        "sys.exit(COMMAND.run(parser.parse_args()))\n"
+        "VIEW.add_arguments(parser)\n"
+        "sys.exit(VIEW.run(parser.parse_args()))\n"
     )
     arguments = [sys.executable, "-c", program, str(tmp_path / "small.safetensors"), "--port", "0"]
     with subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
