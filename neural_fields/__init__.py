@@ -11,7 +11,7 @@ from .evolution import Law, curvature, key_loss, law_loss, mean_curvature, morph
 from .field import Field, Jet, SecondJet
 from .meshing import Mesh, NoSurfaceError, extract_mesh, map_normals
 from .moving import Keyframes, Moving, RigidMotion, ShrinkingSphere
-from .multiscale import MultiscaleSDF
+from .multiscale import MultiscaleSDF, levels_of
 from .radiance import Outside, ViewColor
 from .similarity import Similarity
 from .siren import Siren
@@ -68,6 +68,7 @@ __all__ = [
     "flow",
     "key_loss",
     "law_loss",
+    "levels_of",
     "load_field",
     "load_texture",
     "map_attribute",

@@ -217,12 +217,8 @@ def _describe(field: Field) -> dict[str, Any]:
             "num_features": field.num_features,
         }
     if isinstance(field, MultiscaleSDF):
-        levels = [field.base, *field.residuals]
-        return {
-            "type": "MultiscaleSDF",
-            "taper": field.taper,
-            "levels": [_describe(level) for level in levels],  # pyright: ignore[reportArgumentType]
-        }
+        levels = [_describe(level) for level in field.levels]
+        return {"type": "MultiscaleSDF", "taper": field.taper, "levels": levels}
     if isinstance(field, SpaceTimeSDF):
         return {"type": "SpaceTimeSDF", "sdf": _describe(field.sdf)}
     raise TypeError(

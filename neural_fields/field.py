@@ -113,6 +113,16 @@ class Field(nn.Module, ABC):
         """A tensor of this field's precision, where the field is: ``points.to(field.like)`` can be asked for."""
         return next(self.parameters(), self.deltas)
 
+    def level_values(self, x: Tensor, *, level: int = -1) -> list[Tensor]:
+        """The values of all levels up to ``level`` at ``x`` ``(..., d)``, coarse to fine, ``(...,)`` each.
+
+        This default asks for one level after the other; a field whose levels build on each other evaluates each once.
+
+        Raises:
+            ValueError: as in `value`.
+        """
+        return [self.value(x, level=each) for each in range(self.resolve_level(level) + 1)]
+
     def in_band(self, x: Tensor, *, level: int) -> Tensor:
         """Whether ``level`` may be evaluated at ``x`` ``(..., d)`` → bool ``(...,)``.
 
@@ -122,8 +132,10 @@ class Field(nn.Module, ABC):
             ValueError: the last dimension of ``x`` is not ``in_dim``, or there is no such level.
         """
         inside = torch.ones(self.check_points(x).shape[:-1], dtype=torch.bool, device=x.device)
-        for coarser in range(self.resolve_level(level)):
-            inside = inside & (self.value(x, level=coarser).abs() < self.deltas[coarser])
+        level = self.resolve_level(level)
+        coarser = self.level_values(x, level=level - 1) if level else []
+        for value, delta in zip(coarser, self.deltas, strict=False):
+            inside = inside & (value.abs() < delta)
         return inside
 
     def resolve_level(self, level: int) -> int:

@@ -97,6 +97,10 @@ class Moving(Field):
         """See `Field.value`."""
         return self.field.value(self._home(x), level=level)
 
+    def level_values(self, x: Tensor, *, level: int = -1) -> list[Tensor]:
+        """See `Field.level_values`."""
+        return self.field.level_values(self._home(x), level=level)
+
     def jet(self, x: Tensor, *, level: int = -1) -> Jet:
         """See `Field.jet`; ∂f/∂t = −⟨∇f, V⟩."""
         value, gradient, features = self.field.jet(self._home(x), level=level)

@@ -1,12 +1,13 @@
 """The paper's multiscale SDF (Sec. 3.1): a base field plus residuals, each one only in the band before it.
 
 f_0 is the base; f_{j+1} = f_j + γ(|f_j| / δ_j) r_j where every coarser level is inside its own band, and f_j
-elsewhere. The gate γ lives here and nowhere else.
+elsewhere. The gate γ lives here and nowhere else, and so does the one loop that walks from level to level.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
 
 import torch
 from torch import Tensor, nn
@@ -14,7 +15,10 @@ from torch import Tensor, nn
 from .field import Field, Jet, SecondJet
 from .siren import Siren
 
-__all__ = ["MultiscaleSDF"]
+__all__ = ["MultiscaleSDF", "Parts", "levels_of", "walk_levels"]
+
+# The tensors of a jet of any order, the value first; ``(N,)`` alone is a jet of order 0.
+Parts = tuple[Tensor, ...]
 
 
 class MultiscaleSDF(Field):
@@ -107,119 +111,113 @@ class MultiscaleSDF(Field):
     def with_level(self, residual: Field, *, delta: float) -> MultiscaleSDF:
         """This field with one more level inside ``|f_last| < delta``; the levels are shared, not copied."""
         deltas = [*self.deltas.tolist(), float(delta)]
-        return MultiscaleSDF(self.base, [*self._levels(self.num_levels - 1), residual], deltas, taper=self.taper)
+        return MultiscaleSDF(self.base, [*self.levels[1:], residual], deltas, taper=self.taper)
+
+    @property
+    def levels(self) -> tuple[Field, ...]:
+        """The fields that are added up, coarse to fine: the base, and the residuals after it."""
+        return (self.base, *self.residuals)  # pyright: ignore[reportReturnType]
 
     def value(self, x: Tensor, *, level: int = -1) -> Tensor:
         """See `Field.value`; outside the band of level j − 1, level j is level j − 1."""
-        level = self.resolve_level(level)
-        rows = self.check_points(x).reshape(-1, self.in_dim)
-        f = self.base.value(rows)
-        inside = _Inside(rows)
-        for residual, delta in zip(self._levels(level), self.deltas, strict=False):
-            here = inside.narrow(f, delta)
-            r = residual.value(inside.points)
-            f = f.index_copy(0, inside.rows, here + r * self._gate(here, delta)[0])
-        return f.reshape(x.shape[:-1])
+        (f,) = deque(self._walk(x, level, _value), maxlen=1).pop()
+        return f
+
+    def level_values(self, x: Tensor, *, level: int = -1) -> list[Tensor]:
+        """See `Field.level_values`; every level is evaluated once, and only inside the bands before it."""
+        return [f for (f,) in self._walk(x, level, _value)]
 
     def jet(self, x: Tensor, *, level: int = -1) -> Jet:
         """See `Field.jet`; inside a tapered band ∇(γr) = γ∇r + r γ′ ∇f."""
-        level = self.resolve_level(level)
-        rows = self.check_points(x).reshape(-1, self.in_dim)
-        f, gradient, features = self.base.jet(rows)
-        inside = _Inside(rows)
-        for residual, delta in zip(self._levels(level), self.deltas, strict=False):
-            here = inside.narrow(f, delta)
-            r = residual.jet(inside.points)
-            gate, slope = self._gate(here, delta)
-            grown = (1 + slope * r.value)[:, None] * gradient[inside.rows] + gate[:, None] * r.gradient
-            f = f.index_copy(0, inside.rows, here + gate * r.value)
-            gradient = gradient.index_copy(0, inside.rows, grown)
-            features = features.index_copy(0, inside.rows, features[inside.rows] + gate[:, None] * r.features)
-        shape = x.shape[:-1]
-        return Jet(f.reshape(shape), gradient.reshape(x.shape), features.reshape(*shape, features.shape[-1]))
+        return Jet(*deque(self._walk(x, level, lambda part, points: part.jet(points)), maxlen=1).pop())
 
     def second_jet(self, x: Tensor, *, level: int = -1, dims: int | None = None) -> SecondJet:
         """See `Field.second_jet`; inside a tapered band the product rule is applied twice."""
-        level, dims = self.resolve_level(level), self.resolve_dims(dims)
-        rows = self.check_points(x).reshape(-1, self.in_dim)
-        f, gradient, features, hessian = self.base.second_jet(rows, dims=dims)
-        inside = _Inside(rows)
-        for residual, delta in zip(self._levels(level), self.deltas, strict=False):
-            here = inside.narrow(f, delta)
-            r = residual.second_jet(inside.points, dims=dims)
-            gate, slope = self._gate(here, delta)
-            steeper, before = 1 + slope * r.value, gradient[inside.rows]
-            cross = before[:, :dims, None] * r.gradient[:, None, :dims]
-            bend = (
-                (self._gate_bend(here, delta) * r.value)[:, None, None]
-                * before[:, :dims, None]
-                * before[:, None, :dims]
-            )
-            bent = (
-                steeper[:, None, None] * hessian[inside.rows]
-                + gate[:, None, None] * r.hessian
-                + slope[:, None, None] * (cross + cross.mT)
-                + bend
-            )
-            f = f.index_copy(0, inside.rows, here + gate * r.value)
-            gradient = gradient.index_copy(0, inside.rows, steeper[:, None] * before + gate[:, None] * r.gradient)
-            features = features.index_copy(0, inside.rows, features[inside.rows] + gate[:, None] * r.features)
-            hessian = hessian.index_copy(0, inside.rows, bent)
-        shape = x.shape[:-1]
-        return SecondJet(
-            f.reshape(shape),
-            gradient.reshape(x.shape),
-            features.reshape(*shape, features.shape[-1]),
-            hessian.reshape(*shape, dims, dims),
+        dims = self.resolve_dims(dims)
+        walk = self._walk(x, level, lambda part, points: part.second_jet(points, dims=dims))
+        return SecondJet(*deque(walk, maxlen=1).pop())
+
+    def _walk(self, x: Tensor, level: int, evaluate: Callable[[Field, Tensor], Parts]) -> Iterator[Parts]:
+        """The jets of the levels up to ``level``."""
+        levels = self.levels[: self.resolve_level(level) + 1]
+        return walk_levels(levels, self.deltas, self.check_points(x), evaluate, self._add)
+
+    def _add(self, before: Parts, own: Parts, delta: Tensor) -> Parts:
+        """F + γ(f) r, to the order of the jets f and r."""
+        f, r = before[0], own[0]
+        gate, *slopes = self._gate(f, delta, order=max(0, len(own) - 2))
+        if not slopes:
+            return (f + gate * r,)
+        steeper = 1 + slopes[0] * r
+        gradient = steeper[:, None] * before[1] + gate[:, None] * own[1]
+        value = f + gate * r
+        features = before[2] + gate[:, None] * own[2]
+        if len(slopes) == 1:
+            return value, gradient, features
+        dims = own[3].shape[-1]
+        column, row = before[1][:, :dims, None], before[1][:, None, :dims]
+        cross = column * own[1][:, None, :dims]
+        hessian = (
+            steeper[:, None, None] * before[3]
+            + gate[:, None, None] * own[3]
+            + slopes[0][:, None, None] * (cross + cross.mT)
+            + (slopes[1] * r)[:, None, None] * column * row
         )
+        return value, gradient, features, hessian
 
-    def in_band(self, x: Tensor, *, level: int) -> Tensor:
-        """See `Field.in_band`; each level is evaluated only where the coarser ones allow it."""
-        level = self.resolve_level(level)
-        rows = self.check_points(x).reshape(-1, self.in_dim)
-        allowed = torch.ones(len(rows), dtype=torch.bool, device=x.device)
-        if level:
-            allowed = torch.zeros_like(allowed)
-            f = self.base.value(rows)
-            inside = _Inside(rows)
-            for index, delta in enumerate(self.deltas[:level]):
-                here = inside.narrow(f, delta)
-                if index + 1 < level:
-                    r = self.residuals[index].value(inside.points)  # pyright: ignore[reportCallIssue]
-                    f = f.index_copy(0, inside.rows, here + r * self._gate(here, delta)[0])
-            allowed[inside.rows] = True
-        return allowed.reshape(x.shape[:-1])
-
-    def _levels(self, count: int) -> Iterator[Field]:
-        for residual in self.residuals[:count]:
-            assert isinstance(residual, Field)
-            yield residual
-
-    def _gate(self, f: Tensor, delta: Tensor) -> tuple[Tensor, Tensor]:
-        """γ and dγ/df at values f inside the band."""
+    def _gate(self, f: Tensor, delta: Tensor, order: int) -> list[Tensor]:
+        """γ and its derivatives by f up to an order of at most 2, at values f inside the band."""
         if self.taper == 0:
-            return torch.ones_like(f), torch.zeros_like(f)
+            return [torch.ones_like(f), *(torch.zeros_like(f) for _ in range(order))]
+        width = delta * self.taper
         u = ((f.abs() / delta - (1 - self.taper)) / self.taper).clamp(0, 1)
-        return 1 - u * u * (3 - 2 * u), -6 * u * (1 - u) * f.sign() / (delta * self.taper)
-
-    def _gate_bend(self, f: Tensor, delta: Tensor) -> Tensor:
-        """d²γ/df² at values f inside the band; 0 where the gate is fully open."""
-        if self.taper == 0:
-            return torch.zeros_like(f)
-        u = (f.abs() / delta - (1 - self.taper)) / self.taper
-        return torch.where((u > 0) & (u < 1), -6 * (1 - 2 * u) / (delta * self.taper) ** 2, 0.0)
+        gate = [1 - u * u * (3 - 2 * u)]
+        if order > 0:
+            gate.append(-6 * u * (1 - u) * f.sign() / width)
+        if order > 1:  # it jumps where the gate begins to close
+            gate.append(torch.where((u > 0) & (u < 1), -6 * (1 - 2 * u) / width**2, 0.0))
+        return gate
 
 
-class _Inside:
-    """The rows of a batch that every band so far has let through."""
+def levels_of(field: Field) -> tuple[Field, ...]:
+    """The levels of a `MultiscaleSDF`, coarse to fine; any other field is of one piece."""
+    return field.levels if isinstance(field, MultiscaleSDF) else (field,)
 
-    def __init__(self, points: Tensor) -> None:
-        self.points = points
-        self.rows = torch.arange(len(points), device=points.device)
 
-    def narrow(self, f: Tensor, delta: Tensor) -> Tensor:
-        """Keep the rows with |f| < δ and return their f; ``f`` has a value for every row of the batch."""
-        here = f[self.rows]
-        kept = (here.abs() < delta).nonzero()[:, 0]
-        self.points, self.rows = self.points[kept], self.rows[kept]
-        return here[kept]
+def walk_levels(
+    levels: Sequence[Field],
+    deltas: Tensor,
+    x: Tensor,
+    evaluate: Callable[[Field, Tensor], Parts],
+    join: Callable[[Parts, Parts, Tensor], Parts],
+) -> Iterator[Parts]:
+    """Evaluate level after level, each one once, and only at the points that every band before it lets through.
+
+    Args:
+        levels: coarse to fine; the first one is evaluated everywhere.
+        deltas: half-width δ_j of the band around each level but the last.
+        x: ``(..., d)``.
+        evaluate: a level at points ``(M, d)`` → the parts of its jet, ``(M, …)`` each, the value first.
+        join: the parts so far, those of the next level at the same points, and δ → the parts from there on.
+
+    Yields:
+        The parts ``(..., …)`` with each level in turn; outside the band before it, a level changes nothing.
+    """
+
+    def shaped(parts: Parts) -> Parts:
+        return tuple(part.reshape((*x.shape[:-1], *part.shape[1:])) for part in parts)
+
+    points = x.reshape(-1, x.shape[-1])
+    parts = evaluate(levels[0], points)
+    yield shaped(parts)
+    rows = torch.arange(len(points), device=points.device)
+    for level, delta in zip(levels[1:], deltas, strict=False):
+        kept = (parts[0][rows].abs() < delta).nonzero()[:, 0]
+        points, rows = points[kept], rows[kept]
+        joined = join(tuple(part[rows] for part in parts), evaluate(level, points), delta)
+        parts = tuple(part.index_copy(0, rows, new) for part, new in zip(parts, joined, strict=True))
+        yield shaped(parts)
+
+
+def _value(level: Field, points: Tensor) -> Parts:
+    return (level.value(points),)

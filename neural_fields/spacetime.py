@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from .field import Field, Jet, SecondJet
-from .multiscale import MultiscaleSDF
+from .multiscale import MultiscaleSDF, levels_of
 from .siren import Siren
 
 __all__ = ["SpaceTimeJet", "SpaceTimeSDF", "TimeSlice", "at_time", "spacetime_jet"]
@@ -136,7 +136,7 @@ class SpaceTimeSDF(Field):
             residual_gain=residual_gain,
         )
         with torch.no_grad():
-            for level in _levels(sdf):
+            for level in sdf.levels:
                 assert isinstance(level, Siren)
                 level.layers[0].weight[:, 3] *= time_gain  # pyright: ignore[reportIndexIssue]
         return cls(sdf)
@@ -163,7 +163,7 @@ class SpaceTimeSDF(Field):
             raise ValueError(f"extra_width={extra_width}: expected at least 0")
         taper = field.taper if isinstance(field, MultiscaleSDF) else 0.0
         lifted: list[Field] = []
-        for level in _levels(field):
+        for level in levels_of(field):
             if not isinstance(level, Siren):
                 raise ValueError(f"a level of the field is a {type(level).__name__}; expected a Siren")
             lifted.append(_lift(level, extra_width, time_gain))
@@ -180,7 +180,7 @@ class SpaceTimeSDF(Field):
         The time goes into the biases of the first layers, b + t W_t, so a point costs what it costs in a
         three-dimensional field. Use `TimeSlice` where the copy must not fall behind a field in training.
         """
-        levels = [_slice(level, t) for level in _levels(self.sdf)]
+        levels = [_slice(level, t) for level in self.sdf.levels]
         return _assembled(levels, self.sdf.deltas, self.sdf.taper).requires_grad_(False)
 
     def value(self, x: Tensor, *, level: int = -1) -> Tensor:
@@ -195,9 +195,9 @@ class SpaceTimeSDF(Field):
         """See `Field.second_jet`."""
         return self.sdf.second_jet(x, level=level, dims=dims)
 
-    def in_band(self, x: Tensor, *, level: int) -> Tensor:
-        """See `Field.in_band`."""
-        return self.sdf.in_band(x, level=level)
+    def level_values(self, x: Tensor, *, level: int = -1) -> list[Tensor]:
+        """See `Field.level_values`."""
+        return self.sdf.level_values(x, level=level)
 
 
 class TimeSlice(Field):
@@ -242,9 +242,9 @@ class TimeSlice(Field):
         value, gradient, features, hessian = self.field.second_jet(self._lifted(x), level=level, dims=dims)
         return SecondJet(value, gradient[..., :3], features, hessian)
 
-    def in_band(self, x: Tensor, *, level: int) -> Tensor:
-        """See `Field.in_band`."""
-        return self.field.in_band(self._lifted(x), level=level)
+    def level_values(self, x: Tensor, *, level: int = -1) -> list[Tensor]:
+        """See `Field.level_values`."""
+        return self.field.level_values(self._lifted(x), level=level)
 
     def time_derivative(self, x: Tensor, *, level: int = -1) -> Tensor:
         """∂f/∂t at ``x`` ``(..., 3)`` → ``(...,)``."""
@@ -261,12 +261,6 @@ class TimeSlice(Field):
 def _check_spacetime(field: Field) -> None:
     if field.in_dim != 4:
         raise ValueError(f"field.in_dim={field.in_dim}: expected a field of space-time, four-dimensional")
-
-
-def _levels(field: Field) -> list[Field]:
-    if not isinstance(field, MultiscaleSDF):
-        return [field]
-    return [field.base, *field.residuals]  # pyright: ignore[reportReturnType]
 
 
 def _assembled(levels: list[Field], deltas: Tensor, taper: float) -> MultiscaleSDF:

@@ -25,7 +25,7 @@ import torch
 from torch import Tensor, nn
 from torch.utils.flop_counter import FlopCounterMode
 
-from ...neural_fields import Field, Jet
+from ...neural_fields import Field, Jet, levels_of
 from ...neural_fields.radiance import Outside, ViewColor
 from ..reconstruct.model import RayPool, SceneModel
 from ..reconstruct.trainer import SceneTrainer
@@ -87,7 +87,7 @@ def train_watched(
         report: called now and then.
     """
     plain = model.geometry
-    costs = [(value_flops(level), jet_flops(level)) for level in _levels(plain)]
+    costs = [(value_flops(level), jet_flops(level)) for level in levels_of(plain)]
     color_cost, outside_cost = color_flops(model.color), 0.0 if model.outside is None else outside_flops(model.outside)
     model.geometry, levels = counted(plain)
     colors, outsides = _RowCounter(model.color), _RowCounter(model.outside)
@@ -151,13 +151,6 @@ class _RowCounter:
         """Stop counting."""
         if self.hook is not None:
             self.hook.remove()
-
-
-def _levels(field: Field) -> list[Field]:
-    """The levels as fields of their own, in the order of `counted`."""
-    levels = [level.inner for level in counted(field)[1]]
-    assert all(isinstance(level, Field) for level in levels)
-    return levels
 
 
 def value_flops(level: Field) -> float:

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ...datasets import orbit, read_cloud
 from ...datasets.cameras import Camera
-from ...neural_fields import Field, MultiscaleSDF, Siren, load_field
+from ...neural_fields import Field, Siren, levels_of, load_field
 from ...neural_fields.tracing import BOUNDING_RADIUS
 from ..fit.train import fit
 from ..render.trace import Seen, trace_view
@@ -202,7 +202,7 @@ def _time(
         draw(cameras[0].resized(64, 64))  # the first call pays for what later ones find ready
     timed = [_best([camera] * repeats, draw) for camera in cameras]
     images = [seen for _, seen in timed]
-    levels = _levels(field)[: model.normal_level + 1]
+    levels = levels_of(field)[: model.normal_level + 1]
     pixels = len(cameras) * cameras[0].width * cameras[0].height
     if mode == "naive":
         values = [sum(BUDGET[: model.level + 1])] * len(levels)
@@ -241,10 +241,6 @@ def _best(cameras: Sequence[Camera], draw: Callable[[Camera], Seen]) -> tuple[fl
     return min(drawn, key=lambda pair: pair[0])
 
 
-def _levels(field: Field) -> list[Field]:
-    return [field.base, *field.residuals] if isinstance(field, MultiscaleSDF) else [field]  # pyright: ignore[reportReturnType]
-
-
 @torch.inference_mode()
 def naive_view(field: Field, camera: Camera, *, steps: int, device: torch.device | str = "cpu") -> Seen:
     """Sphere tracing as it is first written: every level everywhere, every ray to the end, all rays in one batch."""
@@ -263,7 +259,7 @@ def naive_view(field: Field, camera: Camera, *, steps: int, device: torch.device
 
 def _everywhere(field: Field, x: Tensor) -> Tensor:
     """The value of the finest level, with the gates as masks on residuals that are evaluated at every point."""
-    levels = _levels(field)
+    levels = levels_of(field)
     f = _unblocked(levels[0], x)
     inside = torch.ones_like(f, dtype=torch.bool)
     for residual, delta in zip(levels[1:], field.deltas, strict=True):

@@ -23,7 +23,7 @@ from scipy.spatial import KDTree
 from skimage.measure import marching_cubes
 from torch import Tensor
 
-from ...neural_fields import Field, Jet, MultiscaleSDF, Siren, load_field, save_field
+from ...neural_fields import Field, Jet, MultiscaleSDF, Siren, levels_of, load_field, save_field
 from ...neural_fields.meshing import DEFAULT_BOUNDS, extract_mesh
 from ..run.folder import find_field
 from ..run.machine import best_seconds, format_table, peak_memory, sgemm_rate
@@ -441,8 +441,7 @@ class Counted(Field):
 
 def counted(field: Field) -> tuple[Field, list[Counted]]:
     """The field with counters in the place of its levels; the levels themselves are shared, not copied."""
+    levels = [Counted(level) for level in levels_of(field)]
     if not isinstance(field, MultiscaleSDF):
-        whole = Counted(field)
-        return whole, [whole]
-    levels = [Counted(level) for level in (field.base, *field.residuals) if isinstance(level, Field)]
+        return levels[0], levels
     return MultiscaleSDF(levels[0], levels[1:], field.deltas, taper=field.taper), levels

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ...neural_fields import MultiscaleSDF, Siren, load_field
+from ...neural_fields import Siren, levels_of, load_field
 from ..run.folder import RECORD_FILE, find_field, is_field
 from ..surface.surface import Surface, components, is_closed, read_surface
 
@@ -42,9 +42,8 @@ def _describe_field(path: Path) -> Rows:
         ),
         ("parameters", f"{count:,} ({file.stat().st_size / 1024:,.0f} KiB on disk)"),
     ]
-    levels = [field.base, *field.residuals] if isinstance(field, MultiscaleSDF) else [field]
     stages = {stage.get("level"): stage for stage in record.get("stages", [])}
-    for index, level in enumerate(levels):
+    for index, level in enumerate(levels_of(field)):
         rows.append((f"level {index}", _describe_level(level, stages.get(index, {}))))
         if index < len(field.deltas):
             delta = float(field.deltas[index])

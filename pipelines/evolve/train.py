@@ -193,7 +193,7 @@ class _Evolving:
         self.stages.append(
             {
                 "level": level,
-                "parameters": sum(p.numel() for p in _levels(field)[level].parameters()),
+                "parameters": sum(p.numel() for p in field.sdf.levels[level].parameters()),
                 "delta": delta,
                 "known": len(trainer.known),
                 "beginning_seconds": round(beginning_seconds, 3),
@@ -314,10 +314,6 @@ class _Evolving:
             "training_seconds": round(seconds, 3),
             "environment": environment(self.device),
         }
-
-
-def _levels(field: SpaceTimeSDF) -> list[torch.nn.Module]:
-    return [field.sdf.base, *field.sdf.residuals]
 
 
 def _with_prefix(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:

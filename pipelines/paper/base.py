@@ -103,13 +103,13 @@ def reviewed(cloud: OrientedCloud, coarse: Field, config: FitConfig) -> Oriented
 
 def up_to(field: MultiscaleSDF, level: int) -> MultiscaleSDF:
     """The levels of a field up to and with ``level``, shared, not copied."""
-    return MultiscaleSDF(field.base, list(field.residuals)[:level], field.deltas[:level])  # pyright: ignore[reportArgumentType]
+    return MultiscaleSDF(field.base, field.levels[1 : level + 1], field.deltas[:level])
 
 
 def without_bands(field: MultiscaleSDF) -> MultiscaleSDF:
     """The plain sum of a field's levels, everywhere."""
     deltas = torch.full_like(field.deltas, math.inf)
-    return MultiscaleSDF(field.base, list(field.residuals), deltas)  # pyright: ignore[reportArgumentType]
+    return MultiscaleSDF(field.base, field.levels[1:], deltas)
 
 
 @torch.no_grad()

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
@@ -17,6 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from ...neural_fields import Field, Jet, MultiscaleSDF, NoSurfaceError, extract_mesh
+from ...neural_fields.multiscale import Parts, walk_levels
 from ..bench.cells import Cell, Findings, Method, Record, Report, Workplace
 from ..bench.tables import Column, Row, Table, TableSpec, Value, mean, median, select, shapes_of
 from ..fit.samples import banded_sources
@@ -92,31 +93,15 @@ class IndependentLevels(Field):
 
     def value(self, x: Tensor, *, level: int = -1) -> Tensor:
         """See `Field.value`."""
-        rows, first, finer = self._start(x, level)
-        f, inside = first.value(rows), torch.arange(len(rows), device=rows.device)
-        for own, delta in finer:
-            inside = inside[f[inside].abs() < delta]
-            f = f.index_copy(0, inside, own.value(rows[inside]))
-        return f.reshape(x.shape[:-1])
+        return self.level_values(x, level=level)[-1]
+
+    def level_values(self, x: Tensor, *, level: int = -1) -> list[Tensor]:
+        """See `Field.level_values`."""
+        return [f for (f,) in self._walk(x, level, lambda own, points: (own.value(points),))]
 
     def jet(self, x: Tensor, *, level: int = -1) -> Jet:
         """See `Field.jet`."""
-        rows, first, finer = self._start(x, level)
-        jet, inside = first.jet(rows), torch.arange(len(rows), device=rows.device)
-        for own, delta in finer:
-            inside = inside[jet.value[inside].abs() < delta]
-            parts = zip(jet, own.jet(rows[inside]), strict=True)
-            jet = Jet(*(before.index_copy(0, inside, here) for before, here in parts))
-        shape = x.shape[:-1]
-        return Jet(*(part.reshape(*shape, *part.shape[1:]) for part in jet))
-
-    def in_band(self, x: Tensor, *, level: int) -> Tensor:
-        """See `Field.in_band`."""
-        allowed = torch.ones(x.shape[:-1], dtype=torch.bool, device=x.device)
-        for coarser in range(self.resolve_level(level)):
-            # Outside the band of a level all finer ones equal it, so their own condition may be anything there.
-            allowed &= self.value(x, level=coarser).abs() < self.deltas[coarser]
-        return allowed
+        return Jet(*list(self._walk(x, level, lambda own, points: own.jet(points)))[-1])
 
     def with_level(self, own: Field, *, delta: float) -> IndependentLevels:
         """This field with one more level inside ``|f_last| < delta``; the levels are shared, not copied."""
@@ -129,10 +114,10 @@ class IndependentLevels(Field):
     def _fields(self) -> list[Field]:
         return [level for level in self.levels if isinstance(level, Field)]
 
-    def _start(self, x: Tensor, level: int) -> tuple[Tensor, Field, Iterator[tuple[Field, Tensor]]]:
-        """Points as rows, the first level, and the finer ones with the bands they live in."""
-        first, *finer = self._fields()[: self.resolve_level(level) + 1]
-        return self.check_points(x).reshape(-1, self.in_dim), first, zip(finer, self.deltas, strict=False)
+    def _walk(self, x: Tensor, level: int, evaluate: Callable[[Field, Tensor], Parts]) -> Iterator[Parts]:
+        """The jets of the levels up to ``level``: inside a band the next one takes the place of the one before."""
+        levels = self._fields()[: self.resolve_level(level) + 1]
+        return walk_levels(levels, self.deltas, self.check_points(x), evaluate, lambda _before, own, _delta: own)
 
 
 class Isolation(Method):

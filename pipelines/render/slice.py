@@ -148,16 +148,11 @@ def take_slice(
     points = slice_points(origin=origin, u=u, v=v, half_size=half_size, size=size).to(field.like)
     deltas = tuple(float(delta) for delta in field.deltas[: level + 1])
     with torch.inference_mode():
-        value = field.value(points, level=0)
-        inside = torch.ones_like(value, dtype=torch.bool)
-        levels, bands = [value], []
-        for index, delta in enumerate(deltas):
+        levels = field.level_values(points, level=level)
+        inside, bands = torch.ones_like(levels[0], dtype=torch.bool), []
+        for value, delta in zip(levels, deltas, strict=False):
             inside = inside & (value.abs() < delta)
             bands.append(inside)
-            if index < level:
-                value = value.clone()
-                value[inside] = field.value(points[inside], level=index + 1)
-                levels.append(value)
     return Slice(
         tuple(values.float().cpu().numpy() for values in levels),
         tuple(band.cpu().numpy() for band in bands),

@@ -176,7 +176,7 @@ def probe(
     point = start + depth * ray
     with torch.no_grad():
         gradient = field.jet(point[None], level=level).gradient[0].cpu().double()
-        values = [float(field.value(point[None], level=each)) * similarity.scale for each in range(field.num_levels)]
+        values = [float(value) * similarity.scale for value in field.level_values(point[None])]
     normal = torch.nn.functional.normalize(gradient, dim=0).numpy()
     unit = point.cpu().double().numpy()
     return Reading(unit, similarity.to_input(unit), normal, field.resolve_level(level), tuple(values), on_plane)
