@@ -10,6 +10,7 @@ from types import MappingProxyType
 import numpy as np
 
 from ...neural_fields import InputError
+from ..files import readable
 from .las import LasStream, read_las
 from .meshes import read_obj, read_off, read_stl
 from .ply import ply_stream, read_ply
@@ -61,10 +62,8 @@ def read_cloud(path: str | Path) -> PointCloud:
         mplicits.neural_fields.errors.InputError: scan.xyzz: no such file; check the path
     """
     path = check_cloud_path(path)
-    try:
+    with readable(path):
         cloud = READERS[path.suffix.lower()](path)
-    except OSError as error:
-        raise _not_readable(path, error) from error
     check_cloud(cloud)
     return cloud
 
@@ -86,11 +85,9 @@ def check_cloud_path(path: str | Path) -> Path:
         nearest = difflib.get_close_matches(extension, READERS, n=1, cutoff=0.5)
         hint = f"did you mean {nearest[0]}? " if nearest else ""
         raise InputError(f"{path}: unknown extension {extension!r}; {hint}known are {known}")
-    try:
+    with readable(path):
         if path.stat().st_size == 0:
             raise InputError(f"{path}: the file is empty; export it again")
-    except OSError as error:
-        raise _not_readable(path, error) from error
     return path
 
 
@@ -101,14 +98,8 @@ def open_stream(path: str | Path) -> CloudStream | None:
         InputError: the file is missing, damaged or of an unknown kind.
     """
     path = check_cloud_path(path)
-    try:
+    with readable(path):
         return STREAMS[path.suffix.lower()](path) if path.suffix.lower() in STREAMS else None
-    except OSError as error:
-        raise _not_readable(path, error) from error
-
-
-def _not_readable(path: Path, error: OSError) -> InputError:
-    return InputError(f"{path}: cannot be read ({error.strerror or error}); check its permissions")
 
 
 def check_cloud(cloud: PointCloud) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +15,7 @@ from torch import Tensor
 
 from ...neural_fields import InputError
 from ..cameras import Camera, pinhole_intrinsics
+from ..files import finite_number, read_json
 
 __all__ = ["DepthCamera", "read_intrinsics"]
 
@@ -156,14 +156,7 @@ def read_intrinsics(path: str | Path) -> DepthCamera:
         InputError: the file is missing or no such JSON, or a field is missing or not a number that it can be.
     """
     path = Path(path)
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; check the path, or give --intrinsics FX FY CX CY") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error}); check the path") from error
-    except ValueError as error:  # both of JSON and of UTF-8
-        raise InputError(f"{path}: is not JSON ({error}); export the intrinsics again") from error
+    content = read_json(path, missing="check the path, or give --intrinsics FX FY CX CY")
     if not isinstance(content, dict):
         raise InputError(f"{path}: expected an object with width, height, fx, fy, cx and cy")
     if "intrinsic_matrix" in content:
@@ -172,7 +165,7 @@ def read_intrinsics(path: str | Path) -> DepthCamera:
     if missing:
         raise InputError(f"{path}: {', '.join(missing)}: missing; add {'it' if len(missing) == 1 else 'them'}")
     numbers = {
-        name: _number(content[name], name, path)
+        name: finite_number(content[name], f"{path}: {name}")
         for name in ("width", "height", "fx", "fy", "cx", "cy", "depth_scale", *COEFFICIENTS, *OTHER_COEFFICIENTS)
         if content.get(name) is not None
     }
@@ -198,13 +191,7 @@ def read_intrinsics(path: str | Path) -> DepthCamera:
 def _open3d(matrix: Any, path: Path) -> dict[str, Any]:
     if not isinstance(matrix, list) or len(matrix) != 9:
         raise InputError(f"{path}: intrinsic_matrix: expected nine numbers, column by column")
-    fx, low, a, skew, fy, b, cx, cy, one = (_number(value, "intrinsic_matrix", path) for value in matrix)
+    fx, low, a, skew, fy, b, cx, cy, one = (finite_number(value, f"{path}: intrinsic_matrix") for value in matrix)
     if any((low, a, skew, b)) or one != 1:
         raise InputError(f"{path}: intrinsic_matrix: {matrix}; expected [fx, 0, 0, 0, fy, 0, cx, cy, 1]")
     return {"fx": fx, "fy": fy, "cx": cx, "cy": cy}
-
-
-def _number(value: Any, name: str, path: Path) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise InputError(f"{path}: {name}: {value!r}; expected a finite number")
-    return float(value)

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...neural_fields import InputError
+from ..files import readable
 from ..views.reading import read_cameras
 from .camera import DepthCamera
 from .images import fit_color, read_color, read_depth
@@ -133,12 +134,10 @@ def read_trajectory(path: str | Path) -> Float64:
         InputError: the file is missing, a line is not as it should be, or a matrix is no rigid pose.
     """
     path = Path(path)
+    with readable(path):
+        data = path.read_bytes()
     try:
-        lines = [line.split() for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; check the path") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error}); check the path") from error
+        lines = [line.split() for line in data.decode("utf-8").splitlines() if line.strip()]
     except ValueError as error:
         raise InputError(f"{path}: is not text; expected a trajectory.log or a transforms.json") from error
     if not lines or len(lines) % 5:

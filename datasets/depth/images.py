@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import zipfile
-import zlib
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -13,6 +10,7 @@ from numpy.typing import NDArray
 
 from ...neural_fields import InputError
 from ..color_space import linear_to_srgb, srgb_to_linear
+from ..files import DAMAGED_ARRAYS, numeric, read_arrays, read_image, read_rgb
 
 __all__ = ["DEPTH_SCALE", "DEPTH_SUFFIXES", "fit_color", "is_depth_file", "read_color", "read_depth"]
 
@@ -43,7 +41,7 @@ def is_depth_file(path: str | Path) -> bool:
             return array.ndim == 3 or (array.ndim == 2 and array.shape[1] not in CLOUD_COLUMNS)
         with array:
             return "points" not in array and len(array.files) > 0
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile):
+    except (OSError, *DAMAGED_ARRAYS):
         return False  # whoever reads it will say what is wrong
 
 
@@ -74,14 +72,12 @@ def read_depth(
         raise InputError(
             f"{path}: unknown extension {path.suffix!r}; depth maps are read from {', '.join(DEPTH_SUFFIXES)}"
         )
-    numbers = _read_array(path) if path.suffix.lower() in (".npy", ".npz") else _decode(path)
+    numbers = _read_array(path) if path.suffix.lower() in (".npy", ".npz") else read_image(path)
     if numbers.ndim == 3 and 1 in (numbers.shape[0], numbers.shape[2]):
         numbers = numbers[0] if numbers.shape[0] == 1 else numbers[..., 0]
     if numbers.ndim != 2:
         raise InputError(f"{path}: shape {numbers.shape}; expected a depth map of one channel, not a colour picture")
-    if numbers.dtype.kind not in "fiu":
-        raise InputError(f"{path}: holds {numbers.dtype}; expected numbers")
-    if numbers.dtype.itemsize == 1:
+    if numeric(numbers, f"{path}").dtype.itemsize == 1:
         raise InputError(
             f"{path}: 8 bits per pixel cannot hold depths; export 16-bit PNG, TIFF or NPY (is it a picture of them?)"
         )
@@ -105,14 +101,8 @@ def read_color(path: str | Path) -> Bytes:
         raise InputError(
             f"{path}: unknown extension {path.suffix!r}; colour pictures are read from {', '.join(COLOR_SUFFIXES)}"
         )
-    image = _decode(path)
-    if image.dtype == np.uint16:
-        image = (image / np.float32(257) + 0.5).astype(np.uint8)
-    if image.dtype != np.uint8 or image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] not in (3, 4)):
-        raise InputError(f"{path}: {image.dtype} of shape {image.shape}; expected a picture with 8 or 16 bits")
-    if image.ndim == 2:
-        return np.repeat(image[..., None], 3, axis=2)
-    return np.ascontiguousarray(image[..., 2::-1])  # OpenCV's channels are blue, green, red
+    rgb, _ = read_rgb(path)
+    return rgb if rgb.dtype == np.uint8 else (rgb / np.float32(257) + 0.5).astype(np.uint8)
 
 
 def fit_color(color: Bytes, size: tuple[int, int], *, source: str, resize: bool = False) -> Bytes:
@@ -141,38 +131,11 @@ def fit_color(color: Bytes, size: tuple[int, int], *, source: str, resize: bool 
     return (linear_to_srgb(resized) * 255 + 0.5).astype(np.uint8)
 
 
-def _decode(path: Path) -> NDArray[Any]:
-    """Any image as it is, channels and bits as stored (blue first)."""
-    try:
-        data = np.fromfile(path, np.uint8)
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; check the path") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error}); check the path") from error
-    # imread would not say why it fails, and has trouble with names that are not ASCII
-    try:
-        image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if len(data) else None
-    except cv2.error:
-        image = None
-    if image is None:
-        raise InputError(f"{path}: cannot be decoded as an image; export it again")
-    return np.asarray(image)
+def _read_array(path: Path) -> NDArray[np.generic]:
+    def choose(names: list[str]) -> list[str]:
+        if "depth" not in names and len(names) != 1:
+            raise InputError(f"{path}: arrays {', '.join(names)}; expected one, or one called depth")
+        return ["depth"] if "depth" in names else names
 
-
-def _read_array(path: Path) -> NDArray[Any]:
-    try:
-        loaded = np.load(path, allow_pickle=False)
-        if isinstance(loaded, np.ndarray):
-            return loaded
-        with loaded:
-            if "depth" in loaded:
-                return loaded["depth"]
-            if len(loaded.files) == 1:
-                return loaded[loaded.files[0]]
-            raise InputError(f"{path}: arrays {', '.join(loaded.files)}; expected one, or one called depth")
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; check the path") from None
-    except InputError:
-        raise
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error) as error:
-        raise InputError(f"{path}: cannot be read as NumPy arrays ({error}); export it again") from error
+    loaded = read_arrays(path, choose)
+    return loaded if isinstance(loaded, np.ndarray) else next(iter(loaded.values()))

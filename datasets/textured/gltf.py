@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from ...neural_fields import InputError
 from ..color_space import linear_to_srgb, srgb_to_linear
-from .mesh import Paint, TexturedMesh, Wrap, decode_image, pack
+from .mesh import Paint, TexturedMesh, Wrap, decode_texture, pack
 
 __all__ = ["read_gltf"]
 
@@ -135,7 +135,7 @@ class _Scene:
         else:
             data = self.resource(image["uri"], f"images[{number}]")
         try:
-            return decode_image(data)
+            return decode_texture(data)
         except ValueError as error:
             raise InputError(f"{self.path}: images[{number}]: {error}; export it with PNG or JPEG images") from error
 

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
-import cv2
-import imageio.v3 as iio
 import numpy as np
 from numpy.typing import NDArray
 
-from ..clouds.point_cloud import colors_from
 from ..color_space import linear_to_srgb, srgb_to_linear
+from ..files import decode_image, rgb_and_alpha, unit_range
 
-__all__ = ["Paint", "Parts", "TexturedMesh", "colors_at", "decode_image", "lookup", "pack"]
+__all__ = ["Paint", "Parts", "TexturedMesh", "colors_at", "decode_texture", "lookup", "pack"]
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -169,25 +167,10 @@ def pack(paints: Sequence[Paint], face: Int64) -> tuple[Float32, Parts]:
     return image, Parts(face, box, wrap)
 
 
-def decode_image(data: bytes) -> Float32:
+def decode_texture(data: bytes) -> Float32:
     """The bytes of an image file → ``(H, W, 3)`` display RGB in [0, 1]; its alpha channel is dropped.
 
     Raises:
         ValueError: it is no image, or of a kind we do not read.
     """
-    flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-    # OpenCV keeps 16 bits; what it does not know (TGA, say) Pillow may.
-    found = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
-    if found is not None:
-        rgb = np.asarray(found)[..., ::-1]
-    else:
-        try:
-            rgb = iio.imread(data, plugin="pillow", mode="RGB")
-        except Exception as error:  # Pillow's readers raise whatever they trip over
-            raise ValueError("not an image that can be read") from error
-    return np.ascontiguousarray(colors_from(rgb) if rgb.dtype == np.uint8 else _unit(rgb), np.float32)
-
-
-def _unit(rgb: NDArray[Any]) -> Float32:
-    scale = np.iinfo(rgb.dtype).max if np.issubdtype(rgb.dtype, np.integer) else 1
-    return (rgb.astype(np.float32) / np.float32(scale)).clip(0, 1)
+    return unit_range(rgb_and_alpha(decode_image(data))[0])

@@ -17,7 +17,7 @@ from ...neural_fields import InputError
 from ..clouds.meshes import _indices, _records, triangulate
 from ..clouds.point_cloud import colors_from
 from ..clouds.tables import numbers
-from .mesh import Paint, TexturedMesh, Wrap, decode_image, pack
+from .mesh import Paint, TexturedMesh, Wrap, decode_texture, pack
 
 __all__ = ["read_textured_obj"]
 
@@ -181,6 +181,6 @@ def _paint(material: _Material) -> Paint:
         return Paint(np.array(material.color, np.float32).reshape(1, 1, 3))
     wrap: Wrap = "clamp" if material.clamp else "repeat"
     try:
-        return Paint(decode_image(material.image.read_bytes()), (wrap, wrap))
+        return Paint(decode_texture(material.image.read_bytes()), (wrap, wrap))
     except ValueError as error:
         raise InputError(f"{material.image}: {error}; save it as PNG or JPEG") from error

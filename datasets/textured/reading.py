@@ -15,6 +15,7 @@ from ...neural_fields import InputError
 from ..clouds.meshes import weld
 from ..clouds.ply import read_ply
 from ..clouds.point_cloud import PointCloud
+from ..files import readable
 from .gltf import read_gltf
 from .mesh import TexturedMesh, colors_at
 from .obj import read_textured_obj
@@ -41,10 +42,8 @@ def read_textured(path: str | Path) -> TexturedMesh:
     if reader is None:
         known = ", ".join(TEXTURED_READERS)
         raise InputError(f"{path}: meshes with colours are read from {known}; export it as one of them")
-    try:
+    with readable(path):
         mesh = reader(path)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error}); check its permissions") from error
     if not np.isfinite(mesh.vertices[np.unique(mesh.faces)]).all():
         raise InputError(f"{path}: a vertex has a coordinate that is not a finite number; export it again")
     if not mesh.has_colors:

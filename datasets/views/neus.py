@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import re
-import zipfile
-import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,6 +14,7 @@ from numpy.typing import NDArray
 
 from ...neural_fields import InputError, Similarity
 from ..cameras import Camera
+from ..files import read_arrays
 from .shots import Shot, image_size, intrinsics, list_images
 
 __all__ = ["read_neus", "read_neus_sphere"]
@@ -81,11 +80,8 @@ def read_neus_sphere(path: Path) -> Similarity | None:
 
 def _arrays(path: Path, kind: str) -> Mapping[str, NDArray[Any]]:
     """The arrays ``kind_i`` of the archive; others, like the inverses that some files hold as well, are not read."""
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            return {name: archive[name] for name in archive.files if re.fullmatch(rf"{kind}_\d+", name)}
-    except (ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise InputError(f"{path}: damaged or not an NPZ archive of numbers; export it again") from error
+    arrays = read_arrays(path, lambda names: [name for name in names if re.fullmatch(rf"{kind}_\d+", name)])
+    return arrays if isinstance(arrays, dict) else {}
 
 
 def _files(path: Path, folders: Sequence[str]) -> list[Path]:

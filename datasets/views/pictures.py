@@ -8,16 +8,15 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ...neural_fields import InputError
 from ..cameras import Camera
 from ..color_space import linear_to_srgb, srgb_to_linear
+from ..files import read_rgb, unit_range
 
 __all__ = ["read_mask", "read_picture", "resample", "shrink", "undistort", "undistorted_camera"]
 
@@ -33,9 +32,8 @@ def read_picture(path: Path) -> tuple[Float32, Float32 | None]:
     Raises:
         InputError: the file is missing, damaged or no picture.
     """
-    image = _decode(path)
-    color = np.repeat(image[..., :1], 3, axis=2) if image.shape[2] == 1 else image[..., 2::-1]  # OpenCV: blue first
-    return _share(color), _share(image[..., 3]) if image.shape[2] == 4 else None
+    color, opacity = read_rgb(path)
+    return unit_range(color), None if opacity is None else unit_range(opacity)
 
 
 def read_mask(path: Path) -> Float32:
@@ -46,7 +44,7 @@ def read_mask(path: Path) -> Float32:
     Raises:
         InputError: the file is missing, damaged or no picture.
     """
-    image = _decode(path)[..., :3]
+    image, _ = read_rgb(path)
     white = 1 if image.max() <= 1 else np.iinfo(image.dtype).max
     return (image.max(axis=2) > white / 2).astype(np.float32)
 
@@ -73,29 +71,6 @@ def resample(color: Float32, alpha: Float32 | None, change: Callable[[Float32], 
 def shrink(image: Float32, width: int, height: int) -> Float32:
     """A smaller picture ``(height, width, ...)``, by the averages over its pixels' areas."""
     return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), np.float32)
-
-
-def _decode(path: Path) -> NDArray[Any]:
-    """``(H, W, C)`` as stored, in 8 or 16 bits."""
-    try:
-        data = np.fromfile(path, np.uint8)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error}); check the path") from error
-    try:
-        image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if len(data) else None
-    except cv2.error:
-        image = None
-    if image is None:
-        raise InputError(f"{path}: cannot be decoded as an image; export it again")
-    stored = np.asarray(image)
-    stored = stored[..., None] if stored.ndim == 2 else stored
-    if stored.dtype not in (np.uint8, np.uint16) or stored.shape[2] not in (1, 3, 4):
-        raise InputError(f"{path}: {stored.dtype} of shape {stored.shape}; expected a picture with 8 or 16 bits")
-    return stored
-
-
-def _share(stored: NDArray[Any]) -> Float32:
-    return stored.astype(np.float32) / np.float32(np.iinfo(stored.dtype).max)
 
 
 Float64 = NDArray[np.float64]

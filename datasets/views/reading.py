@@ -11,6 +11,7 @@ from pathlib import Path
 
 from ...neural_fields import InputError
 from ..cameras import Camera
+from ..files import readable
 from .colmap import find_model, read_colmap
 from .neus import read_neus
 from .shots import Shot
@@ -71,9 +72,7 @@ def read_shots(source: Path) -> list[Shot]:
     Raises:
         InputError: the file is damaged, or a camera in it cannot be one.
     """
-    try:
+    with readable(source):
         if source.is_dir():
             return read_colmap(source)
         return read_neus(source) if source.suffix.lower() == ".npz" else read_transforms(source)
-    except OSError as error:
-        raise InputError(f"{source}: cannot be read ({error.strerror or error}); check its permissions") from error

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 
 from ...neural_fields import InputError
 from ..cameras import Camera
+from ..files import finite_number, read_json
 from .shots import Shot, find_image, image_size, intrinsics
 
 __all__ = ["read_transforms"]
@@ -48,11 +48,7 @@ class _Frame:
 
     def number(self, key: str) -> float | None:
         value = self.get(key)
-        if value is None:
-            return None
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-            raise InputError(f"{self.named(key)}: {value!r}; expected a finite number")
-        return float(value)
+        return None if value is None else finite_number(value, self.named(key))
 
     def positive(self, key: str) -> float | None:
         value = self.number(key)
@@ -73,10 +69,7 @@ def read_transforms(path: Path) -> list[Shot]:
     Raises:
         InputError: the file is damaged, or a frame in it cannot be one.
     """
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:  # both of JSON and of UTF-8
-        raise InputError(f"{path}: is not JSON ({error}); export it again") from error
+    content = read_json(path)
     frames = content.get("frames") if isinstance(content, dict) else None
     if not isinstance(frames, list) or not frames:
         raise InputError(f"{path}: frames: expected a list of at least one camera; is it a transforms.json?")

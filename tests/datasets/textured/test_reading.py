@@ -17,7 +17,7 @@ from mplicits.datasets import (
     srgb_to_linear,
     write_cloud_ply,
 )
-from mplicits.datasets.textured.mesh import Paint, decode_image, lookup, pack
+from mplicits.datasets.textured.mesh import Paint, decode_texture, lookup, pack
 from mplicits.neural_fields import InputError
 from mplicits.neural_fields.meshing import Mesh
 from mplicits.pipelines.mesh.files import write_mesh
@@ -422,7 +422,7 @@ def test_samples_are_uniform_by_area_and_repeat():
 def test_images_of_all_kinds_become_rgb(kind, extension, channels):
     values = (np.arange(2 * 3 * channels).reshape(2, 3, channels) * (np.iinfo(kind).max // 24)).astype(kind)
     rgb = np.repeat(values, 3, axis=2) if channels == 1 else values[..., 2::-1]
-    found = decode_image(cv2.imencode(extension, values)[1].tobytes())
+    found = decode_texture(cv2.imencode(extension, values)[1].tobytes())
     np.testing.assert_allclose(found, rgb / np.iinfo(kind).max, atol=1e-6)
 
 

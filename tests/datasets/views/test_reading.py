@@ -206,7 +206,7 @@ def test_files_that_cannot_be_read_say_so(tmp_path):
         ("absent.json", "no such file"),
         ("", r"none of cameras_sphere\.npz, .* in it; name the file"),
         ("cameras.txt", "unknown extension '.txt'; cameras are read from"),
-        ("cameras.npz", "damaged or not an NPZ"),
+        ("cameras.npz", "damaged or not a NumPy file"),
     ]:
         if name.startswith("cameras"):
             (tmp_path / name).write_text("1 2 3")
