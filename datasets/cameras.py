@@ -1,4 +1,4 @@
-"""Pinhole cameras: from pixels to rays and back, and where to stand to see all of a shape.
+"""Cameras, with a lens or without: from pixels to rays and back, and where to stand to see all of a shape.
 
 OpenCV's convention: x right, y down, z forward, and the centre of pixel (0, 0) at (0, 0), so that the image runs
 from −0.5 to width − 0.5. Everything is float64: at map coordinates (millions of metres) float32 has no centimetres.
@@ -10,7 +10,9 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
+from typing import Any
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -18,27 +20,33 @@ from torch import Tensor
 
 from ..neural_fields import Similarity
 
-__all__ = ["UP_AXES", "Camera", "look_at", "orbit", "pinhole_intrinsics", "turntable"]
+__all__ = ["UP_AXES", "Camera", "intrinsics", "look_at", "orbit", "pinhole_intrinsics", "turntable"]
+
+Float64 = NDArray[np.float64]
 
 UP_AXES: Mapping[str, tuple[float, float, float]] = MappingProxyType({"y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)})
 """The names of the axes that may point up, and their directions."""
 
 RIGID = 1e-6  # how far a pose's axes may be from orthonormal
 STRAIGHT = 1e-9  # sine of the angle below which a view runs along the up direction
+COEFFICIENTS = 8  # at most, of the distortion: k1, k2, p1, p2, k3, k4, k5, k6
+UNDISTORTION = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 200, 1e-12)  # OpenCV's own five steps leave 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A pinhole camera without lens distortion.
+    """A camera at a place: a pinhole, and the distortion of its lens if it has any.
 
     Attributes:
         intrinsics: ``(3, 3)`` float64, in pixels: ``[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]``.
         world_from_camera: ``(4, 4)`` float64 rigid pose; its columns are right, down, forward and the eye.
         width: of the image, in pixels.
         height: of the image, in pixels.
+        distortion: k1, k2, p1, p2, k3, k4, k5, k6 of OpenCV's model, or the first of them; the rest are zero. If all
+            are, it is ``()``.
 
     Raises:
-        ValueError: a matrix has another shape, type or form, or the image has no pixels.
+        ValueError: a matrix has another shape, type or form, the image has no pixels, or a coefficient is not finite.
 
     Example:
         >>> camera = look_at((0, 0, 4), (0, 0, 0), width=3, height=3)
@@ -51,8 +59,13 @@ class Camera:
     world_from_camera: Tensor
     width: int
     height: int
+    distortion: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
+        if len(self.distortion) > COEFFICIENTS or not np.isfinite(self.distortion).all():
+            raise ValueError(f"distortion={self.distortion}: expected at most {COEFFICIENTS} finite numbers")
+        if not any(self.distortion):
+            object.__setattr__(self, "distortion", ())
         for name, shape in (("intrinsics", (3, 3)), ("world_from_camera", (4, 4))):
             matrix = getattr(self, name)
             if tuple(matrix.shape) != shape or matrix.dtype != torch.float64:
@@ -72,6 +85,12 @@ class Camera:
             raise ValueError(
                 f"world_from_camera: {self.world_from_camera.tolist()}; expected a rigid pose (right-handed unit axes)"
             )
+
+    @property
+    def fx_fy_cx_cy(self) -> tuple[float, float, float, float]:
+        """Focal lengths and the place where the axis meets the image, in pixels."""
+        (fx, _, cx), (_, fy, cy), _ = self.intrinsics.tolist()
+        return fx, fy, cx, cy
 
     @property
     def eye(self) -> Tensor:
@@ -100,18 +119,25 @@ class Camera:
             dtype: of both; they are worked out in float64 and rounded once.
             device: where to.
         """
-        from kornia.geometry.camera import unproject_points  # imported here: it takes a fifth of a second
-
         # Metal has no float64: there, the work is done on the CPU.
         place = "cpu" if torch.device(device).type == "mps" else device
         pose = self.world_from_camera.to(place)
-        x = torch.arange(self.width, dtype=torch.float64, device=place)
-        y = torch.arange(self.height, dtype=torch.float64, device=place)
-        pixels = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)  # (H, W, 2)
-        ones = pixels.new_ones(()).expand(*pixels.shape[:2], 1)
-        seen = unproject_points(pixels, ones, self.intrinsics.to(place), normalize=True)
-        directions = seen @ pose[:3, :3].T
+        directions = torch.nn.functional.normalize(self.sight_lines(device=place), dim=-1) @ pose[:3, :3].T
         return pose[:3, 3].to(dtype).to(device), directions.to(dtype).to(device)
+
+    def sight_lines(self, *, device: torch.device | str = "cpu") -> Tensor:
+        """``(H, W, 3)`` float64: the points at depth 1 that the pixels see, in camera coordinates."""
+        from kornia.geometry.depth import unproject_meshgrid  # imported here: it takes a fifth of a second
+
+        if not self.distortion:
+            matrix = self.intrinsics.to(device)[None]
+            return unproject_meshgrid(
+                self.height, self.width, matrix, device=torch.device(device), dtype=torch.float64
+            )[0]
+        pixels = np.stack(np.meshgrid(np.arange(self.width), np.arange(self.height)), axis=-1).astype(np.float64)
+        lines = np.ones((self.height, self.width, 3))
+        lines[..., :2] = self.slopes_at(pixels.reshape(-1, 2)).reshape(self.height, self.width, 2)
+        return torch.from_numpy(lines).to(device)
 
     def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Where points ``(..., 3)`` fall in the image: pixels ``(..., 2)`` and depths z ``(...,)`` along the axis.
@@ -129,8 +155,55 @@ class Camera:
         pose = self.world_from_camera.to(points.device)
         # The eye is taken off first, while map coordinates still have all their digits.
         seen = (points.double() - pose[:3, 3]) @ pose[:3, :3]
-        pixels = project_points(seen.reshape(-1, 3), self.intrinsics.to(points.device))
+        rows = seen.reshape(-1, 3)
+        if self.distortion:
+            pixels = torch.from_numpy(self.pixels_at((rows[:, :2] / rows[:, 2:]).cpu().numpy())).to(points.device)
+        else:
+            pixels = project_points(rows, self.intrinsics.to(points.device))
         return pixels.reshape(*points.shape[:-1], 2), seen[..., 2]
+
+    def in_view(self, points: Float64) -> tuple[Float64, Float64, NDArray[np.bool_]]:
+        """`project` for points ``(N, 3)``, and which of them are in front of the camera and in its image ``(N,)``.
+
+        Far outside the image the polynomials of a distorted lens turn back, and would bring points of its surroundings
+        into it; so a point counts as inside only if its ray is among those of the image.
+        """
+        pixels, depths = (array.numpy() for array in self.project(torch.from_numpy(points)))
+        inside = (
+            (depths > 0) & (pixels >= -0.5).all(axis=1) & (pixels < (self.width - 0.5, self.height - 0.5)).all(axis=1)
+        )
+        if self.distortion:
+            fx, fy, _, _ = self.fx_fy_cx_cy
+            among, pixel = self.sight_lines().numpy()[..., :2], 1 / math.sqrt(fx * fy)
+            seen = (points - self.eye.numpy()) @ self.world_from_camera[:3, :3].numpy()
+            slopes = seen[:, :2] / np.where(depths > 0, depths, 1.0)[:, None]
+            low, high = among.min(axis=(0, 1)) - pixel, among.max(axis=(0, 1)) + pixel
+            inside &= ((slopes >= low) & (slopes <= high)).all(axis=1)
+        return pixels, depths, inside
+
+    def slopes_at(self, pixels: Float64) -> Float64:
+        """Where pixels ``(N, 2)`` look, with the lens undone: x / z and y / z in camera coordinates ``(N, 2)``."""
+        found = cv2.undistortPoints(pixels[:, None], *self.for_opencv, criteria=UNDISTORTION)
+        return np.asarray(found, np.float64).reshape(-1, 2)
+
+    def pixels_at(self, slopes: Float64) -> Float64:
+        """The pixels ``(N, 2)`` that look along slopes ``(N, 2)``: the inverse of `slopes_at`."""
+        if not len(slopes):
+            return slopes
+        ahead = np.column_stack((slopes, np.ones(len(slopes))))
+        found, _ = cv2.projectPoints(ahead, np.zeros(3), np.zeros(3), *self.for_opencv)
+        return np.asarray(found, np.float64).reshape(-1, 2)
+
+    @property
+    def for_opencv(self) -> tuple[Float64, Float64]:
+        """Matrix ``(3, 3)`` and coefficients ``(8,)`` as OpenCV takes them."""
+        return self.intrinsics.cpu().numpy(), np.array(
+            (*self.distortion, *(0.0,) * (COEFFICIENTS - len(self.distortion)))
+        )
+
+    def pinhole(self) -> Camera:
+        """What is left of the camera without the distortion of its lens."""
+        return replace(self, distortion=())
 
     def moved(self, similarity: Similarity) -> Camera:
         """The same camera in unit-sphere coordinates: it sees the moved world in the same pixels."""
@@ -140,9 +213,9 @@ class Camera:
 
     def strip(self, first: int, rows: int) -> Camera:
         """The camera of ``rows`` rows of the image from row ``first`` on."""
-        intrinsics = self.intrinsics.clone()
-        intrinsics[1, 2] -= first
-        return replace(self, intrinsics=intrinsics, height=rows)
+        matrix = self.intrinsics.clone()
+        matrix[1, 2] -= first
+        return replace(self, intrinsics=matrix, height=rows)
 
     def resized(self, width: int, height: int) -> Camera:
         """The same view in other pixels; where the aspect ratio changes, they are no longer square.
@@ -155,6 +228,11 @@ class Camera:
         sx, sy = width / self.width, height / self.height
         scale = self.intrinsics.new_tensor([[sx, 0, (sx - 1) / 2], [0, sy, (sy - 1) / 2], [0, 0, 1]])
         return replace(self, intrinsics=scale @ self.intrinsics, width=width, height=height)
+
+
+def intrinsics(fx: float, fy: float, cx: float, cy: float) -> Tensor:
+    """``(3, 3)``: ``[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]`` in float64."""
+    return torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
 
 
 def pinhole_intrinsics(fov: float, width: int, height: int) -> Tensor:
@@ -171,8 +249,7 @@ def pinhole_intrinsics(fov: float, width: int, height: int) -> Tensor:
     if not 0 < fov < 180:
         raise ValueError(f"fov={fov}: expected degrees between 0 and 180")
     focal = height / 2 / math.tan(math.radians(fov) / 2)
-    matrix = [[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]]
-    return torch.tensor(matrix, dtype=torch.float64)
+    return intrinsics(focal, focal, (width - 1) / 2, (height - 1) / 2)
 
 
 def look_at(
@@ -240,8 +317,8 @@ def orbit(
     Raises:
         ValueError: an argument is out of its range, or the points are not ``(N, 3)``, not finite or all the same.
     """
-    poses = [(azimuth, elevation)]
-    return _around(points, poses, up=up, fov=fov, width=width, height=height, margin=margin, zoom=zoom)[0]
+    view: dict[str, Any] = {"up": up, "fov": fov, "width": width, "height": height, "margin": margin, "zoom": zoom}
+    return turntable(points, 1, azimuth=azimuth, elevation=elevation, **view)[0]
 
 
 def turntable(
@@ -266,22 +343,6 @@ def turntable(
     """
     if frames < 1:
         raise ValueError(f"frames={frames}: expected at least one")
-    poses = [(azimuth + 360 * frame / frames, elevation) for frame in range(frames)]
-    return _around(points, poses, up=up, fov=fov, width=width, height=height, margin=margin, zoom=zoom)
-
-
-def _around(
-    points: NDArray[np.floating] | Tensor,
-    poses: Sequence[tuple[float, float]],
-    *,
-    up: str,
-    fov: float,
-    width: int,
-    height: int,
-    margin: float,
-    zoom: float,
-) -> list[Camera]:
-    """Cameras at (azimuth, elevation), all at the distance from which each has all the points in view."""
     if not 0 < margin <= 1:
         raise ValueError(f"margin={margin}: expected more than 0 and at most 1")
     if not (zoom > 0 and math.isfinite(zoom)):
@@ -293,17 +354,17 @@ def _around(
     offset = points - center
     if not bool(offset.any()):
         raise ValueError("points: all of them coincide, so there is no distance to look from")
-    axes = [_orbit_axes(azimuth, elevation, up) for azimuth, elevation in poses]
-    intrinsics = pinhole_intrinsics(fov, width, height)
-    slopes = margin * torch.tensor([width, height]) / 2 / intrinsics.diagonal()[:2]
+    axes = [_orbit_axes(azimuth + 360 * frame / frames, elevation, up) for frame in range(frames)]
+    matrix = pinhole_intrinsics(fov, width, height)
+    slopes = margin * torch.tensor([width, height]) / 2 / matrix.diagonal()[:2]
     distance = 0.0
     for right, forward in axes:
         seen = offset @ torch.stack((right, torch.linalg.cross(forward, right), forward), dim=1)  # (N, 3)
         # From distance d, a point at camera offset (x, y, z) is in view if |x| ≤ slope (d + z), and so for y.
         needed = (seen[:, :2].abs() / slopes).amax(dim=1) - seen[:, 2]
         distance = max(distance, float(needed.max()))
-    intrinsics[:2, :2] *= zoom
-    return [_camera(center - distance * forward, right, forward, intrinsics, width, height) for right, forward in axes]
+    matrix[:2, :2] *= zoom
+    return [_camera(center - distance * forward, right, forward, matrix, width, height) for right, forward in axes]
 
 
 def _orbit_axes(azimuth: float, elevation: float, up: str) -> tuple[Tensor, Tensor]:
@@ -323,10 +384,10 @@ def _orbit_axes(azimuth: float, elevation: float, up: str) -> tuple[Tensor, Tens
     return torch.tensor(right, dtype=torch.float64), torch.tensor(forward, dtype=torch.float64)
 
 
-def _camera(eye: Tensor, right: Tensor, forward: Tensor, intrinsics: Tensor, width: int, height: int) -> Camera:
+def _camera(eye: Tensor, right: Tensor, forward: Tensor, matrix: Tensor, width: int, height: int) -> Camera:
     pose = torch.eye(4, dtype=torch.float64)
     pose[:3] = torch.stack((right, torch.linalg.cross(forward, right), forward, eye), dim=1)
-    return Camera(intrinsics, pose, width, height)
+    return Camera(matrix, pose, width, height)
 
 
 def _vector(name: str, numbers: Sequence[float] | Tensor) -> Tensor:

@@ -7,14 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from ...neural_fields import InputError
-from ..cameras import Camera, pinhole_intrinsics
+from ..cameras import Camera, intrinsics, pinhole_intrinsics
 from ..files import finite_number, read_json
 
 __all__ = ["DepthCamera", "read_intrinsics"]
@@ -23,12 +22,11 @@ Float64 = NDArray[np.float64]
 
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")  # OpenCV's order
 OTHER_COEFFICIENTS = ("k4", "k5", "k6")  # of lenses that we do not model
-UNDISTORTION = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 200, 1e-13)  # OpenCV's own five steps leave 1e-3
 
 
 @dataclass(frozen=True)
 class DepthCamera:
-    """A pinhole with radial and tangential distortion, in OpenCV's convention (see `Camera`).
+    """The lens of a `Camera` that may stand anywhere, with at most five coefficients, and the scale of its images.
 
     Attributes:
         width: of the depth image, in pixels.
@@ -79,14 +77,23 @@ class DepthCamera:
 
     @classmethod
     def from_camera(cls, camera: Camera) -> DepthCamera:
-        """The lens of a `Camera`."""
-        (fx, _, cx), (_, fy, cy), _ = camera.intrinsics.tolist()
-        return cls(camera.width, camera.height, fx, fy, cx, cy)
+        """The pinhole of a `Camera`; its place and its distortion are left aside."""
+        return cls(camera.width, camera.height, *camera.fx_fy_cx_cy)
+
+    def at(self, world_from_camera: Float64) -> Camera:
+        """The `Camera` with this lens in a pose ``(4, 4)``.
+
+        Raises:
+            ValueError: the pose is not rigid.
+        """
+        pose = torch.from_numpy(np.asarray(world_from_camera, np.float64))
+        matrix = intrinsics(self.fx, self.fy, self.cx, self.cy)
+        return Camera(matrix, pose, self.width, self.height, self.distortion)
 
     @property
     def matrix(self) -> Float64:
         """``(3, 3)``: ``[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]``."""
-        return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], np.float64)
+        return intrinsics(self.fx, self.fy, self.cx, self.cy).numpy()
 
     @property
     def pixel_angle(self) -> float:
@@ -95,54 +102,16 @@ class DepthCamera:
 
     def rays(self) -> Tensor:
         """``(H, W, 3)`` float64: the points at depth 1 that the pixels see, in camera coordinates."""
-        from kornia.geometry.depth import unproject_meshgrid  # here: it takes a fifth of a second
-
-        if not any(self.distortion):
-            matrix = torch.from_numpy(self.matrix)[None]
-            return unproject_meshgrid(self.height, self.width, matrix, dtype=torch.float64)[0]
-        pixels = np.stack(np.meshgrid(np.arange(self.width), np.arange(self.height)), axis=-1).astype(np.float64)
-        flat = cv2.undistortPoints(
-            pixels.reshape(-1, 1, 2), self.matrix, np.array(self.distortion), criteria=UNDISTORTION
-        )
-        rays = np.ones((self.height, self.width, 3))
-        rays[..., :2] = flat.reshape(self.height, self.width, 2)
-        return torch.from_numpy(rays)
+        return self.at(np.eye(4)).sight_lines()
 
     def unproject(self, depth: Float64) -> Float64:
         """The points ``(H, W, 3)`` in camera coordinates that pixels with these depths z ``(H, W)`` see."""
-        from kornia.geometry.depth import depth_to_3d_v2
-
-        matrix = torch.from_numpy(self.matrix)[None]
-        grid = self.rays()[None]
-        return depth_to_3d_v2(torch.from_numpy(depth)[None], matrix, xyz_grid=grid)[0].numpy()
+        return self.rays().numpy() * depth[..., None]
 
     def project(self, points: Float64) -> tuple[Float64, NDArray[np.bool_]]:
-        """Pixels ``(N, 2)`` where points ``(N, 3)`` in camera coordinates fall, and which of them are in the image.
-
-        Far outside the image the polynomials of a distorted lens turn back, and would bring points of its
-        surroundings into it; so a point counts as inside only if its ray is among those of the image.
-        """
-        front = points[:, 2] > 0
-        slopes = points[:, :2] / np.where(front, points[:, 2], 1.0)[:, None]
-        if any(self.distortion):
-            border = self.rays().numpy()[..., :2]
-            low, high = border.min(axis=(0, 1)) - self.pixel_angle, border.max(axis=(0, 1)) + self.pixel_angle
-            front &= ((slopes >= low) & (slopes <= high)).all(axis=1)
-        slopes = np.where(front[:, None], slopes, 0.0)
-        pixels = _distort(slopes, self.distortion) * (self.fx, self.fy) + (self.cx, self.cy)
-        inside = front & (pixels >= -0.5).all(axis=1) & (pixels < (self.width - 0.5, self.height - 0.5)).all(axis=1)
+        """Pixels ``(N, 2)`` where points ``(N, 3)`` in camera coordinates fall, and which of them are in the image."""
+        pixels, _, inside = self.at(np.eye(4)).in_view(points)
         return pixels, inside
-
-
-def _distort(slopes: Float64, coefficients: tuple[float, float, float, float, float]) -> Float64:
-    """OpenCV's model: ``x (1 + k1 r² + k2 r⁴ + k3 r⁶) + 2 p1 x y + p2 (r² + 2x²)``, and y with p1, p2 exchanged."""
-    k1, k2, p1, p2, k3 = coefficients
-    x, y = slopes.T
-    square = x**2 + y**2
-    radial = 1 + square * (k1 + square * (k2 + square * k3))
-    across = x * radial + 2 * p1 * x * y + p2 * (square + 2 * x**2)
-    down = y * radial + p1 * (square + 2 * y**2) + 2 * p2 * x * y
-    return np.stack((across, down), axis=1)
 
 
 def read_intrinsics(path: str | Path) -> DepthCamera:

@@ -304,12 +304,11 @@ def _nearest_around(depth: Float64) -> Float64:
 
 def _verdict(points: Float64, frame: RgbdFrame, nearest: Float64, tolerance: float) -> Int64:
     """Of each point ``(N, 3)`` in world coordinates: 1 if the frame sees through it, −1 if it sees it, else 0."""
-    seen = (points - frame.eye) @ frame.world_from_camera[:3, :3]
-    pixels, inside = frame.camera.project(seen)
+    pixels, depths, inside = frame.view.in_view(points)
     index = np.flatnonzero(inside)
     u, v = np.rint(pixels[index]).astype(np.int64).T
     u, v = u.clip(0, frame.camera.width - 1), v.clip(0, frame.camera.height - 1)
-    z, there = seen[index, 2], np.nan_to_num(frame.depth[v, u], nan=0.0)
+    z, there = depths[index], np.nan_to_num(frame.depth[v, u], nan=0.0)
     verdict = np.zeros(len(points), np.int64)
     verdict[index] = (z < (1 - tolerance) * nearest[v, u]).astype(np.int64)
     verdict[index[np.abs(z - there) <= tolerance * there]] = -1

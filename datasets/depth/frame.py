@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...neural_fields import InputError
+from ..cameras import Camera
 from ..files import readable
 from ..views.reading import read_cameras
 from .camera import DepthCamera
@@ -49,9 +50,12 @@ class RgbdFrame:
             raise ValueError(f"depth: {self.depth.dtype} of shape {self.depth.shape}; expected float64 of {size}")
         if self.color is not None and (self.color.shape != (*size, 3) or self.color.dtype != np.uint8):
             raise ValueError(f"color: {self.color.dtype} of shape {self.color.shape}; expected uint8 of {(*size, 3)}")
-        pose = self.world_from_camera
-        if pose.shape != (4, 4) or not np.allclose(pose[:3, :3].T @ pose[:3, :3], np.eye(3), atol=1e-6):
-            raise ValueError(f"world_from_camera: {pose.tolist()}; expected a rigid (4, 4) pose")
+        self.view  # noqa: B018 (a pose that is not rigid is refused there)
+
+    @property
+    def view(self) -> Camera:
+        """The camera where it stood."""
+        return self.camera.at(self.world_from_camera)
 
     @property
     def eye(self) -> Float64:

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ...neural_fields import InputError
-from ..cameras import Camera
-from .shots import IMAGE_SUFFIXES, Shot, intrinsics
+from ..cameras import Camera, intrinsics
+from .shots import IMAGE_SUFFIXES, Shot
 
 __all__ = ["find_model", "read_colmap", "read_colmap_points"]
 
@@ -91,9 +91,9 @@ def read_colmap(model: Path) -> list[Shot]:
         if pose.lens not in lenses:
             raise InputError(f"{named}: its camera {pose.lens} is not in {cameras.name}; export both again")
         lens = lenses[pose.lens]
-        camera, distortion = _camera(lens, pose, f"{cameras}: camera {pose.lens}", named)
+        camera = _camera(lens, pose, f"{cameras}: camera {pose.lens}", named)
         mask = None if masks is None else _mask(masks, pose.name)
-        shots.append(Shot(pose.name, camera, folder / pose.name, mask, distortion, named))
+        shots.append(Shot(pose.name, camera, folder / pose.name, mask, named))
     return shots
 
 
@@ -132,8 +132,8 @@ def _mask(folder: Path, name: str) -> Path:
     return next((file for file in files if file.is_file()), files[0])
 
 
-def _camera(lens: _Lens, pose: _Pose, named_lens: str, named: str) -> tuple[Camera, tuple[float, ...]]:
-    """The pinhole, and OpenCV's distortion: COLMAP's models have its coefficients in its order."""
+def _camera(lens: _Lens, pose: _Pose, named_lens: str, named: str) -> Camera:
+    """A camera with its lens: COLMAP's models have the coefficients of OpenCV, in its order."""
     if lens.model not in PINHOLES:
         raise InputError(f"{named_lens}: {lens.model}: no pinhole; run colmap image_undistorter and use its output")
     if len(lens.numbers) != MODELS[lens.model]:
@@ -149,8 +149,8 @@ def _camera(lens: _Lens, pose: _Pose, named_lens: str, named: str) -> tuple[Came
     rotation = Rotation.from_quat(quaternion[[1, 2, 3, 0]]).as_matrix()  # camera from world
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = rotation.T, -rotation.T @ shift
-    camera = Camera(intrinsics(fx, fy, cx - 0.5, cy - 0.5), torch.from_numpy(matrix), lens.width, lens.height)
-    return camera, numbers[4:]
+    calibration = intrinsics(fx, fy, cx - 0.5, cy - 0.5)
+    return Camera(calibration, torch.from_numpy(matrix), lens.width, lens.height, numbers[4:])
 
 
 def _lines(path: Path) -> Iterator[str]:

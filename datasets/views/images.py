@@ -128,12 +128,12 @@ def _view(shot: Shot, width: int | None) -> PosedImage:
             sizes = [f"{shape[1]} × {shape[0]}" for shape in (mask.shape, color.shape)]
             raise InputError(f"{shot.mask}: {sizes[0]} pixels, but {shot.image} has {sizes[1]}; make them match")
     try:
-        pinhole = undistorted_camera(camera, shot.distortion)
+        pinhole = undistorted_camera(camera)
     except ValueError as error:
         raise InputError(f"{shot.named}: {error}; check the coefficients, or undistort the images") from error
     steps: list[Callable[[Float32], Float32]] = []
     if pinhole is not camera:
-        steps.append(partial(undistort, camera=camera, distortion=shot.distortion, pinhole=pinhole))
+        steps.append(partial(undistort, camera=camera, pinhole=pinhole))
     if width is not None and width < camera.width:
         pinhole = pinhole.resized(width, max(1, round(camera.height * width / camera.width)))
         steps.append(partial(shrink, width=pinhole.width, height=pinhole.height))

@@ -13,9 +13,9 @@ import torch
 from numpy.typing import NDArray
 
 from ...neural_fields import InputError, Similarity
-from ..cameras import Camera
+from ..cameras import Camera, intrinsics
 from ..files import read_arrays
-from .shots import Shot, image_size, intrinsics, list_images
+from .shots import Shot, image_size, list_images
 
 __all__ = ["read_neus", "read_neus_sphere"]
 
@@ -50,7 +50,7 @@ def read_neus(path: Path) -> list[Shot]:
             raise InputError(f"{path}: {name}: no such array; number them from 0 without gaps")
         camera = _camera(matrices[name], image_size(image), f"{path}: {name}")
         mask = masks[index] if masks else None
-        shots.append(Shot(image.relative_to(path.parent).as_posix(), camera, image, mask, (), f"{path}: {name}"))
+        shots.append(Shot(image.relative_to(path.parent).as_posix(), camera, image, mask, f"{path}: {name}"))
     return shots
 
 

@@ -1,26 +1,25 @@
-"""Photographs and masks from files, as numbers in [0, 1], and what may be done with their light.
-
-Distorted photographs → the pictures of a pinhole, with OpenCV.
-"""
+"""Photographs and masks: from files to numbers in [0, 1], from distorted to those of a pinhole, to fewer pixels."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from ..cameras import Camera
+from ..cameras import Camera, intrinsics
 from ..color_space import linear_to_srgb, srgb_to_linear
 from ..files import read_rgb, unit_range
 
 __all__ = ["read_mask", "read_picture", "resample", "shrink", "undistort", "undistorted_camera"]
 
 Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+
+EXACT = 0.01  # pixels that distorting an undistorted point may miss it by
 
 
 def read_picture(path: Path) -> tuple[Float32, Float32 | None]:
@@ -73,78 +72,56 @@ def shrink(image: Float32, width: int, height: int) -> Float32:
     return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), np.float32)
 
 
-Float64 = NDArray[np.float64]
-
-UNDISTORTION = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 200, 1e-12)  # OpenCV's own five steps leave 1e-3
-EXACT = 0.01  # pixels that distorting an undistorted point may miss it by
-
-
-def undistorted_camera(camera: Camera, distortion: Sequence[float]) -> Camera:
+def undistorted_camera(camera: Camera) -> Camera:
     """The pinhole whose whole image a distorted camera has seen.
 
     It stands where the camera stands and has as many pixels. Its image is the largest rectangle, in the plane at depth
     1, with none of the distorted image's border inside it; so nothing is black, and no mask of valid pixels is needed.
 
-    Args:
-        camera: what is left of the distorted camera without its distortion.
-        distortion: k1, k2, p1, p2, k3, k4, k5, k6 of OpenCV's model, or the first of them.
-
     Raises:
         ValueError: the distortion folds the image over, so that it cannot be undone.
     """
-    if not any(distortion):
+    if not camera.distortion:
         return camera
     across, down = np.arange(camera.width, dtype=np.float64), np.arange(camera.height, dtype=np.float64)
     right, bottom = np.float64(camera.width - 1), np.float64(camera.height - 1)
-    x0, x1 = (_plane(camera, distortion, np.broadcast_to(x, down.shape), down)[:, 0] for x in (0 * right, right))
-    y0, y1 = (_plane(camera, distortion, across, np.broadcast_to(y, across.shape))[:, 1] for y in (0 * bottom, bottom))
+    x0, x1 = (_border(camera, np.broadcast_to(x, down.shape), down)[:, 0] for x in (0 * right, right))
+    y0, y1 = (_border(camera, across, np.broadcast_to(y, across.shape))[:, 1] for y in (0 * bottom, bottom))
     (left, width), (top, height) = (x0.max(), x1.min() - x0.max()), (y0.max(), y1.min() - y0.max())
     if not (width > 0 and height > 0):
-        raise ValueError(f"distortion={tuple(distortion)}: leaves nothing of the image")
+        raise ValueError(f"distortion={camera.distortion}: leaves nothing of the image")
     fx, fy = right / width, bottom / height
-    matrix = [[fx, 0, -fx * left], [0, fy, -fy * top], [0, 0, 1]]
-    pinhole = replace(camera, intrinsics=torch.tensor(matrix, dtype=torch.float64))
-    x, y = _maps(camera, distortion, pinhole)
+    pinhole = replace(camera, intrinsics=intrinsics(fx, fy, -fx * left, -fy * top), distortion=())
+    x, y = _maps(camera, pinhole)
     # Where neighbours change places, two directions share a pixel.
     if np.diff(x, axis=1).min() <= 0 or np.diff(y, axis=0).min() <= 0:
-        raise ValueError(f"distortion={tuple(distortion)}: folds the image over")
+        raise ValueError(f"distortion={camera.distortion}: folds the image over")
     return pinhole
 
 
-def undistort(image: Float32, camera: Camera, distortion: Sequence[float], pinhole: Camera) -> Float32:
+def undistort(image: Float32, camera: Camera, pinhole: Camera) -> Float32:
     """What ``pinhole`` sees, taken out of a distorted picture by linear interpolation.
 
     Args:
         image: ``(H, W)`` or ``(H, W, C)``, C at most 4.
-        camera: of the distorted picture, without its distortion.
-        distortion: see `undistorted_camera`.
+        camera: of the distorted picture.
         pinhole: from `undistorted_camera`.
     """
-    x, y = _maps(camera, distortion, pinhole)
+    x, y = _maps(camera, pinhole)
     return np.asarray(cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.float32)
 
 
-def _maps(camera: Camera, distortion: Sequence[float], pinhole: Camera) -> tuple[Float32, Float32]:
+def _maps(camera: Camera, pinhole: Camera) -> tuple[Float32, Float32]:
     """Where in the distorted picture the pixels of the pinhole are, ``(H, W)`` each."""
-    matrices = camera.intrinsics.numpy(), pinhole.intrinsics.numpy()
-    size = (pinhole.width, pinhole.height)
-    x, y = cv2.initUndistortRectifyMap(matrices[0], _padded(distortion), np.eye(3), matrices[1], size, cv2.CV_32FC1)
+    size, target = (pinhole.width, pinhole.height), pinhole.intrinsics.numpy()
+    x, y = cv2.initUndistortRectifyMap(*camera.for_opencv, np.eye(3), target, size, cv2.CV_32FC1)
     return np.asarray(x, np.float32), np.asarray(y, np.float32)
 
 
-def _plane(camera: Camera, distortion: Sequence[float], x: Float64, y: Float64) -> Float64:
-    """The points ``(N, 2)`` of the plane at depth 1 that the distorted camera sees in pixels x, y ``(N,)``."""
-    matrix, coefficients = camera.intrinsics.numpy(), _padded(distortion)
+def _border(camera: Camera, x: Float64, y: Float64) -> Float64:
+    """The slopes ``(N, 2)`` at pixels x, y ``(N,)``, if they lead back to them."""
     pixels = np.stack((x, y), axis=1)
-    found = cv2.undistortPoints(pixels[:, None], matrix, coefficients, criteria=UNDISTORTION)
-    points = np.asarray(found, np.float64).reshape(-1, 2)
-    seen = np.column_stack((points, np.ones(len(points))))[:, None]
-    again = np.asarray(cv2.projectPoints(seen, np.zeros(3), np.zeros(3), matrix, coefficients)[0]).reshape(-1, 2)
-    if not np.abs(again - pixels).max() < EXACT:
-        raise ValueError(f"distortion={tuple(distortion)}: cannot be undone at the image's border")
-    return points
-
-
-def _padded(distortion: Sequence[float]) -> Float64:
-    """Eight coefficients: OpenCV takes 4, 5 or 8."""
-    return np.array((*distortion, *(0.0,) * (8 - len(distortion))), np.float64)
+    slopes = camera.slopes_at(pixels)
+    if not np.abs(camera.pixels_at(slopes) - pixels).max() < EXACT:
+        raise ValueError(f"distortion={camera.distortion}: cannot be undone at the image's border")
+    return slopes

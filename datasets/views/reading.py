@@ -43,7 +43,7 @@ def read_cameras(path: str | Path) -> list[tuple[str, Camera]]:
         ...
         mplicits.neural_fields.errors.InputError: cameras.txt: no such file; check the path
     """
-    return [(shot.name, shot.camera) for shot in read_shots(find_source(path))]
+    return [(shot.name, shot.camera.pinhole()) for shot in read_shots(find_source(path))]
 
 
 def find_source(path: str | Path) -> Path:

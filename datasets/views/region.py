@@ -65,7 +65,7 @@ def region_from_points(points: Float64, cameras: Sequence[Camera]) -> Similarity
     """
     views = np.zeros(len(points), np.int64)
     for camera in cameras:
-        views += _in_view(camera, points)[1]
+        views += camera.in_view(points)[2]
     kept = points[views * 2 >= len(cameras)]
     try:
         focus = np.array(region_from_cameras(cameras).center)
@@ -118,7 +118,7 @@ def _hull(
     points = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, 3)
     views = np.zeros(len(points), np.int64)
     for camera, mask in zip(cameras, solid, strict=True):
-        pixels, inside = _in_view(camera, points)
+        pixels, _, inside = camera.in_view(points)
         hit = np.zeros(len(points), np.bool_)
         column, row = np.rint(pixels[inside]).astype(np.int64).T
         hit[inside] = mask[row.clip(0, camera.height - 1), column.clip(0, camera.width - 1)]
@@ -131,17 +131,9 @@ def _hull(
     return hull, (high - low) / (CELLS - 1)
 
 
-def _in_view(camera: Camera, points: Float64) -> tuple[Float64, NDArray[np.bool_]]:
-    """Pixels ``(N, 2)``, and which of the points are in front of the camera and in its picture ``(N,)``."""
-    pixels, depths = (array.numpy() for array in camera.project(torch.from_numpy(points)))
-    size = np.array((camera.width, camera.height))
-    inside = (depths > 0) & (pixels >= -0.5).all(axis=1) & (pixels < size - 0.5).all(axis=1)
-    return pixels, inside
-
-
 def _view_radius(camera: Camera, center: Float64) -> float:
     """The radius of the sphere at that distance that fits the picture's longer side; 0 if the point is out of view."""
-    (fx, _, cx), (_, fy, cy), _ = camera.intrinsics.tolist()
+    fx, fy, cx, cy = camera.fx_fy_cx_cy
     x, y, z = (camera.world_from_camera[:3, :3].T @ (torch.from_numpy(center) - camera.eye)).tolist()
     across = _clearances(x, z, (-0.5 - cx) / fx, (camera.width - 0.5 - cx) / fx)
     down = _clearances(y, z, (-0.5 - cy) / fy, (camera.height - 0.5 - cy) / fy)

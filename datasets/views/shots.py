@@ -5,14 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import torch
-from torch import Tensor
-
 from ...neural_fields import InputError
 from ...neural_fields.files import files_in
 from ..cameras import Camera
 
-__all__ = ["IMAGE_SUFFIXES", "Shot", "find_image", "image_size", "intrinsics", "list_images"]
+__all__ = ["IMAGE_SUFFIXES", "Shot", "find_image", "image_size", "list_images"]
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 
@@ -23,10 +20,9 @@ class Shot:
 
     Attributes:
         name: of the image, as the file has it.
-        camera: the pinhole that is left without the lens's distortion.
+        camera: with its lens.
         image: where the photograph should be.
         mask: where its mask should be, or None.
-        distortion: k1, k2, p1, p2, k3, k4, k5, k6 of OpenCV's model, or the first of them; the rest are zero.
         named: file and record, as the beginning of a message.
     """
 
@@ -34,13 +30,7 @@ class Shot:
     camera: Camera
     image: Path
     mask: Path | None
-    distortion: tuple[float, ...]
     named: str
-
-
-def intrinsics(fx: float, fy: float, cx: float, cy: float) -> Tensor:
-    """``(3, 3)``: ``[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]`` in float64."""
-    return torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
 
 
 def find_image(folder: Path, name: str) -> Path:

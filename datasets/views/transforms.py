@@ -12,9 +12,9 @@ import torch
 from numpy.typing import NDArray
 
 from ...neural_fields import InputError
-from ..cameras import Camera
+from ..cameras import Camera, intrinsics
 from ..files import finite_number, read_json
-from .shots import Shot, find_image, image_size, intrinsics
+from .shots import Shot, find_image, image_size
 
 __all__ = ["read_transforms"]
 
@@ -92,7 +92,6 @@ def _shot(frame: _Frame) -> Shot:
         _camera(frame, image),
         image,
         None if mask is None else folder / mask,
-        _distortion(frame),
         f"{frame.path}: frames[{frame.index}]",
     )
 
@@ -125,7 +124,8 @@ def _camera(frame: _Frame, image: Path) -> Camera:
     cx, cy = width / 2 if cx is None else cx, height / 2 if cy is None else cy
     pose = _matrix(frame.own.get("transform_matrix"), frame.named("transform_matrix"))
     turned = camtoworld_graphics_to_vision_4x4(torch.from_numpy(pose)[None])[0]
-    return Camera(intrinsics(fx, fx if fy is None else fy, cx - 0.5, cy - 0.5), turned, width, height)
+    matrix = intrinsics(fx, fx if fy is None else fy, cx - 0.5, cy - 0.5)
+    return Camera(matrix, turned, width, height, _distortion(frame))
 
 
 def _distortion(frame: _Frame) -> tuple[float, ...]:

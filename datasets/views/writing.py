@@ -85,7 +85,7 @@ def write_transforms(folder: str | Path, images: PosedImages) -> None:
         frames = []
         for name, view in _numbered(images):
             _write_png(partial / "images" / name, _with_alpha(view))
-            (fx, _, cx), (_, fy, cy), _ = view.camera.intrinsics.tolist()
+            fx, fy, cx, cy = view.camera.fx_fy_cx_cy
             size = {"w": view.camera.width, "h": view.camera.height}
             lens = {"fl_x": fx, "fl_y": fy, "cx": cx + 0.5, "cy": cy + 0.5}
             pose = (view.camera.world_from_camera.numpy() @ OPENGL).tolist()
@@ -153,7 +153,7 @@ def _write_binary(model: Path, lenses: list[_Lens], places: list[_Place], points
 
 def _lens(camera: Camera) -> _Lens:
     """Width, height, fx, fy, cx, cy of COLMAP, whose first pixel has its centre at (0.5, 0.5)."""
-    (fx, _, cx), (_, fy, cy), _ = camera.intrinsics.tolist()
+    fx, fy, cx, cy = camera.fx_fy_cx_cy
     return camera.width, camera.height, fx, fy, cx + 0.5, cy + 0.5
 
 

@@ -93,7 +93,7 @@ def test_every_model_gives_its_cameras_in_the_order_of_names(model, write, tmp_p
         assert (shot.camera.width, shot.camera.height) == (WIDTH, HEIGHT)
         torch.testing.assert_close(shot.camera.intrinsics, expected.intrinsics)
         torch.testing.assert_close(shot.camera.world_from_camera, expected.world_from_camera, rtol=0, atol=1e-12)
-        assert shot.distortion == LENSES[model][1]
+        assert shot.camera.distortion == LENSES[model][1]
 
 
 @pytest.mark.parametrize("write", WRITERS)

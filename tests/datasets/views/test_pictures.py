@@ -17,17 +17,17 @@ LENSES = {
 }
 
 
-def camera() -> Camera:
+def camera(*lens: float) -> Camera:
     """Pixels that are not square, and an axis away from the middle."""
     view = look_at((0.4, -0.3, -4), (0.05, 0.02, 0), width=WIDTH, height=HEIGHT)
     intrinsics = torch.tensor([[150.0, 0, 86.0], [0, 146.0, 55.5], [0, 0, 1]], dtype=torch.float64)
-    return Camera(intrinsics, view.world_from_camera, WIDTH, HEIGHT)
+    return Camera(intrinsics, view.world_from_camera, WIDTH, HEIGHT, lens)
 
 
-def distorted_pixels(camera: Camera, lens: tuple[float, ...], points: torch.Tensor) -> np.ndarray:
+def distorted_pixels(camera: Camera, points: torch.Tensor) -> np.ndarray:
     seen = torch.linalg.inv(camera.world_from_camera)
     turn, _ = cv2.Rodrigues(seen[:3, :3].numpy())
-    coefficients = np.array((*lens, *(0.0,) * (8 - len(lens))))
+    coefficients = np.array((*camera.distortion, *(0.0,) * (8 - len(camera.distortion))))
     matrix = camera.intrinsics.numpy()
     return cv2.projectPoints(points.numpy(), turn, seen[:3, 3].numpy(), matrix, coefficients)[0].reshape(-1, 2)
 
@@ -41,11 +41,11 @@ def draw(dots: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 
 @pytest.mark.parametrize("lens", LENSES.values(), ids=LENSES)
 def test_dots_land_where_the_pinhole_has_them(lens):
-    before = camera()
+    before = camera(*lens)
     grid = torch.stack(torch.meshgrid(torch.linspace(-1.2, 1.2, 7), torch.linspace(-0.9, 0.9, 5), indexing="ij"), -1)
     points = torch.cat((grid.reshape(-1, 2), 0.2 * grid.reshape(-1, 2)[:, :1]), dim=1).double()
-    pinhole = undistorted_camera(before, lens)
-    picture = undistort(draw(distorted_pixels(before, lens, points), (WIDTH, HEIGHT)), before, lens, pinhole)
+    pinhole = undistorted_camera(before)
+    picture = undistort(draw(distorted_pixels(before, points), (WIDTH, HEIGHT)), before, pinhole)
     expected = pinhole.project(points)[0].numpy()
     checked = 0
     for x, y in expected:
@@ -56,14 +56,14 @@ def test_dots_land_where_the_pinhole_has_them(lens):
             np.testing.assert_allclose(place + np.array((column, row)), (x, y), atol=0.1)
             checked += 1
     assert checked > 20
-    apart = np.abs(distorted_pixels(before, lens, points) - before.project(points)[0].numpy()).max()
+    apart = np.abs(distorted_pixels(before, points) - before.pinhole().project(points)[0].numpy()).max()
     assert apart > 1  # without undistortion they would not
 
 
 @pytest.mark.parametrize("lens", LENSES.values(), ids=LENSES)
 def test_the_picture_is_all_seen_and_no_smaller_than_it_must_be(lens):
-    before = camera()
-    pinhole = undistorted_camera(before, lens)
+    before = camera(*lens)
+    pinhole = undistorted_camera(before)
     assert (pinhole.width, pinhole.height) == (WIDTH, HEIGHT)
     assert pinhole.world_from_camera is before.world_from_camera
     # Pictures that hold their own coordinates show from where each pixel was taken.
@@ -71,33 +71,32 @@ def test_the_picture_is_all_seen_and_no_smaller_than_it_must_be(lens):
     rays = np.stack(((x - float(pinhole.intrinsics[0, 2])) / float(pinhole.intrinsics[0, 0]),) * 2 + (np.ones_like(x),))
     rays[1] = (y - float(pinhole.intrinsics[1, 2])) / float(pinhole.intrinsics[1, 1])
     points = torch.from_numpy(rays.reshape(3, -1).T.astype(np.float64)) @ before.world_from_camera[:3, :3].T
-    taken = distorted_pixels(before, lens, points + before.eye)
+    taken = distorted_pixels(before, points + before.eye)
     assert taken.min() > -0.05
     assert (taken.max(axis=0) < (WIDTH - 0.95, HEIGHT - 0.95)).all()
     near = (taken.min(axis=0), (WIDTH - 1, HEIGHT - 1) - taken.max(axis=0))
     assert np.max(near) < 0.3  # each side of the distorted picture is reached
     for image in (x, y):
-        got = undistort(image, before, lens, pinhole).reshape(-1)
+        got = undistort(image, before, pinhole).reshape(-1)
         np.testing.assert_allclose(got, taken[:, 0 if image is x else 1].clip(0, image.max()), atol=0.05)
 
 
 def test_without_distortion_the_camera_stays():
-    before = camera()
-    for lens in ((), (0.0, 0.0, 0.0, 0.0)):
-        assert undistorted_camera(before, lens) is before
+    for before in (camera(), camera(0.0, 0.0, 0.0, 0.0)):
+        assert undistorted_camera(before) is before
 
 
 @pytest.mark.parametrize("lens", [(-3.0,), (-1.5, 0.0), (0.0, -20.0), (50.0, -900.0)])
 def test_a_lens_that_folds_the_picture_over_is_refused(lens):
     with pytest.raises(ValueError, match="distortion="):
-        undistorted_camera(camera(), lens)
+        undistorted_camera(camera(*lens))
 
 
 def test_colours_keep_their_channels():
-    before, lens = camera(), LENSES["barrel"]
-    pinhole = undistorted_camera(before, lens)
+    before = camera(*LENSES["barrel"])
+    pinhole = undistorted_camera(before)
     picture = np.random.default_rng(0).random((HEIGHT, WIDTH, 4), np.float32)
-    together = undistort(picture, before, lens, pinhole)
+    together = undistort(picture, before, pinhole)
     for channel in range(4):
-        alone = undistort(np.ascontiguousarray(picture[..., channel]), before, lens, pinhole)
+        alone = undistort(np.ascontiguousarray(picture[..., channel]), before, pinhole)
         np.testing.assert_allclose(together[..., channel], alone, atol=1e-6)
