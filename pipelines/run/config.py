@@ -1,20 +1,31 @@
-"""Typed settings: a flat dataclass, filled from a YAML preset and then from command-line flags."""
+"""Typed settings: flat dataclasses whose fields say what is allowed, filled from a YAML preset and then from flags."""
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
 import difflib
+import functools
 import math
 import types
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import yaml
 
-__all__ = ["add_config_flags", "closest", "given_flags", "input_error", "load_config", "preset_names"]
+__all__ = [
+    "Settings",
+    "add_config_flags",
+    "closest",
+    "given_flags",
+    "input_error",
+    "load_config",
+    "preset_names",
+    "setting",
+]
 
 T = TypeVar("T")
 Pairs = Mapping[object, object]
@@ -22,6 +33,87 @@ Pairs = Mapping[object, object]
 
 class _MismatchError(Exception):
     """A value does not fit its annotation; the message says what would."""
+
+
+def setting(
+    default: Any,
+    help: str,
+    *,
+    above: float | None = None,
+    at_least: float | None = None,
+    at_most: float | None = None,
+    per_level: bool = False,
+) -> Any:
+    """A field of `Settings`.
+
+    Args:
+        default: its value where nothing else is said.
+        help: what it is, for the help of its flag.
+        above: the number, or every number of a list, must be larger; None, no number, is under no bound.
+        at_least: it must not be smaller.
+        at_most: it must not be larger; goes with one of the others.
+        per_level: a list with an entry for each level; the first such field of a class says how many there are.
+    """
+    low = at_least if above is None else above
+    if low is None:
+        allowed = ""
+    elif at_most is not None:
+        allowed = f"in {'[' if above is None else '('}{low:g}, {at_most:g}]"
+    else:
+        allowed = f"> {low:g}" if above is not None else f"at least {low:g}" if low else "≥ 0"
+
+    def holds(number: float) -> bool:  # not of NaN
+        return (
+            (above is None or number > above)
+            and (at_least is None or number >= at_least)
+            and (at_most is None or number <= at_most)
+        )
+
+    metadata = {"help": help, "allowed": allowed, "holds": holds, "per_level": per_level}
+    return dataclasses.field(default=default, metadata=metadata)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What all settings share: their fields are made by `setting`, and checked when an instance is made.
+
+    Raises:
+        ValueError: lists of different lengths, a word that is no choice, or a number out of range; the message names
+            the field, what came and what is allowed.
+    """
+
+    def __post_init__(self) -> None:
+        fields = dataclasses.fields(self)
+        lists = {field.name: len(getattr(self, field.name)) for field in fields if field.metadata["per_level"]}
+        first, count = next(iter(lists.items()), ("", 1))
+        if count == 0:
+            raise ValueError(f"{first}: expected at least one level")
+        for name, entries in lists.items():
+            if entries != count:
+                raise ValueError(f"{name}: {entries} entries for {count} {first}; expected one for each")
+        for field in fields:
+            kind, value = _hints(type(self))[field.name], getattr(self, field.name)
+            allowed = None if value is None else _refused(value, _without_none(kind), field.metadata)
+            if allowed is not None:
+                choice = ", or none" * (kind is not _without_none(kind))
+                raise ValueError(f"{field.name}: {value}; expected {allowed}{choice}")
+
+
+def _refused(value: Any, kind: Any, metadata: Mapping[str, Any]) -> str | None:
+    """What is allowed in place of a value; None where it is allowed itself."""
+    if get_origin(kind) is Literal:
+        return None if value in get_args(kind) else "one of " + ", ".join(get_args(kind))
+    numbers, count = value if isinstance(value, list | tuple) else (value,), _length(kind)
+    if count in (None, len(numbers)) and all(map(metadata["holds"], numbers)):
+        return None
+    if get_origin(kind) is tuple:
+        return f"{count or ''} numbers {metadata['allowed']}".strip()
+    return f"{'a number ' * metadata['allowed'].startswith('in')}{metadata['allowed']}"
+
+
+@functools.cache
+def _hints(cls: type) -> dict[str, Any]:
+    return get_type_hints(cls)
 
 
 def load_config(
@@ -44,7 +136,7 @@ def load_config(
         InputError: no such preset or file, not YAML, an unknown key, or a value of the wrong kind. The
             message names the file or flag, the key, what came and what is allowed.
     """
-    hints = get_type_hints(cls)
+    hints = _hints(cls)
     fields = [field.name for field in dataclasses.fields(cls)]  # pyright: ignore[reportArgumentType]
     source, pairs = _read_preset(preset, thing)
     values: dict[str, Any] = {}
@@ -74,7 +166,7 @@ def add_config_flags(parser: argparse.ArgumentParser, cls: type, *, about: str =
         about: a few words above them in the help.
     """
     group = parser.add_argument_group("settings", about)
-    hints = get_type_hints(cls)
+    hints = _hints(cls)
     for field in dataclasses.fields(cls):
         kind = hints[field.name]
         text = str(field.metadata.get("help", "")).replace("%", "%%")
@@ -152,7 +244,7 @@ def _convert(value: object, kind: Any) -> Any:
             return value
         raise _MismatchError("one of " + ", ".join(map(str, args)))
     if origin is tuple:
-        return _convert_tuple(value, args)
+        return _convert_tuple(value, kind)
     if origin is types.UnionType or origin is Union:
         if value is None or value in ("none", ["none"]):
             return None
@@ -185,11 +277,10 @@ def _convert_number(value: object, kind: type[int] | type[float]) -> int | float
     return kind(number)
 
 
-def _convert_tuple(value: object, args: tuple[Any, ...]) -> tuple[Any, ...]:
-    if args[-1] is Ellipsis:
-        count, allowed = None, f"a list of {_plural(args[0])}"
-    else:
-        count, allowed = len(args), f"a list of {len(args)} {_plural(args[0])}"
+def _convert_tuple(value: object, kind: Any) -> tuple[Any, ...]:
+    args = get_args(kind)
+    count = _length(kind)
+    allowed = f"a list of {'' if count is None else f'{count} '}{_plural(args[0])}"
     if not isinstance(value, list | tuple) or len(value) not in (count or len(value),):
         raise _MismatchError(allowed)
     try:
@@ -203,6 +294,12 @@ def _without_none(kind: Any) -> Any:
     if get_origin(kind) is types.UnionType or get_origin(kind) is Union:
         (kind,) = (arg for arg in get_args(kind) if arg is not types.NoneType)
     return kind
+
+
+def _length(kind: Any) -> int | None:
+    """How many items ``tuple[X, Y]`` has; None for ``tuple[X, ...]`` and for what is no tuple."""
+    args = get_args(kind)
+    return len(args) if get_origin(kind) is tuple and args[-1] is not Ellipsis else None
 
 
 def _plural(kind: Any) -> str:

@@ -1,30 +1,31 @@
 """Typed settings: what a YAML file and flags may say, and what each mistake is answered with."""
 
 import argparse
-from dataclasses import dataclass, field
+import math
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import pytest
 from mplicits.neural_fields import InputError
-from mplicits.pipelines.run.config import add_config_flags, given_flags, load_config, preset_names
+from mplicits.pipelines.run import config
+from mplicits.pipelines.run.config import add_config_flags, given_flags, load_config, preset_names, setting
 from mplicits.pipelines.run.settings import FitConfig
 
 
 @dataclass(frozen=True)
-class Settings:
-    widths: tuple[int, ...] = field(default=(128, 256), metadata={"help": "width of each level"})
-    rates: tuple[float, ...] = (1e-3,)
-    normals: Literal["auto", "file"] = "auto"
-    origin: tuple[float, float, float] | None = None
-    budget: float | None = None
-    batch: int = 8192
-    device: str = "cpu"
-    verbose: bool = False
-
-    def __post_init__(self) -> None:
-        if self.batch < 1:
-            raise ValueError(f"batch={self.batch}: expected > 0")
+class Settings(config.Settings):
+    widths: tuple[int, ...] = setting((128, 256), "width of each level", above=0, per_level=True)
+    rates: tuple[float, ...] = setting((1e-3, 1e-4), "rate of each level", at_most=1, above=0, per_level=True)
+    normals: Literal["auto", "file"] = setting("auto", "where from")
+    origin: tuple[float, float, float] | None = setting(None, "a place", at_least=-3, at_most=3)
+    budget: float | None = setting(None, "seconds", above=0)
+    batch: int = setting(8192, "how many", above=0)
+    views: int = setting(3, "how many", at_least=2)
+    share: float = setting(0.5, "of all", above=0, at_most=1)
+    weight: float = setting(1.0, "of a term", at_least=0)
+    device: str = setting("cpu", "where")
+    verbose: bool = setting(False, "whether to say more")
 
 
 def write(folder: Path, text: str) -> Path:
@@ -35,8 +36,8 @@ def write(folder: Path, text: str) -> Path:
 
 def test_defaults_file_and_overrides_apply_in_this_order(tmp_path):
     path = write(tmp_path, "widths: [64, 64, 64]\nrates: [1e-3, 5.0e-4, 1]\nbudget: 60\nverbose: true\nbatch: 1e4\n")
-    config = load_config(Settings, path, {"batch": "512", "origin": ["0", "-1e-3", "2"]})
-    assert config == Settings(
+    loaded = load_config(Settings, path, {"batch": "512", "origin": ["0", "-1e-3", "2"]})
+    assert loaded == Settings(
         widths=(64, 64, 64),
         rates=(1e-3, 5e-4, 1.0),
         budget=60.0,
@@ -44,8 +45,8 @@ def test_defaults_file_and_overrides_apply_in_this_order(tmp_path):
         batch=512,
         origin=(0.0, -1e-3, 2.0),
     )
-    assert isinstance(config.budget, float)
-    assert isinstance(config.rates[2], float)
+    assert isinstance(loaded.budget, float)
+    assert isinstance(loaded.rates[2], float)
     assert load_config(Settings) == Settings()
     assert load_config(Settings, str(path)) == load_config(Settings, path)
 
@@ -76,7 +77,8 @@ def test_an_empty_file_is_the_defaults(tmp_path):
         ("normals: sometimes", r"normals: got 'sometimes', expected one of auto, file$"),
         ("verbose: 1", r"verbose: got '1', expected true or false$"),
         ("device: 0", r"device: got '0', expected text$"),
-        ("batch: -1", r"mine.yaml: batch=-1: expected > 0$"),
+        ("batch: -1", r"mine.yaml: batch: -1; expected > 0$"),
+        ("widths: [1]", r"mine.yaml: rates: 2 entries for 1 widths; expected one for each$"),
         ("- 1\n- 2", r"mine.yaml: expected lines of 'key: value', got a list$"),
         ("a: b: c", r"mine.yaml, line 1, column 5: not YAML"),
     ],
@@ -98,6 +100,33 @@ def test_each_mistake_in_a_file_is_one_line_that_names_it(tmp_path, text, messag
 def test_mistakes_in_flags_are_named_as_flags(overrides, message):
     with pytest.raises(InputError, match=message):
         load_config(Settings, None, overrides)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"widths": ()}, "widths: expected at least one level"),
+        ({"rates": (1e-3,)}, "rates: 1 entries for 2 widths; expected one for each"),
+        ({"widths": (8, 0)}, "widths: (8, 0); expected numbers > 0"),
+        ({"rates": (0.5, 1.5)}, "rates: (0.5, 1.5); expected numbers in (0, 1]"),
+        ({"normals": "none"}, "normals: none; expected one of auto, file"),
+        ({"origin": (1.0, 2.0)}, "origin: (1.0, 2.0); expected 3 numbers in [-3, 3], or none"),
+        ({"origin": (1.0, 2.0, 4.0)}, "origin: (1.0, 2.0, 4.0); expected 3 numbers in [-3, 3], or none"),
+        ({"budget": 0.0}, "budget: 0.0; expected > 0, or none"),
+        ({"budget": math.nan}, "budget: nan; expected > 0, or none"),
+        ({"views": 1}, "views: 1; expected at least 2"),
+        ({"share": 0.0}, "share: 0.0; expected a number in (0, 1]"),
+        ({"weight": -1e-9}, "weight: -1e-09; expected ≥ 0"),
+    ],
+)
+def test_fields_say_what_is_allowed(wrong: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match="expected") as caught:
+        Settings(**wrong)
+    assert str(caught.value) == message
+
+
+def test_bounds_themselves_are_allowed_where_they_belong() -> None:
+    Settings(rates=(1.0, 1.0), origin=(-3.0, 0.0, 3.0), views=2, share=1.0, weight=0.0, budget=None)
 
 
 def test_a_missing_file_and_an_unknown_preset_are_input_errors(tmp_path):
