@@ -18,7 +18,7 @@ from types import MappingProxyType
 from ..run.config import add_config_flags, given_flags, load_config, preset_names
 from ..run.settings import FitConfig, TextureConfig
 from .bench_runs import EVOLVE, PAPER, RECONSTRUCT
-from .command import Command, add_fit_settings, add_json, check_output, fit_settings, positive, whole, write_json
+from .common import Command, add_fit_settings, add_json, check_output, fit_settings, positive, whole, write_json
 
 __all__ = ["BENCH_COMMANDS"]
 

@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 from ..paper.names import METHODS, PRESETS, TABLES
 from ..run.config import add_config_flags, closest, given_flags, input_error, load_config, preset_names
 from ..run.settings import EvolveConfig, ReconstructConfig
-from .command import Command, add_json, check_output, positive, whole, write_json
+from .common import Command, add_json, check_output, positive, whole, write_json
 
 __all__ = ["EVOLVE", "PAPER", "RECONSTRUCT"]
 

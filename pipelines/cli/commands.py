@@ -1,102 +1,28 @@
-"""The commands: their arguments, and the few lines each one runs.
+"""The table of all commands, and those of a few lines: info, doctor, sample, demo.
 
-Whatever a command needs is imported when it runs; this module itself stays light, because
-``mplicits --help`` imports it.
+Whatever a command needs is imported when it runs; this module and those of the other commands stay light, because
+``mplicits --help`` imports them.
 """
 
 from __future__ import annotations
 
 import argparse
-import time
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
 
+from ..run.settings import FitConfig
 from .bench import BENCH_COMMANDS
-from .command import Command, add_fit_settings, add_json, check_output, fit_settings, positive, were_given, whole
+from .common import Command, add_flags, add_settings, check_output, read_settings, were_given
 from .draw import ANIMATE, RENDER, SLICE, VIEW
-from .fit import COMMAND as FIT
+from .fit import FIT
+from .mesh import EVALUATE, MESH
 from .train import EVOLVE, RECONSTRUCT, TEXTURE
 from .views import CHECK_CAMERAS, SCENE
 
-__all__ = ["COMMANDS", "Command"]
+__all__ = ["COMMANDS"]
 
-MESH_FILES = (".ply", ".obj", ".stl", ".glb")
 SAMPLES = ("statue",)
-
-
-def _mesh_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("run", metavar="RUN", help="run directory or .safetensors file")
-    parser.add_argument("-o", "--out", required=True, type=Path, metavar="FILE", help=", ".join(MESH_FILES))
-    parser.add_argument("--resolution", type=whole(8, 2048), default=256, metavar="N", help="cells per side (256)")
-    parser.add_argument("--time", type=float, metavar="T", help="the moment from 0 to 1, of a run that moves")
-    parser.add_argument("--level", type=whole(0), metavar="L", help="0 is the coarsest (default: the finest)")
-    parser.add_argument(
-        "--normal-level", type=whole(0), metavar="L", help="normals of this level on the mesh (default: of its own)"
-    )
-    parser.add_argument("--no-colors", action="store_true", help="leave out the colours of the run's texture")
-    parser.add_argument(
-        "--texture",
-        type=whole(16, 16384),
-        metavar="N",
-        help="unwrap, and bake colours and fine normals into N × N images (.glb, .obj; needs mplicits[texture])",
-    )
-    parser.add_argument(
-        "--texture-faces", type=whole(4), default=50_000, metavar="N", help="triangles to keep with --texture (50000)"
-    )
-    parser.add_argument(
-        "--keep-unsupported", action="store_true", help="keep components that no input points support, too"
-    )
-    parser.add_argument("--keep-largest", action="store_true", help="keep only the component of largest area")
-    parser.add_argument(
-        "--trim-distance",
-        type=positive,
-        metavar="D",
-        help="drop faces further than D (input units) from the points: holes stay holes",
-    )
-    parser.add_argument("--cloud", metavar="FILE", help="the points for --trim-distance (default: those of the fit)")
-
-
-def _mesh(arguments: argparse.Namespace) -> int:
-    from ..mesh.extract import MeshOptions, mesh_run
-
-    started = time.monotonic()
-    options = MeshOptions(
-        resolution=arguments.resolution,
-        time=arguments.time,
-        level=arguments.level,
-        normal_level=arguments.normal_level,
-        colors=not arguments.no_colors,
-        texture=arguments.texture,
-        texture_faces=arguments.texture_faces,
-        keep_unsupported=arguments.keep_unsupported,
-        keep_largest=arguments.keep_largest,
-        trim_distance=arguments.trim_distance,
-        cloud=arguments.cloud,
-    )
-    mesh = mesh_run(arguments.run, arguments.out, options, say=print)
-    seconds = time.monotonic() - started
-    print(f"{arguments.out}: {len(mesh.vertices):,} vertices, {len(mesh.faces):,} faces, in {seconds:.1f} s")
-    return 0
-
-
-def _evaluate_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("mesh", metavar="MESH", help="the mesh to judge")
-    parser.add_argument("reference", metavar="REFERENCE", help="the true mesh, or a point cloud")
-    parser.add_argument("--samples", type=whole(1), default=500_000, metavar="N", help="on each surface (500000)")
-    parser.add_argument("--seed", type=whole(0), default=0, metavar="N", help="of the samples (0)")
-    add_json(parser)
-
-
-def _evaluate(arguments: argparse.Namespace) -> int:
-    check_output(arguments.json, (".json",))
-    from ..surface.measure import evaluate_files, format_metrics, write_metrics
-
-    metrics = evaluate_files(arguments.mesh, arguments.reference, samples=arguments.samples, seed=arguments.seed)
-    print(format_metrics(metrics))
-    if arguments.json:
-        write_metrics(arguments.json, metrics)
-    return 0
 
 
 def _info_arguments(parser: argparse.ArgumentParser) -> None:
@@ -120,8 +46,8 @@ def _doctor(_arguments: argparse.Namespace) -> int:
 
 def _sample_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("name", nargs="?", choices=SAMPLES, default=SAMPLES[0], help="which one (default: statue)")
-    parser.add_argument("-o", "--out", required=True, type=Path, metavar="FILE", help="a .ply file to write")
-    parser.add_argument("--seed", type=whole(0), default=0, metavar="N", help="of the scanners' noise (0)")
+    add_flags(parser, "--out", help="a .ply file to write")
+    add_flags(parser, "--seed", help="of the scanners' noise (0)")
 
 
 def _sample(arguments: argparse.Namespace) -> int:
@@ -136,14 +62,14 @@ def _sample(arguments: argparse.Namespace) -> int:
 
 def _demo_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("cloud", nargs="?", metavar="CLOUD", help="any cloud (default: the bundled statue scan)")
-    parser.add_argument("-o", "--out", type=Path, default=Path("demo"), metavar="DIR", help="directory (demo)")
-    parser.add_argument("--resolution", type=whole(8, 2048), default=320, metavar="N", help="of the meshes (320)")
-    parser.add_argument("--up", choices=("y", "z"), help="the axis that points up in the picture")
-    add_fit_settings(parser)
+    add_flags(parser, "--out", required=False, default=Path("demo"), metavar="DIR", help="directory (demo)")
+    add_flags(parser, "--resolution", default=320, help="of the meshes (320)")
+    add_flags(parser, "--up", help="the axis that points up in the picture")
+    add_settings(parser, FitConfig)
 
 
 def _demo(arguments: argparse.Namespace) -> int:
-    config = fit_settings(arguments) if were_given(arguments) else None
+    config = read_settings(arguments, FitConfig) if were_given(arguments, FitConfig) else None
     from .demo import demo
 
     return demo(arguments.cloud, arguments.out, config=config, up=arguments.up, resolution=arguments.resolution)
@@ -152,15 +78,7 @@ def _demo(arguments: argparse.Namespace) -> int:
 COMMANDS: Mapping[str, Command] = MappingProxyType(
     {
         "fit": FIT,
-        "mesh": Command(
-            "extract a mesh from a fit",
-            """  mplicits mesh runs/scan -o scan.ply --resolution 512
-  mplicits mesh runs/scan -o coarse.obj --level 0
-  mplicits mesh runs/scan -o scan.glb --keep-largest --trim-distance 0.01""",
-            _mesh_arguments,
-            _mesh,
-            "Extract a mesh from a fit, in the coordinates of its input.",
-        ),
+        "mesh": MESH,
         "texture": TEXTURE,
         "reconstruct": RECONSTRUCT,
         "evolve": EVOLVE,
@@ -169,14 +87,7 @@ COMMANDS: Mapping[str, Command] = MappingProxyType(
         "slice": SLICE,
         "view": VIEW,
         "check-cameras": CHECK_CAMERAS,
-        "evaluate": Command(
-            "measure a mesh against a reference",
-            """  mplicits evaluate scan.ply truth.ply
-  mplicits evaluate scan.ply points.xyz --samples 100000 --json figures.json""",
-            _evaluate_arguments,
-            _evaluate,
-            "Measure a mesh against a mesh or a cloud. Lengths are in units of the reference's bounding sphere.",
-        ),
+        "evaluate": EVALUATE,
         "info": Command(
             "say what a run, a checkpoint, a mesh or a cloud is",
             "  mplicits info runs/scan\n  mplicits info scan.ply",

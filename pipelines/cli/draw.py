@@ -1,31 +1,32 @@
-"""``mplicits render``: its arguments, and the checks before any work.
-
-``mplicits slice``: its arguments, and the checks before any work.
-
-``mplicits animate``: its arguments, and the checks before any work.
-
-``mplicits view``: its arguments, and how it is started and stopped.
-"""
+"""The commands that draw: ``mplicits render``, ``slice``, ``animate`` and ``view``."""
 
 from __future__ import annotations
 
 import argparse
-import math
 import re
 import threading
 import time
 from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
+from typing import Any
 
 from ..run.config import add_config_flags, given_flags, input_error, load_config
 from ..run.settings import SHADINGS, ShadeOptions
-from .command import Command, check_output, positive, whole
+from .common import (
+    FILMS,
+    PICTURES,
+    Command,
+    add_flags,
+    between,
+    check_output,
+    check_size,
+    finite,
+    whole,
+)
 
 __all__ = ["ANIMATE", "RENDER", "SLICE", "VIEW"]
 
-PICTURES = (".png", ".jpg", ".jpeg")
-FILMS = (".mp4", ".gif")
 BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), "gray": (0.5, 0.5, 0.5), "transparent": None}
 ORBIT_FLAGS = ("azimuth", "elevation", "up", "fov", "zoom")
 # Settings that one shading alone heeds.
@@ -33,19 +34,15 @@ MEASURED = ("depth", "curvature", "error")
 OWNED = {"limits": MEASURED, "matcap": ("matcap",), "reference": ("error",)}
 
 
-def _between(low: float, high: float) -> Callable[[str], float]:
-    """A converter for argparse: numbers from ``low`` to ``high``."""
+def _draw(out: Path, title: str | None, work: Callable[[Callable[[int, int], None] | None], str]) -> int:
+    """Do the work, which says what it has drawn, and say that; with a progress bar if it has a title."""
+    from ..run.progress import counter_bar
 
-    def convert(text: str) -> float:
-        try:
-            number = float(text)
-        except ValueError:
-            number = float("nan")
-        if not low <= number <= high:
-            raise argparse.ArgumentTypeError(f"got {text!r}, expected a number from {low:g} to {high:g}")
-        return number
-
-    return convert
+    started = time.monotonic()
+    with nullcontext() if title is None else counter_bar(title) as progress:
+        drawn = work(progress)
+    print(f"{out}: {drawn}, in {time.monotonic() - started:.1f} s")
+    return 0
 
 
 def _color(text: str) -> tuple[float, float, float] | None:
@@ -62,90 +59,60 @@ def _render_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("source", metavar="RUN|MESH", help="run directory, .safetensors file, mesh or cloud")
     what = f"{', '.join(PICTURES)}; with {' or '.join(FILMS)} the camera goes around the shape"
-    add("-o", "--out", required=True, type=Path, metavar="FILE", help=what)
-    size = whole(1, 16384)
-    add("--size", type=size, nargs="+", metavar="N", help="width, or width and height (640, or that of the images)")
-    add("--time", type=_between(0, 1), metavar="T", help="the moment from 0 to 1, of a run that moves")
-    add("--level", type=whole(0), metavar="L", help="0 is the coarsest (default: the finest)")
-    add("--normal-level", type=whole(0), metavar="L", help="take the normals of this level (neural normal mapping)")
+    add_flags(parser, "--out", help=what)
+    add_flags(parser, "--size", help="width, or width and height (640, or that of the images)")
+    add_flags(parser, "--time", "--level")
+    add_flags(parser, "--normal-level", help="take the normals of this level (neural normal mapping)")
     add("--levels", action="store_true", help="all levels side by side, and the coarsest with the finest's normals")
     shadings = "; ".join(f"{name}: {text}" for name, text in SHADINGS.items())
     add("--shading", choices=tuple(SHADINGS), help=f"{shadings} (lambert)")
     add("--fast", action="store_true", help="no shadows, no occlusion")
     add("--reference", metavar="FILE", help="cloud or mesh for the error (default: what the run was fitted to)")
-    add("--azimuth", type=_between(-3600, 3600), metavar="A", help="degrees around the up axis from the front (30)")
-    add("--elevation", type=_between(-90, 90), metavar="E", help="degrees above the horizon (15)")
-    add("--up", choices=("y", "z"), help="the axis that points up (y)")
-    add("--fov", type=_between(0.1, 170), metavar="F", help="vertical angle of view, degrees (25)")
-    add("--zoom", type=positive, metavar="Z", help="magnification of the middle (1: the whole shape)")
+    add_flags(parser, "--azimuth", "--elevation", "--up")
+    add("--fov", type=between(0.1, 170), metavar="F", help="vertical angle of view, degrees (25)")
+    add_flags(parser, "--zoom", help="magnification of the middle (1: the whole shape)")
     add("--cameras", metavar="FILE", help="look from posed images instead: transforms.json or cameras_sphere.npz")
     add("--frame", metavar="NAME", help="which of them: a name, or an index from 0; a film goes through all")
     colors = f"#rrggbb or {', '.join(BACKGROUNDS)} (white)"
     add("--background", type=_color, default=BACKGROUNDS["white"], metavar="COLOR", help=colors)
-    add("--no-legend", action="store_true", help="leave out the colour bar")
-    add("--samples", type=whole(1, 8), default=2, metavar="N", help="rays per pixel and direction (2)")
-    add("--frames", type=whole(1, 100_000), default=96, metavar="N", help="of a film around the shape (96)")
-    add("--fps", type=positive, default=24.0, metavar="F", help="frames per second of a film (24)")
-    add("--device", default="auto", help="where to evaluate the field: auto, cpu, cuda, ... (auto)")
+    add("--no-legend", dest="legend", action="store_false", help="leave out the colour bar")
+    add_flags(parser, "--samples", "--fps", "--device")
+    add_flags(parser, "--frames", help="of a film around the shape (96)")
     add_config_flags(parser, ShadeOptions, about="of the shading")
 
 
 def _render(arguments: argparse.Namespace) -> int:
     check_output(arguments.out, (*PICTURES, *FILMS))
     given = given_flags(arguments, ShadeOptions)
-    shading = _shading(arguments, given)
+    arguments.shading = _shading(arguments, given)
     _check(arguments)
     lit = not arguments.fast
-    shade = load_config(ShadeOptions, overrides={"shadows": lit, "occlusion": lit, **given}, thing="render")
+    shade = load_config(ShadeOptions, overrides={"shadows": lit, "occlusion": lit, **given})
 
     from ..render.draw import RenderOptions, render_run
     from ..render.scene import Orbit
 
-    chosen = {name: value for name in ORBIT_FLAGS if (value := getattr(arguments, name)) is not None}
-    options = RenderOptions(
-        size=None if arguments.size is None else tuple(arguments.size),
-        time=arguments.time,
-        level=arguments.level,
-        normal_level=arguments.normal_level,
-        levels=arguments.levels,
-        shading=shading,
-        shade=shade,
-        reference=arguments.reference,
-        orbit=Orbit(**chosen),
-        cameras=arguments.cameras,
-        frame=arguments.frame,
-        background=arguments.background,
-        legend=not arguments.no_legend,
-        samples=arguments.samples,
-        frames=arguments.frames,
-        fps=arguments.fps,
-        device=arguments.device,
+    chosen = given_flags(arguments, RenderOptions) | {"background": arguments.background}
+    options = RenderOptions(shade=shade, orbit=Orbit(**given_flags(arguments, Orbit)), **chosen)
+    return _draw(
+        arguments.out, "render", lambda bar: render_run(arguments.source, arguments.out, options, progress=bar)
     )
-    started = time.monotonic()
-    from ..run.progress import counter_bar
-
-    with counter_bar("render") as progress:
-        drawn = render_run(arguments.source, arguments.out, options, progress=progress)
-    print(f"{arguments.out}: {drawn}, in {time.monotonic() - started:.1f} s")
-    return 0
 
 
 def _shading(arguments: argparse.Namespace, given: dict[str, object]) -> str | None:
     """The shading that is asked for; a matcap or a reference asks for its own."""
     asked = {name for name in OWNED if name in given or getattr(arguments, name, None) is not None}
-    if arguments.shading is None:
-        wanted = [OWNED[name][0] for name in ("matcap", "reference") if name in asked]
-        arguments.shading = wanted[0] if wanted else None
+    wanted = [OWNED[name][0] for name in ("matcap", "reference") if name in asked]
+    shading = arguments.shading or (wanted[0] if wanted else None)
     for name in sorted(asked):
-        if arguments.shading not in OWNED[name]:
+        if shading not in OWNED[name]:
             raise input_error(f"--{name}: goes with --shading {' or '.join(OWNED[name])}")
-    return arguments.shading
+    return shading
 
 
 def _check(arguments: argparse.Namespace) -> None:
     """Refuse what does not go together."""
-    if arguments.size is not None and len(arguments.size) > 2:
-        raise input_error(f"--size: got {len(arguments.size)} numbers; expected a width, or a width and a height")
+    check_size(arguments.size)
     for name in ("level", "normal_level"):
         if arguments.levels and getattr(arguments, name) is not None:
             raise input_error(f"--{name.replace('_', '-')}: --levels draws all of them; leave one of the two out")
@@ -173,59 +140,35 @@ RENDER = Command(
 )
 
 
-def _finite(text: str) -> float:
-    """A converter for argparse: finite numbers."""
-    try:
-        number = float(text)
-    except ValueError:
-        number = math.nan
-    if not math.isfinite(number):
-        raise argparse.ArgumentTypeError(f"got {text!r}, expected a number")
-    return number
-
-
 def _place(text: str) -> tuple[float, bool]:
     """A converter for argparse: a coordinate, or a number and % → (number, whether it is per cent)."""
-    number = _finite(text.removesuffix("%"))
+    number = finite(text.removesuffix("%"))
     if text.endswith("%") and not 0 <= number <= 100:
         raise argparse.ArgumentTypeError(f"got {text!r}, expected 0% to 100%, or a coordinate")
     return number, text.endswith("%")
 
 
 def _slice_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("run", metavar="RUN", help="run directory or .safetensors file")
-    parser.add_argument(
-        "-o",
-        "--out",
-        required=True,
-        type=Path,
-        metavar="FILE",
-        help=f"{', '.join(PICTURES)}; with {' or '.join(FILMS)} the plane sweeps through the shape",
-    )
-    parser.add_argument("--level", type=whole(0), metavar="L", help="0 is the coarsest (default: the finest)")
+    add = parser.add_argument
+    add_flags(parser, "run", "--level")
+    what = f"{', '.join(PICTURES)}; with {' or '.join(FILMS)} the plane sweeps through the shape"
+    add_flags(parser, "--out", help=what)
     direction = parser.add_mutually_exclusive_group()
-    direction.add_argument("--axis", choices=("x", "y", "z"), default="z", help="the plane is across this axis (z)")
-    direction.add_argument(
-        "--normal", type=_finite, nargs=3, metavar=("NX", "NY", "NZ"), help="or it is seen from this direction"
-    )
-    parser.add_argument(
-        "--at", type=_place, metavar="C", help="coordinate on the axis, or per cent of the shape's extent: 30%% (50%%)"
-    )
-    parser.add_argument(
-        "--point", type=_finite, nargs=3, metavar=("X", "Y", "Z"), help="with --normal: a point of the plane"
-    )
-    parser.add_argument("--up", choices=("y", "z"), default="y", help="the axis that points up in the picture (y)")
-    parser.add_argument(
-        "--size", type=whole(64, 8192), nargs="+", default=[800], metavar="N", help="width, or width and height (800)"
-    )
-    parser.add_argument("--iso", type=whole(2, 400), default=40, metavar="N", help="about so many iso-lines fit (40)")
-    parser.add_argument("--zoom", type=positive, default=1.0, metavar="Z", help="magnification (1: the whole shape)")
-    parser.add_argument(
-        "--center", type=_finite, nargs=3, metavar=("X", "Y", "Z"), help="what to zoom in on (default: the middle)"
-    )
-    parser.add_argument("--no-bands", action="store_true", help="leave out the bands |f_i| < δ_i")
-    parser.add_argument("--frames", type=whole(1, 100_000), default=96, metavar="N", help="of a film (96)")
-    parser.add_argument("--fps", type=positive, default=24.0, metavar="F", help="frames per second of a film (24)")
+    direction.add_argument("--axis", choices=("x", "y", "z"), help="the plane is across this axis (z)")
+    vector: dict[str, Any] = {"type": finite, "nargs": 3}
+    what = "or it is seen from this direction"
+    direction.add_argument("--normal", **vector, metavar=("NX", "NY", "NZ"), help=what)
+    what = "coordinate on the axis, or per cent of the shape's extent: 30%% (50%%)"
+    add("--at", type=_place, metavar="C", help=what)
+    add("--point", **vector, metavar=("X", "Y", "Z"), help="with --normal: a point of the plane")
+    add_flags(parser, "--up", help="the axis that points up in the picture (y)")
+    add_flags(parser, "--size", type=whole(64, 8192), help="width, or width and height (800)")
+    add("--iso", dest="lines", type=whole(2, 400), metavar="N", help="about so many iso-lines fit (40)")
+    add_flags(parser, "--zoom", help="magnification (1: the whole shape)")
+    add("--center", **vector, metavar=("X", "Y", "Z"), help="what to zoom in on (default: the middle)")
+    add("--no-bands", dest="bands", action="store_false", help="leave out the bands |f_i| < δ_i")
+    add_flags(parser, "--frames", help="of a film (96)")
+    add_flags(parser, "--fps")
 
 
 def _slice(arguments: argparse.Namespace) -> int:
@@ -240,40 +183,23 @@ def _slice(arguments: argparse.Namespace) -> int:
         raise input_error("--point: goes with --normal; with --axis say --at C")
     if arguments.normal is not None and not any(arguments.normal):
         raise input_error("--normal: has no direction; give three numbers that are not all 0")
-    if len(arguments.size) > 2:
-        raise input_error(f"--size: got {len(arguments.size)} numbers; expected a width, or a width and a height")
+    check_size(arguments.size)
 
     from ..render.slicing import SliceOptions, slice_run
 
-    number, percent = arguments.at or (None, False)
-    options = SliceOptions(
-        level=arguments.level,
-        axis=arguments.axis,
-        at=None if percent else number,
-        percent=number if percent else None,
-        normal=_triple(arguments.normal),
-        point=_triple(arguments.point),
-        up=arguments.up,
-        size=(arguments.size[0], arguments.size[-1]),
-        lines=arguments.iso,
-        zoom=arguments.zoom,
-        center=_triple(arguments.center),
-        bands=not arguments.no_bands,
-        frames=arguments.frames,
-        fps=arguments.fps,
-    )
-    started = time.monotonic()
-    from ..run.progress import counter_bar
+    given = given_flags(arguments, SliceOptions)
+    if "size" in given:
+        given["size"] = (given["size"][0], given["size"][-1])
+    if "at" in given:
+        number, percent = given.pop("at")
+        given["percent" if percent else "at"] = number
+    options = SliceOptions(**given)
 
-    with counter_bar("slices") if film else nullcontext() as bar:
-        progress = None if bar is None else lambda done: bar(done, arguments.frames)
-        drawn = slice_run(arguments.run, arguments.out, options, progress=progress)
-    print(f"{arguments.out}: {drawn}, in {time.monotonic() - started:.1f} s")
-    return 0
+    def work(bar: Callable[[int, int], None] | None) -> str:
+        progress = None if bar is None else lambda done: bar(done, options.frames)
+        return slice_run(arguments.run, arguments.out, options, progress=progress)
 
-
-def _triple(values: list[float] | None) -> tuple[float, float, float] | None:
-    return None if values is None else (values[0], values[1], values[2])
+    return _draw(arguments.out, "slices" if film else None, work)
 
 
 SLICE = Command(
@@ -290,41 +216,27 @@ SLICE = Command(
 )
 
 
-MOVING = (".mp4", ".gif", ".png")
+MOVING = (*FILMS, ".png")
 ANIMATED_SHADINGS = ("lambert", "headlight", "normals", "matcap", "color")
 OF_FILMS = ("size", "up", "azimuth", "elevation", "zoom", "shading", "samples")
-
-
-def _angle(text: str) -> float:
-    try:
-        number = float(text)
-    except ValueError:
-        number = float("nan")
-    if not abs(number) <= 3600:
-        raise argparse.ArgumentTypeError(f"got {text!r}, expected degrees")
-    return number
 
 
 def _animate_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("run", metavar="RUN", help="run directory or .safetensors file of `mplicits evolve`")
     what = "an .mp4 or .gif film, a .png of all frames, a .glb of one mesh that moves, or a folder for one .ply a frame"
-    add("-o", "--out", required=True, type=Path, metavar="OUT", help=what)
-    add("--frames", type=whole(1, 100_000), default=48, metavar="N", help="times from 0 to 1 (48)")
-    add("--fps", type=positive, default=24.0, metavar="F", help="frames per second (24)")
-    add("--level", type=whole(0), metavar="L", help="0 is the coarsest (default: the finest)")
+    add_flags(parser, "--out", metavar="OUT", help=what)
+    add_flags(parser, "--frames", help="times from 0 to 1 (48)")
+    add_flags(parser, "--fps", help="frames per second (24)")
+    add_flags(parser, "--level", "--device")
     add("--colors", metavar="RUN", help="a textured run of the first shape, to ride along (default: RUN's own)")
     add("--no-colors", action="store_true", help="leave colours out")
-    add("--resolution", type=whole(8, 2048), metavar="N", help="meshes: cells per side (128)")
-    add("--size", type=whole(16, 8192), nargs="+", metavar="N", help="film: width, or width and height (640)")
-    add("--up", choices=("y", "z"), help="film: the axis that points up (y)")
-    add("--azimuth", type=_angle, metavar="A", help="film: degrees around the up axis from the front (30)")
-    add("--elevation", type=_angle, metavar="E", help="film: degrees above the horizon (15)")
-    add("--zoom", type=positive, metavar="Z", help="film: magnification of the middle (1)")
+    add_flags(parser, "--resolution", help="meshes: cells per side (128)")
+    add_flags(parser, "--size", type=whole(16, 8192), help="film: width, or width and height (640)")
+    add_flags(parser, "--up", "--azimuth", "--elevation", "--samples", of="film: ")
+    add_flags(parser, "--zoom", help="film: magnification of the middle (1)")
     add("--shading", choices=ANIMATED_SHADINGS, help="film: how it is shaded (lambert)")
     add("--shadows", action="store_true", help="film: shadows and occlusion, for twice the time or more")
-    add("--samples", type=whole(1, 8), metavar="N", help="film: rays per pixel and direction (2)")
-    add("--device", default="auto", help="where to evaluate the field: auto, cpu, cuda, … (auto)")
 
 
 def _animate(arguments: argparse.Namespace) -> int:
@@ -334,36 +246,18 @@ def _animate(arguments: argparse.Namespace) -> int:
             raise input_error(f"--{name}: goes with a film (.mp4, .gif) or a sheet (.png)")
     if film and arguments.resolution is not None:
         raise input_error("--resolution: goes with meshes; a film is traced in pixels (--size)")
-    if arguments.size is not None and len(arguments.size) > 2:
-        raise input_error("--size: give the width, or width and height")
+    check_size(arguments.size)
     if arguments.no_colors and arguments.colors is not None:
         raise input_error("--colors: --no-colors leaves them out; leave one of the two out")
 
     from ..evolve.animate import SequenceOptions, animate_run
     from ..render.scene import Orbit
 
-    chosen = {name: getattr(arguments, name) for name in ("resolution", "shading", "samples")}
-    orbit = {name: getattr(arguments, name) for name in ("up", "azimuth", "elevation", "zoom")}
-    size = arguments.size or [640]
-    options = SequenceOptions(
-        frames=arguments.frames,
-        fps=arguments.fps,
-        size=(size[0], size[-1]),
-        level=arguments.level,
-        colors=arguments.colors,
-        no_colors=arguments.no_colors,
-        orbit=Orbit(**{name: value for name, value in orbit.items() if value is not None}),
-        shadows=arguments.shadows,
-        device=arguments.device,
-        **{name: value for name, value in chosen.items() if value is not None},
-    )
-    started = time.monotonic()
-    from ..run.progress import counter_bar
-
-    with counter_bar("animate") as progress:
-        written = animate_run(arguments.run, arguments.out, options, progress=progress)
-    print(f"{arguments.out}: {written}, in {time.monotonic() - started:.1f} s")
-    return 0
+    given = given_flags(arguments, SequenceOptions)
+    if "size" in given:
+        given["size"] = (given["size"][0], given["size"][-1])
+    options = SequenceOptions(orbit=Orbit(**given_flags(arguments, Orbit)), **given)
+    return _draw(arguments.out, "animate", lambda bar: animate_run(arguments.run, arguments.out, options, progress=bar))
 
 
 ANIMATE = Command(
@@ -381,15 +275,14 @@ ANIMATE = Command(
 
 
 def _view_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("run", metavar="RUN", help="run directory or .safetensors file")
-    parser.add_argument("--up", choices=("y", "z"), default="y", help="the axis that points up (y)")
-    parser.add_argument(
-        "--size", type=whole(64, 4096), default=512, metavar="N", help="images of about N × N pixels (512)"
-    )
-    parser.add_argument("--host", default="127.0.0.1", help="address to listen on (127.0.0.1: this machine only)")
-    parser.add_argument("--port", type=_port, metavar="N", help="port to listen on (default: a free one from 8080 up)")
-    parser.add_argument("--device", default="auto", help="where to evaluate the field: auto, cpu, cuda, … (auto)")
-    parser.add_argument("--open", action=argparse.BooleanOptionalAction, default=False, help="open a browser")
+    add = parser.add_argument
+    add_flags(parser, "run", "--device")
+    add_flags(parser, "--up", default="y")
+    what = "images of about N × N pixels (512)"
+    add("--size", type=whole(64, 4096), default=512, metavar="N", help=what)
+    add("--host", default="127.0.0.1", help="address to listen on (127.0.0.1: this machine only)")
+    add("--port", type=_port, metavar="N", help="port to listen on (default: a free one from 8080 up)")
+    add("--open", action=argparse.BooleanOptionalAction, default=False, help="open a browser")
 
 
 def _port(text: str) -> int | None:

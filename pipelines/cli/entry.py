@@ -15,7 +15,8 @@ from collections.abc import Sequence
 from typing import NoReturn
 
 from ..run.config import closest
-from .commands import COMMANDS, Command
+from .commands import COMMANDS
+from .common import Command, Stopped, check_output
 
 __all__ = ["main"]
 
@@ -84,6 +85,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         return int(stop.code or 0)
     except _UsageError as error:
         return _fail(str(error))
+    except Stopped as stop:
+        print(stop, file=sys.stderr)
+        return 130
     except KeyboardInterrupt:
         print("mplicits: interrupted", file=sys.stderr)
         return 130
@@ -111,7 +115,9 @@ def _run(arguments: list[str]) -> int:
     parser = _Parser(name, command)
     if not {"-h", "--help"} & set(rest):
         parser.check_flags(rest)
-    code = command.run(parser.parse_args(rest))
+    given = parser.parse_args(rest)
+    check_output(getattr(given, "json", None), (".json",))
+    code = command.run(given)
     sys.stdout.flush()
     return code
 

@@ -5,91 +5,107 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..run.config import input_error
-from .command import Command, add_fit_settings, fit_settings, positive, were_given, whole
+from ..run.config import given_flags, input_error
+from ..run.settings import FitConfig
+from .common import (
+    Command,
+    add_new_run,
+    add_settings,
+    positive,
+    read_settings,
+    stoppable,
+    training,
+    were_given,
+    whole,
+)
 from .train import tell_texture
 
 if TYPE_CHECKING:
     from ..fit.depth import DepthInput
     from ..fit.many import FitOutcome
     from ..mesh.finish import FitMesh
-    from ..run.settings import FitConfig
 
-__all__ = ["COMMAND"]
+__all__ = ["FIT"]
+
+DEPTH_FLAGS = (
+    *("intrinsics", "fov", "color", "resize_color", "poses"),
+    *("depth_scale", "inverse_depth", "max_depth", "max_points", "smooth_depth"),
+)
 
 
 def _arguments(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
     what = "PLY, OBJ, STL, OFF, XYZ, TXT, CSV, NPY, NPZ, LAS or LAZ file; a depth map, or a folder of them"
-    parser.add_argument("clouds", nargs="+", metavar="CLOUD", help=f"{what}; several clouds get a run each, RUN/NAME")
-    parser.add_argument("-o", "--out", required=True, type=Path, metavar="RUN", help="directory of the run, or runs")
-    parser.add_argument(
-        "--jobs", type=whole(1), metavar="N", help="several clouds: so many at a time; above 1 needs mplicits[ray]"
-    )
-    parser.add_argument(
-        "--mesh",
-        type=Path,
-        metavar="FILE",
-        help="then learn the colours, if there are any, and write the mesh (.ply, .obj, .stl, .glb)",
-    )
-    parser.add_argument("--no-colors", action="store_true", help="leave the colours out of --mesh")
-    begin = parser.add_mutually_exclusive_group()
-    begin.add_argument("--resume", action="store_true", help="continue the interrupted run in RUN, with its settings")
-    begin.add_argument("--force", action="store_true", help="overwrite the run in RUN")
-    parser.add_argument("--quiet", action="store_true", help="no progress bars")
-    add_fit_settings(parser)
-    add_depth_flags(parser)
+    add("clouds", nargs="+", metavar="CLOUD", help=f"{what}; several clouds get a run each, RUN/NAME")
+    add_new_run(parser, "directory of the run, or runs")
+    add("--jobs", type=whole(1), metavar="N", help="several clouds: so many at a time; above 1 needs mplicits[ray]")
+    what = "then learn the colours, if there are any, and write the mesh (.ply, .obj, .stl, .glb)"
+    add("--mesh", type=Path, metavar="FILE", help=what)
+    add("--no-colors", action="store_true", help="leave the colours out of --mesh")
+    add_settings(parser, FitConfig)
+    _depth_arguments(parser)
+
+
+def _depth_arguments(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument_group("depth maps (PNG, TIFF, NPY or NPZ, or a folder of them)").add_argument
+    what = "camera JSON (ours, or Open3D's), or four numbers in pixels: FX FY CX CY"
+    add("--intrinsics", nargs="+", metavar="FILE|NUMBER", help=what)
+    add("--fov", type=positive, metavar="DEGREES", help="vertical angle of view, if no more is known")
+    add("--color", type=Path, metavar="FILE|DIR", help="the picture, or a folder of one per depth map")
+    add("--resize-color", action="store_true", help="scale pictures to the size of the depth maps")
+    add("--poses", type=Path, metavar="FILE", help="of several depth maps: Open3D's trajectory.log, or transforms.json")
+    what = "numbers per unit (integers: as the camera says, or 1000; else 1)"
+    add("--depth-scale", type=positive, metavar="N", help=what)
+    add("--inverse-depth", action="store_true", help="the numbers are disparities: z = scale / number")
+    add("--max-depth", type=positive, metavar="Z", help="drop what is further away than this")
+    add("--max-points", type=whole(1), metavar="N", help="thin the cloud to as many (200000)")
+    what = "radius of smoothing (as the noise asks for; 0: none)"
+    add("--smooth-depth", type=whole(0, 16), metavar="PIXELS", help=what)
 
 
 def _fit(arguments: argparse.Namespace) -> int:
-    if arguments.resume and were_given(arguments):
+    if arguments.resume and were_given(arguments, FitConfig):
         raise input_error("--resume: continues with the run's own settings; leave out --preset, --config and the rest")
     if arguments.no_colors and arguments.mesh is None:
         raise input_error("--no-colors: is about --mesh FILE; leave it out, or add that")
-    config = None if arguments.resume else fit_settings(arguments)
+    config = None if arguments.resume else read_settings(arguments, FitConfig)
     if len(arguments.clouds) > 1 or arguments.jobs is not None:
         return _fit_many(arguments, config)
-    arguments.cloud = arguments.clouds[0]
     from ..run.team import team
 
     with team(device="auto" if config is None else config.device) as leads:
-        return _fit_one(arguments, config) if leads else _follow(arguments, config)
+        work = _fit_one if leads else _follow
+        return work(arguments, arguments.clouds[0], config)
 
 
-def _fit_one(arguments: argparse.Namespace, config: FitConfig | None) -> int:
+def _fit_one(arguments: argparse.Namespace, cloud: str, config: FitConfig | None) -> int:
     from ..fit.depth import fit_depth, trim_suggestion
     from ..fit.train import fit
-    from ..run.folder import check_new_run, is_fitted
+    from ..run.folder import TEXTURE_FILE, check_new_run, is_fitted
     from ..run.machine import peak_memory
-    from ..run.progress import progress_bars
-    from ..run.trainer import Interrupted
     from .info import describe
 
-    directory, depth = arguments.out, depth_input(arguments)
+    directory, depth = arguments.out, _depth_input(arguments, cloud)
     # A run that was interrupted after its fit goes on there.
     fitted = arguments.resume and arguments.mesh is not None and is_fitted(directory)
     if not fitted:
         check_new_run(directory, resume=arguments.resume, force=arguments.force)
-    mesh = _planned(arguments, depth)
-    again = f"to continue: mplicits fit {arguments.cloud} -o {directory} --resume"
+    mesh = _planned(arguments, Path(cloud) if depth is None else depth)
+    again = f"to continue: mplicits fit {cloud} -o {directory} --resume"
     if mesh is not None:
         again += f" --mesh {mesh.out}" + " --no-colors" * arguments.no_colors
     texture = None
-    try:
-        with nullcontext() if arguments.quiet else progress_bars() as report:
-            if not fitted and depth is None:
-                fit(arguments.cloud, config, out=directory, resume=arguments.resume, progress=report)
-            elif not fitted and depth is not None:
-                fit_depth(depth, config, out=directory, resume=arguments.resume, progress=report, say=print)
-            if mesh is not None:
-                texture = mesh.texture(refit=not fitted, progress=report)
-    except Interrupted:
-        print(f"interrupted; {again}", file=sys.stderr)
-        return 130
+    with training(again, quiet=arguments.quiet) as report:
+        if not fitted and depth is None:
+            fit(cloud, config, out=directory, resume=arguments.resume, progress=report)
+        elif not fitted and depth is not None:
+            fit_depth(depth, config, out=directory, resume=arguments.resume, progress=report, say=print)
+        if mesh is not None:
+            texture = mesh.texture(refit=not fitted, progress=report)
     print(describe(directory))
     memory = peak_memory()
     if memory is not None:
@@ -100,33 +116,34 @@ def _fit_one(arguments: argparse.Namespace, config: FitConfig | None) -> int:
         print(f"next: mplicits mesh {directory} -o {directory / 'mesh.ply'}{trim}")
         return 0
     if texture is not None:
-        from ..run.folder import TEXTURE_FILE
-
-        tell_texture(directory / TEXTURE_FILE, texture)
-        if not texture.record["finished"]:
-            print(f"interrupted; the texture holds what was learnt so far; {again}", file=sys.stderr)
-            return 130
+        tell_texture(directory / TEXTURE_FILE, texture, again)
     started = time.monotonic()
-    try:
+    with stoppable(f"fit and texture are finished; {again}", at_any_time=True):
         made = mesh.extract(say=print)
-    except KeyboardInterrupt:
-        print(f"interrupted; fit and texture are finished; {again}", file=sys.stderr)
-        return 130
     facts = [f"{len(made.vertices):,} vertices", f"{len(made.faces):,} faces"]
     facts += ["with colours"] * mesh.colored + ([trim.strip()] if trim else [])
     print(f"{mesh.out}: {', '.join(facts)}, in {time.monotonic() - started:.1f} s")
     return 0
 
 
-def _follow(arguments: argparse.Namespace, config: FitConfig | None) -> int:
-    """Help the process that does the rest; see `team`."""
+def _planned(arguments: argparse.Namespace, source: Path | DepthInput) -> FitMesh | None:
+    """The mesh that shall follow, checked; None if there is to be none."""
+    if arguments.mesh is None:
+        return None
+    from ..mesh.finish import plan_mesh
+
+    return plan_mesh(arguments.mesh, arguments.out, source, colors=not arguments.no_colors, resume=arguments.resume)
+
+
+def _follow(arguments: argparse.Namespace, cloud: str, config: FitConfig | None) -> int:
+    """Help the process that does the rest, and speaks for all; see `team`."""
     from ..fit.train import fit
     from ..run.trainer import Interrupted
 
-    if depth_input(arguments) is not None:
-        raise input_error(f"{arguments.cloud}: depth maps are fitted by one process; leave out torchrun")
+    if _depth_input(arguments, cloud) is not None:
+        raise input_error(f"{cloud}: depth maps are fitted by one process; leave out torchrun")
     try:
-        fit(arguments.cloud, config, out=arguments.out, resume=arguments.resume)
+        fit(cloud, config, out=arguments.out, resume=arguments.resume)
     except Interrupted:
         return 130
     return 0
@@ -137,30 +154,24 @@ def _fit_many(arguments: argparse.Namespace, config: FitConfig | None) -> int:
     if arguments.mesh is not None:
         raise input_error("--mesh: is for one cloud; leave it out, and mesh the runs afterwards")
     for cloud in arguments.clouds:
-        if depth_input(argparse.Namespace(**{**vars(arguments), "cloud": cloud})) is not None:
+        if _depth_input(arguments, cloud) is not None:
             raise input_error(f"{cloud}: holds depth maps; fit them on their own, without --jobs")
     from ..fit.many import fit_many, format_fits, plan_fits
     from ..run.jobs import check_jobs
-    from ..run.progress import progress_bars
-    from ..run.trainer import Interrupted
 
     jobs = arguments.jobs or 1
     check_jobs(jobs)
     planned = plan_fits(arguments.clouds, arguments.out, config, resume=arguments.resume, force=arguments.force)
-    try:
-        with nullcontext() if arguments.quiet or jobs > 1 else progress_bars() as show:
-            outcomes = fit_many(
-                planned,
-                arguments.out,
-                jobs=jobs,
-                progress=None if show is None else lambda name, step: show(replace(step, stage=f"{name} {step.stage}")),
-                report=None if arguments.quiet or jobs == 1 else _tell_outcome,
-            )
-    except (Interrupted, KeyboardInterrupt):
-        clouds = " ".join(arguments.clouds)
-        again = f"mplicits fit {clouds} -o {arguments.out} --jobs {jobs} --resume"
-        print(f"interrupted; to continue: {again}", file=sys.stderr)
-        return 130
+    again = f"mplicits fit {' '.join(arguments.clouds)} -o {arguments.out} --jobs {jobs} --resume"
+    quiet = arguments.quiet or jobs > 1
+    with training(f"to continue: {again}", quiet=quiet, at_any_time=True) as show:
+        outcomes = fit_many(
+            planned,
+            arguments.out,
+            jobs=jobs,
+            progress=None if show is None else lambda name, step: show(replace(step, stage=f"{name} {step.stage}")),
+            report=None if arguments.quiet or jobs == 1 else _tell_outcome,
+        )
     print(format_fits(outcomes))
     return int(any(outcome.error is not None for outcome in outcomes))
 
@@ -170,18 +181,38 @@ def _tell_outcome(outcome: FitOutcome) -> None:
     print(f"{outcome.item.cloud}: {result}, after {outcome.seconds:.1f} s", file=sys.stderr)
 
 
-def _planned(arguments: argparse.Namespace, depth: DepthInput | None) -> FitMesh | None:
-    """The mesh that shall follow, checked; None if there is to be none."""
-    if arguments.mesh is None:
+def _depth_input(arguments: argparse.Namespace, cloud: str) -> DepthInput | None:
+    """What the arguments say of depth maps; None if CLOUD is a cloud.
+
+    Raises:
+        InputError: there are flags of depth maps, but CLOUD is none.
+    """
+    from ...datasets import DepthSettings, is_depth_file
+    from ...datasets.depth.images import DEPTH_SUFFIXES
+    from ..fit.depth import DepthInput
+
+    given = [
+        name for name in DEPTH_FLAGS if getattr(arguments, name) is not None and getattr(arguments, name) is not False
+    ]
+    path = Path(cloud)
+    if given and not (path.suffix.lower() in DEPTH_SUFFIXES or path.is_dir()):
+        flag, known = given[0].replace("_", "-"), ", ".join(DEPTH_SUFFIXES)
+        raise input_error(f"{path}: --{flag} is for depth maps ({known}, or a folder of them), not for clouds")
+    inside = path.is_dir() and any(is_depth_file(file) for file in path.iterdir())
+    if not given and not inside and not (path.suffix and is_depth_file(path)):
         return None
+    if arguments.fov is not None and arguments.intrinsics:
+        raise input_error("--fov: does not go with --intrinsics; leave out one of them")
+    return DepthInput(
+        depth=path,
+        scale=arguments.depth_scale,
+        inverse=arguments.inverse_depth,
+        settings=DepthSettings(smoothing=arguments.smooth_depth, **given_flags(arguments, DepthSettings)),
+        **given_flags(arguments, DepthInput),
+    )
 
-    source = Path(arguments.cloud) if depth is None else depth
-    from ..mesh.finish import plan_mesh
 
-    return plan_mesh(arguments.mesh, arguments.out, source, colors=not arguments.no_colors, resume=arguments.resume)
-
-
-COMMAND = Command(
+FIT = Command(
     "fit a multiscale SDF to a point cloud or depth maps",
     """  mplicits fit scan.ply -o runs/scan
   mplicits fit scan.ply -o runs/scan --mesh scan_mesh.ply
@@ -196,88 +227,3 @@ COMMAND = Command(
     "Fit a multiscale SDF to a point cloud, or to depth maps. RUN will hold field.safetensors and run.json. Of several "
     "clouds, each gets a run in RUN, named as the cloud.",
 )
-
-
-if TYPE_CHECKING:
-    from ..fit.depth import DepthInput
-
-
-def add_depth_flags(parser: argparse.ArgumentParser) -> None:
-    """Add them, in a group of their own."""
-    add = parser.add_argument_group("depth maps (PNG, TIFF, NPY or NPZ, or a folder of them)").add_argument
-    add(
-        "--intrinsics",
-        nargs="+",
-        metavar="FILE|NUMBER",
-        help="camera JSON (ours, or Open3D's), or four numbers in pixels: FX FY CX CY",
-    )
-    add("--fov", type=positive, metavar="DEGREES", help="vertical angle of view, if no more is known")
-    add("--color", type=Path, metavar="FILE|DIR", help="the picture, or a folder of one per depth map")
-    add("--resize-color", action="store_true", help="scale pictures to the size of the depth maps")
-    add("--poses", type=Path, metavar="FILE", help="of several depth maps: Open3D's trajectory.log, or transforms.json")
-    add(
-        "--depth-scale",
-        type=positive,
-        metavar="N",
-        help="numbers per unit (integers: as the camera says, or 1000; else 1)",
-    )
-    add("--inverse-depth", action="store_true", help="the numbers are disparities: z = scale / number")
-    add("--max-depth", type=positive, metavar="Z", help="drop what is further away than this")
-    add("--max-points", type=whole(1), metavar="N", help="thin the cloud to as many (200000)")
-    add(
-        "--smooth-depth",
-        type=whole(0, 16),
-        metavar="PIXELS",
-        help="radius of smoothing (as the noise asks for; 0: none)",
-    )
-
-
-def depth_input(arguments: argparse.Namespace) -> DepthInput | None:
-    """What the arguments say of depth maps; None if CLOUD is a cloud.
-
-    Raises:
-        InputError: there are flags of depth maps, but CLOUD is none.
-    """
-    flags = {
-        "--intrinsics": arguments.intrinsics,
-        "--fov": arguments.fov,
-        "--color": arguments.color,
-        "--resize-color": arguments.resize_color,
-        "--poses": arguments.poses,
-        "--depth-scale": arguments.depth_scale,
-        "--inverse-depth": arguments.inverse_depth,
-        "--max-depth": arguments.max_depth,
-        "--max-points": arguments.max_points,
-        "--smooth-depth": arguments.smooth_depth is not None,
-    }
-    given = [flag for flag, value in flags.items() if value]
-    path = Path(arguments.cloud)
-    from ...datasets import DepthSettings, is_depth_file
-    from ...datasets.depth.images import DEPTH_SUFFIXES
-
-    named_so = path.suffix.lower() in DEPTH_SUFFIXES or path.is_dir()
-    if given and not named_so:
-        known = ", ".join(DEPTH_SUFFIXES)
-        raise input_error(f"{path}: {given[0]} is for depth maps ({known}, or a folder of them), not for clouds")
-    inside = path.is_dir() and any(is_depth_file(file) for file in path.iterdir())
-    if not given and not inside and not (path.suffix and is_depth_file(path)):
-        return None
-    if arguments.fov is not None and arguments.intrinsics:
-        raise input_error("--fov: does not go with --intrinsics; leave out one of them")
-    from ..fit.depth import DepthInput
-
-    return DepthInput(
-        depth=path,
-        intrinsics=tuple(arguments.intrinsics or ()),
-        fov=arguments.fov,
-        color=arguments.color,
-        poses=arguments.poses,
-        scale=arguments.depth_scale,
-        inverse=arguments.inverse_depth,
-        resize_color=arguments.resize_color,
-        settings=DepthSettings(
-            max_depth=arguments.max_depth,
-            smoothing=arguments.smooth_depth,
-            **({} if arguments.max_points is None else {"max_points": arguments.max_points}),
-        ),
-    )

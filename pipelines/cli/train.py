@@ -1,21 +1,26 @@
-"""``mplicits texture``: its arguments, and the checks before any work.
-
-``mplicits reconstruct``: its arguments, and the checks before any work.
-
-``mplicits evolve``: its arguments, and the checks before any work.
-"""
+"""The commands that train, but for ``fit``: ``mplicits texture``, ``reconstruct`` and ``evolve``."""
 
 from __future__ import annotations
 
 import argparse
 import sys
-from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..run.config import add_config_flags, given_flags, input_error, load_config, preset_names
+from ..run.config import given_flags, input_error, load_config
 from ..run.settings import EvolveConfig, ReconstructConfig, TextureConfig
-from .command import Command, check_output, whole
+from .common import (
+    Command,
+    Stopped,
+    add_begin,
+    add_flags,
+    add_new_run,
+    add_settings,
+    check_output,
+    read_settings,
+    training,
+    were_given,
+)
 
 __all__ = ["EVOLVE", "RECONSTRUCT", "TEXTURE", "tell_texture"]
 
@@ -24,32 +29,20 @@ if TYPE_CHECKING:
 
 
 def _texture_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("run", metavar="RUN", help="run directory or .safetensors file")
-    parser.add_argument(
-        "source",
-        metavar="CLOUD|MESH",
-        help="points with colours (PLY, NPZ, LAS, ...), or a mesh with a texture or vertex colours (OBJ, GLB, PLY)",
-    )
-    parser.add_argument(
-        "-o", "--out", type=Path, metavar="FILE", help=".safetensors (default: texture.safetensors beside the field)"
-    )
-    parser.add_argument("--level", type=whole(0), metavar="L", help="0 is the coarsest (default: the finest)")
-    begin = parser.add_mutually_exclusive_group()
-    begin.add_argument("--resume", action="store_true", help="continue an interrupted training, with its settings")
-    begin.add_argument("--force", action="store_true", help="replace a texture that is there already")
-    parser.add_argument("--quiet", action="store_true", help="no progress bars")
-    source = parser.add_mutually_exclusive_group()
-    names = ", ".join(preset_names("texture"))
-    source.add_argument("--preset", metavar="NAME", help=f"one of {names} (default: default)")
-    source.add_argument("--config", type=Path, metavar="FILE", help="a YAML file of settings")
-    add_config_flags(parser, TextureConfig)
+    add_flags(parser, "run", "--level")
+    what = "points with colours (PLY, NPZ, LAS, ...), or a mesh with a texture or vertex colours (OBJ, GLB, PLY)"
+    parser.add_argument("source", metavar="CLOUD|MESH", help=what)
+    what = ".safetensors (default: texture.safetensors beside the field)"
+    add_flags(parser, "--out", required=False, help=what)
+    resume = "continue an interrupted training, with its settings"
+    add_begin(parser, resume=resume, force="replace a texture that is there already")
+    add_settings(parser, TextureConfig)
 
 
 def _texture(arguments: argparse.Namespace) -> int:
-    preset, flags = arguments.config or arguments.preset, given_flags(arguments, TextureConfig)
-    if arguments.resume and (preset or flags or arguments.level is not None):
+    if arguments.resume and (were_given(arguments, TextureConfig) or arguments.level is not None):
         raise input_error("--resume: continues with its own settings; leave out --preset, --level and the rest")
-    config = load_config(TextureConfig, preset or "default", flags, thing="texture")
+    config = read_settings(arguments, TextureConfig)
     check_output(arguments.out, (".safetensors",))
     from ..run.folder import TEXTURE_FILE, find_field
     from ..texture.train import texture_run
@@ -59,9 +52,7 @@ def _texture(arguments: argparse.Namespace) -> int:
     if target.exists() and target.samefile(field):
         raise input_error(f"{target}: is the field itself; name another -o")
     _check_state(target, resume=arguments.resume, force=arguments.force)
-    from ..run.progress import progress_bars
-
-    with nullcontext() if arguments.quiet else progress_bars() as report:
+    with training(quiet=arguments.quiet) as report:
         fitted = texture_run(
             arguments.run,
             arguments.source,
@@ -71,15 +62,8 @@ def _texture(arguments: argparse.Namespace) -> int:
             resume=arguments.resume,
             progress=report,
         )
-    tell_texture(target, fitted)
-    if not fitted.record["finished"]:
-        where = "" if arguments.out is None else f" -o {arguments.out}"
-        print(
-            f"interrupted; the texture holds what was learnt so far; to continue: mplicits texture {arguments.run} "
-            f"{arguments.source}{where} --resume",
-            file=sys.stderr,
-        )
-        return 130
+    where = "" if arguments.out is None else f" -o {arguments.out}"
+    tell_texture(target, fitted, f"to continue: mplicits texture {arguments.run} {arguments.source}{where} --resume")
     return 0
 
 
@@ -97,8 +81,12 @@ def _check_state(target: Path, *, resume: bool, force: bool) -> None:
         raise input_error(f"{found}{hint} --force replaces it, or choose another -o")
 
 
-def tell_texture(target: Path, fitted: FittedTexture) -> None:
-    """Print what has been trained, and warn of points that were left out."""
+def tell_texture(target: Path, fitted: FittedTexture, again: str) -> None:
+    """Print what has been trained, and warn of points that were left out.
+
+    Raises:
+        Stopped: it is not finished; ``again`` says how to continue.
+    """
     record, config = fitted.record, fitted.record["config"]
     if record["left_out"]:
         everything = record["points"] + record["left_out"]
@@ -111,6 +99,8 @@ def tell_texture(target: Path, fitted: FittedTexture) -> None:
         f"{target}: ({config['width']}, {config['depth']}), {record['parameters']:,} parameters, "
         f"{record['steps']:,} steps in {seconds:.1f} s; {record['psnr_at_points']:.1f} dB at the points"
     )
+    if not record["finished"]:
+        raise Stopped(f"interrupted; the texture holds what was learnt so far; {again}")
 
 
 TEXTURE = Command(
@@ -135,40 +125,22 @@ def _reconstruct_arguments(parser: argparse.ArgumentParser) -> None:
         "directory of NeuS/DTU (cameras_sphere.npz), nerfstudio or Blender (transforms.json), or COLMAP; or that file"
     )
     parser.add_argument("data", metavar="DATA", help=what)
-    parser.add_argument("-o", "--out", required=True, type=Path, metavar="RUN", help="directory of the run")
-    begin = parser.add_mutually_exclusive_group()
-    begin.add_argument("--resume", action="store_true", help="continue the interrupted run in RUN, with its settings")
-    begin.add_argument("--force", action="store_true", help="overwrite the run in RUN")
-    parser.add_argument("--quiet", action="store_true", help="no progress bars")
-    source = parser.add_mutually_exclusive_group()
-    names = ", ".join(preset_names("reconstruct"))
-    source.add_argument("--preset", metavar="NAME", help=f"one of {names} (default: default)")
-    source.add_argument("--config", type=Path, metavar="FILE", help="a YAML file of settings")
-    add_config_flags(parser, ReconstructConfig)
+    add_new_run(parser)
+    add_settings(parser, ReconstructConfig)
 
 
 def _reconstruct(arguments: argparse.Namespace) -> int:
-    flags, preset = given_flags(arguments, ReconstructConfig), arguments.config or arguments.preset
-    if arguments.resume and (flags or preset):
+    if arguments.resume and were_given(arguments, ReconstructConfig):
         raise input_error("--resume: continues with the run's own settings; leave out --preset, --config and the rest")
-    config = (
-        None if arguments.resume else load_config(ReconstructConfig, preset or "default", flags, thing="reconstruct")
-    )
+    config = None if arguments.resume else read_settings(arguments, ReconstructConfig)
     from ..mesh.extract import mesh_run
     from ..reconstruct.train import HELD_OUT_FILE, reconstruct
     from ..run.folder import check_new_run
-    from ..run.progress import progress_bars
-    from ..run.trainer import Interrupted
 
     directory = check_new_run(arguments.out, resume=arguments.resume, force=arguments.force)
-    try:
-        with nullcontext() if arguments.quiet else progress_bars() as report:
-            run = reconstruct(arguments.data, config, out=directory, resume=arguments.resume, progress=report)
-    except Interrupted:
-        print(
-            f"interrupted; to continue: mplicits reconstruct {arguments.data} -o {directory} --resume", file=sys.stderr
-        )
-        return 130
+    again = f"to continue: mplicits reconstruct {arguments.data} -o {directory} --resume"
+    with training(again, quiet=arguments.quiet) as report:
+        run = reconstruct(arguments.data, config, out=directory, resume=arguments.resume, progress=report)
     mesh = mesh_run(directory, directory / MESH_FILE)
     views, held_out = run.record["views"], run.record["held_out"]
     print(
@@ -203,38 +175,24 @@ CONFIG_SUFFIXES = (".yaml", ".yml")
 def _evolve_arguments(parser: argparse.ArgumentParser) -> None:
     what = "runs or .safetensors files of `mplicits fit`, exact shapes such as sphere:0.4@0.2,0,0, or one YAML file"
     parser.add_argument("inputs", nargs="*", metavar="SHAPE|CONFIG", help=what)
-    parser.add_argument("-o", "--out", required=True, type=Path, metavar="RUN", help="directory of the run")
-    begin = parser.add_mutually_exclusive_group()
-    begin.add_argument("--resume", action="store_true", help="continue the interrupted run in RUN, with its settings")
-    begin.add_argument("--force", action="store_true", help="overwrite the run in RUN")
-    parser.add_argument("--quiet", action="store_true", help="no progress bars")
-    source = parser.add_mutually_exclusive_group()
-    names = ", ".join(preset_names("evolve"))
-    source.add_argument("--preset", metavar="NAME", help=f"one of {names} (default: default)")
-    source.add_argument("--config", type=Path, metavar="FILE", help="a YAML file of settings")
-    add_config_flags(parser, EvolveConfig)
+    add_new_run(parser)
+    add_settings(parser, EvolveConfig)
 
 
 def _evolve(arguments: argparse.Namespace) -> int:
-    config = _settings(arguments)
+    config = _evolve_settings(arguments)
     from ..evolve.train import evolve
     from ..run.folder import check_new_run
-    from ..run.progress import progress_bars
-    from ..run.trainer import Interrupted
 
     directory = check_new_run(arguments.out, resume=arguments.resume, force=arguments.force)
-    try:
-        with nullcontext() if arguments.quiet else progress_bars() as report:
-            run = evolve(config, out=directory, resume=arguments.resume, progress=report)
-    except Interrupted:
-        print(f"interrupted; to continue: mplicits evolve -o {directory} --resume", file=sys.stderr)
-        return 130
-    _tell(run.record)
+    with training(f"to continue: mplicits evolve -o {directory} --resume", quiet=arguments.quiet) as report:
+        run = evolve(config, out=directory, resume=arguments.resume, progress=report)
+    _tell_evolution(run.record)
     print(f"{directory}: field.safetensors, run.json")
     return 0
 
 
-def _settings(arguments: argparse.Namespace) -> EvolveConfig:
+def _evolve_settings(arguments: argparse.Namespace) -> EvolveConfig:
     """What the arguments say; of a resumed run its own settings are read later."""
     flags, preset = given_flags(arguments, EvolveConfig), arguments.config or arguments.preset
     if arguments.resume:
@@ -250,13 +208,13 @@ def _settings(arguments: argparse.Namespace) -> EvolveConfig:
         raise input_error("--shapes: the shapes are given already; leave it out")
     if inputs:
         flags["shapes"] = inputs
-    config = load_config(EvolveConfig, preset or "default", flags, thing="evolve")
+    config = load_config(EvolveConfig, preset or "default", flags)
     if not config.shapes:
         raise input_error("no shapes to evolve; give runs of `mplicits fit`, or a CONFIG.yaml with shapes: [...]")
     return config
 
 
-def _tell(record: dict[str, Any]) -> None:
+def _tell_evolution(record: dict[str, Any]) -> None:
     """A few lines on what came out."""
     checks = record["checks"]
     steps = sum(stage["steps"] for stage in record["stages"])

@@ -1,15 +1,11 @@
-"""``mplicits check-cameras``: its arguments, and where figures and warnings go.
-
-``mplicits scene``: exact posed images, to try things on.
-"""
+"""``mplicits check-cameras`` and ``mplicits scene``: posed photographs looked at, and exact ones to try things on."""
 
 from __future__ import annotations
 
 import argparse
 import sys
-from pathlib import Path
 
-from .command import Command, add_json, check_output, whole, write_json
+from .common import Command, add_flags, add_json, check_output, whole, write_json
 
 __all__ = ["CHECK_CAMERAS", "SCENE"]
 
@@ -19,13 +15,12 @@ def _check_arguments(parser: argparse.ArgumentParser) -> None:
         "folder or file: cameras_sphere.npz with image/ and mask/, transforms.json, or COLMAP's sparse/0 with images/"
     )
     parser.add_argument("data", metavar="DATA", help=what)
-    parser.add_argument("-o", "--out", type=Path, metavar="FILE", help=".glb or .ply: the cameras, to look at")
+    add_flags(parser, "--out", required=False, help=".glb or .ply: the cameras, to look at")
     add_json(parser)
 
 
 def _check_cameras(arguments: argparse.Namespace) -> int:
     check_output(arguments.out, (".glb", ".ply"))
-    check_output(arguments.json, (".json",))
     from ..reconstruct.check import check_files
 
     _, check, text = check_files(arguments.data, arguments.out)
@@ -57,27 +52,25 @@ TRUTH = "surface.ply"
 
 def _scene_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("name", metavar="NAME", choices=SCENE_NAMES, help=", ".join(SCENE_NAMES))
-    parser.add_argument("-o", "--out", required=True, type=Path, metavar="DIR", help="a folder that is not there yet")
+    add_flags(parser, "--out", metavar="DIR", help="a folder that is not there yet")
     what = "neus (cameras_sphere.npz), transforms (.json of nerfstudio), colmap or colmap-text (neus)"
     parser.add_argument("--format", choices=FORMATS, default="neus", metavar="FORMAT", help=what)
     parser.add_argument("--views", type=whole(1, 10_000), default=24, metavar="N", help="how many images (24)")
     parser.add_argument("--size", type=whole(8, 4096), default=64, metavar="N", help="images of N × N pixels (64)")
-    parser.add_argument("--samples", type=whole(1, 16), default=3, metavar="N", help="rays per pixel and direction (3)")
-    parser.add_argument(
-        "--shaded", action="store_true", help="light the shape by a fixed lamp, instead of the bare paint"
-    )
-    parser.add_argument("--seed", type=whole(0), default=0, metavar="N", help="of the cameras (0)")
+    add_flags(parser, "--samples", type=whole(1, 16), default=3, help="rays per pixel and direction (3)")
+    what = "light the shape by a fixed lamp, instead of the bare paint"
+    parser.add_argument("--shaded", action="store_true", help=what)
+    add_flags(parser, "--seed", help="of the cameras (0)")
 
 
 def _scene(arguments: argparse.Namespace) -> int:
     from ...datasets.synthetic.scenes import SCENES, render_scene, scene_mesh
     from ...datasets.views.writing import check_new_folder, write_colmap, write_neus, write_transforms
     from ..mesh.files import write_mesh
+    from ..run.progress import counter_bar
 
     folder = check_new_folder(arguments.out)
     scene = SCENES[arguments.name]()
-    from ..run.progress import counter_bar
-
     with counter_bar("render") as progress:
         images = render_scene(
             scene,

@@ -25,6 +25,7 @@ __all__ = [
     "load_config",
     "preset_names",
     "setting",
+    "thing_of",
 ]
 
 T = TypeVar("T")
@@ -121,7 +122,7 @@ def load_config(
     preset: str | Path | None = None,
     overrides: Mapping[str, object] | None = None,
     *,
-    thing: str = "fit",
+    thing: str | None = None,
 ) -> T:
     """Build a ``cls`` from its defaults, then a preset, then overrides.
 
@@ -130,7 +131,7 @@ def load_config(
         preset: the name of a preset in ``mplicits.configs`` (``"fast"`` is ``<thing>_fast.yaml``), or
             the path of a YAML file (a ``Path``, or a string that ends in .yaml or .yml).
         overrides: field name → value or its text; given by flags, and named as flags in messages.
-        thing: what is configured; the first half of a preset's file name.
+        thing: what is configured; the first half of a preset's file name. By default `thing_of` the class.
 
     Raises:
         InputError: no such preset or file, not YAML, an unknown key, or a value of the wrong kind. The
@@ -138,7 +139,7 @@ def load_config(
     """
     hints = _hints(cls)
     fields = [field.name for field in dataclasses.fields(cls)]  # pyright: ignore[reportArgumentType]
-    source, pairs = _read_preset(preset, thing)
+    source, pairs = _read_preset(preset, thing or thing_of(cls))
     values: dict[str, Any] = {}
     for key, value in pairs.items():
         if key not in hints or not isinstance(key, str):
@@ -179,9 +180,19 @@ def add_config_flags(parser: argparse.ArgumentParser, cls: type, *, about: str =
             group.add_argument(_flag(field.name), nargs="+" if many else None, **options)
 
 
-def given_flags(arguments: argparse.Namespace, cls: type) -> dict[str, object]:
-    """The fields of ``cls`` that were given on the command line, ready for ``load_config``'s ``overrides``."""
-    return {field.name: getattr(arguments, field.name) for field in dataclasses.fields(cls) if field.name in arguments}
+def given_flags(arguments: argparse.Namespace, cls: type) -> dict[str, Any]:
+    """The fields of ``cls`` that were given on the command line: neither left out nor None; lists as tuples.
+
+    Those of `add_config_flags` are ready for ``load_config``'s ``overrides``; those of flags of another kind for the
+    class itself, whose defaults then hold for the rest.
+    """
+    given = {field.name: getattr(arguments, field.name, None) for field in dataclasses.fields(cls)}
+    return {k: tuple(v) if isinstance(v, list) else v for k, v in given.items() if v is not None}
+
+
+def thing_of(cls: type) -> str:
+    """What a class of settings configures: ``"fit"`` for ``FitConfig``."""
+    return cls.__name__.removesuffix("Config").lower()
 
 
 def preset_names(thing: str) -> list[str]:

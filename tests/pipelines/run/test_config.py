@@ -157,7 +157,7 @@ def test_flags_come_from_the_dataclass_and_only_given_ones_override():
     add_config_flags(parser, Settings)
     arguments = parser.parse_args(["--widths", "32", "64", "--verbose", "--normals", "file", "--batch", "100"])
     given = given_flags(arguments, Settings)
-    assert given == {"widths": ["32", "64"], "verbose": True, "normals": "file", "batch": "100"}
+    assert given == {"widths": ("32", "64"), "verbose": True, "normals": "file", "batch": "100"}
     assert load_config(Settings, None, given) == Settings(widths=(32, 64), verbose=True, normals="file", batch=100)
     assert given_flags(parser.parse_args([]), Settings) == {}
     assert "width of each level" in parser.format_help()

@@ -23,6 +23,7 @@ from mplicits.neural_fields import (
     map_colors,
     save_field,
 )
+from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.cli.train import TEXTURE as COMMAND
 from mplicits.pipelines.run.config import load_config
 from mplicits.pipelines.run.folder import TEXTURE_FILE, texture_state_file
@@ -401,7 +402,7 @@ def test_the_command_resumes(
     words = ("--steps", "60", "--width", "16", "--depth", "1", "--samples", "1000")
     with monkeypatch.context() as patch:
         patch.setattr(_Lines, "__call__", lambda self, progress, /: press_ctrl_c(progress))
-        assert command(run, cloud, *words) == 130
+        assert main(["texture", str(run), str(cloud), *words]) == 130
     said = capsys.readouterr().err
     assert f"to continue: mplicits texture {run} {cloud} --resume" in said
     with pytest.raises(InputError, match="exists; --resume continues it, --force replaces it"):

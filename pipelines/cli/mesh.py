@@ -1,0 +1,81 @@
+"""``mplicits mesh`` and ``mplicits evaluate``: a mesh out of a run, and how near a mesh is to a reference."""
+
+from __future__ import annotations
+
+import argparse
+import time
+
+from ..run.config import given_flags
+from .common import Command, add_flags, add_json, positive, whole
+
+__all__ = ["EVALUATE", "MESH"]
+
+MESH_FILES = (".ply", ".obj", ".stl", ".glb")
+
+
+def _mesh_arguments(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add_flags(parser, "run", "--time", "--level")
+    add_flags(parser, "--out", help=", ".join(MESH_FILES))
+    add_flags(parser, "--resolution", help="cells per side (256)")
+    add_flags(parser, "--normal-level", help="normals of this level on the mesh (default: of its own)")
+    what = "leave out the colours of the run's texture"
+    add("--no-colors", dest="colors", action="store_false", help=what)
+    what = "unwrap, and bake colours and fine normals into N × N images (.glb, .obj; needs mplicits[texture])"
+    add("--texture", type=whole(16, 16384), metavar="N", help=what)
+    add("--texture-faces", type=whole(4), metavar="N", help="triangles to keep with --texture (50000)")
+    add("--keep-unsupported", action="store_true", help="keep components that no input points support, too")
+    add("--keep-largest", action="store_true", help="keep only the component of largest area")
+    what = "drop faces further than D (input units) from the points: holes stay holes"
+    add("--trim-distance", type=positive, metavar="D", help=what)
+    add("--cloud", metavar="FILE", help="the points for --trim-distance (default: those of the fit)")
+
+
+def _mesh(arguments: argparse.Namespace) -> int:
+    from ..mesh.extract import MeshOptions, mesh_run
+
+    started = time.monotonic()
+    options = MeshOptions(**given_flags(arguments, MeshOptions))
+    mesh = mesh_run(arguments.run, arguments.out, options, say=print)
+    seconds = time.monotonic() - started
+    print(f"{arguments.out}: {len(mesh.vertices):,} vertices, {len(mesh.faces):,} faces, in {seconds:.1f} s")
+    return 0
+
+
+MESH = Command(
+    "extract a mesh from a fit",
+    """  mplicits mesh runs/scan -o scan.ply --resolution 512
+  mplicits mesh runs/scan -o coarse.obj --level 0
+  mplicits mesh runs/scan -o scan.glb --keep-largest --trim-distance 0.01""",
+    _mesh_arguments,
+    _mesh,
+    "Extract a mesh from a fit, in the coordinates of its input.",
+)
+
+
+def _evaluate_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("mesh", metavar="MESH", help="the mesh to judge")
+    parser.add_argument("reference", metavar="REFERENCE", help="the true mesh, or a point cloud")
+    add_flags(parser, "--samples", type=whole(1), default=500_000, help="on each surface (500000)")
+    add_flags(parser, "--seed", help="of the samples (0)")
+    add_json(parser)
+
+
+def _evaluate(arguments: argparse.Namespace) -> int:
+    from ..surface.measure import evaluate_files, format_metrics, write_metrics
+
+    metrics = evaluate_files(arguments.mesh, arguments.reference, samples=arguments.samples, seed=arguments.seed)
+    print(format_metrics(metrics))
+    if arguments.json:
+        write_metrics(arguments.json, metrics)
+    return 0
+
+
+EVALUATE = Command(
+    "measure a mesh against a reference",
+    """  mplicits evaluate scan.ply truth.ply
+  mplicits evaluate scan.ply points.xyz --samples 100000 --json figures.json""",
+    _evaluate_arguments,
+    _evaluate,
+    "Measure a mesh against a mesh or a cloud. Lengths are in units of the reference's bounding sphere.",
+)
