@@ -10,7 +10,7 @@ from mplicits.datasets import PointCloud
 from mplicits.datasets.clouds.ply import write_cloud_ply
 from mplicits.neural_fields import InputError, Siren, Sphere, extract_mesh, save_field
 from mplicits.neural_fields.files import whole_file, write_whole
-from mplicits.pipelines.cli.command import write_json
+from mplicits.pipelines.cli.common import write_json
 from mplicits.pipelines.mesh.files import write_mesh
 from mplicits.pipelines.render.rasterise import write_picture
 from mplicits.pipelines.run.folder import save_state
