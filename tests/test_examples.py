@@ -15,7 +15,7 @@ from mplicits.pipelines.cli import entry as cli
 from mplicits.pipelines.cli.commands import COMMANDS
 
 ROOT = Path(__file__).parent.parent
-DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 MODULES = [
     module.name
     for package in (mplicits.neural_fields, mplicits.datasets, mplicits.pipelines)
@@ -74,3 +74,12 @@ def test_links_of_the_documents_lead_somewhere() -> None:
     for path in DOCUMENTS:
         for target in re.findall(r"\]\((?!http)([^)#]+)", path.read_text(encoding="utf-8")):
             assert (path.parent / target).exists(), f"{path.name} links to {target}"
+
+
+def test_files_and_modules_that_the_documents_name_are_there() -> None:
+    for path in DOCUMENTS:
+        text = path.read_text(encoding="utf-8")
+        for name in re.findall(r"`((?:neural_fields|datasets|pipelines|configs|tests)/[\w./-]*)`", text):
+            assert (ROOT / name).exists(), f"{path.name} names {name}"
+        for name in re.findall(r"`(mplicits(?:\.\w+)+)`", text) + re.findall(r"^::: ([\w.]+)$", text, re.MULTILINE):
+            assert pkgutil.resolve_name(name), f"{path.name} names {name}"
