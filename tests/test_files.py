@@ -12,7 +12,7 @@ from mplicits.neural_fields import InputError, Siren, Sphere, extract_mesh, save
 from mplicits.neural_fields.files import whole_file, write_whole
 from mplicits.pipelines.cli.common import write_json
 from mplicits.pipelines.mesh.files import write_mesh
-from mplicits.pipelines.render.rasterise import write_picture
+from mplicits.pipelines.render.picture import write_picture
 from mplicits.pipelines.run.folder import save_state
 
 WRITERS: dict[str, Callable[[Path], None]] = {

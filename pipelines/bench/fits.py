@@ -29,7 +29,8 @@ from ...neural_fields import InputError, Similarity
 from ...neural_fields.meshing import NoSurfaceError, extract_mesh
 from ..fit.cloud import load_cloud
 from ..fit.train import fit, prepare
-from ..render.rasterise import contact_sheet, picture_of, write_picture
+from ..render.picture import contact_sheet, write_picture
+from ..render.rasterise import picture_of
 from ..run.machine import format_table, peak_memory
 from ..run.settings import FitConfig
 from ..run.trainer import Progress

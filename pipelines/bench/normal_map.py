@@ -10,7 +10,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -18,7 +17,8 @@ from ...datasets import Camera, turntable
 from ...neural_fields import Field, InputError, levels_of, load_field
 from ...neural_fields.meshing import NoSurfaceError, extract_mesh, map_normals
 from ..render.compare import ImageError, draw, image_error, psnr
-from ..render.rasterise import check_picture_path, contact_sheet, mesh_view, write_picture
+from ..render.picture import check_picture_path, contact_sheet, write_picture
+from ..render.rasterise import mesh_view
 from ..render.shade import ShadeOptions, compose, shade
 from ..render.trace import Seen, trace_view
 from ..run.folder import find_field
@@ -140,7 +140,7 @@ def bench_normal_map(
         for line, (_, seen, colors) in zip(lines, timed, strict=True):
             line.append((method.name, compose(seen, colors)))
     if picture is not None:
-        write_picture(picture, np.concatenate([contact_sheet(line) for line in lines]))
+        write_picture(picture, contact_sheet(*lines))
     return rows
 
 

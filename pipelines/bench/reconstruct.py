@@ -18,7 +18,6 @@ from typing import Any
 
 import imageio.v3 as iio
 import numpy as np
-from numpy.typing import NDArray
 from torch import nn
 
 from ...datasets.synthetic.scenes import SCENES, Scene, render_scene, scene_mesh
@@ -31,7 +30,7 @@ from ..mesh.files import write_mesh
 from ..reconstruct.model import RayPool, SceneModel, build_scene
 from ..reconstruct.trainer import SceneTrainer
 from ..reconstruct.views import ViewImage, comparison_sheet, held_out, measure, render_image
-from ..render.rasterise import contact_sheet, write_picture
+from ..render.picture import Image, contact_sheet, write_picture
 from ..run.config import closest
 from ..run.folder import digest_of
 from ..run.machine import choose_device, environment
@@ -297,8 +296,6 @@ class _SceneBench:
         )
 
 
-Image = NDArray[np.uint8]
-
 COMMON_VIEWS = 2  # on the sheet of all rows
 
 
@@ -409,11 +406,8 @@ def common_sheet(sheets: Sequence[tuple[ReconstructRow, Path]], views: Sequence[
             name = "equal time" if row.kind == EQUAL_TIME else row.network.replace("▷", " > ")
             colors.append((f"{name}: {row.psnr:.2f} dB", found[index][1]))
             normals.append((f"normals, {row.steps} steps", found[index][2]))
-        lines += [contact_sheet(colors), contact_sheet(normals)]
-    widest = max(line.shape[1] for line in lines)
-    return np.concatenate(
-        [np.pad(line, ((0, 0), (0, widest - line.shape[1]), (0, 0)), constant_values=255) for line in lines]
-    )
+        lines += [colors, normals]
+    return contact_sheet(*lines)
 
 
 def _panels(sheet: Image, views: Sequence[PosedImage]) -> list[tuple[Image, Image, Image]]:

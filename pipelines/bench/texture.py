@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from ...datasets import Camera, TexturedMesh, read_textured, sample_textured, turntable
 from ...neural_fields import Field, InputError, Similarity, TextureField, load_field, load_texture, map_colors
@@ -24,7 +23,8 @@ from ...neural_fields.files import write_json
 from ...neural_fields.meshing import NoSurfaceError, extract_mesh
 from ..fit.train import fit
 from ..render.compare import Drawing, ImageError, draw, image_error, psnr
-from ..render.rasterise import contact_sheet, mesh_view, textured_view, write_picture
+from ..render.picture import Image, as_bytes, contact_sheet, write_picture
+from ..render.rasterise import mesh_view, textured_view
 from ..render.trace import trace_view
 from ..run.folder import FIELD_FILE, RECORD_FILE, STATE_FILE, TEXTURE_FILE, read_record
 from ..run.machine import choose_device, format_table
@@ -228,21 +228,17 @@ def _row(shape: str, series: _Series, error: ImageError) -> TextureRow:
     )
 
 
-def _sheet(wanted: Sequence[Drawing], series: Sequence[_Series]) -> NDArray[np.uint8]:
+def _sheet(wanted: Sequence[Drawing], series: Sequence[_Series]) -> Image:
     """One line per camera: the original, each of the series, and its differences from the original."""
     lines = []
     for view, original in enumerate(wanted):
-        tiles, differences = [("original", _bytes(original.rgb))], []
+        tiles, differences = [("original", as_bytes(original.rgb))], []
         for one in series:
             label, rgb = one.surface.name.replace("▷", " > "), one.drawings[view].rgb  # OpenCV draws ASCII
-            tiles.append((f"texture on {label}", _bytes(rgb)))
-            differences.append((f"{label}: difference x {MAGNIFIED}", _bytes(MAGNIFIED * np.abs(rgb - original.rgb))))
-        lines.append(contact_sheet(tiles + differences))
-    return np.concatenate(lines)
-
-
-def _bytes(rgb: NDArray[np.float32]) -> NDArray[np.uint8]:
-    return (rgb.clip(0, 1) * 255 + 0.5).astype(np.uint8)
+            tiles.append((f"texture on {label}", as_bytes(rgb)))
+            differences.append((f"{label}: difference x {MAGNIFIED}", as_bytes(MAGNIFIED * np.abs(rgb - original.rgb))))
+        lines.append(tiles + differences)
+    return contact_sheet(*lines)
 
 
 def format_texture(rows: Sequence[TextureRow]) -> str:

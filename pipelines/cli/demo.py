@@ -17,7 +17,8 @@ from ...neural_fields import Field, InputError, Similarity
 from ...neural_fields.meshing import Mesh, NoSurfaceError, extract_mesh
 from ..fit.train import Run, fit
 from ..mesh.files import write_mesh
-from ..render.rasterise import contact_sheet, picture_of, write_picture
+from ..render.picture import contact_sheet, write_picture
+from ..render.rasterise import picture_of
 from ..render.shade import ShadeOptions, compose, shade
 from ..render.trace import trace_view
 from ..run.config import load_config

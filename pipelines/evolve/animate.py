@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,7 +21,7 @@ from ...neural_fields.meshing import NoSurfaceError, extract_mesh
 from ...neural_fields.tracing import BOUNDING_RADIUS
 from ..mesh.files import Motion, glb_origin, write_glb, write_mesh
 from ..render.film import ANIMATIONS, write_animation
-from ..render.rasterise import contact_sheet, write_picture
+from ..render.picture import Image, contact_sheet, in_rows, write_picture
 from ..render.scene import Orbit, orbit_cameras
 from ..render.shade import ShadeOptions, compose, downsample, shade
 from ..render.trace import RESOLUTION, TOLERANCE, pixel_size, see_hits
@@ -32,7 +32,6 @@ from .follow import follow_mesh
 
 __all__ = ["SequenceOptions", "animate_run", "check_sequence_path", "film_frames"]
 
-Image = NDArray[np.uint8]
 Tell = Callable[[int, int], None]
 
 STRIP = 1 << 19  # rays that are worked on at a time: about a third of a gigabyte
@@ -136,9 +135,8 @@ def animate_run(
         return f"{options.frames} frames of {options.size[0]}×{options.size[1]}"
     if out.suffix.lower() == SHEET:
         frames = film_frames(file, field, riding, level, options, progress)
-        write_picture(
-            out, _sheet([(f"t = {time:.2f}", frame) for time, frame in zip(options.times, frames, strict=True)])
-        )
+        moments = [(f"t = {time:.2f}", frame) for time, frame in zip(options.times, frames, strict=True)]
+        write_picture(out, contact_sheet(*in_rows(moments, ACROSS)))
         return f"{options.frames} moments of {options.size[0]}×{options.size[1]}"
     if out.suffix:
         return _write_moving_mesh(out, file, field, riding, similarity, level, options, progress)
@@ -191,14 +189,6 @@ def film_frames(
         if progress is not None:
             progress(index, options.frames)
         yield np.concatenate(parts)
-
-
-def _sheet(pictures: Sequence[tuple[str, Image]]) -> Image:
-    """Labelled pictures of one size in rows, the last one filled up with white."""
-    rows = [contact_sheet(pictures[first : first + ACROSS]) for first in range(0, len(pictures), ACROSS)]
-    width = rows[0].shape[1]
-    filled = [np.pad(row, ((0, 0), (0, width - row.shape[1]), (0, 0)), constant_values=255) for row in rows]
-    return np.concatenate(filled)
 
 
 def _tracer(field: Field, camera: Camera, level: int) -> DynamicTracer:

@@ -20,7 +20,8 @@ from ...neural_fields import Field, InputError, Similarity, sphere_trace
 from ...neural_fields.meshing import Mesh, NoSurfaceError, extract_mesh
 from ..bench.cells import Cell, Workplace
 from ..mesh.files import write_mesh
-from ..render.rasterise import picture_of, write_picture
+from ..render.picture import write_picture
+from ..render.rasterise import picture_of
 from ..run.config import load_config
 from ..run.settings import FitConfig
 from ..surface.measure import evaluate_surfaces

@@ -11,22 +11,15 @@ import numpy as np
 
 from ...datasets import orbit
 from ..bench.cells import Cell, Record, Workplace
-from ..render.rasterise import Image, contact_sheet, picture_of, write_picture
+from ..render.picture import Image, contact_sheet, in_rows, write_picture
+from ..render.rasterise import picture_of
 from ..surface.surface import from_cloud
 from .judge import damaged_cloud, protocol_of, reference_of
 
-__all__ = ["in_rows", "write_sheets"]
+__all__ = ["write_sheets"]
 
 COLUMNS = 4
 LEAST_METHODS = 2  # a sheet of one method compares nothing
-
-
-def in_rows(tiles: list[tuple[str, Image]], columns: int = COLUMNS) -> Image:
-    """Pictures of one size in rows of ``columns``, each under its label; the last row is filled up with white."""
-    rows = [contact_sheet(tiles[start : start + columns]) for start in range(0, len(tiles), columns)]
-    width = max(row.shape[1] for row in rows)
-    padded = [np.pad(row, ((0, 0), (0, width - row.shape[1]), (0, 0)), constant_values=255) for row in rows]
-    return np.concatenate(padded)
 
 
 def write_sheets(name: str, records: Mapping[Cell, Record], out: Path) -> tuple[tuple[str, str], ...]:
@@ -50,7 +43,8 @@ def write_sheets(name: str, records: Mapping[Cell, Record], out: Path) -> tuple[
         (out / "sheets").mkdir(exist_ok=True)
         damaged, *_ = cells[0].name.split(", ")
         file = f"sheets/{name}-{damaged.replace(' + ', '-').replace(' ', '-')}.jpg"
-        write_picture(out / file, in_rows(_tiles({cell: records[cell] for cell in cells}, out)))
+        tiles = _tiles({cell: records[cell] for cell in cells}, out)
+        write_picture(out / file, contact_sheet(*in_rows(tiles, COLUMNS)))
         written.append((file, f"{name}: {damaged}"))
     return tuple(written)
 

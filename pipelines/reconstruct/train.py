@@ -18,7 +18,7 @@ from torch import Tensor
 from ...datasets import PointCloud
 from ...datasets.views.images import PosedImage, PosedImages, read_posed_images
 from ...neural_fields import InputError, Jet, NoSurfaceError, TextureField, extract_mesh, save_field, save_texture
-from ..render.rasterise import write_picture
+from ..render.picture import write_picture
 from ..run.config import load_config
 from ..run.folder import (
     FIELD_FILE,

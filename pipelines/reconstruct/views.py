@@ -14,6 +14,7 @@ from ...datasets.views.images import PosedImage
 from ...neural_fields import Similarity
 from ...neural_fields.volume import sphere_span
 from ...neural_fields.volume_renderer import Sampling
+from ..render.picture import Image, stacked
 from .model import SceneModel, camera_rays
 
 __all__ = ["ViewImage", "comparison_sheet", "held_out", "measure", "render_image", "target_of"]
@@ -120,20 +121,18 @@ def measure(image: ViewImage, view: PosedImage, background: Tensor) -> dict[str,
     return figures
 
 
-def comparison_sheet(pairs: Sequence[tuple[PosedImage, ViewImage]], background: Tensor) -> NDArray[np.uint8]:
+def comparison_sheet(pairs: Sequence[tuple[PosedImage, ViewImage]], background: Tensor) -> Image:
     """Photograph, rendering and normals of each view, side by side, one row per view."""
-    rows = []
+    rows: list[Image] = []
     for view, image in pairs:
         normals = 0.5 + 0.5 * image.normal
         normals = image.opacity[..., None] * normals + (1 - image.opacity[..., None])
         panels = [target_of(view, background), image.color, np.clip(normals, 0, 1)]
-        rows.append(np.concatenate(panels, axis=1))
-    widest = max(row.shape[1] for row in rows)
-    padded = [np.pad(row, ((0, 4), (0, widest - row.shape[1]), (0, 0)), constant_values=1.0) for row in rows]
-    return _enlarged((np.concatenate(padded) * 255).round().astype(np.uint8))
+        rows.append((np.concatenate(panels, axis=1) * 255).round().astype(np.uint8))
+    return _enlarged(stacked(rows, gap=4))
 
 
-def _enlarged(picture: NDArray[np.uint8], least: int = 600) -> NDArray[np.uint8]:
+def _enlarged(picture: Image, least: int = 600) -> Image:
     """Small pictures in whole multiples of their size, so that their pixels can be seen."""
     factor = max(1, least // picture.shape[1])
     return picture.repeat(factor, axis=0).repeat(factor, axis=1)

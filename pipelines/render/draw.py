@@ -19,14 +19,13 @@ from ..run.machine import choose_device
 from .film import ANIMATIONS, write_animation
 from .legend import with_color_bar
 from .light import load_matcap
-from .rasterise import check_picture_path, contact_sheet, write_picture
+from .picture import Image, check_picture_path, contact_sheet, write_picture
 from .scene import Look, Orbit, Scene, open_scene, orbit_cameras, posed_cameras, reference_distance
 from .shade import ShadeOptions, compose, downsample, measure, shade, value_limits
 from .trace import Seen
 
 __all__ = ["RenderOptions", "render_run"]
 
-Image = NDArray[np.uint8]
 Color = tuple[float, float, float]
 
 STRIP = 1 << 19  # pixels that are worked on at a time: about a third of a gigabyte

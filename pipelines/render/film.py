@@ -12,14 +12,12 @@ from typing import IO
 
 import imageio_ffmpeg
 import numpy as np
-from numpy.typing import NDArray
 
 from ...neural_fields import InputError
 from ...neural_fields.files import whole_file
+from .picture import Image
 
 __all__ = ["ANIMATIONS", "write_animation"]
-
-Image = NDArray[np.uint8]
 
 ANIMATIONS = (".mp4", ".gif")
 CRF = 16  # x264's constant rate factor: flat colours and thin lines stay clean, and files are still small

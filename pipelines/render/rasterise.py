@@ -7,11 +7,7 @@ What the pixels of an image see of a mesh with a texture: its colours are looked
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from pathlib import Path
-
 import cv2
-import imageio.v3 as iio
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -20,27 +16,22 @@ from torch import Tensor
 from ...datasets.cameras import Camera
 from ...datasets.clouds.meshes import vertex_normals
 from ...datasets.textured.reading import TexturedMesh, colors_at
-from ...neural_fields import InputError
-from ...neural_fields.files import write_whole
 from ..surface.raster import clip, cover
 from ..surface.surface import Surface
+from .picture import Image
 from .trace import Seen
 
 __all__ = [
-    "check_picture_path",
     "cloud_view",
-    "contact_sheet",
     "mesh_view",
     "nearest_faces",
     "picture_of",
     "rows_seen",
     "textured_view",
-    "write_picture",
 ]
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
-Image = NDArray[np.uint8]
 
 CLAY = (0.80, 0.78, 0.74)
 BACK = (0.62, 0.36, 0.33)  # faces seen from inside, so that holes and wrong normals show
@@ -228,58 +219,6 @@ def _fading(seen: Seen, camera: Camera) -> Tensor:
         return _albedo(seen)
     far = (depth - depth.min()) / (depth.max() - depth.min()).clamp(min=torch.finfo(depth.dtype).tiny)
     return _albedo(seen) * (1 - 0.55 * far)[:, None]
-
-
-def contact_sheet(pictures: Sequence[tuple[str, Image]], *, gap: int = 12, strip: int = 40) -> Image:
-    """Pictures of one height side by side, each one's label above it.
-
-    Raises:
-        ValueError: there are no pictures, or their heights differ.
-    """
-    heights = {image.shape[0] for _, image in pictures}
-    if len(heights) != 1:
-        raise ValueError(f"pictures: expected at least one, all of one height; got heights {sorted(heights)}")
-    tiles = []
-    for label, image in pictures:
-        tile = np.full((image.shape[0] + strip, image.shape[1] + gap, 3), 255, np.uint8)
-        tile[strip:, gap // 2 : gap // 2 + image.shape[1]] = image
-        scale = 0.6
-        (width, _), _ = cv2.getTextSize(label, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)
-        scale = min(scale, scale * (image.shape[1] - 2 * gap) / max(width, 1))
-        place = (gap, strip - 14)
-        cv2.putText(tile, label, place, cv2.FONT_HERSHEY_SIMPLEX, scale, (40, 40, 40), 1, cv2.LINE_AA)
-        tiles.append(tile)
-    return np.concatenate(tiles, axis=1)
-
-
-def check_picture_path(path: str | Path, *, transparent: bool = False) -> None:
-    """Check, before any work is done, that `write_picture` will be able to write there.
-
-    Args:
-        path: of the picture.
-        transparent: whether it has an alpha channel.
-
-    Raises:
-        InputError: the extension is not one of ours or holds no transparency, or the folder does not exist.
-    """
-    path = Path(path)
-    if path.suffix.lower() not in (".png", ".jpg", ".jpeg"):
-        raise InputError(f"{path}: pictures are written as .png or .jpg")
-    if transparent and path.suffix.lower() != ".png":
-        raise InputError(f"{path}: JPEG knows no transparency; write a .png, or give a background")
-    if not path.parent.is_dir():
-        raise InputError(f"{path}: the folder {path.parent} does not exist")
-
-
-def write_picture(path: str | Path, image: Image) -> None:
-    """Write a PNG ``(H, W, 3 | 4)`` or a JPEG ``(H, W, 3)``, whole or not at all.
-
-    Raises:
-        InputError: as for `check_picture_path`, or the file cannot be written.
-    """
-    path = Path(path)
-    check_picture_path(path, transparent=image.shape[2] == 4)
-    write_whole(path, iio.imwrite("<bytes>", image, extension=path.suffix.lower()))
 
 
 def textured_view(mesh: TexturedMesh, camera: Camera) -> Seen:

@@ -18,6 +18,7 @@ from ...datasets.cameras import Camera
 from ...neural_fields import Field
 from ..run.settings import SHADINGS, ShadeOptions
 from .light import ambient_occlusion, load_matcap, mean_curvature, sample_matcap, soft_shadow
+from .picture import Image
 from .trace import Seen
 
 __all__ = [
@@ -31,8 +32,6 @@ __all__ = [
     "shade",
     "value_limits",
 ]
-
-Image = NDArray[np.uint8]
 
 GAMMA = 2.2  # between display values, in which images are stored, and light, which adds up
 

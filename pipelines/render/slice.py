@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ...neural_fields import Field
+from .picture import Image, as_bytes
 
 __all__ = [
     "Slice",
@@ -28,7 +29,6 @@ __all__ = [
     "take_slice",
 ]
 
-Image = NDArray[np.uint8]
 Array = NDArray[np.floating]
 Floats = NDArray[np.float32]
 Color = tuple[float, float, float]
@@ -206,7 +206,7 @@ def draw_slice(taken: Slice, *, iso_step: float, bands: bool = True) -> Image:
         color = FINEST if last and taken.finest else level_color(index)
         width = ZERO_LINE * stroke * (1.0 if last else 0.75)
         _lay(image, color, _stroke(np.abs(level) / _slope(level, taken.pixel), width))
-    return (image.clip(0, 1) * 255 + 0.5).astype(np.uint8)
+    return as_bytes(image)
 
 
 def distance_color(values: Floats, *, reach: float, slope: Floats | float) -> Floats:

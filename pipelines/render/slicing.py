@@ -16,13 +16,12 @@ from ...neural_fields.meshing import NoSurfaceError, extract_mesh
 from ..run.folder import find_field
 from .film import ANIMATIONS, write_animation
 from .legend import with_legend
-from .rasterise import write_picture
+from .picture import Image, write_picture
 from .slice import draw_slice, plane_axes, round_step, take_slice
 
 __all__ = ["SliceOptions", "slice_run"]
 
 Float64 = NDArray[np.float64]
-Image = NDArray[np.uint8]
 Triple = tuple[float, float, float]
 
 MARGIN = 1.16  # the picture is this much larger than the shape

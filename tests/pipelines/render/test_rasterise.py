@@ -1,21 +1,16 @@
 """Pictures: what is drawn where, with which shade, checked against the projection worked out by hand."""
 
-import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
 import trimesh
 from mplicits.datasets import Camera, look_at, orbit
-from mplicits.neural_fields import InputError
 from mplicits.pipelines.render.rasterise import (
     BACK,
     CLAY,
-    check_picture_path,
     cloud_view,
-    contact_sheet,
     mesh_view,
     picture_of,
-    write_picture,
 )
 from mplicits.pipelines.surface.raster import clip
 from mplicits.pipelines.surface.surface import Surface
@@ -213,35 +208,3 @@ def test_pictures_of_the_same_thing_far_from_the_origin_are_the_same():
         picture_of(ball, camera).astype(int),
         atol=1,
     )
-
-
-def test_a_sheet_holds_every_picture_under_its_label():
-    red, blue = np.full((50, 40, 3), (255, 0, 0), np.uint8), np.full((50, 70, 3), (0, 0, 255), np.uint8)
-    sheet = contact_sheet([("red", red), ("a very long label that would not fit", blue)], gap=10, strip=30)
-    assert sheet.shape == (80, 40 + 70 + 20, 3)
-    np.testing.assert_array_equal(sheet[30:, 5:45], red)
-    np.testing.assert_array_equal(sheet[30:, 55:125], blue)
-    assert (sheet[:30] < 128).any()
-    assert (sheet[:30, 125:] == 255).all()
-    with pytest.raises(ValueError, match=r"heights \[50, 60\]"):
-        contact_sheet([("a", red), ("b", np.zeros((60, 40, 3), np.uint8))])
-
-
-@pytest.mark.parametrize("channels", [3, 4])
-def test_pictures_are_written_whole_or_not_at_all(channels, tmp_path):
-    image = np.random.default_rng(0).integers(0, 255, (8, 9, channels)).astype(np.uint8)
-    write_picture(tmp_path / "picture.png", image)
-    np.testing.assert_array_equal(iio.imread(tmp_path / "picture.png"), image)
-    assert len(list(tmp_path.iterdir())) == 1
-    with pytest.raises(InputError, match=r"picture\.bmp: pictures are written as"):
-        write_picture(tmp_path / "picture.bmp", image)
-    with pytest.raises(InputError, match="does not exist"):
-        write_picture(tmp_path / "absent" / "picture.png", image)
-
-
-def test_transparency_and_jpeg_do_not_go_together(tmp_path):
-    with pytest.raises(InputError, match=r"picture\.jpg: JPEG knows no transparency; write a \.png"):
-        write_picture(tmp_path / "picture.jpg", np.zeros((4, 4, 4), np.uint8))
-    assert not list(tmp_path.iterdir())
-    check_picture_path(tmp_path / "picture.jpg")
-    check_picture_path(tmp_path / "picture.png", transparent=True)

@@ -1,0 +1,101 @@
+"""Pictures as arrays and as files: rounded to bytes, laid out as sheets with titles, written whole or not at all.
+
+A picture is ``(H, W, 3)`` uint8 RGB, first row on top, or ``(H, W, 4)`` with an alpha channel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import imageio.v3 as iio
+import numpy as np
+from numpy.typing import NDArray
+
+from ...neural_fields import InputError
+from ...neural_fields.files import write_whole
+
+__all__ = ["Image", "as_bytes", "check_picture_path", "contact_sheet", "in_rows", "stacked", "write_picture"]
+
+Image = NDArray[np.uint8]
+Titled = tuple[str, Image]
+
+
+def as_bytes(colors: NDArray[np.floating]) -> Image:
+    """Numbers in [0, 1] → 0 to 255, rounded to the nearest; what is outside is clamped."""
+    return (colors.clip(0, 1) * 255 + 0.5).astype(np.uint8)
+
+
+def contact_sheet(*rows: Sequence[Titled], gap: int = 12, strip: int = 40) -> Image:
+    """Rows of pictures, each one's title above it; shorter rows are filled up with white.
+
+    Args:
+        rows: titles and pictures ``(H, W, 3)``; within a row of one height.
+        gap: between pictures, in pixels.
+        strip: height of the strip that holds the titles, in pixels.
+
+    Raises:
+        ValueError: there are no pictures, or in one row their heights differ.
+    """
+    return stacked([_row(pictures, gap, strip) for pictures in rows])
+
+
+def in_rows(pictures: Sequence[Titled], columns: int) -> list[Sequence[Titled]]:
+    """Pictures in rows of ``columns``, for `contact_sheet`; the last row may be shorter."""
+    return [pictures[first : first + columns] for first in range(0, len(pictures), columns)]
+
+
+def stacked(rows: Sequence[Image], *, gap: int = 0) -> Image:
+    """Pictures one under the other, on white as wide as the widest, with ``gap`` rows of pixels below each."""
+    width = max(row.shape[1] for row in rows)
+    return np.concatenate(
+        [np.pad(row, ((0, gap), (0, width - row.shape[1]), (0, 0)), constant_values=255) for row in rows]
+    )
+
+
+def _row(pictures: Sequence[Titled], gap: int, strip: int) -> Image:
+    heights = {image.shape[0] for _, image in pictures}
+    if len(heights) != 1:
+        raise ValueError(f"pictures: expected at least one, all of one height; got heights {sorted(heights)}")
+    tiles = []
+    for title, image in pictures:
+        tile = np.full((image.shape[0] + strip, image.shape[1] + gap, 3), 255, np.uint8)
+        tile[strip:, gap // 2 : gap // 2 + image.shape[1]] = image
+        scale = 0.6
+        (width, _), _ = cv2.getTextSize(title, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)
+        scale = min(scale, scale * (image.shape[1] - 2 * gap) / max(width, 1))
+        place = (gap, strip - 14)
+        cv2.putText(tile, title, place, cv2.FONT_HERSHEY_SIMPLEX, scale, (40, 40, 40), 1, cv2.LINE_AA)
+        tiles.append(tile)
+    return np.concatenate(tiles, axis=1)
+
+
+def check_picture_path(path: str | Path, *, transparent: bool = False) -> None:
+    """Check, before any work is done, that `write_picture` will be able to write there.
+
+    Args:
+        path: of the picture.
+        transparent: whether it has an alpha channel.
+
+    Raises:
+        InputError: the extension is not one of ours or holds no transparency, or the folder does not exist.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in (".png", ".jpg", ".jpeg"):
+        raise InputError(f"{path}: pictures are written as .png or .jpg")
+    if transparent and path.suffix.lower() != ".png":
+        raise InputError(f"{path}: JPEG knows no transparency; write a .png, or give a background")
+    if not path.parent.is_dir():
+        raise InputError(f"{path}: the folder {path.parent} does not exist")
+
+
+def write_picture(path: str | Path, image: Image) -> None:
+    """Write a PNG ``(H, W, 3 | 4)`` or a JPEG ``(H, W, 3)``, whole or not at all.
+
+    Raises:
+        InputError: as for `check_picture_path`, or the file cannot be written.
+    """
+    path = Path(path)
+    check_picture_path(path, transparent=image.shape[2] == 4)
+    write_whole(path, iio.imwrite("<bytes>", image, extension=path.suffix.lower()))
