@@ -35,7 +35,7 @@ from ..run.machine import format_table, peak_memory
 from ..run.settings import FitConfig
 from ..run.trainer import Progress
 from ..surface.measure import Metrics, evaluate_surfaces
-from ..surface.surface import Surface, from_cloud, from_mesh, read_reference, read_surface, sample_surface
+from ..surface.surface import Surface, from_cloud, from_mesh, read_reference, read_surface, sample_points
 
 __all__ = [
     "FitRow",
@@ -299,7 +299,7 @@ def write_noisy_cloud(
     with path.open("wb") as file:
         file.write("\n".join(header).encode())
         for start in range(0, count, rows):
-            points, normals = sample_surface(surface, min(rows, count - start), random)
+            points, normals = sample_points(surface, min(rows, count - start), random)
             assert normals is not None
             points = points + random.normal(0, deviation, (len(points), 1)) * normals
             table = np.concatenate((points, normals), axis=1).astype("<f4")

@@ -90,7 +90,7 @@ def _render(arguments: argparse.Namespace) -> int:
     shade = load_config(ShadeOptions, overrides={"shadows": lit, "occlusion": lit, **given})
 
     from ..render.draw import RenderOptions, render_run
-    from ..render.scene import Orbit
+    from ..render.subject import Orbit
 
     chosen = given_flags(arguments, RenderOptions) | {"background": arguments.background}
     options = RenderOptions(shade=shade, orbit=Orbit(**given_flags(arguments, Orbit)), **chosen)
@@ -251,7 +251,7 @@ def _animate(arguments: argparse.Namespace) -> int:
         raise input_error("--colors: --no-colors leaves them out; leave one of the two out")
 
     from ..evolve.animate import SequenceOptions, animate_run
-    from ..render.scene import Orbit
+    from ..render.subject import Orbit
 
     given = given_flags(arguments, SequenceOptions)
     if "size" in given:

@@ -22,8 +22,8 @@ from ...neural_fields.tracing import BOUNDING_RADIUS
 from ..mesh.files import Motion, glb_origin, write_glb, write_mesh
 from ..render.film import ANIMATIONS, write_animation
 from ..render.picture import Image, contact_sheet, in_rows, write_picture
-from ..render.scene import Orbit, orbit_cameras
 from ..render.shade import ShadeOptions, compose, downsample, shade
+from ..render.subject import Orbit, orbit_cameras
 from ..render.trace import RESOLUTION, TOLERANCE, pixel_size, see_hits
 from ..run.folder import find_field
 from ..run.machine import choose_device

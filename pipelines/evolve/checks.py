@@ -12,11 +12,11 @@ from torch import Tensor
 
 from ...neural_fields import Field, NoSurfaceError, TimeSlice, extract_mesh
 from ..surface.measure import chamfer
-from ..surface.surface import Surface, components, from_mesh, sample_surface
+from ..surface.surface import Surface, components, from_mesh, sample_points
 from .problem import End
 from .samples import band_points
 
-__all__ = ["Frame", "check_evolution", "check_frames", "end_figures", "slope_figures", "volume", "warnings"]
+__all__ = ["FrameFigures", "check_evolution", "check_frames", "end_figures", "slope_figures", "volume", "warnings"]
 
 CHAMFER_POINTS = 50_000
 END_RESOLUTION = 192
@@ -25,7 +25,7 @@ MISSED = 1.5
 
 
 @dataclass(frozen=True)
-class Frame:
+class FrameFigures:
     """The surface at one time.
 
     Attributes:
@@ -76,9 +76,9 @@ def check_evolution(
     return checks | {"warnings": warnings(checks)}
 
 
-def check_frames(field: Field, times: Sequence[float], resolution: int) -> list[Frame]:
+def check_frames(field: Field, times: Sequence[float], resolution: int) -> list[FrameFigures]:
     """Volume and components at some times."""
-    return [_frame(field, time, resolution) for time in times]
+    return [_frame_figures(field, time, resolution) for time in times]
 
 
 def end_figures(field: Field, end: End) -> dict[str, Any]:
@@ -102,7 +102,7 @@ def end_figures(field: Field, end: End) -> dict[str, Any]:
         mesh = from_mesh(extract_mesh(at, resolution=END_RESOLUTION, normals=False))
     except NoSurfaceError:
         return figures | {"ratio": None}
-    found, _ = sample_surface(mesh, len(end.points), np.random.default_rng(0))
+    found, _ = sample_points(mesh, len(end.points), np.random.default_rng(0))
     figures["chamfer"] = sum(chamfer(found, end.others.double().numpy()))
     return figures | {"ratio": figures["chamfer"] / figures["floor"]}
 
@@ -146,14 +146,14 @@ def volume(surface: Surface) -> float:
     return float((a * np.cross(b, c)).sum() / 6)
 
 
-def _frame(field: Field, time: float, resolution: int) -> Frame:
+def _frame_figures(field: Field, time: float, resolution: int) -> FrameFigures:
     slice_ = TimeSlice(field, time)
     try:
         surface = from_mesh(extract_mesh(slice_, resolution=resolution, normals=False))
     except NoSurfaceError:
-        return Frame(time, 0.0, 0, None)
+        return FrameFigures(time, 0.0, 0, None)
     slope = _slopes(slice_, torch.from_numpy(surface.vertices).float())
-    return Frame(time, volume(surface), components(surface), float((slope - 1).abs().mean()))
+    return FrameFigures(time, volume(surface), components(surface), float((slope - 1).abs().mean()))
 
 
 @torch.no_grad()

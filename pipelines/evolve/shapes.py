@@ -30,7 +30,7 @@ from ...neural_fields import (
     project_to_surface,
 )
 from ..run.folder import find_field
-from ..surface.surface import Surface, from_mesh, sample_surface
+from ..surface.surface import Surface, from_mesh, sample_points
 
 __all__ = ["Placed", "Placement", "Shape", "aligned", "into_unit_sphere", "read_shape"]
 
@@ -143,7 +143,7 @@ class Shape:
 
     def points(self, count: int, seed: int) -> Tensor:
         """Points uniform on the surface, ``(count, 3)`` float32: of the mesh, then moved to f = 0."""
-        points, _ = sample_surface(self.surface, count, np.random.default_rng(seed))
+        points, _ = sample_points(self.surface, count, np.random.default_rng(seed))
         return project_to_surface(self.field, torch.from_numpy(points).float(), steps=3)[0]
 
     def placed(self, placement: Placement) -> Shape:
@@ -261,7 +261,7 @@ def _turned(first: Shape, shape: Shape) -> Float64:
 
 def _axes(surface: Surface) -> Float64:
     """Principal axes as columns, of a right-handed system, the longest last."""
-    points, _ = sample_surface(surface, 20_000, np.random.default_rng(0))
+    points, _ = sample_points(surface, 20_000, np.random.default_rng(0))
     _, axes = np.linalg.eigh(np.cov(points.T))
     axes[:, 0] *= np.sign(np.linalg.det(axes))
     return axes

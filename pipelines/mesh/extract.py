@@ -18,7 +18,7 @@ from ...neural_fields import Field, InputError, Similarity, map_attribute
 from ...neural_fields.meshing import Mesh, NoSurfaceError, extract_mesh, map_normals
 from ..run.folder import find_field, load_still
 from ..surface.trim import Support, drop_unsupported, in_region, keep_largest, read_support, trim_distance
-from ..texture.riding import Colors, colors_at
+from ..texture.riding import Colors, colors_of_run
 from .bake import check_texture_size, textured_mesh
 from .files import check_mesh_path, check_textured_path, write_mesh
 
@@ -110,7 +110,7 @@ def mesh_run(
         mesh = trim_distance(mesh, points, options.trim_distance / similarity.scale)
     if options.keep_largest:
         mesh = keep_largest(mesh)
-    colors = colors_at(file, field, options.time) if options.colors else None
+    colors = colors_of_run(file, field, options.time) if options.colors else None
     if options.texture is not None:
         _write_textured(out, mesh, field, colors, similarity, options, options.texture)
         return mesh

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ...datasets.cameras import Camera
 from ...datasets.views.images import PosedImages
 from ...neural_fields.meshing import Mesh
-from ..render.shade import COLOR_MAPS, map_colors
+from ..render.shade import COLOR_MAPS, apply_color_map
 
 __all__ = ["camera_mesh", "frustum_size"]
 
@@ -56,7 +56,7 @@ def camera_mesh(images: PosedImages) -> Mesh:
     cameras = [view.camera.moved(images.similarity) for view in images.views]
     size, reach = frustum_size(cameras)
     order = torch.linspace(0, 1, len(cameras), dtype=torch.float64)
-    colors = map_colors(order, (0, 1), COLOR_MAPS["viridis"]).numpy()
+    colors = apply_color_map(order, (0, 1), COLOR_MAPS["viridis"]).numpy()
     parts = [_wire_sphere(), _axes()]
     for view, camera, color in zip(images.views, cameras, colors, strict=True):
         corners = _plane(camera, size, reach)

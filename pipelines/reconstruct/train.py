@@ -34,7 +34,7 @@ from ..run.folder import (
 from ..run.machine import choose_device, environment
 from ..run.settings import ReconstructConfig, TextureConfig
 from ..run.trainer import Interrupted, Progress, stop_on_signals
-from ..surface.surface import from_mesh, sample_surface
+from ..surface.surface import from_mesh, sample_points
 from ..surface.trim import in_region
 from ..texture.train import FittedTexture, fit_texture
 from .model import RayPool, SceneModel, build_scene
@@ -311,7 +311,7 @@ def scene_texture(
     mesh = in_region(extract_mesh(model.geometry, resolution=RESOLUTION))
     if mesh is None:
         raise NoSurfaceError("all of it is outside the region of interest")
-    points, _ = sample_surface(from_mesh(mesh), SAMPLES, np.random.default_rng(config.seed))
+    points, _ = sample_points(from_mesh(mesh), SAMPLES, np.random.default_rng(config.seed))
     colors = surface_colors(model, torch.from_numpy(points).float()).numpy()
     cloud = PointCloud(images.similarity.to_input(points), colors=colors, source=str(images.source))
     settings = TextureConfig(steps=config.texture_steps, samples=SAMPLES, seed=config.seed, device=config.device)

@@ -20,8 +20,8 @@ from .film import ANIMATIONS, write_animation
 from .legend import with_color_bar
 from .light import load_matcap
 from .picture import Image, check_picture_path, contact_sheet, write_picture
-from .scene import Look, Orbit, Scene, open_scene, orbit_cameras, posed_cameras, reference_distance
 from .shade import ShadeOptions, compose, downsample, measure, shade, value_limits
+from .subject import Orbit, Panel, Subject, open_subject, orbit_cameras, posed_cameras, reference_distance
 from .trace import Seen
 
 __all__ = ["RenderOptions", "render_run"]
@@ -113,7 +113,7 @@ def render_run(
         check_picture_path(out, transparent=options.background is None)
     elif options.background is None:
         raise InputError(f"{out}: films know no transparency; write a .png, or give a background")
-    scene = open_scene(
+    subject = open_subject(
         source,
         time=options.time,
         level=options.level,
@@ -121,8 +121,8 @@ def render_run(
         levels=options.levels,
         device=choose_device(options.device),
     )
-    artist = _Artist(scene, options)
-    cameras = _cameras(scene, options, film=film)
+    artist = _Artist(subject, options)
+    cameras = _cameras(subject, options, film=film)
     artist.fit_limits(cameras)
     if film:
         write_animation(out, artist.pictures(cameras, progress), fps=options.fps)
@@ -131,47 +131,51 @@ def render_run(
     return artist.caption(cameras)
 
 
-def _cameras(scene: Scene, options: RenderOptions, *, film: bool) -> list[Camera]:
+def _cameras(subject: Subject, options: RenderOptions, *, film: bool) -> list[Camera]:
     if options.cameras is not None:
         if options.size is not None and len(options.size) != 1:
             raise InputError("--size: with --cameras give the width alone; the height follows from the images")
         width = None if options.size is None else options.size[0]
-        return posed_cameras(options.cameras, options.frame, scene.similarity, width=width, film=film)
+        return posed_cameras(options.cameras, options.frame, subject.similarity, width=width, film=film)
     if options.frame is not None:
         raise InputError(f"--frame {options.frame}: goes with --cameras FILE")
     size = (640,) if options.size is None else options.size
-    return orbit_cameras(scene.outline(), options.orbit, size=(size[0], size[-1]), frames=options.frames if film else 1)
+    return orbit_cameras(
+        subject.outline(), options.orbit, size=(size[0], size[-1]), frames=options.frames if film else 1
+    )
 
 
 class _Artist:
-    """Draws a scene in one manner, with one scale of colours for all pictures."""
+    """Draws a subject in one manner, with one scale of colours for all pictures."""
 
-    def __init__(self, scene: Scene, options: RenderOptions) -> None:
-        """Check that the scene can be drawn so, and read what that needs.
+    def __init__(self, subject: Subject, options: RenderOptions) -> None:
+        """Check that the subject can be drawn so, and read what that needs.
 
         Raises:
             InputError: it cannot.
         """
-        self.scene, self.options = scene, options
-        self.shading = options.shading or _default_shading(scene)
+        self.subject, self.options = subject, options
+        self.shading = options.shading or _default_shading(subject)
         # Normals do not show in depths and errors: another level's would only repeat a picture.
         mapped = self.shading not in ("depth", "error")
-        self.looks = [look for look in scene.looks if mapped or look.level == look.normal_level] or scene.looks[:1]
-        self.unit = scene.similarity.scale ** MEASURES.get(self.shading, ("", 0))[1]
-        if self.shading == "color" and not scene.colored:
-            raise InputError(f"{scene.name}: has no colours for --shading color; leave it out")
-        if self.shading == "curvature" and scene.field is None:
-            raise InputError(f"{scene.name}: --shading curvature needs a field; render the run, not its mesh")
+        self.panels = [
+            panel for panel in subject.panels if mapped or panel.level == panel.normal_level
+        ] or subject.panels[:1]
+        self.unit = subject.similarity.scale ** MEASURES.get(self.shading, ("", 0))[1]
+        if self.shading == "color" and not subject.colored:
+            raise InputError(f"{subject.name}: has no colours for --shading color; leave it out")
+        if self.shading == "curvature" and subject.field is None:
+            raise InputError(f"{subject.name}: --shading curvature needs a field; render the run, not its mesh")
         shading_options = options.shade
-        if scene.field is None:
-            back = scene.looks[0].label == "mesh"
+        if subject.field is None:
+            back = subject.panels[0].label == "mesh"
             shading_options = dataclasses.replace(shading_options, shadows=False, occlusion=False, back_faces=back)
         if options.shade.limits is not None:
             low, high = options.shade.limits
             shading_options = dataclasses.replace(shading_options, limits=(low / self.unit, high / self.unit))
         self.shade_options = shading_options
         self.matcap = load_matcap(options.shade.matcap) if self.shading == "matcap" else None
-        self.reference = reference_distance(scene, options.reference) if self.shading == "error" else None
+        self.reference = reference_distance(subject, options.reference) if self.shading == "error" else None
         self.anything = False
 
     def fit_limits(self, cameras: Sequence[Camera]) -> None:
@@ -182,32 +186,32 @@ class _Artist:
         for camera in cameras[:: math.ceil(len(cameras) / PREVIEWS)]:
             share = min(1.0, PREVIEW / max(camera.width, camera.height))
             small = camera.resized(math.ceil(share * camera.width), math.ceil(share * camera.height))
-            values += [self._measure(self.scene.view(small, look), look) for look in self.looks]
+            values += [self._measure(self.subject.view(small, panel), panel) for panel in self.panels]
         limits = value_limits(torch.cat(values), self.shading, self.shade_options)
         if limits[0] < limits[1]:  # else all pixels show one number, and any limits will do
             self.shade_options = dataclasses.replace(self.shade_options, limits=limits)
 
     def pictures(self, cameras: Sequence[Camera], progress: Callable[[int, int], None] | None) -> Iterator[Image]:
         """The picture from each camera."""
-        per_picture = len(self.looks) * len(list(self._strips(cameras[0])))
+        per_picture = len(self.panels) * len(list(self._strips(cameras[0])))
         total = per_picture * len(cameras)
         for index, camera in enumerate(cameras):
             done = index * per_picture
             tiles = []
-            for look in self.looks:
+            for panel in self.panels:
                 parts = []
                 for strip in self._strips(camera):
-                    parts.append(self._draw(strip, look))
+                    parts.append(self._draw(strip, panel))
                     done += 1
                     if progress is not None:
                         progress(done, total)
-                tiles.append((look.label, np.concatenate(parts)))
+                tiles.append((panel.label, np.concatenate(parts)))
             yield self._with_legend(tiles[0][1] if len(tiles) == 1 else contact_sheet(tiles), camera)
 
     def caption(self, cameras: Sequence[Camera]) -> str:
         """What was drawn, in a few words."""
         first, count = cameras[0], len(cameras)
-        what = ", ".join(look.label for look in self.looks)
+        what = ", ".join(panel.label for panel in self.panels)
         words = [what, self.shading, f"{first.width}×{first.height}" + (f", {count} frames" if count > 1 else "")]
         if self.shading in MEASURES and self.shade_options.limits is not None:
             low, high = (limit * self.unit for limit in self.shade_options.limits)
@@ -222,27 +226,27 @@ class _Artist:
             height = min(rows, camera.height - first)
             yield camera.strip(first, height).resized(camera.width * samples, height * samples)
 
-    def _draw(self, camera: Camera, look: Look) -> Image:
-        seen = self.scene.view(camera, look)
+    def _draw(self, camera: Camera, panel: Panel) -> Image:
+        seen = self.subject.view(camera, panel)
         rgb = seen.position
         if len(seen.pixel):
             self.anything = True
-            rgb = self._colors(seen, camera, look)
+            rgb = self._colors(seen, camera, panel)
         return downsample(compose(seen, rgb, background=self.options.background), self.options.samples)
 
-    def _colors(self, seen: Seen, camera: Camera, look: Look) -> Tensor:
+    def _colors(self, seen: Seen, camera: Camera, panel: Panel) -> Tensor:
         return shade(
             seen,
             self.shading,
             camera=camera,
-            field=self.scene.field,
-            level=look.level,
+            field=self.subject.field,
+            level=panel.level,
             options=self.shade_options,
             matcap=self.matcap,
-            values=self._measure(seen, look) if self.shading in MEASURES else None,
+            values=self._measure(seen, panel) if self.shading in MEASURES else None,
         )
 
-    def _measure(self, seen: Seen, look: Look) -> Tensor:
+    def _measure(self, seen: Seen, panel: Panel) -> Tensor:
         if not len(seen.pixel):
             return seen.depth
         if self.reference is not None:
@@ -250,8 +254,8 @@ class _Artist:
         return measure(
             seen,
             self.shading,
-            field=self.scene.field,
-            level=look.normal_level,  # a curvature is how the normals turn
+            field=self.subject.field,
+            level=panel.normal_level,  # a curvature is how the normals turn
             detail=self.shade_options.detail,
         )
 
@@ -261,7 +265,7 @@ class _Artist:
             return picture
         title = MEASURES[self.shading][0]
         shown = (limits[0] * self.unit, limits[1] * self.unit)
-        paper = self.options.background if len(self.looks) == 1 else (1.0, 1.0, 1.0)
+        paper = self.options.background if len(self.panels) == 1 else (1.0, 1.0, 1.0)
         return with_color_bar(picture, self._scale(camera, limits), shown, title=title, background=paper)
 
     def _scale(self, camera: Camera, limits: tuple[float, float]) -> NDArray[np.float32]:
@@ -272,7 +276,7 @@ class _Artist:
         return shade(facing, self.shading, camera=camera, options=self.shade_options, values=values).numpy()
 
 
-def _default_shading(scene: Scene) -> str:
-    if scene.oriented:
+def _default_shading(subject: Subject) -> str:
+    if subject.oriented:
         return "lambert"
-    return "color" if scene.colored else "depth"
+    return "color" if subject.colored else "depth"

@@ -20,7 +20,7 @@ from torch import Tensor
 from ...neural_fields import Field, InputError
 from ...neural_fields.tracing import BOUNDING_RADIUS
 
-__all__ = ["MATCAPS", "ambient_occlusion", "load_matcap", "mean_curvature", "sample_matcap", "soft_shadow"]
+__all__ = ["MATCAPS", "ambient_occlusion", "level_set_curvature", "load_matcap", "sample_matcap", "soft_shadow"]
 
 # Steps inside the penumbra, in radii of the cone: with 0.5 streaks show on curved surfaces.
 STRIDE = 0.2
@@ -147,7 +147,7 @@ def _light_through(u: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def mean_curvature(field: Field, points: Tensor, *, level: int = -1, step: float = 2e-3) -> Tensor:
+def level_set_curvature(field: Field, points: Tensor, *, level: int = -1, step: float = 2e-3) -> Tensor:
     """H = ½ div(∇f / |∇f|) of the level set through each point, by central differences: 1/r on a sphere.
 
     The unit gradient n changes only within the tangent plane, ⟨n, ∂n⟩ = 0, so that along two tangents a and b

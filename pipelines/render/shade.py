@@ -17,7 +17,7 @@ from torch import Tensor
 from ...datasets.cameras import Camera
 from ...neural_fields import Field
 from ..run.settings import SHADINGS, ShadeOptions
-from .light import ambient_occlusion, load_matcap, mean_curvature, sample_matcap, soft_shadow
+from .light import ambient_occlusion, level_set_curvature, load_matcap, sample_matcap, soft_shadow
 from .picture import Image
 from .trace import Seen
 
@@ -25,9 +25,9 @@ __all__ = [
     "COLOR_MAPS",
     "SHADINGS",
     "ShadeOptions",
+    "apply_color_map",
     "compose",
     "downsample",
-    "map_colors",
     "measure",
     "shade",
     "value_limits",
@@ -102,7 +102,7 @@ def shade(
         values = measure(seen, shading, field=field, level=level, reference=reference, detail=options.detail)
     low, high = value_limits(values, shading, options)
     # What is near is light, what is far from the reference dark: of those two maps the light end is the high one.
-    colors = map_colors(values, (low, high) if shading == "curvature" else (high, low), COLOR_MAPS[_MAPS[shading]])
+    colors = apply_color_map(values, (low, high) if shading == "curvature" else (high, low), COLOR_MAPS[_MAPS[shading]])
     if shading == "depth":
         return colors
     return colors * (1 - options.relief * (1 - _facing(seen)))[:, None]
@@ -125,7 +125,7 @@ def measure(
         field: whose curvature.
         level: of the field.
         reference: the cloud from which the error is measured.
-        detail: step of the differences of which the curvature is made, see `mean_curvature`.
+        detail: step of the differences of which the curvature is made, see `level_set_curvature`.
 
     Raises:
         ValueError: another shading, or it needs a field or a reference that is not there.
@@ -135,7 +135,7 @@ def measure(
     if shading == "curvature":
         if field is None:
             raise ValueError("shading='curvature': needs a field; a mesh has none")
-        return mean_curvature(field, seen.position, level=level, step=detail)
+        return level_set_curvature(field, seen.position, level=level, step=detail)
     if shading == "error":
         if reference is None:
             raise ValueError("shading='error': needs a reference cloud to measure from")
@@ -294,7 +294,7 @@ COLOR_MAPS: dict[str, Float32] = {
 }
 
 
-def map_colors(values: Tensor, limits: tuple[float, float], table: Float32) -> Tensor:
+def apply_color_map(values: Tensor, limits: tuple[float, float], table: Float32) -> Tensor:
     """Colours of ``values`` ``(P,)`` → ``(P, 3)``, linear between the entries of ``table`` and clamped at its ends.
 
     Args:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from ...neural_fields import Field
-from .surface import Surface, face_normals, sample_surface
+from .surface import Surface, face_normals, sample_points
 
 __all__ = ["MeshDistance", "approximation_error", "barycentric_of_nearest", "near_surface"]
 
@@ -160,7 +160,7 @@ def _pieces(corners: Float64, area: float) -> tuple[Float64, Int64, float]:
 def near_surface(surface: Surface, count: int, *, reach: float, seed: int = 0) -> Float64:
     """Points ``(count, 3)`` uniform on a mesh, each moved along its face's normal by U(−reach, reach)."""
     rng = np.random.default_rng(seed)
-    points, normals = sample_surface(surface, count, rng)
+    points, normals = sample_points(surface, count, rng)
     assert normals is not None
     return points + rng.uniform(-reach, reach, (count, 1)) * normals
 

@@ -23,7 +23,7 @@ from scipy.spatial import KDTree
 from ...neural_fields import InputError, Similarity
 from ...neural_fields.files import write_json
 from .raster import cover
-from .surface import Surface, components, is_closed, read_surface, sample_surface
+from .surface import Surface, components, is_closed, read_surface, sample_points
 
 __all__ = [
     "Metrics",
@@ -133,8 +133,8 @@ def evaluate_surfaces(
     similarity = Similarity.to_unit_sphere(reference.used_vertices())
     mesh, reference = mesh.moved(similarity), reference.moved(similarity)
     of_mesh, of_reference, of_floor = np.random.default_rng(seed).spawn(3)
-    points, normals = sample_surface(mesh, samples, of_mesh)
-    target, target_normals = sample_surface(reference, samples, of_reference)
+    points, normals = sample_points(mesh, samples, of_mesh)
+    target, target_normals = sample_points(reference, samples, of_reference)
 
     forward, nearest = KDTree(target, balanced_tree=False).query(points, workers=-1)
     backward, nearest_back = KDTree(points, balanced_tree=False).query(target, workers=-1)
@@ -149,7 +149,7 @@ def evaluate_surfaces(
     if is_cloud:
         notes.append("the reference is a point cloud: distances are to its points; no floor, no iou")
     else:
-        floor = sum(chamfer(target, sample_surface(reference, samples, of_floor)[0]))
+        floor = sum(chamfer(target, sample_points(reference, samples, of_floor)[0]))
         iou, iou_notes = _iou(mesh, reference, columns, closed=closed)
         notes.extend(iou_notes)
     precision, recall = float((forward < threshold).mean()), float((backward < threshold).mean())

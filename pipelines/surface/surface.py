@@ -29,7 +29,7 @@ __all__ = [
     "is_closed",
     "read_reference",
     "read_surface",
-    "sample_surface",
+    "sample_points",
 ]
 
 Float64 = NDArray[np.float64]
@@ -178,7 +178,7 @@ def face_normals(surface: Surface) -> tuple[Float64, Float64]:
     return np.divide(cross, length[:, None], out=np.zeros_like(cross), where=length[:, None] > 0), length / 2
 
 
-def sample_surface(surface: Surface, count: int, rng: np.random.Generator) -> tuple[Float64, Float64 | None]:
+def sample_points(surface: Surface, count: int, rng: np.random.Generator) -> tuple[Float64, Float64 | None]:
     """Points uniform by area ``(count, 3)`` with the normals of their faces.
 
     Of a cloud, its own points (at most ``count``, chosen at random) with their own normals.

@@ -36,7 +36,7 @@ from ...neural_fields.meshing import NoSurfaceError
 from ..run.folder import find_field
 from .train import texture_of
 
-__all__ = ["RIDE", "Colors", "RidingColors", "borrowed_texture", "colors_at", "start_texture"]
+__all__ = ["RIDE", "Colors", "RidingColors", "borrowed_texture", "colors_of_run", "start_texture"]
 
 # Points (N, 3) to display colours (N, 3).
 Colors = Callable[[Tensor], Tensor]
@@ -173,7 +173,7 @@ class _Between:
         return shift + np.einsum("ni,nij->nj", x - place, slope)
 
 
-def colors_at(run: str | Path, field: Field, time: float | None) -> Colors | None:
+def colors_of_run(run: str | Path, field: Field, time: float | None) -> Colors | None:
     """The colours of what `load_still` has loaded, or None.
 
     Args:

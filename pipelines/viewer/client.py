@@ -16,7 +16,7 @@ from .camera import describe_reading, image_size, probe, viser_camera
 from .controls import Controls
 from .frames import Frame, FrameScheduler, Superseded, View
 from .paint import Painter
-from .scene import Scene, Shapes
+from .scene import SceneNodes, Shapes
 
 __all__ = ["Client", "Shown"]
 
@@ -75,7 +75,7 @@ class Client:
             moves=shown.field.in_dim == 4,
         )
         scale = shown.similarity.scale
-        self._scene = Scene(handle.scene, shown.shapes, self._controls, scale=scale, check=self._check)
+        self._scene = SceneNodes(handle.scene, shown.shapes, self._controls, scale=scale, check=self._check)
         self._controls.on_change(self._redraw, self._rearrange)
         self._controls.on_save(self._save_picture, self._save_screenshot)
 

@@ -27,7 +27,7 @@ from .controls import Controls
 from .frames import Superseded
 from .paint import KEPT, Moments
 
-__all__ = ["OffsetField", "Placement", "Scene", "Shapes", "slice_image"]
+__all__ = ["ImagePose", "OffsetField", "SceneNodes", "Shapes", "slice_image"]
 
 T = TypeVar("T")
 
@@ -45,7 +45,7 @@ MARK_RADIUS = 0.012
 WIRE_SCALE = 1.002
 
 
-class Scene:
+class SceneNodes:
     """Keeps viser's scene as the controls want it.
 
     Args:
@@ -262,7 +262,7 @@ class Shapes:
 
 
 @dataclass(frozen=True)
-class Placement:
+class ImagePose:
     """Where an image stands in the scene: its columns run along its own x axis, its rows along its own y axis.
 
     Attributes:
@@ -278,7 +278,7 @@ class Placement:
 
 def slice_image(
     field: Field, axis: int, position: float, *, level: int, scale: float, pixels: int = 384
-) -> tuple[NDArray[np.uint8], Placement]:
+) -> tuple[NDArray[np.uint8], ImagePose]:
     """The picture of a plane across an axis, and its place in the cube [−1, 1]³.
 
     Args:
@@ -295,4 +295,4 @@ def slice_image(
     taken = take_slice(field, origin=center, u=u, v=v, half_size=1.0, size=(pixels, pixels), level=level)
     image = draw_slice(taken, iso_step=round_step(ISO_STEP * scale) / scale)
     quaternion = Rotation.from_matrix(np.stack((u, -v, -np.cross(u, v)), axis=1)).as_quat()
-    return image, Placement((2.0, 2.0), np.roll(quaternion, 1), center)
+    return image, ImagePose((2.0, 2.0), np.roll(quaternion, 1), center)

@@ -21,8 +21,8 @@ from mplicits.pipelines.render import draw as render_run_module
 from mplicits.pipelines.render.draw import RenderOptions, render_run
 from mplicits.pipelines.render.legend import with_color_bar
 from mplicits.pipelines.render.rasterise import mesh_view
-from mplicits.pipelines.render.scene import choose_frame, open_scene, reference_distance
 from mplicits.pipelines.render.shade import SHADINGS
+from mplicits.pipelines.render.subject import choose_frame, open_subject, reference_distance
 from mplicits.pipelines.render.trace import pixel_size, trace_view
 from mplicits.pipelines.surface.surface import from_mesh
 from torch.nn.functional import normalize
@@ -233,8 +233,8 @@ def test_normals_are_drawn_as_colours_of_the_right_pixels(shapes, tmp_path):
     picture = render(
         shapes, "blob.safetensors", tmp_path / "a.png", "--shading", "normals", "--samples", "1", "--size", "48", "32"
     )
-    scene = open_scene(shapes / "blob.safetensors")
-    seen = trace_view(blob(), orbit(scene.outline(), width=48, height=32))
+    subject = open_subject(shapes / "blob.safetensors")
+    seen = trace_view(blob(), orbit(subject.outline(), width=48, height=32))
     normals = normalize(blob_gradient(seen.position), dim=1)
     assert np.abs(picture.reshape(-1, 3)[seen.pixel] - (normals.numpy() + 1) * 127.5).max() < 1
 
@@ -288,8 +288,8 @@ def test_limits_and_legends_are_in_input_units(shapes, tmp_path, capsys, shading
         limits.append([float(number) for number in said.split(" from ")[1].split(",")[0].split(" to ")])
     assert limits[1] == pytest.approx([SCALE**power * limit for limit in limits[0]], rel=1e-3)
     if shading == "depth":
-        scene = open_scene(shapes / "blob.safetensors")
-        eye = float((orbit(scene.outline(), width=24, height=24).eye - torch.tensor(CENTER)).norm())
+        subject = open_subject(shapes / "blob.safetensors")
+        eye = float((orbit(subject.outline(), width=24, height=24).eye - torch.tensor(CENTER)).norm())
         assert limits[1][0] == pytest.approx(SCALE * (eye - REACH), rel=0.05)
     else:
         assert limits[1][0] == -limits[1][1]
@@ -301,14 +301,14 @@ def test_limits_and_legends_are_in_input_units(shapes, tmp_path, capsys, shading
 
 
 def test_the_error_is_the_distance_between_surfaces(shapes):
-    scene = open_scene(shapes / "blob.safetensors", level=0)
-    distance = reference_distance(scene, None)  # the cloud is on level 1
-    seen = scene.view(orbit(scene.outline(), width=40, height=40), scene.looks[0])
+    subject = open_subject(shapes / "blob.safetensors", level=0)
+    distance = reference_distance(subject, None)  # the cloud is on level 1
+    seen = subject.view(orbit(subject.outline(), width=40, height=40), subject.panels[0])
     gap = INSET / blob_gradient(seen.position).norm(dim=1)
     assert torch.allclose(distance(seen.position), gap, rtol=0.1)
-    bare = reference_distance(scene, shapes / "bare.xyz")(seen.position)
+    bare = reference_distance(subject, shapes / "bare.xyz")(seen.position)
     assert bool((bare > 0.9 * gap).all())
-    meshed = reference_distance(scene, shapes / "plain.obj")(seen.position)
+    meshed = reference_distance(subject, shapes / "plain.obj")(seen.position)
     assert torch.allclose(meshed, gap, rtol=0.1)
 
 
@@ -375,7 +375,7 @@ def test_turntables_have_the_frames_asked_for_and_one_scale_of_colours(shapes, t
 
 def test_a_film_goes_through_posed_cameras(shapes, tmp_path):
     cameras = ("--cameras", str(shapes / "even.json"), "--fast")
-    camera = orbit(SIMILARITY.to_input(open_scene(shapes / "unit.safetensors").outline()), width=32, height=32)
+    camera = orbit(SIMILARITY.to_input(open_subject(shapes / "unit.safetensors").outline()), width=32, height=32)
     write_transforms(shapes / "even.json", {"a": camera, "b": camera, "c": camera})
     assert main(["render", str(shapes / "plain.obj"), "-o", str(tmp_path / "a.mp4"), *cameras]) == 0
     assert len(read_mp4(tmp_path / "a.mp4")) == 3

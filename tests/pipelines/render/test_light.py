@@ -3,7 +3,7 @@
 import pytest
 import torch
 from mplicits.neural_fields import Box, Field, MultiscaleSDF, Plane, Siren, Sphere, Torus, Union
-from mplicits.pipelines.render.light import ambient_occlusion, mean_curvature, soft_shadow
+from mplicits.pipelines.render.light import ambient_occlusion, level_set_curvature, soft_shadow
 
 UP = torch.tensor([0.0, 0.0, 1.0])
 HEIGHT, RADIUS = 0.6, 0.2
@@ -147,7 +147,7 @@ def test_no_points_are_no_work_and_bad_numbers_are_refused(device):
     none = torch.empty(0, 3, device=device)
     field = Sphere().to(device)
     assert soft_shadow(field, none, none, UP).shape == ambient_occlusion(field, none, none).shape == (0,)
-    assert mean_curvature(field, none).shape == (0,)
+    assert level_set_curvature(field, none).shape == (0,)
     points, normals = on_plane((0, 0))
     for wrong in ({"softness": 0.0}, {"offset": -1.0}, {"max_steps": 0}):
         with pytest.raises(ValueError, match=next(iter(wrong))):
@@ -155,21 +155,21 @@ def test_no_points_are_no_work_and_bad_numbers_are_refused(device):
     with pytest.raises(ValueError, match="reach"):
         ambient_occlusion(Plane(), points, normals, reach=0)
     with pytest.raises(ValueError, match="step"):
-        mean_curvature(Plane(), points, step=0)
+        level_set_curvature(Plane(), points, step=0)
 
 
 def test_curvature_of_spheres_planes_and_a_torus(dtype):
     tolerance = 2e-4 if dtype == torch.float64 else 2e-2
     direction = torch.nn.functional.normalize(torch.randn(200, 3, dtype=dtype), dim=1)
     for radius in (0.1, 0.25, 0.8):
-        found = mean_curvature(Sphere(radius=radius), radius * direction)
+        found = level_set_curvature(Sphere(radius=radius), radius * direction)
         torch.testing.assert_close(found, torch.full_like(found, 1 / radius), rtol=tolerance, atol=0)
-    found = mean_curvature(Plane(normal=(1, 2, 2)), direction)
+    found = level_set_curvature(Plane(normal=(1, 2, 2)), direction)
     torch.testing.assert_close(found, torch.zeros_like(found))
     points = on_torus(500)
     rho = points[:, :2].norm(dim=1)
     expected = (1 / 0.2 + (rho - 0.5) / 0.2 / rho) / 2  # of the tube, and of the circle around the axis
-    found = mean_curvature(Torus(major=0.5, minor=0.2), points.to(dtype))
+    found = level_set_curvature(Torus(major=0.5, minor=0.2), points.to(dtype))
     torch.testing.assert_close(found, expected.to(dtype), atol=5 * tolerance, rtol=0)
 
 
@@ -180,5 +180,5 @@ def test_curvature_of_a_network_is_half_the_divergence_of_its_unit_gradient():
     unit = torch.nn.functional.normalize(field.jet(points).gradient, dim=-1)
     rows = [torch.autograd.grad(unit[:, k].sum(), points, retain_graph=True)[0][:, k] for k in range(3)]
     exact = torch.stack(rows).sum(0) / 2
-    found = mean_curvature(field, points.detach(), step=1e-4)
+    found = level_set_curvature(field, points.detach(), step=1e-4)
     torch.testing.assert_close(found, exact.detach(), rtol=1e-4, atol=1e-4)

@@ -16,9 +16,9 @@ from mplicits.pipelines.render.shade import (
     COLOR_MAPS,
     SHADINGS,
     ShadeOptions,
+    apply_color_map,
     compose,
     downsample,
-    map_colors,
     measure,
     shade,
     value_limits,
@@ -229,12 +229,12 @@ def test_limits_hold_the_share_of_the_values_that_they_should():
 
 def test_maps_are_linear_between_their_entries_and_clamped():
     table = np.array([[0, 0, 0], [1, 0, 0.5], [1, 1, 1]], np.float32)
-    found = map_colors(torch.tensor([-5.0, 1.0, 1.5, 2.0, 2.5, 3.0, 9.0]), (1.0, 3.0), table)
+    found = apply_color_map(torch.tensor([-5.0, 1.0, 1.5, 2.0, 2.5, 3.0, 9.0]), (1.0, 3.0), table)
     expected = [[0, 0, 0], [0, 0, 0], [0.5, 0, 0.25], [1, 0, 0.5], [1, 0.5, 0.75], [1, 1, 1], [1, 1, 1]]
     torch.testing.assert_close(found, torch.tensor(expected))
-    backwards = map_colors(torch.tensor([3.0, 1.0]), (3.0, 1.0), table)
+    backwards = apply_color_map(torch.tensor([3.0, 1.0]), (3.0, 1.0), table)
     torch.testing.assert_close(backwards, torch.tensor([[0.0, 0, 0], [1, 1, 1]]))
-    assert map_colors(torch.ones(4), (1.0, 1.0), table).isfinite().all()
+    assert apply_color_map(torch.ones(4), (1.0, 1.0), table).isfinite().all()
 
 
 def test_a_matcap_gives_every_normal_its_own_texel(tmp_path):

@@ -17,7 +17,7 @@ from mplicits.pipelines.surface.measure import (
     write_metrics,
 )
 from mplicits.pipelines.surface.raster import cover
-from mplicits.pipelines.surface.surface import Surface, components, is_closed, read_surface, sample_surface
+from mplicits.pipelines.surface.surface import Surface, components, is_closed, read_surface, sample_points
 
 
 def surface(mesh: trimesh.Trimesh) -> Surface:
@@ -200,7 +200,7 @@ def test_components_and_closedness():
 def test_samples_are_uniform_by_area():
     square = np.array([[0.0, 0, 0], [4, 0, 0], [4, 1, 0], [0, 1, 0], [1, 0, 0]])
     uneven = Surface(square, np.array([[0, 4, 3], [4, 1, 2], [4, 2, 3]], np.int64))
-    points, normals = sample_surface(uneven, 100_000, np.random.default_rng(0))
+    points, normals = sample_points(uneven, 100_000, np.random.default_rng(0))
     counts, _, _ = np.histogram2d(points[:, 0], points[:, 1], bins=(8, 4), range=((0, 4), (0, 1)))
     assert abs(counts / 100_000 * 32 - 1).max() < 0.1
     np.testing.assert_array_equal(normals, np.broadcast_to([0.0, 0, 1], normals.shape))
@@ -224,7 +224,7 @@ def test_a_cloud_may_be_the_reference_but_not_the_mesh(tmp_path):
     mesh, cloud = tmp_path / "mesh.ply", tmp_path / "cloud.xyz"
     shape = sphere(1.0, 4)
     trimesh.Trimesh(shape.vertices, shape.faces, process=False).export(mesh)
-    np.savetxt(cloud, sample_surface(shape, 5_000, np.random.default_rng(0))[0])
+    np.savetxt(cloud, sample_points(shape, 5_000, np.random.default_rng(0))[0])
     metrics = evaluate_files(mesh, cloud, samples=2_000)
     assert metrics.chamfer_floor is None
     assert metrics.iou is None

@@ -1,7 +1,4 @@
-"""What ``mplicits render`` draws, a fitted field or the mesh or cloud of a file, behind one interface.
-
-The cameras of ``mplicits render``: around the shape, or those of posed images.
-"""
+"""What ``mplicits render`` draws, and from where: a fitted field or the mesh or cloud of a file, and its cameras."""
 
 from __future__ import annotations
 
@@ -23,17 +20,17 @@ from ...neural_fields.meshing import NoSurfaceError, extract_mesh
 from ...neural_fields.tracing import BOUNDING_RADIUS
 from ..fit.cloud import CloudDistance
 from ..run.folder import find_field, is_field, load_still
-from ..surface.surface import read_surface, sample_surface
-from ..texture.riding import colors_at
+from ..surface.surface import read_surface, sample_points
+from ..texture.riding import colors_of_run
 from .rasterise import cloud_view, mesh_view
 from .trace import Seen, trace_view
 
 __all__ = [
-    "Look",
     "Orbit",
-    "Scene",
+    "Panel",
+    "Subject",
     "choose_frame",
-    "open_scene",
+    "open_subject",
     "orbit_cameras",
     "posed_cameras",
     "reference_distance",
@@ -48,8 +45,8 @@ DISC = 2.2  # diameter of a cloud's discs, in distances between neighbouring poi
 
 
 @dataclass(frozen=True)
-class Look:
-    """One of several pictures side by side.
+class Panel:
+    """One of the pictures that stand side by side.
 
     Attributes:
         label: over it.
@@ -63,13 +60,13 @@ class Look:
 
 
 @dataclass(frozen=True)
-class Scene:
+class Subject:
     """Something to draw, in unit-sphere coordinates.
 
     Attributes:
         name: of the file, for messages.
         similarity: from input coordinates to those.
-        looks: what to draw of it, at least one.
+        panels: what to draw of it, at least one.
         field: what is traced; None for a mesh or a cloud.
         colored: whether it has colours of its own.
         oriented: whether it has normals.
@@ -80,16 +77,16 @@ class Scene:
 
     name: Path
     similarity: Similarity
-    looks: tuple[Look, ...]
+    panels: tuple[Panel, ...]
     field: Field | None
     colored: bool
     oriented: bool
     fitted_to: str | None
     outline: Callable[[], Float64]
-    view: Callable[[Camera, Look], Seen]
+    view: Callable[[Camera, Panel], Seen]
 
 
-def open_scene(
+def open_subject(
     source: str | Path,
     *,
     time: float | None = None,
@@ -97,7 +94,7 @@ def open_scene(
     normal_level: int | None = None,
     levels: bool = False,
     device: torch.device | str = "cpu",
-) -> Scene:
+) -> Subject:
     """Open a run, a .safetensors file, a mesh or a cloud.
 
     Args:
@@ -112,23 +109,23 @@ def open_scene(
         InputError: it cannot be read, or there is no such level.
     """
     if is_field(source):
-        return _field_scene(find_field(source), time, level, normal_level, levels, device)
+        return _field_subject(find_field(source), time, level, normal_level, levels, device)
     for flag, given in (("--level", level), ("--normal-level", normal_level), ("--levels", levels or None)):
         if given is not None:
             raise InputError(f"{flag}: {source} has no levels; render the run that it was made from")
     if time is not None:
         raise InputError(f"--time {time:g}: {source} does not move; leave it out")
-    return _surface_scene(Path(source))
+    return _surface_subject(Path(source))
 
 
-def _field_scene(
+def _field_subject(
     file: Path,
     time: float | None,
     level: int | None,
     normal_level: int | None,
     levels: bool,
     device: torch.device | str,
-) -> Scene:
+) -> Subject:
     field, similarity, metadata = load_still(file, time, device=device)
     finest = field.num_levels - 1
     for flag, given in (("--level", level), ("--normal-level", normal_level)):
@@ -136,18 +133,20 @@ def _field_scene(
             raise InputError(f"{flag} {given}: {file} has levels 0 to {finest}")
     level = finest if level is None else level
     normal_level = level if normal_level is None else normal_level
-    colors = colors_at(file, field, time)
-    looks = [_look(level, normal_level)]
+    colors = colors_of_run(file, field, time)
+    panels = [_panel(level, normal_level)]
     if levels:
-        looks = [_look(index, index) for index in range(finest + 1)] + ([_look(0, finest)] if finest else [])
+        panels = [_panel(index, index) for index in range(finest + 1)] + ([_panel(0, finest)] if finest else [])
 
-    def view(camera: Camera, look: Look) -> Seen:
-        return trace_view(field, camera, level=look.level, normal_level=look.normal_level, colors=colors, device=device)
+    def view(camera: Camera, panel: Panel) -> Seen:
+        return trace_view(
+            field, camera, level=panel.level, normal_level=panel.normal_level, colors=colors, device=device
+        )
 
-    return Scene(
+    return Subject(
         name=file,
         similarity=similarity,
-        looks=tuple(looks),
+        panels=tuple(panels),
         field=field,
         colored=colors is not None,
         oriented=True,
@@ -157,9 +156,9 @@ def _field_scene(
     )
 
 
-def _look(level: int, normal_level: int) -> Look:
+def _panel(level: int, normal_level: int) -> Panel:
     mapped = "" if normal_level == level else f" + normals of level {normal_level}"
-    return Look(f"level {level}{mapped}", level, normal_level)
+    return Panel(f"level {level}{mapped}", level, normal_level)
 
 
 def _fitted_to(metadata: dict[str, Any]) -> str | None:
@@ -178,7 +177,7 @@ def _outline(file: Path, field: Field) -> Float64:
     return vertices[inside] if inside.any() else vertices
 
 
-def _surface_scene(file: Path) -> Scene:
+def _surface_subject(file: Path) -> Subject:
     surface = read_surface(file)
     used = surface.used_vertices()
     try:
@@ -189,17 +188,17 @@ def _surface_scene(file: Path) -> Scene:
     solid = bool(len(surface.faces))
     spacing = 0.0 if solid else _spacing(moved.vertices)
 
-    def view(camera: Camera, _look: Look) -> Seen:
+    def view(camera: Camera, _panel: Panel) -> Seen:
         if solid:
             return mesh_view(moved, camera)
         distance = max(float(camera.eye.norm()), 1e-3)
         size = DISC * spacing * float(camera.intrinsics[1, 1]) / distance
         return cloud_view(moved, camera, point_size=max(size, 1.0))
 
-    return Scene(
+    return Subject(
         name=file,
         similarity=similarity,
-        looks=(Look("mesh" if solid else "cloud"),),
+        panels=(Panel("mesh" if solid else "cloud"),),
         field=None,
         colored=surface.colors is not None,
         oriented=solid or surface.normals is not None,
@@ -215,29 +214,31 @@ def _spacing(points: Float64) -> float:
     return float(np.quantile(KDTree(points).query(chosen, k=2)[0][:, 1], 0.9))
 
 
-def reference_distance(scene: Scene, reference: str | Path | None) -> Callable[[Tensor], Tensor]:
-    """What measures how far points ``(P, 3)`` of a scene are from a reference, ``(P,)``, in the scene's coordinates.
+def reference_distance(subject: Subject, reference: str | Path | None) -> Callable[[Tensor], Tensor]:
+    """What measures how far points ``(P, 3)`` are from a reference, ``(P,)``, in the coordinates of the subject.
 
     Where the reference has normals, its points stand for discs that fill the gaps between them (`CloudDistance`), and
     a surface through them has no error; the distance to bare points is never less than their spacing allows.
 
     Args:
-        scene: what is drawn.
+        subject: what is drawn.
         reference: a cloud, or a mesh, of which points are sampled; by default what the field was fitted to.
 
     Raises:
         InputError: there is none, or it cannot be read.
     """
-    file = scene.fitted_to if reference is None else reference
+    file = subject.fitted_to if reference is None else reference
     if file is None:
-        raise InputError(f"{scene.name}: --shading error needs a cloud to measure from; name it with --reference FILE")
+        raise InputError(
+            f"{subject.name}: --shading error needs a cloud to measure from; name it with --reference FILE"
+        )
     if reference is None and not Path(file).is_file():
-        raise InputError(f"{scene.name}: its cloud {file} is not to be found; name it with --reference FILE")
+        raise InputError(f"{subject.name}: its cloud {file} is not to be found; name it with --reference FILE")
     surface = read_surface(file)
     points, normals = surface.vertices, surface.normals
     if len(surface.faces):
-        points, normals = sample_surface(surface, SAMPLES, np.random.default_rng(0))
-    points = scene.similarity.to_unit(points)
+        points, normals = sample_points(surface, SAMPLES, np.random.default_rng(0))
+    points = subject.similarity.to_unit(points)
     if normals is None:
         tree = KDTree(points)
         return lambda places: torch.as_tensor(tree.query(places.cpu().double().numpy(), workers=-1)[0]).to(places)
