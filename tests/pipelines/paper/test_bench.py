@@ -5,6 +5,7 @@ import json
 import re
 from pathlib import Path
 
+import imageio.v3 as iio
 import pytest
 from mplicits.neural_fields import Similarity, Sphere, extract_mesh
 from mplicits.pipelines.bench.cells import Catalogue, Findings, Method
@@ -14,7 +15,6 @@ from mplicits.pipelines.paper import bench, names
 from mplicits.pipelines.paper.bench import SPECS
 from mplicits.pipelines.paper.judge import Judge
 from mplicits.pipelines.paper.methods import CATALOGUE, METHODS
-from mplicits.pipelines.render.rasterise import iio
 
 PLACE = Similarity((0.0, 0.0, 0.0), 2.0)
 
