@@ -28,9 +28,9 @@ from torch.utils.flop_counter import FlopCounterMode
 from ...neural_fields import Field, Jet, levels_of
 from ...neural_fields.radiance import Outside, ViewColor
 from ..reconstruct.model import RayPool, SceneModel
-from ..reconstruct.trainer import SceneTrainer
+from ..reconstruct.objective import SceneObjective, scene_trainer
 from ..run.settings import ReconstructConfig
-from ..run.trainer import StopFlag
+from ..run.trainer import Progress, StopFlag, Trainer
 from .speed import Counted, counted
 
 __all__ = ["Watched", "color_flops", "jet_flops", "outside_flops", "product_counter", "train_watched", "value_flops"]
@@ -56,7 +56,7 @@ class Watched:
         color_flops: the same of colours and of what is outside.
     """
 
-    trainer: SceneTrainer
+    trainer: Trainer[SceneObjective]
     finished: bool
     step_seconds: float
     values: tuple[int, ...]
@@ -74,7 +74,7 @@ def train_watched(
     flag: StopFlag,
     *,
     seconds: float | None = None,
-    report: Callable[[SceneTrainer], None] | None = None,
+    report: Callable[[Progress], None] | None = None,
 ) -> Watched:
     """Train to the end of the schedule, or until ``flag`` asks to stop.
 
@@ -93,10 +93,10 @@ def train_watched(
     colors, outsides = _RowCounter(model.color), _RowCounter(model.outside)
     if seconds is not None:
         config = replace(config, steps=ENDLESS)
-    trainer = SceneTrainer(model, pool, config, seconds=seconds)
+    trainer = scene_trainer(model, pool, config, seconds=seconds)
     watch = _Watch(trainer, levels, report)
     try:
-        finished = trainer.run(flag, report=watch, save=lambda _: None, report_every=1, save_every=math.inf)
+        finished = trainer.run(flag, report=watch, report_every=1)
     finally:
         colors.remove()
         outsides.remove()
@@ -120,20 +120,23 @@ class _Watch:
     """What the trainer reports to after every step: takes the time, and counts the samples that are rendered."""
 
     def __init__(
-        self, trainer: SceneTrainer, levels: Sequence[Counted], report: Callable[[SceneTrainer], None] | None
+        self,
+        trainer: Trainer[SceneObjective],
+        levels: Sequence[Counted],
+        report: Callable[[Progress], None] | None,
     ) -> None:
-        self.levels, self.report = levels, report
+        self.trainer, self.levels, self.report = trainer, levels, report
         self.times: list[float] = []
         self.samples = self.before = 0
-        self.level, self.started = trainer.level, time.perf_counter()
+        self.level, self.started = trainer.objective.level_at(trainer.fraction), time.perf_counter()
 
-    def __call__(self, trainer: SceneTrainer) -> None:
+    def __call__(self, progress: Progress) -> None:
         self.times.append(time.perf_counter() - self.started)
         if self.level == len(self.levels) - 1:  # the level of the step that has just been made
             self.samples += self.levels[0].jets - self.before
-        if self.report is not None and (trainer.step % REPORT_EVERY == 0 or trainer.fraction >= 1):
-            self.report(trainer)
-        self.before, self.level = self.levels[0].jets, trainer.level
+        if self.report is not None and (progress.step % REPORT_EVERY == 0 or progress.fraction >= 1):
+            self.report(progress)
+        self.before, self.level = self.levels[0].jets, self.trainer.objective.level_at(progress.fraction)
         self.started = time.perf_counter()
 
 

@@ -28,7 +28,6 @@ from ...neural_fields.files import write_json
 from ...neural_fields.meshing import Mesh, extract_mesh
 from ..mesh.files import write_mesh
 from ..reconstruct.model import RayPool, SceneModel, build_scene
-from ..reconstruct.trainer import SceneTrainer
 from ..reconstruct.views import ViewImage, comparison_sheet, held_out, measure, render_image
 from ..render.picture import Image, contact_sheet, write_picture
 from ..run.config import closest
@@ -242,18 +241,18 @@ class _SceneBench:
         model = build_scene(config, has_masks=pool.has_masks).to(self.device)
         start_seconds = time.perf_counter() - started
 
-        def told(trainer: SceneTrainer) -> None:
-            self.progress(Progress(stage, trainer.step, config.steps, trainer.fraction, trainer.losses))
+        def told(progress: Progress) -> None:
+            self.progress(dataclasses.replace(progress, stage=stage, steps=config.steps))
 
         with stop_on_signals() as flag:
             watched = train_watched(model, pool, config, flag, seconds=seconds, report=told)
         if not watched.finished:
             raise Interrupted(self.options.directory)
-        trainer = watched.trainer
+        objective, level = watched.trainer.objective, watched.trainer.objective.level_at(watched.trainer.fraction)
         model.requires_grad_(False)
         pairs: list[tuple[PosedImage, ViewImage]] = []
         for index, view in enumerate(self.test_views):
-            pairs.append((view, render_image(model, view, similarity, trainer.sampling, level=trainer.level)))
+            pairs.append((view, render_image(model, view, similarity, objective.sampling, level=level)))
             done = index + 1
             fraction = done / len(self.test_views)
             self.progress(Progress(f"{stage}: held-out views", done, len(self.test_views), fraction, {}))
@@ -322,7 +321,7 @@ def row_of(
         start_seconds: see `ReconstructRow`.
         device: where it was trained.
     """
-    trainer, model = watched.trainer, watched.trainer.model
+    trainer, model = watched.trainer, watched.trainer.objective.model
     views = [measure(image, view, model.background) for view, image in pairs]
     inside = [figures["psnr_object"] for figures in views if "psnr_object" in figures]
     rays = trainer.step * config.rays

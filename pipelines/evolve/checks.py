@@ -16,7 +16,7 @@ from ..surface.surface import Surface, components, from_mesh, sample_points
 from .problem import End
 from .samples import band_points
 
-__all__ = ["FrameFigures", "check_evolution", "check_frames", "end_figures", "slope_figures", "volume", "warnings"]
+__all__ = ["FrameFigures", "check_evolution", "end_figures", "slope_figures", "volume", "warnings"]
 
 CHAMFER_POINTS = 50_000
 END_RESOLUTION = 192
@@ -47,7 +47,7 @@ def check_evolution(
     *,
     frames: int,
     resolution: int,
-    progress: Callable[[int, int], None] | None = None,
+    count: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]:
     """All figures of a trained field, on the CPU, as ``run.json`` holds them under ``checks``.
 
@@ -56,29 +56,23 @@ def check_evolution(
         ends: the surfaces that it should have met.
         frames: at how many times it is meshed.
         resolution: of those meshes; ends are meshed finer.
-        progress: told how many frames and ends are done, and of how many.
+        count: told how many frames and ends are done, and of how many.
     """
     total = frames + len(ends)
-    tell = progress or (lambda _done, _total: None)
-    shown = []
-    for frame in check_frames(field, torch.linspace(0, 1, frames).tolist(), resolution):
-        shown.append(frame)
-        tell(len(shown), total)
-    met = []
+    count = count or (lambda _done, _total: None)
+    shown, met = [], []
+    for time in torch.linspace(0, 1, frames).tolist():
+        shown.append(_frame_figures(field, time, resolution))
+        count(len(shown), total)
     for end in ends:
         met.append(end_figures(field, end))
-        tell(frames + len(met), total)
+        count(frames + len(met), total)
     checks = {
         "ends": met,
         "slopes": slope_figures(field),
         "frames": [vars(frame) for frame in shown],
     }
     return checks | {"warnings": warnings(checks)}
-
-
-def check_frames(field: Field, times: Sequence[float], resolution: int) -> list[FrameFigures]:
-    """Volume and components at some times."""
-    return [_frame_figures(field, time, resolution) for time in times]
 
 
 def end_figures(field: Field, end: End) -> dict[str, Any]:

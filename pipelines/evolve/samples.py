@@ -20,6 +20,7 @@ __all__ = [
     "Known",
     "around",
     "band_points",
+    "indices_in_band",
     "joined",
     "known_at",
     "no_bounds",
@@ -203,11 +204,11 @@ def band_points(
     x = points[:, :3] + ((goal - value) / slope)[:, None] * gradient[:, :3]
     inside = x.abs().amax(dim=1) < DOMAIN
     points = torch.cat((x, points[:, 3:]), dim=1)[inside]
-    return points[_inside(field, points, level)] if level else points
+    return points[indices_in_band(field, points, level)] if level else points
 
 
 @torch.no_grad()
-def _inside(field: Field, points: Tensor, level: int) -> Tensor:
+def indices_in_band(field: Field, points: Tensor, level: int) -> Tensor:
     """Indices of the points at which a level may be evaluated."""
     parts = [field.in_band(part, level=level) for part in points.split(1 << 17)]
     return torch.cat(parts).nonzero()[:, 0] if parts else torch.empty(0, dtype=torch.long)

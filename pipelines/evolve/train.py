@@ -13,27 +13,17 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ...neural_fields import InputError, MultiscaleSDF, Similarity, Siren, SpaceTimeSDF, save_field
+from ...neural_fields import InputError, MultiscaleSDF, Similarity, Siren, SpaceTimeSDF
+from ..fit.level import RESIDUAL_GAIN
 from ..fit.samples import delta_of
-from ..fit.train import RESIDUAL_GAIN
-from ..run.config import load_config
-from ..run.folder import (
-    FIELD_FILE,
-    STATE_FILE,
-    digest_of,
-    forget_run,
-    load_state,
-    read_record,
-    save_state,
-    write_record,
-)
+from ..run.folder import RunFolder, digest_of
 from ..run.machine import choose_device, environment
 from ..run.settings import EvolveConfig
-from ..run.trainer import Interrupted, Progress, StopFlag, stop_on_signals
+from ..run.trainer import Interrupted, Progress, StopFlag, Trainer, prefixed, stop_on_signals, without_prefix
 from .checks import check_evolution
+from .objective import LONGEST_GRADIENT, EvolveObjective, learn_start
 from .problem import Problem, build_problem
 from .shapes import Shape, read_shape
-from .trainer import EvolveTrainer, learn_start
 
 __all__ = ["Evolution", "evolve", "train_evolution"]
 
@@ -79,20 +69,16 @@ def evolve(
         >>> run = evolve(EvolveConfig(shapes=("runs/spot", "runs/bob")), out="runs/morph")  # doctest: +SKIP
         >>> run.record["checks"]["warnings"]  # doctest: +SKIP
     """
-    directory = None if out is None else Path(out)
-    if resume:
-        if directory is None:
-            raise InputError("resume: needs the run directory (out=...)")
-        config = load_config(EvolveConfig, None, read_record(directory)["config"], thing="evolve")
+    folder = RunFolder(out, resume=resume)
+    config = folder.config(EvolveConfig, config, thing="evolve")
     choose_device(config.device)
-    report, count = progress or (lambda _: None), len(config.shapes) + 1
-    shapes = []
+    report, count, shapes = progress or (lambda _: None), len(config.shapes) + 1, []
     for index, text in enumerate(config.shapes):
         report(Progress("shapes", index, count, index / count, {}))
         shapes.append(read_shape(text))
     report(Progress("shapes", count - 1, count, 1 - 1 / count, {}))
     problem = build_problem(shapes, config)
-    return train_evolution(problem, config, shapes=shapes, out=directory, resume=resume, progress=progress)
+    return train_evolution(problem, config, shapes=shapes, out=out, resume=resume, progress=progress)
 
 
 def train_evolution(
@@ -100,20 +86,16 @@ def train_evolution(
     config: EvolveConfig,
     *,
     shapes: list[Shape] | None = None,
-    out: Path | None = None,
+    out: str | Path | None = None,
     resume: bool = False,
     progress: Callable[[Progress], None] | None = None,
 ) -> Evolution:
     """`evolve` for a problem that was put together by hand; see there."""
-    if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
-    names = [shape.name for shape in shapes or []]
-    training = _Evolving(problem, names, config, choose_device(config.device), out, progress or (lambda _: None))
-    if resume:
-        training.restore()
-    elif out is not None:
-        forget_run(out)
-    with stop_on_signals() as flag:
+    names, folder = [shape.name for shape in shapes or []], RunFolder(out, resume=resume)
+    training = _Evolving(problem, names, config, choose_device(config.device), folder, progress or (lambda _: None))
+    with folder.writing(), stop_on_signals() as flag:
+        if resume:
+            training.restore()
         return training.run(flag)
 
 
@@ -126,36 +108,32 @@ class _Evolving:
         names: list[str],
         config: EvolveConfig,
         device: torch.device,
-        directory: Path | None,
+        folder: RunFolder,
         progress: Callable[[Progress], None],
     ) -> None:
         self.problem, self.names, self.config, self.device = problem, names, config, device
-        self.directory, self.progress = directory, progress
+        self.folder, self.progress = folder, progress
         self.fingerprint = digest_of(part.numpy() for part in vars(problem.known).values())
         self.frozen: SpaceTimeSDF | None = None
         self.stages: list[dict[str, Any]] = []
         self.trainer_state: dict[str, Tensor] = {}
 
     def run(self, flag: StopFlag) -> Evolution:
-        if self.directory is not None:
-            write_record(self.directory, self.record(finished=False))
+        self.folder.begin(self.record(finished=False))
         for level in range(len(self.stages), self.config.num_levels):
             self.train_level(level, flag)
         assert self.frozen is not None
         field = self.frozen.cpu()
         record = self.record(finished=True)
 
-        def tell(done: int, total: int) -> None:
+        def count(done: int, total: int) -> None:
             self.progress(Progress("checks", done, total, done / total, {}))
 
         record["checks"] = check_evolution(
-            field, self.problem.ends, frames=self.config.frames, resolution=self.config.resolution, progress=tell
+            field, self.problem.ends, frames=self.config.frames, resolution=self.config.resolution, count=count
         )
-        if self.directory is not None:
-            self.write_field(field, record)
-            write_record(self.directory, record)
-            (self.directory / STATE_FILE).unlink(missing_ok=True)
-        return Evolution(field, self.problem.similarity, self.directory, record)
+        self.folder.finish(field, self.problem.similarity, record)
+        return Evolution(field, self.problem.similarity, self.folder.out, record)
 
     def train_level(self, level: int, flag: StopFlag) -> None:
         """Begin one level, train it, freeze it."""
@@ -165,29 +143,18 @@ class _Evolving:
         field = self.begun(level, delta, generator)
         beginning_seconds = time.monotonic() - started
         try:
-            trainer = EvolveTrainer(
-                field,
-                self.problem,
-                config,
-                level=level,
-                generator=generator,
-                seconds=self.seconds_for(level, beginning_seconds),
-            )
+            objective = EvolveObjective(field, self.problem, config, level=level, generator=generator)
         except ValueError as error:
             raise InputError(
                 f"{error}; train the level before longer (--steps), or widen the band (--epsilon)"
             ) from error
+        seconds, steps = self.seconds_for(level, beginning_seconds), config.steps[level]
+        trainer = Trainer(objective, stage=f"level {level}", steps=steps, seconds=seconds, clip=LONGEST_GRADIENT)
         if self.trainer_state:
             trainer.restore(self.trainer_state)
             self.trainer_state = {}
-
-        def report(trainer: EvolveTrainer) -> None:
-            self.progress(Progress(f"level {level}", trainer.step, trainer.steps, trainer.fraction, trainer.losses))
-
-        finished = trainer.run(flag, report=report, save=self.save)
-        if not finished:
-            self.save(trainer)
-            raise Interrupted(self.directory)
+        if not trainer.run(flag, report=self.progress, save=lambda: self.save(field, trainer)):
+            raise Interrupted(self.folder.out)
         self.frozen = field.requires_grad_(False)
         errors = self.errors_at_ends()
         self.stages.append(
@@ -195,7 +162,7 @@ class _Evolving:
                 "level": level,
                 "parameters": sum(p.numel() for p in field.sdf.levels[level].parameters()),
                 "delta": delta,
-                "known": len(trainer.known),
+                "known": len(objective.known),
                 "beginning_seconds": round(beginning_seconds, 3),
                 "training_seconds": round(trainer.elapsed, 3),
                 "steps": trainer.step,
@@ -205,7 +172,7 @@ class _Evolving:
                 "max_at_ends": float(errors.abs().max()),
             }
         )
-        self.save(None)
+        self.save(field, None)
 
     def begun(self, level: int, delta: float | None, generator: torch.Generator) -> SpaceTimeSDF:
         """The field with one more level, which is all that is to be trained; of a resumed run with random weights."""
@@ -257,44 +224,25 @@ class _Evolving:
         ]
         return max(config.time_budget - spent - beginning, 1e-3) * work[level] / math.fsum(work[level:])
 
-    def save(self, trainer: EvolveTrainer | None) -> None:
+    def save(self, field: SpaceTimeSDF, trainer: Trainer[EvolveObjective] | None) -> None:
         """Write a usable field and all that `restore` needs."""
-        if self.directory is None:
-            return
-        field = self.frozen if trainer is None else trainer.field
-        assert field is not None
-        record = self.record(finished=False)
-        self.write_field(field, record)
-        tensors = {} if trainer is None else {f"trainer.{k}": v for k, v in trainer.state().items()}
+        tensors = {} if trainer is None else prefixed("trainer.", trainer.state())
         if self.frozen is not None:
-            tensors |= {f"frozen.{name}": tensor for name, tensor in self.frozen.state_dict().items()}
-        save_state(self.directory, tensors, {"fingerprint": self.fingerprint, "stages": self.stages})
-        write_record(self.directory, record)
-
-    def write_field(self, field: SpaceTimeSDF, record: dict[str, Any]) -> None:
-        assert self.directory is not None
-        kept = {name: value for name, value in record.items() if name != "checks"}
-        save_field(self.directory / FIELD_FILE, field, similarity=self.problem.similarity, metadata={"run": kept})
+            tensors |= prefixed("frozen.", self.frozen.state_dict())
+        progress = {"fingerprint": self.fingerprint, "stages": self.stages}
+        self.folder.save(field, self.problem.similarity, self.record(finished=False), tensors, progress)
 
     def restore(self) -> None:
-        """Take up an interrupted run.
-
-        Raises:
-            InputError: nothing to resume, a damaged file, or other shapes than the run began with.
-        """
-        assert self.directory is not None
-        tensors, progress = load_state(self.directory)
-        if progress.get("fingerprint") != self.fingerprint:
-            raise InputError(
-                f"{', '.join(self.names)}: not the shapes that {self.directory} was trained on; "
-                "bring those back, or leave out --resume and choose a new -o"
-            )
+        """Take up an interrupted run; see `RunFolder.restore`."""
+        names = ", ".join(self.names)
+        mismatch = f"{names}: not the shapes that {self.folder.path} was trained on; bring those back"
+        tensors, progress = self.folder.restore(self.fingerprint, mismatch)
         self.stages = progress["stages"]
         if self.stages:
             self.frozen = self.empty(len(self.stages)).to(self.device)
-            self.frozen.load_state_dict(_with_prefix(tensors, "frozen."))
+            self.frozen.load_state_dict(without_prefix("frozen.", tensors))
             self.frozen.requires_grad_(False)
-        self.trainer_state = _with_prefix(tensors, "trainer.")
+        self.trainer_state = without_prefix("trainer.", tensors)
 
     def record(self, *, finished: bool) -> dict[str, Any]:
         """What ``run.json`` holds."""
@@ -314,7 +262,3 @@ class _Evolving:
             "training_seconds": round(seconds, 3),
             "environment": environment(self.device),
         }
-
-
-def _with_prefix(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    return {name.removeprefix(prefix): tensor for name, tensor in tensors.items() if name.startswith(prefix)}

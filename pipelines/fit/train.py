@@ -20,31 +20,18 @@ from torch import Tensor, nn
 from ...datasets import OrientedCloud, PointCloud, prepare_cloud
 from ...datasets.clouds.large import Merging
 from ...datasets.clouds.outliers import agreement
-from ...neural_fields import Field, InputError, MultiscaleSDF, Similarity, Siren, save_field
-from ..run.config import load_config
-from ..run.folder import (
-    FIELD_FILE,
-    STATE_FILE,
-    fingerprint,
-    forget_run,
-    load_state,
-    read_record,
-    save_state,
-    write_record,
-)
+from ...neural_fields import Field, InputError, MultiscaleSDF, Similarity, Siren
+from ..run.folder import RunFolder, digest_of
 from ..run.machine import choose_device, environment, peak_memory
 from ..run.settings import FitConfig
-from ..run.team import is_leader
-from ..run.trainer import Interrupted, Progress, StopFlag, stop_on_signals
+from ..run.trainer import Interrupted, Progress, StopFlag, Trainer, prefixed, stop_on_signals, without_prefix
 from ..surface.trim import write_support
 from .cloud import CloudDistance, load_cloud
-from .level import LevelTrainer
+from .level import LevelObjective, new_level
 from .samples import Band, band_of, banded_sources, first_sources
 
 __all__ = ["FitConfig", "Review", "Run", "fit", "prepare", "review_points"]
 
-# A residual starts at a tenth of the usual output scale, close to the level before it.
-RESIDUAL_GAIN = 0.1
 # A level whose error at the points is so many times that of the level before it is worse than none: set to zero, it is
 # that level. Where data contradict themselves, as the sides of a part do that is thinner than their noise, it happens.
 WORSE = 2.0
@@ -95,25 +82,14 @@ def fit(
         >>> run = fit("scan.ply")  # doctest: +SKIP
         >>> run.field.value(run.similarity.to_unit(points))  # doctest: +SKIP
     """
-    directory = None if out is None else Path(out)
-    if resume:
-        if directory is None:
-            raise InputError("resume: needs the run directory (out=...)")
-        config = load_config(FitConfig, None, read_record(directory)["config"])
-    config = config or FitConfig()
+    folder = RunFolder(out, resume=resume)
+    config = folder.config(FitConfig, config, thing="fit")
     device = choose_device(config.device)
-    raw, merging = load_cloud(_as_cloud(cloud), limit=config.merge_above, isolation=config.isolation, cache=directory)
-    oriented = prepare(raw, config)
-    if directory is not None:
-        directory.mkdir(parents=True, exist_ok=True)
-        if not resume and is_leader():
-            forget_run(directory)
-    fitting = _Fitting(oriented, raw.source, config, device, directory, progress, merging)
-    if resume:
-        fitting.restore()
-    if not is_leader():
-        fitting.directory = None  # of several processes one writes
-    with stop_on_signals() as flag:
+    raw, merging = load_cloud(_as_cloud(cloud), limit=config.merge_above, isolation=config.isolation, cache=folder.path)
+    fitting = _Fitting(prepare(raw, config), raw.source, config, device, folder, progress, merging)
+    with folder.writing(), stop_on_signals() as flag:
+        if resume:
+            fitting.restore()
         return fitting.run(flag)
 
 
@@ -153,14 +129,14 @@ class _Fitting:
         source: str,
         config: FitConfig,
         device: torch.device,
-        directory: Path | None,
+        folder: RunFolder,
         progress: Callable[[Progress], None] | None,
-        merging: Merging | None = None,
+        merging: Merging | None,
     ) -> None:
         self.cloud, self.source, self.config = cloud, source, config
-        self.device, self.directory, self.merging = device, directory, merging
+        self.device, self.folder, self.merging = device, folder, merging
         self.progress = progress or (lambda _: None)
-        self.fingerprint = fingerprint(cloud)
+        self.fingerprint = digest_of((cloud.points, cloud.normals))
         self.points, self.normals = torch.from_numpy(cloud.points), torch.from_numpy(cloud.normals)
         self.index: CloudDistance | None = None  # of the points above
         self.frozen: MultiscaleSDF | None = None
@@ -169,33 +145,25 @@ class _Fitting:
         self.trainer_state: dict[str, Tensor] = {}
 
     def run(self, flag: StopFlag) -> Run:
-        if self.directory is not None:
-            write_record(self.directory, self.record(finished=False))
-            write_support(self.directory, self.points.numpy())
+        self.folder.begin(self.record(finished=False))
+        self.keep_support()
         for level in range(len(self.stages), self.config.num_levels):
             self.train_level(level, flag)
         assert self.frozen is not None
         record = self.record(finished=True)
-        if self.directory is not None:
-            save_field(
-                self.directory / FIELD_FILE, self.frozen, similarity=self.cloud.similarity, metadata={"run": record}
-            )
-            write_record(self.directory, record)
-            (self.directory / STATE_FILE).unlink(missing_ok=True)
-        return Run(self.frozen.cpu(), self.cloud.similarity, self.directory, record)
+        self.folder.finish(self.frozen, self.cloud.similarity, record)
+        return Run(self.frozen.cpu(), self.cloud.similarity, self.folder.out, record)
+
+    def keep_support(self) -> None:
+        """Keep the points that are fitted in the run."""
+        if self.folder.out is not None:
+            write_support(self.folder.out, self.points.numpy())
 
     def train_level(self, level: int, flag: StopFlag) -> None:
         """Make the samples of one level, train it, freeze it."""
         config, started = self.config, time.monotonic()
         generator = torch.Generator().manual_seed(config.seed * 1009 + level)
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(config.seed * 1009 + level)
-            network = Siren(
-                config.widths[level],
-                config.depths[level],
-                omega=config.omegas[level],
-                output_gain=RESIDUAL_GAIN if level else 1.0,
-            ).to(self.device)
+        siren = new_level(config, level, residual=level > 0).to(self.device)
         self.progress(Progress(f"level {level}: samples", 0, config.steps[level], 0.0, {}))
         band = None if self.frozen is None else self.next_band()
         delta = None if band is None else band.delta
@@ -205,37 +173,29 @@ class _Fitting:
         else:
             sources = banded_sources(self.index, self.frozen, delta, config, generator=generator, name=self.source)
         sampling_seconds = time.monotonic() - started
-        trainer = LevelTrainer(
-            network,
-            sources,
+        trainer = Trainer(
+            LevelObjective(siren, sources, learning_rate=config.learning_rates[level], generator=generator),
+            stage=f"level {level}",
             steps=config.steps[level],
-            learning_rate=config.learning_rates[level],
             seconds=self.seconds_for(level, sampling_seconds),
-            generator=generator,
         )
         if self.trainer_state:
             trainer.restore(self.trainer_state)
             self.trainer_state = {}
-
-        def report(trainer: LevelTrainer) -> None:
-            self.progress(Progress(f"level {level}", trainer.step, trainer.steps, trainer.fraction, trainer.losses))
-
-        finished = trainer.run(flag, report=report, save=lambda trainer: self.save(trainer, delta))
-        if not finished:
-            self.save(trainer, delta)
-            raise Interrupted(self.directory)
-        self.frozen = self.grown(network, delta).requires_grad_(False)
+        if not trainer.run(flag, report=self.progress, save=lambda: self.save(self.grown(siren, delta), trainer)):
+            raise Interrupted(self.folder.out)
+        self.frozen = self.grown(siren, delta).requires_grad_(False)
         review = self.review() if level == 0 else None
         before, self.errors = self.errors, self.values_at_cloud()
         silenced = level > 0 and _rms(self.errors) > WORSE * _rms(before)
         if silenced:
-            nn.init.zeros_(network.output.weight)
-            nn.init.zeros_(network.output.bias)
+            nn.init.zeros_(siren.output.weight)
+            nn.init.zeros_(siren.output.bias)
             self.errors = before
         self.stages.append(
             {
                 "level": level,
-                "parameters": sum(p.numel() for p in network.parameters()),
+                "parameters": sum(p.numel() for p in siren.parameters()),
                 "delta": delta,
                 "band": None if band is None else dataclasses.asdict(band),
                 "samples": {source.name: len(source.samples) for source in sources},
@@ -249,7 +209,7 @@ class _Fitting:
                 **self.surface_errors(),
             }
         )
-        self.save(None, None)
+        self.save(self.frozen, None)
 
     def next_band(self) -> Band:
         """The band around the last frozen level (Eq. 5)."""
@@ -272,8 +232,7 @@ class _Fitting:
             self.normals = torch.where(turned[:, None], -self.normals, self.normals)[kept]
             self.points = self.points[kept]
             self.index = None
-            if self.directory is not None:
-                write_support(self.directory, self.points.numpy())
+            self.keep_support()
         return found.report()
 
     @torch.no_grad()
@@ -295,51 +254,33 @@ class _Fitting:
         left = max(self.config.time_budget - spent - sampling_seconds, 1e-3)
         return left * self.config.share_of_time(level)
 
-    def grown(self, network: Siren, delta: float | None) -> MultiscaleSDF:
+    def grown(self, siren: Siren, delta: float | None) -> MultiscaleSDF:
         """The frozen levels and one more."""
         if self.frozen is None or delta is None:
-            return MultiscaleSDF(network, [], []).to(self.device)
-        return self.frozen.with_level(network, delta=delta).to(self.device)
+            return MultiscaleSDF(siren, [], []).to(self.device)
+        return self.frozen.with_level(siren, delta=delta).to(self.device)
 
-    def save(self, trainer: LevelTrainer | None, delta: float | None) -> None:
+    def save(self, field: MultiscaleSDF, trainer: Trainer[LevelObjective] | None) -> None:
         """Write a usable field and all that `restore` needs."""
-        if self.directory is None:
-            return
-        field = self.frozen if trainer is None else self.grown(trainer.network, delta)
-        assert field is not None
-        record = self.record(finished=False)
-        save_field(self.directory / FIELD_FILE, field, similarity=self.cloud.similarity, metadata={"run": record})
-        tensors = {} if trainer is None else {f"trainer.{k}": v for k, v in trainer.state().items()}
+        tensors = {} if trainer is None else prefixed("trainer.", trainer.state())
         if self.frozen is not None:
-            tensors |= {f"frozen.{name}": tensor for name, tensor in self.frozen.state_dict().items()}
-        save_state(self.directory, tensors, {"fingerprint": self.fingerprint, "stages": self.stages})
-        write_record(self.directory, record)
+            tensors |= prefixed("frozen.", self.frozen.state_dict())
+        progress = {"fingerprint": self.fingerprint, "stages": self.stages}
+        self.folder.save(field, self.cloud.similarity, self.record(finished=False), tensors, progress)
 
     def restore(self) -> None:
-        """Take up an interrupted run.
-
-        Raises:
-            InputError: nothing to resume, a damaged file, or another cloud than the run began with.
-        """
-        assert self.directory is not None
-        tensors, progress = load_state(self.directory)
-        if progress["fingerprint"] != self.fingerprint:
-            raise InputError(
-                f"{self.source}: not the cloud that {self.directory} was fitted to; "
-                "resume with that cloud, or leave out --resume and choose a new -o"
-            )
+        """Take up an interrupted run; see `RunFolder.restore`."""
+        mismatch = f"{self.source}: not the cloud that {self.folder.path} was fitted to; resume with that cloud"
+        tensors, progress = self.folder.restore(self.fingerprint, mismatch)
         self.stages = progress["stages"]
-        levels = [
-            Siren(self.config.widths[i], self.config.depths[i], omega=self.config.omegas[i])
-            for i in range(len(self.stages))
-        ]
+        levels = [new_level(self.config, level, residual=False) for level in range(len(self.stages))]
         if levels:
             self.frozen = MultiscaleSDF(levels[0], levels[1:], [1.0] * (len(levels) - 1)).to(self.device)
-            self.frozen.load_state_dict(_with_prefix(tensors, "frozen."))
+            self.frozen.load_state_dict(without_prefix("frozen.", tensors))
             self.frozen.requires_grad_(False)
             self.review()  # again: it follows from the cloud and level 0
             self.errors = self.values_at_cloud()
-        self.trainer_state = _with_prefix(tensors, "trainer.")
+        self.trainer_state = without_prefix("trainer.", tensors)
 
     def record(self, *, finished: bool) -> dict[str, Any]:
         """What ``run.json`` holds."""
@@ -361,10 +302,6 @@ class _Fitting:
 
 def _rms(errors: Tensor) -> float:
     return float(errors.square().mean().sqrt())
-
-
-def _with_prefix(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    return {name.removeprefix(prefix): tensor for name, tensor in tensors.items() if name.startswith(prefix)}
 
 
 # Largest |f_0| in units of its robust scale: half of a sound cloud's errors are below 0.67, and what a coarse level

@@ -18,12 +18,12 @@ from ...datasets import OrientedCloud
 from ...neural_fields import Field, MultiscaleSDF, Similarity, Siren, load_field
 from ..bench.cells import Cell, Report, Workplace
 from ..fit.cloud import CloudDistance
-from ..fit.level import LevelTrainer
+from ..fit.level import LevelObjective, new_level
 from ..fit.samples import Source, Weights, band_of, distance_samples, surface_samples, with_previous
-from ..fit.train import RESIDUAL_GAIN, prepare, review_points
+from ..fit.train import prepare, review_points
 from ..run.folder import find_field
 from ..run.settings import FitConfig
-from ..run.trainer import Progress, StopFlag
+from ..run.trainer import Trainer
 from .judge import damaged_cloud
 from .ours import Ours, our_config
 
@@ -165,26 +165,10 @@ def train_level(
         progress: told now and then.
         stage: name for ``progress``.
     """
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(config.seed * 1009 + level)
-        gain = RESIDUAL_GAIN if residual else 1.0
-        network = Siren(config.widths[level], config.depths[level], omega=config.omegas[level], output_gain=gain)
-    network = network.to(sources[0].samples.points.device)
-    trainer = LevelTrainer(
-        network,
-        sources,
-        steps=config.steps[level],
-        learning_rate=config.learning_rates[level],
-        seconds=None,
-        generator=generator,
-    )
-
-    def report(trainer: LevelTrainer) -> None:
-        if progress is not None:
-            progress(Progress(stage or f"level {level}", trainer.step, trainer.steps, trainer.fraction, trainer.losses))
-
-    trainer.run(StopFlag(), report=report, save=lambda _: None)
-    return network.requires_grad_(False)
+    siren = new_level(config, level, residual=residual).to(sources[0].samples.points.device)
+    objective = LevelObjective(siren, sources, learning_rate=config.learning_rates[level], generator=generator)
+    Trainer(objective, stage=stage or f"level {level}", steps=config.steps[level]).run(report=progress)
+    return siren.requires_grad_(False)
 
 
 def generator_for(config: FitConfig, level: int) -> torch.Generator:

@@ -19,7 +19,7 @@ from ...neural_fields import Field
 from ..bench.cells import Preset, Report
 from ..fit.cloud import CloudDistance
 from ..fit.samples import DOMAIN
-from ..run.trainer import Progress
+from ..run.trainer import Group, Objective, Trainer
 
 __all__ = [
     "Output",
@@ -145,23 +145,24 @@ def descend(
         amsgrad: of Adam: second moments never fall.
         report_every: steps between reports; reading the loss makes a GPU wait.
     """
-    groups = [(list(chosen), schedule) for chosen, schedule in ((parameters, rate), *also)]
-    adam = torch.optim.Adam(
-        [{"params": chosen} for chosen, _ in groups], betas=betas, eps=eps, amsgrad=amsgrad, fused=True
+    groups = [Group(list(chosen), schedule) for chosen, schedule in ((parameters, rate), *also)]
+    Trainer(_Descent(loss, groups), stage=stage, steps=steps, clip=clip, betas=betas, eps=eps, amsgrad=amsgrad).run(
+        report=progress, report_every=report_every
     )
-    trained = [parameter for chosen, _ in groups for parameter in chosen]
-    for step in range(steps):
-        for group, (_, schedule) in zip(adam.param_groups, groups, strict=True):
-            group["lr"] = schedule(step / steps)
-        adam.zero_grad(set_to_none=True)
-        total = loss(step)
-        total.backward()
-        if clip is not None:
-            nn.utils.clip_grad_norm_(trained, clip)
-        adam.step()
-        done = step + 1
-        if progress is not None and (done % report_every == 0 or done == steps):
-            progress(Progress(stage, done, steps, done / steps, {"loss": float(total.detach())}))
+
+
+class _Descent(Objective):
+    """A loss that draws its own batches."""
+
+    def __init__(self, loss: Callable[[int], Tensor], groups: Sequence[Group]) -> None:
+        trained = nn.ParameterList(parameter for group in groups for parameter in group.parameters)
+        super().__init__(trained, groups, torch.Generator())
+        self.loss = loss
+
+    def losses(self, step: int, done: float) -> tuple[dict[str, Tensor], Tensor]:
+        """See `Objective.losses`."""
+        total = self.loss(step)
+        return {"loss": total}, total
 
 
 def cosine(first: float, last: float, done: float) -> float:

@@ -17,20 +17,9 @@ from torch import Tensor
 
 from ...datasets import PointCloud
 from ...datasets.views.images import PosedImage, PosedImages, read_posed_images
-from ...neural_fields import InputError, Jet, NoSurfaceError, TextureField, extract_mesh, save_field, save_texture
+from ...neural_fields import InputError, Jet, NoSurfaceError, TextureField, extract_mesh, save_texture
 from ..render.picture import write_picture
-from ..run.config import load_config
-from ..run.folder import (
-    FIELD_FILE,
-    STATE_FILE,
-    TEXTURE_FILE,
-    digest_of,
-    forget_run,
-    load_state,
-    read_record,
-    save_state,
-    write_record,
-)
+from ..run.folder import TEXTURE_FILE, RunFolder, digest_of
 from ..run.machine import choose_device, environment
 from ..run.settings import ReconstructConfig, TextureConfig
 from ..run.trainer import Interrupted, Progress, stop_on_signals
@@ -38,7 +27,7 @@ from ..surface.surface import from_mesh, sample_points
 from ..surface.trim import in_region
 from ..texture.train import FittedTexture, fit_texture
 from .model import RayPool, SceneModel, build_scene
-from .trainer import SceneTrainer
+from .objective import scene_trainer
 from .views import ViewImage, comparison_sheet, held_out, measure, render_image
 
 __all__ = ["HELD_OUT_FILE", "PREVIEW_FILE", "Reconstruction", "reconstruct", "scene_texture", "surface_colors"]
@@ -93,17 +82,15 @@ def reconstruct(
         >>> run = reconstruct("data/dtu_scan24")  # doctest: +SKIP
         >>> run.record["held_out"]["psnr"]  # doctest: +SKIP
     """
-    directory = None if out is None else Path(out)
-    if resume:
-        if directory is None:
-            raise InputError("resume: needs the run directory (out=...)")
-        config = load_config(ReconstructConfig, None, read_record(directory)["config"], thing="reconstruct")
-    config = config or ReconstructConfig()
+    folder = RunFolder(out, resume=resume)
+    config = folder.config(ReconstructConfig, config, thing="reconstruct")
     device = choose_device(config.device)
     images = data if isinstance(data, PosedImages) else read_posed_images(data, width=config.width)
-    if directory is not None:
-        directory.mkdir(parents=True, exist_ok=True)
-    return _Reconstruction(images, config, device, directory, progress or (lambda _: None)).run(resume=resume)
+    training = _Reconstruction(images, config, device, folder, progress or (lambda _: None))
+    with folder.writing(HELD_OUT_FILE):
+        if resume:
+            training.restore()
+        return training.run()
 
 
 class _Reconstruction:
@@ -114,53 +101,62 @@ class _Reconstruction:
         images: PosedImages,
         config: ReconstructConfig,
         device: torch.device,
-        directory: Path | None,
+        folder: RunFolder,
         progress: Callable[[Progress], None],
     ) -> None:
         self.images, self.config, self.device = images, config, device
-        self.directory, self.progress = directory, progress
+        self.folder, self.progress = folder, progress
         self.train_views, self.test_views = held_out(images.views, config.test_every)
-        self.pool = RayPool(self.train_views, images.similarity, device)
+        pool = RayPool(self.train_views, images.similarity, device)
         progress(Progress("reconstruct: a sphere to begin with", 0, config.steps, 0.0, {}))
-        model = build_scene(config, has_masks=self.pool.has_masks).to(device)
-        self.trainer = SceneTrainer(model, self.pool, config, seconds=config.time_budget)
+        self.model = build_scene(config, has_masks=pool.has_masks).to(device)
+        self.trainer = scene_trainer(self.model, pool, config, seconds=config.time_budget)
+        # Of the training pixels, their masks and the cameras.
+        seen = (pool.colors, pool.eyes, pool.axes, pool.lens, *([] if pool.masks is None else [pool.masks]))
+        self.fingerprint = digest_of(tensor.cpu().numpy() for tensor in seen)
         self.shown = 0
 
-    def run(self, *, resume: bool) -> Reconstruction:
+    @property
+    def level(self) -> int:
+        """The finest level that is switched on by now."""
+        return self.trainer.objective.level_at(self.trainer.fraction)
+
+    def run(self) -> Reconstruction:
         """Train to the end, measure, colour, write."""
-        if resume:
-            self._restore()
-        elif self.directory is not None:
-            forget_run(self.directory, HELD_OUT_FILE)
-        if self.directory is not None:
-            write_record(self.directory, self._record(finished=False))
+        self.folder.begin(self._record(finished=False))
         with stop_on_signals() as flag:
-            finished = self.trainer.run(flag, report=self._report, save=self._save)
+            if not self.trainer.run(flag, report=self._report, save=self._save):
+                raise Interrupted(self.folder.out)
             # What was trained is safe before pictures and texture are made, which may be interrupted or fail too.
-            self._save(self.trainer)
-            if not finished:
-                raise Interrupted(self.directory)
-        model = self.trainer.model.requires_grad_(False)
+            self._save()
+        self.model.requires_grad_(False)
         pairs = self._render_held_out()
         record = self._record(finished=True) | {"held_out": self._figures(pairs)}
-        model.cpu()
-        texture, record["texture"] = self._texture(model)
-        if self.directory is not None:
-            self._write(model, texture, pairs, record)
-        return Reconstruction(model, texture, self.images, self.directory, record)
+        self.model.cpu()
+        texture, record["texture"] = self._texture()
+        out = self.folder.out
+        if out is not None:
+            if texture is not None:
+                save_texture(out / TEXTURE_FILE, texture, metadata={"texture": record["texture"]})
+            if pairs:
+                self._write_sheet(out / HELD_OUT_FILE, pairs[:SHEET_VIEWS])
+            self.folder.finish(self.model.geometry, self.images.similarity, record)
+            (out / PREVIEW_FILE).unlink(missing_ok=True)
+        return Reconstruction(self.model, texture, self.images, out, record)
 
-    def _report(self, trainer: SceneTrainer) -> None:
-        stage = f"reconstruct, level {trainer.level}"
-        self.progress(Progress(stage, trainer.step, self.config.steps, trainer.fraction, trainer.losses))
-        if self.directory is not None and trainer.fraction * (PREVIEWS + 1) >= self.shown + 1 and trainer.fraction < 1:
-            self.shown = int(trainer.fraction * (PREVIEWS + 1))
+    def _report(self, progress: Progress) -> None:
+        self.progress(dataclasses.replace(progress, stage=f"reconstruct, level {self.level}"))
+        done = progress.fraction
+        if self.folder.out is not None and done * (PREVIEWS + 1) >= self.shown + 1 and done < 1:
+            self.shown = int(done * (PREVIEWS + 1))
             view = (self.test_views or self.train_views)[0]
-            pairs = [(view, self._image(view))]
-            write_picture(self.directory / PREVIEW_FILE, comparison_sheet(pairs, trainer.model.background))
+            self._write_sheet(self.folder.out / PREVIEW_FILE, [(view, self._image(view))])
+
+    def _write_sheet(self, file: Path, pairs: Sequence[tuple[PosedImage, ViewImage]]) -> None:
+        write_picture(file, comparison_sheet(pairs, self.model.background))
 
     def _image(self, view: PosedImage) -> ViewImage:
-        trainer = self.trainer
-        return render_image(trainer.model, view, self.images.similarity, trainer.sampling, level=trainer.level)
+        return render_image(self.model, view, self.images.similarity, self.trainer.objective.sampling, level=self.level)
 
     def _render_held_out(self) -> list[tuple[PosedImage, ViewImage]]:
         pairs = []
@@ -174,90 +170,46 @@ class _Reconstruction:
         """Means over the held-out views, and each one's figures; None without such views."""
         if not pairs:
             return None
-        views = {view.name: measure(image, view, self.trainer.model.background) for view, image in pairs}
+        views = {view.name: measure(image, view, self.model.background) for view, image in pairs}
         names = sorted({name for figures in views.values() for name in figures})
         means = {
             name: float(np.mean([figures[name] for figures in views.values() if name in figures])) for name in names
         }
         return means | {"views": views}
 
-    def _texture(self, model: SceneModel) -> tuple[TextureField | None, dict[str, Any] | None]:
+    def _texture(self) -> tuple[TextureField | None, dict[str, Any] | None]:
         if self.config.texture_steps == 0:
             return None, None
         try:
-            fitted = scene_texture(model, self.images, self.config, progress=self.progress)
+            fitted = scene_texture(self.model, self.images, self.config, progress=self.progress)
         except NoSurfaceError as error:
             raise InputError(
                 f"{self.images.source}: the training found no surface ({error}); see `mplicits check-cameras`, "
                 "and train longer (--steps)"
             ) from error
         if not fitted.record["finished"]:
-            raise Interrupted(self.directory)
+            raise Interrupted(self.folder.out)
         return fitted.texture, fitted.record
 
-    def _write(
-        self,
-        model: SceneModel,
-        texture: TextureField | None,
-        pairs: Sequence[tuple[PosedImage, ViewImage]],
-        record: dict[str, Any],
-    ) -> None:
-        assert self.directory is not None
-        kept = self._field_record(record)
-        save_field(
-            self.directory / FIELD_FILE, model.geometry, similarity=self.images.similarity, metadata={"run": kept}
-        )
-        if texture is not None:
-            save_texture(self.directory / TEXTURE_FILE, texture, metadata={"texture": record["texture"]})
-        if pairs:
-            write_picture(self.directory / HELD_OUT_FILE, comparison_sheet(pairs[:SHEET_VIEWS], model.background))
-        write_record(self.directory, record)
-        for name in (STATE_FILE, PREVIEW_FILE):
-            (self.directory / name).unlink(missing_ok=True)
-
-    def _save(self, trainer: SceneTrainer) -> None:
-        """Write a usable field and all that `_restore` needs."""
-        if self.directory is None:
-            return
+    def _save(self) -> None:
+        """Write a usable field and all that `restore` needs."""
+        trainer = self.trainer
+        progress = {"fingerprint": self.fingerprint, "shown": self.shown, "losses": trainer.losses}
         record = self._record(finished=False)
-        save_field(
-            self.directory / FIELD_FILE,
-            trainer.model.geometry,
-            similarity=self.images.similarity,
-            metadata={"run": self._field_record(record)},
-        )
-        progress = {"fingerprint": self._fingerprint(), "shown": self.shown, "losses": trainer.losses}
-        save_state(self.directory, trainer.state(), progress)
-        write_record(self.directory, record)
+        self.folder.save(self.model.geometry, self.images.similarity, record, trainer.state(), progress)
 
-    def _restore(self) -> None:
-        assert self.directory is not None
-        tensors, progress = load_state(self.directory)
-        if progress.get("fingerprint") != self._fingerprint():
-            raise InputError(
-                f"{self.images.source}: not the pictures that {self.directory} was trained on; "
-                "resume with those, or leave out --resume and choose a new -o"
-            )
+    def restore(self) -> None:
+        """Take up an interrupted run; see `RunFolder.restore`."""
+        path, source = self.folder.path, self.images.source
+        mismatch = f"{source}: not the pictures that {path} was trained on; resume with those"
+        tensors, progress = self.folder.restore(self.fingerprint, mismatch)
         self.shown, self.trainer.losses = progress["shown"], progress["losses"]
         self.trainer.restore(tensors)
 
-    def _fingerprint(self) -> str:
-        """A digest of the training pixels, their masks and the cameras."""
-        pool = self.pool
-        tensors = (pool.colors, pool.eyes, pool.axes, pool.lens, *([] if pool.masks is None else [pool.masks]))
-        return digest_of(tensor.cpu().numpy() for tensor in tensors)
-
-    def _field_record(self, record: dict[str, Any]) -> dict[str, Any]:
-        """What goes into the field's own file: not every view's figures."""
-        return {name: value for name, value in record.items() if name != "held_out"}
-
     def _record(self, *, finished: bool) -> dict[str, Any]:
         """What ``run.json`` holds."""
-        trainer = self.trainer
-        counts = {
-            name: sum(p.numel() for p in module.parameters())
-            for name, module in (("geometry", trainer.model.geometry), ("color", trainer.model.color))
-        }
+        model, trainer = self.model, self.trainer
+        parts = {"geometry": model.geometry, "color": model.color}
         return {
             "finished": finished,
             "data": str(self.images.source),
@@ -265,9 +217,9 @@ class _Reconstruction:
             "region": self.images.region,
             "similarity": dataclasses.asdict(self.images.similarity),
             "config": dataclasses.asdict(self.config),
-            "parameters": counts,
-            "deltas": trainer.model.geometry.deltas.tolist(),
-            "inv_std": float(trainer.model.inv_std.detach()),
+            "parameters": {name: sum(p.numel() for p in part.parameters()) for name, part in parts.items()},
+            "deltas": model.geometry.deltas.tolist(),
+            "inv_std": float(model.inv_std.detach()),
             "steps": trainer.step,
             "training_seconds": round(trainer.elapsed, 3),
             "losses": trainer.losses,

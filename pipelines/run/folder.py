@@ -1,19 +1,13 @@
-"""Run directories: which file an argument ``RUN|FILE`` means, and where a new run may be written.
-
-What a fit leaves in its run directory, and how an interrupted one finds its way back.
-
-What an interrupted training of a texture leaves beside the texture, so that it can go on.
-"""
+"""Run directories: what an argument ``RUN|FILE`` means, and what a training writes and finds again."""
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import json
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -22,12 +16,12 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from ...datasets import OrientedCloud, PointCloud
-from ...neural_fields import Field, InputError, SavedField, load_field
+from ...neural_fields import Field, InputError, SavedField, Similarity, load_field, save_field
 from ...neural_fields.dynamic_tracing import moment
 from ...neural_fields.files import write_json, write_whole
 from .config import load_config
-from .settings import TextureConfig
+from .lock import check_unlocked, lock_file, locked
+from .team import is_leader
 
 __all__ = [
     "CLOUD_FILE",
@@ -35,12 +29,10 @@ __all__ = [
     "RECORD_FILE",
     "STATE_FILE",
     "TEXTURE_FILE",
-    "TextureState",
+    "RunFolder",
     "check_new_run",
     "digest_of",
     "find_field",
-    "fingerprint",
-    "forget_run",
     "is_field",
     "is_fitted",
     "kept_cloud",
@@ -51,6 +43,16 @@ __all__ = [
     "texture_state_file",
     "write_record",
 ]
+
+C = TypeVar("C")
+
+FIELD_FILE = "field.safetensors"
+RECORD_FILE = "run.json"
+STATE_FILE = "resume.safetensors"
+TEXTURE_FILE = "texture.safetensors"
+CLOUD_FILE = "cloud.ply"  # what was made of depth maps
+# What is in the record alone: too long for the head of a field's file.
+LONG = ("checks", "held_out")
 
 
 def find_field(path: str | Path) -> Path:
@@ -107,11 +109,34 @@ def load_still(path: str | Path, time: float | None = None, *, device: torch.dev
     return saved._replace(field=moment(saved.field, time))
 
 
+def is_fitted(run: Path) -> bool:
+    """Whether the training in a directory went to its end."""
+    return (run / FIELD_FILE).is_file() and not (run / STATE_FILE).is_file() and bool(read_record(run)["finished"])
+
+
+def kept_cloud(run: Path) -> Path:
+    """The file of the cloud that was made of the depth maps of a run.
+
+    Raises:
+        InputError: the run was not fitted to depth maps.
+    """
+    kept = run / CLOUD_FILE
+    if not kept.is_file():
+        raise InputError(f"{run}: holds no {CLOUD_FILE}, so it was not fitted to depth maps; name its own cloud")
+    return kept
+
+
+def texture_state_file(texture: Path) -> Path:
+    """Where the training of the texture that will be written to ``texture`` is kept."""
+    return texture.with_suffix(".resume.safetensors")
+
+
 def check_new_run(path: str | Path, *, resume: bool, force: bool) -> Path:
     """The directory of a run to be written, if nothing there would be lost.
 
     Raises:
-        InputError: it cannot be made, holds something already, or with ``resume`` holds nothing to resume.
+        InputError: it cannot be made, is being written, holds something already, or with ``resume`` holds nothing to
+            resume.
     """
     path = Path(path)
     if path.exists() and not path.is_dir():
@@ -119,42 +144,118 @@ def check_new_run(path: str | Path, *, resume: bool, force: bool) -> Path:
     parent = path.absolute().parent
     if not path.exists() and not parent.is_dir():
         raise InputError(f"{path}: the folder {parent} does not exist; make it first")
+    check_unlocked(path)
     if resume:
         if not (path / STATE_FILE).is_file():
             finished = (path / FIELD_FILE).is_file()
             reason = "is finished" if finished else "holds no interrupted run"
             raise InputError(f"{path}: {reason}, so there is nothing to resume; leave out --resume")
         return path
-    if path.is_dir() and not force and any(path.iterdir()):
+    if path.is_dir() and not force and any(file != lock_file(path) for file in path.iterdir()):
         hint = " --resume continues it," if (path / STATE_FILE).is_file() else ""
         raise InputError(f"{path}: exists and is not empty;{hint} --force overwrites it, or choose another -o")
     return path
 
 
-def forget_run(directory: Path, *also: str) -> None:
-    """Remove what of an earlier run must not be resumed into a new one in its place, nor colour it.
+class RunFolder:
+    """What a training writes: its record, a field that is usable at any time, and what it can be resumed from.
 
     Args:
-        directory: of the run, once the new data are known to be good.
-        also: names of other files that only this kind of run has.
+        path: the directory; None keeps nothing.
+        resume: whether the interrupted run there is continued.
+
+    Attributes:
+        out: where to write, ``path``; None where nothing is kept, or another process of a team writes.
+
+    Raises:
+        InputError: there is no directory to resume from.
     """
-    texture = directory / TEXTURE_FILE
-    for path in (directory / STATE_FILE, texture, texture_state_file(texture), *(directory / name for name in also)):
-        path.unlink(missing_ok=True)
 
+    def __init__(self, path: str | Path | None, *, resume: bool = False) -> None:
+        if resume and path is None:
+            raise InputError("resume: needs the run directory (out=...)")
+        self.path, self.resume = None if path is None else Path(path), resume
+        self.out = self.path if is_leader() else None
 
-FIELD_FILE = "field.safetensors"
-RECORD_FILE = "run.json"
-STATE_FILE = "resume.safetensors"
+    def config(self, kind: type[C], given: C | None, *, thing: str) -> C:
+        """Settings of the run: its own if it is resumed, else those given, else the defaults.
 
+        Raises:
+            InputError: the record of the run is missing or damaged.
+        """
+        if self.resume and self.path is not None:
+            return load_config(kind, None, read_record(self.path)["config"], thing=thing)
+        return given or kind()
 
-def fingerprint(cloud: OrientedCloud) -> str:
-    """A digest of points and normals, to tell whether a resumed run sees the same cloud."""
-    return digest_of((cloud.points, cloud.normals))
+    @contextmanager
+    def writing(self, *also: str) -> Iterator[None]:
+        """Make the directory and be its only writer; unless it is resumed, forget the run that was there.
+
+        What would be resumed into the new run or colour it is removed, and the files named ``also``.
+
+        Raises:
+            InputError: somebody else writes there.
+        """
+        if self.out is None:
+            yield
+            return
+        self.out.mkdir(parents=True, exist_ok=True)
+        with locked(self.out):
+            if not self.resume:
+                for name in (STATE_FILE, TEXTURE_FILE, texture_state_file(Path(TEXTURE_FILE)).name, *also):
+                    (self.out / name).unlink(missing_ok=True)
+            yield
+
+    def begin(self, record: Mapping[str, Any]) -> None:
+        """Write the record of a run that has not come to a field yet."""
+        if self.out is not None:
+            write_record(self.out, record)
+
+    def save(
+        self,
+        field: Field,
+        similarity: Similarity,
+        record: Mapping[str, Any],
+        tensors: Mapping[str, Tensor],
+        progress: Mapping[str, Any],
+    ) -> None:
+        """Write a checkpoint: a usable field, and the ``tensors`` and ``progress`` (JSON) that `restore` returns."""
+        if self.out is not None:
+            self._save_field(self.out, field, similarity, record)
+            save_state(self.out, tensors, progress)
+            write_record(self.out, record)
+
+    def finish(self, field: Field, similarity: Similarity, record: Mapping[str, Any]) -> None:
+        """Write field and record of a finished run, of which nothing is left to resume."""
+        if self.out is not None:
+            self._save_field(self.out, field, similarity, record)
+            write_record(self.out, record)
+            (self.out / STATE_FILE).unlink(missing_ok=True)
+
+    @staticmethod
+    def _save_field(out: Path, field: Field, similarity: Similarity, record: Mapping[str, Any]) -> None:
+        short = {name: value for name, value in record.items() if name not in LONG}
+        save_field(out / FIELD_FILE, field, similarity=similarity, metadata={"run": short})
+
+    def restore(self, fingerprint: str, mismatch: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        """The tensors and the progress that `save` was given last.
+
+        Args:
+            fingerprint: of what the run learns from; it is in the progress.
+            mismatch: what to say if the run began with another.
+
+        Raises:
+            InputError: there is nothing to resume, it is damaged, or the fingerprint is another.
+        """
+        assert self.path is not None
+        tensors, progress = load_state(self.path)
+        if progress.get("fingerprint") != fingerprint:
+            raise InputError(f"{mismatch}, or leave out --resume and choose a new -o")
+        return tensors, progress
 
 
 def digest_of(arrays: Iterable[NDArray[Any]]) -> str:
-    """SHA-256 of what is in the arrays, one after the other."""
+    """SHA-256 of what is in the arrays, one after the other: tells whether a resumed run sees the same data."""
     digest = hashlib.sha256()
     for array in arrays:
         digest.update(np.ascontiguousarray(array).tobytes())
@@ -207,74 +308,3 @@ def load_state(directory: Path, *, name: str = STATE_FILE) -> tuple[dict[str, Te
             return {name: file.get_tensor(name) for name in file.keys()}, progress  # noqa: SIM118
     except (SafetensorError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: damaged ({error}); begin again without --resume") from error
-
-
-def texture_state_file(texture: Path) -> Path:
-    """Where the training of the texture that will be written to ``texture`` is kept."""
-    return texture.with_suffix(".resume.safetensors")
-
-
-@dataclass(frozen=True)
-class TextureState:
-    """A training under way.
-
-    Attributes:
-        config: its settings.
-        level: of the geometry; None is the finest.
-        fingerprint: of what it learns from; see `fingerprint_of`.
-        tensors: network, optimiser and random numbers; see `pack_training`.
-    """
-
-    config: TextureConfig
-    level: int | None
-    fingerprint: str
-    tensors: Mapping[str, Tensor]
-
-    @staticmethod
-    def fingerprint_of(cloud: PointCloud, geometry: Field) -> str:
-        """A digest of points, colours and field, to tell whether a resumed training sees the same."""
-        assert cloud.colors is not None
-        weights = (tensor.detach().cpu().numpy() for _, tensor in sorted(geometry.state_dict().items()))
-        return digest_of((cloud.points, cloud.colors, *weights))
-
-    def save(self, path: Path) -> None:
-        """Write it, whole or not at all."""
-        about: dict[str, Any] = {"config": dataclasses.asdict(self.config), "level": self.level}
-        save_state(path.parent, self.tensors, about | {"fingerprint": self.fingerprint}, name=path.name)
-
-    @staticmethod
-    def load(path: Path) -> TextureState:
-        """Read what `save` wrote.
-
-        Raises:
-            InputError: there is no such file, or it is damaged.
-        """
-        tensors, about = load_state(path.parent, name=path.name)
-        try:
-            config = load_config(TextureConfig, None, about["config"])
-            return TextureState(config, about["level"], about["fingerprint"], tensors)
-        except KeyError as error:
-            raise InputError(f"{path}: damaged (no {error}); begin again without --resume") from error
-
-
-TEXTURE_FILE = "texture.safetensors"
-
-
-CLOUD_FILE = "cloud.ply"
-
-
-def kept_cloud(run: Path) -> Path:
-    """The file of the cloud that was made of the depth maps of a run.
-
-    Raises:
-        InputError: the run was not fitted to depth maps.
-    """
-    kept = run / CLOUD_FILE
-    if not kept.is_file():
-        raise InputError(f"{run}: holds no {CLOUD_FILE}, so it was not fitted to depth maps; name its own cloud")
-    return kept
-
-
-def is_fitted(run: Path) -> bool:
-    """Whether the fit in a directory was trained to its end."""
-    return (run / FIELD_FILE).is_file() and not (run / STATE_FILE).is_file() and bool(read_record(run)["finished"])

@@ -15,7 +15,7 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
-__all__ = ["agreed", "average_gradients", "is_leader", "my_share", "team", "whole_batch"]
+__all__ = ["agreed", "average_gradients", "is_alone", "is_leader", "my_share", "team", "whole_batch"]
 
 
 @contextmanager
@@ -40,25 +40,30 @@ def team(*, device: str = "auto") -> Iterator[bool]:
         dist.destroy_process_group()
 
 
+def is_alone() -> bool:
+    """Whether no team was joined."""
+    return not dist.is_initialized()
+
+
 def is_leader() -> bool:
     """Whether this process is the one that writes: rank 0, or alone."""
-    return not dist.is_initialized() or dist.get_rank() == 0
+    return is_alone() or dist.get_rank() == 0
 
 
 def whole_batch(count: int) -> int:
     """``count``, rounded up to a multiple of the number of processes: all shares are then equal."""
-    size = dist.get_world_size() if dist.is_initialized() else 1
+    size = 1 if is_alone() else dist.get_world_size()
     return -(-count // size) * size
 
 
 def my_share(index: Tensor) -> Tensor:
     """Of what all have drawn, ``(n,)``, the part that this process looks at."""
-    return index[dist.get_rank() :: dist.get_world_size()] if dist.is_initialized() else index
+    return index if is_alone() else index[dist.get_rank() :: dist.get_world_size()]
 
 
 def average_gradients(parameters: Iterable[Tensor]) -> None:
     """Replace gradients by their mean over all processes, in one message."""
-    if not dist.is_initialized():
+    if is_alone():
         return
     gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
     flat = torch.cat([gradient.flatten() for gradient in gradients])
@@ -70,7 +75,7 @@ def average_gradients(parameters: Iterable[Tensor]) -> None:
 
 def agreed(stop: bool, elapsed: float, device: torch.device) -> tuple[bool, float]:
     """Whether any process was asked to stop, and the longest time: all must take the same number of steps."""
-    if not dist.is_initialized():
+    if is_alone():
         return stop, elapsed
     facts = torch.tensor([float(stop), elapsed], device=device)
     dist.all_reduce(facts, op=dist.ReduceOp.MAX)

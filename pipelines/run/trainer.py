@@ -1,20 +1,38 @@
-"""One level's training: draw from the samples, sum the terms of Eq. 4, step Adam; interruptible and resumable."""
+"""The loop that every training goes through: Adam on a schedule, reports, checkpoints, a time budget, a way to stop."""
 
 from __future__ import annotations
 
 import math
 import signal
 import threading
-from collections.abc import Iterator, Mapping
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
+from typing import Generic, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor, nn
 
-__all__ = ["Interrupted", "Progress", "StopFlag", "pack_training", "set_rate", "stop_on_signals", "unpack_training"]
+from .team import agreed, average_gradients, is_alone
+
+__all__ = [
+    "Group",
+    "Interrupted",
+    "Objective",
+    "Progress",
+    "StopFlag",
+    "Trainer",
+    "prefixed",
+    "stop_on_signals",
+    "warm_cosine",
+    "without_prefix",
+]
+
+Rate = Callable[[float], float]
 
 
 @dataclass(frozen=True)
@@ -34,6 +52,18 @@ class Progress:
     steps: int
     fraction: float
     losses: Mapping[str, float]
+
+
+class Interrupted(Exception):  # noqa: N818  what happened is no error
+    """Training was asked to stop, and a usable checkpoint was written.
+
+    Attributes:
+        directory: the run directory, for ``--resume``; None if the fit had none.
+    """
+
+    def __init__(self, directory: Path | None) -> None:
+        super().__init__("interrupted" if directory is None else f"interrupted; checkpoint in {directory}")
+        self.directory = directory
 
 
 class StopFlag:
@@ -70,52 +100,194 @@ def stop_on_signals() -> Iterator[StopFlag]:
             signal.signal(number, before[number])
 
 
-def set_rate(adam: torch.optim.Adam, peak: float, progress: float) -> None:
-    """Give the optimiser the learning rate for a schedule done to ``progress`` in [0, 1]: warm-up, then a cosine.
+def warm_cosine(peak: float) -> Rate:
+    """Learning rates for a schedule done to a fraction in [0, 1]: a warm-up to ``peak``, then a cosine to 0.
 
     Adam's first steps are as long as its later ones, whatever the gradient: warm up over 2 % of the schedule.
     """
-    rate = peak * min(1.0, (progress + 0.001) / 0.02) * 0.5 * (1 + math.cos(math.pi * progress))
-    for group in adam.param_groups:
-        group["lr"] = rate
+    return lambda done: peak * min(1.0, (done + 0.001) / 0.02) * 0.5 * (1 + math.cos(math.pi * done))
 
 
-def pack_training(
-    network: nn.Module, adam: torch.optim.Adam, generator: torch.Generator, *, step: int, elapsed: float
-) -> dict[str, Tensor]:
-    """All of a training that `unpack_training` needs to continue as if nothing had happened."""
-    state = {f"network.{name}": tensor for name, tensor in network.state_dict().items()}
-    for index, parameter in enumerate(network.parameters()):
-        for name, tensor in adam.state.get(parameter, {}).items():
-            state[f"adam.{index}.{name}"] = tensor
-    state["generator"] = generator.get_state()
-    state["progress"] = torch.tensor([step, elapsed], dtype=torch.float64)
-    return state
-
-
-def unpack_training(
-    state: Mapping[str, Tensor], network: nn.Module, adam: torch.optim.Adam, generator: torch.Generator
-) -> tuple[int, float]:
-    """Give network, optimiser and generator what `pack_training` took → steps done and seconds spent."""
-    prefix = "network."
-    network.load_state_dict({k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)})
-    for index, parameter in enumerate(network.parameters()):
-        prefix = f"adam.{index}."
-        # Adam counts its steps on the CPU, or beside the parameter where the kernel is fused.
-        found = {k.removeprefix(prefix): v.to(parameter.device) for k, v in state.items() if k.startswith(prefix)}
-        if found:
-            adam.state[parameter] = found
-    generator.set_state(state["generator"].cpu())
-    return int(state["progress"][0]), float(state["progress"][1])
-
-
-class Interrupted(Exception):  # noqa: N818  what happened is no error
-    """Training was asked to stop, and a usable checkpoint was written.
+class Group(NamedTuple):
+    """Parameters that are trained at a rate of their own.
 
     Attributes:
-        directory: the run directory, for ``--resume``; None if the fit had none.
+        parameters: the tensors.
+        rate: learning rate for a schedule done to a fraction in [0, 1].
     """
 
-    def __init__(self, directory: Path | None) -> None:
-        super().__init__("interrupted" if directory is None else f"interrupted; checkpoint in {directory}")
-        self.directory = directory
+    parameters: Sequence[nn.Parameter]
+    rate: Rate
+
+
+class Objective(ABC):
+    """What a `Trainer` minimises: a network, its loss, and the random numbers that draw the batches.
+
+    Attributes:
+        network: saved with the training, whole.
+        groups: those of its parameters that are trained.
+        generator: CPU generator that draws the batches.
+        kept: other tensors that later steps depend on, by name; saved with the training.
+    """
+
+    def __init__(
+        self,
+        network: nn.Module,
+        groups: Sequence[Group],
+        generator: torch.Generator,
+        kept: Mapping[str, Tensor] | None = None,
+    ) -> None:
+        self.network, self.groups, self.generator = network, groups, generator
+        self.kept = dict(kept or {})
+
+    @abstractmethod
+    def losses(self, step: int, done: float) -> tuple[dict[str, Tensor], Tensor]:
+        """The terms of one fresh batch, unweighted and by name, and their weighted sum.
+
+        Args:
+            step: steps done.
+            done: fraction of the schedule that is done, in [0, 1).
+        """
+
+
+O = TypeVar("O", bound=Objective)  # noqa: E741
+
+
+class Trainer(Generic[O]):
+    """Minimises an objective with Adam; interruptible, resumable, and by several processes where there is a team.
+
+    Args:
+        objective: what is minimised.
+        stage: what progress displays call it.
+        steps: how many steps.
+        seconds: end the schedule after this long even if steps remain; None for no limit.
+        clip: largest norm of the whole gradient; None for any.
+        network_name: what the network is called in `state`.
+        betas: of Adam.
+        eps: of Adam.
+        amsgrad: of Adam: second moments never fall.
+    """
+
+    def __init__(
+        self,
+        objective: O,
+        *,
+        stage: str,
+        steps: int,
+        seconds: float | None = None,
+        clip: float | None = None,
+        network_name: str = "network",
+        betas: tuple[float, float] = (0.9, 0.99),
+        eps: float = 1e-8,
+        amsgrad: bool = False,
+    ) -> None:
+        self.objective, self.stage, self.steps, self.seconds, self.clip = objective, stage, steps, seconds, clip
+        groups = [list(group.parameters) for group in objective.groups]
+        self.trained = [parameter for group in groups for parameter in group]
+        self.adam = torch.optim.Adam(
+            [{"params": group} for group in groups], betas=betas, eps=eps, amsgrad=amsgrad, fused=True
+        )
+        self.step, self.elapsed = 0, 0.0
+        self.losses: dict[str, float] = {}
+        self._name = f"{network_name}."
+
+    @property
+    def fraction(self) -> float:
+        """How much of the schedule is done, by steps or by time, whichever is further."""
+        by_time = self.elapsed / self.seconds if self.seconds else 0.0
+        return min(1.0, max(self.step / self.steps if self.steps else 1.0, by_time))
+
+    @property
+    def ended_early(self) -> bool:
+        """Whether steps remain."""
+        return self.step < self.steps
+
+    @property
+    def progress(self) -> Progress:
+        """How far the training is, with the losses of the last report."""
+        return Progress(self.stage, self.step, self.steps, self.fraction, self.losses)
+
+    def run(
+        self,
+        flag: StopFlag | None = None,
+        *,
+        report: Callable[[Progress], None] | None = None,
+        save: Callable[[], None] | None = None,
+        report_every: int = 20,
+        save_every: float = 20.0,
+    ) -> bool:
+        """Train until the schedule ends → True, or until somebody asks to stop → False.
+
+        Args:
+            flag: see `stop_on_signals`.
+            report: called every ``report_every`` steps, and at the end, with fresh losses.
+            save: called every ``save_every`` seconds, and before a stop.
+            report_every: steps between reports; reading the losses makes a GPU wait.
+            save_every: seconds between checkpoints.
+        """
+        flag, report, save = flag or StopFlag(), report or (lambda _: None), save or (lambda: None)
+        start, saved = time.monotonic() - self.elapsed, time.monotonic()
+        device = self.trained[0].device
+        stop, self.elapsed = agreed(flag.requested, self.elapsed, device)
+        while self.fraction < 1:
+            if stop:
+                save()
+                return False
+            terms = self._step()
+            # A team agrees here, so that its clocks tell all alike whether this was the last step.
+            stop, self.elapsed = agreed(flag.requested, time.monotonic() - start, device)
+            if self.step % report_every == 0 or self.fraction >= 1:
+                self.losses = {name: float(term) for name, term in terms.items()}
+                report(self.progress)
+            if time.monotonic() - saved > save_every:
+                save()
+                saved = time.monotonic()
+            stop = stop or (is_alone() and flag.requested)
+        return True
+
+    def _step(self) -> dict[str, Tensor]:
+        done = self.fraction
+        for group, (_, rate) in zip(self.adam.param_groups, self.objective.groups, strict=True):
+            group["lr"] = rate(done)
+        terms, total = self.objective.losses(self.step, done)
+        self.adam.zero_grad(set_to_none=True)
+        total.backward()
+        average_gradients(self.trained)
+        if self.clip is not None:
+            nn.utils.clip_grad_norm_(self.trained, self.clip)
+        self.adam.step()
+        self.step += 1
+        return {name: term.detach() for name, term in terms.items()}
+
+    def state(self) -> dict[str, Tensor]:
+        """All that `restore` needs to continue as if nothing had happened."""
+        objective = self.objective
+        state = prefixed(self._name, objective.network.state_dict())
+        for index, parameter in enumerate(objective.network.parameters()):
+            state |= prefixed(f"adam.{index}.", self.adam.state.get(parameter, {}))
+        state["generator"] = objective.generator.get_state()
+        state["progress"] = torch.tensor([self.step, self.elapsed], dtype=torch.float64)
+        return state | objective.kept
+
+    def restore(self, state: Mapping[str, Tensor]) -> None:
+        """Continue from what `state` returned."""
+        objective = self.objective
+        objective.network.load_state_dict(without_prefix(self._name, state))
+        for index, parameter in enumerate(objective.network.parameters()):
+            # Adam counts its steps on the CPU, or beside the parameter where the kernel is fused.
+            moments = without_prefix(f"adam.{index}.", state)
+            if moments:
+                self.adam.state[parameter] = {name: tensor.to(parameter.device) for name, tensor in moments.items()}
+        objective.generator.set_state(state["generator"].cpu())
+        objective.kept = {name: state[name].to(tensor) for name, tensor in objective.kept.items()}
+        self.step, self.elapsed = int(state["progress"][0]), float(state["progress"][1])
+
+
+def prefixed(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The tensors, with ``prefix`` before every name."""
+    return {prefix + name: tensor for name, tensor in tensors.items()}
+
+
+def without_prefix(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Those whose names begin with ``prefix``, without it."""
+    return {name.removeprefix(prefix): tensor for name, tensor in tensors.items() if name.startswith(prefix)}

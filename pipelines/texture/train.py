@@ -8,9 +8,10 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
+from torch import Tensor
 
 from ...datasets import PointCloud
 from ...neural_fields import (
@@ -25,21 +26,25 @@ from ...neural_fields import (
 )
 from ...neural_fields.dynamic_tracing import moment
 from ...neural_fields.losses import color_loss, tangential_loss
+from ..run.config import load_config
 from ..run.folder import (
     RECORD_FILE,
     TEXTURE_FILE,
-    TextureState,
+    digest_of,
     find_field,
+    load_state,
     read_record,
+    save_state,
     texture_state_file,
     write_record,
 )
+from ..run.lock import locked
 from ..run.machine import choose_device, environment
 from ..run.settings import TextureConfig
-from ..run.trainer import Progress, StopFlag, pack_training, set_rate, stop_on_signals, unpack_training
+from ..run.trainer import Group, Objective, Progress, Trainer, stop_on_signals, warm_cosine
 from .samples import BandSamples, ColorSamples, band_directions, match_colors, read_colors
 
-__all__ = ["FittedTexture", "default_delta", "fit_texture", "texture_of", "texture_run"]
+__all__ = ["FittedTexture", "TextureObjective", "default_delta", "fit_texture", "texture_of", "texture_run"]
 
 # A band at least this wide (in units of the field) holds decimated meshes, and the surfaces of small networks.
 LEAST_DELTA = 0.02
@@ -47,8 +52,6 @@ LEAST_DELTA = 0.02
 SINGLE_LEVEL_DELTA = 0.05
 # Points of the pool at which the final error is measured.
 JUDGED = 100_000
-# Seconds between two states that a killed training can be resumed from.
-SAVE_EVERY = 20.0
 
 
 @dataclass(frozen=True)
@@ -72,8 +75,8 @@ def fit_texture(
     similarity: Similarity | None = None,
     level: int = -1,
     progress: Callable[[Progress], None] | None = None,
-    save: Callable[[dict[str, torch.Tensor]], None] | None = None,
-    state: Mapping[str, torch.Tensor] | None = None,
+    save: Callable[[dict[str, Tensor]], None] | None = None,
+    state: Mapping[str, Tensor] | None = None,
 ) -> FittedTexture:
     """Train a texture field by the paper's 𝒯(φ): the colours at points, and none of their change along ∇f.
 
@@ -104,8 +107,8 @@ def fit_texture(
     device, started = choose_device(config.device), time.monotonic()
     level = geometry.resolve_level(level)
     delta = config.delta or default_delta(geometry)
-    report = progress or (lambda _: None)
-    report(Progress("texture: samples", 0, config.steps, 0.0, {}))
+    if progress is not None:
+        progress(Progress("texture: samples", 0, config.steps, 0.0, {}))
     generator = torch.Generator().manual_seed(config.seed)
     home = geometry.like.device
     geometry = geometry.to(device)
@@ -116,11 +119,13 @@ def fit_texture(
         torch.manual_seed(config.seed)
         network = ColorSiren(config.width, config.depth, omega=config.omega, mean=mean).to(samples.points)
     sampling_seconds = time.monotonic() - started
-    trainer = _Trainer(network, samples, band, config, delta=delta, generator=generator, spent=sampling_seconds)
+    seconds = None if config.time_budget is None else max(config.time_budget - sampling_seconds, 1e-3)
+    objective = TextureObjective(network, samples, band, config, delta=delta, generator=generator)
+    trainer = Trainer(objective, stage="texture", steps=config.steps, seconds=seconds)
     if state is not None:
         trainer.restore(state)
     with stop_on_signals() as flag:
-        finished = trainer.run(flag, report, save or (lambda _: None))
+        finished = trainer.run(flag, report=progress, save=None if save is None else lambda: save(trainer.state()))
     record = {
         "finished": finished,
         "source": cloud.source,
@@ -168,43 +173,71 @@ def texture_run(
     Raises:
         InputError: there is no such run or level, the source cannot be used, or there is nothing to resume.
     """
-    config = config or TextureConfig()
     file = find_field(run)
     target = file.with_name(TEXTURE_FILE) if out is None else Path(out)
+    beside = target == file.with_name(TEXTURE_FILE)
     state_file = texture_state_file(target)
-    before = TextureState.load(state_file) if resume else None
-    if before is not None:
-        config, level = before.config, before.level
-    geometry, similarity, _ = load_field(file)
-    if geometry.in_dim == 4:
-        geometry = moment(geometry, 0.0)  # from there, colours ride along
-    if level is not None and not 0 <= level < geometry.num_levels:
-        raise InputError(f"--level {level}: {file} has levels 0 to {geometry.num_levels - 1}")
-    cloud = read_colors(source, samples=config.samples, seed=config.seed)
-    state = TextureState(config, level, TextureState.fingerprint_of(cloud, geometry), {})
-    if before is not None and before.fingerprint != state.fingerprint:
-        raise InputError(
-            f"{source}: not the colours, or {file} not the field, that the interrupted training began with; "
-            "resume with those, or leave out --resume"
+    with locked(file.parent if beside else target):
+        before = _interrupted(state_file) if resume else None
+        if before is not None:
+            config, level = before.config, before.level
+        config = config or TextureConfig()
+        geometry, similarity, _ = load_field(file)
+        if geometry.in_dim == 4:
+            geometry = moment(geometry, 0.0)  # from there, colours ride along
+        if level is not None and not 0 <= level < geometry.num_levels:
+            raise InputError(f"--level {level}: {file} has levels 0 to {geometry.num_levels - 1}")
+        cloud = read_colors(source, samples=config.samples, seed=config.seed)
+        fingerprint = _fingerprint(cloud, geometry)
+        if before is not None and before.fingerprint != fingerprint:
+            raise InputError(
+                f"{source}: not the colours, or {file} not the field, that the interrupted training began with; "
+                "resume with those, or leave out --resume"
+            )
+        if before is None:
+            state_file.unlink(missing_ok=True)  # of another training; this one shall not be resumed from it
+        about = {"config": dataclasses.asdict(config), "level": level, "fingerprint": fingerprint}
+        fitted = fit_texture(
+            geometry,
+            cloud,
+            config,
+            similarity=similarity,
+            level=-1 if level is None else level,
+            progress=progress,
+            save=lambda tensors: save_state(state_file.parent, tensors, about, name=state_file.name),
+            state=None if before is None else before.tensors,
         )
-    if before is None:
-        state_file.unlink(missing_ok=True)  # of another training; this one shall not be resumed from it
-    fitted = fit_texture(
-        geometry,
-        cloud,
-        config,
-        similarity=similarity,
-        level=-1 if level is None else level,
-        progress=progress,
-        save=lambda tensors: dataclasses.replace(state, tensors=tensors).save(state_file),
-        state=None if before is None else before.tensors,
-    )
-    save_texture(target, fitted.texture, metadata={"texture": fitted.record})
-    if target == file.with_name(TEXTURE_FILE) and file.with_name(RECORD_FILE).is_file():
-        write_record(file.parent, read_record(file.parent) | {"texture": fitted.record})
-    if fitted.record["finished"]:
-        state_file.unlink(missing_ok=True)
-    return fitted
+        save_texture(target, fitted.texture, metadata={"texture": fitted.record})
+        if beside and file.with_name(RECORD_FILE).is_file():
+            write_record(file.parent, read_record(file.parent) | {"texture": fitted.record})
+        if fitted.record["finished"]:
+            state_file.unlink(missing_ok=True)
+        return fitted
+
+
+class _Before(NamedTuple):
+    """A training that was interrupted: its settings, the level of the geometry, digest of the data, and the rest."""
+
+    config: TextureConfig
+    level: int | None
+    fingerprint: str
+    tensors: dict[str, Tensor]
+
+
+def _interrupted(file: Path) -> _Before:
+    tensors, about = load_state(file.parent, name=file.name)
+    try:
+        config = load_config(TextureConfig, None, about["config"])
+        return _Before(config, about["level"], about["fingerprint"], tensors)
+    except KeyError as error:
+        raise InputError(f"{file}: damaged (no {error}); begin again without --resume") from error
+
+
+def _fingerprint(cloud: PointCloud, geometry: Field) -> str:
+    """A digest of points, colours and field."""
+    assert cloud.colors is not None
+    weights = (tensor.detach().cpu().numpy() for _, tensor in sorted(geometry.state_dict().items()))
+    return digest_of((cloud.points, cloud.colors, *weights))
 
 
 def texture_of(run: str | Path, geometry: Field) -> TextureField | None:
@@ -228,8 +261,17 @@ def default_delta(geometry: Field) -> float:
     return max(LEAST_DELTA, float(geometry.deltas.max()))
 
 
-class _Trainer:
-    """Trains a colour network with Adam, a warm-up and a cosine schedule."""
+class TextureObjective(Objective):
+    """The paper's 𝒯(φ): the colours at points, and none of their change along ∇f.
+
+    Args:
+        network: the colours.
+        samples: points with colours.
+        band: points with ∇f.
+        config: settings.
+        delta: half-width of the band.
+        generator: CPU generator that draws the batches.
+    """
 
     def __init__(
         self,
@@ -240,69 +282,20 @@ class _Trainer:
         *,
         delta: float,
         generator: torch.Generator,
-        spent: float,
     ) -> None:
-        self.network, self.samples, self.band, self.config = network, samples, band, config
-        self.delta, self.generator = delta, generator
-        self.seconds = None if config.time_budget is None else max(config.time_budget - spent, 1e-3)
-        self.adam = torch.optim.Adam(network.parameters(), lr=config.learning_rate, betas=(0.9, 0.99), fused=True)
-        self.step, self.elapsed = 0, 0.0
-        self.losses: dict[str, float] = {}
+        super().__init__(network, [Group(list(network.parameters()), warm_cosine(config.learning_rate))], generator)
+        self.colors, self.samples, self.band, self.config, self.delta = network, samples, band, config, delta
 
-    @property
-    def fraction(self) -> float:
-        """How much of the schedule is done, by steps or by time, whichever is further."""
-        by_time = self.elapsed / self.seconds if self.seconds else 0.0
-        return min(1.0, max(self.step / self.config.steps, by_time))
-
-    def run(
-        self,
-        flag: StopFlag,
-        report: Callable[[Progress], None],
-        save: Callable[[dict[str, torch.Tensor]], None],
-        *,
-        report_every: int = 20,
-    ) -> bool:
-        """Train until the schedule ends → True, or until somebody asks to stop → False."""
-        start, saved = time.monotonic() - self.elapsed, time.monotonic()
-        while self.fraction < 1:
-            if flag.requested:
-                save(self.state())
-                return False
-            terms = self._step()
-            self.elapsed = time.monotonic() - start
-            if self.step % report_every == 0 or self.fraction >= 1:
-                self.losses = {name: float(term) for name, term in terms.items()}
-                report(Progress("texture", self.step, self.config.steps, self.fraction, self.losses))
-            if time.monotonic() - saved > SAVE_EVERY:
-                save(self.state())
-                saved = time.monotonic()
-        return True
-
-    def state(self) -> dict[str, torch.Tensor]:
-        """All that `restore` needs to continue as if nothing had happened."""
-        return pack_training(self.network, self.adam, self.generator, step=self.step, elapsed=self.elapsed)
-
-    def restore(self, state: Mapping[str, torch.Tensor]) -> None:
-        """Continue from what `state` returned."""
-        self.step, self.elapsed = unpack_training(state, self.network, self.adam, self.generator)
-
-    def _step(self) -> dict[str, torch.Tensor]:
-        set_rate(self.adam, self.config.learning_rate, self.fraction)
-        here, there = (
-            self._draw(self.samples.points, self.config.batch),
-            self._draw(self.band.points, self.config.band_batch),
-        )
-        color = color_loss(self.network.value(self.samples.points[here]), self.samples.colors[here]).mean()
-        _, along = self.network.derivative_along(self.band.points[there], self.band.gradients[there])
+    def losses(self, step: int, done: float) -> tuple[dict[str, Tensor], Tensor]:
+        """See `Objective.losses`."""
+        here = self._draw(self.samples.points, self.config.batch)
+        there = self._draw(self.band.points, self.config.band_batch)
+        color = color_loss(self.colors.value(self.samples.points[here]), self.samples.colors[here]).mean()
+        _, along = self.colors.derivative_along(self.band.points[there], self.band.gradients[there])
         tangential = tangential_loss(along, self.delta).mean()
-        self.adam.zero_grad(set_to_none=True)
-        (color + self.config.tangential_weight * tangential).backward()
-        self.adam.step()
-        self.step += 1
-        return {"color": color.detach(), "tangential": tangential.detach()}
+        return {"color": color, "tangential": tangential}, color + self.config.tangential_weight * tangential
 
-    def _draw(self, pool: torch.Tensor, count: int) -> torch.Tensor:
+    def _draw(self, pool: Tensor, count: int) -> Tensor:
         return torch.randint(len(pool), (count,), generator=self.generator).to(pool.device)
 
 

@@ -37,7 +37,7 @@ from mplicits.pipelines.bench.reconstruct_rows import (
 )
 from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.reconstruct.model import RayPool, build_scene
-from mplicits.pipelines.reconstruct.trainer import SceneTrainer
+from mplicits.pipelines.reconstruct.objective import scene_trainer
 from mplicits.pipelines.run.settings import ReconstructConfig
 from mplicits.pipelines.run.trainer import StopFlag
 from mplicits.pipelines.surface.surface import from_mesh
@@ -94,9 +94,9 @@ def test_counted_flops_are_those_of_a_training(scene: BenchScene, geometry: str)
     config = dataclasses.replace(TINY, geometry=geometry, widths=(48, 64), features=16, color_width=64)
     pool = RayPool(scene.images.views, scene.images.similarity, torch.device("cpu"))
     watched = train_watched(build_scene(config, has_masks=True), pool, config, StopFlag())
-    trainer = SceneTrainer(build_scene(config, has_masks=True), pool, config)
+    trainer = scene_trainer(build_scene(config, has_masks=True), pool, config)
     with product_counter() as counter:
-        trainer.run(StopFlag(), report=lambda _: None, save=lambda _: None)
+        trainer.run()
     assert watched.finished
     assert watched.trainer.losses == trainer.losses  # watching changes nothing
     assert watched.geometry_flops + watched.color_flops == pytest.approx(counter.get_total_flops(), rel=0.02)

@@ -8,10 +8,10 @@ import pytest
 import torch
 import torch.multiprocessing as multiprocessing
 from mplicits.neural_fields import Siren
-from mplicits.pipelines.fit.level import LevelTrainer
+from mplicits.pipelines.fit.level import LevelObjective
 from mplicits.pipelines.fit.samples import Samples, Source
 from mplicits.pipelines.run.team import agreed, average_gradients, is_leader, my_share, team, whole_batch
-from mplicits.pipelines.run.trainer import StopFlag
+from mplicits.pipelines.run.trainer import Trainer
 
 STEPS = 12
 
@@ -22,16 +22,10 @@ def trained() -> tuple[dict[str, torch.Tensor], int]:
     points = torch.nn.functional.normalize(torch.randn(500, 3), dim=1) * 0.5
     samples = Samples(points, distance=torch.zeros(500), normal=2 * points)
     network = Siren(16, 1, omega=15.0)
-    trainer = LevelTrainer(
-        network,
-        [Source("surface", samples, 64, 1e3, 100.0, 50.0)],
-        steps=STEPS,
-        learning_rate=1e-3,
-        seconds=None,
-        generator=torch.Generator().manual_seed(1),
-    )
-    assert trainer.run(StopFlag(), report=lambda _: None, save=lambda _: None)
-    return network.state_dict(), len(trainer._draw(trainer.sources[0]))
+    sources = [Source("surface", samples, 64, 1e3, 100.0, 50.0)]
+    objective = LevelObjective(network, sources, learning_rate=1e-3, generator=torch.Generator().manual_seed(1))
+    assert Trainer(objective, stage="", steps=STEPS).run()
+    return network.state_dict(), len(objective._draw(sources[0]))
 
 
 def worker(rank: int, port: int, folder: str) -> None:

@@ -6,6 +6,7 @@ import math
 import os
 import signal
 from dataclasses import replace
+from functools import partialmethod
 from pathlib import Path
 
 import numpy as np
@@ -29,8 +30,7 @@ from mplicits.pipelines.run.config import load_config
 from mplicits.pipelines.run.folder import TEXTURE_FILE, texture_state_file
 from mplicits.pipelines.run.progress import _Lines
 from mplicits.pipelines.run.settings import TextureConfig
-from mplicits.pipelines.run.trainer import Progress
-from mplicits.pipelines.texture import train as texture_module
+from mplicits.pipelines.run.trainer import Progress, Trainer
 from mplicits.pipelines.texture.samples import read_colors
 from mplicits.pipelines.texture.train import default_delta, fit_texture, texture_of, texture_run
 from numpy.typing import NDArray
@@ -300,7 +300,7 @@ def test_a_killed_training_continues_from_its_last_state(
 ) -> None:
     config = replace(SMALL, steps=60)
     whole = texture_run(run, cloud, config, out=run.parent / "whole.safetensors").texture
-    monkeypatch.setattr(texture_module, "SAVE_EVERY", 0.0)
+    monkeypatch.setattr(Trainer, "run", partialmethod(Trainer.run, save_every=0.0))
 
     def die(progress: Progress) -> None:
         if progress.step == 40:

@@ -11,9 +11,9 @@ from mplicits.neural_fields import MultiscaleSDF
 from mplicits.neural_fields.sphere_start import fit_sphere
 from mplicits.pipelines.reconstruct import model as scene_model
 from mplicits.pipelines.reconstruct.model import RayPool, build_scene
-from mplicits.pipelines.reconstruct.trainer import SceneTrainer
+from mplicits.pipelines.reconstruct.objective import SceneObjective, scene_trainer
 from mplicits.pipelines.run.settings import ReconstructConfig
-from mplicits.pipelines.run.trainer import StopFlag
+from mplicits.pipelines.run.trainer import Progress, StopFlag, Trainer
 from torch import Tensor
 
 TINY = ReconstructConfig(
@@ -44,33 +44,39 @@ def images() -> PosedImages:
     return render_scene(SCENES["painted-sphere"](), views=4, size=16, samples=1)
 
 
-def make(images: PosedImages, config: ReconstructConfig, *, seconds: float | None = None) -> SceneTrainer:
+def make(images: PosedImages, config: ReconstructConfig, *, seconds: float | None = None) -> Trainer[SceneObjective]:
     pool = RayPool(images.views, images.similarity, torch.device("cpu"))
-    return SceneTrainer(build_scene(config, has_masks=pool.has_masks), pool, config, seconds=seconds)
+    return scene_trainer(build_scene(config, has_masks=pool.has_masks), pool, config, seconds=seconds)
 
 
-def train(trainer: SceneTrainer, *, until: int | None = None) -> list[tuple[int, int]]:
+def level(trainer: Trainer[SceneObjective]) -> int:
+    return trainer.objective.level_at(trainer.fraction)
+
+
+def train(trainer: Trainer[SceneObjective], *, until: int | None = None) -> list[tuple[int, int]]:
     """Train, to the end or until so many steps are done → (steps done, level) of every report."""
     flag, seen = StopFlag(), []
 
-    def report(current: SceneTrainer) -> None:
-        seen.append((current.step, current.level))
-        flag.requested = current.step == until
+    def report(progress: Progress) -> None:
+        seen.append((progress.step, level(trainer)))
+        flag.requested = progress.step == until
 
-    finished = trainer.run(flag, report=report, save=lambda _: None, report_every=1)
+    finished = trainer.run(flag, report=report, report_every=1)
     assert finished is (until is None)
     return seen
 
 
-def weights(trainer: SceneTrainer) -> dict[str, Tensor]:
-    return {name: tensor.clone() for name, tensor in trainer.model.state_dict().items()}
+def weights(trainer: Trainer[SceneObjective]) -> dict[str, Tensor]:
+    return {name: tensor.clone() for name, tensor in trainer.objective.model.state_dict().items()}
 
 
-def errors(trainer: SceneTrainer) -> tuple[float, float]:
+def errors(trainer: Trainer[SceneObjective]) -> tuple[float, float]:
     """Mean absolute errors of colours and of opacities over many rays."""
-    rays = trainer.pool.draw(1500, torch.Generator().manual_seed(5))
+    rays = trainer.objective.pool.draw(1500, torch.Generator().manual_seed(5))
     with torch.no_grad():
-        seen = trainer.model.render(rays.origins, rays.directions, trainer.sampling, level=trainer.level)
+        seen = trainer.objective.model.render(
+            rays.origins, rays.directions, trainer.objective.sampling, level=level(trainer)
+        )
     target = torch.lerp(torch.ones(3).expand(1500, 3), rays.color, rays.mask[:, None])
     return float((seen.color - target).abs().mean()), float((seen.opacity - rays.mask).abs().mean())
 
@@ -90,7 +96,7 @@ def test_some_steps_lower_the_errors(images: PosedImages) -> None:
 def test_the_softplus_network_of_neus_is_trained_by_the_same_steps(images: PosedImages) -> None:
     trainer = make(images, replace(TINY, geometry="neus", steps=3, rays=16))
     before = weights(trainer)
-    assert [level for _, level in train(trainer)] == [0, 0, 0]
+    assert [reached for _, reached in train(trainer)] == [0, 0, 0]
     assert all(0 <= value < 10 for value in trainer.losses.values())
     still = [name for name, tensor in weights(trainer).items() if torch.equal(tensor, before[name])]
     assert still == ["background"]
@@ -99,19 +105,19 @@ def test_the_softplus_network_of_neus_is_trained_by_the_same_steps(images: Posed
 def test_levels_are_switched_on_at_their_starts(images: PosedImages) -> None:
     config = replace(TINY, widths=(16,) * 3, depths=(1,) * 3, omegas=(10.0,) * 3, starts=(0.0, 0.25, 0.75))
     trainer = make(images, config)
-    assert trainer.level == 0
+    assert level(trainer) == 0
     # After step k the level is that with which step k + 1 is made.
-    assert [level for _, level in train(trainer)] == [0, 1, 1, 1, 1, 2, 2, 2]
+    assert [reached for _, reached in train(trainer)] == [0, 1, 1, 1, 1, 2, 2, 2]
 
 
 def test_a_level_is_not_trained_before_its_start(images: PosedImages) -> None:
     trainer = make(images, TINY)
-    geometry = trainer.model.geometry
+    geometry = trainer.objective.model.geometry
     assert isinstance(geometry, MultiscaleSDF)
     residual = list(geometry.residuals.parameters())
     first, base = [p.detach().clone() for p in residual], geometry.base.output.weight.detach().clone()
     train(trainer, until=4)
-    assert trainer.level == 1
+    assert level(trainer) == 1
     assert all(parameter.grad is None for parameter in residual)
     assert all(torch.equal(p, before) for p, before in zip(residual, first, strict=True))
     assert not torch.equal(geometry.base.output.weight, base)
@@ -123,10 +129,10 @@ def test_a_level_is_not_trained_before_its_start(images: PosedImages) -> None:
 def test_bands_are_as_wide_as_the_surface_is_unsure(images: PosedImages) -> None:
     trainer = make(images, replace(TINY, band=3.0, least_delta=0.001))
     with torch.no_grad():
-        trainer.model.variance.fill_(0.4)
-    expected = 3 / float(trainer.model.inv_std.detach())
+        trainer.objective.model.variance.fill_(0.4)
+    expected = 3 / float(trainer.objective.model.inv_std.detach())
     train(trainer, until=1)
-    assert trainer.model.geometry.deltas.tolist() == pytest.approx([expected], rel=1e-5)
+    assert trainer.objective.model.geometry.deltas.tolist() == pytest.approx([expected], rel=1e-5)
 
 
 @pytest.mark.parametrize("stop", [3, 6])  # before the second level begins, and after
@@ -137,7 +143,7 @@ def test_a_stopped_training_continues_to_the_same_bits(images: PosedImages, stop
     assert first.step == stop
     state = {name: tensor.clone() for name, tensor in first.state().items()}
     with torch.no_grad():  # nothing of the new trainer may matter
-        for parameter in second.model.parameters():
+        for parameter in second.objective.model.parameters():
             parameter.zero_()
     second.restore(state)
     assert second.step == stop
@@ -177,12 +183,6 @@ def test_a_time_budget_ends_the_schedule(images: PosedImages) -> None:
     assert trainer.fraction == 1
     assert 0.3 <= trainer.elapsed < 5
     assert seen[-1][1] == 1  # levels follow the time as well
-
-
-def test_checkpoints_come_by_the_clock(images: PosedImages) -> None:
-    trainer, saved = make(images, TINY), []
-    trainer.run(StopFlag(), report=lambda _: None, save=lambda current: saved.append(current.step), save_every=0.0)
-    assert saved == list(range(1, 9))
 
 
 def test_masks_are_trained_for_only_where_they_are(images: PosedImages) -> None:

@@ -1,0 +1,137 @@
+"""What ``evolve`` minimises: one level of a field of space-time on what is known, on bounds and on the law."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from ...neural_fields import Jet, Siren, SpaceTimeSDF, key_loss, law_loss, spacetime_jet
+from ...neural_fields.losses import eikonal_loss
+from ..run.settings import EvolveConfig
+from ..run.trainer import Group, Objective, Progress, Trainer, warm_cosine
+from .problem import Problem
+from .samples import Known, band_points, indices_in_band, uniform_spacetime
+
+__all__ = ["LONGEST_GRADIENT", "EvolveObjective", "learn_start"]
+
+REFRESH = 25  # steps after which the points near the surface are drawn anew, since it has moved
+POOL_STEPS = 6  # batches that a pool near the surface holds
+# Norm of the gradient by the weights. Second derivatives have spikes, and a single one, at the peak of the learning
+# rate, would throw the field so far from any distance that it does not come back.
+LONGEST_GRADIENT = 1.0
+
+
+class EvolveObjective(Objective):
+    """The terms of the finest level of a field.
+
+    A batch is half known samples, a sixteenth bounds (level 0 only), a sixteenth anywhere, which shall only obey the
+    eikonal equation, and the rest near the surface, where the law holds.
+
+    Args:
+        field: on the device of the training. Only parameters that require gradients are trained.
+        problem: what it learns.
+        config: settings.
+        level: the level that is trained, the finest of ``field``.
+        generator: CPU generator that draws the batches.
+
+    Raises:
+        ValueError: a level above 0 has no known samples in its band.
+    """
+
+    def __init__(
+        self, field: SpaceTimeSDF, problem: Problem, config: EvolveConfig, *, level: int, generator: torch.Generator
+    ) -> None:
+        device = field.like.device
+        trained = [parameter for parameter in field.parameters() if parameter.requires_grad]
+        rate = warm_cosine(config.learning_rates[level])
+        super().__init__(field, [Group(trained, rate)], generator, {"pool": torch.empty(0, 4, device=device)})
+        self.field, self.config, self.level, self.law = field, config, level, problem.law
+        self.known, self.bounds = problem.known.to(device), problem.bounds.to(device)
+        # In a residual level the band is where anything can be learnt.
+        self.width = config.near
+        if level:
+            self.width = float(field.deltas[level - 1])
+            self.known = self.known.take(indices_in_band(field, self.known.points, level))
+            if not len(self.known):
+                raise ValueError(f"level {level}: no known samples in its band")
+
+    def losses(self, step: int, done: float) -> tuple[dict[str, Tensor], Tensor]:
+        """See `Objective.losses`."""
+        config = self.config
+        if step % REFRESH == 0:
+            count = POOL_STEPS * config.batch // 2
+            self.kept["pool"] = band_points(self.field, count, self.width, self.generator, level=self.level)
+        pool = self.kept["pool"]
+        half, part = config.batch // 2, config.batch // 16
+        known = self.known.take(self._draw(len(self.known), half))
+        bounds = self.bounds.take(self._draw(len(self.bounds), part if len(self.bounds) and not self.level else 0))
+        anywhere = uniform_spacetime(0 if self.level else part, self.generator).to(pool.device)
+        near = pool[self._draw(len(pool), half - len(bounds.points) - len(anywhere))]
+
+        order = 1 if self.law is None else self.law.order
+        loose = torch.cat((bounds.points, anywhere))
+        if order == 1:
+            jet = spacetime_jet(self.field, torch.cat((near, known.points, loose)))
+            obeying = type(jet)(*(value[: len(near)] for value in jet))
+            rest = Jet(jet.value[len(near) :], jet.gradient[len(near) :], jet.features[len(near) :])
+        else:
+            obeying = spacetime_jet(self.field, near, order=order)
+            later = spacetime_jet(self.field, torch.cat((known.points, loose)))
+            rest = Jet(later.value, later.gradient, later.features)
+
+        found = Jet(rest.value[: len(known)], rest.gradient[: len(known)], rest.features[: len(known)])
+        target = Jet(known.value, known.gradient, found.features)
+        terms = {"known": key_loss(found, target, length=config.length).mean()}
+        total = config.data_weights[self.level] * terms["known"]
+        slopes = torch.cat((obeying.gradient, rest.gradient[len(known) :]))
+        terms["eikonal"] = eikonal_loss(slopes).mean()
+        total = total + config.eikonal_weight * terms["eikonal"]
+        if self.law is not None and len(near):
+            terms["law"] = law_loss(obeying, self.law).mean()
+            total = total + config.law_weight * terms["law"]
+        if len(bounds):
+            value = rest.value[len(known) : len(known) + len(bounds)]
+            outside = (bounds.low - value).clamp(min=0) + (value - bounds.high).clamp(min=0)
+            terms["bounds"] = outside.square().mean()
+            total = total + config.bound_weight * terms["bounds"]
+        return terms, total
+
+    def _draw(self, size: int, count: int) -> Tensor:
+        device = self.kept["pool"].device
+        if not size:
+            return torch.empty(0, dtype=torch.long, device=device)
+        return torch.randint(size, (count,), generator=self.generator).to(device)
+
+
+class _StillObjective(Objective):
+    """The shape at time 0, in space alone."""
+
+    def __init__(self, siren: Siren, known: Known, config: EvolveConfig, generator: torch.Generator) -> None:
+        super().__init__(siren, [Group(list(siren.parameters()), warm_cosine(config.learning_rates[0]))], generator)
+        self.siren, self.config = siren, config
+        self.known = known.take((known.points[:, 3] == 0).nonzero()[:, 0])
+
+    def losses(self, step: int, done: float) -> tuple[dict[str, Tensor], Tensor]:
+        """See `Objective.losses`."""
+        chosen = torch.randint(len(self.known), (self.config.batch // 2,), generator=self.generator)
+        batch = self.known.take(chosen.to(self.known.points.device))
+        jet = self.siren.jet(batch.points[:, :3])
+        target = Jet(batch.value, batch.gradient, jet.features)
+        loss = key_loss(jet, target, length=self.config.length).mean()
+        return {"known": loss}, loss
+
+
+def learn_start(
+    known: Known, config: EvolveConfig, generator: torch.Generator, progress: Callable[[Progress], None]
+) -> SpaceTimeSDF:
+    """A field of one level that stands still: the shape at time 0, learnt in space alone and then lifted."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(config.seed)
+        siren = Siren(config.widths[0], config.depths[0], omega=config.omegas[0]).to(known.points)
+    objective = _StillObjective(siren, known, config, generator)
+    Trainer(objective, stage="first shape", steps=config.start_steps).run(report=progress)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(config.seed)
+        return SpaceTimeSDF.from_static(siren)

@@ -1,0 +1,83 @@
+"""What ``reconstruct`` minimises: rendered rays against photographs; levels join on schedule, bands follow 1/s."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ...neural_fields.losses import eikonal_loss
+from ...neural_fields.volume_renderer import Sampling
+from ..run.settings import ReconstructConfig
+from ..run.trainer import Group, Objective, Trainer, warm_cosine
+from .model import RayPool, SceneModel
+
+__all__ = ["SceneObjective", "scene_trainer"]
+
+
+class SceneObjective(Objective):
+    """How far a scene is from the pixels of a pool.
+
+    Args:
+        model: what is trained, on the pool's device.
+        pool: the pixels.
+        config: settings.
+    """
+
+    def __init__(self, model: SceneModel, pool: RayPool, config: ReconstructConfig) -> None:
+        rate = warm_cosine(config.learning_rate)
+        colors = [*model.color.parameters(), *(model.outside.parameters() if model.outside else ())]
+        groups = [
+            Group(list(model.geometry.parameters()), rate),
+            Group(colors, lambda done: config.color_rate * rate(done)),
+            Group([model.variance], lambda done: config.sharpening * rate(done)),
+        ]
+        super().__init__(model, groups, torch.Generator().manual_seed(config.seed))
+        self.model, self.pool, self.config = model, pool, config
+        self.sampling = Sampling(uniform=config.uniform, importance=config.importance)
+
+    def level_at(self, done: float) -> int:
+        """The finest level that is switched on when a fraction of the schedule is done."""
+        started = sum(start <= done for start in self.config.starts)
+        return min(started, self.model.geometry.num_levels) - 1
+
+    def losses(self, step: int, done: float) -> tuple[dict[str, Tensor], Tensor]:
+        """See `Objective.losses`."""
+        config = self.config
+        self.model.widen(config.band, config.least_delta)
+        rays = self.pool.draw(config.rays, self.generator)
+        seen = self.model.render(
+            rays.origins,
+            rays.directions,
+            self.sampling,
+            cos_anneal=min(1.0, done / config.anneal) if config.anneal else 1.0,
+            level=self.level_at(done),
+            least_weight=config.least_weight,
+            generator=self.generator,
+        )
+        target = rays.color
+        if self.pool.has_masks:
+            target = torch.lerp(self.model.background.expand_as(target), target, rays.mask[:, None])
+        color = (seen.color - target).abs().mean()
+        eikonal = eikonal_loss(seen.jet.gradient).mean()
+        terms = {"color": color, "eikonal": eikonal}
+        total = color + config.eikonal_weight * eikonal
+        if self.pool.has_masks and config.mask_weight:
+            opacity = seen.opacity.clamp(1e-3, 1 - 1e-3)
+            mask = torch.nn.functional.binary_cross_entropy(opacity, rays.mask)
+            terms["mask"] = mask
+            total = total + config.mask_weight * mask
+        terms["uncertainty"] = 1 / self.model.inv_std
+        return terms, total
+
+
+def scene_trainer(
+    model: SceneModel, pool: RayPool, config: ReconstructConfig, *, seconds: float | None = None
+) -> Trainer[SceneObjective]:
+    """The training of a scene; see `SceneObjective` and `Trainer`."""
+    return Trainer(
+        SceneObjective(model, pool, config),
+        stage="reconstruct",
+        steps=config.steps,
+        seconds=seconds,
+        network_name="model",
+    )
