@@ -8,7 +8,7 @@ from .checkpoint import SavedField, load_field, load_texture, save_field, save_t
 from .color import ColorSiren, TextureField
 from .errors import InputError
 from .evolution import Law, curvature, key_loss, law_loss, mean_curvature, morph, near_surface, normal_speed, transport
-from .field import Field, Jet, SecondJet
+from .field import Field, Jet, OneLevelField, SecondJet
 from .meshing import Mesh, NoSurfaceError, extract_mesh, map_normals
 from .moving import Keyframes, Moving, RigidMotion, ShrinkingSphere
 from .multiscale import MultiscaleSDF, levels_of
@@ -40,6 +40,7 @@ __all__ = [
     "NerfstudioField",
     "NeuSGeometry",
     "NoSurfaceError",
+    "OneLevelField",
     "Outside",
     "Plane",
     "Rendered",

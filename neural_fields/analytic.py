@@ -7,19 +7,13 @@ from abc import abstractmethod
 import torch
 from torch import Tensor
 
-from .field import Field, Jet
+from .field import Field, Jet, OneLevelField
 
 __all__ = ["Box", "Capsule", "Plane", "Sphere", "Torus", "Union"]
 
 
-class _Exact(Field):
-    """A closed-form field with one level; a subclass gives value and gradient at ``(..., 3)`` points."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.in_dim = 3
-        self.num_levels = 1
-        self.register_buffer("deltas", torch.empty(0), persistent=False)
+class _Exact(OneLevelField):
+    """A closed-form field; a subclass gives value and gradient at ``(..., 3)`` points."""
 
     @abstractmethod
     def _evaluate(self, x: Tensor) -> tuple[Tensor, Tensor]: ...

@@ -16,8 +16,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from .field import Field, Jet
-from .siren import Siren
+from .field import Field, Jet, OneLevelField
+from .siren import Siren, forward, needs_graph, plain_jet
 
 __all__ = ["ColorSiren", "TextureField"]
 
@@ -64,8 +64,8 @@ class ColorSiren(nn.Module):
         """Colours at ``x`` ``(..., d)`` → ``(..., 3)``."""
         rows = self._rows(x)
         parameters = self.siren.folded()
-        if _recorded(rows, parameters):
-            value = _forward(rows, parameters)[0]
+        if needs_graph(rows, parameters):
+            value = forward(rows, parameters)[0]
         else:
             value = torch.cat([_value_in_place(part, parameters) for part in self._blocks(rows)])
         return value.reshape(*x.shape[:-1], CHANNELS)
@@ -74,8 +74,8 @@ class ColorSiren(nn.Module):
         """Colours ``(..., 3)`` and their Jacobian ``(..., 3, d)`` at ``x`` ``(..., d)``, by sweeps back."""
         rows = self._rows(x)
         parameters = self.siren.folded()
-        blocks = [rows] if _recorded(rows, parameters) else self._blocks(rows)
-        values, gradients = zip(*(_jet(part, parameters) for part in blocks), strict=True)
+        blocks = [rows] if needs_graph(rows, parameters) else self._blocks(rows)
+        values, gradients = zip(*(plain_jet(part, parameters, CHANNELS) for part in blocks), strict=True)
         shape = (*x.shape[:-1], CHANNELS)
         return torch.cat(values).reshape(shape), torch.cat(gradients).reshape(*shape, x.shape[-1])
 
@@ -96,7 +96,7 @@ class ColorSiren(nn.Module):
             raise ValueError(f"direction has shape {tuple(direction.shape)}; expected that of x, {tuple(x.shape)}")
         rows, tangents = self._rows(x), self._rows(direction)
         parameters = self.siren.folded()
-        if _recorded(rows, [tangents, *parameters]):
+        if needs_graph(rows, [tangents, *parameters]):
             value, derivative = _tangent(rows, tangents, parameters)
         else:
             pairs = zip(self._blocks(rows), self._blocks(tangents), strict=True)
@@ -113,7 +113,7 @@ class ColorSiren(nn.Module):
         return rows.split(self.siren.block_rows(rows.device))
 
 
-class TextureField(Field):
+class TextureField(OneLevelField):
     """RGB in the band ``|f| < δ`` around a surface, a constant colour elsewhere.
 
     Colours are display numbers (sRGB-encoded) in [0, 1]: the network's output is clamped. Points outside the band
@@ -147,7 +147,7 @@ class TextureField(Field):
         geometry_level: int = -1,
         outside: Sequence[float] = (0.5, 0.5, 0.5),
     ) -> None:
-        super().__init__()
+        super().__init__(geometry.in_dim)
         if not delta > 0:
             raise ValueError(f"delta={delta}: expected > 0")
         if network.siren.in_dim != geometry.in_dim:
@@ -157,8 +157,6 @@ class TextureField(Field):
             raise ValueError(f"outside={tuple(outside)}: expected three numbers from 0 to 1")
         self.geometry, self.network = geometry, network
         self.geometry_level = geometry.resolve_level(geometry_level)
-        self.in_dim, self.num_levels = geometry.in_dim, 1
-        self.register_buffer("deltas", torch.empty(0), persistent=False)
         self.register_buffer("delta", torch.tensor(float(delta)))
         self.register_buffer("outside", color)
         self.delta: Tensor
@@ -214,23 +212,9 @@ class TextureField(Field):
         return self.outside.to(rows).expand(len(rows), CHANNELS)
 
 
-def _recorded(x: Tensor, parameters: Sequence[Tensor]) -> bool:
-    """Whether autograd wants the graph."""
-    return torch.is_grad_enabled() and (x.requires_grad or any(tensor.requires_grad for tensor in parameters))
-
-
 def _unclamped(raw: Tensor) -> Tensor:
     """1 where clamping to [0, 1] changes nothing, 0 elsewhere: the derivative of the clamp."""
     return ((raw >= 0) & (raw <= 1)).to(raw.dtype)
-
-
-def _forward(x: Tensor, parameters: Sequence[Tensor]) -> tuple[Tensor, list[Tensor]]:
-    """Outputs ``(N, 3)`` and the pre-activation of every layer."""
-    h, phases = x, []
-    for weight, bias in zip(parameters[0:-2:2], parameters[1:-2:2], strict=True):
-        phases.append(torch.addmm(bias, h, weight.t()))
-        h = phases[-1].sin()
-    return torch.addmm(parameters[-1], h, parameters[-2].t()), phases
 
 
 def _value_in_place(x: Tensor, parameters: Sequence[Tensor]) -> Tensor:
@@ -239,16 +223,6 @@ def _value_in_place(x: Tensor, parameters: Sequence[Tensor]) -> Tensor:
     for weight, bias in zip(parameters[0:-2:2], parameters[1:-2:2], strict=True):
         h = torch.addmm(bias, h, weight.t()).sin_()
     return torch.addmm(parameters[-1], h, parameters[-2].t())
-
-
-def _jet(x: Tensor, parameters: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
-    """Outputs ``(N, 3)`` and Jacobian ``(N, 3, d)``: the three sweeps back are the rows of one matrix."""
-    value, phases = _forward(x, parameters)
-    g = parameters[-2].expand(len(x), *parameters[-2].shape)  # (N, 3, width)
-    for weight, phase in zip(reversed(parameters[0:-2:2]), reversed(phases), strict=True):
-        g = (g * phase.cos()[:, None, :]).flatten(0, 1) @ weight
-        g = g.reshape(len(x), CHANNELS, weight.shape[1])
-    return value, g
 
 
 def _tangent(x: Tensor, v: Tensor, parameters: Sequence[Tensor]) -> tuple[Tensor, Tensor]:

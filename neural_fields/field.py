@@ -1,4 +1,4 @@
-"""``Field``, ``Jet`` and ``SecondJet``: the one interface between geometry and everything that uses it."""
+"""``Field`` with its ``Jet`` and ``SecondJet``: the one interface between geometry and everything that uses it."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-__all__ = ["Field", "Jet", "SecondJet"]
+__all__ = ["Field", "Jet", "OneLevelField", "SecondJet"]
 
 
 class Jet(NamedTuple):
@@ -167,3 +167,16 @@ class Field(nn.Module, ABC):
         if x.ndim == 0 or x.shape[-1] != self.in_dim:
             raise ValueError(f"x has shape {tuple(x.shape)}; expected (..., {self.in_dim})")
         return x
+
+
+class OneLevelField(Field):
+    """A field with one level of detail, and so without bands.
+
+    Args:
+        in_dim: dimension of the domain.
+    """
+
+    def __init__(self, in_dim: int = 3) -> None:
+        super().__init__()
+        self.in_dim, self.num_levels = in_dim, 1
+        self.register_buffer("deltas", torch.empty(0), persistent=False)

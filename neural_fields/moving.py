@@ -7,7 +7,7 @@ import itertools
 import torch
 from torch import Tensor
 
-from .field import Field, Jet
+from .field import Field, Jet, OneLevelField
 
 __all__ = ["Keyframes", "Moving", "RigidMotion", "ShrinkingSphere"]
 
@@ -113,7 +113,7 @@ class Moving(Field):
         return self.motion.inverse(x[..., :3], x[..., 3])
 
 
-class ShrinkingSphere(Field):
+class ShrinkingSphere(OneLevelField):
     """The sphere that mean curvature shrinks, |x| = √(r₀² − 4αt), as a distance or as a solution.
 
     The distance f = |x| − √(r₀² − 4αt) obeys ∂f/∂t = α|∇f|κ on its surface only: the law would have outer shells
@@ -130,12 +130,10 @@ class ShrinkingSphere(Field):
     """
 
     def __init__(self, *, radius: float = 0.8, alpha: float = 0.1, exact_law: bool = False) -> None:
-        super().__init__()
+        super().__init__(in_dim=4)
         if not (radius > 0 and radius**2 > 4 * alpha):
             raise ValueError(f"radius={radius}, alpha={alpha}: expected radius > 0 and radius² > 4 alpha")
         self.radius, self.alpha, self.exact_law = radius, alpha, exact_law
-        self.in_dim, self.num_levels = 4, 1
-        self.register_buffer("deltas", torch.empty(0), persistent=False)
 
     def radius_at(self, t: Tensor) -> Tensor:
         """r(t) = √(r₀² − 4αt); NaN once the sphere is gone."""
@@ -159,7 +157,7 @@ class ShrinkingSphere(Field):
         return Jet(value, gradient, x.new_empty((*x.shape[:-1], 0)))
 
 
-class Keyframes(Field):
+class Keyframes(OneLevelField):
     """Shapes at given times, blended in between: f(x, t) = Σ_k w_k(t) f_k(x) with hat functions w_k.
 
     Before the first time and after the last the field stands still. The blend is exact at the key times; in between
@@ -174,7 +172,7 @@ class Keyframes(Field):
     """
 
     def __init__(self, times: tuple[float, ...] | list[float], fields: tuple[Field, ...] | list[Field]) -> None:
-        super().__init__()
+        super().__init__(in_dim=4)
         if not times or len(times) != len(fields):
             raise ValueError(f"{len(times)} times for {len(fields)} fields; expected one for each, and at least one")
         if any(not a < b for a, b in itertools.pairwise(times)):
@@ -183,8 +181,6 @@ class Keyframes(Field):
             if field.in_dim != 3:
                 raise ValueError(f"fields[{index}].in_dim={field.in_dim}: expected static fields, three-dimensional")
         self.times, self.fields = tuple(float(t) for t in times), torch.nn.ModuleList(fields)
-        self.in_dim, self.num_levels = 4, 1
-        self.register_buffer("deltas", torch.empty(0), persistent=False)
 
     def key(self, index: int) -> Field:
         """The field at ``times[index]``."""

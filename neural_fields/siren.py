@@ -23,7 +23,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from .field import Field, Jet, SecondJet
+from .field import Jet, OneLevelField, SecondJet
 
 __all__ = ["Siren"]
 
@@ -36,7 +36,7 @@ GPU_BLOCK_FLOATS = 1 << 27
 GRAPH_BLOCK_FACTOR = 8
 
 
-class Siren(Field):
+class Siren(OneLevelField):
     """A signed distance (or a residual of one) as a sinusoidal MLP: the paper's (width, depth).
 
     Initialised as in Sitzmann et al. 2020: first layer U(±1/d), the others U(±√(6/width)/ω₀).
@@ -72,7 +72,7 @@ class Siren(Field):
         output_gain: float = 1.0,
         feature_gain: float = 1.0,
     ) -> None:
-        super().__init__()
+        super().__init__(in_dim)
         for name, number, least in (
             ("width", width, 1),
             ("depth", depth, 1),
@@ -83,9 +83,7 @@ class Siren(Field):
                 raise ValueError(f"{name}={number}: expected at least {least}")
         if not omega > 0:
             raise ValueError(f"omega={omega}: expected > 0")
-        self.width, self.depth, self.omega = width, depth, float(omega)
-        self.in_dim, self.num_levels, self.num_features = in_dim, 1, num_features
-        self.register_buffer("deltas", torch.empty(0), persistent=False)
+        self.width, self.depth, self.omega, self.num_features = width, depth, float(omega), num_features
         sizes = [in_dim] + [width] * depth
         self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in itertools.pairwise(sizes))
         self.output = nn.Linear(width, 1 + num_features)
@@ -107,8 +105,8 @@ class Siren(Field):
         self.resolve_level(level)
         rows = self.check_points(x).reshape(-1, self.in_dim)
         parameters = self.folded()
-        if _needs_graph(rows, parameters):
-            output = _forward(rows, parameters)[0][:, 0]
+        if needs_graph(rows, parameters):
+            output = forward(rows, parameters)[0][:, 0]
         else:
             output = rows.new_empty(len(rows))
             block = self.block_rows(rows.device)
@@ -127,7 +125,7 @@ class Siren(Field):
         rows = self.check_points(x).reshape(-1, self.in_dim)
         parameters = self.folded()
         block = self.block_rows(rows.device)
-        if _needs_graph(rows, parameters):
+        if needs_graph(rows, parameters):
             parts = [_SirenJet.apply(part, *parameters) for part in rows.split(GRAPH_BLOCK_FACTOR * block)]
             output = torch.cat([part[0] for part in parts]) if len(parts) > 1 else parts[0][0]
             gradient = torch.cat([part[1] for part in parts]) if len(parts) > 1 else parts[0][1]
@@ -152,7 +150,7 @@ class Siren(Field):
         dims = self.resolve_dims(dims)
         rows = self.check_points(x).reshape(-1, self.in_dim)
         parameters = self.folded()
-        size = self.block_rows(rows.device) * (GRAPH_BLOCK_FACTOR if _needs_graph(rows, parameters) else 1)
+        size = self.block_rows(rows.device) * (GRAPH_BLOCK_FACTOR if needs_graph(rows, parameters) else 1)
         parts = [_plain_second_jet(part, parameters, dims) for part in rows.split(size)]
         output, gradient, hessian = (torch.cat(part) for part in zip(*parts, strict=True))
         shape = x.shape[:-1]
@@ -182,11 +180,11 @@ class Siren(Field):
         return max(256, (BLOCK_FLOATS if device.type == "cpu" else GPU_BLOCK_FLOATS) // self.width)
 
 
-def _needs_graph(x: Tensor, parameters: Sequence[Tensor]) -> bool:
+def needs_graph(x: Tensor, parameters: Sequence[Tensor]) -> bool:
     return torch.is_grad_enabled() and (x.requires_grad or any(p.requires_grad for p in parameters))
 
 
-def _forward(x: Tensor, parameters: Sequence[Tensor]) -> tuple[Tensor, list[Tensor], list[Tensor]]:
+def forward(x: Tensor, parameters: Sequence[Tensor]) -> tuple[Tensor, list[Tensor], list[Tensor]]:
     """Outputs ``(N, 1 + F)``, then sine and pre-activation of every layer, in plain differentiable operations."""
     h, sines, phases = x, [], []
     for weight, bias in zip(parameters[0:-2:2], parameters[1:-2:2], strict=True):
@@ -196,18 +194,22 @@ def _forward(x: Tensor, parameters: Sequence[Tensor]) -> tuple[Tensor, list[Tens
     return torch.addmm(parameters[-1], h, parameters[-2].t()), sines, phases
 
 
-def _plain_jet(x: Tensor, parameters: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
-    """Outputs and gradient in plain operations, which autograd can differentiate as often as it is asked."""
-    output, _, phases = _forward(x, parameters)
-    g = parameters[-2][:1].expand(len(x), -1)
+def plain_jet(x: Tensor, parameters: Sequence[Tensor], channels: int) -> tuple[Tensor, Tensor]:
+    """Outputs, and the Jacobian ``(N, channels, d)`` of the first of them, by sweeps back that are rows of one matrix.
+
+    In plain operations, which autograd can differentiate as often as it is asked.
+    """
+    output, _, phases = forward(x, parameters)
+    g = parameters[-2][:channels].expand(len(x), -1, -1)  # (N, channels, width)
     for weight, phase in zip(reversed(parameters[0:-2:2]), reversed(phases), strict=True):
-        g = (g * phase.cos()) @ weight
+        g = (g * phase.cos()[:, None]).flatten(0, 1) @ weight
+        g = g.reshape(len(x), channels, weight.shape[1])
     return output, g
 
 
 def _plain_second_jet(x: Tensor, parameters: Sequence[Tensor], dims: int) -> tuple[Tensor, Tensor, Tensor]:
     """Outputs, gradient and the Hessian by the first ``dims`` coordinates, in plain differentiable operations."""
-    output, sines, phases = _forward(x, parameters)
+    output, sines, phases = forward(x, parameters)
     weights, cosines = parameters[0:-2:2], [phase.cos() for phase in phases]
     g, bends = parameters[-2][:1].expand(len(x), -1), []
     for weight, sine, cosine in zip(reversed(weights), reversed(sines), reversed(cosines), strict=True):
@@ -270,7 +272,7 @@ class _SirenJet(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, *parameters: Tensor) -> tuple[Tensor, Tensor]:
-        output, sines, cosines = _forward(x, parameters)
+        output, sines, cosines = forward(x, parameters)
         cosines = [phase.cos_() for phase in cosines]
         s_rows, g_rows = [], [parameters[-2][:1].expand(len(x), -1)]
         for weight, cosine in zip(reversed(parameters[0:-2:2]), reversed(cosines), strict=True):
@@ -326,6 +328,8 @@ def _differentiable_backward(
     """The backward pass in plain operations, for whoever differentiates it again (``create_graph=True``)."""
     inputs = [x, *parameters]
     wanted = [tensor for tensor, need in zip(inputs, needed, strict=True) if need]
-    outputs = _plain_jet(x, parameters)
-    found = iter(torch.autograd.grad(outputs, wanted, cotangents, create_graph=True, materialize_grads=True))
+    output, jacobian = plain_jet(x, parameters, 1)
+    found = iter(
+        torch.autograd.grad((output, jacobian[:, 0]), wanted, cotangents, create_graph=True, materialize_grads=True)
+    )
     return tuple(next(found) if need else None for need in needed)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from ...neural_fields import Field, Jet
+from ...neural_fields import Jet, OneLevelField
 from . import solids
 from .samples import distinct_starts, refine_closest, sample_surface
 from .solids import Solid, Vector
@@ -24,7 +24,7 @@ _EYE: Vector = (0.105, -0.225, 0.435)
 _BLOCK = 8192  # rows evaluated at once, so that the dozens of temporaries stay in cache
 
 
-class Statue(Field):
+class Statue(OneLevelField):
     """An owl on a column, z up, facing -y, inside the unit sphere: one watertight connected solid.
 
     The implicit function is a smooth union of some thirty solids (see :mod:`solids`); it vanishes exactly on
@@ -36,9 +36,6 @@ class Statue(Field):
 
     def __init__(self) -> None:
         super().__init__()
-        self.in_dim = 3
-        self.num_levels = 1
-        self.register_buffer("deltas", torch.empty(0), persistent=False)
         self._samples: tuple[Float64, NDArray[np.floating], KDTree] | None = None
 
     def value(self, x: Tensor, *, level: int = -1) -> Tensor:

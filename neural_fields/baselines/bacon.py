@@ -103,15 +103,14 @@ class BaconSDF(Field):
 
     def value(self, x: Tensor, *, level: int = -1) -> Tensor:
         """See `Field.value`."""
+        return self.level_values(x, level=level)[-1]
+
+    def level_values(self, x: Tensor, *, level: int = -1) -> list[Tensor]:
+        """See `Field.level_values`; all of them for the price of the finest."""
         level = self.resolve_level(level)
         rows = self.check_points(x).reshape(-1, 3)
-        parts = [self._outputs(part, level)[-1] for part in rows.split(BLOCK_ROWS)]
-        return torch.cat(parts).reshape(x.shape[:-1])
-
-    def values(self, x: Tensor) -> Tensor:
-        """All levels at ``x`` ``(N, 3)`` → ``(num_levels, N)``, for the price of the finest."""
-        parts = [torch.stack(self._outputs(part, self.num_levels - 1)) for part in x.split(BLOCK_ROWS)]
-        return torch.cat(parts, dim=1)
+        parts = [self._outputs(part, level) for part in rows.split(BLOCK_ROWS)]
+        return [torch.cat(blocks).reshape(x.shape[:-1]) for blocks in zip(*parts, strict=True)]
 
     def jet(self, x: Tensor, *, level: int = -1) -> Jet:
         """See `Field.jet`; one sweep back through the layers."""

@@ -6,18 +6,19 @@ level's network is asked there and nowhere else, and level k of the cascade is t
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Sequence
 
 import torch
 from torch import Tensor, nn
 
-from ..field import Field, Jet
+from ..field import Field, Jet, OneLevelField
 from ._trilinear import Place, interpolate, interpolate_jet, locate, vertices
 
 __all__ = ["BandLimited", "BanfSDF"]
 
 
-class BandLimited(Field):
+class BandLimited(OneLevelField):
     """A field's trilinear interpolant on a cubic grid; outside its cube, the value at the cube's nearest point.
 
     Args:
@@ -45,9 +46,7 @@ class BandLimited(Field):
             raise ValueError(f"resolution={resolution}: expected at least 1")
         if not extent > 0:
             raise ValueError(f"extent={extent}: expected > 0")
-        self.in_dim, self.num_levels = 3, 1
         self.field, self.resolution, self.extent = field, resolution, float(extent)
-        self.register_buffer("deltas", torch.empty(0), persistent=False)
 
     def value(self, x: Tensor, *, level: int = -1) -> Tensor:
         """See `Field.value`."""
@@ -101,10 +100,11 @@ class BanfSDF(Field):
 
     def value(self, x: Tensor, *, level: int = -1) -> Tensor:
         """See `Field.value`."""
-        total = torch.zeros_like(self.check_points(x)[..., 0])
-        for part in self._parts(level):
-            total = total + part.value(x)
-        return total
+        return self.level_values(x, level=level)[-1]
+
+    def level_values(self, x: Tensor, *, level: int = -1) -> list[Tensor]:
+        """See `Field.level_values`."""
+        return list(itertools.accumulate(part.value(self.check_points(x)) for part in self._parts(level)))
 
     def jet(self, x: Tensor, *, level: int = -1) -> Jet:
         """See `Field.jet`."""

@@ -13,7 +13,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
-from ..field import Field, Jet
+from ..field import Jet, OneLevelField
 from ._trilinear import Place, interpolate, interpolate_jet, locate, vertices
 
 __all__ = ["HashGridSDF", "grid_resolutions", "spatial_hash"]
@@ -40,7 +40,7 @@ def spatial_hash(x: Tensor, y: Tensor, z: Tensor, size: int) -> Tensor:
     return (x * PRIMES[0] ^ y * PRIMES[1] ^ z * PRIMES[2]) & (size - 1)
 
 
-class HashGridSDF(Field):
+class HashGridSDF(OneLevelField):
     """A signed distance read by a ReLU network from interpolated grids.
 
     The field is continuous; its gradient jumps at the faces of cells and at the creases of the network. Outside the
@@ -80,7 +80,6 @@ class HashGridSDF(Field):
         radius: float | None = None,
     ) -> None:
         super().__init__()
-        self.in_dim, self.num_levels = 3, 1
         for name, number in (("levels", levels), ("features", features), ("width", width), ("depth", depth)):
             if number < 1:
                 raise ValueError(f"{name}={number}: expected at least 1")
@@ -92,7 +91,6 @@ class HashGridSDF(Field):
             raise ValueError(f"extent={extent}: expected > 0")
         self.table_size, self.extent, self.radius = table_size, float(extent), radius
         self.resolutions = grid_resolutions(levels, coarsest, finest)
-        self.register_buffer("deltas", torch.empty(0), persistent=False)
         sizes = [min((resolution + 1) ** 3, table_size) for resolution in self.resolutions]
         self.tables = nn.ParameterList(torch.empty(size, features).uniform_(-INITIAL, INITIAL) for size in sizes)
         widths = [levels * features, *[width] * depth, 1]

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils import parametrizations
 
-from ..field import Field, Jet
+from ..field import Jet, OneLevelField
 from ..radiance import encode, encoded_size
 
 __all__ = ["NeusSDF"]
@@ -22,7 +22,7 @@ BETA = 100.0  # of the softplus
 LINEAR = 50.0  # βz above which softplus is z to the last digit; torch's own 20 would show in float64
 
 
-class NeusSDF(Field):
+class NeusSDF(OneLevelField):
     """A softplus MLP that begins as the signed distance of a sphere.
 
     Args:
@@ -51,7 +51,6 @@ class NeusSDF(Field):
         radius: float = 0.5,
     ) -> None:
         super().__init__()
-        self.in_dim, self.num_levels, self.num_features = 3, 1, num_features
         inputs = encoded_size(3, frequencies)
         for name, number, least in (
             ("width", width, inputs + 1),
@@ -62,8 +61,8 @@ class NeusSDF(Field):
             if number < least:
                 raise ValueError(f"{name}={number}: expected at least {least}")
         self.width, self.depth, self.frequencies, self.radius = width, depth, frequencies, radius
+        self.num_features = num_features
         self.joined = depth // 2
-        self.register_buffer("deltas", torch.empty(0), persistent=False)
         sizes = [inputs, *[width] * depth, 1 + num_features]
         layers = []
         for index in range(depth + 1):

@@ -251,7 +251,7 @@ class BaconRecipe(Recipe[BaconSettings]):
             points, distance = (
                 torch.cat([pool[part][index] for pool, index in zip(pools, chosen, strict=True)]) for part in range(2)
             )
-            squares = (field.values(points) - distance).square().mean(dim=0)
+            squares = (torch.stack(field.level_values(points)) - distance).square().mean(dim=0)
             return squares[:half].sum() + settings.coarse_weight * squares[half:].sum()
 
         first, last = settings.rates

@@ -13,13 +13,12 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from ...datasets import read_cloud
-from ...neural_fields import Field, InputError, Jet, Similarity
+from ...neural_fields import Field, InputError, Jet, OneLevelField, Similarity
 from ...neural_fields.meshing import Mesh, NoSurfaceError, extract_mesh
 from ..render.slice import draw_slice, plane_axes, round_step, take_slice
 from .camera import Reading
@@ -164,14 +163,12 @@ MOST_POINTS = 200_000
 ISO_STEP = 0.05
 
 
-class OffsetField(Field):
+class OffsetField(OneLevelField):
     """One level of a field, less a constant: its zero set is where that level has the value ``offset``."""
 
     def __init__(self, field: Field, *, level: int, offset: float) -> None:
-        super().__init__()
-        self.in_dim, self.num_levels = field.in_dim, 1
+        super().__init__(field.in_dim)
         self.field, self.level, self.offset = field, field.resolve_level(level), float(offset)
-        self.register_buffer("deltas", torch.empty(0), persistent=False)
 
     def value(self, x: Tensor, *, level: int = -1) -> Tensor:
         """See `Field.value`."""
