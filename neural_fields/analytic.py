@@ -13,7 +13,7 @@ __all__ = ["Box", "Capsule", "Plane", "Sphere", "Torus", "Union"]
 
 
 class _Exact(OneLevelField):
-    """A closed-form field; a subclass gives value and gradient at ``(..., 3)`` points."""
+    """A closed-form field; a subclass gives value and gradient at points."""
 
     @abstractmethod
     def _evaluate(self, x: Tensor) -> tuple[Tensor, Tensor]: ...
@@ -144,9 +144,9 @@ class Union(_Exact):
     """``min_i f_i(x)``: exact outside every part, a bound inside where parts overlap."""
 
     def __init__(self, *parts: Field) -> None:
-        super().__init__()
-        if not parts:
-            raise ValueError("parts: expected at least one field")
+        if len({part.in_dim for part in parts}) != 1:
+            raise ValueError(f"parts of {[part.in_dim for part in parts]} dimensions; expected at least one, all equal")
+        super().__init__(parts[0].in_dim)
         self.parts = torch.nn.ModuleList(parts)
 
     def _evaluate(self, x: Tensor) -> tuple[Tensor, Tensor]:

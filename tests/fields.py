@@ -7,11 +7,13 @@ from mplicits.neural_fields import (
     Box,
     Capsule,
     Field,
+    Jet,
     Keyframes,
     Moving,
     MultiscaleSDF,
     Plane,
     RigidMotion,
+    SecondJet,
     ShrinkingSphere,
     Siren,
     SpaceTimeSDF,
@@ -21,6 +23,7 @@ from mplicits.neural_fields import (
     Union,
 )
 from mplicits.neural_fields.baselines import BaconSDF, BandLimited, BanfSDF, HashGridSDF, NeusSDF
+from torch import Tensor
 
 
 def small_multiscale(taper: float = 0.0) -> MultiscaleSDF:
@@ -55,6 +58,50 @@ def small_hash_grid() -> HashGridSDF:
     return field
 
 
+class Watched(Field):
+    """A field that remembers at which points it was asked, for values or for jets."""
+
+    def __init__(self, inner: Field) -> None:
+        super().__init__()
+        self.inner, self.in_dim, self.num_levels = inner, inner.in_dim, inner.num_levels
+        self.register_buffer("deltas", inner.deltas)
+        self.values: list[Tensor] = []
+        self.jets: list[Tensor] = []
+
+    def value(self, x: Tensor, *, level: int = -1) -> Tensor:
+        self.values.append(x)
+        return self.inner.value(x, level=level)
+
+    def jet(self, x: Tensor, *, level: int = -1) -> Jet:
+        self.jets.append(x)
+        return self.inner.jet(x, level=level)
+
+    def second_jet(self, x: Tensor, *, level: int = -1, dims: int | None = None) -> SecondJet:
+        self.jets.append(x)
+        return self.inner.second_jet(x, level=level, dims=dims)
+
+    def counts(self) -> tuple[int, int]:
+        """How many points so far, for values and for jets."""
+        values, jets = (sum(x.shape[:-1].numel() for x in asked) for asked in (self.values, self.jets))
+        return values, jets
+
+
+class Scaled(Field):
+    """``factor · f``, whose gradient is not of unit length."""
+
+    def __init__(self, inner: Field, factor: float) -> None:
+        super().__init__()
+        self.inner, self.factor, self.in_dim, self.num_levels = inner, factor, inner.in_dim, inner.num_levels
+        self.register_buffer("deltas", inner.deltas.clone())
+
+    def value(self, x: Tensor, *, level: int = -1) -> Tensor:
+        return self.factor * self.inner.value(x, level=level)
+
+    def jet(self, x: Tensor, *, level: int = -1) -> Jet:
+        value, gradient, features = self.inner.jet(x, level=level)
+        return Jet(self.factor * value, self.factor * gradient, features)
+
+
 # Turns and travels, about an axis off the origin.
 SCREW = RigidMotion(axis=(1.0, 2.0, -1.0), angle=1.5, center=(0.1, -0.2, 0.0), velocity=(0.3, 0.0, -0.2))
 
@@ -65,6 +112,7 @@ FIELDS: dict[str, Callable[[], Field]] = {
     "box": lambda: Box(half_size=(0.5, 0.3, 0.4)),
     "capsule": lambda: Capsule(start=(-0.3, 0.0, 0.0), end=(0.3, 0.2, 0.1), radius=0.2),
     "union": lambda: Union(Sphere(radius=0.3, center=(-0.3, 0, 0)), Sphere(radius=0.3, center=(0.3, 0, 0))),
+    "union-of-moving": lambda: Union(Moving(Sphere(radius=0.3), SCREW), ShrinkingSphere(radius=0.5, alpha=0.05)),
     "siren": lambda: Siren(24, 2, omega=4.0),
     "siren-deep-features": lambda: Siren(16, 4, omega=4.0, num_features=3),
     "siren-one-layer-4d": lambda: Siren(16, 1, omega=4.0, in_dim=4),

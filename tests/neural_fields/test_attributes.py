@@ -6,8 +6,8 @@ import pytest
 import torch
 from mplicits.neural_fields import (
     ColorSiren,
-    Field,
     Jet,
+    OneLevelField,
     Siren,
     Sphere,
     TextureField,
@@ -31,13 +31,8 @@ def angles(count: int) -> tuple[Tensor, Tensor]:
     return tuple(2 * math.pi * torch.rand(2, count, dtype=torch.float64))  # type: ignore[return-value]
 
 
-class _Squared(Field):
+class _Squared(OneLevelField):
     """``|x|² − r²``: right on its zero set, wrong as a distance; steps along ∇f stay on the rays."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.in_dim, self.num_levels = 3, 1
-        self.register_buffer("deltas", torch.empty(0))
 
     def value(self, x: Tensor, *, level: int = -1) -> Tensor:
         return x.square().sum(dim=-1) - 0.25

@@ -2,45 +2,14 @@
 
 import pytest
 import torch
-from fields import SCREW, small_multiscale, small_spacetime
+from fields import SCREW, Watched, small_multiscale, small_spacetime
 from mplicits.datasets.cameras import look_at
-from mplicits.neural_fields import Field, Jet, Moving, RigidMotion, Sphere, TimeSlice, Torus, at_time, sphere_trace
+from mplicits.neural_fields import Field, Moving, RigidMotion, Sphere, TimeSlice, Torus, Union, at_time, sphere_trace
 from mplicits.neural_fields.dynamic_tracing import DynamicTracer, moment
 from mplicits.neural_fields.tracing import Expected, cone_ends, trace_expected
 from torch import Tensor
 
 TIMES = [0.2 + k / 40 for k in range(10)]
-
-
-class Counted(Field):
-    """The same field, which counts the points that it is asked for."""
-
-    def __init__(self, inner: Field) -> None:
-        super().__init__()
-        self.inner, self.in_dim, self.num_levels, self.points = inner, inner.in_dim, inner.num_levels, 0
-        self.register_buffer("deltas", inner.deltas)
-
-    def value(self, x: Tensor, *, level: int = -1) -> Tensor:
-        self.points += x.shape[:-1].numel()
-        return self.inner.value(x, level=level)
-
-    def jet(self, x: Tensor, *, level: int = -1) -> Jet:
-        return self.inner.jet(x, level=level)
-
-
-class Both(Field):
-    """Two moving fields in one."""
-
-    def __init__(self, *parts: Field) -> None:
-        super().__init__()
-        self.parts, self.in_dim, self.num_levels = torch.nn.ModuleList(parts), 4, 1
-        self.register_buffer("deltas", torch.empty(0))
-
-    def value(self, x: Tensor, *, level: int = -1) -> Tensor:
-        return torch.stack([part.value(x) for part in self.parts]).amin(dim=0)
-
-    def jet(self, x: Tensor, *, level: int = -1) -> Jet:
-        raise NotImplementedError
 
 
 def ball(radius: float, center: tuple[float, float, float], velocity: tuple[float, float, float]) -> Field:
@@ -99,7 +68,7 @@ def test_what_comes_into_view_in_front_of_the_last_hit_is_found():
     """A small ball crosses in front of a large one, in steps longer than it is wide."""
     eye, directions = image(dtype=torch.float64)
     small, start, drift = 0.06, (-0.6, 0.1, 0.6), (1.2, 0.0, 0.0)
-    field = Both(ball(0.5, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), ball(small, start, drift)).double()
+    field = Union(ball(0.5, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), ball(small, start, drift)).double()
     tracer = DynamicTracer(field, eye, directions, tolerance=1e-6)
     in_front = uncovered = 0
     before = torch.zeros(directions.shape[:-1], dtype=torch.bool)
@@ -170,7 +139,7 @@ def test_the_slope_of_a_hit_is_how_fast_the_field_falls():
 
 def test_tiles_are_empty_behind_their_ends():
     eye, directions = image(64, dtype=torch.float64)
-    balls = Both(ball(0.3, (0.3, 0.0, 0.0), (0, 0, 0)), ball(0.2, (-0.5, 0.2, -0.3), (0, 0, 0)))
+    balls = Union(ball(0.3, (0.3, 0.0, 0.0), (0, 0, 0)), ball(0.2, (-0.5, 0.2, -0.3), (0, 0, 0)))
     field = TimeSlice(balls.double(), 0.0)
     everything = torch.ones(directions.shape[:-1], dtype=torch.bool)
     ends = cone_ends(field, eye, directions, everything)
@@ -184,19 +153,20 @@ def test_tiles_are_empty_behind_their_ends():
 
 def test_a_frame_costs_less_than_from_scratch():
     eye, directions = image(128)
-    field = Counted(Moving(Torus(major=0.5, minor=0.2), RigidMotion(axis=(1.0, 1.0, 0.0), angle=1.0)))
+    field = Watched(Moving(Torus(major=0.5, minor=0.2), RigidMotion(axis=(1.0, 1.0, 0.0), angle=1.0)))
     settings = {"tolerance": 1e-3, "resolution": 5e-3}
     tracer = DynamicTracer(field, eye, directions, **settings)
     times = [k / 96 for k in range(6)]
     for t in times[:2]:
         tracer.trace(t)
-    field.points = 0
+    field.values.clear()
     for t in times[2:]:
         tracer.trace(t)
-    warm, field.points = field.points, 0
+    warm = field.counts()[0]
+    field.values.clear()
     for t in times[2:]:
         sphere_trace(TimeSlice(field, t), eye, directions, **settings)
-    assert warm < 0.55 * field.points
+    assert warm < 0.55 * field.counts()[0]
 
 
 def test_near_is_where_rays_pass_within_reach():
@@ -226,15 +196,15 @@ def test_near_is_where_rays_pass_within_reach():
 
 def test_frames_in_between_leave_out_what_is_far_and_cost_little_where_it_is_near():
     eye, directions = image(96)
-    field = Counted(Moving(Torus(major=0.5, minor=0.2), RigidMotion(axis=(1.0, 1.0, 0.0), angle=1.0)))
+    field = Watched(Moving(Torus(major=0.5, minor=0.2), RigidMotion(axis=(1.0, 1.0, 0.0), angle=1.0)))
     settings = {"tolerance": 2e-4, "resolution": 3e-3}
     tracer = DynamicTracer(field, eye, directions, **settings)
     costs, kinds = [], []
     for k in range(12):
-        before, key = field.points, tracer._key
+        before, key = field.counts()[0], tracer._key
         hits = tracer.trace(k / 160)
         kinds.append(tracer._key is key)
-        costs.append(field.points - before)
+        costs.append(field.counts()[0] - before)
         fresh = sphere_trace(TimeSlice(field.inner, k / 160), eye, directions, **settings)
         assert int((hits.mask != fresh.mask).sum()) <= 1
         apart = (hits.depth - fresh.depth)[hits.mask & fresh.mask].abs()

@@ -4,7 +4,8 @@ import math
 import numpy as np
 import pytest
 import torch
-from mplicits.neural_fields import Box, Capsule, Field, Jet, MultiscaleSDF, Plane, Siren, Sphere, Torus, Union
+from fields import Scaled
+from mplicits.neural_fields import Box, Capsule, Jet, MultiscaleSDF, OneLevelField, Plane, Siren, Sphere, Torus, Union
 from mplicits.neural_fields._cube import CORNERS, cube_tables
 from mplicits.neural_fields._lattice import Lattice
 from mplicits.neural_fields.meshing import Mesh, NoSurfaceError, extract_mesh, map_normals
@@ -12,13 +13,11 @@ from mplicits.neural_fields.meshing import Mesh, NoSurfaceError, extract_mesh, m
 UNIT = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
 
 
-class Tabulated(Field):
+class Tabulated(OneLevelField):
     """Values given at the points of a lattice over UNIT, for meshing any pattern of signs."""
 
     def __init__(self, values):
         super().__init__()
-        self.in_dim, self.num_levels = 3, 1
-        self.register_buffer("deltas", torch.empty(0))
         self.register_buffer("table", values)
 
     def value(self, x, *, level=-1):
@@ -32,29 +31,12 @@ class Tabulated(Field):
         return Jet(torch.zeros_like(value), torch.ones_like(x), x.new_empty((*x.shape[:-1], 0)))
 
 
-class Scaled(Field):
-    """``factor · f``, whose gradient is not of unit length."""
-
-    def __init__(self, inner, factor):
-        super().__init__()
-        self.inner, self.factor, self.in_dim, self.num_levels = inner, factor, 3, inner.num_levels
-        self.register_buffer("deltas", inner.deltas.clone())
-
-    def value(self, x, *, level=-1):
-        return self.factor * self.inner.value(x, level=level)
-
-    def jet(self, x, *, level=-1):
-        value, gradient, features = self.inner.jet(x, level=level)
-        return Jet(self.factor * value, self.factor * gradient, features)
-
-
-class Ripple(Field):
+class Ripple(OneLevelField):
     """A residual: ``amplitude · sin(k x) sin(k y) sin(k z)``."""
 
     def __init__(self, amplitude, k):
         super().__init__()
-        self.amplitude, self.k, self.in_dim, self.num_levels = amplitude, k, 3, 1
-        self.register_buffer("deltas", torch.empty(0))
+        self.amplitude, self.k = amplitude, k
 
     def value(self, x, *, level=-1):
         return self.jet(x).value

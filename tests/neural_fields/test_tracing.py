@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 import torch
-from fields import FIELDS, small_multiscale
+from fields import FIELDS, Scaled, Watched, small_multiscale
 from mplicits.neural_fields import (
     Box,
     Field,
     Jet,
     MultiscaleSDF,
+    OneLevelField,
     Plane,
     Siren,
     Sphere,
@@ -130,7 +131,7 @@ def nested(field: Field) -> Field:
     """Residuals small enough to keep each surface within the band before it, as training leaves them."""
     if isinstance(field, MultiscaleSDF):
         with torch.no_grad():
-            for residual in field.residuals:
+            for residual in field.levels[1:]:
                 assert isinstance(residual, Siren)
                 residual.output.weight.mul_(0.1)
                 residual.output.bias.mul_(0.1)
@@ -161,8 +162,11 @@ def test_every_field_against_a_dense_search(name):
 
 @pytest.mark.parametrize("level", [0, 1, 2])
 def test_hits_lie_on_the_level_that_was_asked_for(level):
-    residuals = list(small_multiscale().residuals)
-    field = MultiscaleSDF(Sphere(radius=0.5), residuals, [0.3, 0.2], taper=0.5).double().requires_grad_(False)
+    field = (
+        MultiscaleSDF(Sphere(radius=0.5), small_multiscale().levels[1:], [0.3, 0.2], taper=0.5)
+        .double()
+        .requires_grad_(False)
+    )
     origins, directions = random_rays(300, spread=0.3)
     hits = sphere_trace(field, origins, directions, level=level, lipschitz=2.0)
     assert float(hits.mask.double().mean()) > 0.5
@@ -170,17 +174,14 @@ def test_hits_lie_on_the_level_that_was_asked_for(level):
     assert set(hits.level[hits.mask].tolist()) == {level}
 
 
-class Watched(Field):
-    """A residual that remembers the points it was asked at."""
+class Wave(OneLevelField):
+    """A residual: ``amplitude · sin(20 x)``."""
 
     def __init__(self, amplitude: float) -> None:
         super().__init__()
-        self.in_dim, self.num_levels, self.amplitude = 3, 1, amplitude
-        self.register_buffer("deltas", torch.empty(0))
-        self.asked: list[Tensor] = []
+        self.amplitude = amplitude
 
     def value(self, x: Tensor, *, level: int = -1) -> Tensor:
-        self.asked.append(x)
         return self.amplitude * torch.sin(20 * x[..., 0])
 
     def jet(self, x: Tensor, *, level: int = -1) -> Jet:
@@ -188,13 +189,14 @@ class Watched(Field):
 
 
 def test_residuals_are_evaluated_only_in_their_band():
-    base, residual = Sphere(radius=0.5).double(), Watched(0.02)
+    base, residual = Watched(Sphere(radius=0.5)), Watched(Wave(0.02))
     field = MultiscaleSDF(base, [residual], [0.05]).double()
     origins, directions = random_rays(500, spread=0.5)
     hits = sphere_trace(field, origins, directions, lipschitz=1.4)
-    asked = torch.cat(residual.asked)
-    assert 0 < len(asked) < 0.7 * int(hits.steps.sum())
-    assert float(base.value(asked).abs().max()) < 0.05
+    steps, asked = int(hits.steps.sum()), torch.cat(residual.values)
+    assert base.counts() == (steps, 0)  # once for each step, whatever the levels
+    assert 0 < len(asked) < 0.7 * steps
+    assert float(base.inner.value(asked).abs().max()) < 0.05
 
 
 def test_a_ray_from_inside_finds_the_way_out():
@@ -219,27 +221,10 @@ def test_near_and_far_bound_the_search():
     assert sphere_trace(field, torch.zeros_like(origin), direction, near=0.3).depth == pytest.approx(0.5, abs=1e-5)
 
 
-class Steep(Field):
-    """Distances that are too large by a factor."""
-
-    in_dim, num_levels = 3, 1
-
-    def __init__(self, inner: Field, factor: float) -> None:
-        super().__init__()
-        self.register_buffer("deltas", torch.empty(0))
-        self.inner, self.factor = inner, factor
-
-    def value(self, x: Tensor, *, level: int = -1) -> Tensor:
-        return self.factor * self.inner.value(x)
-
-    def jet(self, x: Tensor, *, level: int = -1) -> Jet:
-        raise NotImplementedError
-
-
 def test_steep_fields_need_their_lipschitz_constant():
     origins, directions = random_rays(2000, spread=0.6)
     expected = torus_depth(origins, directions, 0.5, 0.05)
-    hits = sphere_trace(Steep(Torus(major=0.5, minor=0.05), 3.0).double(), origins, directions, lipschitz=3.0)
+    hits = sphere_trace(Scaled(Torus(major=0.5, minor=0.05), 3.0).double(), origins, directions, lipschitz=3.0)
     assert torch.equal(hits.mask, expected.isfinite())
     assert float((hits.depth - expected)[hits.mask].abs().max()) < 1e-5
 
@@ -249,7 +234,7 @@ def test_cones_that_find_themselves_behind_the_surface_go_back():
     rows, columns = torch.meshgrid(across, across, indexing="ij")
     directions = unit(torch.stack((columns, rows, torch.ones_like(rows)), dim=-1))
     origin = torch.tensor([0.0, 0.0, -2.5], dtype=torch.float64)
-    near = cone_starts(Steep(Sphere(radius=0.6), 1.3).double(), origin, directions)
+    near = cone_starts(Scaled(Sphere(radius=0.6), 1.3).double(), origin, directions)
     expected = sphere_depth(origin.expand(64 * 64, 3), directions.reshape(-1, 3), 0.6).reshape(64, 64)
     assert bool(expected.isfinite().all())
     assert bool((near < expected).all())
@@ -264,7 +249,7 @@ def test_without_a_bounding_ball():
 
 
 def test_the_papers_budget_converges_head_on_and_counts():
-    field = MultiscaleSDF(Sphere(radius=0.5), [Watched(0.0), Watched(0.0)], [0.05, 0.02]).double()
+    field = MultiscaleSDF(Sphere(radius=0.5), [Wave(0.0), Wave(0.0)], [0.05, 0.02]).double()
     origins = torch.tensor([[0.0, 0.0, -2.0], [0.0, 0.9, -2.0], [0.0, 3.0, -2.0]], dtype=torch.float64)
     hits = sphere_trace(field, origins, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), budget=(20, 5, 5))
     assert hits.mask.tolist() == [True, False, False]

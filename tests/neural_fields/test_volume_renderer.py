@@ -3,7 +3,7 @@
 import pytest
 import torch
 from fields import FIELDS
-from mplicits.neural_fields import Field, Jet, MultiscaleSDF, Sampling, Siren, Sphere, ViewColor, render_volume
+from mplicits.neural_fields import Jet, MultiscaleSDF, OneLevelField, Sampling, Siren, Sphere, ViewColor, render_volume
 from mplicits.neural_fields.volume import sphere_span
 from mplicits.neural_fields.volume_renderer import sample_depths
 from mplicits.pipelines.bench.speed import counted
@@ -163,11 +163,9 @@ def test_sampling_refuses(setting: dict[str, int]) -> None:
 
 def test_gradients_reach_the_field_through_the_weights() -> None:
     # Growing the sphere brings its surface nearer: ∂depth/∂bias of f = |x| − r is +1 along the axis.
-    class Shifted(Field):
+    class Shifted(OneLevelField):
         def __init__(self) -> None:
             super().__init__()
-            self.in_dim, self.num_levels = 3, 1
-            self.register_buffer("deltas", torch.empty(0))
             self.bias = torch.nn.Parameter(torch.tensor(0.0, dtype=torch.float64))
             self.sphere = Sphere(radius=0.5).double()
 

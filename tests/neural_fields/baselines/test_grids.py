@@ -6,8 +6,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import torch
+from fields import Watched
 from mplicits.datasets import prepare_cloud, sample_sphere
-from mplicits.neural_fields import Field, Jet, Plane, Siren, Sphere, Torus, extract_mesh, sphere_trace
+from mplicits.neural_fields import Field, Plane, Siren, Sphere, Torus, extract_mesh, sphere_trace
 from mplicits.neural_fields.baselines import BandLimited, BanfSDF, HashGridSDF
 from mplicits.neural_fields.baselines.hash_grid import grid_resolutions, spatial_hash
 from mplicits.pipelines.paper.grids import NGP_COARSE, NGP_FINE, BanfRecipe, GridSettings, InstantNgpRecipe
@@ -147,26 +148,10 @@ def test_band_limiting_leaves_a_plane_as_it_is() -> None:
     torch.testing.assert_close(jet.gradient, exact.gradient)
 
 
-class Counting(Field):
-    """A sphere that counts the points it is asked about."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.in_dim, self.num_levels, self.asked = 3, 1, 0
-        self.register_buffer("deltas", torch.empty(0))
-
-    def value(self, x: Tensor, *, level: int = -1) -> Tensor:
-        self.asked += len(x)
-        return x.norm(dim=-1) - 0.5
-
-    def jet(self, x: Tensor, *, level: int = -1) -> Jet:
-        raise AssertionError("a network is asked for values only")
-
-
 def test_network_is_asked_once_for_each_vertex() -> None:
-    network = Counting()
+    network = Watched(Sphere())
     BandLimited(network, 2).jet(2 * torch.rand(1000, 3) - 1)
-    assert network.asked == 27
+    assert network.counts() == (27, 0)
 
 
 def test_cascade_adds_up() -> None:

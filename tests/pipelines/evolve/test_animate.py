@@ -13,9 +13,7 @@ import trimesh
 from mplicits.datasets import linear_to_srgb
 from mplicits.neural_fields import (
     ColorSiren,
-    Field,
     InputError,
-    Jet,
     Moving,
     RigidMotion,
     ShrinkingSphere,
@@ -25,6 +23,7 @@ from mplicits.neural_fields import (
     Sphere,
     TextureField,
     TimeSlice,
+    Union,
     extract_mesh,
     load_field,
     load_texture,
@@ -40,29 +39,10 @@ from mplicits.pipelines.render.draw import RenderOptions, render_run
 from mplicits.pipelines.run.folder import load_still
 from mplicits.pipelines.surface.surface import read_surface
 from mplicits.pipelines.texture.riding import RidingColors, borrowed_texture
-from torch import Tensor
 
 RADIUS, DRIFT = 0.3, torch.tensor([0.5, 0.0, 0.0])
 START = torch.tensor([-0.25, 0.0, 0.0])
 PLACE = Similarity((100.0, -20.0, 3.0), 2.0)
-
-
-class Both(Field):
-    """Two moving fields in one."""
-
-    def __init__(self, *parts: Field) -> None:
-        super().__init__()
-        self.parts, self.in_dim, self.num_levels = torch.nn.ModuleList(parts), 4, 1
-        self.register_buffer("deltas", torch.empty(0))
-
-    def value(self, x: Tensor, *, level: int = -1) -> Tensor:
-        return self.jet(x, level=level).value
-
-    def jet(self, x: Tensor, *, level: int = -1) -> Jet:
-        jets = [part.jet(x) for part in self.parts]
-        value, which = torch.stack([jet.value for jet in jets]).min(dim=0)
-        gradient = torch.where((which == 0)[..., None], jets[0].gradient, jets[1].gradient)
-        return Jet(value, gradient, x.new_empty((*x.shape[:-1], 0)))
 
 
 def travelling_ball() -> SpaceTimeSDF:
@@ -270,10 +250,10 @@ def test_a_mesh_is_not_followed_through_a_merger(speed, when):
     ]
     times = [0.0, 0.2, 0.4, 0.6, 0.8, 1.0]
     if when is None:
-        assert follow_mesh(Both(*parts), times, resolution=24).vertices.shape[0] == 6
+        assert follow_mesh(Union(*parts), times, resolution=24).vertices.shape[0] == 6
         return
     with pytest.raises(InputError, match=r"two: its mesh cannot be followed to time 0\.[68] \(it has 1 piece with"):
-        follow_mesh(Both(*parts), times, resolution=24, name="two")
+        follow_mesh(Union(*parts), times, resolution=24, name="two")
 
 
 def test_colours_ride_along_with_a_rigid_motion(run):
