@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from ..run.progress import Report
 
 __all__ = [
-    "FILMS",
-    "PICTURES",
     "Command",
     "Stopped",
     "add_begin",
@@ -29,7 +27,6 @@ __all__ = [
     "add_settings",
     "between",
     "check_output",
-    "check_size",
     "finite",
     "fit_settings",
     "positive",
@@ -40,9 +37,6 @@ __all__ = [
     "whole",
     "write_json",
 ]
-
-PICTURES = (".png", ".jpg", ".jpeg")
-FILMS = (".mp4", ".gif")
 
 T = TypeVar("T")
 Number = TypeVar("Number", int, float)
@@ -245,12 +239,6 @@ def check_output(path: Path | None, suffixes: Sequence[str]) -> None:
         raise input_error(f"{path}: the folder {path.absolute().parent} does not exist; make it first")
     if path.is_dir():
         raise input_error(f"{path}: is a directory; name a file")
-
-
-def check_size(size: Sequence[int] | None) -> None:
-    """Refuse a ``--size`` of more than a width and a height."""
-    if size is not None and len(size) > 2:
-        raise input_error(f"--size: got {len(size)} numbers; expected a width, or a width and a height")
 
 
 def write_json(path: Path | None, data: Any) -> None:

@@ -20,6 +20,7 @@ __all__ = ["Finding", "examine", "format_findings"]
 PACKAGE = "mplicits"
 OWN_CV2 = "opencv-contrib-python-headless"
 OTHER_CV2 = ("opencv-python", "opencv-python-headless", "opencv-contrib-python")
+DEVELOPERS = "extra == .dev"
 SLOW_GFLOPS = 15.0  # below this, the three minutes of the default preset become more than ten
 
 
@@ -46,8 +47,7 @@ def examine(folder: Path | None = None) -> list[Finding]:
     """
     return [
         _python(),
-        *(_requirement(line) for line in importlib.metadata.requires(PACKAGE) or [] if "extra ==" not in line),
-        *(_extra(line) for line in importlib.metadata.requires(PACKAGE) or [] if re.search(r"extra == .(?!dev)", line)),
+        *(_requirement(line) for line in importlib.metadata.requires(PACKAGE) or [] if not re.search(DEVELOPERS, line)),
         _cv2(),
         _threads(),
         _cuda(),
@@ -72,13 +72,6 @@ def _python() -> Finding:
     return Finding("ok", "Python", f"{platform.python_version()} on {platform.system()} {platform.machine()}")
 
 
-def _split(requirement: str) -> tuple[str, str]:
-    """Name and lowest version of ``name[extras]>=1.2; marker``."""
-    match = re.match(r"([A-Za-z0-9._-]+)(?:\[[^\]]*\])?(?:>=([0-9.]+))?", requirement)
-    assert match is not None, requirement
-    return match[1], match[2] or "0"
-
-
 def _installed(name: str) -> str | None:
     try:
         return importlib.metadata.version(name)
@@ -87,23 +80,21 @@ def _installed(name: str) -> str | None:
 
 
 def _requirement(requirement: str) -> Finding:
-    name, lowest = _split(requirement)
-    version = _installed(name)
-    if version is None:
-        return Finding("error", name, f"not installed; pip install '{name}>={lowest}'")
-    if _numbers(version) < _numbers(lowest):
-        return Finding("error", name, f"{version} is too old; pip install '{name}>={lowest}'")
-    return Finding("ok", name, version)
-
-
-def _extra(requirement: str) -> Finding:
-    name, lowest = _split(requirement)
+    """What is there of ``name[extras]>=1.2; extra == "plot"``: the needed, and what can be done without."""
+    match = re.match(r"([A-Za-z0-9._-]+)(?:\[[^\]]*\])?(?:>=([0-9.]+))?", requirement)
+    assert match is not None, requirement
+    name, lowest = match[1], match[2] or "0"
     extra = re.search(r"""extra == ["']([\w-]+)["']""", requirement)
-    label = extra[1] if extra else "?"
     version = _installed(name)
-    if version is None or _numbers(version) < _numbers(lowest):
-        return Finding("note", name, f"optional, not installed; pip install '{PACKAGE}[{label}]'")
-    return Finding("ok", name, f"{version} (optional: {label})")
+    usable = version is not None and _numbers(version) >= _numbers(lowest)
+    if extra is not None:
+        if usable:
+            return Finding("ok", name, f"{version} (optional: {extra[1]})")
+        return Finding("note", name, f"optional, not installed; pip install '{PACKAGE}[{extra[1]}]'")
+    if usable:
+        return Finding("ok", name, version or "")
+    what = "not installed" if version is None else f"{version} is too old"
+    return Finding("error", name, f"{what}; pip install '{name}>={lowest}'")
 
 
 def _numbers(version: str) -> tuple[int, ...]:

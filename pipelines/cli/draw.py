@@ -6,27 +6,19 @@ import argparse
 import re
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 from ..run.config import add_config_flags, given_flags, input_error, load_config
 from ..run.settings import SHADINGS, ShadeOptions
-from .common import (
-    FILMS,
-    PICTURES,
-    Command,
-    add_flags,
-    between,
-    check_output,
-    check_size,
-    finite,
-    whole,
-)
+from .common import Command, add_flags, between, check_output, finite, whole
 
 __all__ = ["ANIMATE", "RENDER", "SLICE", "VIEW"]
 
+PICTURES = (".png", ".jpg", ".jpeg")
+FILMS = (".mp4", ".gif")
 BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), "gray": (0.5, 0.5, 0.5), "transparent": None}
 ORBIT_FLAGS = ("azimuth", "elevation", "up", "fov", "zoom")
 # Settings that one shading alone heeds.
@@ -43,6 +35,17 @@ def _draw(out: Path, title: str | None, work: Callable[[Callable[[int, int], Non
         drawn = work(progress)
     print(f"{out}: {drawn}, in {time.monotonic() - started:.1f} s")
     return 0
+
+
+def _check_size(size: Sequence[int] | None) -> None:
+    if size is not None and len(size) > 2:
+        raise input_error(f"--size: got {len(size)} numbers; expected a width, or a width and a height")
+
+
+def _pair(size: Sequence[int] | None) -> Sequence[int] | None:
+    """``--size`` as width and height, of which it may leave out the second."""
+    _check_size(size)
+    return None if size is None else (size[0], size[-1])
 
 
 def _color(text: str) -> tuple[float, float, float] | None:
@@ -112,7 +115,7 @@ def _shading(arguments: argparse.Namespace, given: dict[str, object]) -> str | N
 
 def _check(arguments: argparse.Namespace) -> None:
     """Refuse what does not go together."""
-    check_size(arguments.size)
+    _check_size(arguments.size)
     for name in ("level", "normal_level"):
         if arguments.levels and getattr(arguments, name) is not None:
             raise input_error(f"--{name.replace('_', '-')}: --levels draws all of them; leave one of the two out")
@@ -140,12 +143,12 @@ RENDER = Command(
 )
 
 
-def _place(text: str) -> tuple[float, bool]:
-    """A converter for argparse: a coordinate, or a number and % → (number, whether it is per cent)."""
+def _place(text: str) -> dict[str, float]:
+    """A converter for argparse: a coordinate, or a number and % → that field of `SliceOptions`."""
     number = finite(text.removesuffix("%"))
     if text.endswith("%") and not 0 <= number <= 100:
         raise argparse.ArgumentTypeError(f"got {text!r}, expected 0% to 100%, or a coordinate")
-    return number, text.endswith("%")
+    return {"percent" if text.endswith("%") else "at": number}
 
 
 def _slice_arguments(parser: argparse.ArgumentParser) -> None:
@@ -156,8 +159,8 @@ def _slice_arguments(parser: argparse.ArgumentParser) -> None:
     direction = parser.add_mutually_exclusive_group()
     direction.add_argument("--axis", choices=("x", "y", "z"), help="the plane is across this axis (z)")
     vector: dict[str, Any] = {"type": finite, "nargs": 3}
-    what = "or it is seen from this direction"
-    direction.add_argument("--normal", **vector, metavar=("NX", "NY", "NZ"), help=what)
+    seen = "or it is seen from this direction"
+    direction.add_argument("--normal", **vector, metavar=("NX", "NY", "NZ"), help=seen)
     what = "coordinate on the axis, or per cent of the shape's extent: 30%% (50%%)"
     add("--at", type=_place, metavar="C", help=what)
     add("--point", **vector, metavar=("X", "Y", "Z"), help="with --normal: a point of the plane")
@@ -183,17 +186,13 @@ def _slice(arguments: argparse.Namespace) -> int:
         raise input_error("--point: goes with --normal; with --axis say --at C")
     if arguments.normal is not None and not any(arguments.normal):
         raise input_error("--normal: has no direction; give three numbers that are not all 0")
-    check_size(arguments.size)
+    arguments.size = _pair(arguments.size)
 
     from ..render.slicing import SliceOptions, slice_run
 
     given = given_flags(arguments, SliceOptions)
-    if "size" in given:
-        given["size"] = (given["size"][0], given["size"][-1])
-    if "at" in given:
-        number, percent = given.pop("at")
-        given["percent" if percent else "at"] = number
-    options = SliceOptions(**given)
+    place = given.pop("at", {})
+    options = SliceOptions(**given, **place)
 
     def work(bar: Callable[[int, int], None] | None) -> str:
         progress = None if bar is None else lambda done: bar(done, options.frames)
@@ -246,7 +245,7 @@ def _animate(arguments: argparse.Namespace) -> int:
             raise input_error(f"--{name}: goes with a film (.mp4, .gif) or a sheet (.png)")
     if film and arguments.resolution is not None:
         raise input_error("--resolution: goes with meshes; a film is traced in pixels (--size)")
-    check_size(arguments.size)
+    arguments.size = _pair(arguments.size)
     if arguments.no_colors and arguments.colors is not None:
         raise input_error("--colors: --no-colors leaves them out; leave one of the two out")
 
@@ -254,8 +253,6 @@ def _animate(arguments: argparse.Namespace) -> int:
     from ..render.subject import Orbit
 
     given = given_flags(arguments, SequenceOptions)
-    if "size" in given:
-        given["size"] = (given["size"][0], given["size"][-1])
     options = SequenceOptions(orbit=Orbit(**given_flags(arguments, Orbit)), **given)
     return _draw(arguments.out, "animate", lambda bar: animate_run(arguments.run, arguments.out, options, progress=bar))
 

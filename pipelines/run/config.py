@@ -151,7 +151,10 @@ def load_config(
         values[key] = _checked(value, hints[key], _flag(key))
     try:
         return cls(**values)
-    except ValueError as error:  # a range check of the dataclass itself
+    except ValueError as error:  # a check of the dataclass itself, which begins with a field
+        name, _, problem = str(error).partition(":")
+        if name in (overrides or {}):
+            raise input_error(f"{_flag(name)}:{problem}") from error
         raise input_error(f"{source}: {error}" if preset is not None else str(error)) from error
 
 
@@ -187,7 +190,8 @@ def given_flags(arguments: argparse.Namespace, cls: type) -> dict[str, Any]:
     class itself, whose defaults then hold for the rest.
     """
     given = {field.name: getattr(arguments, field.name, None) for field in dataclasses.fields(cls)}
-    return {k: tuple(v) if isinstance(v, list) else v for k, v in given.items() if v is not None}
+    given = {name: value for name, value in given.items() if value is not None}
+    return {name: tuple(value) if isinstance(value, list) else value for name, value in given.items()}
 
 
 def thing_of(cls: type) -> str:

@@ -6,6 +6,7 @@ stays quick.
 
 from __future__ import annotations
 
+import functools
 import itertools
 from dataclasses import dataclass
 from typing import Literal
@@ -14,22 +15,18 @@ from .config import Settings, setting
 
 __all__ = ["SHADINGS", "EvolveConfig", "FitConfig", "ReconstructConfig", "ShadeOptions", "TextureConfig"]
 
+_per_level = functools.partial(setting, above=0, per_level=True)
+
 
 @dataclass(frozen=True)
 class FitConfig(Settings):
     """Settings of ``fit``; the defaults are the ``default`` preset. Raises as `Settings` does."""
 
-    widths: tuple[int, ...] = setting(
-        (128, 256, 400), "neurons per layer, one number per level", above=0, per_level=True
-    )
-    depths: tuple[int, ...] = setting((2, 2, 2), "sine layers, one number per level", above=0, per_level=True)
-    omegas: tuple[float, ...] = setting(
-        (30.0, 80.0, 160.0), "SIREN frequency of each level (Eq. 2)", above=0, per_level=True
-    )
-    steps: tuple[int, ...] = setting((1200, 800, 600), "training steps, one number per level", above=0, per_level=True)
-    learning_rates: tuple[float, ...] = setting(
-        (4e-3, 5e-4, 3e-4), "peak learning rate of each level", above=0, per_level=True
-    )
+    widths: tuple[int, ...] = _per_level((128, 256, 400), "neurons per layer, one number per level")
+    depths: tuple[int, ...] = _per_level((2, 2, 2), "sine layers, one number per level")
+    omegas: tuple[float, ...] = _per_level((30.0, 80.0, 160.0), "SIREN frequency of each level (Eq. 2)")
+    steps: tuple[int, ...] = _per_level((1200, 800, 600), "training steps, one number per level")
+    learning_rates: tuple[float, ...] = _per_level((4e-3, 5e-4, 3e-4), "peak learning rate of each level")
     batch: int = setting(8192, "samples per training step", above=0)
     levels: int | None = setting(None, "train only this many levels, coarse to fine")
     data_weight: float = setting(
@@ -144,9 +141,9 @@ class ReconstructConfig(Settings):
     geometry: Literal["multiscale", "neus"] = setting(
         "multiscale", "multiscale (a coarse SIREN and residuals in bands) or neus (the 8 x 256 softplus network)"
     )
-    widths: tuple[int, ...] = setting((128, 256), "neurons per layer, one number per level", above=0, per_level=True)
-    depths: tuple[int, ...] = setting((4, 5), "sine layers, one number per level", above=0, per_level=True)
-    omegas: tuple[float, ...] = setting((10.0, 25.0), "SIREN frequency of each level (Eq. 2)", above=0, per_level=True)
+    widths: tuple[int, ...] = _per_level((128, 256), "neurons per layer, one number per level")
+    depths: tuple[int, ...] = _per_level((4, 5), "sine layers, one number per level")
+    omegas: tuple[float, ...] = _per_level((10.0, 25.0), "SIREN frequency of each level (Eq. 2)")
     starts: tuple[float, ...] = setting(
         (0.0, 0.25), "when each level is switched on, as shares of the training", per_level=True
     )
@@ -211,16 +208,12 @@ class EvolveConfig(Settings):
     angle: tuple[float, ...] = setting((0.0,), "transport: radians per unit of time, one number per shape")
     twist: tuple[float, ...] = setting((0.0,), "transport: radians more per unit along the axis, one number per shape")
     alpha: float = setting(0.02, "smooth: how fast; a sphere has r(t)^2 = r^2 - 4 alpha t, in units of the field")
-    widths: tuple[int, ...] = setting((128, 256), "neurons per layer, one number per level", above=0, per_level=True)
-    depths: tuple[int, ...] = setting((2, 2), "sine layers, one number per level", above=0, per_level=True)
-    omegas: tuple[float, ...] = setting((15.0, 40.0), "SIREN frequency of each level (Eq. 2)", above=0, per_level=True)
-    steps: tuple[int, ...] = setting((1000, 500), "training steps, one number per level", above=0, per_level=True)
-    learning_rates: tuple[float, ...] = setting(
-        (4e-3, 5e-4), "peak learning rate of each level", above=0, per_level=True
-    )
-    data_weights: tuple[float, ...] = setting(
-        (100.0, 1000.0), "weight of known values and gradients, per level", above=0, per_level=True
-    )
+    widths: tuple[int, ...] = _per_level((128, 256), "neurons per layer, one number per level")
+    depths: tuple[int, ...] = _per_level((2, 2), "sine layers, one number per level")
+    omegas: tuple[float, ...] = _per_level((15.0, 40.0), "SIREN frequency of each level (Eq. 2)")
+    steps: tuple[int, ...] = _per_level((1000, 500), "training steps, one number per level")
+    learning_rates: tuple[float, ...] = _per_level((4e-3, 5e-4), "peak learning rate of each level")
+    data_weights: tuple[float, ...] = _per_level((100.0, 1000.0), "weight of known values and gradients, per level")
     start_steps: int = setting(
         300, "steps in which level 0 learns the first shape, before it learns to move", at_least=0
     )

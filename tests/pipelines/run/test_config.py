@@ -94,6 +94,7 @@ def test_each_mistake_in_a_file_is_one_line_that_names_it(tmp_path, text, messag
     [
         ({"rates": ["fast"]}, r"^--rates: got 'fast', expected a list of finite numbers$"),
         ({"batch": "0.5"}, r"^--batch: got '0.5', expected a whole number$"),
+        ({"batch": "0"}, r"^--batch: 0; expected > 0$"),
         ({"bacht": "1"}, r"^unknown flag --bacht; did you mean '--batch'\?$"),
     ],
 )
@@ -160,6 +161,7 @@ def test_flags_come_from_the_dataclass_and_only_given_ones_override():
     assert given == {"widths": ("32", "64"), "verbose": True, "normals": "file", "batch": "100"}
     assert load_config(Settings, None, given) == Settings(widths=(32, 64), verbose=True, normals="file", batch=100)
     assert given_flags(parser.parse_args([]), Settings) == {}
+    assert given_flags(argparse.Namespace(batch=None, verbose=False, other=3), Settings) == {"verbose": False}
     assert "width of each level" in parser.format_help()
     assert "{auto,file}" in parser.format_help()
 
