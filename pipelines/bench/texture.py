@@ -24,7 +24,7 @@ from ...neural_fields.meshing import NoSurfaceError, extract_mesh
 from ..fit.train import fit
 from ..render.compare import Drawing, ImageError, draw, image_error, psnr
 from ..render.picture import Image, as_bytes, contact_sheet, write_picture
-from ..render.rasterise import mesh_view, textured_view
+from ..render.rasterise import mesh_view
 from ..render.trace import trace_view
 from ..run.folder import FIELD_FILE, RECORD_FILE, STATE_FILE, TEXTURE_FILE, read_record
 from ..run.machine import choose_device, format_table
@@ -164,7 +164,7 @@ def _read(path: Path) -> TexturedMesh:
 
 
 def _original(mesh: TexturedMesh, camera: Camera, samples: int) -> Drawing:
-    seen = textured_view(mesh, camera.resized(camera.width * samples, camera.height * samples))
+    seen = mesh_view(mesh, camera.resized(camera.width * samples, camera.height * samples))
     assert seen.color is not None
     return draw(seen, seen.color, samples=samples)
 

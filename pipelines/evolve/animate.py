@@ -24,7 +24,7 @@ from ..render.film import ANIMATIONS, write_animation
 from ..render.picture import Image, contact_sheet, in_rows, write_picture
 from ..render.shade import ShadeOptions, compose, downsample, shade
 from ..render.subject import Orbit, orbit_cameras
-from ..render.trace import RESOLUTION, TOLERANCE, pixel_size, see_hits
+from ..render.trace import RESOLUTION, TOLERANCE, fine_strips, pixel_size, see_hits
 from ..run.folder import find_field
 from ..run.machine import choose_device
 from ..texture.riding import RidingColors, borrowed_texture, start_texture
@@ -34,7 +34,6 @@ __all__ = ["SequenceOptions", "animate_run", "check_sequence_path", "film_frames
 
 Tell = Callable[[int, int], None]
 
-STRIP = 1 << 19  # rays that are worked on at a time: about a third of a gigabyte
 OUTLINE_RESOLUTION = 48
 OUTLINES = 9  # of the times from which the camera takes what it has to have in view
 WHITE = (1.0, 1.0, 1.0)
@@ -167,12 +166,7 @@ def film_frames(
     """The pictures of a film, each traced with what the one before it knew."""
     camera = orbit_cameras(_outline(file, field, options), options.orbit, size=options.size, frames=1)[0]
     samples, device = options.samples, field.deltas.device
-    rows = max(1, STRIP // samples**2 // camera.width)
-    strips = []
-    for first in range(0, camera.height, rows):
-        height = min(rows, camera.height - first)
-        strip = camera.strip(first, height).resized(camera.width * samples, height * samples)
-        strips.append((strip, _tracer(field, strip, level)))
+    strips = [(strip, _tracer(field, strip, level)) for strip in fine_strips(camera, samples)]
     lit = ShadeOptions(shadows=options.shadows, occlusion=options.shadows)
     for index, time in enumerate(options.times, start=1):
         still = moment(field, time)

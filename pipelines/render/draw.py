@@ -20,15 +20,14 @@ from .film import ANIMATIONS, write_animation
 from .legend import with_color_bar
 from .light import load_matcap
 from .picture import Image, check_picture_path, contact_sheet, write_picture
-from .shade import ShadeOptions, compose, downsample, measure, shade, value_limits
+from .shade import ShadeOptions, compose, default_shading, downsample, measure, shade, value_limits
 from .subject import Orbit, Panel, Subject, open_subject, orbit_cameras, posed_cameras, reference_distance
-from .trace import Seen
+from .trace import Seen, fine_strips
 
 __all__ = ["RenderOptions", "render_run"]
 
 Color = tuple[float, float, float]
 
-STRIP = 1 << 19  # pixels that are worked on at a time: about a third of a gigabyte
 PREVIEW = 160  # pixels on the longer side of the pictures from which colour maps take their limits
 PREVIEWS = 12  # of a film
 # What colours show, as the legend calls it, and the power of the input's unit it is measured in.
@@ -155,7 +154,7 @@ class _Artist:
             InputError: it cannot.
         """
         self.subject, self.options = subject, options
-        self.shading = options.shading or _default_shading(subject)
+        self.shading = options.shading or default_shading(oriented=subject.oriented, colored=subject.colored)
         # Normals do not show in depths and errors: another level's would only repeat a picture.
         mapped = self.shading not in ("depth", "error")
         self.panels = [
@@ -193,14 +192,13 @@ class _Artist:
 
     def pictures(self, cameras: Sequence[Camera], progress: Callable[[int, int], None] | None) -> Iterator[Image]:
         """The picture from each camera."""
-        per_picture = len(self.panels) * len(list(self._strips(cameras[0])))
-        total = per_picture * len(cameras)
-        for index, camera in enumerate(cameras):
-            done = index * per_picture
+        samples, done = self.options.samples, 0
+        total = len(self.panels) * sum(len(fine_strips(camera, samples)) for camera in cameras)
+        for camera in cameras:
             tiles = []
             for panel in self.panels:
                 parts = []
-                for strip in self._strips(camera):
+                for strip in fine_strips(camera, samples):
                     parts.append(self._draw(strip, panel))
                     done += 1
                     if progress is not None:
@@ -217,14 +215,6 @@ class _Artist:
             low, high = (limit * self.unit for limit in self.shade_options.limits)
             words[1] += f" from {low:.4g} to {high:.4g}"
         return ", ".join(words) + ("" if self.anything else "; nothing of it is in view")
-
-    def _strips(self, camera: Camera) -> Iterator[Camera]:
-        """The camera, cut into strips of rows that are worked on one after the other."""
-        samples = self.options.samples
-        rows = max(1, STRIP // samples**2 // camera.width)
-        for first in range(0, camera.height, rows):
-            height = min(rows, camera.height - first)
-            yield camera.strip(first, height).resized(camera.width * samples, height * samples)
 
     def _draw(self, camera: Camera, panel: Panel) -> Image:
         seen = self.subject.view(camera, panel)
@@ -274,9 +264,3 @@ class _Artist:
         forward = camera.forward.float().expand(256, 3)
         facing = Seen((256, 1), torch.arange(256), values, forward, -forward, forward)
         return shade(facing, self.shading, camera=camera, options=self.shade_options, values=values).numpy()
-
-
-def _default_shading(subject: Subject) -> str:
-    if subject.oriented:
-        return "lambert"
-    return "color" if subject.colored else "depth"

@@ -1,10 +1,8 @@
-"""A colour bar under a picture: what the colours of its map mean.
-
-What stands under the picture of a slice: where it is, its scale, and what its colours and lines mean.
-"""
+"""What stands under a picture: a colour bar, or what the colours and lines of a slice mean, and its scale."""
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -13,16 +11,19 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from .picture import Image, as_bytes
 from .slice import FADE, FINEST, LINE, TINT, Color, Slice, distance_color, level_color, round_step
 
 __all__ = ["with_color_bar", "with_legend"]
 
-Image = NDArray[np.uint8]
 Floats = NDArray[np.float32]
 
-DARK, LIGHT = (0.20, 0.22, 0.27), (0.92, 0.93, 0.95)
+DARK: Color = (0.20, 0.22, 0.27)  # ink on light paper
+LIGHT: Color = (0.92, 0.93, 0.95)  # and on dark paper
 LONGEST = 36  # of the bar, in text heights
 LABEL = 7  # room for the number under a tick, in text heights
+CAPTION_WIDTH = 9.5  # in text heights: a place wide enough for any number, so that nothing moves in an animation
+SUBSCRIPTS = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
 
 
 def with_color_bar(
@@ -56,17 +57,15 @@ def with_color_bar(
     index = np.rint(np.linspace(0, len(colors) - 1, length)).astype(np.int64)
     strip[top:bottom, margin : margin + length, :3] = colors[index, :3][: max(0, width - margin)]
     strip[top:bottom, margin : margin + length, 3] = 1
-    font = cv2.FontFace("uni")
-    _write(strip, title, (margin, round(1.2 * text)), font, text, ink)
+    _write(strip, title, (margin, round(1.2 * text)), text, ink)
     for value, label in _ticks(limits, max(2, length // (LABEL * text))):
         low, high = limits
         x = margin + round((value - low) / (high - low) * (length - 1))
         strip[bottom : bottom + text // 3, x : x + max(1, text // 8)] = (*ink, 1)
-        half = _text_width(label, font, text) // 2
+        half = _text_width(label, text) // 2
         left = min(max(x - half, margin // 2), max(margin // 2, width - 2 * half - margin // 2))
-        _write(strip, label, (left, round(4.3 * text)), font, text, ink)
-    strip = (strip.clip(0, 1) * 255 + 0.5).astype(np.uint8)
-    return np.concatenate((picture, strip[..., : picture.shape[2]]))
+        _write(strip, label, (left, round(4.3 * text)), text, ink)
+    return np.concatenate((picture, as_bytes(strip[..., : picture.shape[2]])))
 
 
 def _ticks(limits: tuple[float, float], count: int) -> list[tuple[float, str]]:
@@ -80,32 +79,13 @@ def _ticks(limits: tuple[float, float], count: int) -> list[tuple[float, str]]:
     return [(float(n * step), f"{n * step:.{digits}f}".replace("-", "−")) for n in numbers]
 
 
-def _text_width(words: str, font: cv2.FontFace, text: int) -> int:
-    return int(cv2.getTextSize((0, 0), words, (0, 0), font, text)[2])
-
-
-def _write(
-    strip: Floats, words: str, place: tuple[int, int], font: cv2.FontFace, text: int, ink: tuple[float, float, float]
-) -> None:
-    """Words from ``place``, the middle of their left side; cv2 draws them on bytes, which serve as a mask."""
-    mask = np.zeros((*strip.shape[:2], 3), np.uint8)
-    cv2.putText(mask, words, (place[0], place[1] + round(0.36 * text)), (255, 255, 255), font, text)
-    cover = mask[..., :1].astype(np.float32) / 255
-    strip += cover * (np.array((*ink, 1), np.float32) - strip)
-
-
-TEXT: Color = (0.20, 0.22, 0.27)
-SUBSCRIPTS = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
-CAPTION_WIDTH = 9.5  # in text heights: a place wide enough for any number, so that nothing moves in an animation
-
-
 @dataclass(frozen=True)
 class _Entry:
     """A drawing and the words after it; ``draw`` paints on ``(rows, width, 3)`` float RGB, ``rows`` high."""
 
     width: int
     words: str
-    draw: Callable[[NDArray[np.float32]], None]
+    draw: Callable[[Floats], None]
     least: int = 0  # room it takes at least
 
 
@@ -124,10 +104,9 @@ def with_legend(
     """
     width = picture.shape[1]
     text = round(float(np.clip(width / 48, 9, 40)))
-    font = cv2.FontFace("uni")
     entries = _entries(taken, text, width, caption=caption, iso_step=iso_step, unit=unit, bands=bands)
     margin, gap, row = text, round(1.6 * text), round(1.9 * text)
-    room = [max(entry.least, entry.width + text // 2 + _text_width(entry.words, font, text)) for entry in entries]
+    room = [max(entry.least, entry.width + text // 2 + _text_width(entry.words, text)) for entry in entries]
     places, x, line = [], margin, 0
     for needed in room:
         if x > margin and x + needed > width - margin:
@@ -139,8 +118,8 @@ def with_legend(
         top = text // 2 + line * row
         entry.draw(strip[top : top + row, left : left + entry.width])
         start = left + (entry.width + text // 2 if entry.width else 0)
-        _write_words(strip, entry.words, (start, top + row // 2), font, text)
-    return np.concatenate((picture, (strip.clip(0, 1) * 255 + 0.5).astype(np.uint8)))
+        _write(strip, entry.words, (start, top + row // 2), text, DARK)
+    return np.concatenate((picture, as_bytes(strip)))
 
 
 def _entries(
@@ -168,25 +147,25 @@ def _entries(
     return entries
 
 
-def _scale_bar(area: NDArray[np.float32]) -> None:
+def _scale_bar(area: Floats) -> None:
     middle, tick = area.shape[0] // 2, area.shape[0] // 6
-    area[middle - 1 : middle + 1] = TEXT
-    area[middle - tick : middle + tick, [0, 1, -2, -1]] = TEXT
+    area[middle - 1 : middle + 1] = DARK
+    area[middle - tick : middle + tick, [0, 1, -2, -1]] = DARK
 
 
-def _ramp(area: NDArray[np.float32], reach: float) -> None:
+def _ramp(area: Floats, reach: float) -> None:
     third = area.shape[0] // 3
     distance = np.linspace(-2.5 * reach, 2.5 * reach, area.shape[1]).astype(np.float32)
     area[third:-third] = distance_color(distance, reach=reach, slope=5 * reach / area.shape[1])
 
 
-def _line(area: NDArray[np.float32], color: Color, width: float) -> None:
+def _line(area: Floats, color: Color, width: float) -> None:
     middle = area.shape[0] // 2
     rows = round(max(1, width * area.shape[0] / 32))
     area[middle - rows // 2 : middle - rows // 2 + rows] = color
 
 
-def _swatch(area: NDArray[np.float32], color: Color) -> None:
+def _swatch(area: Floats, color: Color) -> None:
     """A band as it looks: its tint over both sides of the surface, with its outline."""
     third = area.shape[0] // 4
     box = area[third:-third]
@@ -196,8 +175,19 @@ def _swatch(area: NDArray[np.float32], color: Color) -> None:
     inner[:] = (1 - TINT) * distance_color(distance, reach=20.0, slope=0.1) + np.multiply(TINT, color)
 
 
-def _write_words(strip: NDArray[np.float32], words: str, place: tuple[int, int], font: cv2.FontFace, text: int) -> None:
+def _text_width(words: str, text: int) -> int:
+    return int(cv2.getTextSize((0, 0), words, (0, 0), _font(), text)[2])
+
+
+def _write(strip: Floats, words: str, place: tuple[int, int], text: int, ink: Color) -> None:
     """Words from ``place``, the middle of their left side; cv2 draws them on bytes, which serve as a mask."""
-    mask = np.zeros(strip.shape, np.uint8)
-    cv2.putText(mask, words, (place[0], place[1] + round(0.36 * text)), (255, 255, 255), font, text)
-    strip += mask.astype(np.float32) / 255 * (np.asarray(TEXT, np.float32) - strip)
+    mask = np.zeros((*strip.shape[:2], 3), np.uint8)
+    cv2.putText(mask, words, (place[0], place[1] + round(0.36 * text)), (255, 255, 255), _font(), text)
+    cover = mask[..., :1].astype(np.float32) / 255
+    strip += cover * (np.array((*ink, 1)[: strip.shape[2]], np.float32) - strip)
+
+
+@functools.cache
+def _font() -> cv2.FontFace:
+    """OpenCV's own sans-serif, which has all of Unicode that we write."""
+    return cv2.FontFace("uni")

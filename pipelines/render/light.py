@@ -1,10 +1,7 @@
-"""How much light reaches points of a surface, asked of the field itself: soft shadows and ambient occlusion.
+"""What shades a surface: soft shadows, ambient occlusion and curvature, asked of the field itself, and matcaps.
 
-Both work on any `Field` in the unit sphere and cost nothing for rays that are decided: those are gathered away.
-
-Mean curvature of a field's level sets.
-
-Material captures: the picture of a lit sphere, from which every normal takes its colour.
+The first three work on any `Field` in the unit sphere; shadow rays that are decided are gathered away and cost nothing.
+A material capture is the picture of a lit sphere, from which every normal takes its colour.
 """
 
 from __future__ import annotations
@@ -16,12 +13,17 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn.functional import grid_sample, normalize
 
 from ...neural_fields import Field, InputError
 from ...neural_fields.tracing import BOUNDING_RADIUS
 
 __all__ = ["MATCAPS", "ambient_occlusion", "level_set_curvature", "load_matcap", "sample_matcap", "soft_shadow"]
 
+Float32 = NDArray[np.float32]
+
+MATCAPS = ("clay", "chrome")
+SIZE = 256  # of those, in pixels
 # Steps inside the penumbra, in radii of the cone: with 0.5 streaks show on curved surfaces.
 STRIDE = 0.2
 # u below which a ray is given up as dark: v is 0.001 there, and steps only get smaller.
@@ -167,14 +169,10 @@ def level_set_curvature(field: Field, points: Tensor, *, level: int = -1, step: 
     """
     if not step > 0:
         raise ValueError(f"step={step}: expected a number > 0")
-    tangents = _tangents(_unit(field.jet(points, level=level).gradient))  # (2, P, 3)
+    tangents = _tangents(normalize(field.jet(points, level=level).gradient, dim=-1))  # (2, P, 3)
     offsets = step * torch.stack((tangents, -tangents))  # (2, 2, P, 3)
-    normals = _unit(field.jet(points + offsets, level=level).gradient)
+    normals = normalize(field.jet(points + offsets, level=level).gradient, dim=-1)
     return (tangents * (normals[0] - normals[1])).sum((0, -1)) / (4 * step)
-
-
-def _unit(gradient: Tensor) -> Tensor:
-    return torch.nn.functional.normalize(gradient, dim=-1)
 
 
 def _tangents(n: Tensor) -> Tensor:
@@ -186,12 +184,6 @@ def _tangents(n: Tensor) -> Tensor:
     first = torch.stack((1 + sign * x * x * a, sign * b, -sign * x), -1)
     second = torch.stack((b, sign + y * y * a, -y), -1)
     return torch.stack((first, second))
-
-
-Float32 = NDArray[np.float32]
-
-MATCAPS = ("clay", "chrome")
-SIZE = 256
 
 
 def load_matcap(name: str | Path) -> Tensor:
@@ -226,7 +218,7 @@ def sample_matcap(matcap: Tensor, normals: Tensor) -> Tensor:
     across = across * (kept / length.clamp(min=1e-6))
     grid = torch.stack((across[:, 0], -across[:, 1]), -1)[None, :, None]  # (1, P, 1, 2)
     texture = matcap.to(normals).movedim(-1, 0)[None]  # (1, 3, H, W)
-    found = torch.nn.functional.grid_sample(texture, grid, padding_mode="border", align_corners=False)
+    found = grid_sample(texture, grid, padding_mode="border", align_corners=False)
     return found[0, :, :, 0].T
 
 

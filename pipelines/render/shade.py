@@ -1,6 +1,6 @@
 """Colours for what an image sees: pure functions of `Seen`, on its device, for the pixels that see something.
 
-Colours for numbers.
+Fields, meshes and clouds, in pictures, films and the viewer, all stand under these lamps and have these colour maps.
 """
 
 from __future__ import annotations
@@ -27,11 +27,14 @@ __all__ = [
     "ShadeOptions",
     "apply_color_map",
     "compose",
+    "default_shading",
     "downsample",
     "measure",
     "shade",
     "value_limits",
 ]
+
+Float32 = NDArray[np.float32]
 
 GAMMA = 2.2  # between display values, in which images are stored, and light, which adds up
 
@@ -48,6 +51,34 @@ BACK_TINT = (0.62, 0.36, 0.33)
 SEEN_FROM_BEHIND = 0.2
 
 _MAPS = {"depth": "viridis", "curvature": "diverging", "error": "magma"}
+# Blue – pale – red, in display RGB: the ends equally dark, the middle almost the white of the page.
+_DIVERGING = ((0.09, 0.25, 0.55), (0.36, 0.60, 0.83), (0.94, 0.94, 0.92), (0.90, 0.52, 0.34), (0.60, 0.10, 0.14))
+
+
+def _from_opencv(name: int) -> Float32:
+    ramp = np.arange(256, dtype=np.uint8)[:, None]
+    return np.ascontiguousarray(cv2.applyColorMap(ramp, name)[:, 0, ::-1]) / np.float32(255)
+
+
+def _between(anchors: tuple[tuple[float, float, float], ...]) -> Float32:
+    at = np.linspace(0, 1, len(anchors))
+    ramp = np.linspace(0, 1, 257)
+    return np.stack([np.interp(ramp, at, channel) for channel in zip(*anchors, strict=True)], 1).astype(np.float32)
+
+
+# (K, 3) tables in display RGB, from the low end to the high one.
+COLOR_MAPS: dict[str, Float32] = {
+    "viridis": _from_opencv(cv2.COLORMAP_VIRIDIS),
+    "magma": _from_opencv(cv2.COLORMAP_MAGMA),
+    "diverging": _between(_DIVERGING),
+}
+
+
+def default_shading(*, oriented: bool, colored: bool) -> str:
+    """The shading of what has normals, or at least colours, or neither: "lambert", "color" or "depth"."""
+    if oriented:
+        return "lambert"
+    return "color" if colored else "depth"
 
 
 def shade(
@@ -163,6 +194,24 @@ def value_limits(values: Tensor, shading: str, options: ShadeOptions) -> tuple[f
     return (-high if shading == "curvature" else 0.0), high
 
 
+def apply_color_map(values: Tensor, limits: tuple[float, float], table: Float32) -> Tensor:
+    """Colours of ``values`` ``(P,)`` → ``(P, 3)``, linear between the entries of ``table`` and clamped at its ends.
+
+    Args:
+        values: numbers.
+        limits: the values at the first and at the last entry; they may run backwards. Where they are equal, all
+            values get the middle.
+        table: ``(K, 3)`` display RGB.
+    """
+    low, high = limits
+    share = (values - low) / (high - low) if high != low else torch.full_like(values, 0.5)
+    colors = torch.as_tensor(table, dtype=values.dtype, device=values.device)
+    place = share.clamp(0, 1) * (len(table) - 1)
+    lower = place.floor().clamp(max=len(table) - 2)
+    index = lower.long()
+    return torch.lerp(colors[index], colors[index + 1], (place - lower)[:, None])
+
+
 def compose(seen: Seen, rgb: Tensor, *, background: Sequence[float] | None = (1.0, 1.0, 1.0)) -> Image:
     """Put colours ``(P, 3)`` into an image: ``(H, W, 3)`` on a background; without one ``(H, W, 4)``, transparent."""
     width, height = seen.size
@@ -267,46 +316,3 @@ def _view_normals(seen: Seen, camera: Camera) -> Tensor:
     right = torch.nn.functional.normalize(right, dim=-1)
     up = torch.linalg.cross(towards, right)
     return torch.stack([(seen.normal * axis).sum(-1) for axis in (right, up, towards)], -1)
-
-
-Float32 = NDArray[np.float32]
-
-# Blue – pale – red, in display RGB: the ends equally dark, the middle almost the white of the page.
-_DIVERGING = ((0.09, 0.25, 0.55), (0.36, 0.60, 0.83), (0.94, 0.94, 0.92), (0.90, 0.52, 0.34), (0.60, 0.10, 0.14))
-
-
-def _from_opencv(name: int) -> Float32:
-    ramp = np.arange(256, dtype=np.uint8)[:, None]
-    return np.ascontiguousarray(cv2.applyColorMap(ramp, name)[:, 0, ::-1]) / np.float32(255)
-
-
-def _between(anchors: tuple[tuple[float, float, float], ...]) -> Float32:
-    at = np.linspace(0, 1, len(anchors))
-    ramp = np.linspace(0, 1, 257)
-    return np.stack([np.interp(ramp, at, channel) for channel in zip(*anchors, strict=True)], 1).astype(np.float32)
-
-
-# (K, 3) tables in display RGB, from the low end to the high one.
-COLOR_MAPS: dict[str, Float32] = {
-    "viridis": _from_opencv(cv2.COLORMAP_VIRIDIS),
-    "magma": _from_opencv(cv2.COLORMAP_MAGMA),
-    "diverging": _between(_DIVERGING),
-}
-
-
-def apply_color_map(values: Tensor, limits: tuple[float, float], table: Float32) -> Tensor:
-    """Colours of ``values`` ``(P,)`` → ``(P, 3)``, linear between the entries of ``table`` and clamped at its ends.
-
-    Args:
-        values: numbers.
-        limits: the values at the first and at the last entry; they may run backwards. Where they are equal, all
-            values get the middle.
-        table: ``(K, 3)`` display RGB.
-    """
-    low, high = limits
-    share = (values - low) / (high - low) if high != low else torch.full_like(values, 0.5)
-    colors = torch.as_tensor(table, dtype=values.dtype, device=values.device)
-    place = share.clamp(0, 1) * (len(table) - 1)
-    lower = place.floor().clamp(max=len(table) - 2)
-    index = lower.long()
-    return torch.lerp(colors[index], colors[index + 1], (place - lower)[:, None])

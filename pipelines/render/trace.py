@@ -1,12 +1,13 @@
 """From a field and a camera to what every pixel sees: the coarse-to-fine trace, then one jet for each pixel.
 
-What the pixels of an image see of a surface, whether it was traced in a field or rasterised from a mesh.
+`Seen` is the same whether a surface was traced in a field or rasterised from a mesh. Images that are too large to be
+worked on at once are cut into strips.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -16,8 +17,18 @@ from ...datasets.cameras import Camera
 from ...neural_fields import Field, Hits, TextureField, cone_starts, map_colors, sphere_trace
 from ...neural_fields.tracing import BOUNDING_RADIUS, CONE_LIPSCHITZ
 
-__all__ = ["Seen", "pixel_size", "see_hits", "trace_hits", "trace_view"]
+__all__ = [
+    "Seen",
+    "fine_strips",
+    "merge_strips",
+    "pixel_size",
+    "see_hits",
+    "strips",
+    "trace_hits",
+    "trace_view",
+]
 
+STRIP = 1 << 19  # pixels that are worked on at a time: about a third of a gigabyte
 # A trace ends within this share of a pixel; the jet's Newton step, which costs nothing, then leaves about its square.
 TOLERANCE = 0.1
 # Two crossings within this share of a pixel may be overlooked.
@@ -28,6 +39,69 @@ NEWTON_REACH = 2 * TOLERANCE
 SHALLOW = 0.05
 # A camera in the shape looks at things at least this far away, in the field's units.
 NEAREST = 0.05
+
+
+@dataclass(frozen=True)
+class Seen:
+    """One row for each pixel that sees the surface; nothing is kept, or shaded, for the others.
+
+    Attributes:
+        size: width and height of the image.
+        pixel: ``(P,)`` int64, row-major: ``y * width + x``.
+        depth: ``(P,)`` distance from the eye along the pixel's ray.
+        position: ``(P, 3)`` the point seen.
+        normal: ``(P, 3)`` unit outward normal there.
+        direction: ``(P, 3)`` unit direction of the ray, away from the eye.
+        color: ``(P, 3)`` the surface's own colour in [0, 1], where it has one.
+    """
+
+    size: tuple[int, int]
+    pixel: Tensor
+    depth: Tensor
+    position: Tensor
+    normal: Tensor
+    direction: Tensor
+    color: Tensor | None = None
+
+    def part(self, rows: slice) -> Seen:
+        """Some of the rows."""
+        names = ("pixel", "depth", "position", "normal", "direction")
+        kept = {name: getattr(self, name)[rows] for name in names}
+        return replace(self, **kept, color=None if self.color is None else self.color[rows])
+
+
+def strips(camera: Camera, pixels: Callable[[], int]) -> Iterator[tuple[int, Camera]]:
+    """Cut a camera into strips of whole rows: the first row and the camera of each.
+
+    Args:
+        camera: of the whole image.
+        pixels: asked before each strip for about how many pixels it is to have.
+    """
+    first = 0
+    while first < camera.height:
+        rows = min(max(1, pixels() // camera.width), camera.height - first)
+        yield first, camera.strip(first, rows)
+        first += rows
+
+
+def fine_strips(camera: Camera, samples: int) -> list[Camera]:
+    """A camera as strips of `STRIP` pixels at most, each with ``samples`` pixels per pixel and direction."""
+    parts = (part for _, part in strips(camera, lambda: STRIP // samples**2))
+    return [part.resized(part.width * samples, part.height * samples) for part in parts]
+
+
+def merge_strips(size: tuple[int, int], parts: Sequence[tuple[int, Seen]]) -> Seen:
+    """What the whole image sees, from what its strips see and the row that each begins at."""
+    colors = [part.color for _, part in parts if part.color is not None]
+    return Seen(
+        size=size,
+        pixel=torch.cat([part.pixel + first * size[0] for first, part in parts]),
+        depth=torch.cat([part.depth for _, part in parts]),
+        position=torch.cat([part.position for _, part in parts]),
+        normal=torch.cat([part.normal for _, part in parts]),
+        direction=torch.cat([part.direction for _, part in parts]),
+        color=torch.cat(colors) if len(colors) == len(parts) else None,
+    )
 
 
 @torch.inference_mode()
@@ -121,26 +195,3 @@ def pixel_size(camera: Camera) -> float:
     """Width of a pixel at the near side of the ball that holds the surface, in the field's units."""
     distance = max(float(camera.eye.norm()) - BOUNDING_RADIUS, NEAREST)
     return distance / max(float(camera.intrinsics[0, 0]), float(camera.intrinsics[1, 1]))
-
-
-@dataclass(frozen=True)
-class Seen:
-    """One row for each pixel that sees the surface; nothing is kept, or shaded, for the others.
-
-    Attributes:
-        size: width and height of the image.
-        pixel: ``(P,)`` int64, row-major: ``y * width + x``.
-        depth: ``(P,)`` distance from the eye along the pixel's ray.
-        position: ``(P, 3)`` the point seen.
-        normal: ``(P, 3)`` unit outward normal there.
-        direction: ``(P, 3)`` unit direction of the ray, away from the eye.
-        color: ``(P, 3)`` the surface's own colour in [0, 1], where it has one.
-    """
-
-    size: tuple[int, int]
-    pixel: Tensor
-    depth: Tensor
-    position: Tensor
-    normal: Tensor
-    direction: Tensor
-    color: Tensor | None = None

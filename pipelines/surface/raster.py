@@ -40,12 +40,14 @@ class Clipped(NamedTuple):
 
     Attributes:
         faces: ``(F', 3)`` indices of old vertices, and of new ones from V on.
+        owner: ``(F',)`` the old triangle that each is a part of.
         kept: ``(K,)`` old vertex on the near side of the edge that new vertex k cuts.
         dropped: ``(K,)`` the one on the far side.
         share: ``(K,)`` how far from the first to the second the plane is.
     """
 
     faces: Int64
+    owner: Int64
     kept: Int64
     dropped: Int64
     share: Float64
@@ -59,24 +61,28 @@ def clip(height: Float64, faces: Int64) -> Clipped:
     """
     positive = height > 0
     count = positive[faces].sum(axis=1)
-    parts, ends = [faces[count == 3]], []
+    owner = [np.flatnonzero(count == 3)]
+    parts, ends = [faces[owner[0]]], []
     new = len(height)
     for corners in (1, 2):
-        cut = faces[count == corners]
+        of = np.flatnonzero(count == corners)
+        cut = faces[of]
         # Turn the corner that is alone on its side to the front; the order of the other two stays.
         alone = (positive[cut] == (corners == 1)).argmax(axis=1)
         a, b, c = cut[np.arange(len(cut))[:, None], (alone[:, None] + np.arange(3)) % 3].T
         ab, ac = new + np.arange(len(cut)), new + len(cut) + np.arange(len(cut))
         new += 2 * len(cut)
         if corners == 1:
+            owner.append(of)
             parts.append(np.stack((a, ab, ac), axis=1))
             ends.append((np.concatenate((a, a)), np.concatenate((b, c))))
         else:
+            owner += [of, of]
             parts.extend((np.stack((ab, b, c), axis=1), np.stack((ab, c, ac), axis=1)))
             ends.append((np.concatenate((b, c)), np.concatenate((a, a))))
     kept, dropped = (np.concatenate(side) for side in zip(*ends, strict=True))
     share = height[kept] / (height[kept] - height[dropped])
-    return Clipped(np.concatenate(parts), kept, dropped, share)
+    return Clipped(np.concatenate(parts), np.concatenate(owner), kept, dropped, share)
 
 
 def cover(xy: Float64, faces: Int64, shape: tuple[int, int], *, chunk: int = CHUNK) -> Iterator[Coverage]:

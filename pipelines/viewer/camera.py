@@ -1,12 +1,9 @@
-"""What the viewer computes about cameras and images, apart from any browser.
-
-What is under the pointer: where it is, and what the field says there.
-"""
+"""What the viewer works out apart from any browser: its cameras, depths for it, and what is under the pointer."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,9 +20,7 @@ __all__ = [
     "describe_reading",
     "first_eye",
     "image_size",
-    "merge_strips",
     "probe",
-    "strips",
     "viser_camera",
     "z_buffer",
 ]
@@ -69,34 +64,6 @@ def image_size(side: int, canvas: tuple[int, int]) -> tuple[int, int]:
     width, height = (max(number, 1) for number in canvas)
     factor = min(1.0, side / math.sqrt(width * height))
     return max(1, round(width * factor)), max(1, round(height * factor))
-
-
-def strips(camera: Camera, pixels: Callable[[], int]) -> Iterator[tuple[int, Camera]]:
-    """Cut a camera into strips of whole rows: the first row and the camera of each.
-
-    Args:
-        camera: of the whole image.
-        pixels: asked before each strip for about how many pixels it is to have.
-    """
-    first = 0
-    while first < camera.height:
-        rows = min(max(1, pixels() // camera.width), camera.height - first)
-        yield first, camera.strip(first, rows)
-        first += rows
-
-
-def merge_strips(size: tuple[int, int], parts: Sequence[tuple[int, Seen]]) -> Seen:
-    """What the whole image sees, from what its strips see and the row that each begins at."""
-    colors = [part.color for _, part in parts if part.color is not None]
-    return Seen(
-        size=size,
-        pixel=torch.cat([part.pixel + first * size[0] for first, part in parts]),
-        depth=torch.cat([part.depth for _, part in parts]),
-        position=torch.cat([part.position for _, part in parts]),
-        normal=torch.cat([part.normal for _, part in parts]),
-        direction=torch.cat([part.direction for _, part in parts]),
-        color=torch.cat(colors) if len(colors) == len(parts) else None,
-    )
 
 
 def z_buffer(seen: Seen, camera: Camera) -> NDArray[np.float32]:

@@ -1,7 +1,4 @@
-"""The traced image of a field, in pieces small enough to stop between them.
-
-The moments of a field that moves, as the viewer asks for them.
-"""
+"""The traced image of a field, or of the moments of one that moves, in pieces small enough to stop between them."""
 
 from __future__ import annotations
 
@@ -10,7 +7,6 @@ import threading
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -24,9 +20,9 @@ from ...neural_fields import Field, TextureField, map_colors
 from ...neural_fields.dynamic_tracing import moment
 from ..render.light import load_matcap
 from ..render.shade import ShadeOptions, compose, measure, shade
-from ..render.trace import Seen, trace_view
+from ..render.trace import Seen, merge_strips, strips, trace_view
 from ..texture.riding import Colors, RidingColors
-from .camera import merge_strips, strips, z_buffer
+from .camera import z_buffer
 from .frames import Look
 
 __all__ = ["Moments", "Painter"]
@@ -151,15 +147,7 @@ def _pieces(seen: Seen, next_block: Callable[[], int]) -> Iterator[Seen]:
     first = 0
     while first < max(1, len(seen.pixel)):
         part = slice(first, first + next_block())
-        yield replace(
-            seen,
-            pixel=seen.pixel[part],
-            depth=seen.depth[part],
-            position=seen.position[part],
-            normal=seen.normal[part],
-            direction=seen.direction[part],
-            color=None if seen.color is None else seen.color[part],
-        )
+        yield seen.part(part)
         first = part.stop
 
 

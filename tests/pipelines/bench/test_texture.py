@@ -17,7 +17,7 @@ from mplicits.pipelines.bench.texture import PAPER_MSE, TextureRow, bench_textur
 from mplicits.pipelines.cli import bench as bench_colour_commands
 from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.render.compare import Drawing, ImageError, draw, image_error, psnr
-from mplicits.pipelines.render.rasterise import textured_view
+from mplicits.pipelines.render.rasterise import mesh_view
 from mplicits.pipelines.render.trace import Seen
 from mplicits.pipelines.run.settings import FitConfig, TextureConfig
 
@@ -45,7 +45,7 @@ def ramp(size: int) -> np.ndarray:
 
 def test_a_square_seen_from_the_front_is_its_image():
     image = np.random.default_rng(0).random((8, 8, 3))
-    seen = textured_view(square(image), front(8))
+    seen = mesh_view(square(image), front(8))
     assert seen.pixel.tolist() == list(range(64))
     assert seen.color is not None
     np.testing.assert_allclose(seen.color.numpy().reshape(8, 8, 3), image, atol=1e-6)
@@ -57,7 +57,7 @@ def test_a_square_seen_from_the_front_is_its_image():
 
 def test_between_texels_light_is_interpolated_linearly():
     image = np.random.default_rng(1).random((4, 4, 3)).astype(np.float32)
-    seen = textured_view(square(image), front(8))
+    seen = mesh_view(square(image), front(8))
     assert seen.color is not None
     shown = seen.color.numpy().reshape(8, 8, 3)
     light = srgb_to_linear(image)
@@ -71,7 +71,7 @@ def test_between_texels_light_is_interpolated_linearly():
 def test_a_tilted_square_is_interpolated_in_space_and_not_on_the_screen():
     turn = trimesh.transformations.rotation_matrix(1.1, [0.0, 1.0, 0.0])[:3, :3]
     camera = look_at((0.3, 0.4, 3.0), (0.0, 0.0, 0.0), fov=50, width=60, height=40)
-    seen = textured_view(square(ramp(64), CORNERS @ turn.T), camera)
+    seen = mesh_view(square(ramp(64), CORNERS @ turn.T), camera)
     eye, directions = camera.rays(dtype=torch.float64)
     rays = directions.reshape(-1, 3).numpy() @ turn  # in the square's own axes
     start = eye.numpy() @ turn
@@ -92,7 +92,7 @@ def test_the_nearer_of_two_faces_is_seen_and_what_is_behind_the_camera_is_not():
     both = np.concatenate((CORNERS, 0.5 * CORNERS + ahead, CORNERS + 5 * ahead))
     colors = np.repeat(np.eye(3, dtype=np.float32), 4, axis=0)
     faces = np.concatenate((TRIANGLES, TRIANGLES + 4, TRIANGLES + 8))
-    seen = textured_view(TexturedMesh(both, faces, vertex_colors=colors), front(40))
+    seen = mesh_view(TexturedMesh(both, faces, vertex_colors=colors), front(40))
     assert seen.color is not None
     shown = seen.color.reshape(40, 40, 3).numpy()
     # The small square, at two thirds of the distance, covers three quarters of the image.
@@ -103,9 +103,9 @@ def test_the_nearer_of_two_faces_is_seen_and_what_is_behind_the_camera_is_not():
 
 def test_map_coordinates_lose_nothing():
     away = np.array([400_000.0, 5_600_000.0, 100.0])
-    near = textured_view(square(ramp(32)), front(24))
+    near = mesh_view(square(ramp(32)), front(24))
     camera = look_at(away + np.array([0.0, 0.0, 3.0]), away, fov=FILLING, width=24, height=24)
-    far = textured_view(square(ramp(32), CORNERS + away), camera)
+    far = mesh_view(square(ramp(32), CORNERS + away), camera)
     torch.testing.assert_close(far.color, near.color, atol=1e-4, rtol=0)
     torch.testing.assert_close(far.depth, near.depth, atol=1e-5, rtol=0)
 

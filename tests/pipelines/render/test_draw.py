@@ -17,7 +17,7 @@ from mplicits.neural_fields import InputError, MultiscaleSDF, Similarity, Siren,
 from mplicits.neural_fields.meshing import extract_mesh
 from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.mesh.files import write_mesh
-from mplicits.pipelines.render import draw as render_run_module
+from mplicits.pipelines.render import trace
 from mplicits.pipelines.render.draw import RenderOptions, render_run
 from mplicits.pipelines.render.legend import with_color_bar
 from mplicits.pipelines.render.rasterise import mesh_view
@@ -252,7 +252,7 @@ def test_shadows_and_occlusion_are_on_for_fields_and_can_be_left_out(shapes, tmp
 def test_strips_do_not_show(shapes, tmp_path, monkeypatch):
     arguments = ("--shading", "depth", "--levels")
     whole = render(shapes, "blob.safetensors", tmp_path / "a.png", *arguments)
-    monkeypatch.setattr(render_run_module, "STRIP", 24 * 4 * 5)
+    monkeypatch.setattr(trace, "STRIP", 24 * 4 * 5)
     steps = []
     options = RenderOptions(size=(24,), shading="depth", levels=True)
     render_run(shapes / "blob.safetensors", tmp_path / "b.png", options, progress=lambda *done: steps.append(done))

@@ -31,9 +31,7 @@ from mplicits.pipelines.viewer.camera import (
     describe_reading,
     first_eye,
     image_size,
-    merge_strips,
     probe,
-    strips,
     viser_camera,
     z_buffer,
 )
@@ -78,18 +76,6 @@ def test_image_has_the_shape_of_the_canvas_and_is_never_larger(canvas):
     assert height <= canvas[1]
     assert width / height == pytest.approx(canvas[0] / canvas[1], rel=0.01)
     assert width * height == pytest.approx(min(256**2, canvas[0] * canvas[1]), rel=0.01)
-
-
-def test_strips_see_together_what_the_camera_sees():
-    camera, field = some_camera(), Sphere(radius=0.5)
-    parts = list(strips(camera, lambda: 64 * 7))
-    assert [first for first, _ in parts] == list(range(0, 48, 7))
-    directions = torch.cat([strip.rays(dtype=torch.float64)[1] for _, strip in parts])
-    torch.testing.assert_close(directions, camera.rays(dtype=torch.float64)[1], rtol=0, atol=1e-12)
-    whole, merged = trace_view(field, camera), merge_strips((64, 48), [(y, trace_view(field, c)) for y, c in parts])
-    assert merged.size == whole.size
-    assert torch.equal(merged.pixel, whole.pixel)
-    torch.testing.assert_close(merged.depth, whole.depth, rtol=0, atol=1e-4)
 
 
 def test_z_buffer_is_distance_from_the_plane_of_the_eye():
