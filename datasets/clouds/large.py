@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from .point_cloud import PointCloud, colors_from, normals_from, unit_rows
+from .point_cloud import PointCloud, begins, colors_from, normals_from, unit_rows
 from .stream import CloudStream
 
 __all__ = ["Merging", "merge_cloud"]
@@ -70,7 +70,7 @@ class Merging:
         return f"{text}; dropped {dropped}" if dropped else text
 
 
-class _Frame(NamedTuple):
+class _Survey(NamedTuple):
     """Where a cloud lies, and what it stores.
 
     Attributes:
@@ -150,7 +150,7 @@ def merge_cloud(
     )
 
 
-def _survey(stream: CloudStream) -> _Frame:
+def _survey(stream: CloudStream) -> _Survey:
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     finite, normals, brightest = 0, False, None
     stride = 1 + stream.count // SAMPLE
@@ -165,10 +165,10 @@ def _survey(stream: CloudStream) -> _Frame:
         if piece.colors is not None:
             brightest = max(brightest or 0.0, float(np.nan_to_num(piece.colors, posinf=0, neginf=0).max(initial=0)))
     extent = float((high - low).max()) if finite else 0.0
-    return _Frame(low, extent, finite, np.concatenate(samples) - low, normals, brightest)
+    return _Survey(low, extent, finite, np.concatenate(samples) - low, normals, brightest)
 
 
-def _first_size(frame: _Frame, limit: int, *, each: int = 20) -> float:
+def _first_size(frame: _Survey, limit: int, *, each: int = 20) -> float:
     """Edge of the voxels of which a surface meets about half of ``limit``.
 
     Cells with ``each`` points of the sample on average are all found, more or less; the number of cells that a surface
@@ -181,7 +181,7 @@ def _first_size(frame: _Frame, limit: int, *, each: int = 20) -> float:
     return size * math.sqrt(found / (0.5 * limit))
 
 
-def _grouped(stream: CloudStream, frame: _Frame, size: float, limit: int) -> tuple[_Groups, float]:
+def _grouped(stream: CloudStream, frame: _Survey, size: float, limit: int) -> tuple[_Groups, float]:
     """Sums of all points by voxel and direction, and the edge of the voxels, doubled whenever there are too many."""
     size = max(size, frame.extent / ((1 << BITS) - 2))
     groups = _Groups(np.empty(0, np.int64), np.empty((0, 7 if frame.brightest is None else 10)))
@@ -196,7 +196,7 @@ def _grouped(stream: CloudStream, frame: _Frame, size: float, limit: int) -> tup
     return groups, size
 
 
-def _pieces(stream: CloudStream, frame: _Frame) -> Iterator[tuple[Float64, Float64, Float64]]:
+def _pieces(stream: CloudStream, frame: _Survey) -> Iterator[tuple[Float64, Float64, Float64]]:
     """Offsets, unit normals (zero where unusable) and colours (of no columns without any) of the finite points."""
     for piece in stream.pieces(ROWS):
         points = piece.points.astype(np.float64)
@@ -227,15 +227,10 @@ def _summed(keys: Keys, values: Float64) -> _Groups:
     """Add up the rows with equal keys."""
     order = np.argsort(keys, kind="stable")
     ordered = keys[order]
-    starts = np.flatnonzero(_begins(ordered))
+    starts = np.flatnonzero(begins(ordered))
     if len(starts) == 0:
         return _Groups(ordered, values)
     return _Groups(ordered[starts], np.add.reduceat(values[order], starts, axis=0))
-
-
-def _begins(ordered: Keys, step: int = 0) -> NDArray[np.bool_]:
-    """Where a number is not the one before it, or that and ``step``; true at the first."""
-    return np.concatenate(([True], ordered[1:] != ordered[:-1] + step))[: len(ordered)]
 
 
 def _cells(keys: Keys) -> tuple[Keys, Keys, Keys]:
@@ -261,7 +256,7 @@ def _along_normals(groups: _Groups) -> Float64:
         # Numbers one apart are neighbours in one column, facing the same way; the last cell number is never used.
         columns = ((u << BITS | v) << 1 | direction[rows] & 1) << BITS | along
         order = np.argsort(columns, kind="stable")
-        first = _begins(columns[order], step=1)
+        first = begins(columns[order], step=1)
         place = np.arange(len(rows))
         place -= np.maximum.accumulate(np.where(first, place, 0))
         starts = np.flatnonzero(place % RUN == 0)

@@ -9,12 +9,10 @@ from typing import Any
 import numpy as np
 
 from ...neural_fields import InputError
-from .point_cloud import PointCloud, colors_from
+from .point_cloud import PointCloud, colors_from, columns_of
 from .stream import CloudStream, RawRows
 
 __all__ = ["LasStream", "read_las"]
-
-_NORMALS = (("NormalX", "NormalY", "NormalZ"), ("normal_x", "normal_y", "normal_z"), ("nx", "ny", "nz"))
 
 
 def read_las(path: Path) -> PointCloud:
@@ -35,7 +33,7 @@ def read_las(path: Path) -> PointCloud:
     colors = np.stack((las.red, las.green, las.blue), axis=1) if "red" in names else None
     # without colours, writers fill the columns with zeros
     colors = None if colors is None or not colors.any() else colors_from(colors)
-    triple = _normal_names(names)
+    triple = columns_of(names, "normals")
     normals = None if triple is None else np.stack([las[name] for name in triple], axis=1).astype(np.float32)
     return PointCloud(points, normals, colors, str(path))
 
@@ -60,7 +58,7 @@ class LasStream(CloudStream):
             raise
         except Exception as error:  # see `read_las`
             raise _unreadable(path, error) from error
-        self.normals = _normal_names(names)
+        self.normals = columns_of(names, "normals")
         self.colored = "red" in names
         # without colours, writers fill the columns with zeros
         self.colored = self.colored and any(
@@ -89,10 +87,6 @@ def _laspy(path: Path) -> Any:
     except ImportError as error:
         raise InputError(f"{path}: LAS and LAZ need laspy; pip install mplicits[las]") from error
     return laspy
-
-
-def _normal_names(names: set[str]) -> tuple[str, str, str] | None:
-    return next((triple for triple in _NORMALS if names.issuperset(triple)), None)
 
 
 def _unreadable(path: Path, error: Exception) -> InputError:

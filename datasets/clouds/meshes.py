@@ -1,8 +1,7 @@
-"""A mesh as an oriented cloud: its vertices and their area-weighted normals; STL and OFF files.
+"""Meshes as oriented clouds: the vertices of OBJ, STL and OFF files, and area-weighted normals of their faces.
 
-Wavefront OBJ: vertices, their colours (``v x y z r g b``), normals and faces.
-
-Read here and not with trimesh, which splits vertices at creases and seams and loses the normals of files without faces.
+OBJ is read here and not with trimesh, which splits vertices at creases and seams and loses the normals of files
+without faces.
 """
 
 from __future__ import annotations
@@ -19,7 +18,10 @@ from ...neural_fields import InputError
 from .point_cloud import PointCloud, colors_from, unit_rows
 from .tables import numbers
 
-__all__ = ["read_obj", "read_off", "read_stl", "triangulate", "vertex_normals", "weld"]
+__all__ = ["ObjText", "read_obj", "read_off", "read_stl", "triangulate", "vertex_normals", "weld"]
+
+Float64 = NDArray[np.float64]
+Int64 = NDArray[np.int64]
 
 
 def read_stl(path: Path) -> PointCloud:
@@ -31,8 +33,8 @@ def read_stl(path: Path) -> PointCloud:
     vertices, faces = _load(path, "stl")
     if len(faces) == 0:
         raise InputError(f"{path}: facets: there are none; check that it is an STL file")
-    points, index = weld(vertices)
-    faces = index[faces]
+    kept, index = weld(vertices)
+    points, faces = vertices[kept], index[faces]
     return PointCloud(points, vertex_normals(points, faces), None, str(path), "mesh")
 
 
@@ -47,7 +49,7 @@ def read_off(path: Path) -> PointCloud:
     return PointCloud(vertices, normals, None, str(path), "mesh" if len(faces) else "file")
 
 
-def _load(path: Path, kind: str) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def _load(path: Path, kind: str) -> tuple[Float64, Int64]:
     """Vertices and faces as they stand in the file."""
     try:
         with path.open("rb") as file:
@@ -65,18 +67,23 @@ def _load(path: Path, kind: str) -> tuple[NDArray[np.float64], NDArray[np.int64]
     return vertices, faces
 
 
-def weld(vertices: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Merge exactly equal ``vertices`` ``(N, 3)`` → those left ``(M, 3)``, and each old one's new index ``(N,)``."""
-    order = np.lexsort((vertices + 0.0).T)  # + 0.0: minus zero is zero
+def weld(vertices: Float64) -> tuple[Int64, Int64]:
+    """Find equal rows of ``vertices`` ``(N, K)``; minus zero is zero.
+
+    Returns:
+        The index of the first of each ``(M,)``, rows in ascending order, and for each old row its place among them
+        ``(N,)``.
+    """
+    order = np.lexsort((vertices + 0.0).T)  # stable: among equals the first comes first; + 0.0: minus zero is zero
     ordered = vertices[order]
     first = np.ones(len(vertices), bool)
     first[1:] = (ordered[1:] != ordered[:-1]).any(axis=1)
     index = np.empty(len(vertices), np.int64)
     index[order] = np.cumsum(first) - 1
-    return ordered[first], index
+    return order[first], index
 
 
-def triangulate(lengths: NDArray[np.int64], corners: NDArray[np.int64]) -> NDArray[np.int64]:
+def triangulate(lengths: Int64, corners: Int64) -> Int64:
     """Cut polygons into fans of triangles ``(F, 3)``.
 
     Args:
@@ -90,18 +97,82 @@ def triangulate(lengths: NDArray[np.int64], corners: NDArray[np.int64]) -> NDArr
     return np.stack((corners[first], corners[first + step + 1], corners[first + step + 2]), axis=1)
 
 
-def vertex_normals(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.float32]:
+def vertex_normals(vertices: Float64, faces: Int64) -> NDArray[np.float32]:
     """Area-weighted vertex normals ``(N, 3)``, of unit length; zero where no face with an area meets.
 
     Vertices at the same place count as one, so seams of texture coordinates do not split the normals.
     """
-    points, index = weld(vertices)
-    a, b, c = (points[index[faces[:, k]]] for k in range(3))
+    kept, index = weld(vertices)
+    a, b, c = (vertices[kept[index[faces[:, k]]]] for k in range(3))
     weighted = np.cross(b - a, c - a)  # direction times twice the area
     sums = np.stack(
-        [np.bincount(index[faces].T.ravel(), np.tile(weighted[:, k], 3), len(points)) for k in range(3)], axis=1
+        [np.bincount(index[faces].T.ravel(), np.tile(weighted[:, k], 3), len(kept)) for k in range(3)], axis=1
     )
     return unit_rows(sums)[index].astype(np.float32)
+
+
+class ObjText:
+    """A Wavefront OBJ file: its records by keyword, its vertices, and the corners of its polygons.
+
+    Attributes:
+        path: the file.
+        points: ``(N, 3)`` vertices.
+        colors: ``(N, 3)`` of them (``v x y z r g b``), or None.
+        lengths: ``(P,)`` number of corners of each polygon.
+        words: all corners, polygon after polygon, as they stand in the file (``v/vt/vn``).
+        used_at: ``(C,)`` where in the text the polygon of each corner starts.
+        corners: ``(C,)`` the vertex of each.
+
+    Raises:
+        InputError: there is no vertex, something in it is not a number, or an index names no record.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._text = path.read_bytes().decode("utf-8", "replace").replace("\\\n", " ")
+        table, starts = self.table("v", "vertex")
+        if not len(starts):
+            raise InputError(f"{path}: v: no vertex lines in it; check that it is an OBJ file")
+        if table.shape[1] not in (3, 4, 6, 7):
+            raise InputError(f"{path}: v: {table.shape[1]} numbers per vertex; expected x y z, or x y z r g b")
+        self.points = np.ascontiguousarray(table[:, :3])
+        self.colors = colors_from(table[:, 3:6]) if table.shape[1] == 6 else None
+        polygons, polygon_starts = self.records("f")
+        self.lengths = np.array([len(polygon.split()) for polygon in polygons], np.int64)
+        self.words = " ".join(polygons)
+        self.used_at = np.repeat(polygon_starts, self.lengths)
+        self.corners = self.indices(re.sub(r"/\S*", "", self.words), starts, self.used_at, "v")
+
+    def records(self, keyword: str) -> tuple[list[str], Int64]:
+        """All lines that start with ``keyword``, without it, and where in the text each one starts."""
+        found = list(re.finditer(rf"^[ \t]*{keyword}[ \t]+([^#\n]*)", self._text, re.MULTILINE))
+        return [match[1].strip() for match in found], np.array([match.start() for match in found], np.int64)
+
+    def table(self, keyword: str, what: str) -> tuple[Float64, Int64]:
+        """The numbers of all records of ``keyword`` ``(R, K)``, and where each one starts; ``what`` they are."""
+        listed, starts = self.records(keyword)
+        return numbers("\n".join(listed), self.path, first_line=1, what=what) if listed else np.empty((0, 3)), starts
+
+    def indices(self, words: str, record_starts: Int64, used_at: Int64, what: str) -> Int64:
+        """OBJ indices → counted from 0; a negative one counts back from the last record before its use.
+
+        Args:
+            words: the indices.
+            record_starts: ``(R,)`` where the records that they name start.
+            used_at: ``(C,)`` where each of them is used.
+            what: keyword of those records, for messages.
+        """
+        try:
+            index = np.array(words.split(), np.int64)
+        except ValueError as error:
+            raise InputError(f"{self.path}: f: an index is not a whole number ({error}); export it again") from error
+        if len(index) != len(used_at):
+            raise InputError(f"{self.path}: f: a corner without its {what} index; export it again")
+        index = np.where(index < 0, index + np.searchsorted(record_starts, used_at), index - 1)
+        count = len(record_starts)
+        if len(index) and (index.min() < 0 or index.max() >= count):
+            raise InputError(f"{self.path}: f: names a {what} beyond the {count} there are; export it again")
+        return index
 
 
 def read_obj(path: Path) -> PointCloud:
@@ -110,52 +181,16 @@ def read_obj(path: Path) -> PointCloud:
     Raises:
         InputError: there is no vertex, or something in it is not a number.
     """
-    text = path.read_bytes().decode("utf-8", "replace").replace("\\\n", " ")
-    vertices, vertex_starts = _records(text, "v")
-    if not vertices:
-        raise InputError(f"{path}: v: no vertex lines in it; check that it is an OBJ file")
-    table = numbers("\n".join(vertices), path, first_line=1, what="vertex")
-    if table.shape[1] not in (3, 4, 6, 7):
-        raise InputError(f"{path}: v: {table.shape[1]} numbers per vertex; expected x y z, or x y z r g b")
-    points = np.ascontiguousarray(table[:, :3])
-    colors = colors_from(table[:, 3:6]) if table.shape[1] == 6 else None
-    listed, normal_starts = _records(text, "vn")
-    directions = numbers("\n".join(listed), path, first_line=1, what="normal") if listed else np.empty((0, 3))
+    obj = ObjText(path)
+    points, corners = obj.points, obj.corners
+    directions, starts = obj.table("vn", "normal")
     if directions.shape[1] != 3:
         raise InputError(f"{path}: vn: {directions.shape[1]} numbers per normal; expected 3")
-    polygons, polygon_starts = _records(text, "f")
-    if not polygons:
+    if not len(corners):
         normals = directions.astype(np.float32) if len(directions) == len(points) else None
-        return PointCloud(points, normals, colors, str(path))
-
-    lengths = np.array([len(polygon.split()) for polygon in polygons], np.int64)
-    words = " ".join(polygons)
-    owner = np.repeat(np.arange(len(polygons)), lengths)
-    corners = _indices(re.sub(r"/\S*", "", words), vertex_starts, polygon_starts[owner], path, "v")
-    if len(directions) and words.count("/") == 2 * len(corners):
-        chosen = _indices(re.sub(r"\S*/", "", words), normal_starts, polygon_starts[owner], path, "vn")
+        return PointCloud(points, normals, obj.colors, str(path))
+    if len(directions) and obj.words.count("/") == 2 * len(corners):
+        chosen = obj.indices(re.sub(r"\S*/", "", obj.words), starts, obj.used_at, "vn")
         sums = [np.bincount(corners, directions[chosen, k], len(points)) for k in range(3)]
-        return PointCloud(points, np.stack(sums, axis=1).astype(np.float32), colors, str(path))
-    return PointCloud(points, vertex_normals(points, triangulate(lengths, corners)), colors, str(path), "mesh")
-
-
-def _records(text: str, keyword: str) -> tuple[list[str], NDArray[np.int64]]:
-    """All lines that start with ``keyword``, without it, and where in ``text`` each one starts."""
-    found = list(re.finditer(rf"^[ \t]*{keyword}[ \t]+([^#\n]*)", text, re.MULTILINE))
-    return [match[1].strip() for match in found], np.array([match.start() for match in found], np.int64)
-
-
-def _indices(
-    words: str, record_starts: NDArray[np.int64], used_at: NDArray[np.int64], path: Path, what: str
-) -> NDArray[np.int64]:
-    """OBJ indices → counted from 0; a negative one counts back from the last record before its use."""
-    try:
-        index = np.array(words.split(), np.int64)
-    except ValueError as error:
-        raise InputError(f"{path}: f: an index is not a whole number ({error}); export it again") from error
-    if len(index) != len(used_at):
-        raise InputError(f"{path}: f: a corner without its {what} index; export it again")
-    index = np.where(index < 0, index + np.searchsorted(record_starts, used_at), index - 1)
-    if len(index) and (index.min() < 0 or index.max() >= len(record_starts)):
-        raise InputError(f"{path}: f: names a {what} beyond the {len(record_starts)} there are; export it again")
-    return index
+        return PointCloud(points, np.stack(sums, axis=1).astype(np.float32), obj.colors, str(path))
+    return PointCloud(points, vertex_normals(points, triangulate(obj.lengths, corners)), obj.colors, str(path), "mesh")

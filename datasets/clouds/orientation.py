@@ -13,7 +13,15 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 from scipy.spatial import KDTree
 
-__all__ = ["estimate_normals", "fibonacci_directions", "nearest", "openness", "orient_normals", "outwardness"]
+__all__ = [
+    "estimate_normals",
+    "fibonacci_directions",
+    "fit_planes",
+    "nearest",
+    "openness",
+    "orient_normals",
+    "outwardness",
+]
 
 Float64 = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -37,12 +45,15 @@ def estimate_normals(points: Float64, neighbors: Index, *, block: int = 65536) -
     normals, spread = np.empty_like(points), np.empty(len(points))
     for start in range(0, len(points), block):
         near = points[neighbors[start : start + block]]  # (B, k, 3)
-        near = near - near.mean(axis=1, keepdims=True)
-        covariance = near.transpose(0, 2, 1) @ near / near.shape[1]
-        values, vectors = np.linalg.eigh(covariance)  # ascending
-        normals[start : start + block] = vectors[:, :, 0]
-        spread[start : start + block] = np.sqrt(values[:, 0].clip(min=0))
+        normals[start : start + block], spread[start : start + block] = fit_planes(near)
     return normals, spread
+
+
+def fit_planes(near: Float64) -> tuple[Float64, Float64]:
+    """Unit normals ``(B, 3)`` of the planes through sets of points ``(B, k, 3)``, and the deviations from them."""
+    near = near - near.mean(axis=1, keepdims=True)
+    values, vectors = np.linalg.eigh(near.transpose(0, 2, 1) @ near / near.shape[1])  # ascending
+    return vectors[:, :, 0], np.sqrt(values[:, 0].clip(min=0))
 
 
 def orient_normals(points: Float64, normals: Float64, spread: Float64, neighbors: Index) -> tuple[Float64, int]:

@@ -19,6 +19,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
+from .orientation import fit_planes
+
 __all__ = ["Verdict", "agreement", "inspect_points"]
 
 Float64 = NDArray[np.float64]
@@ -154,11 +156,8 @@ class _Cloud:
             self.near[part] = among[np.asarray(found)[:, 1:]]
             self.reach[part] = np.asarray(distance)[:, min(REACH, self.near.shape[1])]
             if not self.signed:
-                near = self.points[self.near[part]]
-                near = near - near.mean(axis=1, keepdims=True)
-                values, vectors = np.linalg.eigh(near.transpose(0, 2, 1) @ near / near.shape[1])  # ascending
-                self.normals[part] = vectors[:, :, 0]
-                self.flat[part] = np.sqrt(values[:, 0].clip(min=0)) < 0.25 * self.reach[part]
+                self.normals[part], spread = fit_planes(self.points[self.near[part]])
+                self.flat[part] = spread < 0.25 * self.reach[part]
 
     def edges(self, rows: Rows) -> tuple[Float64, Float64]:
         """Vectors to the neighbours ``(m, k, 3)``, and their lengths ``(m, k)``, which are never zero."""

@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from ...neural_fields import InputError
 from ...neural_fields.files import write_whole
 from .meshes import triangulate, vertex_normals
-from .point_cloud import PointCloud, colors_from, normals_from
+from .point_cloud import PointCloud, colors_from, columns_of, normals_from
 from .stream import TableStream
 
-__all__ = ["ply_stream", "read_ply", "write_cloud_ply"]
+__all__ = ["ply_stream", "read_ply", "read_ply_mesh", "write_cloud_ply"]
 
 _KINDS = {
     **dict.fromkeys(("char", "int8"), "i1"),
@@ -35,8 +35,6 @@ _KINDS = {
 }
 _ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
 _LONGEST_HEADER = 1 << 20
-_NORMALS = (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"))
-_COLORS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
 
 
 @dataclass(frozen=True)
@@ -70,26 +68,41 @@ def read_ply(path: Path) -> PointCloud:
     Raises:
         InputError: the header is not PLY, x, y or z is missing, or the file ends too early.
     """
+    return _read(path, meshes=False)[0]
+
+
+def read_ply_mesh(path: Path) -> tuple[PointCloud, NDArray[np.int64]]:
+    """Read the vertices and the triangles ``(F, 3)`` of a PLY file; of polygons, fans. There may be none.
+
+    Raises:
+        InputError: see `read_ply`.
+    """
+    return _read(path, meshes=True)
+
+
+def _read(path: Path, *, meshes: bool) -> tuple[PointCloud, NDArray[np.int64]]:
+    """Vertices and faces; unless ``meshes`` are asked for, no faces where the vertices have normals of their own."""
     data = path.read_bytes()
     encoding, elements, body = _parse_header(data, path)
     order = _ORDERS[encoding]
     if encoding == "ascii":
         data, body = _ascii_to_doubles(data[body:], path), 0
     vertex: _Columns | None = None
-    faces: NDArray[np.int64] | None = None
+    faces = np.empty((0, 3), np.int64)
     for element in elements:
         stored = _as_doubles(element) if encoding == "ascii" else element
         columns, body = _decode(data, body, stored, order, path)
         if element.name == "vertex":
             vertex = {p.name: _restore(columns[p.name], p) for p in element.properties}
-            if _channels(vertex, _NORMALS) is not None:
+            if not meshes and _channels(vertex, "normals") is not None:
                 break  # nothing that follows is needed
         elif element.name == "face":
             lists = columns.get("vertex_indices", columns.get("vertex_index"))
-            faces = triangulate(lists.lengths, lists.items.astype(np.int64)) if isinstance(lists, _Lists) else None
+            if isinstance(lists, _Lists):
+                faces = triangulate(lists.lengths, lists.items.astype(np.int64))
     if vertex is None:
         raise InputError(f"{path}: vertex: the header declares no such element; export it as a point cloud")
-    return _cloud(vertex, faces, path)
+    return _cloud(vertex, faces, path), faces
 
 
 def ply_stream(path: Path) -> TableStream | None:
@@ -115,7 +128,7 @@ def ply_stream(path: Path) -> TableStream | None:
     ):
         return None
     names = {p.name for p in vertex.properties}
-    normals, colors = (next((t for t in triples if names.issuperset(t)), None) for triples in (_NORMALS, _COLORS))
+    normals, colors = columns_of(names, "normals"), columns_of(names, "colors")
     has_faces = any(element.name == "face" for element in elements)
     if len(names) < len(vertex.properties) or not names.issuperset("xyz") or (normals is None and has_faces):
         return None
@@ -144,29 +157,26 @@ def write_cloud_ply(path: str | Path, cloud: PointCloud) -> None:
     write_whole(path, "\n".join([*header, "end_header\n"]).encode() + rows.tobytes())
 
 
-def _cloud(vertex: _Columns, faces: NDArray[np.int64] | None, path: Path) -> PointCloud:
-    points = _channels(vertex, (("x", "y", "z"),))
+def _cloud(vertex: _Columns, faces: NDArray[np.int64], path: Path) -> PointCloud:
+    points = _channels(vertex, "points")
     if points is None:
         missing = ", ".join(name for name in "xyz" if name not in vertex)
         raise InputError(f"{path}: vertex: property {missing} is missing; export it with x, y and z")
     points = points.astype(np.float64)
-    normals, colors = _channels(vertex, _NORMALS), _channels(vertex, _COLORS)
-    if faces is not None and len(faces) and (faces.min() < 0 or faces.max() >= len(points)):
+    normals, colors = _channels(vertex, "normals"), _channels(vertex, "colors")
+    if len(faces) and (faces.min() < 0 or faces.max() >= len(points)):
         raise InputError(f"{path}: face: names a vertex beyond the {len(points)} there are; export it again")
     shades = None if colors is None else colors_from(colors)
-    if normals is None and faces is not None and len(faces):
+    if normals is None and len(faces):
         return PointCloud(points, vertex_normals(points, faces), shades, str(path), "mesh")
     return PointCloud(points, None if normals is None else normals_from(normals), shades, str(path))
 
 
-def _channels(columns: _Columns, names: tuple[tuple[str, str, str], ...]) -> NDArray[Any] | None:
-    """The first triple of scalar properties that is there, as ``(N, 3)``."""
-    for triple in names:
-        found = [columns.get(name) for name in triple]
-        arrays = [column for column in found if isinstance(column, np.ndarray)]
-        if len(arrays) == 3:
-            return np.stack(arrays, axis=1)
-    return None
+def _channels(columns: _Columns, what: str) -> NDArray[Any] | None:
+    """The scalar properties that hold points, normals or colours, as ``(N, 3)``; see `columns_of`."""
+    scalars = {name: column for name, column in columns.items() if isinstance(column, np.ndarray)}
+    triple = columns_of(scalars, what)
+    return None if triple is None else np.stack([scalars[name] for name in triple], axis=1)
 
 
 def _parse_header(data: bytes, path: Path) -> tuple[str, list[_Element], int]:

@@ -1,10 +1,8 @@
-"""``PointCloud``: what a file holds, before anything is cleaned or scaled.
-
-Thinning clouds by voxels: of the points in a cube, one stays.
-"""
+"""``PointCloud``: what a file holds before anything is cleaned or scaled, what its numbers mean, and its thinning."""
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -14,7 +12,9 @@ from scipy.spatial import KDTree
 
 __all__ = [
     "PointCloud",
+    "begins",
     "colors_from",
+    "columns_of",
     "normals_from",
     "select",
     "spacing_of",
@@ -23,6 +23,14 @@ __all__ = [
     "unit_rows",
     "voxel_representatives",
 ]
+
+Float64 = NDArray[np.float64]
+
+NAMES = {  # of columns, as files have them; what comes first counts
+    "points": (("x", "y", "z"), ("px", "py", "pz")),
+    "normals": (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"), ("NormalX", "NormalY", "NormalZ")),
+    "colors": (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b")),
+}
 
 
 @dataclass(frozen=True)
@@ -66,6 +74,11 @@ class PointCloud:
         return len(self.points)
 
 
+def columns_of(names: Collection[str], what: str) -> tuple[str, str, str] | None:
+    """Which of the columns of a file hold its "points", "normals" or "colors"; None if none do."""
+    return next((triple for triple in NAMES[what] if all(name in names for name in triple)), None)
+
+
 def normals_from(values: NDArray[Any]) -> NDArray[np.float32]:
     """Normals as files store them → float32; signed integers of b bits are fractions of 2^(b-1) - 1."""
     scale = np.iinfo(values.dtype).max if np.issubdtype(values.dtype, np.signedinteger) else 1
@@ -97,9 +110,6 @@ def unit_rows(vectors: NDArray[np.floating] | NDArray[np.integer]) -> NDArray[np
     rows[~np.isfinite(rows).all(axis=-1)] = 0
     lengths = np.linalg.norm(rows, axis=-1, keepdims=True)
     return np.divide(rows, lengths, out=np.zeros_like(rows), where=lengths > 0)
-
-
-Float64 = NDArray[np.float64]
 
 
 def select(cloud: PointCloud, index: NDArray[np.integer] | NDArray[np.bool_]) -> PointCloud:
@@ -152,15 +162,15 @@ def voxel_representatives(points: Float64, size: float) -> NDArray[np.int64]:
     """Indices, in order, of one point ``(N, 3)`` per voxel: the one nearest the mean of its points."""
     keys = _Cells(points).keys(size)
     order = np.argsort(keys, kind="stable")
-    begins = _begins(keys[order])
+    firsts = begins(keys[order])
     voxel = np.empty(len(points), np.int64)
-    voxel[order] = np.cumsum(begins) - 1
+    voxel[order] = np.cumsum(firsts) - 1
     count = np.bincount(voxel)
     off = np.zeros(len(points))
     for axis in points.T:  # x, y and z
         off += (axis - (np.bincount(voxel, weights=axis) / count)[voxel]) ** 2
     nearest = np.lexsort((off, voxel))
-    return np.sort(nearest[np.flatnonzero(begins)])
+    return np.sort(nearest[np.flatnonzero(firsts)])
 
 
 def spacing_of(points: Float64, *, share: float = 0.95, sample: int = 20_000) -> float:
@@ -190,9 +200,9 @@ class _Cells:
 
     def count(self, size: float) -> int:
         """How many voxels of ``size`` hold points."""
-        return int(_begins(np.sort(self.keys(size))).sum())
+        return int(begins(np.sort(self.keys(size))).sum())
 
 
-def _begins(ordered: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Where a number differs from the one before it; true at the first."""
-    return np.concatenate(([True], ordered[1:] != ordered[:-1]))
+def begins(ordered: NDArray[np.int64], step: int = 0) -> NDArray[np.bool_]:
+    """Where a number is not the one before it, or that and ``step``; true at the first."""
+    return np.concatenate(([True], ordered[1:] != ordered[:-1] + step))[: len(ordered)]

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from ...neural_fields import InputError, Similarity
+from .meshes import weld
 from .noise import noise_level, smooth_along_normals
 from .orientation import estimate_normals, nearest, openness, orient_normals, outwardness
 from .outliers import inspect_points
@@ -156,7 +157,7 @@ def prepare_cloud(
         raise InputError(f"sensor_origin={sensor_origin}: expected three finite numbers")
 
     finite = np.flatnonzero(np.isfinite(cloud.points).all(axis=1))
-    distinct = finite[_first_of_each(cloud.points[finite])]
+    distinct = finite[np.sort(weld(cloud.points[finite])[0])]
     _check_enough(len(distinct), cloud, "are left after dropping NaN and duplicates")
 
     given = unit_rows(cloud.normals[distinct]) if cloud.normals is not None and normals != "estimate" else None
@@ -224,15 +225,6 @@ def _check_enough(count: int, cloud: PointCloud, why: str) -> None:
         raise InputError(
             f"{cloud.source}: points: only {count} of {len(cloud)} {why}; at least {MIN_POINTS} are needed"
         )
-
-
-def _first_of_each(points: Float64) -> NDArray[np.int64]:
-    """Indices, in order, of the points that no earlier point equals."""
-    order = np.lexsort((points + 0.0).T)  # stable: among equals the first comes first; + 0.0: minus zero is zero
-    ordered = points[order]
-    first = np.ones(len(points), bool)
-    first[1:] = (ordered[1:] != ordered[:-1]).any(axis=1)
-    return np.sort(order[first])
 
 
 def _smoothed(points: Float64, normals: Float64, *, flips: bool = False) -> tuple[Float64, float]:

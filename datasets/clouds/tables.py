@@ -1,6 +1,6 @@
-"""XYZ, TXT and CSV: a table of numbers with 3, 6 or 9 columns, or with a header line that names them.
+"""Tables of points: text (XYZ, TXT, CSV), one NumPy array (NPY), or an archive of named ones (NPZ).
 
-NPY ``(N, 3 | 6 | 9)`` and NPZ with ``points`` and, optionally, ``normals`` and ``colors``.
+A table has 3, 6 or 9 columns, or a header line that names them.
 """
 
 from __future__ import annotations
@@ -14,16 +14,10 @@ from numpy.typing import NDArray
 
 from ...neural_fields import InputError
 from ..files import DAMAGED_ARRAYS, numeric, read_arrays
-from .point_cloud import PointCloud, colors_from, normals_from
+from .point_cloud import PointCloud, colors_from, columns_of, normals_from
 from .stream import TableStream
 
-__all__ = ["npy_stream", "numbers", "read_npy", "read_npz", "read_text", "table_to_cloud"]
-
-_NAMES = {
-    "points": (("x", "y", "z"), ("px", "py", "pz")),
-    "normals": (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z")),
-    "colors": (("red", "green", "blue"), ("r", "g", "b")),
-}
+__all__ = ["is_number", "npy_stream", "numbers", "read_npy", "read_npz", "read_text", "table_to_cloud"]
 
 
 def read_text(path: Path) -> PointCloud:
@@ -48,7 +42,7 @@ def read_text(path: Path) -> PointCloud:
     # "1,5;2,5;3,5": with semicolons between columns, a comma is a decimal comma
     commas = "." if ";" in (second or line) else " "
     words = line.replace(";", " ").replace(",", commas).split()
-    has_header = not all(_is_number(word) for word in words)
+    has_header = not all(is_number(word) for word in words)
     is_count = len(words) == 1 and len(re.split(r"[\s,;]+", second)) >= 3
     skipped = first + 1 if has_header or is_count else first
     body = "\n".join(lines[skipped:]).replace("//", "#").replace(",", commas).replace(";", " ")
@@ -102,7 +96,7 @@ def _diagnose(body: str, first_line: int, what: str) -> str:
     for number, line in enumerate(body.split("\n"), start=first_line):
         words = _strip(line).split()
         for word in words:
-            if not _is_number(word):
+            if not is_number(word):
                 return f"{what} {number}: {word[:40]!r} is not a number"
         if words and columns and len(words) != columns:
             return f"{what} {number}: {len(words)} columns where there were {columns} before"
@@ -114,7 +108,8 @@ def _strip(line: str) -> str:
     return re.split("#|//", line, maxsplit=1)[0].strip()
 
 
-def _is_number(word: str) -> bool:
+def is_number(word: str) -> bool:
+    """Whether a word can be read as a number."""
     try:
         float(word)
     except ValueError:
@@ -133,10 +128,8 @@ def _look_like_colors(values: NDArray[np.floating]) -> bool:
 
 def _by_name(names: list[str], table: NDArray[np.float64], path: Path) -> PointCloud | None:
     def pick(what: str) -> NDArray[np.float64] | None:
-        for triple in _NAMES[what]:
-            if all(name in names for name in triple):
-                return table[:, [names.index(name) for name in triple]]
-        return None
+        triple = columns_of(names, what)
+        return None if triple is None else table[:, [names.index(name) for name in triple]]
 
     names = [name.strip("\"'") for name in names if name.strip("\"'")]
     points = pick("points")

@@ -6,7 +6,7 @@ Everything here works on the grid of pixels. Where there is no reading, depth is
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 __all__ = [
     "Noise",
+    "both_sides",
     "edge_pixels",
     "grid_normals",
     "measure_noise",
@@ -67,15 +68,16 @@ def edge_pixels(depth: Float64, *, pixel_angle: float, jump: float = 0.01, incid
     edges = np.zeros(depth.shape, bool)
     for axis in (0, 1):
         broken = _breaks(depth, axis, pixel_angle=pixel_angle, jump=jump, incidence=incidence)
-        edges |= _touching(broken, axis)
+        after, before = both_sides(broken, axis)
+        edges |= after | before
     return edges
 
 
-def _touching(pairs: Mask, axis: int) -> Mask:
-    """Pixels that belong to one of the marked pairs along ``axis``."""
-    before = np.pad(pairs, [(0, 1) if k == axis else (0, 0) for k in (0, 1)])
-    after = np.pad(pairs, [(1, 0) if k == axis else (0, 0) for k in (0, 1)])
-    return before | after
+def both_sides(steps: NDArray[Any], axis: int) -> tuple[NDArray[Any], NDArray[Any]]:
+    """What is known between neighbours along ``axis`` → the step after and the step before each of them, 0 at ends."""
+    sides = ([width if k == axis else (0, 0) for k in range(steps.ndim)] for width in ((0, 1), (1, 0)))
+    after, before = (np.pad(steps, side) for side in sides)
+    return after, before
 
 
 def noise_of(depth: Float64, *, jump: float = 0.01) -> float:
@@ -223,10 +225,7 @@ def grid_normals(points: Float64, *, pixel_angle: float, jump: float = 0.01, rad
 
 def _mean_step(step: Float64, usable: Mask, axis: int, radius: int) -> Float64:
     """Mean of the usable steps that touch a pixel, or of its window; NaN where there is none."""
-    before = [(0, 1) if k == axis else (0, 0) for k in (0, 1)]
-    after = [(1, 0) if k == axis else (0, 0) for k in (0, 1)]
-    count = np.pad(usable, before).astype(np.float64) + np.pad(usable, after)
-    total = np.pad(step, [*before, (0, 0)]) + np.pad(step, [*after, (0, 0)])
+    count, total = np.add(*both_sides(usable.astype(np.float64), axis)), np.add(*both_sides(step, axis))
     size = (2 * radius + 1, 2 * radius + 1)
     if radius:
         count = np.asarray(cv2.boxFilter(count, -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT))

@@ -1,6 +1,6 @@
-"""``frame_cloud``: one depth map → an oriented coloured cloud, and what became of its pixels.
+"""Depth maps → an oriented coloured cloud, and what became of their pixels.
 
-``fuse_frames``: several posed depth maps → one cloud, without what some of them see through.
+`frame_cloud` takes one; `fuse_frames` joins several with poses, and drops what some of them see through.
 """
 
 from __future__ import annotations
@@ -24,9 +24,14 @@ from .frame import RgbdFrame
 __all__ = ["DepthReport", "DepthSettings", "frame_cloud", "fuse_frames"]
 
 Float64 = NDArray[np.float64]
+Int32 = NDArray[np.int32]
+Int64 = NDArray[np.int64]
 
 TYPICAL = 0.99  # share of the points that are nearer than what is called typical
 STRAY = 1.5  # what is further away than so many times that makes everything else coarse
+TOLERANCE = 0.03  # of the depth: a point this much nearer than what a frame sees there is in its way
+WITNESSES = 12  # frames that are asked about each point, so that long sequences take linear time
+ROOM = 2  # times as many points as will stay are kept until all frames have been asked about them
 
 
 @dataclass(frozen=True)
@@ -186,14 +191,6 @@ def frame_cloud(frame: RgbdFrame, settings: DepthSettings | None = None) -> tupl
         typical=float(np.quantile(depth[kept], TYPICAL)),
     )
     return cloud, report
-
-
-Int32 = NDArray[np.int32]
-Int64 = NDArray[np.int64]
-
-TOLERANCE = 0.03  # of the depth: a point this much nearer than what a frame sees there is in its way
-WITNESSES = 12  # frames that are asked about each point, so that long sequences take linear time
-ROOM = 2  # times as many points as will stay are kept until all frames have been asked about them
 
 
 def fuse_frames(

@@ -1,6 +1,6 @@
-"""``RgbdFrame``: a depth map, its lens, its colours and where it was seen from.
+"""``RgbdFrame``: a depth map, its lens, its colours and where it was seen from, each from its file.
 
-Poses of depth frames: Open3D's trajectory.log, and the JSON files that `read_cameras` knows.
+Poses are those of Open3D's trajectory.log, or of the JSON files that `read_cameras` knows.
 """
 
 from __future__ import annotations
@@ -21,6 +21,10 @@ from .images import fit_color, read_color, read_depth
 __all__ = ["PosedFrame", "RgbdFrame", "read_frame", "read_poses", "read_trajectory"]
 
 Float64 = NDArray[np.float64]
+PosedFrame = tuple[str | None, Float64, DepthCamera | None]
+"""Name of the frame's image, if the file has names; its world_from_camera (4, 4); its lens, if the file has one."""
+
+RIGID = 1e-3  # how far the axes in a file, written with few digits, may be from orthonormal
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,12 +103,6 @@ def read_frame(
         picture = fit_color(read_color(color), (width, height), source=str(color), resize=resize_color)
     pose = np.eye(4) if world_from_camera is None else world_from_camera
     return RgbdFrame(values, camera, picture, pose, str(depth))
-
-
-PosedFrame = tuple[str | None, Float64, DepthCamera | None]
-"""Name of the frame's image, if the file has names; its world_from_camera (4, 4); its lens, if the file has one."""
-
-RIGID = 1e-3  # how far the axes in a file, written with few digits, may be from orthonormal
 
 
 def read_poses(path: str | Path) -> list[PosedFrame]:

@@ -1,7 +1,4 @@
-"""Exact synthetic clouds, and the damage (noise, outliers) that the paper's experiments do to them.
-
-Closest points on the zero set of any smooth field.
-"""
+"""Exact points of the zero set of a smooth field: sampled evenly, projected, closest; and damage to such clouds."""
 
 from __future__ import annotations
 
@@ -18,7 +15,8 @@ __all__ = [
     "add_noise",
     "add_outliers",
     "distinct_starts",
-    "project_to_surface",
+    "feet_and_normals",
+    "jet_at",
     "refine_closest",
     "sample_sphere",
     "sample_surface",
@@ -70,9 +68,9 @@ def sample_surface(
         if len(corners) == 0 or barren == 16:
             raise ValueError(f"field: no zero set in the cube of half-size {extent}")
         candidates = corners[random.integers(0, len(corners), block)] + size * random.uniform(0, 1, (block, 3))
-        value, gradient = _evaluate(field, candidates)
+        value, gradient = jet_at(field, candidates)
         candidates = candidates[np.abs(value) < shell * np.linalg.norm(gradient, axis=1)]
-        points, directions, converged = project_to_surface(field, candidates)
+        points, directions, converged = feet_and_normals(field, candidates)
         # a first-order distance can be far off where the gradient is small
         converged &= np.linalg.norm(points - candidates, axis=1) < 3 * shell
         found.append(points[converged])
@@ -83,10 +81,13 @@ def sample_surface(
     return PointCloud(points, directions.astype(np.float32), None, f"sample of {type(field).__name__}")
 
 
-def project_to_surface(
+def feet_and_normals(
     field: Field, points: Float64, *, tolerance: float = 1e-9, steps: int = 20
 ) -> tuple[Float64, Float64, NDArray[np.bool_]]:
     """Move ``points`` ``(N, 3)`` on the zero set by Newton's method along the gradient, x ← x - f ∇f / |∇f|².
+
+    `neural_fields.project_to_surface` does so for fields that are only nearly distances, with steps that it bounds
+    where they are flat; exact clouds come from full steps in float64, and keep the normals of the last one.
 
     Returns:
         The points, unit normals there ``(N, 3)``, and whether |f| got below ``tolerance`` ``(N,)``.
@@ -95,7 +96,7 @@ def project_to_surface(
     converged = np.zeros(len(points), bool)
     active = np.arange(len(points))
     for _ in range(steps):
-        value, gradient = _evaluate(field, points[active])
+        value, gradient = jet_at(field, points[active])
         length = np.linalg.norm(gradient, axis=1)
         normals[active] = gradient / np.maximum(length, 1e-300)[:, None]
         converged[active] = (np.abs(value) < tolerance) & (length > 1e-6)
@@ -188,11 +189,12 @@ def _occupied_cells(
     size = 2 * extent / cells
     axis = -extent + size * np.arange(cells, dtype=np.float64)
     corners: Float64 = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
-    value, _ = _evaluate(field, corners + size / 2)
+    value, _ = jet_at(field, corners + size / 2)
     return corners[np.abs(value) < steepness * (np.sqrt(3) / 2 * size + shell)], size
 
 
-def _evaluate(field: Field, points: Float64) -> tuple[Float64, Float64]:
+def jet_at(field: Field, points: Float64) -> tuple[Float64, Float64]:
+    """Values ``(N,)`` and gradients ``(N, 3)`` of a field at points ``(N, 3)``, worked out in float64."""
     with torch.no_grad():
         jet = field.jet(torch.from_numpy(points))
     return jet.value.double().numpy(), jet.gradient.double().numpy()
@@ -215,7 +217,7 @@ def refine_closest(
         steps: at most.
         tolerance: stop where a move gains less than about this, in the field's units.
     """
-    foot, normal, _ = project_to_surface(field, starts)
+    foot, normal, _ = feet_and_normals(field, starts)
     best = np.linalg.norm(targets - foot, axis=1)
     tangential = _tangential(targets - foot, normal)
     rate = np.ones(len(targets))
@@ -225,7 +227,7 @@ def refine_closest(
         active = active[gain > tolerance]
         if len(active) == 0:
             break
-        moved, turned, landed = project_to_surface(field, foot[active] + rate[active, None] * tangential[active])
+        moved, turned, landed = feet_and_normals(field, foot[active] + rate[active, None] * tangential[active])
         length = np.linalg.norm(targets[active] - moved, axis=1)
         better = landed & (length < best[active])
         rate[active[~better]] *= 0.25

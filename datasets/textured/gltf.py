@@ -57,12 +57,12 @@ def read_gltf(path: Path, *, textures: bool = True) -> TexturedMesh:
         InputError: it is damaged or compressed, holds no triangle, or an image is missing.
     """
     try:
-        scene = _Scene.load(path)
-        needed = next((name for name in _FOREIGN if name in scene.header.get("extensionsRequired", ())), None)
+        document = _Document.load(path)
+        needed = next((name for name in _FOREIGN if name in document.header.get("extensionsRequired", ())), None)
         if needed is not None:
             raise InputError(f"{path}: extensionsRequired: {needed} is not read; export it without compression")
         materials: dict[str, Paint] = {}
-        pieces = list(_pieces(scene, materials, textures=textures))
+        pieces = list(_pieces(document, materials, textures=textures))
         mesh = _joined(pieces, list(materials.values()), str(path))
     except InputError:
         raise
@@ -74,7 +74,7 @@ def read_gltf(path: Path, *, textures: bool = True) -> TexturedMesh:
 
 
 @dataclass(frozen=True)
-class _Scene:
+class _Document:
     """The JSON part of a file, and the binary chunk of a GLB."""
 
     path: Path
@@ -82,7 +82,7 @@ class _Scene:
     chunk: bytes
 
     @classmethod
-    def load(cls, path: Path) -> _Scene:
+    def load(cls, path: Path) -> _Document:
         data = path.read_bytes()
         if data[:4] != b"glTF":
             return cls(path, json.loads(data), b"")
@@ -140,9 +140,9 @@ class _Scene:
             raise InputError(f"{self.path}: images[{number}]: {error}; export it with PNG or JPEG images") from error
 
 
-def _pieces(scene: _Scene, materials: dict[str, Paint], *, textures: bool) -> Iterator[_Piece]:
+def _pieces(document: _Document, materials: dict[str, Paint], *, textures: bool) -> Iterator[_Piece]:
     """All triangle primitives; their materials are collected in ``materials``."""
-    header = scene.header
+    header = document.header
     nodes = header.get("nodes", [])
     roots = range(len(nodes))
     if header.get("scenes"):
@@ -164,7 +164,7 @@ def _pieces(scene: _Scene, materials: dict[str, Paint], *, textures: bool) -> It
                 primitive.get("mode", _TRIANGLES) in (_TRIANGLES, _STRIP, _FAN)
                 and "POSITION" in primitive["attributes"]
             ):
-                yield _piece(scene, primitive, placed, materials, textures=textures)
+                yield _piece(document, primitive, placed, materials, textures=textures)
 
 
 def _transform(node: dict[str, Any]) -> Float64:
@@ -179,14 +179,14 @@ def _transform(node: dict[str, Any]) -> Float64:
 
 
 def _piece(
-    scene: _Scene, primitive: dict[str, Any], placed: Float64, materials: dict[str, Paint], *, textures: bool
+    document: _Document, primitive: dict[str, Any], placed: Float64, materials: dict[str, Paint], *, textures: bool
 ) -> _Piece:
     attributes = primitive["attributes"]
-    vertices = scene.accessor(attributes["POSITION"]).astype(np.float64) @ placed[:3, :3].T + placed[:3, 3]
+    vertices = document.accessor(attributes["POSITION"]).astype(np.float64) @ placed[:3, :3].T + placed[:3, 3]
     count = len(vertices)
     order = np.arange(count)
     if "indices" in primitive:
-        order = scene.accessor(primitive["indices"])[:, 0].astype(np.int64)
+        order = document.accessor(primitive["indices"])[:, 0].astype(np.int64)
     faces = _triangles(order, primitive.get("mode", _TRIANGLES))
     if len(faces) and faces.max() >= count:
         raise ValueError(f"a face names vertex {faces.max()}, but there are only {count}")
@@ -194,16 +194,16 @@ def _piece(
         faces = faces[:, ::-1]
     colors = None
     if "COLOR_0" in attributes:
-        colors = scene.accessor(attributes["COLOR_0"])[:, :3].astype(np.float64).clip(0, 1)
+        colors = document.accessor(attributes["COLOR_0"])[:, :3].astype(np.float64).clip(0, 1)
     uv = np.zeros((count, 2))
     key, paint = "", Paint(np.ones((1, 1, 3), np.float32))
     if textures and "material" in primitive:
-        material = scene.header["materials"][primitive["material"]].get("pbrMetallicRoughness", {})
+        material = document.header["materials"][primitive["material"]].get("pbrMetallicRoughness", {})
         info = material.get("baseColorTexture")
         if info is not None:
-            uv = _texture_coordinates(scene, attributes, info)
+            uv = _texture_coordinates(document, attributes, info)
         key = json.dumps([info, material.get("baseColorFactor")])
-        paint = materials[key] if key in materials else _paint(scene, material)
+        paint = materials[key] if key in materials else _paint(document, material)
     materials.setdefault(key, paint)
     return _Piece(vertices, faces, uv, colors, list(materials).index(key))
 
@@ -218,13 +218,13 @@ def _triangles(order: Int64, mode: int) -> Int64:
     return np.stack((order[k], order[k + 1 + odd], order[k + 2 - odd]), axis=1)
 
 
-def _texture_coordinates(scene: _Scene, attributes: dict[str, int], info: dict[str, Any]) -> Float64:
+def _texture_coordinates(document: _Document, attributes: dict[str, int], info: dict[str, Any]) -> Float64:
     """Texture coordinates of the vertices, moved as KHR_texture_transform says."""
     moved = info.get("extensions", {}).get("KHR_texture_transform", {})
     name = f"TEXCOORD_{moved.get('texCoord', info.get('texCoord', 0))}"
     if name not in attributes:
         raise ValueError(f"{name} is missing, which its texture needs")
-    uv = scene.accessor(attributes[name]).astype(np.float64)
+    uv = document.accessor(attributes[name]).astype(np.float64)
     if not np.isfinite(uv).all():
         raise ValueError(f"{name} has numbers that are not finite")
     cos, sin = np.cos(moved.get("rotation", 0.0)), np.sin(moved.get("rotation", 0.0))
@@ -232,7 +232,7 @@ def _texture_coordinates(scene: _Scene, attributes: dict[str, int], info: dict[s
     return turned + np.array(moved.get("offset", (0, 0)), np.float64)
 
 
-def _paint(scene: _Scene, material: dict[str, Any]) -> Paint:
+def _paint(document: _Document, material: dict[str, Any]) -> Paint:
     """The base colour of a material: its texture (display) times its factor (linear)."""
     factor = np.array(material.get("baseColorFactor", (1, 1, 1, 1))[:3], np.float32)
     info = material.get("baseColorTexture")
@@ -240,12 +240,12 @@ def _paint(scene: _Scene, material: dict[str, Any]) -> Paint:
         return Paint(np.ones((1, 1, 3), np.float32))  # exactly, so that it is known for what it is
     if info is None:
         return Paint(linear_to_srgb(factor.reshape(1, 1, 3)))
-    texture = scene.header["textures"][info["index"]]
+    texture = document.header["textures"][info["index"]]
     webp = texture.get("extensions", {}).get("EXT_texture_webp", {})
-    image = scene.image(webp.get("source", texture.get("source")))
+    image = document.image(webp.get("source", texture.get("source")))
     if (factor != 1).any():
         image = linear_to_srgb(srgb_to_linear(image) * factor)
-    sampler = scene.header["samplers"][texture["sampler"]] if "sampler" in texture else {}
+    sampler = document.header["samplers"][texture["sampler"]] if "sampler" in texture else {}
     return Paint(image, (_WRAPS[sampler.get("wrapS", 10497)], _WRAPS[sampler.get("wrapT", 10497)]))
 
 

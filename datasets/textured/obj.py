@@ -6,7 +6,6 @@ that is missing ``Kd``; both are display colours.
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,15 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...neural_fields import InputError
-from ..clouds.meshes import _indices, _records, triangulate
-from ..clouds.point_cloud import colors_from
-from ..clouds.tables import numbers
+from ..clouds.meshes import ObjText, triangulate
+from ..clouds.tables import is_number
 from .mesh import Paint, TexturedMesh, Wrap, decode_texture, pack
 
 __all__ = ["read_textured_obj"]
 
 Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
 
 WHITE = (1.0, 1.0, 1.0)
 # Options of map_Kd and how many words follow each; those with several numbers may have fewer.
@@ -46,70 +43,62 @@ def read_textured_obj(path: Path) -> TexturedMesh:
     Raises:
         InputError: there are no faces, an index or number is wrong, or a material or an image is missing.
     """
-    text = path.read_bytes().decode("utf-8", "replace").replace("\\\n", " ")
-    vertices, vertex_starts = _records(text, "v")
-    polygons, polygon_starts = _records(text, "f")
-    if not vertices or not polygons:
+    obj = ObjText(path)
+    if not len(obj.corners):
         raise InputError(f"{path}: f: no faces in it; a cloud has no texture, so give a mesh")
-    table = numbers("\n".join(vertices), path, first_line=1, what="vertex")
-    if table.shape[1] not in (3, 4, 6, 7):
-        raise InputError(f"{path}: v: {table.shape[1]} numbers per vertex; expected x y z, or x y z r g b")
-    lengths = np.array([len(polygon.split()) for polygon in polygons], np.int64)
-    owner = np.repeat(np.arange(len(polygons)), lengths)
-    words = " ".join(polygons)
-    corners = _indices(re.sub(r"/\S*", "", words), vertex_starts, polygon_starts[owner], path, "v")
-    triangles = triangulate(lengths, np.arange(len(corners)))  # (F, 3) corners
+    points, corners, colors = obj.points, obj.corners, obj.colors
+    triangles = triangulate(obj.lengths, np.arange(len(corners)))  # (F, 3) corners
     if not len(triangles):
         raise InputError(f"{path}: f: no face has three corners; export it again")
-    faces, polygon = corners[triangles], owner[triangles[:, 0]]
+    faces = corners[triangles]
 
-    names, name_starts = _records(text, "usemtl")
-    materials = _materials(text, path)
-    points = np.ascontiguousarray(table[:, :3])
-    colors = colors_from(table[:, 3:6]) if table.shape[1] == 6 else None
+    names, name_starts = obj.records("usemtl")
+    materials = _materials(obj)
     # Only images say more than vertex colours: a Kd beside them is what an exporter writes when it knows no better.
     if not materials or (colors is not None and not any(material.image for material in materials.values())):
         return TexturedMesh(points, faces, None, None, colors, str(path))
     # What is current where a polygon starts; faces before the first usemtl have the last entry, which is white.
-    used = np.searchsorted(name_starts, polygon_starts) - 1
+    used = np.searchsorted(name_starts, obj.used_at[triangles[:, 0]]) - 1
     number = {name: k for k, name in enumerate(materials)}
     unknown = next((name for name in names if name not in number), None)
     if unknown is not None:
         raise InputError(f"{path}: usemtl: no material {unknown!r} in its MTL file; export both again")
     listed = [*materials.values(), _Material()]
-    chosen = np.array([*(number[name] for name in names), len(materials)])[used][polygon]  # (F,); −1 is the last
+    chosen = np.array([*(number[name] for name in names), len(materials)])[used]  # (F,); −1 is the last
 
     uv = np.zeros((len(corners), 2))
     painted = np.array([material.image is not None for material in listed])[chosen]
     mapped = np.zeros(len(corners), bool)
     mapped[triangles[painted]] = True
     if mapped.any():
-        uv[mapped] = _texture_coordinates(text, words, mapped, polygon_starts[owner], path)
+        uv[mapped] = _texture_coordinates(obj, mapped)
     scale, offset = (np.array([material[k] for material in listed])[chosen][:, None] for k in (3, 4))
     some, chosen = np.unique(chosen % len(listed), return_inverse=True)
     image, parts = pack([_paint(listed[k]) for k in some], chosen)
     return TexturedMesh(points, faces, uv[triangles] * scale + offset, image, None, str(path), parts)
 
 
-def _texture_coordinates(text: str, words: str, mapped: NDArray[np.bool_], used_at: Int64, path: Path) -> Float64:
+def _texture_coordinates(obj: ObjText, mapped: NDArray[np.bool_]) -> Float64:
     """Texture coordinates of the corners that need them."""
-    listed, starts = _records(text, "vt")
-    if not listed:
-        raise InputError(f"{path}: vt: no texture coordinates, but its materials have images; export it with them")
-    table = numbers("\n".join(listed), path, first_line=1, what="texture coordinate")
+    table, starts = obj.table("vt", "texture coordinate")
+    if not len(starts):
+        raise InputError(f"{obj.path}: vt: no texture coordinates, but its materials have images; export it with them")
     if table.shape[1] < 2 or not np.isfinite(table[:, :2]).all():
-        raise InputError(f"{path}: vt: expected two finite numbers, u and v; export it again")
-    second = [[*word.split("/"), ""][1] for word in words.split()]
+        raise InputError(f"{obj.path}: vt: expected two finite numbers, u and v; export it again")
+    second = [[*word.split("/"), ""][1] for word in obj.words.split()]
     needed = [second[k] for k in np.flatnonzero(mapped)]
     if not all(needed):
-        raise InputError(f"{path}: f: a corner of a textured face has no vt index; export it with texture coordinates")
-    return table[_indices(" ".join(needed), starts, used_at[mapped], path, "vt"), :2]
+        raise InputError(
+            f"{obj.path}: f: a corner of a textured face has no vt index; export it with texture coordinates"
+        )
+    return table[obj.indices(" ".join(needed), starts, obj.used_at[mapped], "vt"), :2]
 
 
-def _materials(text: str, path: Path) -> dict[str, _Material]:
+def _materials(obj: ObjText) -> dict[str, _Material]:
     """All materials of all MTL files that the OBJ names."""
     found: dict[str, _Material] = {}
-    for name in _records(text, "mtllib")[0]:
+    path = obj.path
+    for name in obj.records("mtllib")[0]:
         # A line may name several files, or one with spaces in its name.
         whole = _beside(path, name)
         for file in [whole] if whole.is_file() else [_beside(path, word) for word in name.split()]:
@@ -150,9 +139,9 @@ def _with_map(material: _Material, words: str, file: Path, name: str) -> _Materi
     left = words.split(" ")
     while left and left[0] in _OPTIONS:
         option, values, left = left[0], [], left[1:]
-        while left[1:] and len(values) < _OPTIONS[option] and (not values or _is_number(left[0])):
+        while left[1:] and len(values) < _OPTIONS[option] and (not values or is_number(left[0])):
             values.append(left.pop(0))
-        if option in ("-s", "-o") and values and _is_number(values[0]):
+        if option in ("-s", "-o") and values and is_number(values[0]):
             default = (1.0, 1.0) if option == "-s" else (0.0, 0.0)
             pair = (*map(float, values[:2]), *default[len(values[:2]) :])
             material = material._replace(scale=pair) if option == "-s" else material._replace(offset=pair)
@@ -170,10 +159,6 @@ def _beside(file: Path, name: str) -> Path:
     name = name.strip().strip('"').replace("\\", "/")
     relative = file.parent / name
     return relative if relative.is_file() else file.parent / name.rsplit("/", 1)[-1]
-
-
-def _is_number(word: str) -> bool:
-    return re.fullmatch(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", word) is not None
 
 
 def _paint(material: _Material) -> Paint:

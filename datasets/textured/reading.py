@@ -6,14 +6,12 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
 
 import numpy as np
-import trimesh
 
 from ...neural_fields import InputError
 from ..clouds.meshes import weld
-from ..clouds.ply import read_ply
+from ..clouds.ply import read_ply_mesh
 from ..clouds.point_cloud import PointCloud
 from ..files import readable
 from .gltf import read_gltf
@@ -81,16 +79,9 @@ def sample_textured(mesh: TexturedMesh, count: int, *, seed: int) -> PointCloud:
 
 
 def _read_ply(path: Path) -> TexturedMesh:
-    cloud = read_ply(path)
-    try:
-        loaded: Any = trimesh.load(path, file_type="ply", process=False)
-    except Exception as error:  # trimesh lets through whatever its parser trips over
-        raise InputError(f"{path}: its faces cannot be read; export it again") from error
-    faces = np.asarray(getattr(loaded, "faces", ()), np.int64).reshape(-1, 3)
+    cloud, faces = read_ply_mesh(path)
     if not len(faces):
         raise InputError(f"{path}: face: there are none; a cloud with colours is read as it is, without its texture")
-    if len(loaded.vertices) != len(cloud):
-        raise InputError(f"{path}: face: texture coordinates in PLY are not read; export OBJ or GLB")
     return TexturedMesh(cloud.points, faces, None, None, cloud.colors, str(path))
 
 
@@ -99,9 +90,9 @@ def _read_gltf(path: Path) -> TexturedMesh:
     mesh = read_gltf(path)
     colors = mesh.vertex_colors
     keys = mesh.vertices if colors is None else np.concatenate((mesh.vertices, colors), axis=1, dtype=np.float64)
-    left, index = weld(keys)
-    colors = None if colors is None else left[:, 3:].astype(np.float32)
-    return replace(mesh, vertices=np.ascontiguousarray(left[:, :3]), faces=index[mesh.faces], vertex_colors=colors)
+    kept, index = weld(keys)
+    colors = None if colors is None else colors[kept]
+    return replace(mesh, vertices=mesh.vertices[kept], faces=index[mesh.faces], vertex_colors=colors)
 
 
 TEXTURED_READERS: Mapping[str, Callable[[Path], TexturedMesh]] = MappingProxyType(

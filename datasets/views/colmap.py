@@ -251,18 +251,9 @@ def _binary_poses(path: Path) -> list[_Pose]:
 
 
 def _binary_points(path: Path) -> Float64:
-    """Records have no common length: a place, a colour and an error, then as many pairs as views saw the point."""
-    data = path.read_bytes()
-    head, length = struct.Struct("<8x3d11xQ"), struct.Struct("<8x3d11xQ").size
-    try:
-        count, place = struct.unpack_from("<Q", data)[0], 8
-        rows = []
-        for _ in range(count):
-            x, y, z, seen = head.unpack_from(data, place)
-            rows.append((x, y, z))
-            place += length + 8 * seen
-    except struct.error as error:
-        raise InputError(f"{path}: ends early, after {len(data)} bytes; copy or export it again") from error
-    if place > len(data):
-        raise InputError(f"{path}: ends early, after {len(data)} bytes; copy or export it again")
-    return np.array(rows, np.float64).reshape(-1, 3)
+    records, places = _Records(path), []
+    for _ in range(int(records.take("Q")[0])):
+        *place, seen = records.take("8x3d11xQ")  # its number before, its colour and error after
+        places.append(place)
+        records.skip(8 * int(seen))  # which views saw it
+    return np.array(places, np.float64).reshape(-1, 3)

@@ -1,6 +1,7 @@
 """Cameras: rays and projection undo each other, views are where they say, and nothing is lost far from the origin."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -22,14 +23,29 @@ def pixel_grid(camera: Camera) -> torch.Tensor:
     return torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
 
 
-def test_project_undoes_rays():
-    camera = some_camera()
+@pytest.mark.parametrize("lens", [(), (-0.28, 0.09, 1e-3, -7e-4, -0.01), (0.2, 0.05, 0.0, 0.0, 0.01, 0.4, 0.1, 0.02)])
+def test_project_undoes_rays(lens):
+    camera = replace(some_camera(), distortion=lens)
     eye, directions = camera.rays(dtype=torch.float64)
     torch.testing.assert_close(directions.norm(dim=-1), torch.ones(17, 31).double(), rtol=0, atol=1e-14)
     depth = torch.rand(17, 31).double() * 5 + 0.1
     pixels, z = camera.project(eye + depth[..., None] * directions)
     torch.testing.assert_close(pixels, pixel_grid(camera), rtol=0, atol=1e-12)
     torch.testing.assert_close(z, depth * (directions @ camera.forward), rtol=0, atol=1e-12)
+    pixels, _, inside = camera.in_view((eye + depth[..., None] * directions).reshape(-1, 3).numpy())
+    assert inside.all()
+    straight = camera.pinhole().project(eye + directions)[0].reshape(-1, 2)
+    assert (np.abs(pixels - straight.numpy()).max() > 0.1) == bool(lens)
+
+
+def test_what_only_a_turned_back_polynomial_brings_into_the_image_is_not_in_view():
+    """At r² = 1 / 0.28 this lens maps everything to its middle."""
+    camera = replace(look_at((0, 0, -1), (0, 0, 0), width=160, height=120, fov=50), distortion=(-0.28,))
+    places = np.array([[0.0, 0, 0], [np.sqrt(1 / 0.28), 0, 0], [0, 0, -2], [0, 5, 0]])
+    pixels, depths, inside = camera.in_view(places @ np.diag([-1.0, 1, 1]))
+    assert inside.tolist() == [True, False, False, False]
+    assert np.abs(pixels[1] - pixels[0]).max() < 1e-6
+    assert depths.tolist() == [1, 1, -1, 1]
 
 
 def test_the_middle_pixel_and_the_corners_look_where_trigonometry_says():
@@ -195,6 +211,8 @@ def test_map_coordinates_keep_their_precision():
         ({"world_from_camera": torch.diag(torch.tensor([1.0, 1, 1, 2])).double()}, "world_from_camera: .*rigid"),
         ({"width": 0}, "width=0"),
         ({"height": -3}, "height=-3"),
+        ({"distortion": (0.1, math.inf)}, r"distortion=\(0.1, inf\)"),
+        ({"distortion": (0.1,) * 9}, "distortion=.*at most 8"),
     ],
 )
 def test_a_camera_that_cannot_be_says_why(change, message):
