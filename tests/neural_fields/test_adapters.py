@@ -4,6 +4,7 @@ import enum
 
 import pytest
 import torch
+from bounds import assert_within, rounding
 from fields import small_multiscale
 from hosts import Heads, NeuSHost, OldHeads, Separate, points, ray_samples, rays
 from mplicits.neural_fields import InstantNSRGeometry, MultiscaleSDF, NerfstudioField, NeuSGeometry, Siren, Sphere
@@ -148,9 +149,10 @@ def test_instant_nsr_returns_what_the_flags_ask_for() -> None:
     value, gradient, feature, laplace = geometry(x, with_grad=True, with_feature=True, with_laplace=True)
     assert torch.equal(feature[:, 0], value)
     assert laplace.shape == (50,)
-    torch.testing.assert_close(gradient, field.jet(x / 1.5).gradient)
-    torch.testing.assert_close(geometry.forward_level(x), value)
-    torch.testing.assert_close(value, 1.5 * field.value(x / 1.5))
+    off, slope_off, _ = rounding(field, x / 1.5, lambda field, x: field.jet(x))
+    assert_within(gradient, field.jet(x / 1.5).gradient, 2 * slope_off)
+    assert_within(geometry.forward_level(x), value, 3 * off)
+    assert_within(value, 1.5 * field.value(x / 1.5), 3 * off)
 
 
 def test_instant_nsr_defaults_are_the_hosts() -> None:

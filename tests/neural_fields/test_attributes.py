@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from bounds import rounding
 from mplicits.neural_fields import (
     ColorSiren,
     Jet,
@@ -88,8 +89,10 @@ def test_the_surface_of_a_siren() -> None:
         network.output.bias.sub_(network.value(x).median())
     feet, arrived = project_to_surface(network, x, steps=30)
     assert arrived.float().mean() > 0.5
-    assert (network.value(feet[arrived]).abs() < 1e-5).all()
-    assert (network.value(feet[~arrived]).abs() >= 1e-5).all()
+    # The projection looks at the values of jets, which are rounded in their own way.
+    value, off = network.value(feet).abs(), 2 * rounding(network, feet, lambda field, x: [field.value(x)])[0]
+    assert (value < 1e-5 + off)[arrived].all()
+    assert (value >= 1e-5 - off)[~arrived].all()
 
 
 class _AroundTheTube(ColorSiren):

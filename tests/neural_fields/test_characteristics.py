@@ -56,8 +56,16 @@ def test_every_point_has_its_own_time() -> None:
 
 
 def test_the_default_serves_single_precision() -> None:
-    x = torch.randn(500, 3)
-    torch.testing.assert_close(flow(SCREW.velocity, x, 0.0, 1.0), SCREW.forward(x, 1.0), rtol=0, atol=5e-5)
+    x, calls = torch.randn(500, 3), []
+
+    def velocity(x: Tensor, t: Tensor) -> Tensor:
+        calls.append(len(x))
+        return SCREW.velocity(x, t)
+
+    there = flow(velocity, x, 0.0, 1.0)
+    # A step of dopri5 takes six looks and may be off by atol + rtol |x|; a rigid motion carries errors on as they are.
+    step = Solver().atol + Solver().rtol * float(x.abs().max())
+    torch.testing.assert_close(there, SCREW.forward(x, 1.0), rtol=0, atol=len(calls) / 6 * step)
 
 
 def test_tolerances_hold_for_every_point() -> None:

@@ -1,5 +1,7 @@
 """Laws and losses against fields that obey them exactly."""
 
+import math
+
 import pytest
 import torch
 from fields import SCREW, small_spacetime
@@ -59,7 +61,8 @@ def test_extension_keeps_a_distance_a_distance() -> None:
     assert float(transport(lambda x, t: x, extend=True).residual(away).abs().max()) < 1e-12
     assert float(transport(lambda x, t: x).residual(away).abs().max()) > 0.1
     speed = normal_speed(lambda x, t: x.norm(dim=-1), extend=True)
-    assert float(speed.residual(away).abs().max()) < 1e-12
+    # The length of the gradient is √(|∇f|² + ε) with ε = 1e-12, and speeds are below 0.4 e.
+    assert float(speed.residual(away).abs().max()) < 0.4 * math.e * 1e-12 / 2 + 1e-14
     surface = x[:, :3] / x[:, :3].norm(dim=-1, keepdim=True) * (0.4 * x[:, 3:].exp())
     there = spacetime_jet(field, at_time(surface, x[:, 3]))
     assert float(transport(lambda x, t: x).residual(there).abs().max()) < 1e-12
