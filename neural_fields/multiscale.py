@@ -143,7 +143,7 @@ class MultiscaleSDF(Field):
         return walk_levels(levels, self.deltas, self.check_points(x), evaluate, self._add)
 
     def _add(self, before: Parts, own: Parts, delta: Tensor) -> Parts:
-        """F + γ(f) r, to the order of the jets f and r."""
+        """Add γ(f) r to f, to the order of their jets."""
         f, r = before[0], own[0]
         gate, *slopes = self._gate(f, delta, order=max(0, len(own) - 2))
         if not slopes:
