@@ -261,18 +261,16 @@ def _convert(value: object, kind: Any) -> Any:
     if origin is tuple:
         return _convert_tuple(value, kind)
     if origin is types.UnionType or origin is Union:
-        if value is None or value in ("none", ["none"]):
+        if value is None or value in ("none", ["none"], ("none",)):
             return None
         try:
             return _convert(value, _without_none(kind))
         except _MismatchError as error:
             raise _MismatchError(f"{error}, or none") from error
-    if kind is bool and isinstance(value, bool):
-        return value
-    if kind is str and isinstance(value, str):
-        return value
-    if kind is int or kind is float:
+    if kind in (int, float):
         return _convert_number(value, kind)
+    if isinstance(value, kind):
+        return value
     raise _MismatchError({bool: "true or false", str: "text"}[kind])
 
 

@@ -160,6 +160,8 @@ def test_flags_come_from_the_dataclass_and_only_given_ones_override():
     given = given_flags(arguments, Settings)
     assert given == {"widths": ("32", "64"), "verbose": True, "normals": "file", "batch": "100"}
     assert load_config(Settings, None, given) == Settings(widths=(32, 64), verbose=True, normals="file", batch=100)
+    none = given_flags(parser.parse_args(["--origin", "none", "--budget", "none"]), Settings)
+    assert load_config(Settings, None, none) == Settings()
     assert given_flags(parser.parse_args([]), Settings) == {}
     assert given_flags(argparse.Namespace(batch=None, verbose=False, other=3), Settings) == {"verbose": False}
     assert "width of each level" in parser.format_help()
