@@ -20,7 +20,7 @@ from typing import Any, Literal
 from ...neural_fields import InputError
 from ...neural_fields.files import write_json
 from ..run.config import closest
-from ..run.trainer import Progress
+from ..run.trainer import Report
 
 __all__ = [
     "Catalogue",
@@ -40,7 +40,6 @@ __all__ = [
 # smoke: seconds, for tests; cpu: 15 to 30 s of training on two cores, each method; paper: as published.
 Preset = Literal["smoke", "cpu", "paper"]
 # Told now and then how far a training is.
-Report = Callable[[Progress], None]
 
 # What a cell found, as it stands in its JSON file; see `mplicits.pipelines.bench.run.run_cell`.
 Record = Mapping[str, Any]

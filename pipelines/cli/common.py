@@ -14,7 +14,7 @@ from ..run.config import add_config_flags, given_flags, input_error, load_config
 from ..run.settings import FitConfig
 
 if TYPE_CHECKING:
-    from ..run.progress import Report
+    from ..run.trainer import Report
 
 __all__ = [
     "Command",

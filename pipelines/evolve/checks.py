@@ -18,7 +18,6 @@ from .samples import band_points
 
 __all__ = ["FrameFigures", "check_evolution", "end_figures", "slope_figures", "volume", "warnings"]
 
-CHAMFER_POINTS = 50_000
 END_RESOLUTION = 192
 # A surface that shall be met counts as missed where its Chamfer distance is so much above what it would score itself.
 MISSED = 1.5

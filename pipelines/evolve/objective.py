@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import torch
 from torch import Tensor
 
 from ...neural_fields import Jet, Siren, SpaceTimeSDF, key_loss, law_loss, spacetime_jet
 from ...neural_fields.losses import eikonal_loss
 from ..run.settings import EvolveConfig
-from ..run.trainer import Group, Objective, Progress, Trainer, warm_cosine
+from ..run.trainer import Group, Objective, Report, Trainer, warm_cosine
 from .problem import Problem
 from .samples import Known, band_points, indices_in_band, uniform_spacetime
 
@@ -123,9 +121,7 @@ class _StillObjective(Objective):
         return {"known": loss}, loss
 
 
-def learn_start(
-    known: Known, config: EvolveConfig, generator: torch.Generator, progress: Callable[[Progress], None]
-) -> SpaceTimeSDF:
+def learn_start(known: Known, config: EvolveConfig, generator: torch.Generator, progress: Report) -> SpaceTimeSDF:
     """A field of one level that stands still: the shape at time 0, learnt in space alone and then lifted."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)

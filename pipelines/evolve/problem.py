@@ -28,7 +28,7 @@ from ...neural_fields import (
 from ...neural_fields.evolution import VectorField
 from ..run.settings import EvolveConfig
 from .samples import Bounds, Carried, Known, around, joined, known_at, no_bounds, signs, uniform
-from .shapes import Placement, Shape, aligned, into_unit_sphere
+from .shapes import Placement, StaticShape, aligned, into_unit_sphere
 
 __all__ = ["End", "Problem", "between", "build_problem", "morph_law", "velocity_field"]
 
@@ -78,7 +78,7 @@ class Problem:
     placements: tuple[Placement, ...] = ()
 
 
-def build_problem(shapes: Sequence[Shape], config: EvolveConfig) -> Problem:
+def build_problem(shapes: Sequence[StaticShape], config: EvolveConfig) -> Problem:
     """The problem that a configuration means.
 
     Raises:
@@ -136,7 +136,7 @@ def velocity_field(motion: RigidMotion, twist: float = 0.0) -> VectorField:
     return velocity
 
 
-def _morph(shapes: list[Shape], config: EvolveConfig) -> Problem:
+def _morph(shapes: list[StaticShape], config: EvolveConfig) -> Problem:
     placed = aligned(shapes, config.align)
     placed, region = into_unit_sphere(placed, np.concatenate([shape.surface.vertices for shape in placed]))
     generator, keys = torch.Generator().manual_seed(config.seed), config.key_times()
@@ -169,7 +169,7 @@ def morph_law(guide: Field) -> Law:
     return normal_speed(speed, extend=True)
 
 
-def _smooth(shapes: list[Shape], config: EvolveConfig) -> Problem:
+def _smooth(shapes: list[StaticShape], config: EvolveConfig) -> Problem:
     placed, region = into_unit_sphere(shapes, shapes[0].surface.vertices)
     (shape,), alpha = placed, config.alpha / region.scale**2
     generator = torch.Generator().manual_seed(config.seed)
@@ -186,7 +186,7 @@ def _smooth(shapes: list[Shape], config: EvolveConfig) -> Problem:
     return Problem(_composed(shape.similarity, region), known, bounds, law, (end,), _placements(placed))
 
 
-def _transport(shapes: list[Shape], config: EvolveConfig) -> Problem:
+def _transport(shapes: list[StaticShape], config: EvolveConfig) -> Problem:
     shapes = aligned(shapes, "none")
     reach = [
         trajectories(_velocity(config, index, Similarity.identity()), shape.points(REACH_POINTS, 0), _reach_times())
@@ -230,7 +230,7 @@ def _values(field: Field, points: Tensor) -> Tensor:
     return torch.cat([field.value(part) for part in points.split(1 << 17)])
 
 
-def _end(shape: Shape, time: float, seed: int) -> End:
+def _end(shape: StaticShape, time: float, seed: int) -> End:
     return End(shape.name, time, *(shape.points(END_POINTS, seed + 101 + index) for index in range(2)))
 
 
@@ -238,7 +238,7 @@ def _reach_times() -> list[float]:
     return [index / (REACH_TIMES - 1) for index in range(REACH_TIMES)]
 
 
-def _placements(shapes: Sequence[Shape]) -> tuple[Placement, ...]:
+def _placements(shapes: Sequence[StaticShape]) -> tuple[Placement, ...]:
     return tuple(shape.placement for shape in shapes)
 
 

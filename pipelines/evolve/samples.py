@@ -11,8 +11,8 @@ from torch import Tensor
 
 from ...neural_fields import Field, at_time, flow
 from ...neural_fields.evolution import VectorField
-from ..fit.samples import DOMAIN
-from .shapes import Shape
+from ..fit.samples import DOMAIN, Rows
+from .shapes import StaticShape
 
 __all__ = [
     "Bounds",
@@ -30,10 +30,11 @@ __all__ = [
 ]
 
 FLOW_ROWS = 8192  # characteristics that are differentiated at a time
+CANDIDATES = 6  # points tried for one that is near the surface
 
 
 @dataclass(frozen=True, eq=False)
-class Known:
+class Known(Rows):
     """Samples of space-time where the field is known.
 
     Attributes:
@@ -46,20 +47,9 @@ class Known:
     value: Tensor
     gradient: Tensor
 
-    def __len__(self) -> int:
-        return len(self.points)
-
-    def take(self, index: Tensor) -> Known:
-        """The samples at ``index``."""
-        return Known(self.points[index], self.value[index], self.gradient[index])
-
-    def to(self, device: torch.device) -> Known:
-        """The same samples on another device."""
-        return Known(self.points.to(device), self.value.to(device), self.gradient.to(device))
-
 
 @dataclass(frozen=True, eq=False)
-class Bounds:
+class Bounds(Rows):
     """Samples of space-time where the field is only known to lie between two numbers.
 
     Attributes:
@@ -71,17 +61,6 @@ class Bounds:
     points: Tensor
     low: Tensor
     high: Tensor
-
-    def __len__(self) -> int:
-        return len(self.points)
-
-    def take(self, index: Tensor) -> Bounds:
-        """The samples at ``index``."""
-        return Bounds(self.points[index], self.low[index], self.high[index])
-
-    def to(self, device: torch.device) -> Bounds:
-        """The same samples on another device."""
-        return Bounds(self.points.to(device), self.low.to(device), self.high.to(device))
 
 
 class Carried:
@@ -96,7 +75,7 @@ class Carried:
         value, gradient = (torch.cat(part) for part in zip(*parts, strict=True))
         return Known(points, value, gradient)
 
-    def surface(self, shapes: Sequence[Shape], time: float, count: int, seed: int) -> Tensor:
+    def surface(self, shapes: Sequence[StaticShape], time: float, count: int, seed: int) -> Tensor:
         """Points of the surface at a time: of ``count`` on each part those that are in no other one."""
         kept = []
         for index, (shape, velocity) in enumerate(zip(shapes, self.velocities, strict=True)):
@@ -134,7 +113,7 @@ def signs(samples: Known, tolerance: float = 1e-3) -> tuple[Known, Bounds]:
     return known, Bounds(samples.points[~near], low, torch.where(positive, math.inf, 0.0))
 
 
-def known_at(shape: Shape, time: float, count: int, seed: int, generator: torch.Generator) -> Known:
+def known_at(shape: StaticShape, time: float, count: int, seed: int, generator: torch.Generator) -> Known:
     """Samples of a shape at the time when it is reached."""
     points = around(shape, count, seed, generator)
     jets = [shape.field.jet(part) for part in points.split(1 << 16)]
@@ -142,7 +121,7 @@ def known_at(shape: Shape, time: float, count: int, seed: int, generator: torch.
     return Known(at_time(points, time), value.detach(), gradient.detach())
 
 
-def around(shape: Shape, count: int, seed: int, generator: torch.Generator) -> Tensor:
+def around(shape: StaticShape, count: int, seed: int, generator: torch.Generator) -> Tensor:
     """Points ``(count, 3)``: half of them on the surface, a quarter near it, a quarter anywhere."""
     on = shape.points(count // 2, seed)
     near = on[torch.randint(len(on), (count // 4,), generator=generator)]
@@ -156,6 +135,12 @@ def uniform(count: int, generator: torch.Generator) -> Tensor:
     return (2 * torch.rand(count, 3, generator=generator) - 1) * DOMAIN
 
 
+def uniform_spacetime(count: int, generator: torch.Generator) -> Tensor:
+    """Points ``(count, 4)`` anywhere in the cube, at any time."""
+    x = uniform(count, generator)
+    return torch.cat((x, torch.rand(count, 1, generator=generator)), dim=1)
+
+
 def joined(parts: Sequence[Known]) -> Known:
     """All samples in one."""
     columns = zip(*((part.points, part.value, part.gradient) for part in parts), strict=True)
@@ -166,15 +151,6 @@ def joined(parts: Sequence[Known]) -> Known:
 def no_bounds() -> Bounds:
     """No samples."""
     return Bounds(torch.empty(0, 4), torch.empty(0), torch.empty(0))
-
-
-CANDIDATES = 6  # points tried for one that is near the surface
-
-
-def uniform_spacetime(count: int, generator: torch.Generator) -> Tensor:
-    """Points ``(count, 4)`` anywhere in the cube, at any time."""
-    x = uniform(count, generator)
-    return torch.cat((x, torch.rand(count, 1, generator=generator)), dim=1)
 
 
 @torch.no_grad()

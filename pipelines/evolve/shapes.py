@@ -32,7 +32,7 @@ from ...neural_fields import (
 from ..run.folder import find_field
 from ..surface.surface import Surface, from_mesh, sample_points
 
-__all__ = ["Placed", "Placement", "Shape", "aligned", "into_unit_sphere", "read_shape"]
+__all__ = ["Placed", "Placement", "StaticShape", "aligned", "into_unit_sphere", "read_shape"]
 
 Float64 = NDArray[np.float64]
 MESH_RESOLUTION = 128
@@ -124,7 +124,7 @@ class Placed(Field):
 
 
 @dataclass(frozen=True, eq=False)
-class Shape:
+class StaticShape:
     """A static shape.
 
     Attributes:
@@ -146,7 +146,7 @@ class Shape:
         points, _ = sample_points(self.surface, count, np.random.default_rng(seed))
         return project_to_surface(self.field, torch.from_numpy(points).float(), steps=3)[0]
 
-    def placed(self, placement: Placement) -> Shape:
+    def placed(self, placement: Placement) -> StaticShape:
         """This shape moved."""
         return dataclasses.replace(
             self,
@@ -156,7 +156,7 @@ class Shape:
         )
 
 
-def read_shape(text: str) -> Shape:
+def read_shape(text: str) -> StaticShape:
     """A run directory, a .safetensors file, or an exact shape in coordinates of the unit sphere.
 
     Exact shapes are ``sphere:RADIUS``, ``torus:MAJOR,MINOR``, ``box:X,Y,Z`` (half sizes) and ``capsule:HALF,RADIUS``
@@ -182,7 +182,7 @@ def read_shape(text: str) -> Shape:
     return _meshed(text, field, similarity)
 
 
-def aligned(shapes: list[Shape], how: Literal["none", "center", "pca"]) -> list[Shape]:
+def aligned(shapes: list[StaticShape], how: Literal["none", "center", "pca"]) -> list[StaticShape]:
     """All shapes in the frame of the first: its unit sphere.
 
     Args:
@@ -206,7 +206,7 @@ def aligned(shapes: list[Shape], how: Literal["none", "center", "pca"]) -> list[
     return placed
 
 
-def into_unit_sphere(shapes: list[Shape], reach: Float64) -> tuple[list[Shape], Similarity]:
+def into_unit_sphere(shapes: list[StaticShape], reach: Float64) -> tuple[list[StaticShape], Similarity]:
     """The shapes shrunk until all that they will ever reach lies in the unit sphere, and the similarity that did it.
 
     Args:
@@ -238,15 +238,15 @@ def _numbers(text: str, numbers: str, count: int) -> Float64:
     return parsed
 
 
-def _meshed(name: str, field: Field, similarity: Similarity) -> Shape:
+def _meshed(name: str, field: Field, similarity: Similarity) -> StaticShape:
     try:
         mesh = extract_mesh(field, resolution=MESH_RESOLUTION, normals=False)
     except NoSurfaceError as error:
         raise InputError(f"{name}: has no surface in the unit sphere ({error})") from error
-    return Shape(name, field, similarity, from_mesh(mesh))
+    return StaticShape(name, field, similarity, from_mesh(mesh))
 
 
-def _turned(first: Shape, shape: Shape) -> Float64:
+def _turned(first: StaticShape, shape: StaticShape) -> Float64:
     """The rotation that lays the principal axes on each other, and the insides as well as they go."""
     ours, theirs = (_axes(each.surface) for each in (shape, first))
     flips = [np.diag((a, b, a * b)) for a, b in itertools.product((1.0, -1.0), repeat=2)]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,11 +18,11 @@ from ..fit.samples import delta_of
 from ..run.folder import RunFolder, digest_of
 from ..run.machine import choose_device, environment
 from ..run.settings import EvolveConfig
-from ..run.trainer import Interrupted, Progress, StopFlag, Trainer, prefixed, stop_on_signals, without_prefix
+from ..run.trainer import Interrupted, Progress, Report, StopFlag, Trainer, prefixed, stop_on_signals, without_prefix
 from .checks import check_evolution
 from .objective import LONGEST_GRADIENT, EvolveObjective, learn_start
 from .problem import Problem, build_problem
-from .shapes import Shape, read_shape
+from .shapes import StaticShape, read_shape
 
 __all__ = ["Evolution", "evolve", "train_evolution"]
 
@@ -50,7 +49,7 @@ def evolve(
     *,
     out: str | Path | None = None,
     resume: bool = False,
-    progress: Callable[[Progress], None] | None = None,
+    progress: Report | None = None,
 ) -> Evolution:
     """Train a field of space-time.
 
@@ -85,10 +84,10 @@ def train_evolution(
     problem: Problem,
     config: EvolveConfig,
     *,
-    shapes: list[Shape] | None = None,
+    shapes: list[StaticShape] | None = None,
     out: str | Path | None = None,
     resume: bool = False,
-    progress: Callable[[Progress], None] | None = None,
+    progress: Report | None = None,
 ) -> Evolution:
     """`evolve` for a problem that was put together by hand; see there."""
     names, folder = [shape.name for shape in shapes or []], RunFolder(out, resume=resume)
@@ -109,7 +108,7 @@ class _Evolving:
         config: EvolveConfig,
         device: torch.device,
         folder: RunFolder,
-        progress: Callable[[Progress], None],
+        progress: Report,
     ) -> None:
         self.problem, self.names, self.config, self.device = problem, names, config, device
         self.folder, self.progress = folder, progress

@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -31,12 +32,12 @@ from ...neural_fields import InputError
 from ...neural_fields.files import files_in
 from ..run.folder import CLOUD_FILE, kept_cloud, read_record
 from ..run.machine import choose_device
-from ..run.trainer import Progress
+from ..run.trainer import Report
 from .train import FitConfig, Run, fit
 
 __all__ = ["DepthInput", "depth_cloud", "fit_depth", "trim_suggestion"]
 
-"""The cloud of a run that was fitted to depth maps; `mesh --trim-distance` and `texture` read it."""
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -88,8 +89,13 @@ class _Files:
                 f"{source.depth}: {len(files)} depth maps, but no poses to join them by; give --poses trajectory.log "
                 "or transforms.json, or name one depth map"
             )
-        posed = _in_order_of(files, poses, source)
-        colors = _colors(files, source.color)
+        trouble = f"{source.poses}: {len(poses)} poses, but {len(files)} depth maps in {source.depth}"
+        posed = _in_order_of(files, poses, [name for name, _, _ in poses], trouble)
+        colors: list[Path | None] = [None] * len(files)
+        if source.color is not None:
+            pictures = _files(source.color, COLOR_SUFFIXES, "pictures")
+            trouble = f"{source.color}: {len(pictures)} pictures, but {len(files)} depth maps; make their names match"
+            colors = [*_in_order_of(files, pictures, [picture.name for picture in pictures], trouble)]
         cameras = _cameras(files, posed, source)
         self.parts = list(zip(files, cameras, colors, (pose for _, pose, _ in posed), strict=True))
 
@@ -113,7 +119,7 @@ def fit_depth(
     *,
     out: Path,
     resume: bool = False,
-    progress: Callable[[Progress], None] | None = None,
+    progress: Report | None = None,
     say: Callable[[str], None] | None = None,
 ) -> Run:
     """Fit depth maps: make their cloud, keep it as ``cloud.ply`` in the run's directory, and fit that.
@@ -137,9 +143,9 @@ def fit_depth(
         return fit(kept_cloud(out), config, out=out, resume=True, progress=progress)
     config = config or FitConfig()
     choose_device(config.device)  # or it would fail after the directory has been made
-    cloud, report = depth_cloud(source)
+    cloud, facts = depth_cloud(source)
     if say is not None:
-        say(report.summary())
+        say(facts.summary())
     if config.normals == "auto":
         config = dataclasses.replace(config, normals="file")
     out.mkdir(parents=True, exist_ok=True)
@@ -170,27 +176,14 @@ def _files(path: Path, suffixes: tuple[str, ...], what: str) -> list[Path]:
     return files
 
 
-def _in_order_of(files: list[Path], poses: list[PosedFrame], source: DepthInput) -> list[PosedFrame]:
-    """The pose of each file: by name where the poses have names that fit, else by order."""
-    named = {Path(name).stem: pose for pose in poses if (name := pose[0]) is not None}
+def _in_order_of(files: list[Path], items: list[T], names: list[str | None], trouble: str) -> list[T]:
+    """What belongs to each file: by the stem of its name where all have names that fit, else by order."""
+    named = {Path(name).stem: item for name, item in zip(names, items, strict=True) if name is not None}
     if all(file.stem in named for file in files):
         return [named[file.stem] for file in files]
-    if len(poses) != len(files):
-        raise InputError(f"{source.poses}: {len(poses)} poses, but {len(files)} depth maps in {source.depth}")
-    return poses
-
-
-def _colors(files: list[Path], color: Path | None) -> list[Path | None]:
-    """The picture of each depth map: by name where all names fit, else by order."""
-    if color is None:
-        return [None] * len(files)
-    pictures = _files(color, COLOR_SUFFIXES, "pictures")
-    named = {picture.stem: picture for picture in pictures}
-    if all(file.stem in named for file in files):
-        return [named[file.stem] for file in files]
-    if len(pictures) != len(files):
-        raise InputError(f"{color}: {len(pictures)} pictures, but {len(files)} depth maps; make their names match")
-    return list(pictures)
+    if len(items) != len(files):
+        raise InputError(trouble)
+    return items
 
 
 def _cameras(files: list[Path], posed: list[PosedFrame], source: DepthInput) -> list[DepthCamera]:

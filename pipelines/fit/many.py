@@ -18,7 +18,7 @@ from ..run.folder import STATE_FILE, check_new_run, is_fitted, read_record
 from ..run.jobs import Outcome, check_jobs, run_jobs
 from ..run.machine import format_table
 from ..run.settings import FitConfig
-from ..run.trainer import Progress
+from ..run.trainer import Progress, Report
 from .train import fit
 
 __all__ = ["FitJob", "FitOutcome", "fit_many", "format_fits", "plan_fits"]
@@ -125,7 +125,7 @@ def format_fits(outcomes: Sequence[FitOutcome]) -> str:
     return format_table(("cloud", "points", "rms at points", "time", "run"), rows)
 
 
-def _fit(job: FitJob, progress: Callable[[Progress], None] | None = None) -> dict[str, Any]:
+def _fit(job: FitJob, progress: Report | None = None) -> dict[str, Any]:
     """Fit one cloud, or what is left of it → what its ``run.json`` holds."""
     if job.resume and is_fitted(job.directory):
         return read_record(job.directory)
@@ -133,7 +133,7 @@ def _fit(job: FitJob, progress: Callable[[Progress], None] | None = None) -> dic
     return fit(job.cloud, job.config, out=job.directory, resume=resume, progress=progress).record
 
 
-def _named(progress: Callable[[str, Progress], None], name: str) -> Callable[[Progress], None]:
+def _named(progress: Callable[[str, Progress], None], name: str) -> Report:
     return lambda step: progress(name, step)
 
 

@@ -1,16 +1,16 @@
-"""Training samples of one level (paper Sec. 3.2, "Sampling"), made once and drawn from at every step.
+"""What a level learns from (paper Sec. 3.2, "Sampling"): the domain for level 0, the band before it for the others.
 
-Everything that a step would otherwise have to find out again is stored with a sample: the distance and the
-normal that the cloud gives it, and the value and the gradient of the frozen levels before. A step then
-evaluates the residual being trained and nothing else.
-
-What a level of the fit learns from: the domain for level 0, the band around the level before for the others.
+Samples are made once and drawn from at every step. Everything that a step would otherwise have to find out again is
+stored with them: the distance and the normal that the cloud gives, and the value and the gradient of the frozen levels
+before. A step then evaluates the residual being trained and nothing else.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 import torch
@@ -23,6 +23,7 @@ from .cloud import CloudDistance
 
 __all__ = [
     "Band",
+    "Rows",
     "Samples",
     "Source",
     "Weights",
@@ -48,10 +49,32 @@ STRAY = 4.0
 TAIL = 20.0
 # How far a winding number must be from one half to say in or out: it is off by less than 0.05 where it is asked.
 SURE = 0.4
+# So few places that the level before gets wrong far from the cloud are not worth a share of the batch.
+FEWEST = 32
+
+
+class Rows:
+    """What is known about points, a row for each: a dataclass of tensors of equal length, some of which may be None."""
+
+    points: Tensor
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def take(self, index: Tensor) -> Self:
+        """The rows at ``index``."""
+        return self._each(lambda column: column[index])
+
+    def to(self, device: torch.device) -> Self:
+        """The same rows on another device."""
+        return self._each(lambda column: column.to(device))
+
+    def _each(self, change: Callable[[Tensor], Tensor]) -> Self:
+        return type(self)(*(None if column is None else change(column) for column in vars(self).values()))
 
 
 @dataclass(frozen=True)
-class Samples:
+class Samples(Rows):
     """Points with what is known about them.
 
     Attributes:
@@ -68,18 +91,102 @@ class Samples:
     value: Tensor | None = None
     gradient: Tensor | None = None
 
-    def __len__(self) -> int:
-        return len(self.points)
 
-    def take(self, index: Tensor) -> Samples:
-        """The samples at ``index``."""
-        parts = (self.points, self.distance, self.normal, self.value, self.gradient)
-        return Samples(*(None if part is None else part[index] for part in parts))  # pyright: ignore[reportArgumentType]
+@dataclass(frozen=True)
+class Source:
+    """Samples, how many of them go into each batch, and the weights of their terms."""
 
-    def to(self, device: torch.device) -> Samples:
-        """The same samples on another device."""
-        parts = (self.points, self.distance, self.normal, self.value, self.gradient)
-        return Samples(*(None if part is None else part.to(device) for part in parts))  # pyright: ignore[reportArgumentType]
+    name: str
+    samples: Samples
+    batch: int
+    data: float
+    normal: float
+    eikonal: float
+
+
+@dataclass(frozen=True)
+class Weights:
+    """Weights of the three terms of Eq. 4, as they stand; None is what the fit would take.
+
+    Attributes:
+        data: of (f(x) − d)²; the fit's own is `FitConfig.data_weight_after`.
+        normal: of 1 − cos(∇f, N).
+        eikonal: of (|∇f| − 1)².
+    """
+
+    data: float | None = None
+    normal: float | None = None
+    eikonal: float | None = None
+
+    def resolved(self, config: FitConfig, errors: Tensor, noise: float) -> tuple[float, float, float]:
+        """Data, normal and eikonal weight, where the levels before miss the surface samples by ``errors`` ``(n,)``."""
+        data = config.data_weight_after(float(errors.square().mean()), noise)
+        given = (self.data, self.normal, self.eikonal)
+        usual = (data, config.normal_weight, config.eikonal_weight)
+        return tuple(u if g is None else g for g, u in zip(given, usual, strict=True))  # pyright: ignore[reportReturnType]
+
+
+def first_sources(
+    index: CloudDistance, config: FitConfig, *, generator: torch.Generator, device: torch.device
+) -> list[Source]:
+    """Level 0's: the cloud, and distances in the whole domain."""
+    domain = distance_samples(index, config.samples, generator=generator).to(device)
+    near, far = config.data_weight, config.data_weight * config.domain_weight
+    half = config.batch // 2
+    return [
+        Source("surface", surface_samples(index).to(device), half, near, config.normal_weight, config.eikonal_weight),
+        Source("domain", domain, half, far, 0.0, config.eikonal_weight),
+    ]
+
+
+def banded_sources(
+    index: CloudDistance,
+    previous: Field,
+    delta: float,
+    config: FitConfig,
+    *,
+    generator: torch.Generator,
+    weights: Weights | None = None,
+    name: str = "cloud",
+) -> list[Source]:
+    """A residual level's: the cloud, its offsets and dithered points, inside the band (Sec. 3.2); and empty places.
+
+    Args:
+        index: the cloud.
+        previous: the frozen levels.
+        delta: half-width of the band around the finest of them.
+        config: weights, batch and number of samples.
+        generator: draws the samples.
+        weights: other weights than the fit's own.
+        name: what messages call the cloud.
+
+    Raises:
+        InputError: one kind of samples is empty.
+    """
+    device = previous.like.device
+    offset = offset_samples(index, delta, config.samples, generator=generator)
+    band = band_samples(index, delta, config.samples, generator=generator)
+    kept = {
+        kind: with_previous(samples, previous, delta, device=device)
+        for kind, samples in (("surface", surface_samples(index)), ("offset", offset), ("band", band))
+    }
+    for kind, samples in kept.items():
+        if not len(samples):
+            raise InputError(
+                f"{name}: no {kind} samples within {delta:.2g} of the level before; train it longer "
+                "(--steps) or widen the band (--epsilon)"
+            )
+    before = kept["surface"].value
+    assert before is not None
+    terms = (weights or Weights()).resolved(config, before, index.noise)
+    third = config.batch // 3
+    sources = [Source(kind, samples, third, *terms) for kind, samples in kept.items()]
+    # Of its own generator: a cloud without such places is fitted as if nobody had looked for them.
+    own = torch.Generator().manual_seed(generator.initial_seed() + 1)
+    empty = empty_samples(index, previous, delta, config.samples, generator=own, device=device)
+    if len(empty) >= FEWEST:
+        sources.append(Source("empty", empty, third // 4, terms[0], 0.0, 0.0))
+    return sources
 
 
 @dataclass(frozen=True)
@@ -130,6 +237,12 @@ def delta_of(errors: Tensor, *, epsilon: float, quantile: float | None) -> float
         usual = min(q * ordered[math.ceil(share * len(ordered)) - 1] for q, share in ((STRAY, 0.99), (TAIL, 0.9)))
         return (1 + epsilon) * float(ordered[ordered <= usual][-1])
     return (1 + epsilon) * float(ordered[max(0, math.ceil(quantile * len(ordered)) - 1)])
+
+
+def surface_samples(index: CloudDistance) -> Samples:
+    """The cloud itself: distance 0, and its normals."""
+    points = torch.from_numpy(index.points)
+    return Samples(points, distance=torch.zeros(len(points)), normal=torch.from_numpy(index.normals))
 
 
 def distance_samples(cloud: CloudDistance, count: int, *, generator: torch.Generator) -> Samples:
@@ -250,110 +363,3 @@ def with_previous(samples: Samples, field: Field, delta: float, *, device: torch
     moved = samples.to(device)
     full = Samples(points, moved.distance, moved.normal, jet.value, jet.gradient)
     return full.take(kept.nonzero()[:, 0])
-
-
-@dataclass(frozen=True)
-class Source:
-    """Samples, how many of them go into each batch, and the weights of their terms."""
-
-    name: str
-    samples: Samples
-    batch: int
-    data: float
-    normal: float
-    eikonal: float
-
-
-# So few places that the level before gets wrong far from the cloud are not worth a share of the batch.
-FEWEST = 32
-
-
-@dataclass(frozen=True)
-class Weights:
-    """Weights of the three terms of Eq. 4, as they stand; None is what the fit would take.
-
-    Attributes:
-        data: of (f(x) − d)²; the fit's own is `FitConfig.data_weight_after`.
-        normal: of 1 − cos(∇f, N).
-        eikonal: of (|∇f| − 1)².
-    """
-
-    data: float | None = None
-    normal: float | None = None
-    eikonal: float | None = None
-
-    def resolved(self, config: FitConfig, errors: Tensor, noise: float) -> tuple[float, float, float]:
-        """Data, normal and eikonal weight, where the levels before miss the surface samples by ``errors`` ``(n,)``."""
-        data = config.data_weight_after(float(errors.square().mean()), noise)
-        given = (self.data, self.normal, self.eikonal)
-        usual = (data, config.normal_weight, config.eikonal_weight)
-        return tuple(u if g is None else g for g, u in zip(given, usual, strict=True))  # pyright: ignore[reportReturnType]
-
-
-def surface_samples(index: CloudDistance) -> Samples:
-    """The cloud itself: distance 0, and its normals."""
-    points = torch.from_numpy(index.points)
-    return Samples(points, distance=torch.zeros(len(points)), normal=torch.from_numpy(index.normals))
-
-
-def first_sources(
-    index: CloudDistance, config: FitConfig, *, generator: torch.Generator, device: torch.device
-) -> list[Source]:
-    """Level 0's: the cloud, and distances in the whole domain."""
-    domain = distance_samples(index, config.samples, generator=generator).to(device)
-    near, far = config.data_weight, config.data_weight * config.domain_weight
-    half = config.batch // 2
-    return [
-        Source("surface", surface_samples(index).to(device), half, near, config.normal_weight, config.eikonal_weight),
-        Source("domain", domain, half, far, 0.0, config.eikonal_weight),
-    ]
-
-
-def banded_sources(
-    index: CloudDistance,
-    previous: Field,
-    delta: float,
-    config: FitConfig,
-    *,
-    generator: torch.Generator,
-    weights: Weights | None = None,
-    name: str = "cloud",
-) -> list[Source]:
-    """A residual level's: the cloud, its offsets and dithered points, inside the band (Sec. 3.2); and empty places.
-
-    Args:
-        index: the cloud.
-        previous: the frozen levels.
-        delta: half-width of the band around the finest of them.
-        config: weights, batch and number of samples.
-        generator: draws the samples.
-        weights: other weights than the fit's own.
-        name: what messages call the cloud.
-
-    Raises:
-        InputError: one kind of samples is empty.
-    """
-    device = previous.like.device
-    offset = offset_samples(index, delta, config.samples, generator=generator)
-    band = band_samples(index, delta, config.samples, generator=generator)
-    kept = {
-        kind: with_previous(samples, previous, delta, device=device)
-        for kind, samples in (("surface", surface_samples(index)), ("offset", offset), ("band", band))
-    }
-    for kind, samples in kept.items():
-        if not len(samples):
-            raise InputError(
-                f"{name}: no {kind} samples within {delta:.2g} of the level before; train it longer "
-                "(--steps) or widen the band (--epsilon)"
-            )
-    before = kept["surface"].value
-    assert before is not None
-    terms = (weights or Weights()).resolved(config, before, index.noise)
-    third = config.batch // 3
-    sources = [Source(kind, samples, third, *terms) for kind, samples in kept.items()]
-    # Of its own generator: a cloud without such places is fitted as if nobody had looked for them.
-    own = torch.Generator().manual_seed(generator.initial_seed() + 1)
-    empty = empty_samples(index, previous, delta, config.samples, generator=own, device=device)
-    if len(empty) >= FEWEST:
-        sources.append(Source("empty", empty, third // 4, terms[0], 0.0, 0.0))
-    return sources

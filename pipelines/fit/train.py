@@ -1,13 +1,12 @@
 """``fit``: from an oriented point cloud to a multiscale SDF, level by level (paper Sec. 3.2).
 
-What the coarse level tells of the points it was fitted to: outliers by their residual, flipped normals.
+What the coarse level shows to be wrong with the cloud, outliers and flipped normals, the finer ones do not see.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -24,7 +23,7 @@ from ...neural_fields import Field, InputError, MultiscaleSDF, Similarity, Siren
 from ..run.folder import RunFolder, digest_of
 from ..run.machine import choose_device, environment, peak_memory
 from ..run.settings import FitConfig
-from ..run.trainer import Interrupted, Progress, StopFlag, Trainer, prefixed, stop_on_signals, without_prefix
+from ..run.trainer import Interrupted, Progress, Report, StopFlag, Trainer, prefixed, stop_on_signals, without_prefix
 from ..surface.trim import write_support
 from .cloud import CloudDistance, load_cloud
 from .level import LevelObjective, new_level
@@ -35,6 +34,12 @@ __all__ = ["FitConfig", "Review", "Run", "fit", "prepare", "review_points"]
 # A level whose error at the points is so many times that of the level before it is worse than none: set to zero, it is
 # that level. Where data contradict themselves, as the sides of a part do that is thinner than their noise, it happens.
 WORSE = 2.0
+# Largest |f_0| in units of its robust scale: half of a sound cloud's errors are below 0.67, and what a coarse level
+# misses of fine parts is above 8; so is every stray that is worth finding.
+FAR = 8.0
+MAD = 1.4826  # a Gaussian's standard deviation over its median magnitude
+AGAINST = -0.7  # cosine between a normal and the gradient of level 0, below which the normal may be flipped
+OPPOSED = -0.3  # and the mean of its neighbours', along its own
 
 Cloud = PointCloud | str | Path | NDArray[np.floating]
 
@@ -62,7 +67,7 @@ def fit(
     *,
     out: str | Path | None = None,
     resume: bool = False,
-    progress: Callable[[Progress], None] | None = None,
+    progress: Report | None = None,
 ) -> Run:
     """Fit a multiscale SDF to a point cloud.
 
@@ -130,7 +135,7 @@ class _Fitting:
         config: FitConfig,
         device: torch.device,
         folder: RunFolder,
-        progress: Callable[[Progress], None] | None,
+        progress: Report | None,
         merging: Merging | None,
     ) -> None:
         self.cloud, self.source, self.config = cloud, source, config
@@ -233,7 +238,7 @@ class _Fitting:
             self.points = self.points[kept]
             self.index = None
             self.keep_support()
-        return found.report()
+        return found.record()
 
     @torch.no_grad()
     def values_at_cloud(self) -> Tensor:
@@ -304,14 +309,6 @@ def _rms(errors: Tensor) -> float:
     return float(errors.square().mean().sqrt())
 
 
-# Largest |f_0| in units of its robust scale: half of a sound cloud's errors are below 0.67, and what a coarse level
-# misses of fine parts is above 8; so is every stray that is worth finding.
-FAR = 8.0
-MAD = 1.4826  # a Gaussian's standard deviation over its median magnitude
-AGAINST = -0.7  # cosine between a normal and the gradient of level 0, below which the normal may be flipped
-OPPOSED = -0.3  # and the mean of its neighbours', along its own
-
-
 class Review(NamedTuple):
     """Which points of a cloud the next levels must not see as they are; each ``(N,)``.
 
@@ -325,7 +322,7 @@ class Review(NamedTuple):
     turned: NDArray[np.bool_]
     scale: float
 
-    def report(self) -> dict[str, Any]:
+    def record(self) -> dict[str, Any]:
         """Counts for ``run.json``."""
         return {
             "dropped_outliers": int(self.dropped.sum()),

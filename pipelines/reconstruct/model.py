@@ -1,7 +1,4 @@
-"""What ``reconstruct`` learns: geometry, colour by direction, the surface's uncertainty, and what is behind.
-
-All pixels of some pictures, and rays drawn from them at random.
-"""
+"""What ``reconstruct`` learns, and from what: a scene of geometry, colours and uncertainty, and rays of pictures."""
 
 from __future__ import annotations
 

@@ -1,12 +1,12 @@
 """``reconstruct``: from posed photographs to a surface with colours, by volume rendering (NeuS) of a multiscale SDF.
 
-From colours that depend on the view to the texture of a surface, which every other command can use.
+Colours are learnt by direction; at the end a texture learns those seen head-on, which every other command can use.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ from ..render.picture import write_picture
 from ..run.folder import TEXTURE_FILE, RunFolder, digest_of
 from ..run.machine import choose_device, environment
 from ..run.settings import ReconstructConfig, TextureConfig
-from ..run.trainer import Interrupted, Progress, stop_on_signals
+from ..run.trainer import Interrupted, Progress, Report, stop_on_signals
 from ..surface.surface import from_mesh, sample_points
 from ..surface.trim import in_region
 from ..texture.train import FittedTexture, fit_texture
@@ -36,6 +36,9 @@ HELD_OUT_FILE = "held_out.png"
 PREVIEW_FILE = "preview.png"
 PREVIEWS = 5  # pictures of the first view on the way
 SHEET_VIEWS = 4  # rows of the sheet of held-out views
+TEXTURE_RESOLUTION = 128  # of the mesh whose points are coloured: finer than the texture's band is wide
+TEXTURE_SAMPLES = 100_000
+BATCH = 1 << 15
 
 
 @dataclass(frozen=True)
@@ -63,7 +66,7 @@ def reconstruct(
     *,
     out: str | Path | None = None,
     resume: bool = False,
-    progress: Callable[[Progress], None] | None = None,
+    progress: Report | None = None,
 ) -> Reconstruction:
     """Train geometry and colour on posed photographs.
 
@@ -102,7 +105,7 @@ class _Reconstruction:
         config: ReconstructConfig,
         device: torch.device,
         folder: RunFolder,
-        progress: Callable[[Progress], None],
+        progress: Report,
     ) -> None:
         self.images, self.config, self.device = images, config, device
         self.folder, self.progress = folder, progress
@@ -227,11 +230,6 @@ class _Reconstruction:
         }
 
 
-RESOLUTION = 128  # of the mesh whose points are coloured: finer than the texture's band is wide
-SAMPLES = 100_000
-BATCH = 1 << 15
-
-
 @torch.no_grad()
 def surface_colors(model: SceneModel, points: Tensor) -> Tensor:
     """Colours ``(N, 3)`` of points ``(N, 3)`` near the surface, each seen along its normal, from outside."""
@@ -247,7 +245,7 @@ def scene_texture(
     images: PosedImages,
     config: ReconstructConfig,
     *,
-    progress: Callable[[Progress], None] | None = None,
+    progress: Report | None = None,
 ) -> FittedTexture:
     """Train a `TextureField` on the head-on colours of a scene's surface.
 
@@ -260,11 +258,13 @@ def scene_texture(
     Raises:
         NoSurfaceError: the geometry has no surface.
     """
-    mesh = in_region(extract_mesh(model.geometry, resolution=RESOLUTION))
+    mesh = in_region(extract_mesh(model.geometry, resolution=TEXTURE_RESOLUTION))
     if mesh is None:
         raise NoSurfaceError("all of it is outside the region of interest")
-    points, _ = sample_points(from_mesh(mesh), SAMPLES, np.random.default_rng(config.seed))
+    points, _ = sample_points(from_mesh(mesh), TEXTURE_SAMPLES, np.random.default_rng(config.seed))
     colors = surface_colors(model, torch.from_numpy(points).float()).numpy()
     cloud = PointCloud(images.similarity.to_input(points), colors=colors, source=str(images.source))
-    settings = TextureConfig(steps=config.texture_steps, samples=SAMPLES, seed=config.seed, device=config.device)
+    settings = TextureConfig(
+        steps=config.texture_steps, samples=TEXTURE_SAMPLES, seed=config.seed, device=config.device
+    )
     return fit_texture(model.geometry, cloud, settings, similarity=images.similarity, progress=progress)

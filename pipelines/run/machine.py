@@ -1,7 +1,4 @@
-"""What every benchmark needs: best-of-n times, the machine's matrix rate, and a table.
-
-The most memory that this process has held.
-"""
+"""The machine under a run: its device, versions, speed and memory; and tables of what was measured on it."""
 
 from __future__ import annotations
 
@@ -19,6 +16,10 @@ import torch
 from ...neural_fields import InputError
 
 __all__ = ["best_seconds", "environment", "format_table", "peak_memory", "sgemm_rate"]
+
+# Linux keeps the high-water mark of a process here. Not getrusage: its maximum survives exec, so that a child would
+# report what its parent held when it was born.
+STATUS = Path("/proc/self/status")
 
 
 def best_seconds(work: Callable[[], object], *, repeats: int = 5) -> float:
@@ -56,11 +57,6 @@ def format_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
         ]
         lines.append("  ".join(cells).rstrip())
     return "\n".join(lines)
-
-
-# Linux keeps the high-water mark of a process here. Not getrusage: its maximum survives exec, so that a child would
-# report what its parent held when it was born.
-STATUS = Path("/proc/self/status")
 
 
 def peak_memory() -> int | None:

@@ -5,22 +5,15 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Protocol
 
 from rich.console import Console, RenderableType
 from rich.progress import BarColumn, TaskID, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.progress import Progress as Bars
 from rich.text import Text
 
-from .trainer import Progress
+from .trainer import Progress, Report
 
 __all__ = ["counter_bar", "progress_bars"]
-
-
-class Report(Protocol):
-    """What `fit` calls."""
-
-    def __call__(self, progress: Progress, /) -> None: ...
 
 
 @contextmanager

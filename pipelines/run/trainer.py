@@ -24,6 +24,7 @@ __all__ = [
     "Interrupted",
     "Objective",
     "Progress",
+    "Report",
     "StopFlag",
     "Trainer",
     "prefixed",
@@ -52,6 +53,9 @@ class Progress:
     steps: int
     fraction: float
     losses: Mapping[str, float]
+
+
+Report = Callable[[Progress], None]
 
 
 class Interrupted(Exception):  # noqa: N818  what happened is no error
@@ -211,7 +215,7 @@ class Trainer(Generic[O]):
         self,
         flag: StopFlag | None = None,
         *,
-        report: Callable[[Progress], None] | None = None,
+        report: Report | None = None,
         save: Callable[[], None] | None = None,
         report_every: int = 20,
         save_every: float = 20.0,

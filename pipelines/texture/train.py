@@ -41,7 +41,7 @@ from ..run.folder import (
 from ..run.lock import locked
 from ..run.machine import choose_device, environment
 from ..run.settings import TextureConfig
-from ..run.trainer import Group, Objective, Progress, Trainer, stop_on_signals, warm_cosine
+from ..run.trainer import Group, Objective, Progress, Report, Trainer, stop_on_signals, warm_cosine
 from .samples import BandSamples, ColorSamples, band_directions, match_colors, read_colors
 
 __all__ = ["FittedTexture", "TextureObjective", "default_delta", "fit_texture", "texture_of", "texture_run"]
@@ -74,7 +74,7 @@ def fit_texture(
     *,
     similarity: Similarity | None = None,
     level: int = -1,
-    progress: Callable[[Progress], None] | None = None,
+    progress: Report | None = None,
     save: Callable[[dict[str, Tensor]], None] | None = None,
     state: Mapping[str, Tensor] | None = None,
 ) -> FittedTexture:
@@ -155,7 +155,7 @@ def texture_run(
     out: str | Path | None = None,
     level: int | None = None,
     resume: bool = False,
-    progress: Callable[[Progress], None] | None = None,
+    progress: Report | None = None,
 ) -> FittedTexture:
     """Train a texture for a run and write it, by default beside its field, where ``run.json`` records it.
 

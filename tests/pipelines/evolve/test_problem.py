@@ -24,7 +24,7 @@ from mplicits.neural_fields import (
 )
 from mplicits.pipelines.evolve import problem as evolve_problem
 from mplicits.pipelines.evolve.problem import between, build_problem, velocity_field
-from mplicits.pipelines.evolve.shapes import Placed, Placement, Shape, aligned, into_unit_sphere, read_shape
+from mplicits.pipelines.evolve.shapes import Placed, Placement, StaticShape, aligned, into_unit_sphere, read_shape
 from mplicits.pipelines.run.settings import EvolveConfig
 from mplicits.pipelines.surface.surface import from_mesh
 
@@ -39,9 +39,9 @@ def _few_points(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(evolve_problem, "REACH_POINTS", 200)
 
 
-def shape_of(field, *, similarity: Similarity | None = None) -> Shape:
+def shape_of(field, *, similarity: Similarity | None = None) -> StaticShape:
     mesh = extract_mesh(field, resolution=48)
-    return Shape("made", field, similarity or Similarity.identity(), from_mesh(mesh))
+    return StaticShape("made", field, similarity or Similarity.identity(), from_mesh(mesh))
 
 
 def test_a_placement_and_its_inverse() -> None:

@@ -43,7 +43,7 @@ def test_residuals_find_strays_and_gradients_find_flipped_normals() -> None:
     assert found.dropped[4000:].sum() > 40  # those with normals unlike the sphere's gradient
     assert found.turned[:200].all()
     assert not found.turned[200:4000].any()
-    assert found.report()["turned_normals"] == found.turned.sum()
+    assert found.record()["turned_normals"] == found.turned.sum()
     nothing = review_points(points, normals, Sphere(radius=0.5), device=CPU, outliers=False, turn=False)
     assert not nothing.dropped.any()
     assert not nothing.turned.any()

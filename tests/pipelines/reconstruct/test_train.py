@@ -50,8 +50,8 @@ FLAGS += " --color-frequencies 2 --steps 3 --rays 16 --uniform 8 --importance 4 
 
 def small_textures(patch: pytest.MonkeyPatch) -> None:
     """Colour fewer points of a coarser mesh by a smaller network: how textures are trained is tested elsewhere."""
-    patch.setattr(reconstruct_texture, "SAMPLES", 2000)
-    patch.setattr(reconstruct_texture, "RESOLUTION", 32)
+    patch.setattr(reconstruct_texture, "TEXTURE_SAMPLES", 2000)
+    patch.setattr(reconstruct_texture, "TEXTURE_RESOLUTION", 32)
     small = partial(TextureConfig, samples=2000, width=16, depth=1, batch=256, band_batch=256)
     patch.setattr(reconstruct_texture, "TextureConfig", small)
 
