@@ -1,0 +1,99 @@
+"""Files are opened in one way: what they hold comes back as stored, and what is wrong with them is one line."""
+
+import cv2
+import imageio.v3 as iio
+import numpy as np
+import pytest
+from mplicits.datasets.files import (
+    decode_image,
+    finite_number,
+    read_arrays,
+    read_image,
+    read_json,
+    read_rgb,
+    rgb_and_alpha,
+    unit_range,
+)
+from mplicits.neural_fields import InputError
+
+RGBA = np.random.default_rng(0).integers(0, 256, (3, 5, 4)).astype(np.uint8)
+
+
+def stored(extension, image):
+    return cv2.imencode(extension, image)[1].tobytes()
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+@pytest.mark.parametrize("extension", [".png", ".tif"])
+@pytest.mark.parametrize("channels", [1, 3, 4])
+def test_images_keep_their_bits_and_channels(kind, extension, channels):
+    values = RGBA.astype(kind) * (257 if kind is np.uint16 else 1)
+    expected = values[..., 0] if channels == 1 else values[..., :channels]
+    blue_first = expected if channels == 1 else values[..., [2, 1, 0, 3][:channels]]
+    found = decode_image(stored(extension, blue_first))
+    assert found.dtype == kind
+    assert np.array_equal(found, expected)
+    rgb, alpha = rgb_and_alpha(found)
+    assert np.array_equal(rgb, np.repeat(values[..., :1], 3, axis=2) if channels == 1 else values[..., :3])
+    assert (alpha is None) == (channels < 4)
+    assert alpha is None or np.array_equal(alpha, values[..., 3])
+    assert np.abs(unit_range(rgb) - rgb / np.iinfo(kind).max).max() < 1e-7
+
+
+def test_what_opencv_does_not_know_pillow_may(tmp_path):
+    iio.imwrite(tmp_path / "a.tga", RGBA[..., :3])
+    assert np.array_equal(read_rgb(tmp_path / "a.tga")[0], RGBA[..., :3])
+
+
+def test_floating_point_images_are_no_pictures_of_8_or_16_bits(tmp_path):
+    values = np.array([[-1.0, 0.25], [0.5, 3.0]], np.float32)
+    (tmp_path / "a.tif").write_bytes(stored(".tif", values))
+    assert np.array_equal(read_image(tmp_path / "a.tif"), values)
+    assert np.array_equal(unit_range(values), values.clip(0, 1))
+    with pytest.raises(InputError, match=r"a\.tif: float32 of shape \(2, 2\); expected a picture with 8 or 16 bits"):
+        read_rgb(tmp_path / "a.tif")
+
+
+def test_arrays_by_name_or_alone(tmp_path):
+    np.save(tmp_path / "a.npy", RGBA)
+    assert np.array_equal(read_arrays(tmp_path / "a.npy"), RGBA)
+    np.savez(tmp_path / "b.npz", one=RGBA, two=np.array([None]))
+    assert list(read_arrays(tmp_path / "b.npz", lambda names: [names[0]])) == ["one"]
+    with pytest.raises(InputError, match=r"b\.npz: two: holds Python objects; export it again as plain numbers"):
+        read_arrays(tmp_path / "b.npz")
+
+
+@pytest.mark.parametrize(
+    ("read", "content", "message"),
+    [
+        (read_json, None, "no such file; check the path"),
+        (read_json, b"{", "is not JSON"),
+        (read_json, b"\xff\xfe", "is not JSON"),
+        (read_arrays, None, "no such file; check the path"),
+        (read_arrays, b"nothing", "damaged or not a NumPy file"),
+        (read_arrays, b"PK\x03\x04 broken", "damaged or not a NumPy file"),
+        (read_image, None, "no such file; check the path"),
+        (read_image, b"", "cannot be decoded as an image"),
+        (read_image, b"\x89PNG\r\n\x1a\n", "cannot be decoded as an image"),
+    ],
+)
+def test_what_is_wrong_is_one_line_that_names_the_file(tmp_path, read, content, message):
+    path = tmp_path / "file"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(InputError, match=message) as caught:
+        read(path)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_folder_in_the_place_of_a_file_is_said(tmp_path):
+    with pytest.raises(InputError, match="cannot be read"):
+        read_json(tmp_path)
+
+
+@pytest.mark.parametrize("value", [True, "1", None, float("nan"), float("inf"), [1.0]])
+def test_numbers_of_json_are_finite(value):
+    assert finite_number(3, "a.json: fx") == 3.0
+    with pytest.raises(InputError, match=r"a\.json: fx: .*; expected a finite number"):
+        finite_number(value, "a.json: fx")
