@@ -20,7 +20,7 @@ from torch import Tensor
 
 from ..neural_fields import Similarity
 
-__all__ = ["UP_AXES", "Camera", "intrinsics", "look_at", "orbit", "pinhole_intrinsics", "turntable"]
+__all__ = ["COEFFICIENTS", "UP_AXES", "Camera", "intrinsics", "look_at", "orbit", "pinhole_intrinsics", "turntable"]
 
 Float64 = NDArray[np.float64]
 
@@ -29,7 +29,7 @@ UP_AXES: Mapping[str, tuple[float, float, float]] = MappingProxyType({"y": (0.0,
 
 RIGID = 1e-6  # how far a pose's axes may be from orthonormal
 STRAIGHT = 1e-9  # sine of the angle below which a view runs along the up direction
-COEFFICIENTS = 8  # at most, of the distortion: k1, k2, p1, p2, k3, k4, k5, k6
+COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # of OpenCV's distortion, in its order
 UNDISTORTION = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 200, 1e-12)  # OpenCV's own five steps leave 1e-3
 
 
@@ -62,8 +62,8 @@ class Camera:
     distortion: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        if len(self.distortion) > COEFFICIENTS or not np.isfinite(self.distortion).all():
-            raise ValueError(f"distortion={self.distortion}: expected at most {COEFFICIENTS} finite numbers")
+        if len(self.distortion) > len(COEFFICIENTS) or not np.isfinite(self.distortion).all():
+            raise ValueError(f"distortion={self.distortion}: expected at most {len(COEFFICIENTS)} finite numbers")
         if not any(self.distortion):
             object.__setattr__(self, "distortion", ())
         for name, shape in (("intrinsics", (3, 3)), ("world_from_camera", (4, 4))):
@@ -197,9 +197,9 @@ class Camera:
     @property
     def for_opencv(self) -> tuple[Float64, Float64]:
         """Matrix ``(3, 3)`` and coefficients ``(8,)`` as OpenCV takes them."""
-        return self.intrinsics.cpu().numpy(), np.array(
-            (*self.distortion, *(0.0,) * (COEFFICIENTS - len(self.distortion)))
-        )
+        coefficients = np.zeros(len(COEFFICIENTS))
+        coefficients[: len(self.distortion)] = self.distortion
+        return self.intrinsics.cpu().numpy(), coefficients
 
     def pinhole(self) -> Camera:
         """What is left of the camera without the distortion of its lens."""

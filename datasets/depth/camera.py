@@ -13,15 +13,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ...neural_fields import InputError
-from ..cameras import Camera, intrinsics, pinhole_intrinsics
+from ..cameras import COEFFICIENTS, Camera, intrinsics, pinhole_intrinsics
 from ..files import finite_number, read_json
 
 __all__ = ["DepthCamera", "read_intrinsics"]
 
 Float64 = NDArray[np.float64]
 
-COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")  # OpenCV's order
-OTHER_COEFFICIENTS = ("k4", "k5", "k6")  # of lenses that we do not model
+MODELLED = 5  # of the coefficients, in depth cameras; lenses with others are not read
 
 
 @dataclass(frozen=True)
@@ -56,7 +55,11 @@ class DepthCamera:
             value = getattr(self, name)
             if value is not None and not 0 < value < math.inf:
                 raise ValueError(f"{name}={value}: expected a finite number > 0")
-        for name, value in (("cx", self.cx), ("cy", self.cy), *zip(COEFFICIENTS, self.distortion, strict=True)):
+        for name, value in (
+            ("cx", self.cx),
+            ("cy", self.cy),
+            *zip(COEFFICIENTS[:MODELLED], self.distortion, strict=True),
+        ):
             if not math.isfinite(value):
                 raise ValueError(f"{name}={value}: expected a finite number")
 
@@ -135,16 +138,16 @@ def read_intrinsics(path: str | Path) -> DepthCamera:
         raise InputError(f"{path}: {', '.join(missing)}: missing; add {'it' if len(missing) == 1 else 'them'}")
     numbers = {
         name: finite_number(content[name], f"{path}: {name}")
-        for name in ("width", "height", "fx", "fy", "cx", "cy", "depth_scale", *COEFFICIENTS, *OTHER_COEFFICIENTS)
+        for name in ("width", "height", "fx", "fy", "cx", "cy", "depth_scale", *COEFFICIENTS)
         if content.get(name) is not None
     }
-    for name in OTHER_COEFFICIENTS:
+    for name in COEFFICIENTS[MODELLED:]:
         if numbers.get(name):
             raise InputError(f"{path}: {name}: lenses with k4 to k6 are not supported; undistort the images first")
     for name in ("width", "height"):
         if not numbers[name].is_integer():
             raise InputError(f"{path}: {name}: {numbers[name]:g}; expected a whole number of pixels")
-    k1, k2, p1, p2, k3 = (numbers.get(name, 0.0) for name in COEFFICIENTS)
+    k1, k2, p1, p2, k3 = (numbers.get(name, 0.0) for name in COEFFICIENTS[:MODELLED])
     try:
         return DepthCamera(
             int(numbers["width"]),

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from ...neural_fields import InputError
-from ..cameras import Camera, intrinsics
+from ..cameras import COEFFICIENTS, Camera, intrinsics
 from ..files import finite_number, read_json
 from .shots import Shot, find_image, image_size
 
@@ -22,8 +22,7 @@ Float64 = NDArray[np.float64]
 
 # Camera models of nerfstudio and COLMAP that are pinholes, once undistorted.
 LENSES = ("PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "FULL_OPENCV", "SIMPLE_RADIAL", "RADIAL")
-COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")  # OpenCV's order
-DIVISOR = ("k4", "k5", "k6")
+COMMON, DIVISOR = COEFFICIENTS[:5], COEFFICIENTS[5:]
 OBLIQUE = 1e-3  # how far the axes of a pose may be from orthogonal and of one length, as a share of their length
 
 
@@ -130,7 +129,7 @@ def _camera(frame: _Frame, image: Path) -> Camera:
 
 def _distortion(frame: _Frame) -> tuple[float, ...]:
     """OpenCV's coefficients. k4 to k6 are the divisor of its full model; elsewhere k4 is a fourth radial term."""
-    common = tuple(frame.number(key) or 0.0 for key in COEFFICIENTS)
+    common = tuple(frame.number(key) or 0.0 for key in COMMON)
     divisor = tuple(frame.number(key) or 0.0 for key in DIVISOR)
     if not any(divisor):
         return common
