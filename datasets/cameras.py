@@ -163,20 +163,20 @@ class Camera:
         return pixels.reshape(*points.shape[:-1], 2), seen[..., 2]
 
     def in_view(self, points: Float64) -> tuple[Float64, Float64, NDArray[np.bool_]]:
-        """`project` for points ``(N, 3)``, and which of them are in front of the camera and in its image ``(N,)``.
+        """Pixels ``(N, 2)`` and depths ``(N,)`` of points ``(N, 3)``, and which of them are in the picture ``(N,)``.
 
         Far outside the image the polynomials of a distorted lens turn back, and would bring points of its surroundings
         into it; so a point counts as inside only if its ray is among those of the image.
         """
-        pixels, depths = (array.numpy() for array in self.project(torch.from_numpy(points)))
-        inside = (
-            (depths > 0) & (pixels >= -0.5).all(axis=1) & (pixels < (self.width - 0.5, self.height - 0.5)).all(axis=1)
-        )
+        seen = (points - self.eye.numpy()) @ self.world_from_camera[:3, :3].numpy()
+        depths = seen[:, 2]
+        inside = depths > 0
+        slopes = np.where(inside[:, None], seen[:, :2] / np.where(inside, depths, 1.0)[:, None], 0.0)
+        pixels = self.pixels_at(slopes)
+        inside &= (pixels >= -0.5).all(axis=1) & (pixels < (self.width - 0.5, self.height - 0.5)).all(axis=1)
         if self.distortion:
             fx, fy, _, _ = self.fx_fy_cx_cy
             among, pixel = self.sight_lines().numpy()[..., :2], 1 / math.sqrt(fx * fy)
-            seen = (points - self.eye.numpy()) @ self.world_from_camera[:3, :3].numpy()
-            slopes = seen[:, :2] / np.where(depths > 0, depths, 1.0)[:, None]
             low, high = among.min(axis=(0, 1)) - pixel, among.max(axis=(0, 1)) + pixel
             inside &= ((slopes >= low) & (slopes <= high)).all(axis=1)
         return pixels, depths, inside
