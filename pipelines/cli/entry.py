@@ -7,7 +7,6 @@ it, never for help or for a mistake in the arguments.
 from __future__ import annotations
 
 import argparse
-import importlib.metadata
 import os
 import re
 import sys
@@ -109,7 +108,9 @@ def _run(arguments: list[str]) -> int:
         print(OVERVIEW.format(commands="\n".join(f"  {n:<{width}}  {c.summary}" for n, c in COMMANDS.items())))
         return 0 if arguments else 2
     if arguments[0] == "--version":
-        print(f"mplicits {importlib.metadata.version('mplicits')}")
+        from importlib.metadata import version  # late, as all that --help can do without
+
+        print(f"mplicits {version('mplicits')}")
         return 0
     name, command, rest = _choose(arguments)
     parser = _Parser(name, command)

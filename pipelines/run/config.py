@@ -14,8 +14,6 @@ from importlib import resources
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-import yaml
-
 __all__ = [
     "Settings",
     "add_config_flags",
@@ -214,6 +212,8 @@ def closest(name: str, known: Iterable[str]) -> str:
 
 def _read_preset(preset: str | Path | None, thing: str) -> tuple[str, Pairs]:
     """Name for messages, and the key-value pairs of a preset."""
+    import yaml  # late, as all that --help can do without
+
     if preset is None:
         return thing, {}
     if isinstance(preset, Path) or preset.endswith((".yaml", ".yml")):
