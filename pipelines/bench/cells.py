@@ -1,117 +1,94 @@
-"""A cell: one method trained once on one cloud. Every table that needs it shares what it found.
+"""A cell: a piece of work that is done once and kept. Every table that needs it shares what it found.
 
-What stands in a row of a table: a `Method`, which does the work of a cell and says what it found.
-
-What a bench keeps between two runs: a JSON file per cell, meshes, fields and pictures.
+A `Method` does the work of a cell and says what it found; a bench keeps a JSON file per cell, and the meshes, fields
+and pictures that were made on the way.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import json
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Generic, Protocol, TypeVar
 
 from ...neural_fields import InputError
 from ...neural_fields.files import write_json
 from ..run.config import closest
-from ..run.trainer import Report
+from ..run.trainer import Progress, Report
 
 __all__ = [
     "Catalogue",
     "Cell",
     "Findings",
     "Method",
-    "Preset",
     "Record",
-    "Report",
     "Workplace",
+    "key_of",
     "make_folder",
     "read_record",
     "record_file",
     "write_record",
 ]
 
-# smoke: seconds, for tests; cpu: 15 to 30 s of training on two cores, each method; paper: as published.
-Preset = Literal["smoke", "cpu", "paper"]
-# Told now and then how far a training is.
-
 # What a cell found, as it stands in its JSON file; see `mplicits.pipelines.bench.run.run_cell`.
 Record = Mapping[str, Any]
 
 
-@dataclass(frozen=True)
-class Cell:
-    """One training, with all that decides how it ends.
+class Cell(Protocol):
+    """A piece of work, with all that decides how it ends; hashable."""
 
-    Attributes:
-        shape: the file; its vertices are the cloud.
-        method: name of a `Method`, as on the command line.
-        preset: how large and how long.
-        seed: of everything random.
-        noise: the points move by up to this many diagonals of the bounding box along their normals.
-        outliers: strays appended, as a fraction of the points.
-        flipped: fraction of the points whose normals are turned round.
-        overrides: fields of `FitConfig` that differ from the preset's; only for our own method and its variants.
-        reference: the surface that results are measured against; None for ``shape`` itself.
-    """
-
-    shape: Path
-    method: str
-    preset: Preset
-    seed: int = 0
-    noise: float = 0.0
-    outliers: float = 0.0
-    flipped: float = 0.0
-    overrides: tuple[tuple[str, Any], ...] = ()
-    reference: Path | None = None
+    @property
+    def method(self) -> str:
+        """Name of the `Method` that does it."""
+        ...
 
     @property
     def name(self) -> str:
-        """One line for people, e.g. "armadillo + noise 0.01, idf"."""
-        damage = [
-            f"{what} {amount:g}"
-            for what, amount in (("noise", self.noise), ("outliers", self.outliers), ("flipped normals", self.flipped))
-            if amount
-        ]
-        changes = [f"{key}={_text(value)}" for key, value in self.overrides]
-        return ", ".join([" + ".join([self.shape.stem, *damage]), self.method, *changes])
+        """One line for people."""
+        ...
+
+    @property
+    def inputs(self) -> Sequence[Path | None]:
+        """Files that count by what they hold; None where one is left out."""
+        ...
+
+    @property
+    def parameters(self) -> Mapping[str, Any]:
+        """All else that decides the result, as JSON."""
+        ...
 
     def as_dict(self) -> dict[str, Any]:
-        """All of it, for JSON; the shape by its stem."""
-        pairs = dataclasses.asdict(self)
-        pairs |= {"shape": self.shape.stem, "file": str(self.shape), "overrides": dict(self.overrides)}
-        return pairs | {"reference": None if self.reference is None else str(self.reference)}
+        """All of it, for JSON."""
+        ...
 
-    def key(self, settings: Mapping[str, Any]) -> str:
-        """Twelve hexadecimal digits of everything that decides the result.
 
-        The files count by what they hold, not by their names, so that a shape that has moved is not trained again.
+C = TypeVar("C", bound=Cell)
 
-        Args:
-            settings: of the protocol and of the method, as far as they are not in the cell.
 
-        Raises:
-            OSError: a file cannot be read.
-        """
-        files = [None if path is None else _digest(path) for path in (self.shape, self.reference)]
-        pairs = {field: value for field, value in self.as_dict().items() if field not in ("shape", "file", "reference")}
-        text = json.dumps([files, pairs, dict(settings)], sort_keys=True)
-        return hashlib.sha256(text.encode()).hexdigest()[:12]
+def key_of(cell: Cell, settings: Mapping[str, Any]) -> str:
+    """Twelve hexadecimal digits of everything that decides the result of a cell.
+
+    Files count by what they hold, not by their names, so that a file that has moved does not make work again.
+
+    Args:
+        cell: the work.
+        settings: of the protocol and of the method, as far as they are not in the cell.
+
+    Raises:
+        OSError: a file cannot be read.
+    """
+    files = [None if path is None else _digest(path) for path in cell.inputs]
+    text = json.dumps([files, {"method": cell.method, **cell.parameters}, dict(settings)], sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
 def _digest(path: Path) -> str:
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def _text(value: Any) -> str:
-    return " ".join(map(str, value)) if isinstance(value, tuple | list) else str(value)
 
 
 @dataclass(frozen=True)
@@ -123,6 +100,7 @@ class Workplace:
         key: of the cell; names of files begin with it.
         device: a torch device.
         progress: called now and then with how far the training is.
+        say: told what comes next.
         first: does another cell, unless it is done, before this one goes on from what it left → where it works; given
             by `run_cell`.
     """
@@ -131,7 +109,17 @@ class Workplace:
     key: str
     device: str = "cpu"
     progress: Report | None = None
-    first: Callable[[Cell], Workplace] | None = None
+    say: Callable[[str], None] = lambda _: None
+    first: Callable[[Any], Workplace] | None = None
+
+    def stage(self, name: str) -> Report:
+        """A receiver of progress that puts ``name`` before the names of its stages."""
+
+        def report(step: Progress, /) -> None:
+            if self.progress is not None:
+                self.progress(replace(step, stage=f"{name} {step.stage}"))
+
+        return report
 
     def mesh(self, output: str) -> Path:
         """Where the mesh of an output goes, in input coordinates."""
@@ -151,7 +139,7 @@ class Findings:
     """What a cell found.
 
     Attributes:
-        outputs: one dict of figures per surface, coarse to fine, each with its "name"; all of it JSON.
+        outputs: one dict of figures per surface (coarse to fine, each with its "name") or row; all of it JSON.
         deltas: half-widths of the bands, where there are any.
         details: anything else worth keeping.
     """
@@ -161,11 +149,11 @@ class Findings:
     details: Mapping[str, Any] = field(default_factory=dict)
 
 
-class Method(ABC):
+class Method(ABC, Generic[C]):
     """A method, or a measurement, that tables ask for by name.
 
     Attributes:
-        name: as on the command line and in `Cell.method`.
+        name: as in `Cell.method`.
         source: where it comes from.
         differs: what differs from its source here.
         depends: whether it goes on from cells of methods that do not.
@@ -180,21 +168,21 @@ class Method(ABC):
         """What must be installed for it, in a few words; None if nothing is missing."""
         return None
 
-    def settings(self, cell: Cell) -> Mapping[str, Any]:
+    def settings(self, cell: C) -> Mapping[str, Any]:
         """What decides the result beside the cell itself, as JSON; part of the key."""
         return {}
 
     @abstractmethod
-    def run(self, cell: Cell, work: Workplace) -> Findings:
+    def run(self, cell: C, work: Workplace) -> Findings:
         """Do the work of a cell.
 
         Raises:
-            InputError: the cloud cannot be read or used.
+            InputError: what is asked for cannot be read or used.
         """
 
 
 @dataclass(frozen=True)
-class Catalogue:
+class Catalogue(Generic[C]):
     """The methods that a bench knows.
 
     Attributes:
@@ -202,10 +190,10 @@ class Catalogue:
         protocol: what decides the figures of every method beside its own settings, for a cell; part of its key.
     """
 
-    methods: Sequence[Method]
-    protocol: Callable[[Cell], Mapping[str, Any]] = lambda _: {}
+    methods: Sequence[Method[C]]
+    protocol: Callable[[C], Mapping[str, Any]] = lambda _: {}
 
-    def named(self, name: str) -> Method:
+    def named(self, name: str) -> Method[C]:
         """The method that a cell asks for.
 
         Raises:
@@ -216,14 +204,14 @@ class Catalogue:
                 return method
         raise ValueError(f"method {name!r}: there is none{closest(name, [method.name for method in self.methods])}")
 
-    def key(self, cell: Cell) -> str:
+    def key(self, cell: C) -> str:
         """The name under which a cell is stored: all that decides its figures.
 
         Raises:
             OSError: a file cannot be read.
             ValueError: there is no such method.
         """
-        return cell.key({**self.protocol(cell), **self.named(cell.method).settings(cell)})
+        return key_of(cell, {**self.protocol(cell), **self.named(cell.method).settings(cell)})
 
 
 def _slug(name: str) -> str:

@@ -4,21 +4,25 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from skimage.measure import marching_cubes
 
 from ...datasets.cameras import Camera, orbit
-from ...neural_fields import Field, Hits, SpaceTimeSDF, extract_mesh, sphere_trace
+from ...neural_fields import Field, Hits, InputError, SpaceTimeSDF, extract_mesh, load_field, sphere_trace
 from ...neural_fields.dynamic_tracing import DynamicTracer, moment
 from ...neural_fields.meshing import DEFAULT_BOUNDS
 from ..render.trace import RESOLUTION, TOLERANCE, pixel_size, trace_hits
-from ..run.machine import format_table
+from ..run.folder import find_field
+from .benchmark import Benchmark, Part
+from .cells import Workplace
+from .evolve import MorphBench
 from .speed import counted, evaluate_slabs
+from .tables import Column, Figure, Table, tabulated
 
-__all__ = ["DynamicRow", "dynamic_table", "format_dynamic"]
+__all__ = ["DynamicBench", "DynamicRow", "dynamic_rows"]
 
 FIRST = 2  # frames that the dynamic tracer needs to know a motion; they are left out of all figures
 FRAMES_OF_MOTION = 96  # from t = 0 to t = 1: four seconds of a film
@@ -54,12 +58,65 @@ class DynamicRow:
         """Frames per second."""
         return 1 / self.seconds
 
-    def as_dict(self) -> dict[str, Any]:
-        """All figures, for JSON."""
-        return asdict(self) | {"fps": self.fps}
+
+@dataclass(frozen=True, kw_only=True)
+class DynamicBench(Benchmark[DynamicRow]):
+    """Frames of a motion, seen in several ways; see `dynamic_rows`.
+
+    Attributes:
+        run_file: a run of ``mplicits evolve``; or
+        morph: the bench whose morph is seen.
+        size: pictures have so many pixels squared.
+        resolution: of the meshes.
+        frames: see `dynamic_rows`.
+    """
+
+    name = "dynamic"
+    source = "the dynamic tracer against tracing every frame from scratch, and against meshing it"
+    depends = True
+    row = DynamicRow
+    apart = ("run_file",)
+    run_file: str | Path | None = None
+    morph: MorphBench | None = None
+    size: int = 512
+    resolution: int = 256
+    frames: int = 14
+
+    def cells(self) -> list[Part]:
+        """One; see `Benchmark.cells`."""
+        if self.morph is not None:
+            return [Part(self.name, "the morph, traced", tuple(map(Path, self.morph.meshes)))]
+        assert self.run_file is not None
+        file = find_field(self.run_file)
+        if load_field(file).field.in_dim != 4:
+            raise InputError(f"--trace {self.run_file}: does not move; give a run of `mplicits evolve`")
+        return [Part(self.name, f"{file.parent.name}, traced", (file,))]
+
+    def measure(self, cell: Part, work: Workplace) -> list[DynamicRow]:
+        """See `Benchmark.measure`."""
+        if self.morph is None:
+            (file,) = cell.files
+        else:
+            assert work.first is not None
+            (morph,) = self.morph.cells()
+            file = find_field(work.first(morph).run())
+        return dynamic_rows(load_field(file).field, frames=self.frames, size=self.size, cells=self.resolution)
+
+    def tables(self, rows: Sequence[DynamicRow], *, sgemm: float) -> tuple[Table, ...]:
+        """See `Benchmark.tables`."""
+        figures: list[Figure[DynamicRow]] = [
+            (Column("s", ".3f"), lambda r: r.seconds),
+            (Column("frames / s", ".2f"), lambda r: r.fps),
+            (Column("× dynamic is faster", ".1f"), lambda r: r.speedup),
+            (Column("evaluations / 1000", "s"), lambda r: " ".join(f"{n / 1000:,.0f}" for n in r.evaluations)),
+            (Column("hits differ", ".1f"), lambda r: r.differing),
+            (Column("depth, px", ".2f"), lambda r: r.deviation),
+        ]
+        items = [(row.way, row) for row in rows]
+        return (tabulated(self.name, "Frames of a motion", "every frame", figures, items),)
 
 
-def dynamic_table(
+def dynamic_rows(
     field: Field, *, frames: int = 14, size: int = 512, cells: int = 256, level: int = -1
 ) -> list[DynamicRow]:
     """Trace a part of a motion in three ways, and mesh one of its frames in three.
@@ -128,32 +185,6 @@ def dynamic_table(
         differing, deviation = _compare(seen, reference, pixel_size(camera))
         rows.append(DynamicRow(name, seconds, seconds / fastest, evaluations, differing, deviation))
     return rows
-
-
-def format_dynamic(rows: Sequence[DynamicRow]) -> str:
-    """The table that ``mplicits bench evolve`` prints."""
-    header = (
-        "every frame",
-        "s",
-        "frames / s",
-        "dynamic is faster",
-        "evaluations / 1000",
-        "hits differ",
-        "depth, px",
-    )
-    cells = [
-        (
-            row.way,
-            f"{row.seconds:.3f}",
-            f"{row.fps:.2f}",
-            f"{row.speedup:.1f}×",
-            " ".join(f"{count / 1000:,.0f}" for count in row.evaluations),
-            "" if row.differing is None else f"{row.differing:.1f}",
-            "" if row.deviation is None else f"{row.deviation:.2f}",
-        )
-        for row in rows
-    ]
-    return format_table(header, cells)
 
 
 def _camera(field: Field, times: Sequence[float], size: int) -> Camera:

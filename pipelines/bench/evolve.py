@@ -1,14 +1,11 @@
-"""``mplicits bench evolve``: evolutions whose every frame is known.
-
-``mplicits bench evolve --meshes A B``: a morph between the fits of two meshes, measured against the meshes.
-"""
+"""``mplicits bench evolve``: evolutions whose every frame is known, and a morph measured at both ends."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -33,23 +30,22 @@ from ...neural_fields import (
 from ..evolve.checks import slope_figures
 from ..evolve.shapes import Placed, Placement
 from ..evolve.train import evolve
-from ..fit.train import fit
-from ..run.folder import FIELD_FILE, STATE_FILE
-from ..run.machine import format_table
+from ..run.folder import FIELD_FILE
 from ..run.settings import EvolveConfig, FitConfig
-from ..run.trainer import Progress
 from ..surface.measure import evaluate_surfaces
 from ..surface.surface import components, from_mesh, read_reference
+from .benchmark import Benchmark, Part
+from .cells import Workplace
+from .fits import fit_home, kept_fit
+from .tables import Column, Figure, Table, tabulated
 
 __all__ = [
     "CASES",
+    "ExactBench",
     "ExactCase",
     "ExactRow",
+    "MorphBench",
     "MorphRow",
-    "bench_exact",
-    "bench_morph",
-    "format_exact",
-    "format_morph",
     "measure_exact",
 ]
 
@@ -101,10 +97,6 @@ class ExactRow:
     expected: tuple[int, ...]
     times: tuple[float, ...]
 
-    def as_dict(self) -> dict[str, Any]:
-        """All figures, for JSON."""
-        return dataclasses.asdict(self)
-
 
 _SCREW = RigidMotion(axis=(0.0, 0.0, 1.0), angle=2.0, velocity=(0.3, 0.1, 0.0))
 _TUMBLE = RigidMotion(axis=(1.0, 1.0, 0.0), angle=2.5, velocity=(0.2, -0.2, 0.3))
@@ -154,26 +146,56 @@ CASES: Mapping[str, ExactCase] = MappingProxyType(
 )
 
 
-def bench_exact(
-    config: EvolveConfig,
-    *,
-    cases: Sequence[str] = tuple(CASES),
-    progress: Callable[[str, Progress], None] | None = None,
-) -> list[ExactRow]:
-    """Train each case and measure it at 20 times, between which there was no data either.
+@dataclass(frozen=True, kw_only=True)
+class ExactBench(Benchmark[ExactRow]):
+    """Exact cases, trained and measured at 20 times, between which there was no data either.
 
-    Args:
+    Attributes:
         config: how all are trained; what is trained comes from the case.
         cases: names in `CASES`.
-        progress: called with the name of the case and its progress.
     """
-    rows = []
-    for name in cases:
-        case = CASES[name]
-        own = dataclasses.replace(config, **case.settings)
-        run = evolve(own, progress=None if progress is None else _named(progress, name))
-        rows.append(measure_exact(name, run.field, case, run.record["training_seconds"]))
-    return rows
+
+    name = "exact"
+    source = "evolutions that are known in closed form"
+    row = ExactRow
+    apart = ("cases",)
+    config: EvolveConfig
+    cases: Sequence[str] = tuple(CASES)
+
+    def cells(self) -> list[Part]:
+        """One for each case; see `Benchmark.cells`."""
+        return [Part(self.name, case, options=(("case", case),)) for case in self.cases]
+
+    def measure(self, cell: Part, work: Workplace) -> list[ExactRow]:
+        """See `Benchmark.measure`."""
+        case = CASES[cell.name]
+        run = evolve(dataclasses.replace(self.config, **case.settings), progress=work.stage(cell.name))
+        return [measure_exact(cell.name, run.field, case, run.record["training_seconds"])]
+
+    def tables(self, rows: Sequence[ExactRow], *, sgemm: float) -> tuple[Table, ...]:
+        """See `Benchmark.tables`."""
+
+        def spread(row: ExactRow) -> str | None:
+            low, high = row.slopes["low"], row.slopes["high"]
+            return None if low is None else f"{low:.3f} to {high:.3f}"
+
+        def parts(row: ExactRow) -> str:
+            wrong = sum(found != expected for found, expected in zip(row.components, row.expected, strict=True))
+            return f"{wrong} of {len(row.times)} wrong" if wrong else "right"
+
+        figures: list[Figure[ExactRow]] = [
+            (Column("mean error", ".2e"), lambda r: r.mean_error),
+            (Column("worst time", ".2e"), lambda r: r.worst_error),
+            (Column("max", ".1e"), lambda r: r.max_error),
+            (Column("|f| on it", ".2e"), lambda r: r.mean_value),
+            (Column("|∇f|", ".3f"), lambda r: r.slopes["mean"]),
+            (Column("5 % to 95 %", "s"), spread),
+            (Column("parts", "s"), parts),
+            (Column("train, s", ".0f"), lambda r: r.seconds),
+        ]
+        note = f"distances over {TIMES} times in units of the field; the aim is a mean error below {TARGET:g}"
+        items = [(row.case, row) for row in rows]
+        return (tabulated(self.name, "Exact evolutions", "exact case", figures, items, notes=[note]),)
 
 
 def measure_exact(name: str, field: Field, case: ExactCase, seconds: float) -> ExactRow:
@@ -209,30 +231,6 @@ def measure_exact(name: str, field: Field, case: ExactCase, seconds: float) -> E
     )
 
 
-def format_exact(rows: Sequence[ExactRow]) -> str:
-    """The table that the command prints."""
-    header = ("exact case", "mean error", "worst time", "max", "|f| on it", "|∇f|", "5 % to 95 %", "parts", "train")
-    cells = []
-    for row in rows:
-        slopes = row.slopes
-        wrong = sum(found != expected for found, expected in zip(row.components, row.expected, strict=True))
-        cells.append(
-            (
-                row.case,
-                f"{row.mean_error:.2e}",
-                f"{row.worst_error:.2e}",
-                f"{row.max_error:.1e}",
-                f"{row.mean_value:.2e}",
-                "" if slopes["mean"] is None else f"{slopes['mean']:.3f}",
-                "" if slopes["low"] is None else f"{slopes['low']:.3f} to {slopes['high']:.3f}",
-                "right" if not wrong else f"{wrong} of {len(row.times)} wrong",
-                f"{row.seconds:.0f} s",
-            )
-        )
-    note = f"distances over {TIMES} times in units of the field; the aim is a mean error below {TARGET:g}"
-    return f"{format_table(header, cells)}\n{note}"
-
-
 def _nearest(parts: Sequence[Field], points: Tensor, time: float) -> Tensor:
     """Exact signed distances of points ``(N, 3)`` from the union of the parts."""
     return torch.stack([part.value(at_time(points, time)) for part in parts]).amin(dim=0)
@@ -246,10 +244,6 @@ def _exact_points(parts: Sequence[Field], time: float) -> Tensor:
         points = torch.from_numpy(mesh.vertices).float()
         kept.append(points[_nearest(parts, points, time) > -1e-4])
     return torch.cat(kept)
-
-
-def _named(progress: Callable[[str, Progress], None], name: str) -> Callable[[Progress], None]:
-    return lambda report: progress(name, report)
 
 
 @dataclass(frozen=True)
@@ -278,86 +272,94 @@ class MorphRow:
     times: tuple[float, ...]
     warnings: tuple[str, ...]
 
-    def as_dict(self) -> dict[str, Any]:
-        """All figures, for JSON."""
-        return dataclasses.asdict(self)
 
+@dataclass(frozen=True, kw_only=True)
+class MorphBench(Benchmark[MorphRow]):
+    """A morph between the fits of two meshes, both of whose ends are measured against the meshes.
 
-def bench_morph(
-    first: str | Path,
-    second: str | Path,
-    config: EvolveConfig,
-    *,
-    directory: Path,
-    fit_config: FitConfig | None = None,
-    resolution: int = 256,
-    samples: int = 500_000,
-    progress: Callable[[str, Progress], None] | None = None,
-) -> MorphRow:
-    """Fit two meshes, morph between the fits, and measure both ends against the meshes.
-
-    Args:
-        first: mesh file.
-        second: mesh file.
+    Attributes:
+        meshes: the two files.
         config: how the morph is trained and aligned.
-        directory: keeps the fits and the morph; fits that are there are used, and continued if interrupted.
-        fit_config: of the fits.
+        fits: settings of the fits.
         resolution: of the meshes that are measured.
         samples: points drawn on each surface.
-        progress: called with what is being trained and its progress.
-
-    Raises:
-        InputError: a file cannot be read, holds no faces to compare with, or both have one name.
     """
-    paths = [Path(first), Path(second)]
-    if len({"morph", *(path.stem for path in paths)}) < 3:
-        raise InputError(f"--meshes {first} {second}: their names are those of their runs; rename one")
-    references = [read_reference(path) for path in paths]
-    runs = [directory / path.stem for path in paths]
-    for path, run in zip(paths, runs, strict=True):
-        interrupted = (run / STATE_FILE).is_file()
-        if not (run / FIELD_FILE).is_file() or interrupted:
-            tell = None if progress is None else _named(progress, path.stem)
-            fit(path, fit_config, out=run, resume=interrupted, progress=tell)
-    own = dataclasses.replace(config, kind="morph", shapes=tuple(map(str, runs)), times=())
-    tell = None if progress is None else _named(progress, "morph")
-    run = evolve(own, out=directory / "morph", progress=tell)
-    fits, ends, floors = [], [], []
-    for time, (path, reference) in enumerate(zip(runs, references, strict=True)):
-        field, similarity, _ = load_field(path / FIELD_FILE)
-        moved = reference.moved(similarity)
-        back = Placement.from_dict(run.record["placements"][time]).inverse()
-        for found, into in ((field, fits), (Placed(run.field.at(float(time)), back), ends)):
-            mesh = from_mesh(extract_mesh(found, resolution=resolution))
-            metrics = evaluate_surfaces(mesh, moved, samples=samples, columns=16)  # the volumes are not asked for
-            into.append(metrics.chamfer)
-            floor = metrics.chamfer_floor
-        floors.append(floor)
-    frames = run.record["checks"]["frames"]
-    return MorphRow(
-        (paths[0].stem, paths[1].stem),
-        run.record["training_seconds"],
-        (fits[0], fits[1]),
-        (ends[0], ends[1]),
-        (floors[0], floors[1]),
-        tuple(frame["volume"] for frame in frames),
-        tuple(frame["components"] for frame in frames),
-        tuple(frame["time"] for frame in frames),
-        tuple(run.record["checks"]["warnings"]),
-    )
 
+    name = "morph"
+    source = "a morph between the fits of two meshes"
+    row = MorphRow
+    apart = ("meshes",)
+    meshes: tuple[str | Path, str | Path]
+    config: EvolveConfig
+    fits: FitConfig = field(default_factory=FitConfig)
+    resolution: int = 256
+    samples: int = 500_000
 
-def format_morph(row: MorphRow) -> str:
-    """The table that the command prints, and the curves below it."""
-    header = ("morph", "Chamfer", "of the fit", "floor", "ratio")
-    cells = [
-        (f"{name} at t = {time}", f"{end:.2e}", f"{fitted:.2e}", f"{floor:.2e}", f"{end / fitted:.2f}")
-        for time, (name, end, fitted, floor) in enumerate(zip(row.shapes, row.ends, row.fits, row.floors, strict=True))
-    ]
-    curve = [
-        (f"{time:.2f}", f"{volume:.3f}", str(count))
-        for time, volume, count in zip(row.times, row.volumes, row.components, strict=True)
-    ]
-    lines = [format_table(header, cells), f"trained in {row.seconds:.0f} s; the aim is a ratio below 1.5", ""]
-    lines.append(format_table(("t", "volume", "components"), curve))
-    return "\n".join([*lines, *(f"warning: {warning}" for warning in row.warnings)])
+    def cells(self) -> list[Part]:
+        """One; see `Benchmark.cells`."""
+        first, second = paths = [Path(mesh) for mesh in self.meshes]
+        if first.stem == second.stem:
+            raise InputError(f"--meshes {first} {second}: both are called {first.stem}; rename one")
+        for path in paths:
+            read_reference(path)
+        return [Part(self.name, f"{first.stem} to {second.stem}", (first, second))]
+
+    def measure(self, cell: Part, work: Workplace) -> list[MorphRow]:
+        """See `Benchmark.measure`; the morph is left in the run directory of the cell."""
+        runs = []
+        for path in cell.files:
+            home, told = fit_home(work.out, path, self.fits), work.stage(path.stem)
+            kept_fit(home, path, self.fits, progress=told)
+            runs.append(home)
+        own = dataclasses.replace(self.config, kind="morph", shapes=tuple(map(str, runs)), times=())
+        run = evolve(own, out=work.run(), progress=work.stage("morph"))
+        fits, ends, floors = [], [], []
+        for time, (path, directory) in enumerate(zip(cell.files, runs, strict=True)):
+            fitted, similarity, _ = load_field(directory / FIELD_FILE)
+            moved = read_reference(path).moved(similarity)
+            back = Placement.from_dict(run.record["placements"][time]).inverse()
+            for found, into in ((fitted, fits), (Placed(run.field.at(float(time)), back), ends)):
+                mesh = from_mesh(extract_mesh(found, resolution=self.resolution))
+                # The volumes are not asked for.
+                metrics = evaluate_surfaces(mesh, moved, samples=self.samples, columns=16)
+                into.append(metrics.chamfer)
+                floor = metrics.chamfer_floor
+            floors.append(floor)
+        frames = run.record["checks"]["frames"]
+        first, second = cell.files
+        return [
+            MorphRow(
+                (first.stem, second.stem),
+                run.record["training_seconds"],
+                (fits[0], fits[1]),
+                (ends[0], ends[1]),
+                (floors[0], floors[1]),
+                tuple(frame["volume"] for frame in frames),
+                tuple(frame["components"] for frame in frames),
+                tuple(frame["time"] for frame in frames),
+                tuple(run.record["checks"]["warnings"]),
+            )
+        ]
+
+    def tables(self, rows: Sequence[MorphRow], *, sgemm: float) -> tuple[Table, ...]:
+        """Both ends, and the curves below them."""
+        (row,) = rows
+        ends = list(zip(row.shapes, row.ends, row.fits, row.floors, strict=True))
+        figures: list[Figure[tuple[str, float, float, float]]] = [
+            (Column("Chamfer", ".2e"), lambda end: end[1]),
+            (Column("of the fit", ".2e"), lambda end: end[2]),
+            (Column("floor", ".2e"), lambda end: end[3]),
+            (Column("ratio", ".2f"), lambda end: end[1] / end[2]),
+        ]
+        curves: list[Figure[tuple[float, int]]] = [
+            (Column("volume", ".3f"), lambda frame: frame[0]),
+            (Column("components", "d"), lambda frame: frame[1]),
+        ]
+        notes = [f"trained in {row.seconds:.0f} s; the aim is a ratio below 1.5"]
+        notes += [f"warning: {warning}" for warning in row.warnings]
+        named = [(f"{end[0]} at t = {time}", end) for time, end in enumerate(ends)]
+        frames = zip(map("{:.2f}".format, row.times), zip(row.volumes, row.components, strict=True), strict=True)
+        return (
+            tabulated(self.name, "Both ends of the morph", "morph", figures, named, notes=notes),
+            tabulated("morph-curves", "On the way", "t", curves, frames),
+        )

@@ -1,11 +1,7 @@
-"""``mplicits bench fit``: every level of our fit, and screened Poisson, against the shapes the clouds came from.
+"""``mplicits bench fit`` and ``mplicits bench scale``: how near fits come to the shapes that clouds were drawn from.
 
-``mplicits bench scale``: what clouds of 100 thousand to 10 million points cost, and what more points gain.
-
-Clouds of every size are drawn from one mesh and moved by the same noise. Each is fitted and meshed by a process of its
-own, so that the most memory that one has held is that of this size.
-
-Screened Poisson reconstruction (Kazhdan and Hoppe 2013) through pymeshlab: a peer for benchmarks, never needed.
+`FitBench` compares every level of ours with screened Poisson reconstruction (Kazhdan and Hoppe 2013, through pymeshlab,
+which is never needed). `ScaleBench` fits clouds of several sizes.
 """
 
 from __future__ import annotations
@@ -13,9 +9,9 @@ from __future__ import annotations
 import dataclasses
 import importlib.util
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -25,29 +21,73 @@ import torch
 
 from ...datasets import OrientedCloud, PointCloud, add_noise, orbit, read_cloud
 from ...datasets.synthetic.statue import Statue
-from ...neural_fields import InputError, Similarity
-from ...neural_fields.meshing import NoSurfaceError, extract_mesh
+from ...neural_fields import InputError, MultiscaleSDF, Similarity, load_field
+from ...neural_fields.meshing import Mesh, NoSurfaceError, extract_mesh
 from ..fit.cloud import load_cloud
-from ..fit.train import fit, prepare
+from ..fit.train import Run, fit, prepare
 from ..render.picture import contact_sheet, write_picture
 from ..render.rasterise import picture_of
-from ..run.machine import format_table, peak_memory
+from ..run.folder import FIELD_FILE, RECORD_FILE, STATE_FILE, is_fitted, read_record
+from ..run.machine import peak_memory
 from ..run.settings import FitConfig
-from ..run.trainer import Progress
+from ..run.trainer import Report
 from ..surface.measure import Metrics, evaluate_surfaces
 from ..surface.surface import Surface, from_cloud, from_mesh, read_reference, read_surface, sample_points
+from .benchmark import Benchmark, Part, plain
+from .cells import Workplace, key_of
+from .tables import Column, Figure, Table, tabulated
 
 __all__ = [
+    "FitBench",
     "FitRow",
+    "ScaleBench",
     "ScaleRow",
-    "bench_fit",
-    "bench_scale",
-    "format_fit",
-    "format_scale",
+    "fit_home",
     "has_poisson",
+    "kept_fit",
     "screened_poisson",
     "write_noisy_cloud",
 ]
+
+
+def fit_home(out: Path, source: Path, config: FitConfig, **more: Any) -> Path:
+    """The run directory of a fit in a folder of results; its name is made of all that decides the fit.
+
+    Args:
+        out: the folder.
+        source: the file that is fitted.
+        config: settings of the fit.
+        more: what else decides it, as JSON.
+
+    Raises:
+        InputError: the file cannot be read.
+    """
+    try:
+        key = key_of(Part("fit", source.stem, (source,)), {"fit": plain(config), **more})
+    except OSError as error:
+        raise InputError(f"{source}: cannot be read ({error.strerror})") from error
+    return out / "runs" / f"{source.stem}-{key}"
+
+
+def kept_fit(directory: Path, cloud: PointCloud | Path, config: FitConfig, *, progress: Report | None = None) -> Run:
+    """The fit in a directory; what is not finished there goes on, and what is not there is fitted.
+
+    Args:
+        directory: see `fit_home`.
+        cloud: what is fitted.
+        config: settings.
+        progress: called now and then with how far the training is.
+
+    Raises:
+        InputError: the cloud cannot be used.
+        Interrupted: the fit was asked to stop; the next call goes on with it.
+    """
+    if not (directory / RECORD_FILE).is_file() or not is_fitted(directory):
+        directory.parent.mkdir(parents=True, exist_ok=True)
+        return fit(cloud, config, out=directory, resume=(directory / STATE_FILE).is_file(), progress=progress)
+    field, similarity, _ = load_field(directory / FIELD_FILE)
+    assert isinstance(field, MultiscaleSDF)
+    return Run(field, similarity, directory, read_record(directory))
 
 
 @dataclass(frozen=True)
@@ -71,123 +111,118 @@ class FitRow:
     mesh_seconds: float
     metrics: Metrics | None
 
-    def as_dict(self) -> dict[str, Any]:
-        """All figures, for JSON."""
-        return asdict(self)
 
-
-def bench_fit(
-    shapes: Sequence[str | Path],
-    config: FitConfig,
-    *,
-    noise: float = 0.0,
-    resolution: int = 512,
-    samples: int = 500_000,
-    poisson_depth: int = 10,
-    pictures: Path | None = None,
-    progress: Callable[[str, Progress], None] | None = None,
-) -> list[FitRow]:
-    """Fit the vertices of each mesh with their area-weighted normals, and compare with the mesh itself.
+@dataclass(frozen=True, kw_only=True)
+class FitBench(Benchmark[FitRow]):
+    """Fits of the vertices of meshes with their area-weighted normals, measured against the meshes themselves.
 
     The protocol is the paper's: unit sphere, ``resolution``³ marching cubes, ``samples`` points on each surface.
     Noise moves the points along their normals, which stay as they were (the paper's Tab. 3).
 
-    Args:
+    Attributes:
         shapes: mesh files.
-        config: settings of the fit.
+        config: settings of the fits.
         noise: see `FitRow`.
         resolution: cells along each side of the extraction box.
         samples: points drawn on each surface.
         poisson_depth: octree depth of screened Poisson, which runs if its extra is installed.
         pictures: folder for one contact sheet per shape.
-        progress: called with the shape's name and the fit's progress.
-
-    Raises:
-        InputError: a file cannot be read, or holds no faces to compare with.
     """
-    references = [read_reference(shape) for shape in shapes]
-    rows: list[FitRow] = []
-    for path, reference in zip(map(Path, shapes), references, strict=True):
-        cloud = read_cloud(path)
-        if noise:
-            cloud = add_noise(cloud, noise, seed=config.seed)
+
+    name = "fit"
+    source = "how near fits come, level by level"
+    row = FitRow
+    apart = ("shapes", "pictures")
+    shapes: Sequence[str | Path]
+    config: FitConfig
+    noise: float = 0.0
+    resolution: int = 512
+    samples: int = 500_000
+    poisson_depth: int = 10
+    pictures: Path | None = None
+
+    def cells(self) -> list[Part]:
+        """One for each shape; see `Benchmark.cells`."""
+        for shape in self.shapes:
+            read_reference(shape)
+        poisson = (("poisson", has_poisson()), ("pictures", None if self.pictures is None else str(self.pictures)))
+        return [Part(self.name, Path(shape).stem, (Path(shape),), poisson) for shape in self.shapes]
+
+    def measure(self, cell: Part, work: Workplace) -> list[FitRow]:
+        """See `Benchmark.measure`."""
+        (path,), seed = cell.files, self.config.seed
+        cloud, reference = read_cloud(path), read_reference(path)
+        if self.noise:
+            cloud = add_noise(cloud, self.noise, seed=seed)
+        rows: list[FitRow] = []
         drawn: list[tuple[str, Surface]] = [("input", from_cloud(cloud))]
-        for method, seconds, mesh_seconds, mesh in _reconstructions(
-            cloud, config, resolution, poisson_depth, None if progress is None else _named(progress, path.stem)
-        ):
+        home = fit_home(work.out, path, self.config, noise=self.noise)
+        for method, seconds, mesh_seconds, mesh in self.reconstructions(cloud, home, work.stage(path.stem)):
             metrics = None
             if mesh is not None:
-                metrics = evaluate_surfaces(mesh, reference, samples=samples, seed=config.seed)
+                metrics = evaluate_surfaces(mesh, reference, samples=self.samples, seed=seed)
                 drawn.append((method, mesh))
-            rows.append(FitRow(path.stem, noise, method, seconds, mesh_seconds, metrics))
-        if pictures is not None:
+            rows.append(FitRow(path.stem, self.noise, method, seconds, mesh_seconds, metrics))
+        if self.pictures is not None:
+            self.pictures.mkdir(parents=True, exist_ok=True)
             camera = orbit(reference.vertices)
             tiles = [(label, picture_of(surface, camera)) for label, surface in [*drawn, ("reference", reference)]]
-            write_picture(pictures / f"{path.stem}{f'-noise-{noise:g}' if noise else ''}.png", contact_sheet(tiles))
-    return rows
+            damage = f"-noise-{self.noise:g}" if self.noise else ""
+            write_picture(self.pictures / f"{path.stem}{damage}.png", contact_sheet(tiles))
+        return rows
 
-
-def format_fit(rows: Sequence[FitRow]) -> str:
-    """The table that the command prints."""
-    header = ("shape", "method", "Chamfer", "floor", "Hausdorff", "IoU", "shell IoU", "normals", "parts", "fit", "mesh")
-    cells = []
-    for row in rows:
-        name = f"{row.shape}{f' + noise {row.noise:g}' if row.noise else ''}"
-        if row.metrics is None:
-            cells.append((name, row.method, "no surface", *[""] * 6, f"{row.seconds:.1f} s", ""))
-            continue
-        m = row.metrics
-        cells.append(
-            (
-                name,
-                row.method,
-                f"{m.chamfer:.2e}",
-                "" if m.chamfer_floor is None else f"{m.chamfer_floor:.2e}",
-                f"{m.hausdorff:.1e}",
-                "" if m.iou is None else f"{m.iou:.4f}",
-                f"{m.shell_iou:.3f}",
-                "" if m.normal_consistency is None else f"{m.normal_consistency:.4f}",
-                str(m.components),
-                f"{row.seconds:.1f} s",
-                f"{row.mesh_seconds:.1f} s" if row.mesh_seconds else "",
-            )
-        )
-    return format_table(header, cells)
-
-
-def _named(progress: Callable[[str, Progress], None], name: str) -> Callable[[Progress], None]:
-    return lambda report: progress(name, report)
-
-
-def _reconstructions(
-    cloud: PointCloud,
-    config: FitConfig,
-    resolution: int,
-    poisson_depth: int,
-    progress: Callable[[Progress], None] | None,
-) -> list[tuple[str, float, float, Surface | None]]:
-    """Method, its seconds, seconds of meshing, and the mesh in input coordinates."""
-    run = fit(cloud, config, progress=progress)
-    results: list[tuple[str, float, float, Surface | None]] = []
-    seconds = 0.0
-    for level, stage in enumerate(run.record["stages"]):
-        seconds += stage["sampling_seconds"] + stage["training_seconds"]
-        started = time.perf_counter()
-        try:
-            mesh = _in_input(from_mesh(extract_mesh(run.field, resolution=resolution, level=level)), run.similarity)
-        except NoSurfaceError:
-            mesh = None
-        results.append((f"level {level}", seconds, time.perf_counter() - started, mesh))
-    if has_poisson():
+    def reconstructions(
+        self, cloud: PointCloud, home: Path, progress: Report
+    ) -> Iterator[tuple[str, float, float, Surface | None]]:
+        """Method, its seconds, seconds of meshing, and the mesh in input coordinates."""
+        run = kept_fit(home, cloud, self.config, progress=progress)
+        seconds = 0.0
+        for level, stage in enumerate(run.record["stages"]):
+            seconds += stage["sampling_seconds"] + stage["training_seconds"]
+            mesh, meshing = timed_mesh(run, self.resolution, level)
+            surface = None if mesh is None else _in_input(from_mesh(mesh), run.similarity)
+            yield f"level {level}", seconds, meshing, surface
+        if not has_poisson():
+            return
         given = {"screened Poisson": False}  # smoothing is part of ours
         if run.record["cleaning"]["smoothed_noise"]:
             given["screened Poisson, smoothed"] = True  # and what it would do for others
         for method, smooth in given.items():
-            oriented = prepare(cloud, dataclasses.replace(config, smooth_noise=smooth))
+            oriented = prepare(cloud, dataclasses.replace(self.config, smooth_noise=smooth))
             started = time.perf_counter()
-            mesh = screened_poisson(oriented, depth=poisson_depth)
-            results.append((method, time.perf_counter() - started, 0.0, _in_input(mesh, oriented.similarity)))
-    return results
+            surface = screened_poisson(oriented, depth=self.poisson_depth)
+            yield method, time.perf_counter() - started, 0.0, _in_input(surface, oriented.similarity)
+
+    def tables(self, rows: Sequence[FitRow], *, sgemm: float) -> tuple[Table, ...]:
+        """See `Benchmark.tables`."""
+
+        def of(name: str) -> Callable[[FitRow], Any]:
+            return lambda row: None if row.metrics is None else getattr(row.metrics, name)
+
+        figures: list[Figure[FitRow]] = [
+            (Column("method", "s"), lambda row: row.method),
+            (Column("Chamfer", ".2e"), lambda row: "no surface" if row.metrics is None else row.metrics.chamfer),
+            (Column("floor", ".2e"), of("chamfer_floor")),
+            (Column("Hausdorff", ".1e"), of("hausdorff")),
+            (Column("IoU", ".4f"), of("iou")),
+            (Column("shell IoU", ".3f"), of("shell_iou")),
+            (Column("normals", ".4f"), of("normal_consistency")),
+            (Column("parts", "d"), of("components")),
+            (Column("fit, s", ".1f"), lambda row: row.seconds),
+            (Column("mesh, s", ".1f"), lambda row: row.mesh_seconds or None),
+        ]
+        items = [(f"{row.shape}{f' + noise {row.noise:g}' if row.noise else ''}", row) for row in rows]
+        return (tabulated(self.name, "How near fits come", "shape", figures, items),)
+
+
+def timed_mesh(run: Run, resolution: int, level: int = -1) -> tuple[Mesh | None, float]:
+    """The mesh of a level in unit-sphere coordinates, if it has a surface, and the seconds of its extraction."""
+    started = time.perf_counter()
+    try:
+        mesh = extract_mesh(run.field, resolution=resolution, level=level)
+    except NoSurfaceError:
+        mesh = None
+    return mesh, time.perf_counter() - started
 
 
 def _in_input(surface: Surface, similarity: Similarity) -> Surface:
@@ -224,58 +259,83 @@ class ScaleRow:
     chamfer: float | None
     chamfer_floor: float | None
 
-    def as_dict(self) -> dict[str, Any]:
-        """All figures, for JSON."""
-        return asdict(self)
 
+@dataclass(frozen=True, kw_only=True)
+class ScaleBench(Benchmark[ScaleRow]):
+    """Fits of clouds of several sizes, drawn from one mesh and moved by the same noise.
 
-def bench_scale(
-    counts: Sequence[int],
-    config: FitConfig,
-    folder: Path,
-    *,
-    shape: str | Path | None = None,
-    noise: float = 0.001,
-    resolution: int = 256,
-    samples: int = 500_000,
-    report: Callable[[str], None] | None = None,
-) -> list[ScaleRow]:
-    """Fit clouds of several sizes drawn from one shape.
+    Each is fitted and meshed by a process of its own, so that the most memory that one has held is that of this size.
 
-    Args:
+    Attributes:
         counts: how many points.
         config: settings of the fits.
-        folder: the clouds are written there, one at a time, and removed: 24 bytes for each point.
+        folder: the clouds are written there, one at a time, and removed: 24 bytes for each point. By default, that of
+            the results.
         shape: a mesh; by default that of the bundled statue.
         noise: standard deviation of what points are moved by along their normals, in bounding-box diagonals.
         resolution: cells along each side of the extraction box.
         samples: points on each surface for the Chamfer distance.
-        report: told what comes next.
-
-    Raises:
-        InputError: the shape cannot be read, or has no faces.
     """
-    report = report or (lambda _: None)
-    surface = from_mesh(extract_mesh(Statue(), resolution=384)) if shape is None else read_surface(shape)
-    if not len(surface.faces):
-        raise InputError(f"{shape}: has no faces, so there is no surface to draw points from; give a mesh")
-    rows = []
-    for count in counts:
-        path = folder / f"cloud_{count}.ply"
-        report(f"{count:,} points")
+
+    name = "scale"
+    source = "what clouds of many sizes cost, and what more points gain"
+    row = ScaleRow
+    apart = ("counts", "folder", "shape")
+    counts: Sequence[int]
+    config: FitConfig
+    folder: Path | None = None
+    shape: str | Path | None = None
+    noise: float = 0.001
+    resolution: int = 256
+    samples: int = 500_000
+
+    def cells(self) -> list[Part]:
+        """One for each size; see `Benchmark.cells`."""
+        if self.shape is not None and not len(read_surface(self.shape).faces):
+            raise InputError(f"{self.shape}: has no faces, so there is no surface to draw points from; give a mesh")
+        files = () if self.shape is None else (Path(self.shape),)
+        return [Part(self.name, f"{count:,} points", files, (("points", count),)) for count in self.counts]
+
+    def measure(self, cell: Part, work: Workplace) -> list[ScaleRow]:
+        """See `Benchmark.measure`."""
+        count = cell.parameters["points"]
+        path = (self.folder or work.out) / f"cloud_{count}.ply"
+        work.say(cell.name)
+        surface = read_surface(self.shape) if self.shape else from_mesh(extract_mesh(Statue(), resolution=384))
         try:
-            write_noisy_cloud(path, surface, count, noise=noise, seed=config.seed)
+            write_noisy_cloud(path, surface, count, noise=self.noise, seed=self.config.seed)
             with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as other:
-                measured, mesh = other.submit(_measured, path, config, resolution).result()
+                measured, mesh = other.submit(_measured, path, self.config, self.resolution).result()
         finally:
             path.unlink(missing_ok=True)
-        # Volumes are not asked for: few columns.
-        metrics = (
-            None if mesh is None else evaluate_surfaces(mesh, surface, samples=samples, seed=config.seed, columns=8)
-        )
-        chamfer, floor = (None, None) if metrics is None else (metrics.chamfer, metrics.chamfer_floor)
-        rows.append(ScaleRow(points=count, chamfer=chamfer, chamfer_floor=floor, **measured))
-    return rows
+        chamfer = floor = None
+        if mesh is not None:  # volumes are not asked for: few columns
+            metrics = evaluate_surfaces(mesh, surface, samples=self.samples, seed=self.config.seed, columns=8)
+            chamfer, floor = metrics.chamfer, metrics.chamfer_floor
+        return [ScaleRow(points=count, chamfer=chamfer, chamfer_floor=floor, **measured)]
+
+    def tables(self, rows: Sequence[ScaleRow], *, sgemm: float) -> tuple[Table, ...]:
+        """The figures, and how many times as long as the smallest cloud the others took."""
+        first = rows[0].fit_seconds + rows[0].mesh_seconds
+        figures: list[Figure[ScaleRow]] = [
+            (Column("kept", ",d"), lambda row: row.kept),
+            (Column("read, s", ".1f"), lambda row: row.read_seconds),
+            (Column("prepare, s", ".1f"), lambda row: row.prepare_seconds),
+            (Column("samples, s", ".1f"), lambda row: row.sampling_seconds),
+            (Column("step, ms", ".0f"), lambda row: 1000 * row.step_seconds),
+            (Column("fit, s", ".1f"), lambda row: row.fit_seconds),
+            (Column("mesh, s", ".1f"), lambda row: row.mesh_seconds),
+            (Column("ratio", ".2f"), lambda row: (row.fit_seconds + row.mesh_seconds) / first),
+            (
+                Column("peak memory, MiB", ",.0f"),
+                lambda row: None if row.peak_memory is None else row.peak_memory / 2**20,
+            ),
+            (Column("Chamfer", ".3e"), lambda row: "no surface" if row.chamfer is None else row.chamfer),
+        ]
+        floors = [row.chamfer_floor for row in rows if row.chamfer_floor is not None]
+        notes = [f"Two samplings of the mesh itself are {floor:.3e} apart." for floor in floors[:1]]
+        items = [(f"{row.points:,}", row) for row in rows]
+        return (tabulated(self.name, "What more points cost", "points", figures, items, notes=notes),)
 
 
 def write_noisy_cloud(
@@ -287,7 +347,7 @@ def write_noisy_cloud(
         path: the file.
         surface: a mesh.
         count: how many points.
-        noise: see `bench_scale`.
+        noise: see `ScaleBench`.
         seed: of the random numbers.
         rows: points held at once.
     """
@@ -307,7 +367,7 @@ def write_noisy_cloud(
             file.write(table[random.permutation(len(table))].tobytes())
 
 
-def _measured(path: Path, config: FitConfig, resolution: int) -> tuple[dict[str, Any], Surface | None]:
+def _measured(path: Path, config: FitConfig, resolution: int) -> tuple[Mapping[str, Any], Surface | None]:
     """Fit and mesh a file → figures of `ScaleRow`, and the mesh in the coordinates of the file."""
     started = time.perf_counter()
     cloud, merging = load_cloud(path, limit=config.merge_above, isolation=config.isolation)
@@ -316,12 +376,7 @@ def _measured(path: Path, config: FitConfig, resolution: int) -> tuple[dict[str,
     total = time.perf_counter() - started
     stages = run.record["stages"]
     sampling, training = (sum(stage[f"{what}_seconds"] for stage in stages) for what in ("sampling", "training"))
-    started = time.perf_counter()
-    try:
-        mesh = from_mesh(extract_mesh(run.field, resolution=resolution))
-        mesh = Surface(run.similarity.to_input(mesh.vertices), mesh.faces)
-    except NoSurfaceError:
-        mesh = None
+    mesh, meshing = timed_mesh(run, resolution)
     figures = {
         "kept": len(cloud) if merging is None else merging.kept,
         "read_seconds": read,
@@ -329,35 +384,13 @@ def _measured(path: Path, config: FitConfig, resolution: int) -> tuple[dict[str,
         "sampling_seconds": sampling,
         "step_seconds": training / sum(stage["steps"] for stage in stages),
         "fit_seconds": total,
-        "mesh_seconds": time.perf_counter() - started,
+        "mesh_seconds": meshing,
         "peak_memory": peak_memory(),
     }
-    return figures, mesh
-
-
-def format_scale(rows: Sequence[ScaleRow]) -> str:
-    """A table, and how many times as long as the smallest cloud the others took."""
-    header = ("points", "kept", "read", "prepare", "samples", "step", "fit", "mesh", "ratio", "peak memory", "Chamfer")
-    cells = []
-    first = rows[0].fit_seconds + rows[0].mesh_seconds
-    for row in rows:
-        seconds = (row.read_seconds, row.prepare_seconds, row.sampling_seconds)
-        cells.append(
-            (
-                f"{row.points:,}",
-                f"{row.kept:,}",
-                *(f"{second:.1f} s" for second in seconds),
-                f"{1000 * row.step_seconds:.0f} ms",
-                f"{row.fit_seconds:.1f} s",
-                f"{row.mesh_seconds:.1f} s",
-                f"{(row.fit_seconds + row.mesh_seconds) / first:.2f}",
-                "" if row.peak_memory is None else f"{row.peak_memory / 2**20:,.0f} MiB",
-                "no surface" if row.chamfer is None else f"{row.chamfer:.3e}",
-            )
-        )
-    floors = [row.chamfer_floor for row in rows if row.chamfer_floor is not None]
-    note = f"Two samplings of the mesh itself are {floors[0]:.3e} apart." if floors else ""
-    return "\n".join([format_table(header, cells), note]).strip()
+    if mesh is None:
+        return figures, None
+    surface = from_mesh(mesh)
+    return figures, Surface(run.similarity.to_input(surface.vertices), surface.faces)
 
 
 def has_poisson() -> bool:

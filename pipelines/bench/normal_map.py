@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ...datasets import Camera, turntable
-from ...neural_fields import Field, InputError, levels_of, load_field
+from ...neural_fields import Field, InputError, MultiscaleSDF, load_field
 from ...neural_fields.meshing import NoSurfaceError, extract_mesh, map_normals
 from ..render.compare import ImageError, draw, image_error, psnr
 from ..render.picture import check_picture_path, contact_sheet, write_picture
@@ -22,10 +22,13 @@ from ..render.rasterise import mesh_view
 from ..render.shade import ShadeOptions, compose, shade
 from ..render.trace import Seen, trace_view
 from ..run.folder import find_field
-from ..run.machine import choose_device, format_table
+from ..run.machine import choose_device
 from ..surface.surface import Surface, from_mesh, read_reference
+from .benchmark import Benchmark, Part
+from .cells import Workplace
+from .tables import Column, Figure, Table, tabulated
 
-__all__ = ["NormalMapRow", "bench_normal_map", "format_normal_map"]
+__all__ = ["NormalMapBench", "NormalMapRow"]
 
 # A reference whose vertices are mostly further than this from the coarse surface is another shape (unit sphere).
 ELSEWHERE = 0.1
@@ -55,14 +58,25 @@ class NormalMapRow:
     seconds: float
     prepare_seconds: float
 
-    def as_dict(self) -> dict[str, Any]:
-        """All figures, for JSON."""
-        return asdict(self) | {
-            "rmse_either": math.sqrt(self.error.either),
-            "rmse_both": math.sqrt(self.error.both),
-            "psnr_either": psnr(self.error.either),
-            "psnr_both": psnr(self.error.both),
-        }
+    @property
+    def rmse_either(self) -> float:
+        """Over the pixels that see the shape in either image."""
+        return math.sqrt(self.error.either)
+
+    @property
+    def rmse_both(self) -> float:
+        """Over the pixels that are inside both."""
+        return math.sqrt(self.error.both)
+
+    @property
+    def psnr_either(self) -> float:
+        """The same in dB."""
+        return psnr(self.error.either)
+
+    @property
+    def psnr_both(self) -> float:
+        """The same in dB."""
+        return psnr(self.error.both)
 
 
 @dataclass(frozen=True)
@@ -73,27 +87,15 @@ class _Method:
     view: View
 
 
-def bench_normal_map(
-    run: str | Path,
-    reference: str | Path,
-    *,
-    shading: str = "headlight",
-    size: int = 512,
-    views: int = 3,
-    up: str = "y",
-    resolution: int = 256,
-    repeats: int = 2,
-    device: str = "auto",
-    picture: Path | None = None,
-    report: Callable[[str], None] | None = None,
-) -> list[NormalMapRow]:
-    """Draw every level of a run, and the coarsest with the normals of the finest, as the original is drawn.
+@dataclass(frozen=True, kw_only=True)
+class NormalMapBench(Benchmark[NormalMapRow]):
+    """Every level of a run, and the coarsest with the normals of the finest, drawn as the original is drawn.
 
     The original's normals are those of its vertices, interpolated. No shadows or occlusion: they would add errors of
     their own.
 
-    Args:
-        run: run directory or .safetensors file of at least two levels.
+    Attributes:
+        run_file: run directory or .safetensors file of at least two levels.
         reference: the mesh that the run was fitted to, in the same coordinates.
         shading: "headlight", "lambert" or "normals".
         size: width and height of the images.
@@ -101,47 +103,79 @@ def bench_normal_map(
         up: "y" or "z".
         resolution: of the marching cubes of the coarsest level.
         repeats: the best of so many is the time of an image.
-        device: where to trace.
         picture: a contact sheet: one line per camera, the original first.
-        report: called with what is going on.
-
-    Raises:
-        InputError: the run or the mesh cannot be used, or they are not in the same coordinates.
     """
-    say = report or (lambda _: None)
-    if picture is not None:
-        check_picture_path(picture)
-    file, place = find_field(run), choose_device(device)
-    field, similarity, _ = load_field(file, device=place)
-    if field.num_levels < 2:
-        raise InputError(f"{file}: has one level; normals are mapped from a finer level to a coarser one")
-    original = read_reference(reference).moved(similarity)
-    _check_place(field, original, f"{reference}", place)
-    cameras = turntable(original.used_vertices(), views, width=size, height=size, up=up)
-    say("the original")
-    truth = [mesh_view(original, camera) for camera in cameras]
-    wanted = [draw(seen, shade(seen, shading, camera=c, options=PLAIN)) for seen, c in zip(truth, cameras, strict=True)]
-    rows, lines = [], [[("original", _image(seen, c, shading))] for seen, c in zip(truth, cameras, strict=True)]
-    for method in _methods(field, f"{file}", resolution, place, say):
-        say(method.name)
-        method.view(cameras[0].resized(64, 64))  # the first call pays for what later ones find ready
-        timed = [_best(method.view, camera, shading, repeats) for camera in cameras]
-        drawings = [draw(seen, colors) for _, seen, colors in timed]
-        rows.append(
-            NormalMapRow(
-                method=method.name,
-                parameters=_parameters(field, method.levels),
-                error=image_error(zip(wanted, drawings, strict=True)),
-                degrees=_degrees([(one, seen) for one, (_, seen, _) in zip(truth, timed, strict=True)]),
-                seconds=sum(seconds for seconds, _, _ in timed) / len(cameras),
-                prepare_seconds=method.prepare_seconds,
+
+    name = "normal-map"
+    source = "what the normals of a fine level do for a coarse surface"
+    row = NormalMapRow
+    apart = ("run_file", "reference")
+    run_file: str | Path
+    reference: str | Path
+    shading: str = "headlight"
+    size: int = 512
+    views: int = 3
+    up: str = "y"
+    resolution: int = 256
+    repeats: int = 2
+    picture: Path | None = None
+
+    def cells(self) -> list[Part]:
+        """One; see `Benchmark.cells`."""
+        if self.picture is not None:
+            check_picture_path(self.picture)
+        file, reference = find_field(self.run_file), Path(self.reference)
+        read_reference(reference)
+        return [Part(self.name, f"{file.parent.name} against {reference.name}", (file, reference))]
+
+    def measure(self, cell: Part, work: Workplace) -> list[NormalMapRow]:
+        """See `Benchmark.measure`."""
+        (file, reference), place, shading = cell.files, choose_device(self.device), self.shading
+        field, similarity, _ = load_field(file, device=place)
+        if field.num_levels < 2:
+            raise InputError(f"{file}: has one level; normals are mapped from a finer level to a coarser one")
+        original = read_reference(reference).moved(similarity)
+        _check_place(field, original, f"{reference}", place)
+        cameras = turntable(original.used_vertices(), self.views, width=self.size, height=self.size, up=self.up)
+        work.say("the original")
+        truth = [(mesh_view(original, camera), camera) for camera in cameras]
+        wanted = [draw(seen, shade(seen, shading, camera=c, options=PLAIN)) for seen, c in truth]
+        rows, lines = [], [[("original", _image(seen, c, shading))] for seen, c in truth]
+        for method in _methods(field, f"{file}", self.resolution, place, work.say):
+            work.say(method.name)
+            method.view(cameras[0].resized(64, 64))  # the first call pays for what later ones find ready
+            timed = [_best(method.view, camera, shading, self.repeats) for camera in cameras]
+            drawings = [draw(seen, colors) for _, seen, colors in timed]
+            rows.append(
+                NormalMapRow(
+                    method=method.name,
+                    parameters=_parameters(field, method.levels),
+                    error=image_error(zip(wanted, drawings, strict=True)),
+                    degrees=_degrees([(one, seen) for (one, _), (_, seen, _) in zip(truth, timed, strict=True)]),
+                    seconds=sum(seconds for seconds, _, _ in timed) / len(cameras),
+                    prepare_seconds=method.prepare_seconds,
+                )
             )
-        )
-        for line, (_, seen, colors) in zip(lines, timed, strict=True):
-            line.append((method.name, compose(seen, colors)))
-    if picture is not None:
-        write_picture(picture, contact_sheet(*lines))
-    return rows
+            for line, (_, seen, colors) in zip(lines, timed, strict=True):
+                line.append((method.name, compose(seen, colors)))
+        if self.picture is not None:
+            write_picture(self.picture, contact_sheet(*lines))
+        return rows
+
+    def tables(self, rows: Sequence[NormalMapRow], *, sgemm: float) -> tuple[Table, ...]:
+        """Errors over the pixels that see the shape in either image, or in both."""
+        figures: list[Figure[NormalMapRow]] = [
+            (Column("parameters", ",d"), lambda r: r.parameters),
+            (Column("RMSE either", ".4f"), lambda r: r.rmse_either),
+            (Column("PSNR, dB", ".1f"), lambda r: r.psnr_either),
+            (Column("RMSE both", ".4f"), lambda r: r.rmse_both),
+            (Column("PSNR, dB", ".1f"), lambda r: r.psnr_both),
+            (Column("normals", "s"), lambda r: f"{r.degrees:.1f}°"),
+            (Column("ms per image", ".0f"), lambda r: 1e3 * r.seconds),
+            (Column("mesh, s", ".1f"), lambda r: r.prepare_seconds or None),
+        ]
+        items = [(row.method, row) for row in rows]
+        return (tabulated(self.name, "Normals of a fine level on a coarse surface", "method", figures, items),)
 
 
 def _check_place(field: Field, original: Surface, name: str, device: torch.device) -> None:
@@ -200,7 +234,8 @@ def _image(seen: Seen, camera: Camera, shading: str) -> Any:
 
 def _parameters(field: Field, levels: int) -> int:
     """Of the first ``levels`` levels."""
-    return sum(parameter.numel() for part in levels_of(field)[:levels] for parameter in part.parameters())
+    parts = [field.base, *field.residuals] if isinstance(field, MultiscaleSDF) else [field]
+    return sum(parameter.numel() for part in parts[:levels] for parameter in part.parameters())
 
 
 def _degrees(pairs: Sequence[tuple[Seen, Seen]]) -> float:
@@ -213,23 +248,3 @@ def _degrees(pairs: Sequence[tuple[Seen, Seen]]) -> float:
         sine = torch.linalg.cross(mine[shared], other[shared]).norm(dim=1)
         angles.append(torch.atan2(sine, (mine[shared] * other[shared]).sum(dim=1)))
     return math.degrees(float(torch.cat(angles).mean()))
-
-
-def format_normal_map(rows: Sequence[NormalMapRow]) -> str:
-    """The table that the command prints: errors over the pixels that see the shape in either image, or in both."""
-    header = ("method", "parameters", "RMSE either", "PSNR", "RMSE both", "PSNR", "normals", "ms per image", "mesh")
-    cells = [
-        (
-            row.method,
-            f"{row.parameters:,}",
-            f"{math.sqrt(row.error.either):.4f}",
-            f"{psnr(row.error.either):.1f} dB",
-            f"{math.sqrt(row.error.both):.4f}",
-            f"{psnr(row.error.both):.1f} dB",
-            f"{row.degrees:.1f}°",
-            f"{1e3 * row.seconds:.0f}",
-            f"{row.prepare_seconds:.1f} s" if row.prepare_seconds else "",
-        )
-        for row in rows
-    ]
-    return format_table(header, cells)

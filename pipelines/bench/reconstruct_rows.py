@@ -1,16 +1,13 @@
-"""One row of ``mplicits bench reconstruct``: what a geometry cost on a scene, and how near it came.
-
-What ``mplicits bench reconstruct`` prints: the figures of all rows, and how ours compare with those of NeuS.
-"""
+"""Rows of ``mplicits bench reconstruct``: what geometries cost on scenes, how near they come, and how ours compare."""
 
 from __future__ import annotations
 
+import dataclasses
 import statistics
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
-from ..run.machine import format_table
+from .tables import Column, Figure, Row, Table, tabulated
 
 __all__ = [
     "EQUAL_TIME",
@@ -20,7 +17,7 @@ __all__ = [
     "ReconstructRow",
     "SurfaceFigures",
     "comparisons",
-    "format_reconstruct",
+    "reconstruct_tables",
 ]
 
 NEUS = "neus"
@@ -30,7 +27,7 @@ EQUAL_TIME = "equal-time"
 
 @dataclass(frozen=True)
 class SurfaceFigures:
-    """A reconstructed surface against the exact one; see `evaluate.Metrics`.
+    """A reconstructed surface against the exact one; see `Metrics`.
 
     Attributes:
         chamfer: squared L2, both ways, in units of the exact surface's bounding sphere.
@@ -53,7 +50,7 @@ class SurfaceFigures:
 class ReconstructRow:
     """One geometry, trained on one scene.
 
-    FLOPs are those of the matrix products of training; how they are counted is said in `bench_reconstruct_train`.
+    FLOPs are those of the matrix products of training; how they are counted is said in `flops`.
 
     Attributes:
         scene: name of the scene or data set.
@@ -118,28 +115,9 @@ class ReconstructRow:
         return self.geometry_flops + self.color_flops
 
     @property
-    def rate(self) -> float:
-        """FLOP/s that the training reached."""
+    def flops_per_second(self) -> float:
+        """That the training reached."""
         return self.flops_per_ray * self.rays * self.steps / self.seconds
-
-    def as_dict(self) -> dict[str, Any]:
-        """All figures, for JSON."""
-        return asdict(self) | {"flops_per_ray": self.flops_per_ray, "flops_per_second": self.rate}
-
-    @classmethod
-    def from_dict(cls, figures: Mapping[str, Any]) -> ReconstructRow:
-        """The row that `as_dict` wrote.
-
-        Raises:
-            KeyError: a figure is missing.
-            TypeError: a figure is of another kind.
-        """
-        known = {name: figures[name] for name in cls.__dataclass_fields__}
-        for name in ("values_per_ray", "jets_per_ray", "deltas"):
-            known[name] = tuple(known[name])
-        if known["surface"] is not None:
-            known["surface"] = SurfaceFigures(**known["surface"])
-        return cls(**known)
 
 
 # The paper's table of PSNR in dB over DTU scans 24, 37, 40, 55 and 63, and its text: "37 % fewer parameters".
@@ -176,11 +154,11 @@ class Comparison:
     equal_time_chamfer: float | None
 
 
-def comparisons(rows: Sequence[ReconstructRow]) -> list[Comparison]:
-    """One for every scene that has both rows of equal steps; of two or more, their means last.
+ARITHMETIC = ("neus", "ours", "equal_time", "fewer")  # means of decibels and shares; those of ratios are geometric
 
-    Means of decibels are arithmetic, means of ratios geometric.
-    """
+
+def comparisons(rows: Sequence[ReconstructRow]) -> list[Comparison]:
+    """One for every scene that has both rows of equal steps; of two or more, their means last."""
     found = []
     for scene in dict.fromkeys(row.scene for row in rows):
         of = {row.kind: row for row in rows if row.scene == scene}
@@ -188,19 +166,12 @@ def comparisons(rows: Sequence[ReconstructRow]) -> list[Comparison]:
             found.append(_comparison(of[NEUS], of[MULTISCALE], of.get(EQUAL_TIME)))
     if len(found) < 2:
         return found
-    mean = Comparison(
-        name=f"mean of {len(found)} scenes",
-        neus=statistics.fmean(one.neus for one in found),
-        ours=statistics.fmean(one.ours for one in found),
-        equal_time=_mean([one.equal_time for one in found], statistics.fmean),
-        fewer=statistics.fmean(one.fewer for one in found),
-        step=statistics.geometric_mean(one.step for one in found),
-        mean_step=statistics.geometric_mean(one.mean_step for one in found),
-        flops=statistics.geometric_mean(one.flops for one in found),
-        chamfer=_mean([one.chamfer for one in found], statistics.geometric_mean),
-        equal_time_chamfer=_mean([one.equal_time_chamfer for one in found], statistics.geometric_mean),
-    )
-    return [*found, mean]
+    means = {}
+    for name in (field.name for field in dataclasses.fields(Comparison)[1:]):
+        numbers = [getattr(one, name) for one in found]
+        mean = statistics.fmean if name in ARITHMETIC else statistics.geometric_mean
+        means[name] = None if None in numbers else mean(numbers)
+    return [*found, Comparison(name=f"mean of {len(found)} scenes", **means)]
 
 
 def _comparison(neus: ReconstructRow, ours: ReconstructRow, equal: ReconstructRow | None) -> Comparison:
@@ -224,86 +195,75 @@ def _nearer(neus: ReconstructRow, ours: ReconstructRow) -> float | None:
     return neus.surface.largest_chamfer / ours.surface.largest_chamfer
 
 
-def _mean(numbers: Iterable[float | None], mean: Callable[[list[float]], float]) -> float | None:
-    """None if one of them is."""
-    known = list(numbers)
-    return None if None in known else mean([number for number in known if number is not None])
-
-
-def format_reconstruct(rows: Sequence[ReconstructRow], *, sgemm: float) -> str:
-    """Both tables, and what their columns mean.
+def reconstruct_tables(name: str, rows: Sequence[ReconstructRow], *, sgemm: float) -> tuple[Table, ...]:
+    """All rows, and ours against NeuS where a scene has both.
 
     Args:
-        rows: of `bench_reconstruct`.
+        name: of the tables' files.
+        rows: of the bench.
         sgemm: the machine's matrix rate in FLOP/s, the limit of every row.
     """
-    header = (
-        *("scene, geometry", "steps", "trained", "a step", "PSNR", "object", "SSIM", "Chamfer", "floor", "largest"),
-        *("parameters", "colour", "a ray", "geometry", "fine", "GFLOP/s", "of SGEMM"),
-    )
-    cells = []
-    for row in rows:
-        surface = row.surface
-        near = ("no surface" if row.exact else "", "", "")
-        if surface is not None:
-            largest = f"{surface.largest_chamfer:.2e}" if surface.components > 1 else ""
-            near = (f"{surface.chamfer:.2e}", "" if surface.floor is None else f"{surface.floor:.2e}", largest)
-        cells.append(
-            (
-                f"{row.scene} {row.network}{', equal time' if row.kind == EQUAL_TIME else ''}",
-                f"{row.steps:,}",
-                f"{row.seconds:.1f} s",
-                f"{1e3 * row.step_seconds:.1f} ms",
-                f"{row.psnr:.2f} dB",
-                "" if row.psnr_object is None else f"{row.psnr_object:.2f} dB",
-                f"{row.ssim:.4f}",
-                *near,
-                f"{row.parameters:,}",
-                f"{row.color_parameters + row.outside_parameters:,}",
-                f"{row.flops_per_ray / 1e6:.1f} MFLOP",
-                f"{row.geometry_flops / 1e6:.1f}",
-                "" if row.finest_share is None else f"{row.finest_share:.1%}",
-                f"{row.rate / 1e9:.1f}",
-                f"{row.rate / sgemm:.0%}",
-            )
-        )
+
+    def surface(name: str) -> Callable[[ReconstructRow], float | None]:
+        return lambda row: None if row.surface is None else getattr(row.surface, name)
+
+    def largest(row: ReconstructRow) -> float | None:
+        return None if row.surface is None or row.surface.components < 2 else row.surface.largest_chamfer
+
+    figures: list[Figure[ReconstructRow]] = [
+        (Column("steps", ",d"), lambda r: r.steps),
+        (Column("trained, s", ".1f"), lambda r: r.seconds),
+        (Column("a step, ms", ".1f"), lambda r: 1e3 * r.step_seconds),
+        (Column("PSNR, dB", ".2f"), lambda r: r.psnr),
+        (Column("object, dB", ".2f"), lambda r: r.psnr_object),
+        (Column("SSIM", ".4f"), lambda r: r.ssim),
+        (Column("Chamfer", ".2e"), lambda r: "no surface" if r.exact and r.surface is None else surface("chamfer")(r)),
+        (Column("floor", ".2e"), surface("floor")),
+        (Column("largest", ".2e"), largest),
+        (Column("parameters", ",d"), lambda r: r.parameters),
+        (Column("colour", ",d"), lambda r: r.color_parameters + r.outside_parameters),
+        (Column("a ray, MFLOP", ".1f"), lambda r: r.flops_per_ray / 1e6),
+        (Column("geometry", ".1f"), lambda r: r.geometry_flops / 1e6),
+        (Column("fine", ".1%"), lambda r: r.finest_share),
+        (Column("GFLOP/s", ".1f"), lambda r: r.flops_per_second / 1e9),
+        (Column("of SGEMM", ".0%"), lambda r: r.flops_per_second / sgemm),
+    ]
     counts = " or ".join(map(str, sorted({row.views for row in rows})))
     notes = (
         f"PSNR and SSIM: means over the held-out views ({counts}); object: PSNR inside the masks. a step: the median.",
-        "a ray: FLOPs of all matrix products of training; geometry: its own. fine: share of the samples that the",
+        "a ray: FLOPs of all matrix products of training; geometry: its own. fine: share of the samples that the "
         "finest level sees, once it is switched on. largest: Chamfer of the largest component, where there are others.",
-        f"This machine multiplies float32 matrices at {sgemm / 1e9:.0f} GFLOP/s ({rows[0].device}).",
     )
-    parts = [format_table(header, cells), "\n".join(notes)]
+    items = [(f"{r.scene} {r.network}{', equal time' if r.kind == EQUAL_TIME else ''}", r) for r in rows]
+    table = tabulated(name, "Geometries on the same rays", "scene, geometry", figures, items, notes=notes)
     found = comparisons(rows)
-    if found:
-        parts.append(_format_comparisons(found))
-    return "\n\n".join(parts)
+    return (table, _against_neus(f"{name}-against-neus", found)) if found else (table,)
 
 
-def _format_comparisons(found: Sequence[Comparison]) -> str:
-    header = (
-        *("ours against NeuS", "NeuS", "equal steps", "gain", "equal time", "gain", "parameters", "a step"),
-        *("mean step", "FLOPs a ray", "Chamfer", "equal time"),
-    )
-    cells = []
-    for one in found:
-        timed = ("", "")
-        if one.equal_time is not None:
-            timed = (f"{one.equal_time:.2f} dB", f"{one.equal_time - one.neus:+.2f} dB")
-        ratios = (one.step, one.mean_step, one.flops, one.chamfer, one.equal_time_chamfer)
-        cells.append(
-            (
-                one.name,
-                f"{one.neus:.2f} dB",
-                f"{one.ours:.2f} dB",
-                f"{one.ours - one.neus:+.2f} dB",
-                *timed,
-                f"{-one.fewer:+.0%}",
-                *("" if ratio is None else f"{ratio:.{1 if ratio >= 1 else 3}f}×" for ratio in ratios),
-            )
-        )
-    for name, neus, ours in PAPER:
-        gain = f"{ours - neus:+.2f} dB"
-        cells.append((name, f"{neus:.2f} dB", f"{ours:.2f} dB", gain, "", "", f"{-PAPER_PARAMETERS:+.0%}", *[""] * 5))
-    return f"{format_table(header, cells)}\n×: how many times less than NeuS; Chamfer: of the largest components"
+def _against_neus(name: str, found: Sequence[Comparison]) -> Table:
+    def gain(psnr: float | None, neus: float) -> str | None:
+        return None if psnr is None else f"{psnr - neus:+.2f}"
+
+    def times(factor: float | None) -> str | None:
+        return None if factor is None else f"{factor:.{1 if factor >= 1 else 3}f}"
+
+    figures: list[Figure[Comparison]] = [
+        (Column("NeuS, dB", ".2f"), lambda c: c.neus),
+        (Column("equal steps, dB", ".2f"), lambda c: c.ours),
+        (Column("gain", "s"), lambda c: gain(c.ours, c.neus)),
+        (Column("equal time, dB", ".2f"), lambda c: c.equal_time),
+        (Column("gain", "s"), lambda c: gain(c.equal_time, c.neus)),
+        (Column("parameters", "s"), lambda c: f"{-c.fewer:+.0%}"),
+        (Column("× a step", "s"), lambda c: times(c.step)),
+        (Column("× mean step", "s"), lambda c: times(c.mean_step)),
+        (Column("× FLOPs a ray", "s"), lambda c: times(c.flops)),
+        (Column("× Chamfer", "s"), lambda c: times(c.chamfer)),
+        (Column("× equal time", "s"), lambda c: times(c.equal_time_chamfer)),
+    ]
+    printed = [
+        Row(title, (neus, ours, gain(ours, neus), None, None, f"{-PAPER_PARAMETERS:+.0%}", *[None] * 5))
+        for title, neus, ours in PAPER
+    ]
+    notes = ["×: how many times less than NeuS; Chamfer: of the largest components"]
+    items = [(one.name, one) for one in found]
+    return tabulated(name, "Ours against NeuS", "scene", figures, items, more=printed, notes=notes)

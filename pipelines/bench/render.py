@@ -4,28 +4,27 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from ...datasets import orbit, read_cloud
 from ...datasets.cameras import Camera
-from ...neural_fields import Field, Siren, levels_of, load_field
+from ...neural_fields import Field, Siren, levels_of
 from ...neural_fields.tracing import BOUNDING_RADIUS
-from ..fit.train import fit
 from ..render.trace import Seen, trace_view
-from ..run.folder import FIELD_FILE, STATE_FILE
-from ..run.machine import format_table
 from ..run.settings import FitConfig
-from ..run.trainer import Progress
+from .benchmark import Benchmark, Part
+from .cells import Workplace
+from .fits import fit_home, kept_fit
 from .render_truth import Agreement, Truth
 from .speed import counted
+from .tables import Column, Figure, Table, ratio, tabulated
 
-__all__ = ["NETWORKS", "RenderRow", "bench_render", "fit_networks", "format_render"]
+__all__ = ["NETWORKS", "RenderBench", "RenderRow", "naive_view"]
 
 Networks = Mapping[str, Sequence[tuple[int, int, float, int, float]]]
 
@@ -91,98 +90,95 @@ class RenderRow:
     flops: float
     agreement: Agreement
 
-    def as_dict(self) -> dict[str, Any]:
-        """All figures, for JSON."""
-        return asdict(self)
 
+@dataclass(frozen=True, kw_only=True)
+class RenderBench(Benchmark[RenderRow]):
+    """The networks of Tab. 4 fitted to each shape, and the times of pictures of them.
 
-def bench_render(
-    shapes: Sequence[str | Path],
-    directory: Path,
-    config: FitConfig,
-    *,
-    size: int = 512,
-    views: int = 3,
-    mesh_resolution: int = 512,
-    repeats: int = 2,
-    naive: bool = True,
-    device: str = "cpu",
-    networks: Networks = NETWORKS,
-    progress: Callable[[str, Progress], None] | None = None,
-    report: Callable[[str], None] | None = None,
-) -> list[RenderRow]:
-    """Fit the networks of Tab. 4 to each shape, and time pictures of them.
-
-    Args:
+    Attributes:
         shapes: meshes or clouds.
-        directory: where the fits are kept; those that are there already are used.
         config: settings of the fits, apart from the networks and their steps.
         size: width and height of the images.
         views: how many cameras, evenly around the shape.
         mesh_resolution: cells along each side of the meshes that holes are counted against.
         repeats: the best of so many is what counts.
         naive: whether to time the naive tracer as well (one camera, once: it takes a minute).
-        device: where to trace.
         networks: what to fit; the names are those of `NETWORKS`.
-        progress: called with a name and the progress of a fit.
-        report: called with what is going on.
-
-    Raises:
-        InputError: a file cannot be read, or a fit has no surface.
     """
-    say = report or (lambda _: None)
-    rows: list[RenderRow] = []
-    for shape in map(Path, shapes):
-        fields = fit_networks(shape, directory / shape.stem, config, networks=networks, progress=progress)
-        fields = {name: field.to(device).requires_grad_(False) for name, field in fields.items()}
-        truth = Truth(fields, resolution=mesh_resolution, device=device, report=say)
-        corners = truth.outline("128x2_256x2_400x2")
-        cameras = [orbit(corners, azimuth=30 + 360 * view / views, width=size, height=size) for view in range(views)]
-        for mode in ("adaptive", "budget"):
+
+    name = "render"
+    source = "the rows of the paper's Tab. 4"
+    row = RenderRow
+    apart = ("shapes",)
+    shapes: Sequence[str | Path]
+    config: FitConfig
+    size: int = 512
+    views: int = 3
+    mesh_resolution: int = 512
+    repeats: int = 2
+    naive: bool = True
+    networks: Networks = field(default_factory=lambda: NETWORKS)
+
+    def cells(self) -> list[Part]:
+        """One for each shape; see `Benchmark.cells`."""
+        for shape in self.shapes:
+            read_cloud(shape)
+        return [Part(self.name, Path(shape).stem, (Path(shape),)) for shape in self.shapes]
+
+    def measure(self, cell: Part, work: Workplace) -> list[RenderRow]:
+        """See `Benchmark.measure`; raises `InputError` where a fit has no surface."""
+        (shape,) = cell.files
+        fields = {name: one.to(self.device).requires_grad_(False) for name, one in self.fits(shape, work).items()}
+        truth = Truth(fields, resolution=self.mesh_resolution, device=self.device, report=work.say)
+        corners, side = truth.outline("128x2_256x2_400x2"), self.size
+        cameras = [
+            orbit(corners, azimuth=30 + 360 * view / self.views, width=side, height=side) for view in range(self.views)
+        ]
+        rows: list[RenderRow] = []
+        modes = [("adaptive", MODELS), ("budget", MODELS)] + [("naive", (MODELS[0], MODELS[-1]))] * self.naive
+        for mode, models in modes:
+            seen, repeats = (cameras[:1], 1) if mode == "naive" else (cameras, self.repeats)
             found: list[RenderRow] = []
-            for model in MODELS:
-                say(f"{shape.stem}: {model.name}, {mode}")
-                row = _time(fields[model.network], model, mode, cameras, truth, repeats, device)
+            for model in models:
+                work.say(f"{shape.stem}: {model.name}, {mode}")
+                row = _time(fields[model.network], model, mode, seen, truth, repeats, self.device)
                 base = found[0].seconds if found else row.seconds
-                found.append(replace(row, shape=shape.stem, speedup=base / row.seconds))
+                paper = None if mode == "naive" else row.paper_speedup
+                found.append(replace(row, shape=shape.stem, speedup=base / row.seconds, paper_speedup=paper))
             rows += found
-        if naive:
-            found = []
-            for model in (MODELS[0], MODELS[-1]):
-                say(f"{shape.stem}: {model.name}, naive")
-                row = _time(fields[model.network], model, "naive", cameras[:1], truth, 1, device)
-                base = found[0].seconds if found else row.seconds
-                found.append(replace(row, shape=shape.stem, speedup=base / row.seconds, paper_speedup=None))
-            rows += found
-    return rows
+        return rows
 
-
-def fit_networks(
-    shape: Path,
-    directory: Path,
-    config: FitConfig,
-    *,
-    networks: Networks = NETWORKS,
-    progress: Callable[[str, Progress], None] | None = None,
-) -> dict[str, Field]:
-    """The networks fitted to a shape; each is a run in ``directory``, and what is there is not fitted again."""
-    cloud = read_cloud(shape)
-    fields: dict[str, Field] = {}
-    for name, levels in networks.items():
-        run = directory / name
-        if not (run / FIELD_FILE).is_file() or (run / STATE_FILE).is_file():
+    def fits(self, shape: Path, work: Workplace) -> dict[str, Field]:
+        """The networks fitted to a shape, those that are there already taken as they are."""
+        fields, cloud = {}, read_cloud(shape)
+        for name, levels in self.networks.items():
             widths, depths, omegas, steps, rates = zip(*levels, strict=True)
-            settings = replace(
-                config, widths=widths, depths=depths, omegas=omegas, steps=steps, learning_rates=rates, levels=None
+            config = replace(
+                self.config, widths=widths, depths=depths, omegas=omegas, steps=steps, learning_rates=rates, levels=None
             )
-            told = None if progress is None else _named(progress, f"{shape.stem} {name}")
-            fit(cloud, settings, out=run, resume=(run / STATE_FILE).is_file(), progress=told)
-        fields[name] = load_field(run / FIELD_FILE).field
-    return fields
+            home, told = fit_home(work.out, shape, config), work.stage(f"{shape.stem} {name}")
+            fields[name] = kept_fit(home, cloud, config, progress=told).field
+        return fields
 
-
-def _named(progress: Callable[[str, Progress], None], name: str) -> Callable[[Progress], None]:
-    return lambda step: progress(name, step)
+    def tables(self, rows: Sequence[RenderRow], *, sgemm: float) -> tuple[Table, ...]:
+        """Speed-ups are over (400,4) in the same mode, over it with the paper's 20 steps, and those of the paper."""
+        fixed = {row.shape: row.seconds for row in rows if row.mode == "budget" and row.model == MODELS[0].name}
+        figures: list[Figure[RenderRow]] = [
+            (Column("parameters", ",d"), lambda r: r.parameters),
+            (Column("fps", ".2f"), lambda r: 1 / r.seconds),
+            (Column("× same mode", ".1f"), lambda r: r.speedup),
+            (Column("× 20 steps", ".1f"), lambda r: fixed[r.shape] / r.seconds),
+            (Column("× paper", ".1f"), lambda r: r.paper_speedup),
+            (Column("evaluations per pixel", "s"), lambda r: " + ".join(f"{count:.2f}" for count in r.evaluations)),
+            (Column("of SGEMM", ".0%"), lambda r: r.flops / r.seconds / sgemm),
+            (Column("image rms", ".4f"), lambda r: r.agreement.image_error),
+            (Column("depth 99.9 %", ".1e"), lambda r: r.agreement.depth_error),
+            (Column("holes", "d"), lambda r: r.agreement.holes),
+            (Column("per 100 K", ".1f"), lambda r: ratio(1e5 * r.agreement.holes, r.agreement.silhouette)),
+            (Column("false", "d"), lambda r: r.agreement.false_hits),
+        ]
+        items = [(f"{row.shape} {row.mode} {row.model}", row) for row in rows]
+        return (tabulated(self.name, "What a picture costs", "shape, mode, model", figures, items),)
 
 
 def _time(
@@ -275,40 +271,3 @@ def _unblocked(level: Field, x: Tensor) -> Tensor:
     for layer_weight, layer_bias in zip(hidden[::2], hidden[1::2], strict=True):
         x = torch.addmm(layer_bias, x, layer_weight.t()).sin_()
     return torch.addmv(bias[:1], x, weight[0])
-
-
-def format_render(rows: Sequence[RenderRow], *, sgemm: float) -> str:
-    """The table that the command prints.
-
-    Speed-ups are over (400,4) in the same mode, over (400,4) with the paper's 20 steps, and those of the paper.
-
-    Args:
-        rows: of `bench_render`.
-        sgemm: the machine's matrix rate in FLOP/s, the limit of every row.
-    """
-    header = (
-        *("shape, mode, model", "parameters", "fps", "same mode", "20 steps", "paper", "evaluations per pixel"),
-        *("of SGEMM", "image rms", "depth 99.9 %", "holes", "per 100 K", "false"),
-    )
-    fixed = {row.shape: row.seconds for row in rows if row.mode == "budget" and row.model == MODELS[0].name}
-    cells = []
-    for row in rows:
-        agreement = row.agreement
-        cells.append(
-            (
-                f"{row.shape} {row.mode:8} {row.model}",
-                f"{row.parameters:,}",
-                f"{1 / row.seconds:.2f}",
-                f"{row.speedup:.1f}×",
-                f"{fixed[row.shape] / row.seconds:.1f}×",
-                "" if row.paper_speedup is None else f"{row.paper_speedup:.1f}×",
-                " + ".join(f"{count:.2f}" for count in row.evaluations),
-                f"{row.flops / row.seconds / sgemm:.0%}",
-                f"{agreement.image_error:.4f}",
-                f"{agreement.depth_error:.1e}",
-                str(agreement.holes),
-                f"{1e5 * agreement.holes / agreement.silhouette:.1f}" if agreement.silhouette else "",
-                str(agreement.false_hits),
-            )
-        )
-    return format_table(header, cells)

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
+from ..run.machine import format_table
 from .tables import Column, Row, Table, Value
 
 __all__ = [
@@ -16,6 +17,7 @@ __all__ = [
     "as_dict",
     "as_markdown",
     "as_page",
+    "as_text",
     "from_dict",
     "section_as_dict",
     "section_from_dict",
@@ -31,7 +33,7 @@ class Section:
 
     Attributes:
         name: as after ``--table``.
-        label: the paper's label.
+        label: the paper's label, if it has one.
         summary: what it shows.
         tables: the table, and those behind it.
         plots: files, relative to the page, with their titles.
@@ -52,22 +54,35 @@ class Section:
 
 def as_markdown(table: Table) -> str:
     """A table with the published figures in brackets beside ours, and the best of each column in bold."""
-    best = [_best(table, index) for index in range(len(table.columns))]
-    lines = [
-        _line([table.head, *(column.name for column in table.columns)]),
-        "|" + "---|" + "---:|" * len(table.columns),
-    ]
+    lines = [_line(_heads(table)), "|" + "---|" + "---:|" * len(table.columns)]
+    return "\n".join([*lines, *(_line(cells) for cells in _cells(table, best="**{}**", published="*({})*"))])
+
+
+def as_text(table: Table) -> str:
+    """The same for a terminal: title, aligned columns, notes."""
+    rows = _cells(table, best="{}", published="({})")
+    return "\n".join([table.title, format_table(_heads(table), rows), *table.notes])
+
+
+def _heads(table: Table) -> list[str]:
+    return [table.head, *(column.name for column in table.columns)]
+
+
+def _cells(table: Table, *, best: str, published: str) -> list[list[str]]:
+    """The words of every row; the best of a column and what the paper says are put into these forms."""
+    lowest = [_best(table, index) for index in range(len(table.columns))]
+    rows = []
     for row in table.rows:
         cells = [row.name]
         for index, column in enumerate(table.columns):
             text = _text(row.values[index], column)
-            if row.competes and best[index] is not None and row.values[index] == best[index]:
-                text = f"**{text}**"
+            if row.competes and lowest[index] is not None and row.values[index] == lowest[index]:
+                text = best.format(text)
             if row.published is not None and row.published[index] is not None:
-                text += f" *({_text(row.published[index], column)})*"
+                text += " " + published.format(_text(row.published[index], column))
             cells.append(text)
-        lines.append(_line(cells))
-    return "\n".join(lines)
+        rows.append(cells)
+    return rows
 
 
 def _best(table: Table, index: int) -> Value:
@@ -162,27 +177,27 @@ def with_missing(table: Table, missing: Mapping[str, str]) -> Table:
     return replace(table, rows=table.rows + rows)
 
 
-def as_page(sections: Sequence[Section], *, command: str, protocol: Sequence[str], machine: str) -> str:
+def as_page(
+    sections: Sequence[Section], *, title: str, command: str, machine: str, protocol: Sequence[str] = ()
+) -> str:
     """The page of results.
 
     Args:
         sections: in order.
+        title: of the page.
         command: that wrote it.
-        protocol: sentences.
         machine: what it ran on.
+        protocol: sentences.
     """
     methods = list(dict.fromkeys(method for section in sections for method in section.methods))
-    parts = [
-        "# The paper's tables, measured here",
-        "Written by",
-        f"    {command}",
-        "In *(brackets)*: what the paper prints. In **bold**: the best of a column here.",
-        "## Protocol",
-        "\n".join(f"- {sentence}" for sentence in protocol),
-        f"Machine: {machine}.",
-        "## Methods",
-        "\n".join(["| method | source | what differs here |", "|---|---|---|", *map(_line, methods)]),
-    ]
+    parts = [f"# {title}", "Written by", f"    {command}"]
+    parts.append("In *(brackets)*: what the paper prints. In **bold**: the best of a column here.")
+    if protocol:
+        parts += ["## Protocol", "\n".join(f"- {sentence}" for sentence in protocol)]
+    parts.append(f"Machine: {machine}.")
+    if methods:
+        rows = "\n".join(["| method | source | what differs here |", "|---|---|---|", *map(_line, methods)])
+        parts += ["## Methods", rows]
     for section in sections:
         parts += _section(section)
     return "\n\n".join(parts) + "\n"
@@ -193,7 +208,9 @@ def _line(cells: Sequence[str]) -> str:
 
 
 def _section(section: Section) -> list[str]:
-    parts = [f"## {section.name}: {section.summary}", f"The paper's `{section.label}`."]
+    parts = [f"## {section.name}: {section.summary}"]
+    if section.label:
+        parts.append(f"The paper's `{section.label}`.")
     for table in section.tables:
         parts += [f"### {table.title}", as_markdown(table) if table.rows else "No figures yet."]
         if table.notes:

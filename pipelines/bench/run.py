@@ -2,73 +2,52 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import json
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Generic, TypeVar
 
 import torch
 
 from ..run.jobs import Outcome, check_jobs, run_jobs
 from ..run.machine import choose_device, environment
-from ..run.trainer import Interrupted
-from .cells import Catalogue, Cell, Preset, Record, Report, Workplace, read_record, write_record
-from .tables import TableSpec
+from ..run.trainer import Interrupted, Report
+from .cells import Catalogue, Cell, Record, Workplace, read_record, write_record
 
-__all__ = ["Ran", "Shape", "cells_of", "kept_records", "run_cell", "run_cells"]
+__all__ = ["Ran", "Say", "kept_records", "run_cell", "run_cells"]
 
 Say = Callable[[str], None]
-
-
-@dataclass(frozen=True)
-class Shape:
-    """One input.
-
-    Attributes:
-        path: its vertices are the cloud.
-        reference: what results are measured against; None for the shape itself.
-    """
-
-    path: Path
-    reference: Path | None = None
-
-
-def cells_of(spec: TableSpec, shapes: Sequence[Shape], preset: Preset, *, seed: int = 0) -> list[Cell]:
-    """The cells of a table, with seed and references, each once.
-
-    Args:
-        spec: the table.
-        shapes: the inputs.
-        preset: how large and how long.
-        seed: of everything.
-    """
-    references = {shape.path: shape.reference for shape in shapes}
-    cells = spec.cells([shape.path for shape in shapes], preset)
-    planned = [dataclasses.replace(cell, seed=seed, reference=references.get(cell.shape)) for cell in cells]
-    return list(dict.fromkeys(planned))
+C = TypeVar("C", bound=Cell)
 
 
 def run_cell(
-    cell: Cell, out: Path, catalogue: Catalogue, *, device: str = "cpu", progress: Report | None = None
+    cell: C,
+    out: Path,
+    catalogue: Catalogue[C],
+    *,
+    device: str = "cpu",
+    progress: Report | None = None,
+    say: Say = lambda _: None,
 ) -> Record:
     """Do the work of a cell and keep its record; a cell that has one is not run again.
 
     Args:
         cell: what to do.
-        out: folder of the bench (see `store.make_folder`).
+        out: folder of the bench (see `make_folder`).
         catalogue: the methods.
         device: a torch device.
         progress: called now and then with how far the training is.
+        say: told what comes next.
 
     Returns:
-        See `mplicits.pipelines.bench.tables`.
+        What the cell is, its method, and what it found: "outputs", "deltas" and "details" of `Findings`.
 
     Raises:
-        InputError: the cloud cannot be read or used. Whatever a method raises is kept as the record's "error", and
-            such a cell is run again next time.
+        InputError: what the cell is about cannot be read or used. Whatever a method raises is kept as the record's
+            "error", and such a cell is run again next time.
         Interrupted: Ctrl-C during a fit of ours, which goes on there next time.
     """
     method, key = catalogue.named(cell.method), catalogue.key(cell)
@@ -77,13 +56,13 @@ def run_cell(
         return found
     head = {"cell": cell.as_dict(), "method": {"source": method.source, "differs": method.differs}}
 
-    def first(other: Cell) -> Workplace:
-        run_cell(other, out, catalogue, device=device, progress=progress)
-        return Workplace(out, catalogue.key(other), device, progress, first)
+    def first(other: C) -> Workplace:
+        run_cell(other, out, catalogue, device=device, progress=progress, say=say)
+        return Workplace(out, catalogue.key(other), device, progress, say, first)
 
     started = time.perf_counter()
     try:
-        findings = method.run(cell, Workplace(out, key, device, progress, first))
+        findings = method.run(cell, Workplace(out, key, device, progress, say, first))
     except Interrupted:
         raise
     except Exception as error:
@@ -102,7 +81,7 @@ def run_cell(
 
 
 @dataclass(frozen=True)
-class Ran:
+class Ran(Generic[C]):
     """What became of the cells.
 
     Attributes:
@@ -111,14 +90,22 @@ class Ran:
         lacking: methods that need something that is not installed, and what.
     """
 
-    records: Mapping[Cell, Record]
-    failures: Mapping[Cell, str]
+    records: Mapping[C, Record]
+    failures: Mapping[C, str]
     lacking: Mapping[str, str]
 
 
 def run_cells(
-    cells: Sequence[Cell], out: Path, catalogue: Catalogue, *, jobs: int = 1, device: str = "cpu", say: Say
-) -> Ran:
+    cells: Sequence[C],
+    out: Path,
+    catalogue: Catalogue[C],
+    *,
+    jobs: int = 1,
+    device: str = "cpu",
+    say: Say,
+    progress: Report | None = None,
+    tell: Say = lambda _: None,
+) -> Ran[C]:
     """Run what has no record yet, one line each.
 
     Args:
@@ -128,6 +115,8 @@ def run_cells(
         jobs: how many at a time (see `run_jobs`).
         device: a torch device, or "auto".
         say: told one line per cell.
+        progress: called now and then with how far a training is; with one job only.
+        tell: told what comes next in a cell; with one job only.
 
     Raises:
         InputError: no such device, or no Ray for more than one job.
@@ -146,8 +135,9 @@ def run_cells(
     if records and waiting:
         say(f"{len(records)} of {len(possible)} cells are there already")
     counter = _Counter(len(waiting), say)
-    work = functools.partial(run_cell, out=out, catalogue=catalogue, device=where)
-    failures: dict[Cell, str] = {}
+    heard = {"progress": progress, "say": tell} if jobs == 1 else {}
+    work = functools.partial(run_cell, out=out, catalogue=catalogue, device=where, **heard)
+    failures: dict[C, str] = {}
     # What others go on from comes first, so that it is not trained twice side by side.
     for depends in (False, True):
         group = [cell for cell in waiting if methods[cell].depends is depends]
@@ -159,7 +149,7 @@ def run_cells(
     return Ran({cell: records[cell] for cell in cells if cell in records}, failures, lacking)
 
 
-def kept_records(cells: Sequence[Cell], out: Path, catalogue: Catalogue) -> Mapping[Cell, Record]:
+def kept_records(cells: Sequence[C], out: Path, catalogue: Catalogue[C]) -> Mapping[C, Record]:
     """The records of those cells that are done."""
     found = {cell: read_record(out, catalogue.key(cell)) for cell in cells}
     return {cell: record for cell, record in found.items() if record is not None}
@@ -172,7 +162,7 @@ class _Counter:
         self.total, self.say = total, say
         self.done, self.started = 0, time.monotonic()
 
-    def __call__(self, outcome: Outcome[Cell, Record]) -> None:
+    def __call__(self, outcome: Outcome[Any, Record]) -> None:
         self.done += 1
         left = (time.monotonic() - self.started) / self.done * (self.total - self.done)
         rest = f"; about {_duration(left)} left" if self.done < self.total else ""

@@ -1,18 +1,16 @@
-"""``mplicits bench normals``: what a gradient costs, four ways, beside the machine's matrix rate.
+"""``mplicits bench normals`` and ``mplicits bench mesh``: what gradients and extraction cost, beside their peers.
 
-``mplicits bench mesh``: adaptive extraction beside the paper's scheme and a dense SIREN, in one run.
-
-Counting how often each level of a field is evaluated.
+Both count: seconds of the same work in several ways, and how often each level of a field is evaluated.
 """
 
 from __future__ import annotations
 
 import itertools
-import tempfile
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -23,22 +21,22 @@ from scipy.spatial import KDTree
 from skimage.measure import marching_cubes
 from torch import Tensor
 
-from ...neural_fields import Field, Jet, MultiscaleSDF, Siren, levels_of, load_field, save_field
+from ...neural_fields import Field, Jet, MultiscaleSDF, Siren, levels_of, load_field
 from ...neural_fields.meshing import DEFAULT_BOUNDS, extract_mesh
 from ..run.folder import find_field
-from ..run.machine import best_seconds, format_table, peak_memory, sgemm_rate
+from ..run.machine import best_seconds, peak_memory, sgemm_rate
+from .benchmark import Benchmark, Part
+from .cells import Workplace
+from .tables import Column, Figure, Table, tabulated
 
 __all__ = [
     "Counted",
     "MeshBench",
     "MeshRow",
+    "NormalsBench",
     "NormalsRow",
-    "bench_mesh",
-    "bench_normals",
     "counted",
     "evaluate_slabs",
-    "format_bench_mesh",
-    "format_normals",
     "printed_jet",
     "tangent_jet",
 ]
@@ -61,82 +59,84 @@ class NormalsRow:
     gemm: float
     largest_difference: float
 
-    def as_dict(self) -> dict[str, float]:
-        """All figures, for JSON."""
-        return asdict(self)
 
-
-def bench_normals(
-    *,
-    points: int = 262_144,
-    sizes: tuple[tuple[int, int], ...] = SIZES,
-    repeats: int = 3,
-    device: str = "cpu",
-    seed: int = 0,
-) -> list[NormalsRow]:
-    """Time value, jet, the paper's Algorithm 1 and torch.autograd on the same random points and weights.
+@dataclass(frozen=True, kw_only=True)
+class NormalsBench(Benchmark[NormalsRow]):
+    """Value, jet, the paper's Algorithm 1 and torch.autograd, timed on the same random points and weights.
 
     Algorithm 1 runs in the same blocks and buffers as the jet, so that they differ in method only: once as the
     paper prints it, where each of the three asynchronous passes makes its own activations, and once with
     the activations shared, the best a forward method can do on one processor. Autograd runs as users run
     it, on all points at once.
+
+    Attributes:
+        points: how many.
+        sizes: widths and depths of the networks.
+        repeats: the best of so many is what counts.
+        seed: of points and weights.
     """
-    generator = torch.Generator().manual_seed(seed)
-    x = (2 * torch.rand(points, 3, generator=generator) - 1).to(device)
-    rows = []
-    for width, depth in sizes:
+
+    name = "normals"
+    source = "what a gradient costs, four ways"
+    row = NormalsRow
+    apart = ("sizes",)
+    points: int = 262_144
+    sizes: tuple[tuple[int, int], ...] = SIZES
+    repeats: int = 3
+    seed: int = 0
+
+    def cells(self) -> list[Part]:
+        """One for each network."""
+        return [Part(self.name, f"({w},{d})", options=(("width", w), ("depth", d))) for w, d in self.sizes]
+
+    def measure(self, cell: Part, work: Workplace) -> list[NormalsRow]:
+        """See `Benchmark.measure`."""
+        return [self.timed(**cell.parameters)]
+
+    def timed(self, width: int, depth: int) -> NormalsRow:
+        """The row of one network."""
+        generator = torch.Generator().manual_seed(self.seed)
+        x = (2 * torch.rand(self.points, 3, generator=generator) - 1).to(self.device)
         with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed)
-            network = Siren(width, depth).to(device).requires_grad_(False)
+            torch.manual_seed(self.seed)
+            network = Siren(width, depth).to(self.device).requires_grad_(False)
+
+        def seconds(way: Callable[[Tensor], object]) -> float:
+            return best_seconds(lambda: way(x), repeats=self.repeats)
+
         with torch.inference_mode():
-            value = best_seconds(lambda n=network: n.value(x), repeats=repeats)
-            jet = best_seconds(lambda n=network: n.jet(x), repeats=repeats)
-            printed = best_seconds(lambda n=network: printed_jet(n, x), repeats=repeats)
-            tangents = best_seconds(lambda n=network: tangent_jet(n, x), repeats=repeats)
-        autograd = best_seconds(lambda n=network: _autograd_jet(n, x), repeats=repeats)
-        flops = 2 * 2 * points * ((depth - 1) * width**2 + 4 * width)
-        rate = sgemm_rate(width, rows=network.block_rows(x.device), device=x.device)
-        rows.append(
-            NormalsRow(
-                width,
-                depth,
-                points,
-                value,
-                jet,
-                printed,
-                tangents,
-                autograd,
-                flops / rate,
-                _largest_difference(network, x[:4096]),
-            )
-        )
-    return rows
+            value, jet = seconds(network.value), seconds(network.jet)
+            printed, tangents = (seconds(partial(way, network)) for way in (printed_jet, tangent_jet))
+        autograd = seconds(partial(_autograd_jet, network))
+        flops = 2 * 2 * self.points * ((depth - 1) * width**2 + 4 * width)
+        gemm = flops / sgemm_rate(width, rows=network.block_rows(x.device), device=x.device)
+        apart = _largest_difference(network, x[:4096])
+        return NormalsRow(width, depth, self.points, value, jet, printed, tangents, autograd, gemm, apart)
 
-
-def format_normals(rows: list[NormalsRow]) -> str:
-    """The table that the command prints."""
-    header = (
-        *("network", "value", "jet", "Alg. 1", "shared", "autograd"),
-        *("jet/value", "Alg.1/jet", "shared/jet", "autograd/jet", "of GEMM peak"),
-    )
-    cells = [
-        (
-            f"({r.width},{r.depth})",
-            *(f"{1e3 * t:.0f} ms" for t in (r.value, r.jet, r.printed, r.tangents, r.autograd)),
-            *(f"{a / b:.2f}" for a, b in ((r.jet, r.value), (r.printed, r.jet), (r.tangents, r.jet))),
-            f"{r.autograd / r.jet:.2f}",
-            f"{100 * r.gemm / r.jet:.0f} %",
+    def tables(self, rows: Sequence[NormalsRow], *, sgemm: float) -> tuple[Table, ...]:
+        """See `Benchmark.tables`."""
+        figures: list[Figure[NormalsRow]] = [
+            (Column("value, ms", ".0f"), lambda r: 1e3 * r.value),
+            (Column("jet, ms", ".0f"), lambda r: 1e3 * r.jet),
+            (Column("Alg. 1, ms", ".0f"), lambda r: 1e3 * r.printed),
+            (Column("shared, ms", ".0f"), lambda r: 1e3 * r.tangents),
+            (Column("autograd, ms", ".0f"), lambda r: 1e3 * r.autograd),
+            (Column("jet/value", ".2f"), lambda r: r.jet / r.value),
+            (Column("Alg.1/jet", ".2f"), lambda r: r.printed / r.jet),
+            (Column("shared/jet", ".2f"), lambda r: r.tangents / r.jet),
+            (Column("autograd/jet", ".2f"), lambda r: r.autograd / r.jet),
+            (Column("of GEMM peak", ".0%"), lambda r: r.gemm / r.jet),
+        ]
+        notes = (
+            f"{rows[0].points:,} points, float32; value, jet and both tangent methods in the same blocks.",
+            "Alg. 1: as the paper prints it: three passes with their own activations. shared: the three tangents on "
+            "one set of activations.",
+            "autograd: torch.autograd.grad on all points at once. of GEMM peak: the jet's matrix products at the "
+            "measured SGEMM rate, over its time.",
+            f"largest difference between the gradients: {max(r.largest_difference for r in rows):.1e}",
         )
-        for r in rows
-    ]
-    notes = (
-        f"{rows[0].points:,} points, {torch.get_num_threads()} threads, float32; value, jet and both tangent methods "
-        "in the same blocks.\nAlg. 1: as the paper prints it: three passes with their own activations. shared: the "
-        "three tangents on one set of activations.\nautograd: torch.autograd.grad on all points at once. of GEMM "
-        "peak: the jet's matrix products at the measured SGEMM rate, over its time.\n"
-        f"largest difference between the gradients: {max(r.largest_difference for r in rows):.1e}"
-    )
-    return f"{format_table(header, cells)}\n{notes}"
+        items = [(f"({r.width},{r.depth})", r) for r in rows]
+        return (tabulated(self.name, "What a gradient costs", "network", figures, items, notes=notes),)
 
 
 @torch.inference_mode()
@@ -214,7 +214,7 @@ def _largest_difference(network: Siren, x: Tensor) -> float:
     return max(float((method(network, x)[1] - jet.gradient).abs().max()) for method in methods)
 
 
-PAPER, DENSE = "level 0 on every vertex (paper)", "dense SIREN (256,4)"
+ADAPTIVE, PAPER, DENSE = "adaptive", "level 0 on every vertex (paper)", "dense SIREN (256,4)"
 SAMPLED_SHARE = 1 / 32
 
 
@@ -232,6 +232,9 @@ class MeshRow:
         peak: most memory the process held at any time, Python and libraries included, in bytes; None where the system
             does not keep it.
         share: fraction of the lattice that was really evaluated.
+        mean_distance: of the paper's scheme: mean over its vertices and over ours, each to the nearest of the other, in
+            cells.
+        max_distance: the largest of them.
     """
 
     method: str
@@ -242,106 +245,91 @@ class MeshRow:
     vertices: int
     peak: int | None
     share: float = 1.0
+    mean_distance: float | None = None
+    max_distance: float | None = None
 
 
-@dataclass(frozen=True)
-class MeshBench:
-    """All rows, and how far our vertices are from the nearest ones of the paper's scheme, in cells.
-
-    Attributes:
-        rows: adaptive ones first, then the peers at the reference resolution.
-        reference: resolution at which methods are compared.
-        mean_distance: mean over our vertices and over the peer's, each to the nearest of the other.
-        max_distance: the largest of them.
-        limit: a line about the machine's limit, printed as it is.
-    """
-
-    rows: tuple[MeshRow, ...]
-    reference: int
-    mean_distance: float
-    max_distance: float
-    limit: str = ""
-
-
-def bench_mesh(
-    source: str | Path | Field,
-    *,
-    resolutions: Sequence[int] = (256, 512, 1024),
-    reference: int = 512,
-    full: bool = False,
-    limit: str = "",
-    report: Callable[[str], None] | None = None,
-) -> MeshBench:
-    """Time ours at each of ``resolutions``, and the peers at ``reference``, over the same box.
+@dataclass(frozen=True, kw_only=True)
+class MeshBench(Benchmark[MeshRow]):
+    """Ours at each of ``resolutions``, and its peers at ``reference``, over the same box.
 
     The paper's scheme evaluates level 0 at every lattice point and finer levels in their bands, then runs dense
     marching cubes (scikit-image). The dense peer is one (256,4) SIREN with random weights, of which only the
     evaluation is timed; unless ``full``, on every 32nd slab of the lattice, and extrapolated linearly.
-    Every row runs in a fresh process, so that its peak memory is its own.
+    Every row is made in a fresh process, so that its peak memory is its own.
 
-    Args:
-        source: a run, a .safetensors file or a field.
+    Attributes:
+        run_file: a run, or a .safetensors file.
         resolutions: where ours is timed.
         reference: where ours is compared; added to ``resolutions`` if it is not among them.
         full: whether the dense peer evaluates the whole lattice.
-        limit: text about the machine's limit to print with the table.
-        report: told what is being run.
-
-    Raises:
-        InputError: ``source`` is no run and no field's file.
     """
-    say = report or (lambda _: None)
-    with tempfile.TemporaryDirectory() as scratch:
-        if isinstance(source, Field):
-            path = Path(scratch) / "field.safetensors"
-            save_field(path, source)
-        else:
-            path = find_field(source)
-        rows = []
-        for resolution in sorted({*resolutions, reference}):
-            say(f"adaptive at {resolution}³")
-            keep = Path(scratch) / "ours.npy" if resolution == reference else None
-            rows.append(_alone(_adaptive, path, resolution, keep))
-        say(f"{PAPER} at {reference}³")
-        rows.append(_alone(_paper, path, reference, Path(scratch) / "paper.npy"))
-        say(f"{DENSE} at {reference}³")
-        rows.append(_alone(_dense, reference, 1.0 if full else SAMPLED_SHARE))
-        mean, largest = _distances(np.load(Path(scratch) / "ours.npy"), np.load(Path(scratch) / "paper.npy"))
-    cell = _step(reference)
-    return MeshBench(tuple(rows), reference, mean / cell, largest / cell, limit)
+
+    name = "mesh"
+    source = "what extraction costs: adaptive, the paper's scheme, dense"
+    row = MeshRow
+    apart = ("run_file", "resolutions", "reference", "full")
+    run_file: str | Path
+    resolutions: Sequence[int] = (256, 512, 1024)
+    reference: int = 512
+    full: bool = False
+
+    def cells(self) -> list[Part]:
+        """Every row is one; see `Benchmark.cells`."""
+        file = find_field(self.run_file)
+        wanted = [(ADAPTIVE, resolution, 1.0) for resolution in sorted({*self.resolutions, self.reference})]
+        wanted += [(PAPER, self.reference, 1.0), (DENSE, self.reference, 1.0 if self.full else SAMPLED_SHARE)]
+        return [
+            Part(self.name, f"{method} at {cells}³", (file,), (("scheme", method), ("cells", cells), ("share", share)))
+            for method, cells, share in wanted
+        ]
+
+    def measure(self, cell: Part, work: Workplace) -> list[MeshRow]:
+        """See `Benchmark.measure`; the paper's scheme is compared with the adaptive mesh of the same resolution."""
+        (file,), (scheme, cells, share) = cell.files, cell.parameters.values()
+        if scheme == DENSE:
+            return [_alone(_dense, cells, share)]
+        keep = _vertices(work)
+        row = _alone(_adaptive if scheme == ADAPTIVE else _paper, file, cells, keep)
+        if scheme == ADAPTIVE:
+            return [row]
+        ours = next(one for one in self.cells() if dict(one.options) == {**cell.parameters, "scheme": ADAPTIVE})
+        assert work.first is not None
+        mean, largest = _distances(np.load(_vertices(work.first(ours))), np.load(keep))
+        return [replace(row, mean_distance=mean / _step(cells), max_distance=largest / _step(cells))]
+
+    def tables(self, rows: Sequence[MeshRow], *, sgemm: float) -> tuple[Table, ...]:
+        """The figures, the growth per doubling, the ratios, and whether both found the same surface."""
+        figures: list[Figure[MeshRow]] = [
+            (Column("cells", "s"), lambda r: f"{r.resolution}³"),
+            (Column("seconds", "s"), lambda r: f"{r.seconds:.2f}" if r.share == 1 else f"~{r.seconds:.0f}"),
+            (Column("+ normals", ".2f"), lambda r: r.normals),
+            (Column("evaluations per level", "s"), lambda r: " + ".join(f"{n / 1e6:.2f} M" for n in r.evaluations)),
+            (Column("vertices", ",d"), lambda r: r.vertices or None),
+            (Column("peak memory, MiB", ".0f"), lambda r: None if r.peak is None else r.peak / 2**20),
+        ]
+        notes = []
+        adaptive = [row for row in rows if row.method == ADAPTIVE]
+        for small, large in itertools.pairwise(adaptive):
+            growth = f"×{large.seconds / small.seconds:.2f} in time"
+            growth += f", ×{sum(large.evaluations) / sum(small.evaluations):.2f} in evaluations"
+            notes.append(f"{small.resolution}³ → {large.resolution}³: {growth}")
+        for peer in (row for row in rows if row.method != ADAPTIVE):
+            how = "" if peer.share == 1 else f" (timed on {peer.share:.1%} of the slabs, extrapolated linearly)"
+            at = f"{peer.method} at {peer.resolution}³{how}"
+            same = [row for row in adaptive if row.resolution == peer.resolution]
+            notes += [f"{peer.seconds / ours.seconds:.1f}× faster than {at}" for ours in same]
+            if peer.mean_distance is not None:
+                notes.append(
+                    "vertices of ours and the paper's scheme, to the nearest of the other: "
+                    f"mean {peer.mean_distance:.4f} cells, max {peer.max_distance:.3f} cells"
+                )
+        items = [(row.method, row) for row in rows]
+        return (tabulated(self.name, "What extraction costs", "method", figures, items, notes=notes),)
 
 
-def format_bench_mesh(bench: MeshBench) -> str:
-    """The table, the growth per doubling, the ratios, and whether both found the same surface."""
-    table = [_cells(row) for row in bench.rows]
-    header = ("method", "cells", "seconds", "+ normals", "evaluations per level", "vertices", "peak memory")
-    lines = [format_table(header, table), ""]
-    adaptive = [row for row in bench.rows if row.method == "adaptive"]
-    for small, large in itertools.pairwise(adaptive):
-        growth = f"×{large.seconds / small.seconds:.2f} in time"
-        growth += f", ×{sum(large.evaluations) / sum(small.evaluations):.2f} in evaluations"
-        lines.append(f"{small.resolution}³ → {large.resolution}³: {growth}")
-    ours = next(row for row in adaptive if row.resolution == bench.reference)
-    for peer in bench.rows[len(adaptive) :]:
-        how = "" if peer.share == 1 else f" (timed on {peer.share:.1%} of the slabs, extrapolated linearly)"
-        lines.append(f"{peer.seconds / ours.seconds:.1f}× faster than {peer.method} at {bench.reference}³{how}")
-    lines.append(
-        f"vertices of ours and the paper's scheme, to the nearest of the other: mean {bench.mean_distance:.4f} cells, "
-        f"max {bench.max_distance:.3f} cells"
-    )
-    return "\n".join([*lines, bench.limit] if bench.limit else lines)
-
-
-def _cells(row: MeshRow) -> tuple[str, ...]:
-    return (
-        row.method,
-        f"{row.resolution}³",
-        f"{row.seconds:.2f}" if row.share == 1 else f"~{row.seconds:.0f}",
-        "" if row.normals is None else f"{row.normals:.2f}",
-        " + ".join(f"{count / 1e6:.2f} M" for count in row.evaluations),
-        f"{row.vertices:,}" if row.vertices else "",
-        "" if row.peak is None else f"{row.peak / 2**20:.0f} MiB",
-    )
+def _vertices(work: Workplace) -> Path:
+    return work.out / "meshes" / f"{work.key}.npy"
 
 
 def _alone(work: Callable[..., MeshRow], *arguments: object) -> MeshRow:
@@ -355,7 +343,7 @@ def _with_threads(threads: int, work: Callable[..., MeshRow], *arguments: object
     return work(*arguments)
 
 
-def _adaptive(path: Path, resolution: int, keep: Path | None) -> MeshRow:
+def _adaptive(path: Path, resolution: int, keep: Path) -> MeshRow:
     field, levels = counted(load_field(path).field)
     start = time.perf_counter()
     mesh = extract_mesh(field, resolution=resolution)
@@ -363,9 +351,8 @@ def _adaptive(path: Path, resolution: int, keep: Path | None) -> MeshRow:
     assert mesh.stats is not None
     normals = mesh.stats.seconds["normals"]
     counts = tuple(level.values for level in levels)
-    if keep is not None:
-        np.save(keep, mesh.vertices)
-    return MeshRow("adaptive", resolution, seconds - normals, normals, counts, len(mesh.vertices), peak_memory())
+    np.save(keep, mesh.vertices)
+    return MeshRow(ADAPTIVE, resolution, seconds - normals, normals, counts, len(mesh.vertices), peak_memory())
 
 
 def _paper(path: Path, resolution: int, keep: Path) -> MeshRow:

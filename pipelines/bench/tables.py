@@ -1,46 +1,15 @@
-"""What a table is: which cells it needs, and how rows come from their records. Nothing is trained here.
-
-A record is what a cell found, as it stands in its JSON file::
-
-    {"cell": {"shape": stem, "method", "preset", "seed", "noise", "outliers", "flipped", "overrides": {…}, …},
-     "outputs": [{"name", "chamfer", "iou", …}, …],   # one per surface, coarse to fine
-     "deltas": [δ_1, …], …}
-
-A cell that failed has no record; tables say "–" where one is missing.
-"""
+"""What a table is, and how its rows come from items and the figures that are wanted of them."""
 
 from __future__ import annotations
 
 import statistics
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Literal, TypeVar
 
-from .cells import Cell, Record
-from .plots import Plot
+__all__ = ["Column", "Figure", "Row", "Table", "Value", "mean", "median", "ratio", "tabulated"]
 
-if TYPE_CHECKING:
-    from .cells import Preset
-
-__all__ = [
-    "Column",
-    "Row",
-    "Table",
-    "TableSpec",
-    "Value",
-    "by_shape",
-    "figure",
-    "mean",
-    "median",
-    "of_output",
-    "outputs_of",
-    "printed_name",
-    "ratio",
-    "select",
-    "shapes_of",
-]
-
+T = TypeVar("T")
 Value = float | int | str | None
 
 
@@ -110,82 +79,52 @@ class Table:
                     raise ValueError(f"{self.name}: {row.name}: {len(values)} values for {len(self.columns)} columns")
 
 
-@dataclass(frozen=True)
-class TableSpec:
-    """One table of the paper.
+# A column, and what stands in it of an item.
+Figure = tuple[Column, Callable[[T], Value]]
 
-    Attributes:
-        name: as after ``--table``.
-        label: the paper's own, e.g. "Tab. 1 (t-comparison)".
-        summary: what it shows, in one line.
-        cells: the shapes and the preset → what must be trained. Seeds, references and the choice of methods are
-            the harness's business.
-        tables: the records of those cells, as many as there are → the tables.
-        plots: the same → the plots.
-        sheets: whether there is a contact sheet of its meshes per shape.
+
+def tabulated(
+    name: str,
+    title: str,
+    head: str,
+    figures: Sequence[Figure[T]],
+    items: Iterable[tuple[str, T]],
+    *,
+    published: Callable[[T], tuple[Value, ...] | None] = lambda _: None,
+    about: Callable[[T], tuple[str, str]] = lambda _: ("", ""),
+    more: Iterable[Row] = (),
+    notes: Iterable[str] = (),
+) -> Table:
+    """A table with one row per item.
+
+    Args:
+        name: see `Table`.
+        title: see `Table`.
+        head: see `Table`.
+        figures: the columns, and what stands in them.
+        items: each with the name of its row.
+        published: what the paper says of an item; values that it lacks at the end may be left out.
+        about: source of an item's method, and what differs from it here.
+        more: rows below.
+        notes: see `Table`.
+
+    Example:
+        >>> table = tabulated("t", "Squares", "n", [(Column("n²", "d"), lambda n: n * n)], [("two", 2)])
+        >>> table.rows[0].values
+        (4,)
     """
-
-    name: str
-    label: str
-    summary: str
-    cells: Callable[[Sequence[Path], Preset], list[Cell]]
-    tables: Callable[[Sequence[Record]], tuple[Table, ...]]
-    plots: Callable[[Sequence[Record]], tuple[Plot, ...]] = lambda _: ()
-    sheets: bool = False
-
-
-def select(records: Iterable[Record], **wanted: Any) -> list[Record]:
-    """The records whose cells have these fields; a field that is not named may be anything.
-
-    ``overrides`` is compared as a dict: ``select(records, method="ours", noise=0.0, overrides={})``.
-    """
-    return [r for r in records if all(r["cell"][field] == value for field, value in wanted.items())]
-
-
-def shapes_of(records: Iterable[Record]) -> list[str]:
-    """Names of the shapes, each once, in their order."""
-    return list(dict.fromkeys(record["cell"]["shape"] for record in records))
-
-
-def outputs_of(records: Iterable[Record]) -> list[str]:
-    """Names of the surfaces, each once, in their order."""
-    return list(dict.fromkeys(output["name"] for record in records for output in record["outputs"]))
-
-
-def of_output(records: Iterable[Record], name: str, figure: str) -> list[float | None]:
-    """One figure of the surface called ``name`` in every record that has one; None where it was not found."""
-    return [o.get(figure) for record in records for o in record["outputs"] if o["name"] == name]
-
-
-def figure(records: Sequence[Record], name: str) -> float | None:
-    """One figure of the finest surface of the first record; None where there is no record or no surface."""
-    outputs = records[0]["outputs"] if records else []
-    return outputs[-1].get(name) if outputs else None
-
-
-def by_shape(records: Iterable[Record], output: str, name: str) -> dict[str, float | None]:
-    """One figure of an output, by shape."""
-    return {
-        record["cell"]["shape"]: found.get(name)
-        for record in records
-        for found in record["outputs"]
-        if found["name"] == output
-    }
+    rows = []
+    for row, item in items:
+        printed = published(item)
+        if printed is not None:
+            printed = (*printed, *[None] * (len(figures) - len(printed)))
+        rows.append(Row(row, tuple(of(item) for _, of in figures), printed, *about(item)))
+    return Table(name, title, head, tuple(column for column, _ in figures), (*rows, *more), tuple(notes))
 
 
 def ratio(above: float | None, below: float | None) -> float | None:
     """``above / below``; None where either is missing or the second is zero."""
     return above / below if above is not None and below else None
-
-
-def printed_name(shape: str, names: Iterable[str]) -> str | None:
-    """Which of the paper's shapes a file is, by its name.
-
-    Example:
-        >>> printed_name("Armadillo_50k", ["lucy", "armadillo"])
-        'armadillo'
-    """
-    return next((name for name in names if name in shape.lower()), None)
 
 
 def mean(values: Iterable[float | None]) -> float | None:

@@ -1,12 +1,7 @@
-"""``mplicits bench texture``: texture fields on coarse surfaces against the UV-textured meshes they learnt from.
-
-The fits and textures of ``mplicits bench texture``: kept in a folder, and used again if they are the same.
-"""
+"""``mplicits bench texture``: texture fields on coarse surfaces against the UV-textured meshes they learnt from."""
 
 from __future__ import annotations
 
-import hashlib
-import json
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -19,31 +14,24 @@ import torch
 
 from ...datasets import Camera, TexturedMesh, read_textured, sample_textured, turntable
 from ...neural_fields import Field, InputError, Similarity, TextureField, load_field, load_texture, map_colors
-from ...neural_fields.files import write_json
 from ...neural_fields.meshing import NoSurfaceError, extract_mesh
-from ..fit.train import fit
 from ..render.compare import Drawing, ImageError, draw, image_error, psnr
 from ..render.picture import Image, as_bytes, contact_sheet, write_picture
 from ..render.rasterise import mesh_view
 from ..render.trace import trace_view
-from ..run.folder import FIELD_FILE, RECORD_FILE, STATE_FILE, TEXTURE_FILE, read_record
-from ..run.machine import choose_device, format_table
+from ..run.folder import FIELD_FILE, TEXTURE_FILE, digest_of, read_record
+from ..run.machine import choose_device
 from ..run.settings import FitConfig, TextureConfig
-from ..run.trainer import Progress
 from ..surface.surface import Surface, from_mesh
 from ..texture.train import texture_run
+from .benchmark import Benchmark, Part, one_of_each
+from .cells import Workplace
+from .fits import fit_home, kept_fit
+from .tables import Column, Figure, Table, tabulated
 
-__all__ = [
-    "PAPER_MSE",
-    "Fitted",
-    "Report",
-    "TextureRow",
-    "bench_texture",
-    "check_kept",
-    "fitted_texture",
-    "format_texture",
-]
+__all__ = ["PAPER_MSE", "Fitted", "TextureBench", "TextureRow"]
 
+FIT_POINTS = 100_000
 # "Textures" in the supplement; over which pixels, of what images, it does not say.
 PAPER_MSE: Mapping[str, float] = MappingProxyType(
     {"spot": 0.0329, "bob": 0.0434, "bunny": 0.0720, "egg": 0.0291, "earth": 0.0033}
@@ -77,9 +65,38 @@ class TextureRow:
     error: ImageError
     paper: float | None
 
-    def as_dict(self) -> dict[str, Any]:
-        """All figures, for JSON."""
-        return asdict(self) | {"psnr_either": psnr(self.error.either), "psnr_both": psnr(self.error.both)}
+    @property
+    def psnr_either(self) -> float:
+        """In dB, over the pixels that see the shape in either image."""
+        return psnr(self.error.either)
+
+    @property
+    def psnr_both(self) -> float:
+        """In dB, over the pixels that are inside both."""
+        return psnr(self.error.both)
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A surface and its texture.
+
+    Attributes:
+        field: the surface, on the device of the texture's settings.
+        similarity: from input to its coordinates.
+        texture: around it.
+        record: what ``run.json`` says of both.
+    """
+
+    field: Field
+    similarity: Similarity
+    texture: TextureField
+    record: dict[str, Any]
+
+    @property
+    def name(self) -> str:
+        """The widths and depths of its levels, as the paper writes them."""
+        sizes = zip(self.record["config"]["widths"], self.record["config"]["depths"], strict=True)
+        return "▷".join(f"({width},{depth})" for width, depth in sizes)
 
 
 @dataclass(frozen=True)
@@ -92,29 +109,15 @@ class _Series:
     drawings: list[Drawing]
 
 
-def bench_texture(
-    meshes: Sequence[str | Path],
-    directory: Path,
-    texture: TextureConfig,
-    *,
-    coarse: FitConfig,
-    full: FitConfig | None = None,
-    views: int = 6,
-    size: int = 512,
-    samples: int = 2,
-    up: str = "y",
-    resolution: int = 256,
-    progress: Report | None = None,
-    report: Callable[[str], None] | None = None,
-) -> list[TextureRow]:
-    """Fit a coarse surface to each mesh, train its colours around it, and compare images of both.
+@dataclass(frozen=True, kw_only=True)
+class TextureBench(Benchmark[TextureRow]):
+    """Coarse surfaces fitted to meshes, their colours trained around them, and images of both compared.
 
-    Images are unlit, on white, and averaged in linear light from ``samples``² per pixel. Fits, textures and a contact
-    sheet per mesh are kept in ``directory``; those that are there already are used.
+    Images are unlit, on white, and averaged in linear light from ``samples``² per pixel. A contact sheet per mesh is
+    written into the folder of the results.
 
-    Args:
+    Attributes:
         meshes: OBJ or glTF files with texture coordinates and an image.
-        directory: made if it is not there.
         texture: settings of the textures.
         coarse: settings of the coarse fit.
         full: settings of another fit, for more rows: its surface, and its texture on the coarse surface.
@@ -123,37 +126,104 @@ def bench_texture(
         samples: per pixel and direction.
         up: "y" or "z".
         resolution: of the marching cubes of the coarse surface.
-        progress: called with a name and the progress of a training.
-        report: called with what is going on.
-
-    Raises:
-        InputError: a mesh cannot be used, two have one name, or ``directory`` holds fits with other settings.
-        Interrupted: a fit was asked to stop; the same call goes on with it.
-        KeyboardInterrupt: a texture was asked to stop.
     """
-    say = report or (lambda _: None)
-    paths = [Path(path) for path in meshes]
-    originals = [_read(path) for path in paths]
-    names = [path.stem for path in paths]
-    if len(set(names)) < len(names):
-        raise InputError(f"{max(names, key=names.count)}: two of the meshes are called that; rename one of them")
-    directory.mkdir(parents=True, exist_ok=True)
-    for path, mesh in zip(paths, originals, strict=True):
-        check_kept(directory / path.stem, mesh, {"coarse": coarse, "full": full}, texture)
-    rows: list[TextureRow] = []
-    for path, mesh in zip(paths, originals, strict=True):
-        home = directory / path.stem
-        fits = [fitted_texture(path, mesh, home / "coarse", coarse, texture, progress)]
-        if full is not None:
-            fits.append(fitted_texture(path, mesh, home / "full", full, texture, progress))
+
+    name = "texture"
+    source = "textures on coarse surfaces; supplement of the paper, Textures"
+    row = TextureRow
+    apart = ("meshes",)
+    meshes: Sequence[str | Path]
+    texture: TextureConfig
+    coarse: FitConfig
+    full: FitConfig | None = None
+    views: int = 6
+    size: int = 512
+    samples: int = 2
+    up: str = "y"
+    resolution: int = 256
+
+    def cells(self) -> list[Part]:
+        """One for each mesh; see `Benchmark.cells`."""
+        paths = [Path(path) for path in self.meshes]
+        found = [(path, _read(path)) for path in paths]
+        one_of_each([path.stem for path in paths], "meshes")
+        return [Part(self.name, path.stem, (path,), (("image", _digest(mesh)),)) for path, mesh in found]
+
+    def measure(self, cell: Part, work: Workplace) -> list[TextureRow]:
+        """See `Benchmark.measure`; raises `KeyboardInterrupt` where a texture was asked to stop."""
+        (path,), shape = cell.files, cell.name
+        mesh = _read(path)
+        configs = {"coarse": self.coarse} | ({} if self.full is None else {"full": self.full})
+        fits = [self.fitted(path, mesh, config, name, work) for name, config in configs.items()]
         outline = mesh.vertices[np.unique(mesh.faces)]
-        cameras = turntable(outline, views, width=size, height=size, up=up)
-        say(f"{path.stem}: the original")
-        wanted = [_original(mesh, camera, samples) for camera in cameras]
-        series = _drawn(path.stem, fits, cameras, samples, resolution, say)
-        rows += [_row(path.stem, one, image_error(zip(wanted, one.drawings, strict=True))) for one in series]
-        write_picture(directory / f"{path.stem}.png", _sheet(wanted, series[: len(fits)]))
-    return rows
+        cameras = turntable(outline, self.views, width=self.size, height=self.size, up=self.up)
+        work.say(f"{shape}: the original")
+        wanted = [_original(mesh, camera, self.samples) for camera in cameras]
+        series = self.drawn(shape, fits, cameras, work.say)
+        write_picture(work.out / f"{shape}.png", _sheet(wanted, series[: len(fits)]))
+        return [_row(shape, one, image_error(zip(wanted, one.drawings, strict=True))) for one in series]
+
+    def fitted(self, path: Path, mesh: TexturedMesh, config: FitConfig, name: str, work: Workplace) -> Fitted:
+        """A surface and its texture; whatever is not in the folder of the results yet is trained.
+
+        Raises:
+            Interrupted: the fit was asked to stop; the next call resumes it.
+            KeyboardInterrupt: the texture was asked to stop; the next call trains it anew.
+        """
+        more = {"image": _digest(mesh), "points": FIT_POINTS, "texture": asdict(self.texture) | {"device": None}}
+        run, progress = fit_home(work.out, path, config, **more), work.stage(f"{path.stem} {name}")
+        kept_fit(run, sample_textured(mesh, FIT_POINTS, seed=config.seed), config, progress=progress)
+        trained = (run / TEXTURE_FILE).is_file() and read_record(run).get("texture", {}).get("finished", False)
+        if not trained and not texture_run(run, path, self.texture, progress=progress).record["finished"]:
+            raise KeyboardInterrupt
+        field, similarity, _ = load_field(run / FIELD_FILE, device=choose_device(self.texture.device))
+        return Fitted(field, similarity, load_texture(run / TEXTURE_FILE, field), read_record(run))
+
+    def drawn(
+        self, shape: str, fits: Sequence[Fitted], cameras: Sequence[Camera], say: Callable[[str], None]
+    ) -> list[_Series]:
+        """All that is compared; first each fit, traced, with its own texture."""
+        coarse, samples = fits[0], self.samples
+        series = []
+        for fitted in fits:
+            say(f"{shape}: {fitted.name}, traced")
+            series.append(_Series(fitted, "traced", fitted, [_traced(fitted, fitted, c, samples) for c in cameras]))
+        say(f"{shape}: the mesh of {coarse.name}")
+        try:
+            mesh = from_mesh(extract_mesh(coarse.field, resolution=self.resolution))
+        except NoSurfaceError as error:
+            raise InputError(f"{shape}: the coarse fit has no surface ({error}); give it more steps") from error
+        series.append(_Series(coarse, "mesh", coarse, [_rasterised(mesh, coarse, c, samples) for c in cameras]))
+        for other in fits[1:]:
+            say(f"{shape}: {coarse.name} with the texture of {other.name}")
+            series.append(_Series(coarse, "traced", other, [_traced(coarse, other, c, samples) for c in cameras]))
+        return series
+
+    def tables(self, rows: Sequence[TextureRow], *, sgemm: float) -> tuple[Table, ...]:
+        """Mean squared errors, each with how many times the paper's it is below."""
+
+        def error(region: str) -> Callable[[TextureRow], str]:
+            def text(row: TextureRow) -> str:
+                mse = getattr(row.error, region)
+                return f"{mse:.3g}{_times(row.paper, mse)}"
+
+            return text
+
+        figures: list[Figure[TextureRow]] = [
+            (Column("texture around", "s"), lambda r: r.texture),
+            (Column("parameters", ",d"), lambda r: r.parameters),
+            (Column("fit, s", ".1f"), lambda r: r.fit_seconds),
+            (Column("texture", ",d"), lambda r: r.texture_parameters),
+            (Column("trained in, s", ".1f"), lambda r: r.texture_seconds),
+            (Column("MSE, all pixels", "s"), error("everywhere")),
+            (Column("seen by either", "s"), error("either")),
+            (Column("inside both", "s"), error("both")),
+            (Column("paper", ".4f"), lambda r: r.paper),
+            (Column("PSNR either, dB", ".1f"), lambda r: r.psnr_either),
+            (Column("PSNR both, dB", ".1f"), lambda r: r.psnr_both),
+        ]
+        items = [(f"{row.shape} {row.surface}", row) for row in rows]
+        return (tabulated(self.name, "Textures on coarse surfaces", "shape, surface", figures, items),)
 
 
 def _read(path: Path) -> TexturedMesh:
@@ -163,35 +233,15 @@ def _read(path: Path) -> TexturedMesh:
     return mesh
 
 
+def _digest(mesh: TexturedMesh) -> str:
+    """Of the mesh and its image, which is in a file of its own."""
+    return digest_of(array for array in (mesh.vertices, mesh.faces, mesh.uv, mesh.image) if array is not None)
+
+
 def _original(mesh: TexturedMesh, camera: Camera, samples: int) -> Drawing:
     seen = mesh_view(mesh, camera.resized(camera.width * samples, camera.height * samples))
     assert seen.color is not None
     return draw(seen, seen.color, samples=samples)
-
-
-def _drawn(
-    shape: str,
-    fits: Sequence[Fitted],
-    cameras: Sequence[Camera],
-    samples: int,
-    resolution: int,
-    say: Callable[[str], None],
-) -> list[_Series]:
-    """All that is compared; first each fit, traced, with its own texture."""
-    coarse, series = fits[0], []
-    for fitted in fits:
-        say(f"{shape}: {fitted.name}, traced")
-        series.append(_Series(fitted, "traced", fitted, [_traced(fitted, fitted, c, samples) for c in cameras]))
-    say(f"{shape}: the mesh of {coarse.name}")
-    try:
-        mesh = from_mesh(extract_mesh(coarse.field, resolution=resolution))
-    except NoSurfaceError as error:
-        raise InputError(f"{shape}: the coarse fit has no surface ({error}); give it more steps") from error
-    series.append(_Series(coarse, "mesh", coarse, [_rasterised(mesh, coarse, c, samples) for c in cameras]))
-    for other in fits[1:]:
-        say(f"{shape}: {coarse.name} with the texture of {other.name}")
-        series.append(_Series(coarse, "traced", other, [_traced(coarse, other, c, samples) for c in cameras]))
-    return series
 
 
 @torch.inference_mode()
@@ -241,135 +291,9 @@ def _sheet(wanted: Sequence[Drawing], series: Sequence[_Series]) -> Image:
     return contact_sheet(*lines)
 
 
-def format_texture(rows: Sequence[TextureRow]) -> str:
-    """The table that the command prints: mean squared errors, each with how many times the paper's it is below."""
-    header = (
-        *("shape, surface", "texture around", "parameters", "fit", "texture", "trained in"),
-        *("MSE, all pixels", "seen by either", "inside both", "paper", "PSNR either", "PSNR both"),
-    )
-    cells = []
-    for row in rows:
-        errors = (row.error.everywhere, row.error.either, row.error.both)
-        cells.append(
-            (
-                f"{row.shape} {row.surface}",
-                row.texture,
-                f"{row.parameters:,}",
-                f"{row.fit_seconds:.1f} s",
-                f"{row.texture_parameters:,}",
-                f"{row.texture_seconds:.1f} s",
-                *(f"{mse:.3g}{_times(row.paper, mse)}" for mse in errors),
-                "" if row.paper is None else f"{row.paper:.4f}",
-                f"{psnr(row.error.either):.1f} dB",
-                f"{psnr(row.error.both):.1f} dB",
-            )
-        )
-    return format_table(header, cells)
-
-
 def _times(paper: float | None, mse: float) -> str:
     """How many times smaller than the paper's figure an error is, to one or two digits."""
     if paper is None or not mse > 0:
         return ""
     ratio = paper / mse
     return f" ({ratio:.0f}×)" if ratio >= 9.95 else f" ({ratio:.1f}×)"
-
-
-FIT_POINTS = 100_000
-MESH_FILE = "mesh.json"
-
-Report = Callable[[str, Progress], None]
-
-
-@dataclass(frozen=True)
-class Fitted:
-    """A surface and its texture.
-
-    Attributes:
-        field: the surface, on the device of the texture's settings.
-        similarity: from input to its coordinates.
-        texture: around it.
-        record: what ``run.json`` says of both.
-    """
-
-    field: Field
-    similarity: Similarity
-    texture: TextureField
-    record: dict[str, Any]
-
-    @property
-    def name(self) -> str:
-        """The widths and depths of its levels, as the paper writes them."""
-        sizes = zip(self.record["config"]["widths"], self.record["config"]["depths"], strict=True)
-        return "▷".join(f"({width},{depth})" for width, depth in sizes)
-
-
-def check_kept(home: Path, mesh: TexturedMesh, fits: Mapping[str, FitConfig | None], texture: TextureConfig) -> None:
-    """Check that what is kept in a folder was made from this mesh and with these settings; make the folder if new.
-
-    Args:
-        home: the folder of the mesh.
-        mesh: with an image.
-        fits: settings by the names of the runs in that folder; None: it is not asked for.
-        texture: settings of their textures.
-
-    Raises:
-        InputError: something there is of another mesh or has other settings.
-    """
-    digest = hashlib.sha256()
-    for array in (mesh.vertices, mesh.faces, mesh.uv, mesh.image):
-        digest.update(np.ascontiguousarray(array).tobytes())
-    file = home / MESH_FILE
-    if file.is_file() and file.read_text(encoding="utf-8") != json.dumps(digest.hexdigest(), indent=2) + "\n":
-        raise InputError(f"{home}: holds the fits of another mesh than {mesh.source}; choose another -o, or remove it")
-    for name, config in fits.items():
-        run = home / name
-        if config is None or not (run / RECORD_FILE).is_file():
-            continue
-        record = read_record(run)
-        _check_settings(run, record["config"], config)
-        if "texture" in record:
-            _check_settings(run / TEXTURE_FILE, record["texture"]["config"], texture)
-    home.mkdir(exist_ok=True)
-    write_json(file, digest.hexdigest())
-
-
-def _check_settings(where: Path, kept: Mapping[str, Any], wanted: FitConfig | TextureConfig) -> None:
-    given = json.loads(json.dumps(asdict(wanted)))  # lists, as the file has them
-    for name in given:
-        if name != "device" and kept.get(name) != given[name]:
-            raise InputError(
-                f"{where}: was made with {name} {kept.get(name)}, not {given[name]}; choose another -o, or remove it"
-            )
-
-
-def fitted_texture(
-    path: Path, mesh: TexturedMesh, run: Path, config: FitConfig, texture: TextureConfig, progress: Report | None
-) -> Fitted:
-    """The surface and its texture; whatever is not in the folder ``run`` yet is trained.
-
-    Args:
-        path: of the mesh.
-        mesh: what it holds.
-        run: run directory of the fit and its texture; its name is that of the fit.
-        config: settings of the fit.
-        texture: settings of the texture.
-        progress: called with a name and the progress of a training.
-
-    Raises:
-        Interrupted: the fit was asked to stop; the next call resumes it.
-        KeyboardInterrupt: the texture was asked to stop; the next call trains it anew.
-    """
-
-    def told(step: Progress) -> None:
-        if progress is not None:
-            progress(f"{path.stem} {run.name}", step)
-
-    resume = (run / STATE_FILE).is_file()
-    if resume or not (run / FIELD_FILE).is_file():
-        fit(sample_textured(mesh, FIT_POINTS, seed=config.seed), config, out=run, resume=resume, progress=told)
-    trained = (run / TEXTURE_FILE).is_file() and read_record(run).get("texture", {}).get("finished", False)
-    if not trained and not texture_run(run, path, texture, progress=told).record["finished"]:
-        raise KeyboardInterrupt
-    field, similarity, _ = load_field(run / FIELD_FILE, device=choose_device(texture.device))
-    return Fitted(field, similarity, load_texture(run / TEXTURE_FILE, field), read_record(run))

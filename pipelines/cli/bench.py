@@ -1,9 +1,4 @@
-"""``mplicits bench …``: thin arguments around the benchmarks.
-
-``mplicits bench texture`` and ``mplicits bench normal-map``: their arguments, and the checks before any work.
-
-``mplicits bench scale``: its arguments.
-"""
+"""``mplicits bench …``: the arguments of the benchmarks, the checks before any work, and the one way to run them."""
 
 from __future__ import annotations
 
@@ -11,155 +6,189 @@ import argparse
 import dataclasses
 import sys
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
 
-from ..run.config import add_config_flags, given_flags, load_config, preset_names
-from ..run.settings import FitConfig, TextureConfig
-from .bench_runs import EVOLVE, PAPER, RECONSTRUCT
-from .common import Command, add_fit_settings, add_json, check_output, fit_settings, positive, whole, write_json
+from ..run.config import add_config_flags, given_flags, input_error, load_config, preset_names
+from ..run.settings import EvolveConfig, FitConfig, ReconstructConfig, TextureConfig
+from .bench_paper import PAPER
+from .common import (
+    PICTURES,
+    Command,
+    add_fit_settings,
+    add_json,
+    add_settings,
+    check_output,
+    fit_settings,
+    positive,
+    read_settings,
+    typed,
+    whole,
+    write_json,
+)
+
+if TYPE_CHECKING:
+    from ..bench.benchmark import Benchmark
 
 __all__ = ["BENCH_COMMANDS"]
 
 
+def _run(arguments: argparse.Namespace, benches: Sequence[Benchmark[Any]], *, out: Path | None) -> int:
+    """Do what is not done yet, print the tables, and write them.
+
+    Args:
+        arguments: of the command.
+        benches: each with its own cells.
+        out: folder of the results; None keeps nothing.
+    """
+    from ..bench.benchmark import write_results
+    from ..bench.cells import Catalogue, make_folder
+    from ..bench.report import as_text
+    from ..bench.run import run_cells
+    from ..run.progress import progress_bars
+    from ..run.trainer import Interrupted
+
+    cells = [cell for bench in benches for cell in bench.cells()]
+    code = 0
+    with ExitStack() as stack:
+        folder = out or Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        make_folder(folder)
+        try:
+            with progress_bars() as bars:
+                ran = run_cells(
+                    cells, folder, Catalogue(benches), device=benches[0].device, say=_say, progress=bars, tell=_say
+                )
+            code = 1 if ran.failures else 0
+        except (Interrupted, KeyboardInterrupt):
+            kept = "; the same command goes on after the last finished cell" if out else ""
+            print(f"interrupted{kept}", file=sys.stderr)
+            code = 130
+        tables, figures = write_results(benches, folder, command=typed(arguments))
+    if tables:
+        print("\n\n".join(map(as_text, tables)))
+        print(f"machine: {figures['machine']}")
+        write_json(arguments.json, figures)
+    if out is not None:
+        print(f"tables, cells, fits and pictures: {out}")
+    return code
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr)
+
+
+def _number(
+    parser: argparse._ArgumentGroup | argparse.ArgumentParser,
+    flag: str,
+    kind: Callable[[str], float],
+    default: float | Sequence[int] | None,
+    about: str,
+    **more: Any,
+) -> None:
+    """A flag for a number, or several, whose help ends with its default."""
+    shown = (
+        "" if default is None else f" ({' '.join(map(str, default)) if isinstance(default, tuple) else f'{default:g}'})"
+    )
+    metavar = "X" if kind is positive else "N"
+    parser.add_argument(flag, type=kind, default=default, metavar=metavar, help=about + shown, **more)
+
+
+def _folder(parser: argparse.ArgumentParser, *, required: bool = False) -> None:
+    about = "keeps cells, fits and tables; what is there is used, and an interrupted bench goes on"
+    parser.add_argument("-o", "--out", type=Path, metavar="DIR", required=required, help=about)
+
+
+def _measured(parser: argparse.ArgumentParser, resolution: int) -> None:
+    _number(parser, "--resolution", whole(8, 2048), resolution, "of the meshes")
+    _number(parser, "--eval-samples", whole(1), 500_000, "points per surface")
+
+
 def _normals_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--points", type=whole(1), default=262_144, metavar="N", help="how many (262144)")
-    parser.add_argument("--repeats", type=whole(1), default=3, metavar="N", help="the best of how many (3)")
+    _number(parser, "--points", whole(1), 262_144, "how many")
+    _number(parser, "--repeats", whole(1), 3, "the best of how many")
     parser.add_argument("--device", default="cpu", help="torch device (cpu)")
-    parser.add_argument("--seed", type=whole(0), default=0, metavar="N", help="of points and weights (0)")
+    _number(parser, "--seed", whole(0), 0, "of points and weights")
+    _folder(parser)
     add_json(parser)
 
 
 def _normals(arguments: argparse.Namespace) -> int:
-    check_output(arguments.json, (".json",))
-    from ..bench.speed import bench_normals, format_normals
+    from ..bench.speed import NormalsBench
 
-    rows = bench_normals(
-        points=arguments.points, repeats=arguments.repeats, device=arguments.device, seed=arguments.seed
-    )
-    print(format_normals(rows))
-    write_json(arguments.json, [row.as_dict() for row in rows])
-    return 0
+    options = {name: getattr(arguments, name) for name in ("points", "repeats", "seed", "device")}
+    return _run(arguments, [NormalsBench(**options)], out=arguments.out)
 
 
 def _mesh_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("run", metavar="RUN", help="run directory or .safetensors file")
-    parser.add_argument(
-        "--resolutions",
-        type=whole(8, 2048),
-        nargs="+",
-        default=(256, 512, 1024),
-        metavar="N",
-        help="where ours is timed (256 512 1024)",
-    )
-    parser.add_argument("--reference", type=whole(8, 1024), default=512, metavar="N", help="where all are (512)")
+    _number(parser, "--resolutions", whole(8, 2048), (256, 512, 1024), "where ours is timed", nargs="+")
+    _number(parser, "--reference", whole(8, 1024), 512, "where all are")
     parser.add_argument("--full", action="store_true", help="evaluate the dense peer on the whole lattice: very slow")
+    _folder(parser)
     add_json(parser)
 
 
 def _mesh(arguments: argparse.Namespace) -> int:
-    check_output(arguments.json, (".json",))
-    from ..bench.speed import bench_mesh, format_bench_mesh
-    from ..run.machine import sgemm_rate
+    from ..bench.speed import MeshBench
 
-    bench = bench_mesh(
-        arguments.run,
+    bench = MeshBench(
+        run_file=arguments.run,
         resolutions=arguments.resolutions,
         reference=arguments.reference,
         full=arguments.full,
-        limit=f"this machine multiplies float32 matrices at {sgemm_rate(256) / 1e9:.0f} GFLOP/s",
-        report=lambda text: print(f"{text} …", file=sys.stderr),
     )
-    print(format_bench_mesh(bench))
-    write_json(arguments.json, dataclasses.asdict(bench))
-    return 0
+    return _run(arguments, [bench], out=arguments.out)
 
 
 def _fit_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("shapes", nargs="+", metavar="SHAPE", help="mesh files")
-    parser.add_argument("--noise", type=positive, metavar="X", help="move points by up to X bounding-box diagonals")
-    parser.add_argument("--resolution", type=whole(8, 2048), default=512, metavar="N", help="of the meshes (512)")
-    parser.add_argument("--eval-samples", type=whole(1), default=500_000, metavar="N", help="per surface (500000)")
-    parser.add_argument("--poisson-depth", type=whole(4, 14), default=10, metavar="N", help="octree depth (10)")
+    _number(parser, "--noise", positive, None, "move points by up to X bounding-box diagonals")
+    _measured(parser, 512)
+    _number(parser, "--poisson-depth", whole(4, 14), 10, "octree depth")
     parser.add_argument("--pictures", type=Path, metavar="DIR", help="write a picture of all methods per shape")
+    _folder(parser)
     add_json(parser)
     add_fit_settings(parser)
 
 
 def _fit(arguments: argparse.Namespace) -> int:
-    check_output(arguments.json, (".json",))
     config = fit_settings(arguments)
-    from ..bench.fits import bench_fit, format_fit
-    from ..run.progress import progress_bars
-    from ..run.trainer import Interrupted
+    from ..bench.fits import FitBench
 
-    if arguments.pictures is not None:
-        arguments.pictures.mkdir(parents=True, exist_ok=True)
-    try:
-        with progress_bars() as report:
-            rows = bench_fit(
-                arguments.shapes,
-                config,
-                noise=arguments.noise or 0.0,
-                resolution=arguments.resolution,
-                samples=arguments.eval_samples,
-                poisson_depth=arguments.poisson_depth,
-                pictures=arguments.pictures,
-                progress=lambda shape, step: report(dataclasses.replace(step, stage=f"{shape} {step.stage}")),
-            )
-    except Interrupted:
-        print("interrupted", file=sys.stderr)
-        return 130
-    print(format_fit(rows))
-    write_json(arguments.json, [row.as_dict() for row in rows])
-    return 0
+    bench = FitBench(
+        shapes=arguments.shapes,
+        config=config,
+        noise=arguments.noise or 0.0,
+        resolution=arguments.resolution,
+        samples=arguments.eval_samples,
+        poisson_depth=arguments.poisson_depth,
+        pictures=arguments.pictures,
+    )
+    return _run(arguments, [bench], out=arguments.out)
 
 
 def _render_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("shapes", nargs="+", metavar="SHAPE", help="meshes or clouds")
-    parser.add_argument(
-        "-o", "--out", required=True, type=Path, metavar="DIR", help="keeps the fits; those that are there are used"
-    )
-    parser.add_argument("--size", type=whole(16, 4096), default=512, metavar="N", help="of the images (512)")
-    parser.add_argument("--views", type=whole(1), default=3, metavar="N", help="cameras around the shape (3)")
-    parser.add_argument("--repeats", type=whole(1), default=2, metavar="N", help="the best of how many (2)")
+    _folder(parser, required=True)
+    _number(parser, "--size", whole(16, 4096), 512, "of the images")
+    _number(parser, "--views", whole(1), 3, "cameras around the shape")
+    _number(parser, "--repeats", whole(1), 2, "the best of how many")
     parser.add_argument("--no-naive", action="store_true", help="leave out the naive tracer, which takes minutes")
     add_json(parser)
     add_fit_settings(parser)
 
 
 def _render(arguments: argparse.Namespace) -> int:
-    check_output(arguments.json, (".json",))
     config = fit_settings(arguments)
-    from ..bench.render import bench_render, format_render
-    from ..run.machine import choose_device, sgemm_rate
-    from ..run.progress import progress_bars
-    from ..run.trainer import Interrupted
+    from ..bench.render import RenderBench
+    from ..run.machine import choose_device
 
-    device = choose_device(config.device)
-    try:
-        with progress_bars() as report:
-            rows = bench_render(
-                arguments.shapes,
-                arguments.out,
-                config,
-                size=arguments.size,
-                views=arguments.views,
-                repeats=arguments.repeats,
-                naive=not arguments.no_naive,
-                device=str(device),
-                progress=lambda name, step: report(dataclasses.replace(step, stage=f"{name} {step.stage}")),
-                report=lambda text: print(f"{text} …", file=sys.stderr),
-            )
-    except Interrupted:
-        print("interrupted; the same command goes on from here", file=sys.stderr)
-        return 130
-    rate = sgemm_rate(256, device=device)
-    print(format_render(rows, sgemm=rate))
-    print(f"this machine multiplies float32 matrices at {rate / 1e9:.0f} GFLOP/s on {device}")
-    write_json(arguments.json, [row.as_dict() for row in rows])
-    return 0
+    options = {name: getattr(arguments, name) for name in ("shapes", "size", "views", "repeats")}
+    naive, device = not arguments.no_naive, str(choose_device(config.device))
+    return _run(arguments, [RenderBench(config=config, naive=naive, device=device, **options)], out=arguments.out)
 
 
 # The paper's (64,1), with a frequency and a schedule at which it is a closed surface that looks like the shape.
@@ -167,31 +196,22 @@ COARSE = FitConfig(widths=(64,), depths=(1,), omegas=(40.0,), steps=(1500,), lea
 
 
 def _view_arguments(parser: argparse.ArgumentParser, *, views: int) -> None:
-    parser.add_argument("--views", type=whole(1), default=views, metavar="N", help=f"cameras around it ({views})")
-    parser.add_argument("--size", type=whole(16, 4096), default=512, metavar="N", help="of the images (512)")
+    _number(parser, "--views", whole(1), views, "cameras around it")
+    _number(parser, "--size", whole(16, 4096), 512, "of the images")
     parser.add_argument("--up", choices=("y", "z"), default="y", help="the axis that points up (y)")
-    parser.add_argument(
-        "--resolution", type=whole(8, 2048), default=256, metavar="N", help="of the coarse surface's mesh (256)"
-    )
+    _number(parser, "--resolution", whole(8, 2048), 256, "of the coarse surface's mesh")
     add_json(parser)
 
 
 def _texture_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("meshes", nargs="+", metavar="MESH", help="OBJ, GLB or glTF with a texture")
-    parser.add_argument(
-        "-o",
-        "--out",
-        required=True,
-        type=Path,
-        metavar="DIR",
-        help="keeps fits, textures and pictures; those that are there are used",
-    )
+    _folder(parser, required=True)
     _view_arguments(parser, views=6)
     coarse = parser.add_argument_group("coarse surface")
-    coarse.add_argument("--coarse-width", type=whole(1), default=64, metavar="N", help="neurons per layer (64)")
-    coarse.add_argument("--coarse-depth", type=whole(1), default=1, metavar="N", help="sine layers (1)")
-    coarse.add_argument("--coarse-omega", type=positive, default=40.0, metavar="X", help="SIREN frequency (40)")
-    coarse.add_argument("--coarse-steps", type=whole(1), default=1500, metavar="N", help="training steps (1500)")
+    _number(coarse, "--coarse-width", whole(1), 64, "neurons per layer")
+    _number(coarse, "--coarse-depth", whole(1), 1, "sine layers")
+    _number(coarse, "--coarse-omega", positive, 40.0, "SIREN frequency")
+    _number(coarse, "--coarse-steps", whole(1), 1500, "training steps")
     coarse.add_argument("--full", action="store_true", help="compare with a fit of several levels as well")
     names = ", ".join(preset_names("fit"))
     coarse.add_argument("--fit-preset", default="default", metavar="NAME", help=f"of --full: {names} (default)")
@@ -199,159 +219,158 @@ def _texture_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _texture(arguments: argparse.Namespace) -> int:
-    check_output(arguments.json, (".json",))
-    texture = load_config(TextureConfig, None, given_flags(arguments, TextureConfig), thing="texture")
+    texture = load_config(TextureConfig, None, given_flags(arguments, TextureConfig))
     shared = {"seed": texture.seed, "device": texture.device}
-    coarse = dataclasses.replace(
-        COARSE,
-        widths=(arguments.coarse_width,),
-        depths=(arguments.coarse_depth,),
-        omegas=(arguments.coarse_omega,),
-        steps=(arguments.coarse_steps,),
-        **shared,
-    )
+    own = {f"{name}s": (getattr(arguments, f"coarse_{name}"),) for name in ("width", "depth", "omega")}
+    coarse = dataclasses.replace(COARSE, **own, steps=(arguments.coarse_steps,), **shared)
     full = load_config(FitConfig, arguments.fit_preset, shared) if arguments.full else None
-    from ..bench.texture import bench_texture, format_texture
-    from ..run.progress import progress_bars
-    from ..run.trainer import Interrupted
+    from ..bench.texture import TextureBench
 
-    try:
-        with progress_bars() as report:
-            rows = bench_texture(
-                arguments.meshes,
-                arguments.out,
-                texture,
-                coarse=coarse,
-                full=full,
-                views=arguments.views,
-                size=arguments.size,
-                up=arguments.up,
-                resolution=arguments.resolution,
-                progress=lambda name, step: report(dataclasses.replace(step, stage=f"{name} {step.stage}")),
-                report=lambda text: print(f"{text} …", file=sys.stderr),
-            )
-    except Interrupted:
-        print("interrupted; the same command goes on", file=sys.stderr)
-        return 130
-    print(format_texture(rows))
-    print(f"pictures and fits: {arguments.out}")
-    write_json(arguments.json, [row.as_dict() for row in rows])
-    return 0
+    options = {name: getattr(arguments, name) for name in ("meshes", "views", "size", "up", "resolution")}
+    bench = TextureBench(texture=texture, coarse=coarse, full=full, device=texture.device, **options)
+    return _run(arguments, [bench], out=arguments.out)
 
 
 def _normal_map_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("run", metavar="RUN", help="run directory or .safetensors file")
     parser.add_argument("reference", metavar="REFERENCE", help="the mesh that was fitted")
-    parser.add_argument("-o", "--out", type=Path, metavar="FILE", help="a .png or .jpg with all the images")
-    parser.add_argument(
-        "--shading",
-        choices=("headlight", "lambert", "normals"),
-        default="headlight",
-        help="what is compared",
-    )
-    parser.add_argument("--repeats", type=whole(1), default=2, metavar="N", help="the best of how many (2)")
+    about = "a .png or .jpg with all the images, or a folder that keeps them and the figures"
+    parser.add_argument("-o", "--out", type=Path, metavar="PATH", help=about)
+    shadings = ("headlight", "lambert", "normals")
+    parser.add_argument("--shading", choices=shadings, default="headlight", help="what is compared")
+    _number(parser, "--repeats", whole(1), 2, "the best of how many")
     parser.add_argument("--device", default="auto", help="torch device (auto)")
     _view_arguments(parser, views=3)
 
 
 def _normal_map(arguments: argparse.Namespace) -> int:
-    check_output(arguments.json, (".json",))
-    check_output(arguments.out, (".png", ".jpg", ".jpeg"))
-    from ..bench.normal_map import bench_normal_map, format_normal_map
+    out: Path | None = arguments.out
+    picture = None
+    if out is not None and out.suffix and not out.is_dir():
+        check_output(out, PICTURES)
+        picture, out = out, None
+    elif out is not None:
+        picture = out / "images.png"
+    from ..bench.normal_map import NormalMapBench
 
-    rows = bench_normal_map(
-        arguments.run,
-        arguments.reference,
-        shading=arguments.shading,
-        size=arguments.size,
-        views=arguments.views,
-        up=arguments.up,
-        resolution=arguments.resolution,
-        repeats=arguments.repeats,
-        device=arguments.device,
-        picture=arguments.out,
-        report=lambda text: print(f"{text} …", file=sys.stderr),
+    names = ("reference", "shading", "size", "views", "up", "resolution", "repeats", "device")
+    options = {name: getattr(arguments, name) for name in names}
+    return _run(arguments, [NormalMapBench(run_file=arguments.run, picture=picture, **options)], out=out)
+
+
+def _reconstruct_arguments(parser: argparse.ArgumentParser) -> None:
+    what = "an exact scene (painted-sphere, striped-torus, figure, statue), or the path of posed photographs"
+    parser.add_argument("scenes", nargs="+", metavar="SCENE", help=what)
+    _folder(parser)
+    _number(parser, "--views", whole(2, 10_000), 24, "of an exact scene")
+    _number(parser, "--size", whole(8, 4096), 64, "of an exact scene's images")
+    _number(parser, "--test-views", whole(1), 8, "measure at most so many held-out views")
+    parser.add_argument(
+        "--equal-time",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="train ours once more, for as long as NeuS took (yes)",
     )
-    print(format_normal_map(rows))
-    write_json(arguments.json, [row.as_dict() for row in rows])
-    return 0
+    _measured(parser, 256)
+    _number(parser, "--neus-learning-rate", positive, 1e-3, "peak rate of the NeuS rows")
+    add_json(parser)
+    add_settings(parser, ReconstructConfig, about="of all rows; the geometry is chosen by the benchmark")
 
 
-TEXTURE = Command(
-    "how near textures on coarse surfaces come to UV textures",
-    """  mplicits bench texture spot.obj bob.obj -o bench_texture
-  mplicits bench texture spot.obj -o bench_texture --full --fit-preset fast --json texture.json""",
-    _texture_arguments,
-    _texture,
-    "Fit a coarse surface to each mesh, train a texture field around it, and compare unlit images of it with those of "
-    "the mesh and its UV texture. Errors are in display RGB from 0 to 1.",
-)
+def _reconstruct(arguments: argparse.Namespace) -> int:
+    if "geometry" in given_flags(arguments, ReconstructConfig):
+        raise input_error("--geometry: the benchmark trains both; leave it out")
+    config = read_settings(arguments, ReconstructConfig)
+    if config.time_budget is not None:
+        raise input_error("--time-budget: rows are compared after as many steps; leave it out, and give --steps")
+    from ..bench.reconstruct import ReconstructBench, read_scene
+    from ..run.progress import counter_bar
 
-NORMAL_MAP = Command(
-    "what the normals of a fine level do for a coarse surface",
-    """  mplicits bench normal-map runs/scan scan.ply
-  mplicits bench normal-map runs/scan scan.ply --shading lambert --views 6 -o images.png""",
-    _normal_map_arguments,
-    _normal_map,
-    "Compare shaded images of the levels of a run, and of the coarsest with the normals of the finest, with images of "
-    "the mesh that was fitted.",
-)
+    scenes = []
+    for name in arguments.scenes:
+        with counter_bar(name) as progress:
+            scenes.append(
+                read_scene(name, views=arguments.views, size=arguments.size, width=config.width, progress=progress)
+            )
+    options = {
+        name: getattr(arguments, name) for name in ("equal_time", "test_views", "resolution", "neus_learning_rate")
+    }
+    options |= {"samples": arguments.eval_samples, "device": config.device}
+    return _run(arguments, [ReconstructBench(scenes=scenes, config=config, **options)], out=arguments.out)
 
 
-def _arguments(parser: argparse.ArgumentParser) -> None:
+FROM_CASES = ("kind", "shapes", "times", "velocity", "axis", "center", "angle", "twist", "alpha")
+
+
+def _evolve_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--meshes", nargs=2, type=Path, metavar=("A", "B"), help="morph between the fits of these meshes as well"
+    )
+    _folder(parser)
+    parser.add_argument(
+        "--trace",
+        metavar="RUN",
+        help="time the dynamic tracer on this run of `mplicits evolve` (with --meshes: the morph)",
+    )
+    _number(parser, "--size", whole(16, 4096), 512, "pixels squared of --trace")
+    parser.add_argument("--no-exact", action="store_true", help="leave out the exact cases")
+    _number(parser, "--mesh-resolution", whole(8, 2048), 256, "with --meshes and --trace")
+    _number(parser, "--eval-samples", whole(1), 500_000, "per surface")
+    add_json(parser)
+    add_settings(
+        parser,
+        EvolveConfig,
+        default="exact, or default with --meshes",
+        about="of the exact cases; with --meshes of the morph instead, and the exact cases have their preset",
+    )
+
+
+def _evolve(arguments: argparse.Namespace) -> int:
+    if arguments.meshes and arguments.out is None:
+        raise input_error("--meshes: the fits need a folder; add -o DIR")
+    if arguments.no_exact and not arguments.meshes and not arguments.trace:
+        raise input_error("--no-exact: nothing is left to measure; add --meshes A B or --trace RUN")
+    if arguments.meshes and arguments.trace:
+        raise input_error("--trace: with --meshes the morph is traced; leave it out")
+    flags = given_flags(arguments, EvolveConfig)
+    for name in FROM_CASES:
+        if name in flags:
+            raise input_error(f"--{name}: the benchmark says what is trained; leave it out")
+    given = read_settings(arguments, EvolveConfig, default="default" if arguments.meshes else "exact")
+    exact = load_config(EvolveConfig, "exact") if arguments.meshes else given
+    from ..bench.dynamic import DynamicBench
+    from ..bench.evolve import ExactBench, MorphBench
+
+    benches: list[Benchmark[Any]] = [] if arguments.no_exact else [ExactBench(config=exact)]
+    resolution, samples = arguments.mesh_resolution, arguments.eval_samples
+    morph = None
+    if arguments.meshes:
+        morph = MorphBench(meshes=tuple(arguments.meshes), config=given, resolution=resolution, samples=samples)
+        benches.append(morph)
+    if arguments.meshes or arguments.trace:
+        benches.append(DynamicBench(run_file=arguments.trace, morph=morph, size=arguments.size, resolution=resolution))
+    return _run(arguments, benches, out=arguments.out)
+
+
+def _scale_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("shape", nargs="?", metavar="SHAPE", help="a mesh (default: the bundled statue)")
-    parser.add_argument(
-        "--points",
-        type=whole(1000),
-        nargs="+",
-        default=(100_000, 1_000_000, 10_000_000),
-        metavar="N",
-        help="sizes of the clouds (100000 1000000 10000000)",
-    )
-    parser.add_argument(
-        "--noise", type=positive, default=0.001, metavar="X", help="deviation, in bounding-box diagonals (0.001)"
-    )
-    parser.add_argument("--resolution", type=whole(8, 2048), default=256, metavar="N", help="of the meshes (256)")
-    parser.add_argument("--eval-samples", type=whole(1), default=500_000, metavar="N", help="per surface (500000)")
+    _number(parser, "--points", whole(1000), (100_000, 1_000_000, 10_000_000), "sizes of the clouds", nargs="+")
+    _number(parser, "--noise", positive, 0.001, "deviation, in bounding-box diagonals")
+    _measured(parser, 256)
     parser.add_argument("--folder", type=Path, metavar="DIR", help="where the clouds are written, and removed")
+    _folder(parser)
     add_json(parser)
     add_fit_settings(parser)
 
 
-def _run(arguments: argparse.Namespace) -> int:
-    check_output(arguments.json, (".json",))
+def _scale(arguments: argparse.Namespace) -> int:
     config = fit_settings(arguments)
-    from ..bench.fits import bench_scale, format_scale
-    from ..run.trainer import Interrupted
+    from ..bench.fits import ScaleBench
 
-    try:
-        with tempfile.TemporaryDirectory(dir=arguments.folder) as folder:
-            rows = bench_scale(
-                arguments.points,
-                config,
-                Path(folder),
-                shape=arguments.shape,
-                noise=arguments.noise,
-                resolution=arguments.resolution,
-                samples=arguments.eval_samples,
-                report=lambda text: print(f"{text} …", file=sys.stderr),
-            )
-    except Interrupted:
-        print("interrupted", file=sys.stderr)
-        return 130
-    print(format_scale(rows))
-    write_json(arguments.json, [row.as_dict() for row in rows])
-    return 0
+    options = {name: getattr(arguments, name) for name in ("folder", "shape", "noise", "resolution")}
+    bench = ScaleBench(counts=arguments.points, config=config, samples=arguments.eval_samples, **options)
+    return _run(arguments, [bench], out=arguments.out)
 
-
-SCALE = Command(
-    "what millions of points cost, and what they gain",
-    """  mplicits bench scale --preset fast
-  mplicits bench scale armadillo.ply --points 100000 10000000 --json scale.json""",
-    _arguments,
-    _run,
-    "Draw clouds of several sizes from one shape, fit and mesh each in a process of its own, and compare.",
-)
 
 BENCH_COMMANDS: Mapping[str, Command] = MappingProxyType(
     {
@@ -384,11 +403,52 @@ BENCH_COMMANDS: Mapping[str, Command] = MappingProxyType(
             "Fit the networks of the paper's Tab. 4 to each shape, trace pictures of them in several ways, and judge "
             "the pictures by converged traces and by a raycast of fine meshes.",
         ),
-        "bench texture": TEXTURE,
-        "bench normal-map": NORMAL_MAP,
-        "bench reconstruct": RECONSTRUCT,
-        "bench evolve": EVOLVE,
+        "bench texture": Command(
+            "how near textures on coarse surfaces come to UV textures",
+            """  mplicits bench texture spot.obj bob.obj -o bench_texture
+  mplicits bench texture spot.obj -o bench_texture --full --fit-preset fast --json texture.json""",
+            _texture_arguments,
+            _texture,
+            "Fit a coarse surface to each mesh, train a texture field around it, and compare unlit images of it with "
+            "those of the mesh and its UV texture. Errors are in display RGB from 0 to 1.",
+        ),
+        "bench normal-map": Command(
+            "what the normals of a fine level do for a coarse surface",
+            """  mplicits bench normal-map runs/scan scan.ply
+  mplicits bench normal-map runs/scan scan.ply --shading lambert --views 6 -o images.png""",
+            _normal_map_arguments,
+            _normal_map,
+            "Compare shaded images of the levels of a run, and of the coarsest with the normals of the finest, with "
+            "images of the mesh that was fitted.",
+        ),
+        "bench reconstruct": Command(
+            "the multiscale geometry against the network of NeuS",
+            """  mplicits bench reconstruct painted-sphere figure -o bench --preset fast
+  mplicits bench reconstruct data/dtu_scan24 -o bench --width 400 --steps 20000 --json scan24.json""",
+            _reconstruct_arguments,
+            _reconstruct,
+            "Train the network of NeuS and the multiscale geometry on the same rays of posed photographs: PSNR of "
+            "held-out views, Chamfer distance where the surface is known, parameters, time and FLOPs.",
+        ),
+        "bench evolve": Command(
+            "surfaces that move: exact cases, and morphs of meshes",
+            """  mplicits bench evolve
+  mplicits bench evolve --meshes spot.obj bob.obj -o bench_evolve --json evolve.json
+  mplicits bench evolve --no-exact --trace runs/morph""",
+            _evolve_arguments,
+            _evolve,
+            "Train evolutions that are known in closed form and measure their surfaces at 20 times; with --meshes, fit "
+            "two meshes, morph between the fits, measure both ends against the meshes, and time the dynamic tracer on "
+            "the morph.",
+        ),
         "bench paper": PAPER,
-        "bench scale": SCALE,
+        "bench scale": Command(
+            "what millions of points cost, and what they gain",
+            """  mplicits bench scale --preset fast
+  mplicits bench scale armadillo.ply --points 100000 10000000 --json scale.json""",
+            _scale_arguments,
+            _scale,
+            "Draw clouds of several sizes from one shape, fit and mesh each in a process of its own, and compare.",
+        ),
     }
 )

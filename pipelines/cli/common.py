@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
@@ -33,6 +34,7 @@ __all__ = [
     "read_settings",
     "stoppable",
     "training",
+    "typed",
     "were_given",
     "whole",
     "write_json",
@@ -239,6 +241,18 @@ def check_output(path: Path | None, suffixes: Sequence[str]) -> None:
         raise input_error(f"{path}: the folder {path.absolute().parent} does not exist; make it first")
     if path.is_dir():
         raise input_error(f"{path}: is a directory; name a file")
+
+
+def check_size(size: Sequence[int] | None) -> None:
+    """Refuse a ``--size`` of more than a width and a height."""
+    if size is not None and len(size) > 2:
+        raise input_error(f"--size: got {len(size)} numbers; expected a width, or a width and a height")
+
+
+def typed(arguments: argparse.Namespace) -> str:
+    """The command as it could be typed again beside its files: pages are for others, who have other folders."""
+    words = (Path(word).name if Path(word).is_absolute() else word for word in arguments.words)
+    return shlex.join(["mplicits", *words])
 
 
 def write_json(path: Path | None, data: Any) -> None:

@@ -118,6 +118,7 @@ def _run(arguments: list[str]) -> int:
         parser.check_flags(rest)
     given = parser.parse_args(rest)
     check_output(getattr(given, "json", None), (".json",))
+    given.words = arguments  # as they were typed, for pages of results
     code = command.run(given)
     sys.stdout.flush()
     return code

@@ -13,20 +13,22 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ...neural_fields import MultiscaleSDF, Similarity
-from ..bench.cells import Cell, Findings, Method, Record, Report, Workplace
+from ..bench.cells import Findings, Method, Record, Workplace
 from ..bench.plots import Plot, Series
-from ..bench.tables import Column, Row, Table, TableSpec, Value, mean, select, shapes_of
+from ..bench.tables import Column, Row, Table, Value, mean
 from ..fit.cloud import CloudDistance
 from ..fit.samples import Weights, banded_sources
 from ..run.settings import FitConfig
+from ..run.trainer import Report
 from ..surface.distance import Float64, MeshDistance, approximation_error, near_surface
 from .base import base_cell, base_of, delta_after, generator_for, train_level, up_to
+from .cells import PaperCell, TableSpec, select, shapes_of
 from .judge import reference_of
 from .ours import Ours, our_config
 from .published import ABL_DELTA, ABL_GRAD, ABL_NORMAL, ABL_SDF
 
 if TYPE_CHECKING:
-    from ..bench.cells import Preset
+    from .cells import Preset
 
 __all__ = [
     "DELTA_FACTOR",
@@ -69,7 +71,7 @@ LEVELS = ("medium", "fine")
 SHORT_STEPS, SHORT_BATCH = 120, 4096
 
 
-class LossWeights(Method):
+class LossWeights(Method[PaperCell]):
     """One constraint's weight at one level, the others as they are; ``overrides``: constraint, level."""
 
     name = "loss-weights"
@@ -79,11 +81,11 @@ class LossWeights(Method):
         "normals by their cosine; the weights not varied are ours, that of the distances relative to the error before"
     )
 
-    def settings(self, cell: Cell) -> Mapping[str, Any]:
+    def settings(self, cell: PaperCell) -> Mapping[str, Any]:
         """See `Method.settings`."""
         return {**_settings(cell), "weights": WEIGHTS[cell.preset]}
 
-    def run(self, cell: Cell, work: Workplace) -> Findings:
+    def run(self, cell: PaperCell, work: Workplace) -> Findings:
         """See `Method.run`: one output per weight, each with its "weight" and "error"."""
         choice = dict(cell.overrides)
         constraint, level = choice["constraint"], int(choice["level"])
@@ -103,7 +105,7 @@ class LossWeights(Method):
         return Findings(tuple(outputs), deltas=(delta,), details=details)
 
 
-class DeltaFactor(Method):
+class DeltaFactor(Method[PaperCell]):
     """Both residual levels in bands of another width; ``overrides``: epsilon, one less than the factor."""
 
     name = "delta-factor"
@@ -111,11 +113,11 @@ class DeltaFactor(Method):
     source = "paper, supplement, table abl-delta"
     differs = "δ is a robust maximum of |f| over the points (fit's own), not the plain one"
 
-    def settings(self, cell: Cell) -> Mapping[str, Any]:
+    def settings(self, cell: PaperCell) -> Mapping[str, Any]:
         """See `Method.settings`."""
         return _settings(cell)
 
-    def run(self, cell: Cell, work: Workplace) -> Findings:
+    def run(self, cell: PaperCell, work: Workplace) -> Findings:
         """See `Method.run`: one output per residual level, each with its "error"."""
         base = base_of(cell, work)
         config = dataclasses.replace(short(base.config, cell.preset), **dict(cell.overrides))
@@ -138,7 +140,7 @@ def short(config: FitConfig, preset: Preset) -> FitConfig:
     return dataclasses.replace(config, steps=steps, batch=SHORT_BATCH, samples=100_000)
 
 
-def _settings(cell: Cell) -> dict[str, Any]:
+def _settings(cell: PaperCell) -> dict[str, Any]:
     base = base_cell(cell)
     level = short(our_config(base), cell.preset)
     sizes = {"points": POINTS[cell.preset], "reach": REACH, "steps": level.steps, "batch": level.batch}
@@ -164,7 +166,7 @@ def _next_level(
 class _Truth:
     """Points near the surface of a cell's shape, in the fit's coordinates, and their exact distances."""
 
-    def __init__(self, cell: Cell, similarity: Similarity) -> None:
+    def __init__(self, cell: PaperCell, similarity: Similarity) -> None:
         surface = reference_of(cell).moved(similarity)
         self.points: Float64 = near_surface(surface, POINTS[cell.preset], reach=REACH, seed=cell.seed)
         self.distances: Float64 = MeshDistance(surface).signed(self.points)
@@ -174,15 +176,15 @@ class _Truth:
         return approximation_error(field, self.points, self.distances)
 
 
-def loss_weight_cells(shapes: Sequence[Path], preset: Preset) -> list[Cell]:
+def loss_weight_cells(shapes: Sequence[Path], preset: Preset) -> list[PaperCell]:
     """The fits, and for each shape, constraint and residual level one cell with all weights."""
     varied = [
-        Cell(shape, LossWeights.name, preset, overrides=(("constraint", constraint), ("level", level)))
+        PaperCell(shape, LossWeights.name, preset, overrides=(("constraint", constraint), ("level", level)))
         for shape in shapes
         for constraint in CONSTRAINTS
         for level in (1, 2)
     ]
-    return [*(base_cell(Cell(shape, LossWeights.name, preset)) for shape in shapes), *varied]
+    return [*(base_cell(PaperCell(shape, LossWeights.name, preset)) for shape in shapes), *varied]
 
 
 def loss_weight_tables(records: Sequence[Record]) -> tuple[Table, ...]:
@@ -214,14 +216,14 @@ def loss_weight_tables(records: Sequence[Record]) -> tuple[Table, ...]:
     return tuple(tables)
 
 
-def delta_factor_cells(shapes: Sequence[Path], preset: Preset) -> list[Cell]:
+def delta_factor_cells(shapes: Sequence[Path], preset: Preset) -> list[PaperCell]:
     """The fits, and one cell for each shape and factor."""
     varied = [
-        Cell(shape, DeltaFactor.name, preset, overrides=(("epsilon", round(factor - 1, 6)),))
+        PaperCell(shape, DeltaFactor.name, preset, overrides=(("epsilon", round(factor - 1, 6)),))
         for shape in shapes
         for factor in FACTORS[preset]
     ]
-    return [*(base_cell(Cell(shape, DeltaFactor.name, preset)) for shape in shapes), *varied]
+    return [*(base_cell(PaperCell(shape, DeltaFactor.name, preset)) for shape in shapes), *varied]
 
 
 def delta_factor_tables(records: Sequence[Record]) -> tuple[Table, ...]:

@@ -16,14 +16,15 @@ import torch
 
 from ...datasets import OrientedCloud
 from ...neural_fields import Field, MultiscaleSDF, Similarity, Siren, load_field
-from ..bench.cells import Cell, Report, Workplace
+from ..bench.cells import Workplace
 from ..fit.cloud import CloudDistance
 from ..fit.level import LevelObjective, new_level
 from ..fit.samples import Source, Weights, band_of, distance_samples, surface_samples, with_previous
 from ..fit.train import prepare, review_points
 from ..run.folder import find_field
 from ..run.settings import FitConfig
-from ..run.trainer import Trainer
+from ..run.trainer import Report, Trainer
+from .cells import PaperCell
 from .judge import damaged_cloud
 from .ours import Ours, our_config
 
@@ -64,12 +65,12 @@ class Base:
         return CloudDistance(points, normals, noise=self.cloud.noise)
 
 
-def base_cell(cell: Cell, overrides: tuple[tuple[str, Any], ...] = ()) -> Cell:
+def base_cell(cell: PaperCell, overrides: tuple[tuple[str, Any], ...] = ()) -> PaperCell:
     """The cell of our own method on the same cloud, with its own settings or others."""
     return dataclasses.replace(cell, method=Ours.name, overrides=overrides)
 
 
-def base_of(cell: Cell, work: Workplace, overrides: tuple[tuple[str, Any], ...] = ()) -> Base:
+def base_of(cell: PaperCell, work: Workplace, overrides: tuple[tuple[str, Any], ...] = ()) -> Base:
     """Load that fit; train it first if nobody has.
 
     Raises:

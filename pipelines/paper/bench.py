@@ -7,25 +7,23 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import platform
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from ...neural_fields import InputError
 from ...neural_fields.files import files_in, write_json, write_whole
-from ..bench.cells import Cell, Preset, Record, make_folder
+from ..bench.benchmark import machine_words
+from ..bench.cells import Record, make_folder
 from ..bench.plots import to_svg
 from ..bench.report import Section, as_csv, as_page, section_as_dict, section_from_dict, with_missing
-from ..bench.run import Ran, Shape, cells_of, kept_records, run_cells
-from ..bench.tables import TableSpec
+from ..bench.run import Ran, kept_records, run_cells
 from ..run.machine import choose_device, sgemm_rate
 from ..surface.surface import MESH_SUFFIXES, read_reference, read_surface
 from .ablations import DELTA_FACTOR, LOSS_WEIGHTS
+from .cells import Input, PaperCell, Preset, TableSpec, cells_of
 from .comparison import BANF_TABLE, COMPARISON_TABLE, NOISE_TABLE, POISSON_TABLE
 from .isolation import ISOLATION
 from .judge import protocol_of
@@ -54,6 +52,7 @@ SPECS: tuple[TableSpec, ...] = (
 )
 
 PAGE = "results.md"
+TITLE = "The paper's tables, measured here"
 
 
 @dataclass(frozen=True)
@@ -72,7 +71,7 @@ class Bench:
         page: where else the page is written, its plots and sheets in a folder of that name beside it.
     """
 
-    shapes: Sequence[Shape]
+    shapes: Sequence[Input]
     tables: Sequence[str]
     preset: Preset
     methods: Sequence[str] = METHODS
@@ -125,11 +124,12 @@ def bench_paper(bench: Bench, out: Path, *, say: Callable[[str], None]) -> tuple
         pairs = stamp | {"section": section_as_dict(section), "records": own}
         write_json(out / f"{section.name}.json", pairs)
     there = _kept(out, stamp)
-    protocol, machine = _protocol(bench), _machine(bench.device)
-    write_whole(out / PAGE, as_page(there, command=bench.command, protocol=protocol, machine=machine))
+    where = choose_device(bench.device)
+    protocol, machine = _protocol(bench), machine_words(where, sgemm_rate(256, device=where))
+    write_whole(out / PAGE, as_page(there, title=TITLE, command=bench.command, protocol=protocol, machine=machine))
     if bench.page is not None:
         moved = [_copied(section, out, bench.page) for section in there]
-        write_whole(bench.page, as_page(moved, command=bench.command, protocol=protocol, machine=machine))
+        write_whole(bench.page, as_page(moved, title=TITLE, command=bench.command, protocol=protocol, machine=machine))
     return sections, len(ran.failures)
 
 
@@ -146,7 +146,9 @@ def _copied(section: Section, out: Path, page: Path) -> Section:
     return dataclasses.replace(section, plots=plots, sheets=sheets)
 
 
-def _section(spec: TableSpec, own: Mapping[Cell, Record], cells: Sequence[Cell], ran: Ran, out: Path) -> Section:
+def _section(
+    spec: TableSpec, own: Mapping[PaperCell, Record], cells: Sequence[PaperCell], ran: Ran[PaperCell], out: Path
+) -> Section:
     """Tables, plots and sheets of one spec.
 
     Args:
@@ -216,23 +218,7 @@ def _protocol(bench: Bench) -> list[str]:
     ]
 
 
-def _machine(device: str) -> str:
-    where = choose_device(device)
-    name = torch.cuda.get_device_name(where) if where.type == "cuda" else _processor()
-    rate = sgemm_rate(256, device=where) / 1e9
-    return (
-        f"{name}, {torch.get_num_threads()} threads, float32 matrices at {rate:.0f} GFLOP/s, torch {torch.__version__}"
-    )
-
-
-def _processor() -> str:
-    info = Path("/proc/cpuinfo")
-    lines = info.read_text(encoding="utf-8").splitlines() if info.is_file() else []
-    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor() or platform.machine()
-
-
-def find_shapes(paths: Sequence[str | Path], *, reference: Path | None = None) -> list[Shape]:
+def find_shapes(paths: Sequence[str | Path], *, reference: Path | None = None) -> list[Input]:
     """The shapes that files and folders name.
 
     Args:
@@ -266,9 +252,9 @@ def _files(path: Path) -> list[Path]:
     return found
 
 
-def _shape(file: Path, reference: Path | None) -> Shape:
+def _shape(file: Path, reference: Path | None) -> Input:
     if len(read_surface(file).faces):
-        return Shape(file)
+        return Input(file)
     if reference is None:
         raise InputError(f"{file}: has no faces, so there is no surface to compare with; give --reference MESH")
-    return Shape(file, reference)
+    return Input(file, reference)

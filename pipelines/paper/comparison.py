@@ -6,30 +6,15 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..bench.cells import Cell, Record
+from ..bench.cells import Record
 from ..bench.plots import Plot, Series
-from ..bench.tables import (
-    Column,
-    Row,
-    Table,
-    TableSpec,
-    Value,
-    by_shape,
-    figure,
-    mean,
-    median,
-    of_output,
-    outputs_of,
-    printed_name,
-    ratio,
-    select,
-    shapes_of,
-)
+from ..bench.tables import Column, Row, Table, Value, mean, median, ratio
+from .cells import PaperCell, TableSpec, by_shape, figure, of_output, outputs_of, printed_name, select, shapes_of
 from .names import METHODS
 from .published import BANF, COMPARISON, NOISE, POISSON
 
 if TYPE_CHECKING:
-    from ..bench.cells import Preset
+    from .cells import Preset
 
 __all__ = ["BANF_TABLE", "COMPARISON_TABLE", "NOISE_TABLE", "POISSON_TABLE"]
 
@@ -52,16 +37,16 @@ def _methods(names: Iterable[str]) -> list[str]:
     return [name for name in METHODS if name in names]
 
 
-def _comparison_cells(shapes: Sequence[Path], preset: Preset) -> list[Cell]:
+def _comparison_cells(shapes: Sequence[Path], preset: Preset) -> list[PaperCell]:
     peers = [name for name in METHODS if name not in VARIANTS]
-    return [Cell(shape, method, preset) for shape in shapes for method in peers]
+    return [PaperCell(shape, method, preset) for shape in shapes for method in peers]
 
 
-def _noise_cells(shapes: Sequence[Path], preset: Preset) -> list[Cell]:
+def _noise_cells(shapes: Sequence[Path], preset: Preset) -> list[PaperCell]:
     peers = [name for name in METHODS if name not in VARIANTS]
-    cells = [Cell(shape, method, preset, noise=NOISE_LEVEL) for shape in shapes for method in peers]
+    cells = [PaperCell(shape, method, preset, noise=NOISE_LEVEL) for shape in shapes for method in peers]
     more = [
-        Cell(shape, method, preset, noise=noise)
+        PaperCell(shape, method, preset, noise=noise)
         for shape in shapes
         for method in _methods(CURVE_METHODS)
         for noise in (0.0, *CURVE)
@@ -69,19 +54,19 @@ def _noise_cells(shapes: Sequence[Path], preset: Preset) -> list[Cell]:
     return cells + more
 
 
-def _poisson_cells(shapes: Sequence[Path], preset: Preset) -> list[Cell]:
+def _poisson_cells(shapes: Sequence[Path], preset: Preset) -> list[PaperCell]:
     cells = [
-        Cell(shape, method, preset, noise=noise)
+        PaperCell(shape, method, preset, noise=noise)
         for shape in shapes
         for method in ("poisson-trim", "poisson", "ours")
         for noise in (0.0, NOISE_LEVEL)
     ]
-    return cells + [Cell(shape, "poisson-smoothed", preset, noise=NOISE_LEVEL) for shape in shapes]
+    return cells + [PaperCell(shape, "poisson-smoothed", preset, noise=NOISE_LEVEL) for shape in shapes]
 
 
-def _banf_cells(shapes: Sequence[Path], preset: Preset) -> list[Cell]:
+def _banf_cells(shapes: Sequence[Path], preset: Preset) -> list[PaperCell]:
     return [
-        Cell(shape, method, preset, noise=noise)
+        PaperCell(shape, method, preset, noise=noise)
         for shape in shapes
         for method in ("ours", "banf")
         for noise in (0.0, NOISE_LEVEL)

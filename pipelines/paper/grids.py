@@ -14,8 +14,9 @@ from ...datasets import OrientedCloud
 from ...neural_fields import Field
 from ...neural_fields.baselines import BandLimited, BanfSDF, HashGridSDF
 from ...neural_fields.losses import data_loss, eikonal_loss
-from ..bench.cells import Preset, Report
 from ..fit.samples import DOMAIN
+from ..run.trainer import Report
+from .cells import Preset
 from .recipe import (
     Output,
     Recipe,

@@ -18,9 +18,10 @@ from torch import Tensor, nn
 
 from ...neural_fields import Field, Jet, MultiscaleSDF, NoSurfaceError, extract_mesh
 from ...neural_fields.multiscale import Parts, walk_levels
-from ..bench.cells import Cell, Findings, Method, Record, Report, Workplace
-from ..bench.tables import Column, Row, Table, TableSpec, Value, mean, median, select, shapes_of
+from ..bench.cells import Findings, Method, Record, Workplace
+from ..bench.tables import Column, Row, Table, Value, mean, median
 from ..fit.samples import banded_sources
+from ..run.trainer import Report
 from .base import (
     Base,
     base_cell,
@@ -33,11 +34,12 @@ from .base import (
     up_to,
     without_bands,
 )
+from .cells import PaperCell, TableSpec, select, shapes_of
 from .judge import Judge, protocol_of
 from .ours import Ours
 
 if TYPE_CHECKING:
-    from ..bench.cells import Preset
+    from .cells import Preset
 
 __all__ = ["ISOLATION", "TAB_ISOLATION", "IndependentLevels", "Isolation", "isolation_tables", "steepness"]
 
@@ -120,7 +122,7 @@ class IndependentLevels(Field):
         return walk_levels(levels, self.deltas, self.check_points(x), evaluate, lambda _before, own, _delta: own)
 
 
-class Isolation(Method):
+class Isolation(Method[PaperCell]):
     """One variant of the residual levels, trained on the coarse level of our fit; ``overrides``: variant, a, b or c.
 
     Variant (a) is the fit itself, so its cell only extracts it once more: as it is, and without culling. No blobs are
@@ -132,11 +134,11 @@ class Isolation(Method):
     source = "paper, supplement, table isolation"
     differs = "the schedule, the weights and the samples are those of our fit"
 
-    def settings(self, cell: Cell) -> Mapping[str, Any]:
+    def settings(self, cell: PaperCell) -> Mapping[str, Any]:
         """See `Method.settings`."""
         return Ours().settings(base_cell(cell))
 
-    def run(self, cell: Cell, work: Workplace) -> Findings:
+    def run(self, cell: PaperCell, work: Workplace) -> Findings:
         """See `Method.run`; outputs "a", "b" or "c", and with noise "a without culling" and "c without culling"."""
         variant = str(dict(cell.overrides)["variant"])
         base, judge = base_of(cell, work), Judge(cell, work)
@@ -218,11 +220,11 @@ def steepness(field: Field, *, count: int = 1 << 16, margin: float = 1.25, seed:
     return max(LIPSCHITZ, margin * float(slopes.max()))
 
 
-def isolation_cells(shapes: Sequence[Path], preset: Preset) -> list[Cell]:
+def isolation_cells(shapes: Sequence[Path], preset: Preset) -> list[PaperCell]:
     """The fits and the variants of each shape, clean and with noise."""
-    plain = [Cell(shape, Isolation.name, preset, noise=noise) for shape in shapes for noise in (0.0, NOISE)]
+    plain = [PaperCell(shape, Isolation.name, preset, noise=noise) for shape in shapes for noise in (0.0, NOISE)]
     varied = [
-        Cell(cell.shape, cell.method, preset, noise=cell.noise, overrides=(("variant", variant),))
+        PaperCell(cell.shape, cell.method, preset, noise=cell.noise, overrides=(("variant", variant),))
         for cell in plain
         for variant in VARIANTS
     ]

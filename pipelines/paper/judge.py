@@ -18,7 +18,7 @@ import torch
 from ...datasets import OrientedCloud, PointCloud, add_noise, add_outliers, orbit, prepare_cloud, read_cloud
 from ...neural_fields import Field, InputError, Similarity, sphere_trace
 from ...neural_fields.meshing import Mesh, NoSurfaceError, extract_mesh
-from ..bench.cells import Cell, Workplace
+from ..bench.cells import Workplace
 from ..mesh.files import write_mesh
 from ..render.picture import write_picture
 from ..render.rasterise import picture_of
@@ -27,6 +27,7 @@ from ..run.settings import FitConfig
 from ..surface.measure import evaluate_surfaces
 from ..surface.surface import Surface, from_mesh, read_reference
 from ..surface.trim import Support, drop_unsupported
+from .cells import PaperCell
 
 __all__ = [
     "STEEP",
@@ -46,7 +47,7 @@ STEEP = 2.0
 FIRST_STEPS, MORE_STEPS = 20, 5
 
 
-def reference_of(cell: Cell) -> Surface:
+def reference_of(cell: PaperCell) -> Surface:
     """The surface that a cell's results are measured against.
 
     Raises:
@@ -62,7 +63,7 @@ class Judge:
         InputError: see `reference_of`.
     """
 
-    def __init__(self, cell: Cell, work: Workplace) -> None:
+    def __init__(self, cell: PaperCell, work: Workplace) -> None:
         self.work = work
         self.seed = cell.seed
         self.reference = reference_of(cell)
@@ -160,7 +161,7 @@ class Judge:
 
 
 if TYPE_CHECKING:
-    from ..bench.cells import Preset
+    from .cells import Preset
 
 
 @dataclass(frozen=True)
@@ -220,7 +221,7 @@ def fit_config(preset: Preset) -> FitConfig:
     return load_config(FitConfig, {"cpu": "fast", "paper": "paper"}[preset])
 
 
-def damaged_cloud(cell: Cell) -> PointCloud:
+def damaged_cloud(cell: PaperCell) -> PointCloud:
     """The cloud of a cell's shape, damaged as the cell asks: noise first, then flipped normals, then strays.
 
     Raises:
@@ -254,7 +255,7 @@ def flip_normals(cloud: PointCloud, fraction: float, *, seed: int = 0) -> PointC
     return replace(cloud, normals=normals)
 
 
-def oriented_cloud(cell: Cell, *, smooth_noise: bool = False) -> OrientedCloud:
+def oriented_cloud(cell: PaperCell, *, smooth_noise: bool = False) -> OrientedCloud:
     """What every method but ours learns from: the damaged cloud in the unit sphere, no point judged to be a stray.
 
     Ours reads the same damaged cloud, but what `fit` does to find strays is part of our method, not of the others'.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from ..bench.cells import Catalogue, Method
 from .ablations import DeltaFactor, LossWeights
+from .cells import PaperCell
 from .grids import BanfRecipe, InstantNgpRecipe
 from .isolation import Isolation
 from .judge import protocol_of
@@ -14,7 +15,7 @@ from .speed import MarchingCubes, Normals
 __all__ = ["CATALOGUE", "METHODS"]
 
 # The first ones are those of `names.METHODS`; a test holds the two together.
-METHODS: tuple[Method, ...] = (
+METHODS: tuple[Method[PaperCell], ...] = (
     Ours(),
     FromRecipe(SirenRecipe()),
     FromRecipe(InstantNgpRecipe("coarse")),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from ..bench.cells import Preset
+    from .cells import Preset
 
 __all__ = ["METHODS", "PRESETS", "TABLES"]
 

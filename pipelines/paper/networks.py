@@ -12,8 +12,9 @@ from ...datasets import OrientedCloud
 from ...neural_fields import Siren
 from ...neural_fields.baselines import BaconSDF, IdfSDF
 from ...neural_fields.baselines.idf import attenuation
-from ..bench.cells import Preset, Report
 from ..fit.cloud import CloudDistance
+from ..run.trainer import Report
+from .cells import Preset
 from .recipe import Output, Recipe, cosine, count, descend, finished, seeded
 
 __all__ = [

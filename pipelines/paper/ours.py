@@ -17,12 +17,13 @@ import numpy as np
 
 from ...neural_fields import MultiscaleSDF, load_field
 from ...neural_fields.meshing import Mesh
-from ..bench.cells import Cell, Findings, Method, Workplace
+from ..bench.cells import Findings, Method, Workplace
 from ..bench.fits import has_poisson, screened_poisson
 from ..fit.train import Run, fit
 from ..run.folder import FIELD_FILE, RECORD_FILE, STATE_FILE, is_fitted, read_record
 from ..run.settings import FitConfig
 from ..surface.trim import read_support
+from .cells import PaperCell
 from .judge import Judge, damaged_cloud, fit_config, oriented_cloud, protocol_of
 from .recipe import Recipe
 
@@ -31,7 +32,7 @@ __all__ = ["FromRecipe", "Ours", "Poisson", "level_names", "our_config"]
 LIPSCHITZ = 1.25  # the eikonal term keeps |∇f| near 1
 
 
-def our_config(cell: Cell) -> FitConfig:
+def our_config(cell: PaperCell) -> FitConfig:
     """The preset's settings with what the cell overrides.
 
     Raises:
@@ -51,7 +52,7 @@ def level_names(count: int) -> list[str]:
     return [f"Ours {name}" for name in ["coarse", *middle, "fine"][:count]]
 
 
-class Ours(Method):
+class Ours(Method[PaperCell]):
     """One training; every level is an output, with the time and the parameters up to and with it."""
 
     name = "ours"
@@ -61,11 +62,11 @@ class Ours(Method):
         "`mplicits fit`, whose finest level is (256, 2), not (400, 2)"
     )
 
-    def settings(self, cell: Cell) -> Mapping[str, Any]:
+    def settings(self, cell: PaperCell) -> Mapping[str, Any]:
         """All settings of the fit but the device."""
         return {"fit": {k: v for k, v in dataclasses.asdict(our_config(cell)).items() if k != "device"}}
 
-    def run(self, cell: Cell, work: Workplace) -> Findings:
+    def run(self, cell: PaperCell, work: Workplace) -> Findings:
         """Fit, and measure every level; an interrupted fit goes on, and a finished one is taken as it is."""
         judge, directory = Judge(cell, work), work.run()
         config = dataclasses.replace(our_config(cell), device=work.device)
@@ -105,18 +106,18 @@ def _finished(directory: Path, device: str) -> Run | None:
     return Run(saved.field, saved.similarity, directory, read_record(directory))
 
 
-class FromRecipe(Method):
+class FromRecipe(Method[PaperCell]):
     """A recipe, trained on the cell's cloud, and the figures of each of its outputs."""
 
     def __init__(self, recipe: Recipe) -> None:
         self.recipe = recipe
         self.name, self.source, self.differs = recipe.name, recipe.source, recipe.differs
 
-    def settings(self, cell: Cell) -> Mapping[str, Any]:
+    def settings(self, cell: PaperCell) -> Mapping[str, Any]:
         """Size and schedule at the cell's preset."""
         return {"recipe": repr(self.recipe.presets[cell.preset])}
 
-    def run(self, cell: Cell, work: Workplace) -> Findings:
+    def run(self, cell: PaperCell, work: Workplace) -> Findings:
         """Train, then measure every output."""
         judge, cloud = Judge(cell, work), oriented_cloud(cell)
         trained = self.recipe.train(cloud, cell.preset, seed=cell.seed, device=work.device, progress=work.progress)
@@ -134,7 +135,7 @@ class FromRecipe(Method):
         return Findings(tuple(outputs), details={"steps": trained.steps})
 
 
-class Poisson(Method):
+class Poisson(Method[PaperCell]):
     """Screened Poisson reconstruction.
 
     Args:
@@ -160,7 +161,7 @@ class Poisson(Method):
         """The extra, where it is not installed."""
         return None if has_poisson() else "needs pip install mplicits[poisson]"
 
-    def run(self, cell: Cell, work: Workplace) -> Findings:
+    def run(self, cell: PaperCell, work: Workplace) -> Findings:
         """Reconstruct, and measure."""
         judge, cloud = Judge(cell, work), oriented_cloud(cell, smooth_noise=self.smoothed)
         importlib.import_module("pymeshlab")  # so that loading it is not timed

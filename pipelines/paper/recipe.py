@@ -16,10 +16,10 @@ from torch import Tensor, nn
 
 from ...datasets import OrientedCloud
 from ...neural_fields import Field
-from ..bench.cells import Preset, Report
 from ..fit.cloud import CloudDistance
 from ..fit.samples import DOMAIN
-from ..run.trainer import Group, Objective, Trainer
+from ..run.trainer import Group, Objective, Report, Trainer
+from .cells import Preset
 
 __all__ = [
     "Output",

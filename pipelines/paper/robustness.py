@@ -6,15 +6,16 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..bench.cells import Cell, Record
+from ..bench.cells import Record
 from ..bench.plots import Plot, Series
-from ..bench.tables import Column, Row, Table, TableSpec, Value, figure, printed_name, ratio, select, shapes_of
+from ..bench.tables import Column, Row, Table, Value, ratio
+from .cells import PaperCell, TableSpec, figure, printed_name, select, shapes_of
 from .comparison import NOISE_LEVEL
 from .judge import fit_config
 from .published import DELTAS, OUTLIERS, UNDERTRAINED
 
 if TYPE_CHECKING:
-    from ..bench.cells import Preset
+    from .cells import Preset
 
 __all__ = ["DELTAS_TABLE", "OUTLIERS_TABLE", "UNDERTRAINED_TABLE"]
 
@@ -24,14 +25,14 @@ OUTLIER_METHODS = ("ours", "poisson", "poisson-trim")
 SHARES = (0.25, 0.5, 1.0)
 
 
-def _outlier_cells(shapes: Sequence[Path], preset: Preset) -> list[Cell]:
+def _outlier_cells(shapes: Sequence[Path], preset: Preset) -> list[PaperCell]:
     strays = [
-        Cell(shape, method, preset, outliers=fraction)
+        PaperCell(shape, method, preset, outliers=fraction)
         for shape in shapes
         for fraction in CONTAMINATION
         for method in OUTLIER_METHODS
     ]
-    flipped = [Cell(shape, method, preset, flipped=FLIPPED) for shape in shapes for method in ("ours", "poisson")]
+    flipped = [PaperCell(shape, method, preset, flipped=FLIPPED) for shape in shapes for method in ("ours", "poisson")]
     return strays + flipped
 
 
@@ -115,9 +116,9 @@ def shortened(steps: Sequence[int], share: float) -> tuple[tuple[str, Any], ...]
     return () if share == 1 else (("steps", (max(round(share * steps[0]), 1), *steps[1:])),)
 
 
-def _undertrained_cells(shapes: Sequence[Path], preset: Preset) -> list[Cell]:
+def _undertrained_cells(shapes: Sequence[Path], preset: Preset) -> list[PaperCell]:
     steps = fit_config(preset).steps
-    return [Cell(shape, "ours", preset, overrides=shortened(steps, share)) for shape in shapes for share in SHARES]
+    return [PaperCell(shape, "ours", preset, overrides=shortened(steps, share)) for shape in shapes for share in SHARES]
 
 
 def undertrained_tables(records: Sequence[Record]) -> tuple[Table, ...]:
@@ -155,8 +156,8 @@ def _share(record: Record) -> float:
     return min(SHARES, key=lambda share: abs(share - steps[0] / full))
 
 
-def _delta_cells(shapes: Sequence[Path], preset: Preset) -> list[Cell]:
-    return [Cell(shape, "ours", preset, noise=noise) for shape in shapes for noise in (0.0, NOISE_LEVEL)]
+def _delta_cells(shapes: Sequence[Path], preset: Preset) -> list[PaperCell]:
+    return [PaperCell(shape, "ours", preset, noise=noise) for shape in shapes for noise in (0.0, NOISE_LEVEL)]
 
 
 def delta_tables(records: Sequence[Record]) -> tuple[Table, ...]:

@@ -10,10 +10,11 @@ import imageio.v3 as iio
 import numpy as np
 
 from ...datasets import orbit
-from ..bench.cells import Cell, Record, Workplace
+from ..bench.cells import Record, Workplace
 from ..render.picture import Image, contact_sheet, in_rows, write_picture
 from ..render.rasterise import picture_of
 from ..surface.surface import from_cloud
+from .cells import PaperCell
 from .judge import damaged_cloud, protocol_of, reference_of
 
 __all__ = ["write_sheets"]
@@ -22,7 +23,7 @@ COLUMNS = 4
 LEAST_METHODS = 2  # a sheet of one method compares nothing
 
 
-def write_sheets(name: str, records: Mapping[Cell, Record], out: Path) -> tuple[tuple[str, str], ...]:
+def write_sheets(name: str, records: Mapping[PaperCell, Record], out: Path) -> tuple[tuple[str, str], ...]:
     """Write one sheet for each shape and damage into ``out / "sheets"``.
 
     Args:
@@ -33,7 +34,7 @@ def write_sheets(name: str, records: Mapping[Cell, Record], out: Path) -> tuple[
     Returns:
         Files relative to ``out``, and titles.
     """
-    groups: dict[tuple[Path, float, float, float], list[Cell]] = {}
+    groups: dict[tuple[Path, float, float, float], list[PaperCell]] = {}
     for cell in records:
         groups.setdefault((cell.shape, cell.noise, cell.outliers, cell.flipped), []).append(cell)
     written = []
@@ -49,7 +50,7 @@ def write_sheets(name: str, records: Mapping[Cell, Record], out: Path) -> tuple[
     return tuple(written)
 
 
-def _tiles(records: Mapping[Cell, Record], out: Path) -> list[tuple[str, Image]]:
+def _tiles(records: Mapping[PaperCell, Record], out: Path) -> list[tuple[str, Image]]:
     first = next(iter(records))
     size, reference = protocol_of(first.preset).tile, reference_of(first)
     camera = orbit(reference.vertices, width=size, height=size)

@@ -11,15 +11,16 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from ...neural_fields import Field, Siren, extract_mesh
-from ..bench.cells import Cell, Findings, Method, Record, Workplace
-from ..bench.speed import bench_normals
-from ..bench.tables import Column, Row, Table, TableSpec, Value, select
+from ..bench.cells import Findings, Method, Record, Workplace
+from ..bench.speed import NormalsBench
+from ..bench.tables import Column, Row, Table, Value
 from .base import base_cell, base_of, without_bands
+from .cells import PaperCell, TableSpec, select
 from .judge import protocol_of
 from .ours import Ours
 
 if TYPE_CHECKING:
-    from ..bench.cells import Preset
+    from .cells import Preset
 
 __all__ = [
     "MARCHING_CUBES",
@@ -79,7 +80,7 @@ REPEATS: Mapping[Preset, int] = MappingProxyType({"smoke": 1, "cpu": 3, "paper":
 WIDTH, DEPTHS = 256, (2, 3)
 
 
-class MarchingCubes(Method):
+class MarchingCubes(Method[PaperCell]):
     """Seconds for a grid: one large SIREN, the multiscale field without and with its bands, and our own extraction."""
 
     name = "marching-cubes"
@@ -87,12 +88,12 @@ class MarchingCubes(Method):
     source = "paper, Tab. time_mc"
     differs = "evaluation of the grid only, but for our own extraction, which is timed with its triangles"
 
-    def settings(self, cell: Cell) -> Mapping[str, Any]:
+    def settings(self, cell: PaperCell) -> Mapping[str, Any]:
         """See `Method.settings`."""
         fit = Ours().settings(base_cell(cell, SIZES[cell.preset]))
         return {**fit, "baseline": BASELINE, "every": EVERY[cell.preset]}
 
-    def run(self, cell: Cell, work: Workplace) -> Findings:
+    def run(self, cell: PaperCell, work: Workplace) -> Findings:
         """See `Method.run`: one output per scheme, each with its "seconds"."""
         field = base_of(cell, work, SIZES[cell.preset]).field
         resolution, every = protocol_of(cell.preset).resolution, EVERY[cell.preset]
@@ -128,7 +129,7 @@ def grid_seconds(field: Field, resolution: int, *, every: int = 1) -> float:
     return (time.perf_counter() - started) * (resolution + 1) / len(slabs)
 
 
-class Normals(Method):
+class Normals(Method[PaperCell]):
     """Seconds for value and gradient at as many points as an image has pixels; ``overrides``: depth, side.
 
     What they cost does not depend on the shape, so the weights are random ones.
@@ -138,28 +139,24 @@ class Normals(Method):
     source = "paper, supplement, Tab. time_auto"
     differs = "random weights; the first shape stands for all"
 
-    def settings(self, cell: Cell) -> Mapping[str, Any]:
+    def settings(self, cell: PaperCell) -> Mapping[str, Any]:
         """See `Method.settings`."""
         return {"width": WIDTH, "repeats": REPEATS[cell.preset]}
 
-    def run(self, cell: Cell, work: Workplace) -> Findings:
+    def run(self, cell: PaperCell, work: Workplace) -> Findings:
         """See `Method.run`: outputs "autograd", "algorithm 1" and "ours", each with its "seconds"."""
         choice = dict(cell.overrides)
-        (row,) = bench_normals(
-            points=int(choice["side"]) ** 2,
-            sizes=((WIDTH, int(choice["depth"])),),
-            repeats=REPEATS[cell.preset],
-            device=work.device,
-            seed=cell.seed,
-        )
+        points, size = int(choice["side"]) ** 2, (WIDTH, int(choice["depth"]))
+        bench = NormalsBench(points=points, repeats=REPEATS[cell.preset], device=work.device, seed=cell.seed)
+        row = bench.timed(*size)
         times = {"autograd": row.autograd, "algorithm 1": row.printed, "ours": row.jet}
         outputs = [{"name": name, "seconds": seconds} for name, seconds in times.items()]
         return Findings(tuple(outputs), details={"largest_difference": row.largest_difference})
 
 
-def marching_cubes_cells(shapes: Sequence[Path], preset: Preset) -> list[Cell]:
+def marching_cubes_cells(shapes: Sequence[Path], preset: Preset) -> list[PaperCell]:
     """For each shape the fit of the paper's sizes for this table, and its timing."""
-    timed = [Cell(shape, MarchingCubes.name, preset) for shape in shapes]
+    timed = [PaperCell(shape, MarchingCubes.name, preset) for shape in shapes]
     return [*(base_cell(cell, SIZES[preset]) for cell in timed), *timed]
 
 
@@ -211,10 +208,10 @@ def _published_grid(shape: str) -> tuple[Value, ...] | None:
     return None
 
 
-def normals_cells(shapes: Sequence[Path], preset: Preset) -> list[Cell]:
+def normals_cells(shapes: Sequence[Path], preset: Preset) -> list[PaperCell]:
     """One cell per network and number of points."""
     return [
-        Cell(shapes[0], Normals.name, preset, overrides=(("depth", depth), ("side", side)))
+        PaperCell(shapes[0], Normals.name, preset, overrides=(("depth", depth), ("side", side)))
         for depth in DEPTHS
         for side in SIDES[preset]
     ]

@@ -1,6 +1,5 @@
 """The benchmark of evolutions: closed forms score no error, fields that miss something do, morphs are measured."""
 
-import json
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +10,11 @@ import trimesh
 from evolutions import QUICK, ball, fails, few_points
 from mplicits.neural_fields import Field, Jet
 from mplicits.pipelines.bench import evolve as bench_evolve
-from mplicits.pipelines.bench.evolve import CASES, bench_exact, bench_morph, format_exact, format_morph, measure_exact
+from mplicits.pipelines.bench.evolve import CASES, ExactBench, MorphBench, measure_exact
+from mplicits.pipelines.bench.fits import fit_home
+from mplicits.pipelines.bench.report import as_text
+from mplicits.pipelines.run.folder import write_record
+from mplicits.pipelines.run.settings import FitConfig
 from torch import Tensor
 
 
@@ -59,28 +62,33 @@ def test_a_missing_part_is_seen() -> None:
     assert row.mean_value > 0.1
 
 
-def test_exact_cases_are_trained_and_printed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_exact_cases_are_trained_and_printed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(bench_evolve, "TIMES", 3)
     monkeypatch.setattr(bench_evolve, "RESOLUTION", 24)
     (name, *_) = CASES
-    rows = bench_exact(replace(QUICK, steps=(120,)), cases=[name])
+    bench = ExactBench(config=replace(QUICK, steps=(120,)), cases=[name])
+    rows = bench.rows(tmp_path)
     assert rows[0].mean_error < 0.05
     assert rows[0].components == (1, 1, 1)
-    assert name in format_exact(rows)
-    assert json.loads(json.dumps(rows[0].as_dict()))["case"] == name
+    assert rows[0].case == name
+    assert name in as_text(*bench.tables(rows, sgemm=1e9))
 
 
 def test_a_morph_is_measured_against_meshes(tmp_path: Path) -> None:
     meshes = []
     for name, radius in (("small", 0.4), ("large", 0.6)):
-        (tmp_path / name).mkdir()
-        ball(tmp_path / name / "field.safetensors", radius)
         mesh = trimesh.creation.icosphere(subdivisions=4, radius=2 * radius)
         mesh.apply_translation((5.0, 0.0, 0.0))  # the similarity of `ball`
         meshes.append(tmp_path / f"{name}.ply")
         mesh.export(meshes[-1])
+        home = fit_home(tmp_path / "out", meshes[-1], FitConfig())  # where its fit is kept
+        home.mkdir(parents=True)
+        ball(home / "field.safetensors", radius)
+        write_record(home, {"config": {}, "finished": True})
     config = replace(QUICK, align="none", steps=(150,), samples=4000)
-    row = bench_morph(*meshes, config, directory=tmp_path, resolution=32, samples=5000)
+    first, second = meshes
+    bench = MorphBench(meshes=(first, second), config=config, resolution=32, samples=5000)
+    (row,) = bench.rows(tmp_path / "out")
     assert row.shapes == ("small", "large")
     for end, fitted, floor in zip(row.ends, row.fits, row.floors, strict=True):
         # Nothing but the sampling, and in units of the meshes' spheres the errors of fit and morph, squared.
@@ -89,10 +97,12 @@ def test_a_morph_is_measured_against_meshes(tmp_path: Path) -> None:
     assert row.volumes[0] == pytest.approx(4 / 3 * math.pi * 0.4**3, rel=0.2)
     assert row.volumes[-1] == pytest.approx(4 / 3 * math.pi * 0.6**3, rel=0.2)
     assert row.components == (1, 1, 1)
-    table = format_morph(row)
+    ends, curves = bench.tables([row], sgemm=1e9)
+    table = as_text(ends)
     assert "small at t = 0" in table
     assert f"{row.ends[1] / row.fits[1]:.2f}" in table
-    assert (tmp_path / "morph" / "run.json").is_file()
+    assert [frame.values for frame in curves.rows] == list(zip(row.volumes, row.components, strict=True))
+    assert len(list((tmp_path / "out" / "runs").glob("*/run.json"))) == 3
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from mplicits.neural_fields import InputError, Similarity, Sphere, extract_mesh
 from mplicits.pipelines.bench import fits as module
-from mplicits.pipelines.bench.fits import bench_fit, format_fit
+from mplicits.pipelines.bench.fits import FitBench
+from mplicits.pipelines.bench.report import as_text
 from mplicits.pipelines.mesh.files import write_mesh
 from mplicits.pipelines.run.settings import FitConfig
 
@@ -30,7 +31,8 @@ def ball(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_rows_picture_and_table(ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "has_poisson", lambda: False)
-    rows = bench_fit([ball], SMALL, resolution=32, samples=5000, pictures=tmp_path)
+    bench = FitBench(shapes=[ball], config=SMALL, resolution=32, samples=5000, pictures=tmp_path)
+    rows = bench.rows(tmp_path / "out")
     assert [row.method for row in rows] == ["level 0", "level 1"]
     assert rows[1].seconds > rows[0].seconds > 0
     for row in rows:
@@ -40,38 +42,39 @@ def test_rows_picture_and_table(ball: Path, tmp_path: Path, monkeypatch: pytest.
         assert row.metrics.components == 1
         assert row.metrics.chamfer < 2 * row.metrics.chamfer_floor
     assert (tmp_path / "ball.png").stat().st_size > 1000
-    table = format_fit(rows)
+    table = as_text(*bench.tables(rows, sgemm=1e9))
     assert f"{rows[1].metrics.chamfer:.2e}" in table  # type: ignore[union-attr]
 
 
-def test_noise_reaches_the_fit(ball: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_noise_reaches_the_fit(ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     seen = []
 
-    def reconstruct(cloud, *_):
+    def reconstruct(self, cloud, *_):
         radii = np.linalg.norm(cloud.points - [5.0, 0.0, -1.0], axis=1)
         seen.append(abs(radii - 14.0).max())
         return []
 
-    monkeypatch.setattr(module, "_reconstructions", reconstruct)
-    bench_fit([ball], SMALL)
-    bench_fit([ball], SMALL, noise=0.01)
+    monkeypatch.setattr(FitBench, "reconstructions", reconstruct)
+    FitBench(shapes=[ball], config=SMALL).rows(tmp_path)
+    FitBench(shapes=[ball], config=SMALL, noise=0.01).rows(tmp_path)
     diagonal = 28.0 * 3**0.5
     assert seen[0] < 0.02
     assert 0.9 * 0.01 * diagonal < seen[1] < 1.01 * 0.01 * diagonal + 0.02
 
 
-def test_screened_poisson_when_installed(ball: Path) -> None:
+def test_screened_poisson_when_installed(ball: Path, tmp_path: Path) -> None:
     pytest.importorskip("pymeshlab", reason="the extra mplicits[poisson] is not installed")
-    rows = bench_fit([ball], SMALL, resolution=32, samples=5000, poisson_depth=6)
+    rows = FitBench(shapes=[ball], config=SMALL, resolution=32, samples=5000, poisson_depth=6).rows(tmp_path)
     assert [row.method for row in rows] == ["level 0", "level 1", "screened Poisson"]
     assert rows[-1].metrics is not None
     assert rows[-1].metrics.iou is not None
     assert rows[-1].metrics.iou > 0.95
 
 
-def test_screened_poisson_on_what_ours_has_smoothed(ball: Path) -> None:
+def test_screened_poisson_on_what_ours_has_smoothed(ball: Path, tmp_path: Path) -> None:
     pytest.importorskip("pymeshlab", reason="the extra mplicits[poisson] is not installed")
-    rows = bench_fit([ball], SMALL, noise=0.02, resolution=32, samples=5000, poisson_depth=6)
+    bench = FitBench(shapes=[ball], config=SMALL, noise=0.02, resolution=32, samples=5000, poisson_depth=6)
+    rows = bench.rows(tmp_path)
     assert [row.method for row in rows[-2:]] == ["screened Poisson", "screened Poisson, smoothed"]
     noisy, smoothed = (row.metrics for row in rows[-2:])
     assert noisy is not None
@@ -79,12 +82,13 @@ def test_screened_poisson_on_what_ours_has_smoothed(ball: Path) -> None:
     assert smoothed.chamfer - smoothed.chamfer_floor < (noisy.chamfer - noisy.chamfer_floor) / 3
 
 
-def test_a_level_without_a_surface_is_a_row(monkeypatch: pytest.MonkeyPatch, ball: Path) -> None:
-    monkeypatch.setattr(module, "_reconstructions", lambda *_: [("level 0", 1.0, 0.1, None)])
-    assert "no surface" in format_fit(bench_fit([ball], SMALL))
+def test_a_level_without_a_surface_is_a_row(monkeypatch: pytest.MonkeyPatch, ball: Path, tmp_path: Path) -> None:
+    monkeypatch.setattr(FitBench, "reconstructions", lambda *_: [("level 0", 1.0, 0.1, None)])
+    bench = FitBench(shapes=[ball], config=SMALL)
+    assert "no surface" in as_text(*bench.tables(bench.rows(tmp_path), sgemm=1e9))
 
 
 def test_a_cloud_is_no_reference(tmp_path: Path) -> None:
     np.savetxt(tmp_path / "cloud.xyz", np.random.default_rng(0).random((50, 3)))
     with pytest.raises(InputError, match="has no faces"):
-        bench_fit([tmp_path / "cloud.xyz"], SMALL)
+        FitBench(shapes=[tmp_path / "cloud.xyz"], config=SMALL).cells()

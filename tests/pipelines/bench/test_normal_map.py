@@ -1,5 +1,6 @@
 """The normal mapping benchmark on fields whose surfaces are known."""
 
+import dataclasses
 import json
 import math
 from pathlib import Path
@@ -21,7 +22,9 @@ from mplicits.neural_fields import (
 )
 from mplicits.neural_fields.checkpoint import SavedField
 from mplicits.pipelines.bench import normal_map as module
-from mplicits.pipelines.bench.normal_map import bench_normal_map, format_normal_map
+from mplicits.pipelines.bench.cells import Workplace
+from mplicits.pipelines.bench.normal_map import NormalMapBench
+from mplicits.pipelines.bench.report import as_text
 from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.mesh.files import write_mesh
 
@@ -55,17 +58,18 @@ def bumpy_ball() -> MultiscaleSDF:
 def opened(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     """Makes a field what the bench reads, and the mesh of one of its levels the reference."""
 
-    def prepare(field: Field, level: int) -> tuple[Path, Path]:
+    def prepare(field: Field, level: int) -> NormalMapBench:
         monkeypatch.setattr(module, "find_field", Path)
+        (tmp_path / "run").write_bytes(b"")
         monkeypatch.setattr(module, "load_field", lambda *_, **__: SavedField(field, PLACE, {}))
         write_mesh(tmp_path / "reference.ply", extract_mesh(field, resolution=128, level=level), PLACE)
-        return tmp_path / "run", tmp_path / "reference.ply"
+        return NormalMapBench(run_file=tmp_path / "run", reference=tmp_path / "reference.ply", **VIEW)
 
     return prepare
 
 
-def test_the_level_that_is_the_original_has_no_error(opened):
-    rows = bench_normal_map(*opened(bumpy_ball(), 0), **VIEW)
+def test_the_level_that_is_the_original_has_no_error(opened, tmp_path):
+    rows = opened(bumpy_ball(), 0).rows(tmp_path / "out")
     assert [row.method for row in rows] == METHODS
     exact = {row.method: row for row in rows}
     for method in ("level 0", "mesh of level 0"):
@@ -78,7 +82,8 @@ def test_the_level_that_is_the_original_has_no_error(opened):
 
 
 def test_mapped_normals_are_between_the_levels(opened, tmp_path):
-    rows = bench_normal_map(*opened(bumpy_ball(), 1), picture=tmp_path / "sheet.png", **VIEW)
+    bench = dataclasses.replace(opened(bumpy_ball(), 1), picture=tmp_path / "sheet.png")
+    rows = bench.rows(tmp_path / "out")
     coarse, mapped, coarse_mesh, mapped_mesh, fine = rows
     assert fine.degrees < 1
     assert math.sqrt(fine.error.both) < 0.01
@@ -91,7 +96,7 @@ def test_mapped_normals_are_between_the_levels(opened, tmp_path):
     assert iio.imread(tmp_path / "sheet.png").shape == (2 * (64 + 40), 6 * (64 + 12), 3)
 
 
-def test_the_angle_between_normals_in_closed_form(opened):
+def test_the_angle_between_normals_in_closed_form(opened, tmp_path):
     class Shifted(Field):
         """A sphere whose second level has the gradient of a sphere about another point."""
 
@@ -110,7 +115,7 @@ def test_the_angle_between_normals_in_closed_form(opened):
         def in_band(self, x, *, level):
             return torch.ones_like(x[..., 0], dtype=torch.bool)
 
-    rows = bench_normal_map(*opened(Shifted(), 0), **VIEW)
+    rows = opened(Shifted(), 0).rows(tmp_path / "out")
     outline = extract_mesh(Sphere(radius=RADIUS), resolution=128).vertices
     angles = []
     for camera in turntable(outline, 2, width=64, height=64):
@@ -124,39 +129,39 @@ def test_the_angle_between_normals_in_closed_form(opened):
     assert rows[1].degrees == pytest.approx(np.concatenate(angles).mean(), rel=5e-3)
 
 
-def test_lambert_and_normals_are_compared_too(opened):
-    files = opened(bumpy_ball(), 1)
+def test_lambert_and_normals_are_compared_too(opened, tmp_path):
+    bench = opened(bumpy_ball(), 1)
     for shading in ("lambert", "normals"):
-        rows = bench_normal_map(*files, shading=shading, **VIEW)
+        rows = dataclasses.replace(bench, shading=shading).rows(tmp_path / "out")
         assert rows[4].error.both < rows[1].error.both < rows[0].error.both
 
 
-def test_the_table(opened):
-    rows = bench_normal_map(*opened(bumpy_ball(), 1), **VIEW)
-    text = format_normal_map(rows)
-    assert len(text.splitlines()) == 2 + len(rows)
+def test_the_table(opened, tmp_path):
+    bench = opened(bumpy_ball(), 1)
+    rows = bench.rows(tmp_path / "out")
+    text = as_text(*bench.tables(rows, sgemm=1e9))
+    assert len(text.splitlines()) == 3 + len(rows)
     line = next(line for line in text.splitlines() if line.startswith("level 0 + normals of level 1"))
     assert f"{math.sqrt(rows[1].error.either):.4f}" in line
     assert f"{rows[1].degrees:.1f}°" in line
-    figures = json.loads(json.dumps(rows[1].as_dict()))
-    assert figures["rmse_both"] == math.sqrt(rows[1].error.both)
+    assert bench.run(bench.cells()[0], Workplace(tmp_path, "")).outputs[1]["rmse_both"] == rows[1].rmse_both
     assert rows[4].parameters - rows[0].parameters == 16 * 3 + 16 + 17
     assert rows[3].prepare_seconds > rows[2].prepare_seconds > 0 == rows[0].prepare_seconds
 
 
 def test_another_shape_or_place_is_refused(opened, tmp_path):
-    run, _ = opened(bumpy_ball(), 0)
+    bench = opened(bumpy_ball(), 0)
     for name, similarity in (("unit.ply", Similarity.identity()), ("large.ply", Similarity(PLACE.center, 40.0))):
         write_mesh(tmp_path / name, extract_mesh(Sphere(radius=RADIUS), resolution=32), similarity)
         with pytest.raises(InputError, match=f"{name}: half of its vertices are further than 0.1"):
-            bench_normal_map(run, tmp_path / name, **VIEW)
+            dataclasses.replace(bench, reference=tmp_path / name).rows(tmp_path / "out")
     np.savetxt(tmp_path / "cloud.xyz", np.random.default_rng(0).random((50, 3)))
     with pytest.raises(InputError, match=r"cloud.xyz: has no faces"):
-        bench_normal_map(run, tmp_path / "cloud.xyz", **VIEW)
+        dataclasses.replace(bench, reference=tmp_path / "cloud.xyz").cells()
     with pytest.raises(InputError, match="level 0 has no surface"):
         module._methods(Sphere(radius=0.5, center=(9.0, 0.0, 0.0)), "run", 32, torch.device("cpu"), lambda _: None)
     with pytest.raises(InputError, match="has one level"):
-        bench_normal_map(*opened(Sphere(radius=RADIUS), 0), **VIEW)
+        opened(Sphere(radius=RADIUS), 0).rows(tmp_path / "out")
 
 
 def test_the_command(tmp_path, capsys):
@@ -169,7 +174,8 @@ def test_the_command(tmp_path, capsys):
     files = ["-o", str(tmp_path / "sheet.png"), "--json", str(tmp_path / "figures.json")]
     assert main([*command, *files]) == 0
     assert "mesh of level 0 + normals of level 1" in capsys.readouterr().out
-    assert [row["method"] for row in json.loads((tmp_path / "figures.json").read_text())] == METHODS
+    (record,) = json.loads((tmp_path / "figures.json").read_text())["records"]
+    assert [row["method"] for row in record["outputs"]] == METHODS
     assert (tmp_path / "sheet.png").stat().st_size > 500
     assert main([*command, "-o", str(tmp_path / "sheet.gif")]) == 2
     assert "unknown extension '.gif'" in capsys.readouterr().err

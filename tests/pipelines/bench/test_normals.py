@@ -1,11 +1,13 @@
 """The peers of the jet benchmark compute the same thing; the table says what was measured."""
 
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 import torch
 from mplicits.neural_fields import Siren
-from mplicits.pipelines.bench.speed import bench_normals, format_normals, printed_jet, tangent_jet
+from mplicits.pipelines.bench.report import as_text
+from mplicits.pipelines.bench.speed import NormalsBench, printed_jet, tangent_jet
 from torch import Tensor
 
 
@@ -20,12 +22,13 @@ def test_algorithm_1_is_the_jet(depth: int, method: Callable[[Siren, Tensor], tu
     torch.testing.assert_close(gradient, jet.gradient)
 
 
-def test_rows_and_table() -> None:
-    rows = bench_normals(points=3000, sizes=((16, 2), (24, 3)), repeats=1)
+def test_rows_and_table(tmp_path: Path) -> None:
+    bench = NormalsBench(points=3000, sizes=((16, 2), (24, 3)), repeats=1)
+    rows = bench.rows(tmp_path)
     assert [(row.width, row.depth) for row in rows] == [(16, 2), (24, 3)]
     for row in rows:
         assert min(row.value, row.jet, row.printed, row.tangents, row.autograd, row.gemm) > 0
         assert row.largest_difference < 1e-3
-    table = format_normals(rows)
+    table = as_text(*bench.tables(rows, sgemm=1e9))
     assert "(24,3)" in table
     assert f"{rows[0].jet / rows[0].value:.2f}" in table

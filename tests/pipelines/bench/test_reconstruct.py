@@ -12,6 +12,7 @@ from mplicits.neural_fields import InputError, Siren, Sphere, Union, extract_mes
 from mplicits.neural_fields.baselines import NeusSDF
 from mplicits.neural_fields.radiance import Outside, ViewColor
 from mplicits.pipelines.bench import reconstruct as module
+from mplicits.pipelines.bench.cells import Catalogue, record_file
 from mplicits.pipelines.bench.flops import (
     color_flops,
     jet_flops,
@@ -20,21 +21,9 @@ from mplicits.pipelines.bench.flops import (
     train_watched,
     value_flops,
 )
-from mplicits.pipelines.bench.reconstruct import (
-    BenchOptions,
-    BenchScene,
-    bench_reconstruct,
-    read_scene,
-    surface_figures,
-)
-from mplicits.pipelines.bench.reconstruct_rows import (
-    EQUAL_TIME,
-    MULTISCALE,
-    NEUS,
-    ReconstructRow,
-    comparisons,
-    format_reconstruct,
-)
+from mplicits.pipelines.bench.reconstruct import BenchScene, ReconstructBench, read_scene, surface_figures
+from mplicits.pipelines.bench.reconstruct_rows import EQUAL_TIME, MULTISCALE, NEUS, ReconstructRow, comparisons
+from mplicits.pipelines.bench.report import as_text
 from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.reconstruct.model import RayPool, build_scene
 from mplicits.pipelines.reconstruct.objective import scene_trainer
@@ -115,10 +104,12 @@ def test_a_training_that_is_asked_to_stop_has_not_finished(scene: BenchScene):
 
 
 @pytest.fixture(scope="module")
-def bench(scene, tmp_path_factory) -> tuple[Path, BenchOptions, list[ReconstructRow], list[torch.Tensor]]:
+def bench(scene, tmp_path_factory) -> tuple[Path, ReconstructBench, list[ReconstructRow], list[torch.Tensor]]:
     """Folder, options, rows, and the directions of the rays that were drawn."""
     out = tmp_path_factory.mktemp("bench") / "out"
-    options = BenchOptions(out, test_views=1, resolution=16, samples=2000, neus_learning_rate=3e-4)
+    ours = ReconstructBench(
+        scenes=[scene], config=TINY, test_views=1, resolution=16, samples=2000, neus_learning_rate=3e-4
+    )
     drawn: list[torch.Tensor] = []
     draw = RayPool.draw
 
@@ -129,7 +120,7 @@ def bench(scene, tmp_path_factory) -> tuple[Path, BenchOptions, list[Reconstruct
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(RayPool, "draw", spy)
-        return out, options, list(bench_reconstruct([scene], TINY, options)), drawn
+        return out, ours, ours.rows(out), drawn
 
 
 def test_rows(bench):
@@ -204,12 +195,19 @@ def test_what_lies_outside_the_region_of_interest_is_left_out():
     assert in_region(extract_mesh(corner, resolution=32)) is None
 
 
+def files_of(bench, folder: str, suffix: str) -> dict[str, Path]:
+    """What is kept of each row."""
+    out, ours, *_ = bench
+    key = Catalogue([ours]).key
+    return {part.parameters["kind"]: out / folder / f"{key(part)}{suffix}" for part in ours.cells()}
+
+
 def test_pictures_and_meshes(bench):
     out = bench[0]
-    names = {f"{kind}.{suffix}" for kind in (NEUS, MULTISCALE, EQUAL_TIME) for suffix in ("json", "png", "ply")}
-    assert {path.name for path in (out / "painted-sphere").iterdir()} == names
+    for folder, suffix in (("cells", ".json"), ("pictures", "-views.png"), ("meshes", "-surface.ply")):
+        assert {*(out / folder).iterdir()} == {*files_of(bench, folder, suffix).values()}
     factor = 600 // 24
-    sheet = iio.imread(out / "painted-sphere" / "neus.png")
+    sheet = iio.imread(files_of(bench, "pictures", "-views.png")[NEUS])
     assert sheet.shape == (12 * factor, 24 * factor, 3)
     common = iio.imread(out / "painted-sphere.png")
     assert common.shape == (2 * (8 * factor + 40), 4 * (8 * factor + 12), 3)
@@ -221,46 +219,45 @@ def test_pictures_and_meshes(bench):
     assert (common[80 + side :, side + 18 : 2 * side + 18] == sheet[:side, 2 * side :]).all()
 
 
-def test_finished_rows_are_used_again(bench, scene):
-    out, options, rows, _ = bench
-    home = out / "painted-sphere"
-    files = [home / f"{kind}.json" for kind in (NEUS, MULTISCALE, EQUAL_TIME)]
-    before = [file.stat().st_mtime_ns for file in files]
-    said: list[str] = []
-    assert list(bench_reconstruct([scene], TINY, options, report=said.append)) == rows
-    assert said == [f"painted-sphere, {kind}: from {home}" for kind in (NEUS, MULTISCALE, EQUAL_TIME)]
-    assert [file.stat().st_mtime_ns for file in files] == before
+def test_finished_rows_are_used_again(bench):
+    out, ours, rows, _ = bench
+    files = files_of(bench, "cells", ".json")
+    before = {kind: file.stat().st_mtime_ns for kind, file in files.items()}
+    assert ours.rows(out) == rows
+    assert {kind: file.stat().st_mtime_ns for kind, file in files.items()} == before
     # The row of equal time belongs to the time of NeuS.
-    kept = json.loads(files[2].read_text())
-    files[2].write_text(json.dumps(kept | {"seconds": kept["seconds"] + 1}))
-    again = list(bench_reconstruct([scene], TINY, options))
-    assert again[:2] == rows[:2]
-    assert json.loads(files[2].read_text())["seconds"] == rows[0].seconds
-    assert [file.stat().st_mtime_ns == then for file, then in zip(files, before, strict=True)] == [True, True, False]
+    files[NEUS].unlink()
+    again = ours.rows(out)
+    assert again[1] == rows[1]
+    assert again[2].seconds >= again[0].seconds
+    changed = {kind for kind, file in files.items() if file.stat().st_mtime_ns != before[kind]}
+    assert changed == {NEUS, EQUAL_TIME}
 
 
-def test_rows_of_other_settings_are_refused(bench, scene, tmp_path):
-    _, options, _, _ = bench
-    other = dataclasses.replace(TINY, steps=5)
-    with pytest.raises(InputError, match=r"neus\.json: was made with steps 4, not 5; choose another -o, or remove it"):
-        list(bench_reconstruct([scene], other, options))
+def test_rows_of_other_settings_are_other_rows(bench, scene):
+    out, ours, _, _ = bench
     repainted = dataclasses.replace(scene, images=render_scene(SCENES["painted-sphere"](), 6, 8, seed=1))
-    with pytest.raises(InputError, match=r"neus\.json: was made with pictures"):
-        list(bench_reconstruct([repainted], TINY, options))
-    damaged = tmp_path / "painted-sphere"
-    damaged.mkdir()
-    for suffix in ("json", "png"):
-        (damaged / f"neus.{suffix}").write_text("{}")
-    with pytest.raises(InputError, match=r"neus\.json: damaged .*; remove it"):
-        list(bench_reconstruct([scene], TINY, dataclasses.replace(options, directory=tmp_path)))
+    keys = {Catalogue([ours]).key(part) for part in ours.cells()}
+    for other, apart in (
+        (dataclasses.replace(ours, config=dataclasses.replace(TINY, steps=5)), 3),
+        (dataclasses.replace(ours, scenes=[repainted]), 3),
+        (dataclasses.replace(ours, resolution=17), 3),
+        (dataclasses.replace(ours, neus_learning_rate=1e-3), 1),
+        (dataclasses.replace(ours, config=dataclasses.replace(TINY, texture_steps=5)), 0),
+    ):
+        assert len({Catalogue([other]).key(part) for part in other.cells()} - keys) == apart
+    damaged = record_file(out, Catalogue([ours]).key(ours.cells()[1]))
+    damaged.write_text("{}")
+    assert [row.kind for row in ours.rows(out)] == [NEUS, MULTISCALE, EQUAL_TIME]
+    assert damaged.stat().st_size > 1000
 
 
 def test_what_cannot_be_measured_is_refused(scene, tmp_path):
-    options = BenchOptions(tmp_path / "out")
+    ours = ReconstructBench(scenes=[scene], config=TINY)
     with pytest.raises(InputError, match="painted-sphere: no picture is held out"):
-        list(bench_reconstruct([scene], dataclasses.replace(TINY, test_every=0), options))
+        dataclasses.replace(ours, config=dataclasses.replace(TINY, test_every=0)).rows(tmp_path / "out")
     with pytest.raises(InputError, match="painted-sphere: two of the scenes are called that"):
-        list(bench_reconstruct([scene, scene], TINY, options))
+        dataclasses.replace(ours, scenes=[scene, scene]).rows(tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
@@ -280,18 +277,22 @@ def test_the_tables(bench):
     assert (other.step, other.equal_time, other.chamfer) == (pytest.approx(1.5), None, None)
     assert (mean.neus, mean.ours, mean.step) == pytest.approx((24.0, 25.25, 4.5**0.5))
     assert (mean.equal_time, mean.chamfer) == (None, None)
-    text = format_reconstruct([neus, ours, timed, *second], sgemm=50e9)
-    for part in ("+1.50 dB", "+3.00 dB", "-38%", "12.5%", "6.0 MFLOP", "100.0 ms", "mean of 2 scenes", "50 GFLOP/s"):
+    table, against = bench[1].tables([neus, ours, timed, *second], sgemm=50e9)
+    text = "\n".join(map(as_text, (table, against)))
+    for part in ("+1.50", "+3.00", "-38%", "12.5%", "   6.0 ", " 100.0 ", "mean of 2 scenes"):
         assert part in text
+    assert table.rows[0].values[-1] == pytest.approx(1.2e8 / 50e9)
     # NeuS: 6 MFLOP a ray, 8 rays, 10 steps, 4 seconds.
-    assert neus.rate == pytest.approx(1.2e8)
+    assert neus.flops_per_second == pytest.approx(1.2e8)
     lines = [" ".join(line.split()) for line in text.splitlines()]
-    assert "paper, DTU scan 24 28.20 dB 31.50 dB +3.30 dB -37%" in lines
-    assert "paper, mean of 5 DTU scans 28.86 dB 29.94 dB +1.08 dB -37%" in lines
+    assert "paper, DTU scan 24 28.20 31.50 +3.30 – – -37% – – – – –" in lines
+    assert "paper, mean of 5 DTU scans 28.86 29.94 +1.08 – – -37% – – – – –" in lines
     assert "no surface" in text
-    alone = format_reconstruct([neus], sgemm=50e9)
-    assert "against" not in alone
-    assert ReconstructRow.from_dict(json.loads(json.dumps(ours.as_dict()))) == ours
+    assert len(bench[1].tables([neus], sgemm=50e9)) == 1
+
+
+def rows_in(file: Path) -> list[dict]:
+    return [row for record in json.loads(file.read_text())["records"] for row in record["outputs"]]
 
 
 def run(*arguments: object) -> int:
@@ -312,15 +313,15 @@ def test_the_command_goes_on_after_an_interruption(tmp_path, capsys, monkeypatch
     assert run(*command) == 130
     output, error = capsys.readouterr()
     assert "painted-sphere NeuS (256,8)" in output
-    assert "interrupted; the same command goes on after the last finished row" in error
-    assert [row["kind"] for row in json.loads((tmp_path / "rows.json").read_text())] == [NEUS]
+    assert "interrupted; the same command goes on after the last finished cell" in error
+    assert [row["kind"] for row in rows_in(tmp_path / "rows.json")] == [NEUS]
     assert run(*command) == 0
     output, error = capsys.readouterr()
-    assert "painted-sphere, neus: from" in error
+    assert "1 of 2 cells are there already" in error
     assert "painted-sphere (16,1)▷(24,1)" in output
     assert "equal time" not in output.split("\n\n")[0]
     assert len(calls) == 3
-    figures = json.loads((tmp_path / "rows.json").read_text())
+    figures = rows_in(tmp_path / "rows.json")
     assert [row["kind"] for row in figures] == [NEUS, MULTISCALE]
     assert figures[1]["flops_per_second"] > 0
 

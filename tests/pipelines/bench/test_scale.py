@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 import trimesh
 from mplicits.datasets import read_cloud
-from mplicits.pipelines.bench.fits import ScaleRow, bench_scale, format_scale, write_noisy_cloud
+from mplicits.pipelines.bench.fits import ScaleBench, ScaleRow, write_noisy_cloud
+from mplicits.pipelines.bench.report import as_text
 from mplicits.pipelines.run.settings import FitConfig
 from mplicits.pipelines.surface.surface import read_surface
 
@@ -34,7 +35,10 @@ def test_rows_of_two_sizes(tmp_path: Path) -> None:
         merge_above=2000,
         device="cpu",
     )
-    rows = bench_scale([1000, 20_000], config, tmp_path, shape=tmp_path / "ball.ply", resolution=32, samples=2000)
+    bench = ScaleBench(
+        counts=[1000, 20_000], config=config, folder=tmp_path, shape=tmp_path / "ball.ply", resolution=32, samples=2000
+    )
+    rows = bench.rows(tmp_path / "out")
     assert [row.points for row in rows] == [1000, 20_000]
     assert rows[0].kept == 1000
     assert 300 < rows[1].kept <= 2000
@@ -45,26 +49,7 @@ def test_rows_of_two_sizes(tmp_path: Path) -> None:
 def test_the_table_says_how_many_times_as_long() -> None:
     small = ScaleRow(1000, 1000, 1.0, 2.0, 3.0, 0.004, 8.0, 2.0, 3 << 20, 1e-5, 2e-6)
     large = ScaleRow(100_000, 2000, 1.0, 2.0, 3.0, 0.004, 13.0, 2.0, None, None, 2e-6)
-    text = format_scale([small, large]).splitlines()
-    assert text[2].split() == [
-        "1,000",
-        "1,000",
-        "1.0",
-        "s",
-        "2.0",
-        "s",
-        "3.0",
-        "s",
-        "4",
-        "ms",
-        "8.0",
-        "s",
-        "2.0",
-        "s",
-        "1.00",
-        "3",
-        "MiB",
-        "1.000e-05",
-    ]
-    assert text[3].split()[-3:] == ["1.50", "no", "surface"]
-    assert "2.000e-06" in text[4]
+    text = as_text(*ScaleBench(counts=[], config=FitConfig()).tables([small, large], sgemm=1e9)).splitlines()
+    assert text[3].split() == ["1,000", "1,000", "1.0", "2.0", "3.0", "4", "8.0", "2.0", "1.00", "3", "1.000e-05"]
+    assert text[4].split()[-4:] == ["1.50", "–", "no", "surface"]
+    assert "2.000e-06" in text[5]

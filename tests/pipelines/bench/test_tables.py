@@ -18,7 +18,8 @@ from mplicits.pipelines.bench.report import (
     section_from_dict,
     with_missing,
 )
-from mplicits.pipelines.bench.tables import Column, Row, Table, mean, median, printed_name, ratio, select
+from mplicits.pipelines.bench.tables import Column, Row, Table, mean, median, ratio
+from mplicits.pipelines.paper.cells import printed_name, select
 from mplicits.pipelines.paper.comparison import (
     banf_tables,
     comparison_tables,
@@ -291,7 +292,13 @@ def test_page() -> None:
         (("ours", "A | B", "nothing"),),
         ("a, idf: no luck",),
     )
-    page = as_page([section, section], command="mplicits bench paper x", protocol=["One.", "Two."], machine="a lathe")
+    page = as_page(
+        [section, section],
+        title="Made up",
+        command="mplicits bench paper x",
+        protocol=["One.", "Two."],
+        machine="a lathe",
+    )
     assert "    mplicits bench paper x\n" in page
     assert page.count("| ours | A \\| B | nothing |") == 1
     assert "| poisson: needs an extra | – | – | – |" in page

@@ -13,7 +13,8 @@ import trimesh
 from mplicits.datasets import Camera, TexturedMesh, linear_to_srgb, look_at, srgb_to_linear
 from mplicits.neural_fields import InputError
 from mplicits.pipelines.bench import texture as bench_texture_fits
-from mplicits.pipelines.bench.texture import PAPER_MSE, TextureRow, bench_texture, format_texture
+from mplicits.pipelines.bench.report import as_text
+from mplicits.pipelines.bench.texture import PAPER_MSE, TextureBench, TextureRow
 from mplicits.pipelines.cli import bench as bench_colour_commands
 from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.render.compare import Drawing, ImageError, draw, image_error, psnr
@@ -170,6 +171,11 @@ SMALL = TextureConfig(
 VIEW = {"views": 2, "size": 48, "resolution": 48}
 
 
+def of(*meshes: Path, **options: object) -> TextureBench:
+    given = {"texture": SMALL, "coarse": COARSE, "device": "cpu", **VIEW, **options}
+    return TextureBench(meshes=meshes, **given)  # type: ignore[arg-type]
+
+
 def write_ball(folder: Path, *, image: np.ndarray | None = None) -> Path:
     """spot.obj: a ball of radius 7 about (5, 0, -1), painted along z with a smooth image."""
     ball = trimesh.creation.icosphere(subdivisions=3, radius=1.0)
@@ -193,7 +199,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, list[Te
     path, out = write_ball(folder), folder / "out"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(bench_texture_fits, "FIT_POINTS", 3000)
-        return path, out, bench_texture([path], out, SMALL, coarse=COARSE, full=FULL, **VIEW)
+        return path, out, of(path, full=FULL).rows(out)
 
 
 def test_rows_errors_and_sheet(bench):
@@ -221,49 +227,51 @@ def test_rows_errors_and_sheet(bench):
 def test_the_table_prints_the_papers_figures_beside_ours(bench):
     rows = bench[2]
     known = dataclasses.replace(rows[0], error=ImageError(0.00329, 0.00823, 0.0658, 7, 6))
-    text = format_texture([known, *rows[1:]])
+    (table,) = of().tables([known, *rows[1:]], sgemm=1e9)
+    text = as_text(table)
     assert "0.0329" in text
     assert "0.00329 (10×)" in text
     assert "0.00823 (4.0×)" in text
     assert "0.0658 (0.5×)" in text
-    assert f"{psnr(0.0658):.1f} dB" in text
-    assert len(text.splitlines()) == 2 + len(rows)
-    unknown = format_texture([dataclasses.replace(rows[0], shape="teapot", paper=None)])
+    assert f"{psnr(0.0658):.1f}" in text
+    assert len(text.splitlines()) == 3 + len(rows)
+    unknown = as_text(*of().tables([dataclasses.replace(rows[0], shape="teapot", paper=None)], sgemm=1e9))
     assert "0.0329" not in unknown
     assert "×" not in unknown
-    assert json.loads(json.dumps(rows[0].as_dict()))["psnr_either"] == psnr(rows[0].error.either)
+    assert rows[0].psnr_either == psnr(rows[0].error.either)
 
 
-def test_what_is_there_is_used_and_what_is_not_is_trained(bench):
+def test_what_is_there_is_used_and_what_is_not_is_trained(bench, tmp_path, monkeypatch):
+    monkeypatch.setattr(bench_texture_fits, "FIT_POINTS", 3000)
     path, out, rows = bench
-    home = out / "spot"
-    files = [home / name / file for name in ("coarse", "full") for file in ("field.safetensors", "texture.safetensors")]
+    runs = sorted((out / "runs").iterdir())
+    assert len(runs) == 2
+    files = [run / name for run in runs for name in ("field.safetensors", "texture.safetensors")]
     before = [file.stat().st_mtime_ns for file in files]
-    again = bench_texture([path], out, SMALL, coarse=COARSE, full=FULL, **VIEW)
-    assert [row.error for row in again] == [row.error for row in rows]
+    assert of(path, full=FULL).rows(out) == rows
+    other = of(path, full=FULL, size=24).rows(out)
+    assert [row.texture_seconds for row in other] == [row.texture_seconds for row in rows]
     assert [file.stat().st_mtime_ns for file in files] == before
-    # A texture that was interrupted is trained again.
-    record = json.loads((home / "coarse" / "run.json").read_text())
+    # A texture that was interrupted is trained again, its fit is not.
+    coarse = next(run for run in runs if len(json.loads((run / "run.json").read_text())["stages"]) == 1)
+    record = json.loads((coarse / "run.json").read_text())
     record["texture"]["finished"] = False
-    (home / "coarse" / "run.json").write_text(json.dumps(record))
-    bench_texture([path], out, SMALL, coarse=COARSE, **VIEW)
-    assert [file.stat().st_mtime_ns == then for file, then in zip(files, before, strict=True)] == [
-        *(True, False),
-        *(True, True),
-    ]
+    (coarse / "run.json").write_text(json.dumps(record))
+    of(path, size=32).rows(out)
+    changed = [file for file, then in zip(files, before, strict=True) if file.stat().st_mtime_ns != then]
+    assert changed == [coarse / "texture.safetensors"]
+    # Other settings, or an image of another mesh beside the same OBJ file, are other fits.
+    kept = {part.name: of(path).settings(part) for part in of(path).cells()}
+    assert kept != {part.name: of(path, coarse=FULL).settings(part) for part in of(path).cells()}
+    painted = write_ball(tmp_path, image=np.full((4, 4, 3), 0.5))
+    assert painted.read_bytes() == path.read_bytes()
+    assert of(painted).cells()[0].options != of(path).cells()[0].options
 
 
-def test_other_settings_or_another_mesh_are_refused(bench, tmp_path):
-    path, out, _ = bench
-    with pytest.raises(InputError, match=r"spot/coarse: was made with omegas \[8.0\], not \[9.0\]; choose another -o"):
-        bench_texture([path], out, SMALL, coarse=dataclasses.replace(COARSE, omegas=(9.0,)))
-    with pytest.raises(InputError, match=r"texture.safetensors: was made with steps 150, not 151; choose another -o"):
-        bench_texture([path], out, dataclasses.replace(SMALL, steps=151), coarse=COARSE)
-    other = write_ball(tmp_path, image=np.full((4, 4, 3), 0.5))
-    with pytest.raises(InputError, match=r"holds the fits of another mesh than .*spot\.obj"):
-        bench_texture([other], out, SMALL, coarse=COARSE)
+def test_two_meshes_of_one_name_are_refused(bench, tmp_path):
+    path, other = bench[0], write_ball(tmp_path)
     with pytest.raises(InputError, match="spot: two of the meshes are called that"):
-        bench_texture([path, other], tmp_path / "out", SMALL, coarse=COARSE)
+        of(path, other).rows(tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
@@ -272,7 +280,7 @@ def test_a_mesh_without_texture_coordinates_is_refused_before_any_work(tmp_path)
     ball.visual.vertex_colors = np.full((len(ball.vertices), 4), 200, np.uint8)  # type: ignore[union-attr]
     ball.export(tmp_path / "ball.ply")
     with pytest.raises(InputError, match=r"ball.ply: no texture coordinates and image in it"):
-        bench_texture([tmp_path / "ball.ply"], tmp_path / "out", SMALL, coarse=COARSE)
+        of(tmp_path / "ball.ply").rows(tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
@@ -286,7 +294,7 @@ def test_the_command(tmp_path, capsys, monkeypatch):
     command = ["bench", "texture", str(path), "-o", str(tmp_path / "out"), *settings.split(), *view.split()]
     assert main([*command, str(tmp_path / "figures.json")]) == 0
     assert "spot (16,1) mesh" in capsys.readouterr().out
-    figures = json.loads((tmp_path / "figures.json").read_text())
+    figures = json.loads((tmp_path / "figures.json").read_text())["records"][0]["outputs"]
     assert [row["surface"] for row in figures] == ["(16,1) traced", "(16,1) mesh"]
     assert figures[0]["error"]["either"] < 0.2
     (tmp_path / "spot.obj").unlink()

@@ -11,7 +11,7 @@ import torch
 from imageio.v3 import imread
 from mplicits.datasets import read_cloud
 from mplicits.neural_fields import Box, InputError, MultiscaleSDF, Similarity, Siren, Sphere, extract_mesh
-from mplicits.pipelines.bench.cells import Cell, make_folder
+from mplicits.pipelines.bench.cells import make_folder
 from mplicits.pipelines.bench.run import run_cell
 from mplicits.pipelines.fit.cloud import CloudDistance
 from mplicits.pipelines.fit.samples import Weights, banded_sources
@@ -36,6 +36,7 @@ from mplicits.pipelines.paper.base import (
     up_to,
     without_bands,
 )
+from mplicits.pipelines.paper.cells import PaperCell
 from mplicits.pipelines.paper.isolation import (
     ISOLATION,
     IndependentLevels,
@@ -458,6 +459,6 @@ def test_a_cloud_without_faces_has_no_exact_distances(tmp_path: Path, out: Path)
     normals = rng.normal(size=(400, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     np.savetxt(tmp_path / "cloud.xyz", np.concatenate((normals, normals), axis=1))
-    cell = Cell(tmp_path / "cloud.xyz", "delta-factor", "smoke", overrides=(("epsilon", 0.3),))
+    cell = PaperCell(tmp_path / "cloud.xyz", "delta-factor", "smoke", overrides=(("epsilon", 0.3),))
     with pytest.raises(InputError, match="has no faces"):
         run_cell(cell, out, CATALOGUE)

@@ -13,6 +13,7 @@ from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.mesh.files import write_mesh
 from mplicits.pipelines.paper import bench, names
 from mplicits.pipelines.paper.bench import SPECS
+from mplicits.pipelines.paper.cells import PaperCell
 from mplicits.pipelines.paper.judge import Judge
 from mplicits.pipelines.paper.methods import CATALOGUE, METHODS
 
@@ -26,7 +27,7 @@ def ball(tmp_path: Path) -> Path:
     return path
 
 
-class Exact(Method):
+class Exact(Method[PaperCell]):
     source, differs = "a test", "nothing"
     runs = 0
 
@@ -71,10 +72,10 @@ def test_a_bench(ball: Path, tmp_path: Path, exact, capsys: pytest.CaptureFixtur
     assert main([*command, "--table", "comparison", "--json", str(figures)]) == 0
     assert exact.runs == 2
     printed, said = capsys.readouterr()
-    assert "| SIREN |" in printed
+    assert "\nSIREN " in printed
     assert "1 tables, 1 shapes, 2 cells" in said
     page = (out / "results.md").read_text()
-    assert f"mplicits bench paper {ball.name} -o {out.name} --table comparison --preset smoke" in page
+    assert f"mplicits bench paper {ball.name} -o {out.name} --preset smoke --device cpu --methods ours,siren" in page
     with (out / "comparison.csv").open() as file:
         rows = {row["method"]: row for row in csv.DictReader(file)}
     (section,) = json.loads(figures.read_text())
@@ -118,8 +119,8 @@ def test_failures_are_told_and_the_rest_is_written(
     printed, said = capsys.readouterr()
     assert "ball, idf: failed: RuntimeError: no luck" in said
     assert "1 cells failed" in said
-    assert "| idf: failed, RuntimeError: no luck |" in printed
-    assert "| Ours fine |" in printed
+    assert "\nidf: failed, RuntimeError: no luck " in printed
+    assert "\nOurs fine " in printed
 
 
 def test_ctrl_c(ball: Path, tmp_path: Path, exact, monkeypatch, capsys: pytest.CaptureFixture[str]) -> None:

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from mplicits.datasets import PointCloud, read_cloud
 from mplicits.neural_fields import InputError, Similarity, Sphere, extract_mesh
-from mplicits.pipelines.bench.cells import Catalogue, Cell, Findings, Method, make_folder, read_record, record_file
-from mplicits.pipelines.bench.run import Shape, cells_of, run_cell, run_cells
-from mplicits.pipelines.bench.tables import TableSpec
+from mplicits.pipelines.bench.cells import Catalogue, Findings, Method, key_of, make_folder, read_record, record_file
+from mplicits.pipelines.bench.run import run_cell, run_cells
 from mplicits.pipelines.mesh.files import write_mesh
 from mplicits.pipelines.paper.bench import find_shapes
+from mplicits.pipelines.paper.cells import Input, PaperCell, TableSpec, cells_of
 from mplicits.pipelines.paper.judge import Judge, damaged_cloud, fit_config, flip_normals, oriented_cloud, protocol_of
 from mplicits.pipelines.paper.methods import CATALOGUE
 from mplicits.pipelines.paper.ours import FromRecipe, Ours, level_names
@@ -23,7 +23,7 @@ from mplicits.pipelines.run.trainer import Interrupted
 PLACE = Similarity((5.0, 0.0, -1.0), 20.0)
 
 
-class Exact(Method):
+class Exact(Method[PaperCell]):
     """Knows the answer: the ball of the test's file, or of another radius."""
 
     source, differs = "a test", "nothing"
@@ -56,12 +56,12 @@ def out(tmp_path: Path) -> Path:
 def test_keys_are_of_contents_and_settings(ball: Path, tmp_path: Path) -> None:
     copy = tmp_path / "elsewhere.ply"
     copy.write_bytes(ball.read_bytes())
-    cell = Cell(ball, "ours", "smoke")
-    key = cell.key({"a": 1})
-    assert key == cell.key({"a": 1}) == Cell(copy, "ours", "smoke").key({"a": 1})
+    cell = PaperCell(ball, "ours", "smoke")
+    key = key_of(cell, {"a": 1})
+    assert key == key_of(cell, {"a": 1}) == key_of(PaperCell(copy, "ours", "smoke"), {"a": 1})
     assert len(key) == 12
     others = [
-        dataclasses.replace(cell, **change).key({"a": 1})
+        key_of(dataclasses.replace(cell, **change), {"a": 1})
         for change in (
             {"method": "idf"},
             {"preset": "cpu"},
@@ -73,14 +73,14 @@ def test_keys_are_of_contents_and_settings(ball: Path, tmp_path: Path) -> None:
             {"reference": copy},
         )
     ]
-    assert len({key, *others, cell.key({"a": 2})}) == len(others) + 2
+    assert len({key, *others, key_of(cell, {"a": 2})}) == len(others) + 2
     copy.write_bytes(ball.read_bytes() + b"\n")
-    assert Cell(copy, "ours", "smoke").key({"a": 1}) != key
+    assert key_of(PaperCell(copy, "ours", "smoke"), {"a": 1}) != key
 
 
 def test_settings_of_ours_are_in_the_key_but_not_the_device(ball: Path) -> None:
     ours = Ours()
-    plain = Cell(ball, "ours", "smoke")
+    plain = PaperCell(ball, "ours", "smoke")
     settings = ours.settings(plain)["fit"]
     assert settings["steps"] == fit_config("smoke").steps
     assert "device" not in settings
@@ -90,8 +90,8 @@ def test_settings_of_ours_are_in_the_key_but_not_the_device(ball: Path) -> None:
 
 
 def test_names() -> None:
-    assert Cell(Path("a/b.ply"), "idf", "cpu").name == "b, idf"
-    cell = Cell(Path("b.ply"), "ours", "cpu", noise=0.01, outliers=0.05, overrides=(("steps", (1, 2)),))
+    assert PaperCell(Path("a/b.ply"), "idf", "cpu").name == "b, idf"
+    cell = PaperCell(Path("b.ply"), "ours", "cpu", noise=0.01, outliers=0.05, overrides=(("steps", (1, 2)),))
     assert cell.name == "b + noise 0.01 + outliers 0.05, ours, steps=1 2"
     assert level_names(2) == ["Ours coarse", "Ours fine"]
     assert level_names(4) == ["Ours coarse", "Ours medium 1", "Ours medium 2", "Ours fine"]
@@ -113,7 +113,7 @@ def test_flipped_normals_are_as_many_as_asked_for() -> None:
 def test_damage(ball: Path) -> None:
     clean = read_cloud(ball)
     count = len(clean)
-    cell = Cell(ball, "x", "smoke", noise=0.01, outliers=0.05, flipped=0.1)
+    cell = PaperCell(ball, "x", "smoke", noise=0.01, outliers=0.05, flipped=0.1)
     cloud = damaged_cloud(cell)
     assert len(cloud) == count + round(0.05 * count)
     moved = np.linalg.norm(cloud.points[:count] - [5.0, 0.0, -1.0], axis=1) - 14
@@ -130,13 +130,13 @@ def test_damage(ball: Path) -> None:
 def test_damage_needs_normals(tmp_path: Path) -> None:
     np.savetxt(tmp_path / "cloud.xyz", np.random.default_rng(0).random((50, 3)))
     with pytest.raises(InputError, match="has no normals for noise"):
-        damaged_cloud(Cell(tmp_path / "cloud.xyz", "x", "smoke", noise=0.01))
+        damaged_cloud(PaperCell(tmp_path / "cloud.xyz", "x", "smoke", noise=0.01))
 
 
 def test_a_record_is_measured_kept_and_not_made_again(ball: Path, out: Path) -> None:
     exact = Exact()
     methods = Catalogue((exact,))
-    cell = Cell(ball, "exact", "smoke")
+    cell = PaperCell(ball, "exact", "smoke")
     record = run_cell(cell, out, methods)
     key = record["key"]
     assert json.loads(record_file(out, key).read_text()) == record == run_cell(cell, out, methods)
@@ -155,7 +155,7 @@ def test_a_record_is_measured_kept_and_not_made_again(ball: Path, out: Path) -> 
 
 def test_no_surface_is_a_result(ball: Path, out: Path) -> None:
     methods = Catalogue((Exact(radius=1.9),))  # all of the box is inside
-    (output,) = run_cell(Cell(ball, "exact", "smoke"), out, methods)["outputs"]
+    (output,) = run_cell(PaperCell(ball, "exact", "smoke"), out, methods)["outputs"]
     assert output["chamfer"] is None
     assert "iou" not in output
 
@@ -168,7 +168,7 @@ def test_a_failure_stops_nothing_and_is_tried_again(ball: Path, out: Path) -> No
             bad,
         )
     )
-    cells = [Cell(ball, "bad", "smoke"), Cell(ball, "good", "smoke")]
+    cells = [PaperCell(ball, "bad", "smoke"), PaperCell(ball, "good", "smoke")]
     lines: list[str] = []
     ran = run_cells(cells, out, methods, say=lines.append)
     assert list(ran.records) == cells[1:]
@@ -191,7 +191,7 @@ def test_a_failure_stops_nothing_and_is_tried_again(ball: Path, out: Path) -> No
 def test_a_damaged_record_is_made_again(ball: Path, out: Path) -> None:
     exact = Exact()
     methods = Catalogue((exact,))
-    cell = Cell(ball, "exact", "smoke")
+    cell = PaperCell(ball, "exact", "smoke")
     record_file(out, methods.key(cell)).write_text("{")
     run_cell(cell, out, methods)
     assert exact.runs == 1
@@ -205,7 +205,7 @@ def test_what_is_not_installed_is_left_out(ball: Path, out: Path) -> None:
     absent = Absent("absent")
     methods = Catalogue((absent,))
     lines: list[str] = []
-    ran = run_cells([Cell(ball, "absent", "smoke")], out, methods, say=lines.append)
+    ran = run_cells([PaperCell(ball, "absent", "smoke")], out, methods, say=lines.append)
     assert not ran.records
     assert not ran.failures
     assert ran.lacking == {"absent": "needs pip install something"}
@@ -226,7 +226,7 @@ def test_ctrl_c_keeps_what_is_finished(ball: Path, out: Path, reason: BaseExcept
             stopped,
         )
     )
-    cells = [Cell(ball, "good", "smoke"), Cell(ball, "stopped", "smoke")]
+    cells = [PaperCell(ball, "good", "smoke"), PaperCell(ball, "stopped", "smoke")]
     with pytest.raises(type(reason)):
         run_cells(cells, out, methods, say=lambda _: None)
     assert read_record(out, methods.key(cells[0])) is not None
@@ -245,15 +245,15 @@ def test_recipes_learn_from_the_unit_sphere(ball: Path, out: Path, monkeypatch) 
             return (Output("Known", Sphere(radius=0.999), -1, 4),), 17
 
     methods = Catalogue((FromRecipe(Known()),))
-    record = run_cell(Cell(ball, "known", "smoke", seed=2), out, methods)
+    record = run_cell(PaperCell(ball, "known", "smoke", seed=2), out, methods)
     (output,) = record["outputs"]
     assert output["chamfer"] < 1.5 * output["chamfer_floor"]
     assert record["details"] == {"steps": 17}
     # Another size or schedule makes another cell.
-    cell, method = Cell(ball, "known", "smoke", seed=2), FromRecipe(Known())
-    before = cell.key(method.settings(cell))
+    cell, method = PaperCell(ball, "known", "smoke", seed=2), FromRecipe(Known())
+    before = key_of(cell, method.settings(cell))
     monkeypatch.setattr(Known, "presets", {"smoke": "larger"})
-    assert cell.key(method.settings(cell)) != before
+    assert key_of(cell, method.settings(cell)) != before
     assert record["method"] == {"source": "s", "differs": "d"}
 
 
@@ -261,14 +261,14 @@ def test_poisson_on_what_ours_has_smoothed(ball: Path, out: Path) -> None:
     pytest.importorskip("pymeshlab", reason="the extra mplicits[poisson] is not installed")
 
     def error(name: str) -> float:
-        (output,) = run_cell(Cell(ball, name, "smoke", noise=0.02), out, CATALOGUE)["outputs"]
+        (output,) = run_cell(PaperCell(ball, name, "smoke", noise=0.02), out, CATALOGUE)["outputs"]
         return output["chamfer"] - output["chamfer_floor"]
 
     assert 0 < error("poisson-smoothed") < error("poisson") / 3
 
 
 def test_ours(ball: Path, out: Path) -> None:
-    cell = Cell(ball, "ours", "smoke", overrides=(("steps", (120, 20, 20)), ("samples", 5000)))
+    cell = PaperCell(ball, "ours", "smoke", overrides=(("steps", (120, 20, 20)), ("samples", 5000)))
     record = run_cell(cell, out, CATALOGUE)
     assert [output["name"] for output in record["outputs"]] == ["Ours coarse", "Ours medium", "Ours fine"]
     sizes = [output["parameters"] for output in record["outputs"]]
@@ -283,7 +283,7 @@ def test_ours(ball: Path, out: Path) -> None:
 def test_a_finished_fit_is_measured_again_but_not_trained(
     ball: Path, out: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    cell = Cell(ball, "ours", "smoke", overrides=(("steps", (120, 20, 20)), ("samples", 5000)))
+    cell = PaperCell(ball, "ours", "smoke", overrides=(("steps", (120, 20, 20)), ("samples", 5000)))
     first = run_cell(cell, out, CATALOGUE)
     (out / "cells" / f"{first['key']}.json").unlink()
     monkeypatch.delattr("mplicits.pipelines.paper.ours.fit")
@@ -294,13 +294,13 @@ def test_a_finished_fit_is_measured_again_but_not_trained(
 
 def test_cells_of_a_table(ball: Path) -> None:
     def cells(shapes, preset):
-        return [Cell(shape, method, preset) for shape in shapes for method in ("a", "b", "a")]
+        return [PaperCell(shape, method, preset) for shape in shapes for method in ("a", "b", "a")]
 
     spec = TableSpec("t", "l", "s", cells, lambda _: ())
     other = ball.with_name("scan.npz")
-    planned = cells_of(spec, [Shape(ball), Shape(other, ball)], "smoke", seed=4)
+    planned = cells_of(spec, [Input(ball), Input(other, ball)], "smoke", seed=4)
     assert planned == [
-        Cell(shape, method, "smoke", seed=4, reference=reference)
+        PaperCell(shape, method, "smoke", seed=4, reference=reference)
         for shape, reference in ((ball, None), (other, ball))
         for method in ("a", "b")
     ]
@@ -314,7 +314,7 @@ def test_shapes(ball: Path, tmp_path: Path) -> None:
     for name in ("b.ply", "a.ply", "._a.ply"):
         (folder / name).write_bytes(ball.read_bytes())
     (folder / "notes.txt").write_text("not a mesh")
-    assert find_shapes([folder, ball]) == [Shape(folder / "a.ply"), Shape(folder / "b.ply"), Shape(ball)]
+    assert find_shapes([folder, ball]) == [Input(folder / "a.ply"), Input(folder / "b.ply"), Input(ball)]
     (tmp_path / "a.ply").write_bytes(ball.read_bytes())
     with pytest.raises(InputError, match="has the same name"):
         find_shapes([folder, tmp_path / "a.ply"])
@@ -329,7 +329,7 @@ def test_shapes(ball: Path, tmp_path: Path) -> None:
         find_shapes([scan], reference=scan)
     with pytest.raises(InputError, match="leave it out"):
         find_shapes([ball], reference=ball)
-    assert find_shapes([ball, scan], reference=ball) == [Shape(ball), Shape(scan, ball)]
+    assert find_shapes([ball, scan], reference=ball) == [Input(ball), Input(scan, ball)]
 
 
 def test_presets_grow() -> None:
