@@ -16,7 +16,6 @@ from ..run.config import add_config_flags, given_flags, input_error, load_config
 from ..run.settings import EvolveConfig, FitConfig, ReconstructConfig, TextureConfig
 from .bench_paper import PAPER
 from .common import (
-    PICTURES,
     Command,
     add_fit_settings,
     add_json,
@@ -247,7 +246,7 @@ def _normal_map(arguments: argparse.Namespace) -> int:
     out: Path | None = arguments.out
     picture = None
     if out is not None and out.suffix and not out.is_dir():
-        check_output(out, PICTURES)
+        check_output(out, (".png", ".jpg", ".jpeg"))
         picture, out = out, None
     elif out is not None:
         picture = out / "images.png"

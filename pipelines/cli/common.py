@@ -243,12 +243,6 @@ def check_output(path: Path | None, suffixes: Sequence[str]) -> None:
         raise input_error(f"{path}: is a directory; name a file")
 
 
-def check_size(size: Sequence[int] | None) -> None:
-    """Refuse a ``--size`` of more than a width and a height."""
-    if size is not None and len(size) > 2:
-        raise input_error(f"--size: got {len(size)} numbers; expected a width, or a width and a height")
-
-
 def typed(arguments: argparse.Namespace) -> str:
     """The command as it could be typed again beside its files: pages are for others, who have other folders."""
     words = (Path(word).name if Path(word).is_absolute() else word for word in arguments.words)
