@@ -85,7 +85,7 @@ def fit_texture(
 
     Args:
         geometry: f.
-        cloud: points with colours, in input coordinates; of meshes see `texture_samples.read_colors`.
+        cloud: points with colours, in input coordinates; of meshes see `read_colors`.
         config: settings; the defaults are those of the ``default`` preset.
         similarity: from input to the geometry's coordinates; the identity if there is none.
         level: the level of the geometry that the colours belong to.
