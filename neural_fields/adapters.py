@@ -14,6 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from ._checks import positive
 from ._point_memo import PointMemo
 from .field import Field, Jet
 from .meshing import extract_mesh
@@ -46,7 +47,8 @@ class NeuSGeometry(nn.Module):
 
     def __init__(self, field: Field, *, scale: float = 1.0) -> None:
         super().__init__()
-        self.field, self.scale = field, _positive(scale, "scale")
+        positive(scale=scale)
+        self.field, self.scale = field, float(scale)
         self._memo = PointMemo()
 
     def forward(self, x: Tensor) -> Tensor:
@@ -95,9 +97,10 @@ class InstantNSRGeometry(nn.Module):
 
     def __init__(self, field: Field, *, radius: float = 1.0, scale: float | None = None, resolution: int = 512) -> None:
         super().__init__()
-        self.field, self.radius = field, _positive(radius, "radius")
-        self.scale = _positive(1 / self.radius if scale is None else scale, "scale")
-        self.resolution = resolution
+        positive(radius=radius)
+        scale = 1 / radius if scale is None else scale
+        positive(scale=scale)
+        self.field, self.radius, self.scale, self.resolution = field, float(radius), float(scale), resolution
 
     def forward(
         self,
@@ -197,7 +200,8 @@ class NerfstudioField(nn.Module):
         self, field: Field, color: nn.Module, *, heads: Any, scale: float = 1.0, deviation: float = 0.3
     ) -> None:
         super().__init__()
-        self.field, self.color, self.scale = field, color, _positive(scale, "scale")
+        positive(scale=scale)
+        self.field, self.color, self.scale = field, color, float(scale)
         self.heads = heads
         self.deviation_network = Deviation(deviation)
         self.cos_anneal_ratio = 1.0
@@ -275,12 +279,6 @@ class NerfstudioField(nn.Module):
     def _evaluate(self, x: Tensor) -> tuple[Tensor, Tensor]:
         jet = _jet(self.field, x, self.scale)
         return _joined(jet), jet.gradient
-
-
-def _positive(number: float, name: str) -> float:
-    if not number > 0:
-        raise ValueError(f"{name}={number}: expected > 0")
-    return float(number)
 
 
 def _value(field: Field, x: Tensor, scale: float) -> Tensor:

@@ -7,6 +7,7 @@ from abc import abstractmethod
 import torch
 from torch import Tensor
 
+from ._checks import positive
 from .field import Field, Jet, OneLevelField
 
 __all__ = ["Box", "Capsule", "Plane", "Sphere", "Torus", "Union"]
@@ -50,8 +51,7 @@ class Sphere(_Exact):
 
     def __init__(self, *, radius: float = 0.5, center: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> None:
         super().__init__()
-        if not radius > 0:
-            raise ValueError(f"radius={radius}: expected > 0")
+        positive(radius=radius)
         self.radius, self.center = radius, center
 
     def _evaluate(self, x: Tensor) -> tuple[Tensor, Tensor]:

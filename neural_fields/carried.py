@@ -14,11 +14,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from ._checks import at_least
 from .attributes import project_to_surface
 from .dynamic_tracing import moment
 from .field import Field
 from .spacetime import at_time
-from .tracing import BOUNDING_RADIUS
+from .tracing import BOUNDING_RADIUS, ball_points
 
 __all__ = ["CarriedVelocity"]
 
@@ -60,12 +61,10 @@ class CarriedVelocity:
         least_slope: float = 0.1,
         seed: int = 0,
     ) -> None:
-        if nodes < 2:
-            raise ValueError(f"nodes={nodes}: expected at least 2")
+        at_least(2, nodes=nodes)
         self.field, self.level, self.least_slope = field, field.resolve_level(level), least_slope
         generator = torch.Generator().manual_seed(seed)
-        points = torch.nn.functional.normalize(torch.randn(samples, 3, generator=generator), dim=-1)
-        points = points * torch.rand(samples, 1, generator=generator) ** (1 / 3)
+        points = ball_points(samples, radius=1.0, generator=generator)
         parts = [self._whole(points.to(field.like), t) for t in torch.linspace(0, 1, nodes).tolist()]
         self.parts = torch.stack(parts)  # (nodes, 7)
 

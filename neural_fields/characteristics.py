@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from ._checks import at_least, positive
 from .attributes import project_to_surface
 from .evolution import VectorField
 from .field import Field
@@ -75,11 +76,8 @@ class Solver:
     def __post_init__(self) -> None:
         if self.method not in ADAPTIVE + FIXED:
             raise ValueError(f"method={self.method!r}: expected one of {', '.join(ADAPTIVE + FIXED)}")
-        for name in ("rtol", "atol", "step", "max_steps"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name}={getattr(self, name)}: expected > 0")
-        if not self.min_step >= 0:
-            raise ValueError(f"min_step={self.min_step}: expected at least 0")
+        positive(rtol=self.rtol, atol=self.atol, step=self.step, max_steps=self.max_steps)
+        at_least(0, min_step=self.min_step)
 
 
 class Tracks(NamedTuple):

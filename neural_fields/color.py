@@ -16,6 +16,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from ._checks import positive
 from .field import Field, Jet, OneLevelField
 from .siren import Siren, forward, needs_graph, plain_jet
 
@@ -148,8 +149,7 @@ class TextureField(OneLevelField):
         outside: Sequence[float] = (0.5, 0.5, 0.5),
     ) -> None:
         super().__init__(geometry.in_dim)
-        if not delta > 0:
-            raise ValueError(f"delta={delta}: expected > 0")
+        positive(delta=delta)
         if network.siren.in_dim != geometry.in_dim:
             raise ValueError(f"network: of {network.siren.in_dim} dimensions; the geometry has {geometry.in_dim}")
         color = torch.tensor([float(channel) for channel in outside])

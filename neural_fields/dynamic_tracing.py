@@ -23,8 +23,18 @@ import torch
 from torch import Tensor
 
 from .field import Field
-from .spacetime import SpaceTimeSDF, TimeSlice
-from .tracing import BOUNDING_RADIUS, CONE_LIPSCHITZ, Expected, Hits, Near, cone_ends, cone_starts, trace_expected
+from .spacetime import SpaceTimeSDF, TimeSlice, check_spacetime
+from .tracing import (
+    BOUNDING_RADIUS,
+    CONE_LIPSCHITZ,
+    Expected,
+    Hits,
+    Near,
+    ball_points,
+    cone_ends,
+    cone_starts,
+    trace_expected,
+)
 
 __all__ = ["DynamicTracer", "moment"]
 
@@ -124,8 +134,7 @@ class DynamicTracer:
         reach: float | None = None,
         speed: float | None = None,
     ) -> None:
-        if field.in_dim != 4:
-            raise ValueError(f"field.in_dim={field.in_dim}: expected a field of space-time, four-dimensional")
+        check_spacetime(field)
         for name, number in (("reach", reach), ("speed", speed)):
             if number is not None and number < 0:
                 raise ValueError(f"{name}={number}: expected ≥ 0")
@@ -184,10 +193,7 @@ class DynamicTracer:
     def _measured_speed(self, t: float) -> float:
         """How fast values change at this time near the surface; of a distance, that is how fast the surface moves."""
         generator = torch.Generator().manual_seed(0)
-        points = torch.nn.functional.normalize(torch.randn(SPEED_POINTS, 3, generator=generator), dim=-1)
-        points = (self.radius * torch.rand(SPEED_POINTS, 1, generator=generator) ** (1 / 3) * points).to(
-            self.directions
-        )
+        points = ball_points(SPEED_POINTS, radius=self.radius, generator=generator).to(self.directions)
         before, after = (moment(self.field, t + sign * SPEED_INTERVAL / 2).value(points, level=0) for sign in (-1, 1))
         rate = (after - before).abs() / SPEED_INTERVAL
         close = before.abs() < max(SPEED_NEAR, 4 * self.reach)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from torch.nn.functional import normalize
 
 from ._blocks import ActiveCells, NoSurfaceError, active_cells, cull_blocks
+from ._checks import positive
 from ._cube import EDGE_AXIS, EDGE_ENDS, cube_tables
 from ._lattice import Bounds, Lattice, Progress, Sampler
 from .field import Field
@@ -111,9 +112,7 @@ def extract_mesh(
     """
     if field.in_dim != 3:
         raise ValueError(f"field.in_dim={field.in_dim}: expected 3 (fix the time of a field in space-time first)")
-    for name, number in (("lipschitz", lipschitz), ("batch", batch)):
-        if not number > 0:
-            raise ValueError(f"{name}={number}: expected > 0")
+    positive(lipschitz=lipschitz, batch=batch)
     if not 0 < clearance < 0.5:
         raise ValueError(f"clearance={clearance}: expected a fraction of a cell in (0, 0.5)")
     level = field.resolve_level(level)

@@ -8,6 +8,7 @@ import math
 import torch
 from torch import Tensor, nn
 
+from ._checks import at_least
 from .field import Jet
 
 __all__ = ["Outside", "ViewColor", "encode", "encoded_size"]
@@ -57,15 +58,8 @@ class ViewColor(nn.Module):
         point_frequencies: int = 0,
     ) -> None:
         super().__init__()
-        for name, number, least in (
-            ("num_features", num_features, 0),
-            ("width", width, 1),
-            ("depth", depth, 1),
-            ("view_frequencies", view_frequencies, 0),
-            ("point_frequencies", point_frequencies, 0),
-        ):
-            if number < least:
-                raise ValueError(f"{name}={number}: expected at least {least}")
+        at_least(1, width=width, depth=depth)
+        at_least(0, num_features=num_features, view_frequencies=view_frequencies, point_frequencies=point_frequencies)
         self.num_features, self.width, self.depth = num_features, width, depth
         self.view_frequencies, self.point_frequencies = view_frequencies, point_frequencies
         inputs = encoded_size(3, point_frequencies) + encoded_size(3, view_frequencies) + 3 + num_features

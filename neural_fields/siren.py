@@ -23,6 +23,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from ._checks import at_least, positive
 from .field import Jet, OneLevelField, SecondJet
 
 __all__ = ["Siren"]
@@ -73,16 +74,9 @@ class Siren(OneLevelField):
         feature_gain: float = 1.0,
     ) -> None:
         super().__init__(in_dim)
-        for name, number, least in (
-            ("width", width, 1),
-            ("depth", depth, 1),
-            ("in_dim", in_dim, 1),
-            ("num_features", num_features, 0),
-        ):
-            if number < least:
-                raise ValueError(f"{name}={number}: expected at least {least}")
-        if not omega > 0:
-            raise ValueError(f"omega={omega}: expected > 0")
+        at_least(1, width=width, depth=depth, in_dim=in_dim)
+        at_least(0, num_features=num_features)
+        positive(omega=omega)
         self.width, self.depth, self.omega, self.num_features = width, depth, float(omega), num_features
         sizes = [in_dim] + [width] * depth
         self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in itertools.pairwise(sizes))

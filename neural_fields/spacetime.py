@@ -13,6 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from ._checks import at_least
 from .field import Field, Jet, SecondJet
 from .multiscale import MultiscaleSDF, levels_of
 from .siren import Siren
@@ -54,7 +55,7 @@ def spacetime_jet(field: Field, x: Tensor, *, level: int = -1, order: int = 1) -
     Raises:
         ValueError: the field is not four-dimensional, a shape does not fit, or ``order`` is neither.
     """
-    _check_spacetime(field)
+    check_spacetime(field)
     if order not in (1, 2):
         raise ValueError(f"order={order}: expected 1 or 2")
     if order == 1:
@@ -94,7 +95,7 @@ class SpaceTimeSDF(Field):
 
     def __init__(self, sdf: MultiscaleSDF) -> None:
         super().__init__()
-        _check_spacetime(sdf)
+        check_spacetime(sdf)
         self.sdf = sdf
         self.in_dim, self.num_levels = 4, sdf.num_levels
 
@@ -159,8 +160,7 @@ class SpaceTimeSDF(Field):
         """
         if field.in_dim != 3:
             raise ValueError(f"field.in_dim={field.in_dim}: expected a static field, three-dimensional")
-        if extra_width < 0:
-            raise ValueError(f"extra_width={extra_width}: expected at least 0")
+        at_least(0, extra_width=extra_width)
         taper = field.taper if isinstance(field, MultiscaleSDF) else 0.0
         lifted: list[Field] = []
         for level in levels_of(field):
@@ -216,7 +216,7 @@ class TimeSlice(Field):
 
     def __init__(self, field: Field, t: Tensor | float) -> None:
         super().__init__()
-        _check_spacetime(field)
+        check_spacetime(field)
         if isinstance(t, Tensor) and t.ndim:
             raise ValueError(f"t has shape {tuple(t.shape)}; expected one number")
         self.field, self.t = field, t
@@ -258,7 +258,12 @@ class TimeSlice(Field):
         return at_time(self.check_points(x), self.t)
 
 
-def _check_spacetime(field: Field) -> None:
+def check_spacetime(field: Field) -> None:
+    """Refuse a field that is not four-dimensional.
+
+    Raises:
+        ValueError: it is not.
+    """
     if field.in_dim != 4:
         raise ValueError(f"field.in_dim={field.in_dim}: expected a field of space-time, four-dimensional")
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import nn
 
+from ._checks import positive
 from .losses import data_loss, eikonal_loss, normal_loss
 from .siren import Siren
 
@@ -31,8 +32,7 @@ def fit_sphere(
     Raises:
         ValueError: the radius is not positive.
     """
-    if not radius > 0:
-        raise ValueError(f"radius={radius}: expected > 0")
+    positive(radius=radius)
     place = network.output.weight
     adam = torch.optim.Adam(network.parameters(), lr=learning_rate, betas=(0.9, 0.99))
     for step in range(steps):

@@ -17,10 +17,22 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from ._checks import positive
 from ._march import Expected, Found, Near, Rays, Rule, march, march_budget
 from .field import Field
+from .volume import ball_chord
 
-__all__ = ["BOUNDING_RADIUS", "Expected", "Hits", "Near", "cone_ends", "cone_starts", "sphere_trace", "trace_expected"]
+__all__ = [
+    "BOUNDING_RADIUS",
+    "Expected",
+    "Hits",
+    "Near",
+    "ball_points",
+    "cone_ends",
+    "cone_starts",
+    "sphere_trace",
+    "trace_expected",
+]
 
 # Fields live in the unit sphere; their surfaces may pass it by a little.
 BOUNDING_RADIUS = 1.05
@@ -104,15 +116,31 @@ def sphere_trace(
         >>> bool(hits.mask), round(float(hits.depth), 4)
         (True, 1.5)
     """
+    if budget is None:
+        hits, _, _ = trace_expected(
+            field,
+            origins,
+            directions,
+            None,
+            level=level,
+            near=near,
+            far=far,
+            tolerance=tolerance,
+            resolution=resolution,
+            lipschitz=lipschitz,
+            radius=radius,
+            max_steps=max_steps,
+        )
+        return hits
     level = field.resolve_level(level)
     _check(field, origins, directions, tolerance=tolerance, resolution=resolution, lipschitz=lipschitz)
-    if budget is not None and len(budget) != level + 1:
+    if len(budget) != level + 1:
         raise ValueError(f"budget={list(budget)}: expected {level + 1} number(s) of steps, one for each level")
-    if budget is not None and bool((field.deltas[:level].isinf().cpu() & (torch.tensor(budget[:level]) > 0)).any()):
+    if bool((field.deltas[:level].isinf().cpu() & (torch.tensor(budget[:level]) > 0)).any()):
         raise ValueError(f"budget={list(budget)}: a level without a band leads to no other; give it 0 steps")
-    rule = Rule(field.deltas[:level].to(directions), tolerance, resolution, lipschitz)
-    ends = _Ends(near, far, radius)
-    return _trace(field, origins, directions, level, ends, rule, None, max_steps, budget, capture)[0]
+    rays, found = _begin(origins, directions, near, far, radius)
+    march_budget(field, rays, found, budget, tolerance, capture)
+    return _hits(found, origins, directions)
 
 
 @torch.no_grad()
@@ -165,58 +193,37 @@ def trace_expected(
     level = field.resolve_level(level)
     _check(field, origins, directions, tolerance=tolerance, resolution=resolution, lipschitz=lipschitz)
     rule = Rule(field.deltas[:level].to(directions), tolerance, resolution, lipschitz)
-    ends = _Ends(near, far, radius)
-    return _trace(field, origins, directions, level, ends, rule, expected, max_steps, None, 0.0, reach)
-
-
-class _Ends(NamedTuple):
-    """Where rays begin and end."""
-
-    near: Tensor | float
-    far: Tensor | float
-    radius: float | None
-
-
-def _trace(
-    field: Field,
-    origins: Tensor,
-    directions: Tensor,
-    level: int,
-    limits: _Ends,
-    rule: Rule,
-    expected: Expected | None,
-    max_steps: int,
-    budget: Sequence[int] | None,
-    capture: float,
-    reach: float | None = None,
-) -> tuple[Hits, Tensor, Near]:
-    """The hits, the slopes of the last steps, and where rays came near the surface; both modes."""
-    origins, directions = torch.broadcast_tensors(origins, directions)
-    shape = directions.shape[:-1]
-    starts, ends = (torch.as_tensor(x).to(directions).broadcast_to(shape).reshape(-1) for x in limits[:2])
-    origins, directions = origins.reshape(-1, 3), directions.reshape(-1, 3)
-    entries = torch.zeros_like(starts)
-    if limits.radius is not None:
-        entry, leave = _ball_crossing(origins, directions, limits.radius)
-        entries, ends = entry.clamp(min=0), torch.minimum(ends, leave)
-    rays = Rays.begin(origins, directions, entries, torch.maximum(starts, entries), ends)
-    found = Found(starts)
+    rays, found = _begin(origins, directions, near, far, radius)
+    shape = torch.broadcast_shapes(origins.shape, directions.shape)[:-1]
     if expected is not None:
         flat = Expected(*(part.to(directions).broadcast_to(shape).reshape(-1) for part in expected))
         rays = rays.expecting(flat, rule)
-    if budget is None:
-        march(field, level, rays, found, rule, max_steps, reach)
-    else:
-        march_budget(field, rays, found, budget, rule.tolerance, capture)
-    position = origins + found.depth[:, None] * directions
-    hits = Hits(
-        found.mask.reshape(shape),
-        found.depth.reshape(shape),
-        position.reshape(*shape, 3),
-        found.level.reshape(shape),
-        found.steps.reshape(shape),
-    )
-    return hits, found.slope.reshape(shape), Near(*(column.reshape(shape) for column in found.near))
+    march(field, level, rays, found, rule, max_steps, reach)
+    near_surface = Near(*(column.reshape(shape) for column in found.near))
+    return _hits(found, origins, directions), found.slope.reshape(shape), near_surface
+
+
+def _begin(
+    origins: Tensor, directions: Tensor, near: Tensor | float, far: Tensor | float, radius: float | None
+) -> tuple[Rays, Found]:
+    """Rays between ``near`` and ``far``, where they are in the ball of ``radius``; and room for what they find."""
+    origins, directions = torch.broadcast_tensors(origins, directions)
+    shape = directions.shape[:-1]
+    starts, ends = (torch.as_tensor(depth).to(directions).broadcast_to(shape).reshape(-1) for depth in (near, far))
+    origins, directions = origins.reshape(-1, 3), directions.reshape(-1, 3)
+    entries = torch.zeros_like(starts)
+    if radius is not None:
+        entry, leave = _ball_crossing(origins, directions, radius)
+        entries, ends = entry.clamp(min=0), torch.minimum(ends, leave)
+    return Rays.begin(origins, directions, entries, torch.maximum(starts, entries), ends), Found(starts)
+
+
+def _hits(found: Found, origins: Tensor, directions: Tensor) -> Hits:
+    """What was found, in the shape of the rays."""
+    shape = torch.broadcast_shapes(origins.shape, directions.shape)[:-1]
+    depth = found.depth.reshape(shape)
+    position = origins + depth[..., None] * directions
+    return Hits(found.mask.reshape(shape), depth, position, found.level.reshape(shape), found.steps.reshape(shape))
 
 
 @torch.no_grad()
@@ -401,22 +408,23 @@ def _check_image(field: Field, origin: Tensor, directions: Tensor, lipschitz: fl
     _check(field, origin, directions, lipschitz=lipschitz)
 
 
-def _check(field: Field, origins: Tensor, directions: Tensor, **positive: float) -> None:
+def _check(field: Field, origins: Tensor, directions: Tensor, **numbers: float) -> None:
     if field.in_dim != 3:
         raise ValueError(f"field.in_dim={field.in_dim}: rays are traced in three dimensions; take a TimeSlice")
     for name, rows in (("origins", origins), ("directions", directions)):
         if rows.ndim == 0 or rows.shape[-1] != 3:
             raise ValueError(f"{name} has shape {tuple(rows.shape)}; expected (..., 3)")
-    for name, number in positive.items():
-        if not number > 0:
-            raise ValueError(f"{name}={number}: expected > 0")
+    positive(**numbers)
 
 
 def _ball_crossing(origins: Tensor, directions: Tensor, radius: float | Tensor) -> tuple[Tensor, Tensor]:
     """Depths at which rays enter and leave the ball around 0; those that miss it enter after they leave."""
-    closest = -(origins * directions).sum(dim=-1)
-    # From the point of closest approach, and not from |o|² − (o·d)², which cancels for far cameras.
-    squared = radius**2 - (origins + closest[:, None] * directions).square().sum(dim=-1)
-    half = squared.clamp(min=0).sqrt()
-    missed = squared <= 0
-    return torch.where(missed, torch.inf, closest - half), torch.where(missed, -torch.inf, closest + half)
+    middle, half = ball_chord(origins, directions, radius)
+    missed = half == 0
+    return torch.where(missed, torch.inf, middle - half), torch.where(missed, -torch.inf, middle + half)
+
+
+def ball_points(count: int, *, radius: float, generator: torch.Generator) -> Tensor:
+    """Points ``(count, 3)`` uniform in the ball around 0."""
+    directions = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1)
+    return radius * torch.rand(count, 1, generator=generator) ** (1 / 3) * directions

@@ -18,6 +18,7 @@ from torch import Tensor
 from torch.nn.functional import softplus
 
 __all__ = [
+    "ball_chord",
     "composite",
     "importance_depths",
     "invert_outside",
@@ -109,6 +110,20 @@ def ray_points(origins: Tensor, directions: Tensor, depths: Tensor) -> Tensor:
     return origins[:, None] + depths[..., None] * directions[:, None]
 
 
+def ball_chord(origins: Tensor, directions: Tensor, radius: Tensor | float) -> tuple[Tensor, Tensor]:
+    """Depth at which lines are nearest to 0, and half the length of their way through a ball around it, 0 if they miss.
+
+    Args:
+        origins: ``(R, 3)``.
+        directions: ``(R, 3)`` unit vectors.
+        radius: of the ball, one or ``(R,)``.
+    """
+    middle = -(origins * directions).sum(dim=-1)
+    # From the nearest point, and not from |o|² − middle², which cancels for far cameras.
+    squared = radius**2 - (origins + middle[:, None] * directions).square().sum(dim=-1)
+    return middle, squared.clamp(min=0).sqrt()
+
+
 def sphere_span(origins: Tensor, directions: Tensor, *, radius: float = 1.0) -> tuple[Tensor, Tensor]:
     """Where rays enter and leave a sphere around the origin: depths ``(R,)`` and ``(R,)``.
 
@@ -120,10 +135,7 @@ def sphere_span(origins: Tensor, directions: Tensor, *, radius: float = 1.0) -> 
         directions: ``(R, 3)`` unit vectors.
         radius: of the sphere.
     """
-    middle = -(origins * directions).sum(dim=-1)
-    # The point nearest to the centre is taken first: |o|² − middle² would cancel for far cameras.
-    nearest = origins + middle[:, None] * directions
-    half = (radius**2 - nearest.square().sum(dim=-1)).clamp(min=0).sqrt()
+    middle, half = ball_chord(origins, directions, radius)
     far = (middle + half).clamp(min=0)
     return (middle - half).clamp(min=0).minimum(far), far
 

@@ -14,6 +14,7 @@ from typing import NamedTuple, Protocol
 import torch
 from torch import Tensor
 
+from ._checks import at_least, positive
 from .field import Field, Jet
 from .volume import (
     composite,
@@ -66,11 +67,10 @@ class Sampling:
     outside: int = 32
 
     def __post_init__(self) -> None:
-        for name, least in (("uniform", 2), ("importance", 0), ("rounds", 1), ("outside", 1)):
-            if getattr(self, name) < least:
-                raise ValueError(f"{name}={getattr(self, name)}: expected at least {least}")
-        if not self.sharpness > 0:
-            raise ValueError(f"sharpness={self.sharpness}: expected > 0")
+        at_least(2, uniform=self.uniform)
+        at_least(1, rounds=self.rounds, outside=self.outside)
+        at_least(0, importance=self.importance)
+        positive(sharpness=self.sharpness)
 
 
 class Rendered(NamedTuple):

@@ -21,6 +21,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from .._checks import at_least, positive
 from ..field import Field, Jet
 
 __all__ = ["BaconSDF"]
@@ -67,14 +68,12 @@ class BaconSDF(Field):
     ) -> None:
         super().__init__()
         bands, outputs = tuple(bands), tuple(outputs)
-        if width < 1:
-            raise ValueError(f"width={width}: expected at least 1")
+        at_least(1, width=width)
         if len(bands) < 2 or min(bands) < 1:
             raise ValueError(f"bands={bands}: expected at least two whole numbers ≥ 1")
         if not outputs or any(a >= b for a, b in itertools.pairwise((0, *outputs, len(bands)))):
             raise ValueError(f"outputs={outputs}: expected rising numbers from 1 to {len(bands) - 1}")
-        if not period > 0:
-            raise ValueError(f"period={period}: expected > 0")
+        positive(period=period)
         self.in_dim, self.num_levels = 3, len(outputs)
         self.width, self.bands, self.outputs, self.period = width, bands, outputs, float(period)
         self.register_buffer("deltas", torch.full((len(outputs) - 1,), math.inf), persistent=False)

@@ -12,6 +12,7 @@ from collections.abc import Iterator, Sequence
 import torch
 from torch import Tensor, nn
 
+from .._checks import at_least, positive
 from ..field import Field, Jet, OneLevelField
 from ._trilinear import Place, interpolate, interpolate_jet, locate, vertices
 
@@ -42,10 +43,8 @@ class BandLimited(OneLevelField):
         super().__init__()
         if field.in_dim != 3:
             raise ValueError(f"field.in_dim={field.in_dim}: expected 3")
-        if resolution < 1:
-            raise ValueError(f"resolution={resolution}: expected at least 1")
-        if not extent > 0:
-            raise ValueError(f"extent={extent}: expected > 0")
+        at_least(1, resolution=resolution)
+        positive(extent=extent)
         self.field, self.resolution, self.extent = field, resolution, float(extent)
 
     def value(self, x: Tensor, *, level: int = -1) -> Tensor:

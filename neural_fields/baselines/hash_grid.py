@@ -13,6 +13,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
+from .._checks import at_least, positive
 from ..field import Jet, OneLevelField
 from ._trilinear import Place, interpolate, interpolate_jet, locate, vertices
 
@@ -80,15 +81,12 @@ class HashGridSDF(OneLevelField):
         radius: float | None = None,
     ) -> None:
         super().__init__()
-        for name, number in (("levels", levels), ("features", features), ("width", width), ("depth", depth)):
-            if number < 1:
-                raise ValueError(f"{name}={number}: expected at least 1")
+        at_least(1, levels=levels, features=features, width=width, depth=depth)
         if table_size < 1 or table_size & (table_size - 1):
             raise ValueError(f"table_size={table_size}: expected a power of two")
         if not 1 <= coarsest <= finest:
             raise ValueError(f"coarsest={coarsest}, finest={finest}: expected 1 ≤ coarsest ≤ finest")
-        if not extent > 0:
-            raise ValueError(f"extent={extent}: expected > 0")
+        positive(extent=extent)
         self.table_size, self.extent, self.radius = table_size, float(extent), radius
         self.resolutions = grid_resolutions(levels, coarsest, finest)
         sizes = [min((resolution + 1) ** 3, table_size) for resolution in self.resolutions]

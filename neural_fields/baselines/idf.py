@@ -17,6 +17,7 @@ import math
 import torch
 from torch import Tensor
 
+from .._checks import positive
 from ..field import Field, Jet
 from ..siren import Siren
 
@@ -57,9 +58,7 @@ class IdfSDF(Field):
         reach: float = 0.05,
     ) -> None:
         super().__init__()
-        for name, number in (("limit", limit), ("reach", reach)):
-            if not number > 0:
-                raise ValueError(f"{name}={number}: expected > 0")
+        positive(limit=limit, reach=reach)
         self.in_dim, self.num_levels = 3, 2
         self.limit, self.reach = float(limit), float(reach)
         self.register_buffer("deltas", torch.tensor([math.inf]), persistent=False)

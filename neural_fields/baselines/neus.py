@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils import parametrizations
 
+from .._checks import at_least
 from ..field import Jet, OneLevelField
 from ..radiance import encode, encoded_size
 
@@ -52,14 +53,9 @@ class NeusSDF(OneLevelField):
     ) -> None:
         super().__init__()
         inputs = encoded_size(3, frequencies)
-        for name, number, least in (
-            ("width", width, inputs + 1),
-            ("depth", depth, 2),
-            ("frequencies", frequencies, 0),
-            ("num_features", num_features, 0),
-        ):
-            if number < least:
-                raise ValueError(f"{name}={number}: expected at least {least}")
+        at_least(inputs + 1, width=width)
+        at_least(2, depth=depth)
+        at_least(0, frequencies=frequencies, num_features=num_features)
         self.width, self.depth, self.frequencies, self.radius = width, depth, frequencies, radius
         self.num_features = num_features
         self.joined = depth // 2
