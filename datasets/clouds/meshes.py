@@ -18,7 +18,7 @@ from ...neural_fields import InputError
 from .point_cloud import PointCloud, colors_from, unit_rows
 from .tables import numbers
 
-__all__ = ["ObjText", "read_obj", "read_off", "read_stl", "triangulate", "vertex_normals", "weld"]
+__all__ = ["ObjText", "read_obj", "read_off", "read_stl", "spread_on_faces", "triangulate", "vertex_normals", "weld"]
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
@@ -81,6 +81,26 @@ def weld(vertices: Float64) -> tuple[Int64, Int64]:
     index = np.empty(len(vertices), np.int64)
     index[order] = np.cumsum(first) - 1
     return order[first], index
+
+
+def spread_on_faces(areas: Float64, count: int, rng: np.random.Generator) -> tuple[Int64, Float64]:
+    """Places uniform by area: their faces ``(N,)``, in increasing order, and weights ``(N, 3)`` of the faces' corners.
+
+    Args:
+        areas: ``(F,)`` of the faces, or numbers in proportion to them.
+        count: N.
+        rng: draws them.
+
+    Raises:
+        ValueError: there is no area.
+    """
+    total = np.cumsum(areas)
+    if not total[-1] > 0:
+        raise ValueError("surface: all of its faces have zero area")
+    face = np.searchsorted(total, rng.uniform(0, total[-1], count), side="right").clip(max=len(total) - 1)
+    face = np.sort(face)  # neighbours in memory are then neighbours in space, which k-d trees like
+    root, second = np.sqrt(rng.uniform(size=count)), rng.uniform(size=count)
+    return face, np.stack((1 - root, root * (1 - second), root * second), axis=1)
 
 
 def triangulate(lengths: Int64, corners: Int64) -> Int64:

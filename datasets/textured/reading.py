@@ -10,7 +10,7 @@ from types import MappingProxyType
 import numpy as np
 
 from ...neural_fields import InputError
-from ..clouds.meshes import weld
+from ..clouds.meshes import spread_on_faces, weld
 from ..clouds.ply import read_ply_mesh
 from ..clouds.point_cloud import PointCloud
 from ..files import readable
@@ -62,17 +62,12 @@ def sample_textured(mesh: TexturedMesh, count: int, *, seed: int) -> PointCloud:
     """
     if not mesh.has_colors:
         raise InputError(f"{mesh.source}: neither a texture nor vertex colours in it; export it with its colours")
-    rng = np.random.default_rng(seed)
     corners = mesh.vertices[mesh.faces]  # (F, 3, 3)
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     doubled = np.linalg.norm(cross, axis=1)  # twice the area
-    total = np.cumsum(doubled)
-    if not total[-1] > 0:
+    if not doubled.sum() > 0:
         raise InputError(f"{mesh.source}: all of its faces have zero area; export it again")
-    face = np.searchsorted(total, rng.uniform(0, total[-1], count), side="right").clip(max=len(total) - 1)
-    face = np.sort(face)  # neighbours in memory are then neighbours in space, which k-d trees like
-    root, second = np.sqrt(rng.uniform(size=count)), rng.uniform(size=count)
-    weights = np.stack((1 - root, root * (1 - second), root * second), axis=1)  # (N, 3)
+    face, weights = spread_on_faces(doubled, count, np.random.default_rng(seed))
     points = np.einsum("nk,nkc->nc", weights, corners[face])
     normals = (cross[face] / doubled[face, None]).astype(np.float32)
     return PointCloud(points, normals, colors_at(mesh, face, weights), mesh.source, "mesh")

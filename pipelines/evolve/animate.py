@@ -12,14 +12,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ...datasets import srgb_to_linear
 from ...datasets.cameras import Camera
 from ...neural_fields import Field, InputError, Similarity, load_field
 from ...neural_fields.dynamic_tracing import DynamicTracer, moment
-from ...neural_fields.files import whole_file
 from ...neural_fields.meshing import NoSurfaceError, extract_mesh
 from ...neural_fields.tracing import BOUNDING_RADIUS
-from ..mesh.files import Motion, glb_origin, write_glb, write_mesh
+from ..mesh.files import write_mesh, write_moving
 from ..render.film import ANIMATIONS, write_animation
 from ..render.picture import Image, contact_sheet, in_rows, write_picture
 from ..render.shade import ShadeOptions, compose, downsample, shade
@@ -254,22 +252,18 @@ def _write_moving_mesh(
     tracked = follow_mesh(
         field, options.times, resolution=options.resolution, level=level, name=str(file), progress=progress
     )
-    origin = glb_origin(similarity)
-    places = [(similarity.to_input(vertices) - origin).astype("<f4") for vertices in tracked.vertices]
-    attributes = {"POSITION": places[0], "NORMAL": tracked.normals[0].astype("<f4")}
-    targets = [
-        {"POSITION": place - places[0], "NORMAL": (normals - tracked.normals[0]).astype("<f4")}
-        for place, normals in zip(places[1:], tracked.normals[1:], strict=True)
-    ]
+    colors = None
     if riding is not None:
         points = torch.from_numpy(tracked.vertices[0]).to(field.like)
         colors = riding.at(0.0)(points).cpu().numpy()
-        opaque = np.full((len(colors), 4), 65535, "<u2")  # linear by the standard; 8 bits would merge dark shades
-        opaque[:, :3] = np.rint(srgb_to_linear(np.clip(colors, 0, 1)) * 65535)
-        attributes["COLOR_0"] = opaque
-    motion = Motion(np.arange(options.frames) / options.fps, targets)
-    material = {"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.8}}
-    with whole_file(out) as partial:
-        write_glb(partial, tracked.faces, attributes, material=material, origin=origin, motion=motion)
+    write_moving(
+        out,
+        tracked.faces,
+        list(tracked.vertices),
+        list(tracked.normals),
+        seconds=np.arange(options.frames) / options.fps,
+        similarity=similarity,
+        colors=colors,
+    )
     size = math.ceil(out.stat().st_size / 1e6)
-    return f"{len(places[0]):,} vertices in {options.frames} frames, {size} MB"
+    return f"{tracked.vertices.shape[1]:,} vertices in {options.frames} frames, {size} MB"

@@ -1,6 +1,4 @@
-"""Texture coordinates for a mesh that has none: decimation, and an atlas of charts made by xatlas.
-
-Tangent frames of textured meshes: the axes in which normal maps are written.
+"""Texture coordinates for a mesh that has none, made by xatlas, and the axes in which its normal map is written.
 
 The tangent of a vertex is what MikkTSpace makes it (M. Mikkelsen, "Simulation of Wrinkled Surfaces Revisited", 2008,
 Sec. 3.3; Blender and glTF ask for it): the direction of growing u on each face around the vertex, laid into the plane

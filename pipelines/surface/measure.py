@@ -1,12 +1,9 @@
 """How far a mesh is from a reference: the figures of the paper's tables, and a true volumetric IoU.
 
-Protocol (paper, Sec. 5; DESIGN Sec. 4): both shapes are moved by the similarity that puts the REFERENCE
-into the unit sphere; distances are between area-weighted uniform samples of the two surfaces.
-
-Volumes of closed meshes, and of their intersection and union, by columns.
-
-A column is a line along one axis. Sorted along it, the crossings of an oriented closed surface give the
-winding number between them, so lengths inside are exact; only the choice of columns is a discretisation.
+Both shapes are moved by the similarity that puts the REFERENCE into the unit sphere (paper, Sec. 5); distances are
+between area-weighted uniform samples of the two surfaces. Volumes are summed over columns, lines along one axis: sorted
+along one, the crossings of an oriented closed surface give the winding number between them, so that lengths inside are
+exact, and only the choice of columns is a discretisation.
 """
 
 from __future__ import annotations
@@ -37,6 +34,10 @@ __all__ = [
 ]
 
 Float64 = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+
+# Where a column stands in its cell. Not the middle: models like to have their edges there.
+OFFSET = (0.5 + 0.0372036, 0.5 - 0.0618034)
 
 
 @dataclass(frozen=True)
@@ -240,12 +241,6 @@ def format_metrics(metrics: Metrics) -> str:
 def write_metrics(path: str | Path, metrics: Metrics) -> None:
     """Write the figures as JSON, through a temporary file beside the target."""
     write_json(path, dataclasses.asdict(metrics))
-
-
-Int64 = NDArray[np.int64]
-
-# Where a column stands in its cell. Not the middle: models like to have their edges there.
-OFFSET = (0.5 + 0.0372036, 0.5 - 0.0618034)
 
 
 class Overlap(NamedTuple):

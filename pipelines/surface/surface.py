@@ -14,6 +14,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from ...datasets import PointCloud, read_cloud
+from ...datasets.clouds.meshes import spread_on_faces
 from ...datasets.clouds.point_cloud import unit_rows
 from ...datasets.textured.gltf import read_gltf
 from ...neural_fields import InputError, Similarity
@@ -22,6 +23,7 @@ from ...neural_fields.meshing import Mesh
 __all__ = [
     "MESH_SUFFIXES",
     "Surface",
+    "component_of_faces",
     "components",
     "face_normals",
     "from_cloud",
@@ -40,7 +42,10 @@ MESH_SUFFIXES = (".ply", ".obj", ".stl", ".off", ".glb", ".gltf")
 
 @dataclass(frozen=True)
 class Surface:
-    """A triangle mesh, or with no faces a cloud of points.
+    """A triangle mesh, or with no faces a cloud of points: what is read from files, measured and drawn.
+
+    A `Mesh` is what was extracted from a field: in its coordinates, and in the number types of files. A `TexturedMesh`
+    was read with images, an `Unwrapped` mesh has texture coordinates and waits for them to be baked.
 
     Attributes:
         vertices: ``(V, 3)``.
@@ -170,9 +175,9 @@ def from_mesh(mesh: Mesh) -> Surface:
     return Surface(mesh.vertices, mesh.faces.astype(np.int64), normals, colors)
 
 
-def face_normals(surface: Surface) -> tuple[Float64, Float64]:
+def face_normals(mesh: Surface | Mesh) -> tuple[Float64, Float64]:
     """Unit normals ``(F, 3)`` (zero for a face without area) and areas ``(F,)``."""
-    a, b, c = (surface.vertices[surface.faces[:, k]] for k in range(3))
+    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
     cross = np.cross(b - a, c - a)
     length = np.linalg.norm(cross, axis=1)
     return np.divide(cross, length[:, None], out=np.zeros_like(cross), where=length[:, None] > 0), length / 2
@@ -192,27 +197,22 @@ def sample_points(surface: Surface, count: int, rng: np.random.Generator) -> tup
             chosen = rng.permutation(len(surface.vertices))[:count]
         return surface.vertices[chosen], None if surface.normals is None else surface.normals[chosen]
     normals, areas = face_normals(surface)
-    total = np.cumsum(areas)
-    if not total[-1] > 0:
-        raise ValueError("surface: all of its faces have zero area")
-    face = np.searchsorted(total, rng.uniform(0, total[-1], count), side="right").clip(max=len(total) - 1)
-    face = np.sort(face)  # neighbours in memory are then neighbours in space, which k-d trees like
-    root, second = np.sqrt(rng.uniform(size=count)), rng.uniform(size=count)
-    weights = np.stack((1 - root, root * (1 - second), root * second), axis=1)  # (N, 3)
+    face, weights = spread_on_faces(areas, count, rng)
     points = sum(weights[:, k, None] * surface.vertices[surface.faces[face, k]] for k in range(3))
     return np.asarray(points), normals[face]
 
 
 def components(surface: Surface) -> int:
     """Connected components of the faces, through shared vertices, equal vertices merged."""
-    whole = surface.merged
-    if not len(whole.faces):
-        return 0
-    a, b = whole.faces[:, [0, 1]].reshape(-1), whole.faces[:, [1, 2]].reshape(-1)
-    size = len(whole.vertices)
+    return len(np.unique(component_of_faces(surface.merged)))
+
+
+def component_of_faces(mesh: Surface | Mesh) -> NDArray[np.int32]:
+    """The number ``(F,)`` of the connected component of each face, through vertices that faces share."""
+    a, b = mesh.faces[:, [0, 1]].ravel(), mesh.faces[:, [1, 2]].ravel()
+    size = len(mesh.vertices)
     graph = coo_array((np.ones(len(a), np.int8), (a, b)), shape=(size, size)).tocsr()
-    labels = connected_components(graph, directed=False)[1]
-    return len(np.unique(labels[whole.faces[:, 0]]))
+    return connected_components(graph, directed=False)[1][mesh.faces[:, 0]]
 
 
 def is_closed(surface: Surface) -> bool:

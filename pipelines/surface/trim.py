@@ -1,6 +1,7 @@
 """Parts of a mesh: the largest component, what lies near or rests on the input points, the region of interest.
 
-The points that a fit rests on, kept in its run: what meshing needs to tell a part from a blob, without the cloud.
+The points that a fit rests on are kept in its run, thinned: with them meshing tells a part from a blob, without the
+cloud.
 """
 
 from __future__ import annotations
@@ -12,8 +13,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from ...datasets import spacing_of
@@ -21,13 +20,13 @@ from ...datasets.clouds.point_cloud import voxel_representatives
 from ...neural_fields import InputError
 from ...neural_fields.meshing import Mesh
 from ..run.folder import FIELD_FILE, load_state, save_state
+from .surface import component_of_faces, face_normals
 
 __all__ = [
     "SUPPORT_FILE",
     "Support",
     "Supported",
     "drop_unsupported",
-    "face_areas",
     "in_region",
     "keep_faces",
     "keep_largest",
@@ -38,18 +37,16 @@ __all__ = [
     "write_support",
 ]
 
+SUPPORT_FILE = "support.safetensors"
+# Voxels of this size, in the unit sphere, keep one point each: some 60,000 of a surface of area 4, in half precision
+# (off by 0.0003 at most) 400 KB.
+VOXEL = 1 / 128
 # Least share of a component's area near some point. A part that was measured has nearly all of it there, an open scan
 # that the fit closed behind still a third or so; a blob has none, or what a stray point or a neighbouring part touches.
 LEAST_SUPPORT = 0.05
 # And fewest points that it must be the nearest component to, if it is as large as twice their share of the surface:
 # around one or two strays a fit may close a bubble as small as their spacing.
 FEWEST_POINTS = 3
-
-
-def face_areas(mesh: Mesh) -> NDArray[np.float64]:
-    """Areas ``(F,)``."""
-    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
-    return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
 
 
 def keep_faces(mesh: Mesh, kept: NDArray[np.bool_]) -> Mesh:
@@ -69,8 +66,8 @@ def keep_faces(mesh: Mesh, kept: NDArray[np.bool_]) -> Mesh:
 
 def keep_largest(mesh: Mesh) -> Mesh:
     """Keep the connected component (through shared vertices) with the largest area."""
-    component = _component_of_faces(mesh)
-    return keep_faces(mesh, component == np.bincount(component, weights=face_areas(mesh)).argmax())
+    component = component_of_faces(mesh)
+    return keep_faces(mesh, component == np.bincount(component, weights=face_normals(mesh)[1]).argmax())
 
 
 class Supported(NamedTuple):
@@ -110,11 +107,11 @@ def drop_unsupported(
     reach = support_radius(points) if radius is None else radius
     if not reach > 0:
         raise ValueError(f"radius={reach}: expected > 0")
-    component = _component_of_faces(mesh)
+    component = component_of_faces(mesh)
     number = np.unique(component, return_inverse=True)[1]
     nearest = KDTree(points).query(mesh.vertices, distance_upper_bound=reach, workers=-1)[0]
     share = np.isfinite(nearest)[mesh.faces].mean(axis=1)
-    areas = face_areas(mesh)
+    areas = face_normals(mesh)[1]
     whole = np.bincount(number, weights=areas)
     kept = np.bincount(number, weights=areas * share) >= least * whole
     kept &= np.bincount(number, weights=share) > 0  # nothing of no area either
@@ -146,7 +143,7 @@ def without_voids(mesh: Mesh) -> Mesh:
 
     What photographs do not show, training leaves to chance; a void that is really there is lost as well.
     """
-    component = _component_of_faces(mesh)
+    component = component_of_faces(mesh)
     a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
     volume = np.bincount(component, weights=(np.cross(a, b) * c).sum(axis=1))
     starts, ends = mesh.faces.ravel().astype(np.int64), np.roll(mesh.faces, -1, axis=1).ravel().astype(np.int64)
@@ -155,14 +152,6 @@ def without_voids(mesh: Mesh) -> Mesh:
     is_open = np.zeros(len(volume), bool)
     is_open[np.repeat(component, 3)[uses[edge] == 1]] = True
     return keep_faces(mesh, (is_open | (volume >= 0))[component])
-
-
-def _component_of_faces(mesh: Mesh) -> NDArray[np.int32]:
-    """The number ``(F,)`` of the connected component, through shared vertices, of each face."""
-    a, b = mesh.faces[:, [0, 1]].ravel(), mesh.faces[:, [1, 2]].ravel()
-    size = len(mesh.vertices)
-    graph = coo_array((np.ones(len(a), np.int8), (a, b)), shape=(size, size)).tocsr()
-    return connected_components(graph, directed=False)[1][mesh.faces[:, 0]]
 
 
 def in_region(mesh: Mesh) -> Mesh | None:
@@ -194,12 +183,6 @@ def trim_distance(mesh: Mesh, points: NDArray[np.floating], distance: float) -> 
             f"--trim-distance: none of {len(mesh.faces)} faces is within {distance:.4g} of the points; raise it"
         )
     return keep_faces(mesh, kept)
-
-
-SUPPORT_FILE = "support.safetensors"
-# Voxels of this size, in the unit sphere, keep one point each: some 60,000 of a surface of area 4, in half precision
-# (off by 0.0003 at most) 400 KB.
-VOXEL = 1 / 128
 
 
 class Support(NamedTuple):

@@ -32,6 +32,8 @@ WHITE = (1.0, 1.0, 1.0)
 # at least, because rows of empty pixels say nothing about those that follow.
 ATTENTION = 0.25
 BLOCK, SMALLEST_BLOCK, LARGEST_BLOCK = 1 << 13, 1 << 12, 1 << 15
+# Moments are small, but each has the meshes that were made of it.
+KEPT = 16
 # Shadings that map numbers to colours, whose limits depend on all pixels together.
 MEASURED = ("depth", "curvature", "error")
 
@@ -149,10 +151,6 @@ def _pieces(seen: Seen, next_block: Callable[[], int]) -> Iterator[Seen]:
         part = slice(first, first + next_block())
         yield seen.part(part)
         first = part.stop
-
-
-# Moments are small, but each has the meshes that were made of it.
-KEPT = 16
 
 
 class Moments:
