@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ...datasets import Camera, turntable
-from ...neural_fields import Field, InputError, MultiscaleSDF, load_field
+from ...neural_fields import Field, InputError, levels_of, load_field
 from ...neural_fields.meshing import NoSurfaceError, extract_mesh, map_normals
 from ..render.compare import ImageError, draw, image_error, psnr
 from ..render.picture import check_picture_path, contact_sheet, write_picture
@@ -234,8 +234,7 @@ def _image(seen: Seen, camera: Camera, shading: str) -> Any:
 
 def _parameters(field: Field, levels: int) -> int:
     """Of the first ``levels`` levels."""
-    parts = [field.base, *field.residuals] if isinstance(field, MultiscaleSDF) else [field]
-    return sum(parameter.numel() for part in parts[:levels] for parameter in part.parameters())
+    return sum(parameter.numel() for part in levels_of(field)[:levels] for parameter in part.parameters())
 
 
 def _degrees(pairs: Sequence[tuple[Seen, Seen]]) -> float:

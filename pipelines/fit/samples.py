@@ -356,10 +356,13 @@ def band_samples(cloud: CloudDistance, delta: float, count: int, *, generator: t
 def with_previous(samples: Samples, field: Field, delta: float, *, device: torch.device) -> Samples:
     """Add the frozen levels' value and gradient, and reject the samples outside ``|f| < delta`` or a coarser band."""
     points = samples.points.to(device)
-    level = field.num_levels - 1
     jets = [field.jet(part) for part in points.split(1 << 16)]
     jet = Jet(*(torch.cat(parts) for parts in zip(*jets, strict=True)))
-    kept = (jet.value.abs() < delta) & (field.in_band(points, level=level) if level else True)
+    size = jet.value.abs()
+    kept = size < delta
+    if field.num_levels > 1:  # outside a band the value is that of its level, so a smaller one is inside all of them
+        unsure = (kept & (size >= field.deltas.min())).nonzero()[:, 0]
+        kept[unsure] = field.in_band(points[unsure], level=field.num_levels - 1)
     moved = samples.to(device)
     full = Samples(points, moved.distance, moved.normal, jet.value, jet.gradient)
     return full.take(kept.nonzero()[:, 0])

@@ -153,8 +153,8 @@ def test_band_samples_are_rejected_outside_the_band(cloud: CloudDistance) -> Non
 def test_previous_levels_reject_by_every_band() -> None:
     field = MultiscaleSDF(Sphere(radius=RADIUS), [Siren(8, 1)], [0.05])
     with torch.no_grad():
-        field.residuals[0].output.weight.zero_()  # type: ignore[union-attr]
-        field.residuals[0].output.bias.zero_()  # type: ignore[union-attr]
+        for parameter in field.levels[1].parameters():
+            parameter.zero_()
     x = 2 * torch.rand(5000, 3, generator=generator()) - 1
     kept = with_previous(Samples(x), field, 0.2, device=CPU)  # the second band is wider than the first
     assert len(kept) == int(((x.norm(dim=1) - RADIUS).abs() < 0.05).sum())

@@ -156,9 +156,8 @@ def small(levels: int = 3) -> MultiscaleSDF:
 def test_without_bands_is_the_sum_of_all_levels_everywhere() -> None:
     field, x = small(), 2 * torch.rand(500, 3) - 1
     everywhere = without_bands(field)
-    levels = [field.base, *field.residuals]
-    torch.testing.assert_close(everywhere.value(x), torch.stack([level.value(x) for level in levels]).sum(dim=0))  # type: ignore[operator]
-    gradients = torch.stack([level.jet(x).gradient for level in levels]).sum(dim=0)  # type: ignore[operator]
+    torch.testing.assert_close(everywhere.value(x), torch.stack([level.value(x) for level in field.levels]).sum(dim=0))
+    gradients = torch.stack([level.jet(x).gradient for level in field.levels]).sum(dim=0)
     torch.testing.assert_close(everywhere.jet(x).gradient, gradients)
     assert not torch.allclose(everywhere.value(x), field.value(x))
     assert everywhere.in_band(x, level=2).all()
