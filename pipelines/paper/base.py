@@ -1,6 +1,6 @@
-"""The finished fit that the variants of a table start from: a cell of our own method, shared with every other table.
+"""The finished fit that the variants of a table start from, and single levels trained anew from the fit's own pieces.
 
-Single levels trained out of the usual order: what the ablations need of a fit, from the same pieces as the fit.
+The fit is a cell of our own method, shared with every other table.
 """
 
 from __future__ import annotations

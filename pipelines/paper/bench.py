@@ -1,7 +1,4 @@
-"""``mplicits bench paper``: the cells that the tables need, then the tables, plots, sheets and the page of results.
-
-Which shapes a bench is about: files, and folders full of them, checked before any work.
-"""
+"""``mplicits bench paper``: the clouds it is about, the cells that its tables need, and the page of results."""
 
 from __future__ import annotations
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..bench.cells import Record
 from ..bench.plots import Plot, Series
-from ..bench.tables import Column, Row, Table, Value, mean, median, ratio
+from ..bench.tables import Column, Figure, Row, Table, Value, mean, median, ratio, tabulated
 from .cells import PaperCell, TableSpec, by_shape, figure, of_output, outputs_of, printed_name, select, shapes_of
 from .names import METHODS
 from .published import BANF, COMPARISON, NOISE, POISSON
@@ -25,7 +26,6 @@ VARIANTS = ("poisson-trim", "poisson-smoothed")  # of a peer, in its own table o
 POISSONS = ("Screened Poisson (1% trim)", "Screened Poisson", "Screened Poisson (our smoothing)")
 FRAME = 512 * 512  # pixels of the paper's frames
 
-CHAMFER = Column("Chamfer", ".2e", "lowest")
 FOUND = "A row's means are over the shapes on which the method found a surface; `found` counts them."
 SHELL = (
     "`shell IoU` is the overlap of the surface voxels of size 0.01, which is what the paper's code measures; "
@@ -81,24 +81,25 @@ def _source(records: Sequence[Record], output: str) -> tuple[str, str]:
     return "", ""
 
 
-def _quality(records: Sequence[Record], output: str) -> tuple[Value, ...]:
+def _quality(records: Sequence[Record]) -> list[Figure[str]]:
     """Means and medians of an output over the shapes."""
-    chamfer, shell, volume = (of_output(records, output, name) for name in ("chamfer", "shell_iou", "iou"))
-    found = sum(value is not None for value in chamfer)
-    values = (mean(chamfer), median(chamfer), mean(shell), median(shell), mean(volume))
-    parts = mean(of_output(records, output, "components"))
-    return (*values, parts, f"{found}/{len(chamfer)}")
 
+    def of(figure: str, average: Callable[[Iterable[float | None]], float | None]) -> Callable[[str], float | None]:
+        return lambda output: average(of_output(records, output, figure))
 
-QUALITY = (
-    Column("mean CD", ".2e", "lowest"),
-    Column("median CD", ".2e", "lowest"),
-    Column("mean shell IoU", ".3f", "highest"),
-    Column("median shell IoU", ".3f", "highest"),
-    Column("mean IoU", ".3f", "highest"),
-    Column("mean parts", ".1f"),
-    Column("found"),
-)
+    def found(output: str) -> str:
+        values = of_output(records, output, "chamfer")
+        return f"{sum(value is not None for value in values)}/{len(values)}"
+
+    return [
+        (Column("mean CD", ".2e", "lowest"), of("chamfer", mean)),
+        (Column("median CD", ".2e", "lowest"), of("chamfer", median)),
+        (Column("mean shell IoU", ".3f", "highest"), of("shell_iou", mean)),
+        (Column("median shell IoU", ".3f", "highest"), of("shell_iou", median)),
+        (Column("mean IoU", ".3f", "highest"), of("iou", mean)),
+        (Column("mean parts", ".1f"), of("components", mean)),
+        (Column("found"), found),
+    ]
 
 
 def _floor_row(records: Sequence[Record], columns: int) -> Row:
@@ -137,30 +138,21 @@ def _reading(records: Sequence[Record]) -> list[str]:
 
 def comparison_tables(records: Sequence[Record]) -> tuple[Table, ...]:
     """The paper's Tab. 2, and the figures of every shape behind it."""
-    columns = (
-        *QUALITY,
-        Column("parameters", ",d", "lowest"),
-        Column("training (min)", ".2f", "lowest"),
-        Column("meshing (s)", ".2f", "lowest"),
-        Column("FPS at 512²", ".2f", "highest"),
-    )
-    rows = []
-    for name in outputs_of(records):
-        rays = mean(of_output(records, name, "rays_per_second"))
-        minutes = mean(of_output(records, name, "train_seconds"))
-        values = (
-            *_quality(records, name),
-            _most(of_output(records, name, "parameters")),
-            None if minutes is None else minutes / 60,
-            mean(of_output(records, name, "mesh_seconds")),
-            None if rays is None else rays / FRAME,
-        )
-        printed = COMPARISON.get(name)
-        published = None
-        if printed is not None:
-            published = (*printed[:4], None, None, None, *printed[4:])
-        rows.append(Row(name, values, published, *_source(records, name)))
-    rows.append(_floor_row(records, len(columns)))
+
+    def average(name: str, per: float = 1) -> Callable[[str], float | None]:
+        return lambda output: ratio(mean(of_output(records, output, name)), per)
+
+    def published(output: str) -> tuple[Value, ...] | None:
+        printed = COMPARISON.get(output)
+        return None if printed is None else (*printed[:4], None, None, None, *printed[4:])
+
+    figures: list[Figure[str]] = [
+        *_quality(records),
+        (Column("parameters", ",d", "lowest"), lambda output: _most(of_output(records, output, "parameters"))),
+        (Column("training (min)", ".2f", "lowest"), average("train_seconds", per=60)),
+        (Column("meshing (s)", ".2f", "lowest"), average("mesh_seconds")),
+        (Column("FPS at 512²", ".2f", "highest"), average("rays_per_second", per=FRAME)),
+    ]
     notes = (
         *_reading(records),
         FOUND,
@@ -168,19 +160,13 @@ def comparison_tables(records: Sequence[Record]) -> tuple[Table, ...]:
         "FPS: sphere tracing with 20 steps on the first level and 5 on each finer one, no normals, measured at a "
         "smaller size and scaled by the number of pixels. The paper's seconds and FPS are of an RTX 5090.",
     )
-    table = Table("comparison", "Surface reconstruction of clean clouds", "method", columns, tuple(rows), notes)
-    return (table, *_per_shape("comparison", records))
+    title = "Surface reconstruction of clean clouds"
+    return (_of_outputs("comparison", title, records, figures, published, notes), *_per_shape("comparison", records))
 
 
 def noise_tables(records: Sequence[Record]) -> tuple[Table, ...]:
     """The paper's Tab. 3, and the figures of every shape behind it."""
     noisy = select(records, noise=NOISE_LEVEL)
-    rows = []
-    for name in outputs_of(noisy):
-        printed = NOISE.get(name)
-        published = None if printed is None else (*printed, None, None, None)
-        rows.append(Row(name, _quality(noisy, name), published, *_source(noisy, name)))
-    rows.append(_floor_row(noisy, len(QUALITY)))
     notes = (
         *_reading(noisy),
         "Points are moved along their normals by up to 1 % of the bounding box's diagonal; results are measured "
@@ -188,25 +174,47 @@ def noise_tables(records: Sequence[Record]) -> tuple[Table, ...]:
         FOUND,
         SHELL,
     )
-    table = Table("noise", "Surface reconstruction under 1 % noise", "method", QUALITY, tuple(rows), notes)
-    return (table, *_per_shape("noise", noisy))
+    title = "Surface reconstruction under 1 % noise"
+    return (_of_outputs("noise", title, noisy, _quality(noisy), NOISE.get, notes), *_per_shape("noise", noisy))
+
+
+def _of_outputs(
+    name: str,
+    title: str,
+    records: Sequence[Record],
+    figures: Sequence[Figure[str]],
+    published: Callable[[str], tuple[Value, ...] | None],
+    notes: Iterable[str],
+) -> Table:
+    """One row per output, and what a perfect mesh would score."""
+    return tabulated(
+        name,
+        title,
+        "method",
+        figures,
+        [(output, output) for output in outputs_of(records)],
+        published=published,
+        about=lambda output: _source(records, output),
+        more=[_floor_row(records, len(figures))],
+        notes=notes,
+    )
 
 
 def _per_shape(name: str, records: Sequence[Record]) -> list[Table]:
     """Chamfer distance, IoU and number of parts of every output on every shape."""
-    outputs = outputs_of(records)
+
+    def of(shape: str, figure: str) -> Callable[[str], float | None]:
+        return lambda output: by_shape(records, output, figure).get(shape)
+
+    items = [(output, output) for output in outputs_of(records)]
     tables = []
     for what, title, column in (
-        ("chamfer", "Chamfer distance", CHAMFER),
-        ("iou", "IoU of the volumes", Column("IoU", ".3f", "highest")),
-        ("components", "connected parts", Column("parts", ",d")),
+        ("chamfer", "Chamfer distance", Column("", ".2e", "lowest")),
+        ("iou", "IoU of the volumes", Column("", ".3f", "highest")),
+        ("components", "connected parts", Column("", ",d")),
     ):
-        rows = []
-        for output in outputs:
-            values = by_shape(records, output, what)
-            rows.append(Row(output, tuple(values.get(shape) for shape in shapes_of(records))))
-        columns = tuple(Column(shape, column.form, column.best) for shape in shapes_of(records))
-        tables.append(Table(f"{name}-{what}", f"Per shape: {title}", "method", columns, tuple(rows)))
+        figures: list[Figure[str]] = [(replace(column, name=shape), of(shape, what)) for shape in shapes_of(records)]
+        tables.append(tabulated(f"{name}-{what}", f"Per shape: {title}", "method", figures, items))
     return tables
 
 
@@ -267,23 +275,22 @@ def noise_plots(records: Sequence[Record]) -> tuple[Plot, ...]:
 
 def poisson_tables(records: Sequence[Record]) -> tuple[Table, ...]:
     """The paper's comparison with screened Poisson."""
-    columns = (
-        Column("mean CD", ".2e", "lowest"),
-        Column("mean shell IoU", ".3f", "highest"),
-        Column("mean IoU", ".3f", "highest"),
-        Column("mean parts", ".1f"),
-    )
-    rows = []
-    for noise, words in ((0.0, "clean"), (NOISE_LEVEL, "1 % noise")):
-        some = select(records, noise=noise)
-        for output in (*POISSONS, "Ours fine"):
-            if output not in outputs_of(some):
-                continue
-            figures = ("chamfer", "shell_iou", "iou", "components")
-            values = tuple(mean(of_output(some, output, name)) for name in figures)
-            printed = POISSON.get((output, noise))
-            published = None if printed is None else (*printed, None, None)
-            rows.append(Row(f"{words}, {output}", values, published, *_source(some, output)))
+
+    def of(figure: str) -> Callable[[tuple[str, float]], float | None]:
+        return lambda row: mean(of_output(select(records, noise=row[1]), row[0], figure))
+
+    figures: list[Figure[tuple[str, float]]] = [
+        (Column("mean CD", ".2e", "lowest"), of("chamfer")),
+        (Column("mean shell IoU", ".3f", "highest"), of("shell_iou")),
+        (Column("mean IoU", ".3f", "highest"), of("iou")),
+        (Column("mean parts", ".1f"), of("components")),
+    ]
+    items = [
+        (f"{words}, {output}", (output, noise))
+        for noise, words in ((0.0, "clean"), (NOISE_LEVEL, "1 % noise"))
+        for output in (*POISSONS, "Ours fine")
+        if output in outputs_of(select(records, noise=noise))
+    ]
 
     def factor(output: str, noise: float) -> float | None:
         some = select(records, noise=noise)
@@ -300,35 +307,46 @@ def poisson_tables(records: Sequence[Record]) -> tuple[Table, ...]:
     if smoothed is not None:
         notes.append(f"Given the cloud that ours has smoothed, screened Poisson is at {smoothed:.2f} times ours.")
     notes.append(SHELL)
-    return (Table("poisson", "Screened Poisson", "setting", columns, tuple(rows), tuple(notes)),)
+    table = tabulated(
+        "poisson",
+        "Screened Poisson",
+        "setting",
+        figures,
+        items,
+        published=POISSON.get,
+        about=lambda row: _source(select(records, noise=row[1]), row[0]),
+        notes=notes,
+    )
+    return (table,)
 
 
 def banf_tables(records: Sequence[Record]) -> tuple[Table, ...]:
     """The paper's comparison with BANF: clean, noisy, and what noise costs."""
-    columns = (
-        Column("ours clean", ".2e"),
-        Column("BANF clean", ".2e"),
-        Column("ours noise", ".2e"),
-        Column("BANF noise", ".2e"),
-        Column("ours degr.", ".1f"),
-        Column("BANF degr.", ".1f"),
-    )
-    clean, noisy = (select(records, noise=noise) for noise in (0.0, NOISE_LEVEL))
-    rows = []
-    for shape in shapes_of(records):
-        values = [
-            figure(select(some, shape=shape, method=method), "chamfer")
-            for some in (clean, noisy)
-            for method in ("ours", "banf")
-        ]
+
+    def chamfer(method: str, noise: float) -> Callable[[str], float | None]:
+        return lambda shape: figure(select(records, noise=noise, shape=shape, method=method), "chamfer")
+
+    def degradation(method: str) -> Callable[[str], float | None]:
+        return lambda shape: ratio(chamfer(method, NOISE_LEVEL)(shape), chamfer(method, 0.0)(shape))
+
+    def published(shape: str) -> tuple[Value, ...] | None:
         printed = BANF.get(printed_name(shape, BANF) or "")
-        published = None if printed is None else (*printed, printed[2] / printed[0], printed[3] / printed[1])
-        rows.append(Row(shape, (*values, ratio(values[2], values[0]), ratio(values[3], values[1])), published))
+        return None if printed is None else (*printed, printed[2] / printed[0], printed[3] / printed[1])
+
+    figures: list[Figure[str]] = [
+        (Column("ours clean", ".2e"), chamfer("ours", 0.0)),
+        (Column("BANF clean", ".2e"), chamfer("banf", 0.0)),
+        (Column("ours noise", ".2e"), chamfer("ours", NOISE_LEVEL)),
+        (Column("BANF noise", ".2e"), chamfer("banf", NOISE_LEVEL)),
+        (Column("ours degr.", ".1f"), degradation("ours")),
+        (Column("BANF degr.", ".1f"), degradation("banf")),
+    ]
+    items = [(shape, shape) for shape in shapes_of(records)]
     notes = (
         "Chamfer distance of the finest level of each; `degr.` is that under 1 % noise over that on the clean cloud.",
         "The paper's BANF is a re-implementation as well: the authors' code has no reconstruction from points.",
     )
-    return (Table("banf", "BANF", "shape", columns, tuple(rows), notes),)
+    return (tabulated("banf", "BANF", "shape", figures, items, published=published, notes=notes),)
 
 
 COMPARISON_TABLE = TableSpec(

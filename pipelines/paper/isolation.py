@@ -37,24 +37,14 @@ from .base import (
 from .cells import PaperCell, TableSpec, select, shapes_of
 from .judge import Judge, protocol_of
 from .ours import Ours
+from .published import CD_WITHOUT_CULLING, COMPONENTS, TAB_ISOLATION
 
 if TYPE_CHECKING:
     from .cells import Preset
 
-__all__ = ["ISOLATION", "TAB_ISOLATION", "IndependentLevels", "Isolation", "isolation_tables", "steepness"]
+__all__ = ["ISOLATION", "IndependentLevels", "Isolation", "isolation_tables", "steepness"]
 
 NOISE = 0.01
-# The table of that label: variant → mean CD, median CD, mean Hausdorff, mean IoU; with noise, then clean.
-TAB_ISOLATION: Mapping[str, tuple[tuple[float, ...], tuple[float, ...]]] = MappingProxyType(
-    {
-        "a": ((6.39e-5, 1.49e-5, 1.45e-3, 0.687), (3.87e-5, 1.38e-5, 5.86e-3, 0.653)),
-        "b": ((6.34e-5, 2.26e-5, 5.23e-3, 0.555), (4.26e-5, 2.36e-5, 6.75e-3, 0.655)),
-        "c": ((1.04e-4, 2.36e-5, 5.72e-3, 0.669), (3.47e-5, 1.62e-5, 4.01e-3, 0.749)),
-    }
-)
-# In the text below it: mean CD with noise, extracted without culling.
-CD_WITHOUT_CULLING: Mapping[str, float] = MappingProxyType({"a": 6.42e-5, "c": 2.8e-1})
-COMPONENTS: Mapping[str, str] = MappingProxyType({"a": "1 to 4", "c": "365 to 4,109"})
 VARIANTS: Mapping[str, str] = MappingProxyType(
     {
         "a": "(a) with residual, with bands (ours)",

@@ -1,6 +1,4 @@
-"""Judges surfaces: extracts them, writes and draws them, and measures them as the protocol says.
-
-How all methods are trained and measured: sizes, damage to the clouds, and what may not differ between rows.
+"""How all methods are judged: sizes of a preset, damage to the clouds, and a `Judge` that extracts and measures.
 
 The paper's own (Sec. 4): unit sphere, 512³ marching cubes, 500 K samples on each surface, squared-L2 Chamfer distance
 both ways. The smaller presets change sizes and times, nothing else.
@@ -10,7 +8,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import asdict, dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -27,7 +25,7 @@ from ..run.settings import FitConfig
 from ..surface.measure import evaluate_surfaces
 from ..surface.surface import Surface, from_mesh, read_reference
 from ..surface.trim import Support, drop_unsupported
-from .cells import PaperCell
+from .cells import PaperCell, Preset
 
 __all__ = [
     "STEEP",
@@ -158,10 +156,6 @@ class Judge:
         hits = sphere_trace(field, origin, directions, level=level, budget=budget)
         hits.mask.any().item()  # a GPU works on after the call returns
         return size * size / (time.perf_counter() - started)
-
-
-if TYPE_CHECKING:
-    from .cells import Preset
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,4 @@
-"""Our own method: `fit`, whose levels are the coarse, medium and fine rows of the paper.
-
-The others: every `Recipe` as a `Method`, and screened Poisson, which needs no training.
-"""
+"""The methods: ours, whose levels are coarse, medium and fine rows of the paper, recipes, and screened Poisson."""
 
 from __future__ import annotations
 
@@ -10,17 +7,14 @@ import importlib
 import time
 from collections.abc import Mapping
 from itertools import accumulate
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ...neural_fields import MultiscaleSDF, load_field
 from ...neural_fields.meshing import Mesh
 from ..bench.cells import Findings, Method, Workplace
-from ..bench.fits import has_poisson, screened_poisson
-from ..fit.train import Run, fit
-from ..run.folder import FIELD_FILE, RECORD_FILE, STATE_FILE, is_fitted, read_record
+from ..bench.fits import has_poisson, kept_fit, screened_poisson
+from ..run.folder import FIELD_FILE
 from ..run.settings import FitConfig
 from ..surface.trim import read_support
 from .cells import PaperCell
@@ -70,11 +64,7 @@ class Ours(Method[PaperCell]):
         """Fit, and measure every level; an interrupted fit goes on, and a finished one is taken as it is."""
         judge, directory = Judge(cell, work), work.run()
         config = dataclasses.replace(our_config(cell), device=work.device)
-        directory.parent.mkdir(exist_ok=True)
-        run = _finished(directory, work.device)
-        if run is None:
-            resume = (directory / STATE_FILE).is_file()
-            run = fit(damaged_cloud(cell), config, out=directory, resume=resume, progress=work.progress)
+        run = kept_fit(directory, damaged_cloud(cell), config, progress=work.progress)
         stages = run.record["stages"]
         seconds = accumulate(stage["sampling_seconds"] + stage["training_seconds"] for stage in stages)
         parameters = accumulate(stage["parameters"] for stage in stages)
@@ -95,15 +85,6 @@ class Ours(Method[PaperCell]):
         ]
         details = {"cleaning": run.record["cleaning"], "stages": stages}
         return Findings(tuple(outputs), tuple(run.record["deltas"]), details)
-
-
-def _finished(directory: Path, device: str) -> Run | None:
-    """The fit in a directory, if it was trained to its end: what is wrong with its meshes need not cost another one."""
-    if not (directory / RECORD_FILE).is_file() or not is_fitted(directory):
-        return None
-    saved = load_field(directory / FIELD_FILE, device=device)
-    assert isinstance(saved.field, MultiscaleSDF)
-    return Run(saved.field, saved.similarity, directory, read_record(directory))
 
 
 class FromRecipe(Method[PaperCell]):

@@ -1,7 +1,4 @@
-"""What every method of the comparison is: a `Recipe`, which trains fields on a cloud as its own paper says.
-
-What the grid baselines learn from, and their terms: relative errors, and derivatives by finite differences.
-"""
+"""What every peer is: a `Recipe`, which trains fields on a cloud as its own paper says, and what recipes share."""
 
 from __future__ import annotations
 

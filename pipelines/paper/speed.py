@@ -18,6 +18,7 @@ from .base import base_cell, base_of, without_bands
 from .cells import PaperCell, TableSpec, select
 from .judge import protocol_of
 from .ours import Ours
+from .published import PAPER_MODELS, TIME_AUTO, TIME_MC
 
 if TYPE_CHECKING:
     from .cells import Preset
@@ -25,42 +26,12 @@ if TYPE_CHECKING:
 __all__ = [
     "MARCHING_CUBES",
     "NORMALS",
-    "TIME_AUTO",
-    "TIME_MC",
     "MarchingCubes",
     "Normals",
     "grid_seconds",
     "marching_cubes_tables",
     "normals_tables",
 ]
-
-# The paper's tables of the same labels, on an RTX 5090. Model → seconds at 512³: baseline, without culling, with it.
-TIME_MC: Mapping[str, tuple[float, float, float]] = MappingProxyType(
-    {
-        "Armadillo": (4.87, 4.10, 0.99),
-        "Lucy": (4.87, 7.49, 1.07),
-        "Dragon": (4.88, 7.28, 1.71),
-        "Thai": (4.89, 7.28, 1.73),
-    }
-)
-# (model, hidden layers of 256, side of the image) → autograd, theirs, in seconds.
-TIME_AUTO: Mapping[tuple[str, int, int], tuple[float, float]] = MappingProxyType(
-    {
-        ("Armadillo", 2, 512): (0.007, 0.003),
-        ("Armadillo", 2, 1024): (0.024, 0.010),
-        ("Armadillo", 3, 512): (0.010, 0.005),
-        ("Armadillo", 3, 1024): (0.025, 0.012),
-        ("Buddha", 2, 512): (0.008, 0.005),
-        ("Buddha", 2, 1024): (0.021, 0.014),
-        ("Buddha", 3, 512): (0.011, 0.005),
-        ("Buddha", 3, 1024): (0.024, 0.012),
-        ("Lucy", 2, 512): (0.007, 0.004),
-        ("Lucy", 2, 1024): (0.021, 0.012),
-        ("Lucy", 3, 512): (0.011, 0.007),
-        ("Lucy", 3, 1024): (0.025, 0.015),
-    }
-)
-PAPER_MODELS = ("Armadillo", "Buddha", "Lucy")
 
 Overrides = tuple[tuple[str, Any], ...]
 SIZES: Mapping[Preset, Overrides] = MappingProxyType(
