@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from mplicits.neural_fields import Similarity, Siren, Sphere, save_field
+from mplicits.neural_fields import MultiscaleSDF, Similarity, Siren, Sphere, save_field
 from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.evolve import checks as evolve_checks
 from mplicits.pipelines.evolve import problem as evolve_problem
@@ -48,8 +48,14 @@ def few_points(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(evolve_checks, "END_RESOLUTION", 32)
 
 
-def ball(path: Path, radius: float) -> None:
-    """A fit of a ball around (5, 0, 0), twice as large in input coordinates; off by less than 0.01."""
+def ball(path: Path, radius: float, *, levels: bool = False) -> None:
+    """A fit of a ball around (5, 0, 0), twice as large in input coordinates; off by less than 0.01.
+
+    Args:
+        path: of the file.
+        radius: in unit-sphere coordinates.
+        levels: whether it is a multiscale field of one level, as those that `fit` makes.
+    """
     siren = Siren(24, 2, omega=3.0)
     adam = torch.optim.Adam(siren.parameters(), lr=1e-2, betas=(0.9, 0.99))
     for step in range(200):
@@ -59,7 +65,8 @@ def ball(path: Path, radius: float) -> None:
         adam.zero_grad()
         loss.backward()
         adam.step()
-    save_field(path, siren, similarity=Similarity((5.0, 0.0, 0.0), 2.0))
+    field = MultiscaleSDF(siren, [], []) if levels else siren
+    save_field(path, field, similarity=Similarity((5.0, 0.0, 0.0), 2.0))
 
 
 def fails(capsys: pytest.CaptureFixture[str], line: str) -> str:

@@ -83,7 +83,7 @@ def test_a_morph_is_measured_against_meshes(tmp_path: Path) -> None:
         mesh.export(meshes[-1])
         home = fit_home(tmp_path / "out", meshes[-1], FitConfig())  # where its fit is kept
         home.mkdir(parents=True)
-        ball(home / "field.safetensors", radius)
+        ball(home / "field.safetensors", radius, levels=True)
         write_record(home, {"config": {}, "finished": True})
     config = replace(QUICK, align="none", steps=(150,), samples=4000)
     first, second = meshes
