@@ -16,14 +16,13 @@ from ...datasets.cameras import Camera
 from ...neural_fields import Field, InputError, Similarity, load_field
 from ...neural_fields.dynamic_tracing import DynamicTracer, moment
 from ...neural_fields.meshing import NoSurfaceError, extract_mesh
-from ...neural_fields.tracing import BOUNDING_RADIUS
 from ..mesh.files import write_mesh, write_moving
 from ..render.film import ANIMATIONS, write_animation
 from ..render.picture import Image, contact_sheet, in_rows, write_picture
 from ..render.shade import ShadeOptions, compose, downsample, shade
-from ..render.subject import Orbit, orbit_cameras
+from ..render.subject import Orbit, orbit_cameras, traced_part
 from ..render.trace import RESOLUTION, TOLERANCE, fine_strips, pixel_size, see_hits
-from ..run.folder import find_field
+from ..run.folder import chosen_level, find_field
 from ..run.machine import choose_device
 from ..texture.riding import RidingColors, borrowed_texture, start_texture
 from .follow import follow_mesh
@@ -121,9 +120,7 @@ def animate_run(
     field, similarity, _ = load_field(file, device=choose_device(options.device))
     if field.in_dim != 4:
         raise InputError(f"{file}: does not move; use `mplicits render` or `mplicits mesh`")
-    level = field.num_levels - 1 if options.level is None else options.level
-    if not 0 <= level < field.num_levels:
-        raise InputError(f"--level {level}: {file} has levels 0 to {field.num_levels - 1}")
+    level = chosen_level(field, file, options.level)
     riding = _riding(file, field, similarity, level, options)
     if options.shading == "color" and riding is None:
         raise InputError(f"--shading color: {file} has no texture; name a textured run with --colors RUN")
@@ -199,9 +196,7 @@ def _outline(file: Path, field: Field, options: SequenceOptions) -> NDArray[np.f
             continue  # a surface may come and go
     if not seen:
         raise InputError(f"{file}: no surface at any time")
-    points = np.concatenate(seen)
-    inside = np.linalg.norm(points, axis=1) <= BOUNDING_RADIUS
-    return points[inside] if inside.any() else points
+    return traced_part(np.concatenate(seen))
 
 
 def _write_series(

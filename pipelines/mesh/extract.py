@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ...datasets import read_cloud
 from ...neural_fields import Field, InputError, Similarity, map_attribute
 from ...neural_fields.meshing import Mesh, NoSurfaceError, extract_mesh, map_normals
-from ..run.folder import find_field, load_still
+from ..run.folder import chosen_level, find_field, load_still
 from ..surface.trim import Support, drop_unsupported, in_region, keep_largest, read_support, trim_distance
 from ..texture.riding import Colors, colors_of_run
 from .bake import check_texture_size, textured_mesh
@@ -82,11 +82,8 @@ def mesh_run(
     file = find_field(run)
     field, similarity, metadata = load_still(file, options.time)
     check(out, similarity)  # again: not every format can hold every place
-    level = field.num_levels - 1 if options.level is None else options.level
-    normal_level = level if options.normal_level is None else options.normal_level
-    for flag, number in (("--level", level), ("--normal-level", normal_level)):
-        if not 0 <= number < field.num_levels:
-            raise InputError(f"{flag} {number}: {file} has levels 0 to {field.num_levels - 1}")
+    level = chosen_level(field, file, options.level)
+    normal_level = chosen_level(field, file, options.normal_level, otherwise=level, flag="--normal-level")
     support = None
     if not options.keep_unsupported and options.time is None:
         support = read_support(file, metadata.get("run", {}), level)

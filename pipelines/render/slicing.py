@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ...neural_fields import Field, InputError, Similarity, load_field
 from ...neural_fields.meshing import NoSurfaceError, extract_mesh
-from ..run.folder import find_field
+from ..run.folder import chosen_level, find_field
 from .film import ANIMATIONS, write_animation
 from .legend import with_legend
 from .picture import Image, write_picture
@@ -94,9 +94,7 @@ def slice_run(
     field, similarity, _ = load_field(file)
     if field.in_dim != 3:
         raise InputError(f"{file}: a field of {field.in_dim} coordinates; slices are drawn of fields of 3")
-    level = field.num_levels - 1 if options.level is None else options.level
-    if not 0 <= level < field.num_levels:
-        raise InputError(f"--level {level}: {file} has levels 0 to {field.num_levels - 1}")
+    level = chosen_level(field, file, options.level)
     view = _View(file, field, similarity, level, options)
     if out.suffix.lower() not in ANIMATIONS:
         offset = view.offset()

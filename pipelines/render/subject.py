@@ -19,7 +19,7 @@ from ...neural_fields import Field, InputError, Similarity
 from ...neural_fields.meshing import NoSurfaceError, extract_mesh
 from ...neural_fields.tracing import BOUNDING_RADIUS
 from ..fit.cloud import CloudDistance
-from ..run.folder import find_field, is_field, load_still
+from ..run.folder import chosen_level, find_field, is_field, load_still
 from ..surface.surface import read_surface, sample_points
 from ..texture.riding import colors_of_run
 from .rasterise import cloud_view, mesh_view
@@ -34,6 +34,7 @@ __all__ = [
     "orbit_cameras",
     "posed_cameras",
     "reference_distance",
+    "traced_part",
 ]
 
 Float64 = NDArray[np.float64]
@@ -128,11 +129,8 @@ def _field_subject(
 ) -> Subject:
     field, similarity, metadata = load_still(file, time, device=device)
     finest = field.num_levels - 1
-    for flag, given in (("--level", level), ("--normal-level", normal_level)):
-        if given is not None and not 0 <= given <= finest:
-            raise InputError(f"{flag} {given}: {file} has levels 0 to {finest}")
-    level = finest if level is None else level
-    normal_level = level if normal_level is None else normal_level
+    level = chosen_level(field, file, level)
+    normal_level = chosen_level(field, file, normal_level, otherwise=level, flag="--normal-level")
     colors = colors_of_run(file, field, time)
     panels = [_panel(level, normal_level)]
     if levels:
@@ -172,9 +170,16 @@ def _outline(file: Path, field: Field) -> Float64:
         vertices = extract_mesh(field, resolution=FRAME_RESOLUTION).vertices.astype(np.float64)
     except NoSurfaceError as error:
         raise InputError(f"{file}: no surface to render ({error})") from error
-    # An open surface may go on to the corners of the mesher's cube, but is not traced there.
-    inside = np.linalg.norm(vertices, axis=1) <= BOUNDING_RADIUS
-    return vertices[inside] if inside.any() else vertices
+    return traced_part(vertices)
+
+
+def traced_part(points: Float64) -> Float64:
+    """Those of the points ``(N, 3)`` of a mesh that rays reach, or all if none are.
+
+    An open surface may go on to the corners of the mesher's cube, but is not traced there.
+    """
+    inside = np.linalg.norm(points, axis=1) <= BOUNDING_RADIUS
+    return points[inside] if inside.any() else points
 
 
 def _surface_subject(file: Path) -> Subject:

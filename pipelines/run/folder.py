@@ -31,6 +31,7 @@ __all__ = [
     "TEXTURE_FILE",
     "RunFolder",
     "check_new_run",
+    "chosen_level",
     "digest_of",
     "find_field",
     "is_field",
@@ -107,6 +108,19 @@ def load_still(path: str | Path, time: float | None = None, *, device: torch.dev
     if not 0 <= time <= 1:
         raise InputError(f"--time {time:g}: expected a time from 0 to 1")
     return saved._replace(field=moment(saved.field, time))
+
+
+def chosen_level(field: Field, file: Path, level: int | None, *, otherwise: int = -1, flag: str = "--level") -> int:
+    """A level of the field in ``file``, counted from 0, or ``otherwise``, by default the finest, where it is None.
+
+    Raises:
+        InputError: the field has no such level; the message names the ``flag``.
+    """
+    if level is None:
+        return field.resolve_level(otherwise)
+    if not 0 <= level < field.num_levels:
+        raise InputError(f"{flag} {level}: {file} has levels 0 to {field.num_levels - 1}")
+    return level
 
 
 def is_fitted(run: Path) -> bool:
