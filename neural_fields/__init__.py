@@ -9,6 +9,7 @@ from .color import ColorSiren, TextureField
 from .errors import InputError
 from .evolution import Law, curvature, key_loss, law_loss, mean_curvature, morph, near_surface, normal_speed, transport
 from .field import Field, Jet, OneLevelField, SecondJet
+from .function import FunctionField
 from .meshing import Mesh, NoSurfaceError, extract_mesh, map_normals
 from .moving import Keyframes, Moving, RigidMotion, ShrinkingSphere
 from .multiscale import MultiscaleSDF, levels_of
@@ -19,13 +20,16 @@ from .spacetime import SpaceTimeJet, SpaceTimeSDF, TimeSlice, at_time, spacetime
 from .sphere_start import fit_sphere
 from .tracing import Hits, cone_starts, sphere_trace
 from .volume_renderer import Rendered, Sampling, render_volume
+from .world import Closest, WorldField, WorldHits
 
 __all__ = [
     "Box",
     "Capsule",
+    "Closest",
     "ColorSiren",
     "Deviation",
     "Field",
+    "FunctionField",
     "Hits",
     "InputError",
     "InstantNSRGeometry",
@@ -61,6 +65,8 @@ __all__ = [
     "Tracks",
     "Union",
     "ViewColor",
+    "WorldField",
+    "WorldHits",
     "at_time",
     "cone_starts",
     "curvature",

@@ -49,6 +49,8 @@ class Sphere(_Exact):
         tensor([0.5000])
     """
 
+    defined_by = ("radius", "center")
+
     def __init__(self, *, radius: float = 0.5, center: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> None:
         super().__init__()
         positive(radius=radius)
@@ -61,6 +63,8 @@ class Sphere(_Exact):
 
 class Plane(_Exact):
     """``f(x) = ⟨normal, x⟩ − offset`` with a unit normal; negative on the side the normal leaves."""
+
+    defined_by = ("normal", "offset")
 
     def __init__(self, *, normal: tuple[float, float, float] = (0.0, 0.0, 1.0), offset: float = 0.0) -> None:
         super().__init__()
@@ -76,6 +80,8 @@ class Plane(_Exact):
 
 class Torus(_Exact):
     """``f(x) = √((√(x² + y²) − major)² + z²) − minor``, around the z axis."""
+
+    defined_by = ("major", "minor")
 
     def __init__(self, *, major: float = 0.5, minor: float = 0.2) -> None:
         super().__init__()
@@ -94,6 +100,8 @@ class Box(_Exact):
 
     Outside, the distance to the nearest point of the box; inside, minus the distance to the nearest face.
     """
+
+    defined_by = ("half_size", "center")
 
     def __init__(
         self,
@@ -119,6 +127,8 @@ class Box(_Exact):
 
 class Capsule(_Exact):
     """All points within ``radius`` of the segment from ``start`` to ``end``."""
+
+    defined_by = ("start", "end", "radius")
 
     def __init__(
         self,

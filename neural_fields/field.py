@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -48,16 +49,40 @@ class Field(nn.Module, ABC):
     Levels count from 0, coarse to fine (level i is the paper's f_{i+1}); ``level=-1`` is the finest.
     Each level but the last has a band, ``|f_i(x)| < deltas[i]``, outside which the next level adds nothing.
 
+    A subclass gives `value` and `jet`, and has then one level in three dimensions unless it says otherwise. Called as a
+    module, a field answers with its value.
+
     Attributes:
         in_dim: dimension d of the domain, 3, or 4 for (x, y, z, t).
         num_levels: how many levels of detail the field has.
         deltas: ``(num_levels - 1,)`` half-widths of the bands, in the field's own units; infinite where there is no
             band, because the next level is an alternative and not a refinement.
+        defined_by: names of the attributes that decide the function beside its tensors; see `definition`.
+
+    Example:
+        >>> import torch
+        >>> from mplicits.neural_fields import Field, Jet, sphere_trace
+        >>> class Ball(Field):
+        ...     def value(self, x, *, level=-1):
+        ...         return x.norm(dim=-1) - 0.5
+        ...
+        ...     def jet(self, x, *, level=-1):
+        ...         return Jet(self.value(x), x / x.norm(dim=-1, keepdim=True), x[..., :0])
+        >>> Ball()(torch.tensor([[0.0, 0.0, 2.0]]))
+        tensor([1.5000])
+        >>> bool(sphere_trace(Ball(), torch.tensor([0.0, 0.0, 2.0]), torch.tensor([0.0, 0.0, -1.0])).mask)
+        True
     """
 
-    in_dim: int
-    num_levels: int
+    in_dim: int = 3
+    num_levels: int = 1
     deltas: Tensor
+    defined_by: ClassVar[tuple[str, ...]] = ()
+
+    def __init__(self) -> None:
+        super().__init__()
+        if not hasattr(type(self), "deltas"):  # a wrapper has those of the field that it wraps
+            self.register_buffer("deltas", torch.empty(0), persistent=False)
 
     @abstractmethod
     def value(self, x: Tensor, *, level: int = -1) -> Tensor:
@@ -76,6 +101,21 @@ class Field(nn.Module, ABC):
         Raises:
             ValueError: the last dimension of ``x`` is not ``in_dim``, or there is no such level.
         """
+
+    def forward(self, x: Tensor, *, level: int = -1) -> Tensor:
+        """See `value`."""
+        return self.value(x, level=level)
+
+    def definition(self) -> Mapping[str, Any]:
+        """What decides the function beside its tensors, by name; shown by ``repr`` and kept beside state dicts."""
+        return {name: getattr(self, name) for name in self.defined_by}
+
+    def extra_repr(self) -> str:
+        """The `definition`, and the bands."""
+        shown = dict(self.definition())
+        if len(self.deltas):
+            shown["deltas"] = [float(f"{delta:.6g}") for delta in self.deltas.tolist()]
+        return ", ".join(f"{name}={value!r}" for name, value in shown.items())
 
     def second_jet(self, x: Tensor, *, level: int = -1, dims: int | None = None) -> SecondJet:
         """Evaluate value, gradient and Hessian together at ``x`` ``(..., d)``.
@@ -168,6 +208,37 @@ class Field(nn.Module, ABC):
             raise ValueError(f"x has shape {tuple(x.shape)}; expected (..., {self.in_dim})")
         return x
 
+    def _save_to_state_dict(self, destination: Any, prefix: str, keep_vars: bool) -> None:
+        """Note the definition in the metadata that `torch.nn.Module.state_dict` keeps beside the tensors."""
+        super()._save_to_state_dict(destination, prefix, keep_vars)
+        destination._metadata[prefix[:-1]]["definition"] = dict(self.definition())
+
+    def _load_from_state_dict(
+        self,
+        state_dict: Any,
+        prefix: str,
+        local_metadata: Any,
+        strict: bool,
+        missing_keys: Any,
+        unexpected_keys: Any,
+        error_msgs: Any,
+    ) -> None:
+        """Refuse tensors that would make another function here than the one that they were taken from.
+
+        Where the metadata has been lost on the way (a plain dict, a safetensors file), there is nothing to compare.
+        """
+        here = self.definition()
+        there = local_metadata.get("definition", here)
+        error_msgs += [
+            f"{prefix}{name} is {there.get(name)!r} where the tensors come from and {here.get(name)!r} here: "
+            "the same tensors would be another function"
+            for name in sorted({*here, *there})
+            if here.get(name) != there.get(name)
+        ]
+        super()._load_from_state_dict(
+            state_dict, prefix, local_metadata, strict, missing_keys, unexpected_keys, error_msgs
+        )
+
 
 class OneLevelField(Field):
     """A field with one level of detail, and so without bands.
@@ -178,5 +249,4 @@ class OneLevelField(Field):
 
     def __init__(self, in_dim: int = 3) -> None:
         super().__init__()
-        self.in_dim, self.num_levels = in_dim, 1
-        self.register_buffer("deltas", torch.empty(0), persistent=False)
+        self.in_dim = in_dim

@@ -81,6 +81,8 @@ class Moving(Field):
         motion: how it moves.
     """
 
+    defined_by = ("motion",)
+
     def __init__(self, field: Field, motion: RigidMotion) -> None:
         super().__init__()
         if field.in_dim != 3:
@@ -129,6 +131,8 @@ class ShrinkingSphere(OneLevelField):
         ValueError: ``radius`` is not positive, or the sphere is gone before t = 1.
     """
 
+    defined_by = ("radius", "alpha", "exact_law")
+
     def __init__(self, *, radius: float = 0.8, alpha: float = 0.1, exact_law: bool = False) -> None:
         super().__init__(in_dim=4)
         if not (radius > 0 and radius**2 > 4 * alpha):
@@ -170,6 +174,8 @@ class Keyframes(OneLevelField):
     Raises:
         ValueError: there are none, numbers differ, the times do not increase, or a field is not three-dimensional.
     """
+
+    defined_by = ("times",)
 
     def __init__(self, times: tuple[float, ...] | list[float], fields: tuple[Field, ...] | list[Field]) -> None:
         super().__init__(in_dim=4)

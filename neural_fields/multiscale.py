@@ -44,6 +44,8 @@ class MultiscaleSDF(Field):
         (3, 246627)
     """
 
+    defined_by = ("taper",)
+
     def __init__(
         self, base: Field, residuals: Sequence[Field], deltas: Sequence[float] | Tensor, *, taper: float = 0.0
     ) -> None:

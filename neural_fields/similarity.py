@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 __all__ = ["Similarity"]
 
@@ -49,7 +49,7 @@ class Similarity:
             raise ValueError("points: all of them coincide, so there is no scale")
         return cls((float(center[0]), float(center[1]), float(center[2])), radius)
 
-    def to_unit(self, points: Float64) -> Float64:
+    def to_unit(self, points: ArrayLike) -> Float64:
         """Map ``(..., 3)`` input coordinates into the unit sphere, in float64."""
         return (np.asarray(points, np.float64) - np.asarray(self.center)) / self.scale
 

@@ -62,6 +62,8 @@ class Siren(OneLevelField):
         (torch.Size([5]), torch.Size([5, 3]))
     """
 
+    defined_by = ("width", "depth", "omega", "in_dim", "num_features")
+
     def __init__(
         self,
         width: int,

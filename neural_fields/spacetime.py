@@ -214,6 +214,8 @@ class TimeSlice(Field):
         ValueError: the field is not four-dimensional, or ``t`` is not one number.
     """
 
+    defined_by = ("t",)
+
     def __init__(self, field: Field, t: Tensor | float) -> None:
         super().__init__()
         check_spacetime(field)

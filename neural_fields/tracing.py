@@ -45,7 +45,8 @@ class Hits(NamedTuple):
 
     Attributes:
         mask: ``(...,)`` bool, whether the ray meets it.
-        depth: ``(...,)`` distance from the origin along the ray; for a ray that misses, where its search ended.
+        depth: ``(...,)`` along the ray, in lengths of its direction (a distance where that is 1): the point is
+            origin + depth · direction. For a ray that misses, where its search ended.
         position: ``(..., 3)`` the point at that depth.
         level: ``(...,)`` int64, the finest level that had a say in the last step.
         steps: ``(...,)`` int64, how often the field was evaluated on the ray.
@@ -58,7 +59,6 @@ class Hits(NamedTuple):
     steps: Tensor
 
 
-@torch.no_grad()
 def sphere_trace(
     field: Field,
     origins: Tensor,
@@ -74,6 +74,7 @@ def sphere_trace(
     max_steps: int = 512,
     budget: Sequence[int] | None = None,
     capture: float = 2e-3,
+    differentiable: bool = False,
 ) -> Hits:
     """First intersections of rays with the zero set of a level.
 
@@ -89,10 +90,18 @@ def sphere_trace(
 
     A ray that starts inside the surface looks for the way out.
 
+    Depth and position have no graph, unless the trace is to be ``differentiable``. Then they carry the derivatives of
+    the implicit function f(o + t d) = 0 with respect to origins, directions and parameters, by one Newton step on the
+    graph whose slope is held fixed,
+
+        t ← t − f(o + t d) / ⟨∇f, d⟩,
+
+    so that dt = −(df + ⟨∇f, do + t dd⟩) / ⟨∇f, d⟩. They grow without bound where rays graze the surface.
+
     Args:
         field: what to trace, three-dimensional.
         origins: ``(..., 3)``.
-        directions: ``(..., 3)`` of unit length; broadcast with ``origins``.
+        directions: ``(..., 3)`` of any length but 0; broadcast with ``origins``.
         level: whose surface to find.
         near: depth at which to start, a number or a tensor that broadcasts to ``(...,)``: up to there nothing is
             expected (see `cone_starts`). A ray that is behind the surface there starts from the beginning instead.
@@ -104,6 +113,7 @@ def sphere_trace(
         max_steps: rays that need more end as misses.
         budget: steps on each level up to ``level``, for the fixed mode.
         capture: the |f| that the fixed mode takes for a hit.
+        differentiable: whether depth and position of the hits carry gradients.
 
     Raises:
         ValueError: shapes do not fit, the field is not three-dimensional, a number is out of range, or a ``budget`` is
@@ -131,16 +141,48 @@ def sphere_trace(
             radius=radius,
             max_steps=max_steps,
         )
-        return hits
+    else:
+        hits = _trace_budget(field, origins, directions, budget, level, near, far, tolerance, radius, capture)
+    return _on_graph(field, origins, directions, level, hits) if differentiable else hits
+
+
+def _on_graph(field: Field, origins: Tensor, directions: Tensor, level: int, hits: Hits) -> Hits:
+    """Hits whose depth and position carry the derivatives of the implicit function."""
+    origins, directions = torch.broadcast_tensors(origins, directions)
+    rows = hits.mask.reshape(-1).nonzero()[:, 0]
+    o, d, depth = origins.reshape(-1, 3)[rows], directions.reshape(-1, 3)[rows], hits.depth.reshape(-1)
+    jet = field.jet(o + depth[rows, None] * d, level=level)
+    slope = (jet.gradient * d).sum(dim=-1).detach()
+    slope = torch.where(slope == 0, torch.finfo(slope.dtype).eps, slope)
+    # The value itself is left out: where the trace ended is known better than one step from there.
+    depth = depth.index_add(0, rows, (jet.value.detach() - jet.value) / slope).reshape(hits.depth.shape)
+    return hits._replace(depth=depth, position=origins + depth[..., None] * directions)
+
+
+@torch.no_grad()
+def _trace_budget(
+    field: Field,
+    origins: Tensor,
+    directions: Tensor,
+    budget: Sequence[int],
+    level: int,
+    near: Tensor | float,
+    far: Tensor | float,
+    tolerance: float,
+    radius: float | None,
+    capture: float,
+) -> Hits:
+    """The paper's mode of `sphere_trace`."""
     level = field.resolve_level(level)
-    _check(field, origins, directions, tolerance=tolerance, resolution=resolution, lipschitz=lipschitz)
+    _check(field, origins, directions, tolerance=tolerance)
     if len(budget) != level + 1:
         raise ValueError(f"budget={list(budget)}: expected {level + 1} number(s) of steps, one for each level")
     if bool((field.deltas[:level].isinf().cpu() & (torch.tensor(budget[:level]) > 0)).any()):
         raise ValueError(f"budget={list(budget)}: a level without a band leads to no other; give it 0 steps")
-    rays, found = _begin(origins, directions, near, far, radius)
+    directions, length = _unit_directions(directions)
+    rays, found = _begin(origins, directions, length, near, far, radius)
     march_budget(field, rays, found, budget, tolerance, capture)
-    return _hits(found, origins, directions)
+    return _hits(found, origins, directions, length)
 
 
 @torch.no_grad()
@@ -193,23 +235,36 @@ def trace_expected(
     level = field.resolve_level(level)
     _check(field, origins, directions, tolerance=tolerance, resolution=resolution, lipschitz=lipschitz)
     rule = Rule(field.deltas[:level].to(directions), tolerance, resolution, lipschitz)
-    rays, found = _begin(origins, directions, near, far, radius)
+    directions, length = _unit_directions(directions)
+    rays, found = _begin(origins, directions, length, near, far, radius)
     shape = torch.broadcast_shapes(origins.shape, directions.shape)[:-1]
     if expected is not None:
-        flat = Expected(*(part.to(directions).broadcast_to(shape).reshape(-1) for part in expected))
+        depth, slope, value = (part.to(directions).broadcast_to(shape) for part in expected)
+        flat = Expected((depth * length).reshape(-1), slope.reshape(-1), value.reshape(-1))
         rays = rays.expecting(flat, rule)
     march(field, level, rays, found, rule, max_steps, reach)
-    near_surface = Near(*(column.reshape(shape) for column in found.near))
-    return _hits(found, origins, directions), found.slope.reshape(shape), near_surface
+    clear, value, leave = (column.reshape(shape) for column in found.near)
+    near_surface = Near(clear / length, value, leave / length)
+    return _hits(found, origins, directions, length), found.slope.reshape(shape), near_surface
 
 
 def _begin(
-    origins: Tensor, directions: Tensor, near: Tensor | float, far: Tensor | float, radius: float | None
+    origins: Tensor,
+    directions: Tensor,
+    length: Tensor,
+    near: Tensor | float,
+    far: Tensor | float,
+    radius: float | None,
 ) -> tuple[Rays, Found]:
-    """Rays between ``near`` and ``far``, where they are in the ball of ``radius``; and room for what they find."""
+    """Rays between ``near`` and ``far``, where they are in the ball of ``radius``; and room for what they find.
+
+    The directions are of unit length; ``near`` and ``far`` count in the ``length`` that they had.
+    """
     origins, directions = torch.broadcast_tensors(origins, directions)
     shape = directions.shape[:-1]
-    starts, ends = (torch.as_tensor(depth).to(directions).broadcast_to(shape).reshape(-1) for depth in (near, far))
+    starts, ends = (
+        (torch.as_tensor(depth).to(directions).broadcast_to(shape) * length).reshape(-1) for depth in (near, far)
+    )
     origins, directions = origins.reshape(-1, 3), directions.reshape(-1, 3)
     entries = torch.zeros_like(starts)
     if radius is not None:
@@ -218,12 +273,14 @@ def _begin(
     return Rays.begin(origins, directions, entries, torch.maximum(starts, entries), ends), Found(starts)
 
 
-def _hits(found: Found, origins: Tensor, directions: Tensor) -> Hits:
-    """What was found, in the shape of the rays."""
+def _hits(found: Found, origins: Tensor, directions: Tensor, length: Tensor) -> Hits:
+    """What was found, in the shape of the rays; see `_begin`."""
     shape = torch.broadcast_shapes(origins.shape, directions.shape)[:-1]
     depth = found.depth.reshape(shape)
     position = origins + depth[..., None] * directions
-    return Hits(found.mask.reshape(shape), depth, position, found.level.reshape(shape), found.steps.reshape(shape))
+    return Hits(
+        found.mask.reshape(shape), depth / length, position, found.level.reshape(shape), found.steps.reshape(shape)
+    )
 
 
 @torch.no_grad()
@@ -248,7 +305,7 @@ def cone_starts(
     Args:
         field: what to trace, three-dimensional.
         origin: ``(3,)`` the common origin of all rays.
-        directions: ``(H, W, 3)`` of unit length.
+        directions: ``(H, W, 3)`` of any length but 0.
         level: the level that will be traced from there.
         tiles: sides of the tiles in pixels, each a multiple of the next.
         lipschitz: see `sphere_trace`.
@@ -264,13 +321,14 @@ def cone_starts(
     """
     level = field.resolve_level(level)
     _check_image(field, origin, directions, lipschitz)
-    depth = torch.zeros_like(directions[..., 0])
+    directions, length = _unit_directions(directions)
+    depth = torch.zeros_like(length)
     for tile in tiles:
         cones = _Cones.of(directions, tile)
         starts = depth[::tile, ::tile].reshape(-1)
         free = _march_cones(field, origin, cones, starts, level, lipschitz, radius, max_steps, clearance)
         depth = free[cones.of_pixel]
-    return depth
+    return depth / length
 
 
 @torch.no_grad()
@@ -312,8 +370,9 @@ def cone_ends(
     """
     level = field.resolve_level(level)
     _check_image(field, origin, directions, lipschitz)
+    directions, length = _unit_directions(directions)
     reach = origin.norm() + radius
-    depth = torch.full_like(directions[..., 0], torch.inf)
+    depth = torch.full_like(length, torch.inf)
     delta = clearance + (float(field.deltas[0]) if level else 0.0)
     for tile in tiles:
         cones = _Cones.of(directions, tile)
@@ -332,7 +391,7 @@ def cone_ends(
             ends[active] = torch.minimum(t, closer)
             active = active[(t - closer > t * sigma) & (closer > entry[active])]
         depth = torch.where(asked, ends, torch.inf)[cones.of_pixel]
-    return depth
+    return depth / length
 
 
 def _march_cones(
@@ -415,6 +474,14 @@ def _check(field: Field, origins: Tensor, directions: Tensor, **numbers: float) 
         if rows.ndim == 0 or rows.shape[-1] != 3:
             raise ValueError(f"{name} has shape {tuple(rows.shape)}; expected (..., 3)")
     positive(**numbers)
+
+
+def _unit_directions(directions: Tensor) -> tuple[Tensor, Tensor]:
+    """Directions of length 1 and the lengths they had; those that are 1 but for rounding stay as they are."""
+    length = directions.norm(dim=-1)
+    rounding = 8 * torch.finfo(length.dtype).eps  # of a normalised vector: half a unit for each operation
+    length = torch.where(((length - 1).abs() <= rounding) | (length == 0), torch.ones_like(length), length)
+    return directions / length[..., None], length
 
 
 def _ball_crossing(origins: Tensor, directions: Tensor, radius: float | Tensor) -> tuple[Tensor, Tensor]:

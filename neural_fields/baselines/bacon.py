@@ -58,6 +58,8 @@ class BaconSDF(Field):
         (4, 24, 192)
     """
 
+    defined_by = ("width", "bands", "outputs", "period")
+
     def __init__(
         self,
         width: int = 256,

@@ -39,6 +39,8 @@ class BandLimited(OneLevelField):
         tensor([0.])
     """
 
+    defined_by = ("resolution", "extent")
+
     def __init__(self, field: Field, resolution: int, *, extent: float = 1.05) -> None:
         super().__init__()
         if field.in_dim != 3:

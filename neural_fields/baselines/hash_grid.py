@@ -67,6 +67,8 @@ class HashGridSDF(OneLevelField):
         2049153
     """
 
+    defined_by = ("resolutions", "table_size", "extent", "radius")
+
     def __init__(
         self,
         *,

@@ -48,6 +48,8 @@ class IdfSDF(Field):
         397314
     """
 
+    defined_by = ("limit", "reach")
+
     def __init__(
         self,
         width: int = 256,

@@ -42,6 +42,8 @@ class NeusSDF(OneLevelField):
         529076
     """
 
+    defined_by = ("width", "depth", "frequencies", "num_features")
+
     def __init__(
         self,
         width: int = 256,

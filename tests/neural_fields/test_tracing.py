@@ -334,3 +334,68 @@ def test_bad_arguments(change, message):
 def test_four_dimensional_fields_are_refused():
     with pytest.raises(ValueError, match="in_dim=4"):
         sphere_trace(FIELDS["siren-one-layer-4d"](), torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
+
+
+@pytest.mark.parametrize("length", [0.5, 1.2, 2.0, 1e-3, 1e3])
+@pytest.mark.parametrize("budget", [None, (60,)])
+def test_directions_of_any_length(length: float, budget: tuple[int, ...] | None) -> None:
+    """Depths count in lengths of the direction; near and far do, too."""
+    origins = torch.tensor([[0.0, 0.0, -2.0], [0.2, 0.1, -2.0], [0.0, 0.9, -2.0]])
+    directions = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.05, 0.9], [0.0, 0.0, 1.0]])
+    directions = directions / directions.norm(dim=1, keepdim=True)
+    field = Sphere(radius=0.5)
+    unit = sphere_trace(field, origins, directions, budget=budget)
+    scaled = sphere_trace(field, origins, length * directions, budget=budget)
+    assert unit.mask.tolist() == scaled.mask.tolist() == [True, True, False]
+    torch.testing.assert_close(scaled.depth[:2] * length, unit.depth[:2], rtol=1e-6, atol=2e-5)
+    torch.testing.assert_close(scaled.position[:2], unit.position[:2], rtol=0, atol=2e-5)
+    later = sphere_trace(field, origins[0], length * directions[0], near=1.4 / length)
+    assert abs(float(later.depth) * length - 1.5) < 2e-5
+    assert not bool(sphere_trace(field, origins[0], length * directions[0], far=1.4 / length).mask)
+
+
+def test_a_direction_of_no_length_meets_nothing() -> None:
+    assert not bool(sphere_trace(Sphere(radius=0.5), torch.tensor([0.0, 0.0, -2.0]), torch.zeros(3)).mask)
+
+
+@pytest.mark.parametrize("name", ["sphere", "torus", "multiscale-tapered", "union"])
+def test_depths_against_finite_differences(name: str) -> None:
+    """With respect to origins, directions and parameters, of hits that do not graze."""
+    field = FIELDS[name]().double()
+    torch.manual_seed(1)
+    origins = (torch.tensor([0.3, 0.1, -2.0]) + 0.1 * torch.rand(40, 3)).double().requires_grad_()
+    directions = (torch.tensor([0.0, 0.0, 1.3]) + 0.1 * torch.rand(40, 3)).double().requires_grad_()
+
+    def trace(o, d):
+        return sphere_trace(field, o, d, tolerance=1e-12, differentiable=True, max_steps=2000)
+
+    hits = trace(origins, directions)
+    slope = (field.jet(hits.position).gradient * directions).sum(dim=1).abs()
+    kept = (hits.mask & (slope > 0.3)).detach()
+    assert kept.any()
+    ours = torch.autograd.grad(hits.depth[kept].sum(), (origins, directions), retain_graph=True)
+    step = 1e-6
+    for index, gradient in enumerate(ours):
+        for axis in range(3):
+            shift = torch.zeros(3, dtype=torch.float64)
+            shift[axis] = step
+            ends = [
+                trace(*(x + sign * shift if i == index else x for i, x in enumerate((origins, directions)))).depth
+                for sign in (1, -1)
+            ]
+            numeric = ((ends[0] - ends[1]) / (2 * step)).detach()
+            # Central differences are off by step² of a third derivative, and by the tolerance over the step.
+            torch.testing.assert_close(gradient[kept, axis], numeric[kept], rtol=1e-4, atol=1e-4)
+    parameters = [p for p in field.parameters() if p.requires_grad]
+    if parameters:
+        assert any(g is not None for g in torch.autograd.grad(hits.depth[kept].sum(), parameters, allow_unused=True))
+    torch.testing.assert_close(
+        hits.position[kept], origins[kept] + hits.depth[kept, None] * directions[kept], rtol=0, atol=1e-14
+    )
+
+
+def test_misses_carry_no_gradient() -> None:
+    origin = torch.tensor([[0.0, 0.0, -2.0], [0.0, 2.0, -2.0]], requires_grad=True)
+    hits = sphere_trace(Sphere(radius=0.5), origin, torch.tensor([0.0, 0.0, 1.0]), differentiable=True)
+    (gradient,) = torch.autograd.grad(hits.depth.sum(), origin)
+    assert gradient.tolist() == [[0.0, 0.0, -1.0], [0.0, 0.0, 0.0]]

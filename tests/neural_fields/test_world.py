@@ -1,0 +1,111 @@
+"""A field in input coordinates: exact answers for a ball of radius 10 around a map coordinate."""
+
+import numpy as np
+import pytest
+import torch
+from fields import small_multiscale, small_spacetime
+from mplicits.neural_fields import MultiscaleSDF, Similarity, Siren, Sphere, WorldField
+
+CENTER = np.array([500_000.25, 4_100_000.5, 120.0])
+SCALE, RADIUS = 20.0, 10.0
+BALL = WorldField(Sphere(radius=RADIUS / SCALE), Similarity(tuple(CENTER), SCALE))
+# Fields answer in float32: half a unit in the last place of each of a handful of operations on numbers up to 2 units.
+ROUNDING = 16 * 2.0**-24 * 2 * SCALE
+
+
+@pytest.fixture
+def offsets() -> np.ndarray:
+    rng = np.random.default_rng(0)
+    directions = rng.normal(size=(40, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    return directions * rng.uniform(4, 16, (40, 1))
+
+
+def test_arrays_far_from_the_origin_keep_their_digits(offsets: np.ndarray) -> None:
+    lengths = np.linalg.norm(offsets, axis=1)
+    found = BALL.distance(CENTER + offsets)
+    assert found.dtype == np.float64
+    np.testing.assert_allclose(found, lengths - RADIUS, rtol=0, atol=ROUNDING)
+    np.testing.assert_allclose(BALL.normals(CENTER + offsets), offsets / lengths[:, None], rtol=0, atol=1e-6)
+    position, normal, reached = BALL.closest(CENTER + offsets)
+    assert reached.all()
+    np.testing.assert_allclose(position - CENTER, RADIUS * offsets / lengths[:, None], rtol=0, atol=2 * ROUNDING)
+    np.testing.assert_allclose(normal, offsets / lengths[:, None], rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("shape", [(3,), (0, 3), (1, 3), (2, 5, 3)])
+@pytest.mark.parametrize("kind", ["float32", "float64", "int64", "numpy"])
+def test_shapes_and_kinds_come_back(shape: tuple[int, ...], kind: str) -> None:
+    world = WorldField(small_multiscale())
+    points = np.zeros(shape) if kind == "numpy" else torch.zeros(shape, dtype=getattr(torch, kind))
+    distance, normals, closest = world.distance(points), world.normals(points), world.closest(points)
+    assert type(distance) is type(points)
+    assert distance.shape == shape[:-1]
+    assert normals.shape == closest.position.shape == closest.normal.shape == shape
+    assert closest.reached.shape == shape[:-1]
+    if kind == "float32" or kind == "float64":
+        assert distance.dtype == normals.dtype == points.dtype
+    hits = world.trace(points, points + 1)
+    assert hits.mask.shape == hits.depth.shape == shape[:-1]
+    assert hits.position.shape == hits.normal.shape == shape
+
+
+def test_levels_are_those_of_the_field() -> None:
+    field = small_multiscale().double().requires_grad_(False)
+    world, x = WorldField(field), torch.rand(50, 3, dtype=torch.float64)
+    for level in range(3):
+        torch.testing.assert_close(world.distance(x, level=level), field.value(x, level=level), rtol=0, atol=0)
+    with pytest.raises(ValueError, match="levels 0 to 2"):
+        world.distance(x, level=3)
+
+
+def test_tensors_carry_their_graph() -> None:
+    points = torch.tensor(np.add(CENTER, (0.0, 0.0, 13.0)), requires_grad=True)
+    (gradient,) = torch.autograd.grad(BALL.distance(points), points)
+    torch.testing.assert_close(gradient, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
+    siren = Siren(8, 1)
+    WorldField(siren).distance(torch.rand(4, 3)).sum().backward()
+    assert siren.output.weight.grad is not None
+
+
+def test_rays_in_input_units_with_directions_of_any_length() -> None:
+    origins = CENTER + np.array([[0.0, 0.0, -30.0], [0.0, 11.0, -30.0]])
+    hits = BALL.trace(origins, np.array([0.0, 0.0, 2.0]))
+    assert hits.mask.tolist() == [True, False]
+    np.testing.assert_allclose(hits.depth, [10.0, np.inf], atol=ROUNDING)
+    np.testing.assert_allclose(hits.position[0] - CENTER, [0, 0, -RADIUS], atol=2 * ROUNDING)
+    np.testing.assert_allclose(hits.normal[0], [0, 0, -1], atol=1e-6)
+    assert np.isnan(hits.position[1]).all()
+    assert np.isnan(hits.normal[1]).all()
+    with pytest.raises(ValueError, match="two arrays or two tensors"):
+        BALL.trace(origins, torch.tensor([0.0, 0.0, 1.0]))
+
+
+def test_depths_of_tensors_can_be_differentiated() -> None:
+    origin = torch.tensor(np.add(CENTER, (0.0, 0.0, -30.0)), requires_grad=True)
+    hits = BALL.trace(origin, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), differentiable=True)
+    (gradient,) = torch.autograd.grad(hits.depth, origin)
+    torch.testing.assert_close(gradient, torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64))
+
+
+@pytest.mark.parametrize("bounds", [None, (CENTER - 12, CENTER + 12)])
+def test_meshes_lie_where_the_input_was(bounds: tuple[np.ndarray, np.ndarray] | None) -> None:
+    mesh = BALL.mesh(48, bounds=bounds)
+    radii = np.linalg.norm(mesh.vertices - CENTER, axis=1)
+    assert abs(radii - RADIUS).max() < 1e-3
+    assert mesh.normals is not None
+
+
+@pytest.mark.parametrize("points", [np.zeros((2, 2)), np.float64(1), torch.zeros(4, 2), torch.tensor(1.0)])
+def test_what_are_no_points_is_refused(points: object) -> None:
+    with pytest.raises(ValueError, match=r"expected \(\.\.\., 3\)"):
+        BALL.distance(points)
+
+
+def test_space_time_is_refused_and_a_repr_says_where_it_is() -> None:
+    with pytest.raises(ValueError, match="in_dim=4"):
+        WorldField(small_spacetime())
+    assert repr(BALL) == (
+        "WorldField(center=(500000.25, 4100000.5, 120), scale=20, field=Sphere(radius=0.5, center=(0.0, 0.0, 0.0)))"
+    )
+    assert "taper=0.3" in repr(WorldField(MultiscaleSDF(Sphere(), [], [], taper=0.3)))
