@@ -1,0 +1,137 @@
+"""Neural implicit surfaces as nested multiscale residuals: what most scripts need, by one import.
+
+    import mplicits
+
+    run = mplicits.fit("scan.ply")
+    shape = mplicits.load("runs/scan")
+    shape.distance(points)  # in the scan's coordinates and units
+
+Names are looked up when they are asked for, so that ``import mplicits`` loads neither torch nor numpy.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from mplicits.neural_fields import (  # pyright: ignore[reportMissingImports]
+        Field,
+        FunctionField,
+        InputError,
+        Jet,
+        Mesh,
+        MultiscaleSDF,
+        NeuSGeometry,
+        Similarity,
+        Siren,
+        Sphere,
+        TextureField,
+        WorldField,
+        extract_mesh,
+        load_field,
+        render_volume,
+        save_field,
+        sphere_trace,
+    )
+    from mplicits.pipelines.fit import FitConfig, Run, fit  # pyright: ignore[reportMissingImports]
+    from torch import device as Device  # noqa: N812
+
+# Which package each name comes from.
+HOMES = {
+    "neural_fields": (
+        "Field",
+        "FunctionField",
+        "InputError",
+        "Jet",
+        "Mesh",
+        "MultiscaleSDF",
+        "NeuSGeometry",
+        "Similarity",
+        "Siren",
+        "Sphere",
+        "TextureField",
+        "WorldField",
+        "extract_mesh",
+        "load_field",
+        "render_volume",
+        "save_field",
+        "sphere_trace",
+    ),
+    "pipelines.fit": ("FitConfig", "Run", "fit"),
+}
+PACKAGES = ("configs", "datasets", "neural_fields", "pipelines")
+
+__all__ = [  # noqa: RUF022
+    "__version__",
+    "load",
+    "save",
+    "Field",
+    "FitConfig",
+    "FunctionField",
+    "InputError",
+    "Jet",
+    "Mesh",
+    "MultiscaleSDF",
+    "NeuSGeometry",
+    "Run",
+    "Similarity",
+    "Siren",
+    "Sphere",
+    "TextureField",
+    "WorldField",
+    "extract_mesh",
+    "fit",
+    "load_field",
+    "render_volume",
+    "save_field",
+    "sphere_trace",
+]
+
+
+def load(path: str | Path, *, time: float | None = None, device: Device | str = "cpu") -> WorldField:
+    """What a run answers, in the coordinates of its input.
+
+    Args:
+        path: run directory of ``mplicits fit``, ``reconstruct`` or ``evolve``, or a .safetensors file.
+        time: the moment, from 0 to 1, of a surface that moves; None for one that does not.
+        device: where to put the field.
+
+    Raises:
+        InputError: there is no such run, it is damaged, or the time does not fit to it.
+    """
+    folder = importlib.import_module("mplicits.pipelines.run.folder")
+    saved = folder.load_still(path, time, device=device)
+    return importlib.import_module("mplicits.neural_fields").WorldField(saved.field, saved.similarity)
+
+
+def save(path: str | Path, shape: WorldField | Run | Field) -> None:
+    """Write a field and where it belongs to a .safetensors file, whole or not at all; `load` reads it.
+
+    Args:
+        path: the file.
+        shape: what `load` or `fit` returned, or a field, which is then taken to be in input coordinates.
+
+    Raises:
+        InputError: the file cannot be written.
+        TypeError: a field of this type has no description on disk.
+    """
+    field, similarity = getattr(shape, "field", shape), getattr(shape, "similarity", None)
+    importlib.import_module("mplicits.neural_fields").save_field(path, field, similarity=similarity)
+
+
+def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        return importlib.import_module("importlib.metadata").version("mplicits")
+    if name in PACKAGES:
+        return importlib.import_module(f"mplicits.{name}")
+    for home, names in HOMES.items():
+        if name in names:
+            return getattr(importlib.import_module(f"mplicits.{home}"), name)
+    raise AttributeError(f"module 'mplicits' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__, *PACKAGES})
