@@ -142,6 +142,7 @@ def sphere_trace(
             max_steps=max_steps,
         )
     else:
+        _check(field, origins, directions, tolerance=tolerance, resolution=resolution, lipschitz=lipschitz)
         hits = _trace_budget(field, origins, directions, budget, level, near, far, tolerance, radius, capture)
     return _on_graph(field, origins, directions, level, hits) if differentiable else hits
 
@@ -174,7 +175,6 @@ def _trace_budget(
 ) -> Hits:
     """The paper's mode of `sphere_trace`."""
     level = field.resolve_level(level)
-    _check(field, origins, directions, tolerance=tolerance)
     if len(budget) != level + 1:
         raise ValueError(f"budget={list(budget)}: expected {level + 1} number(s) of steps, one for each level")
     if bool((field.deltas[:level].isinf().cpu() & (torch.tensor(budget[:level]) > 0)).any()):

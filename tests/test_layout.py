@@ -10,6 +10,8 @@ import tomllib
 from graphlib import TopologicalSorter
 from pathlib import Path
 
+import mplicits
+import numpy as np
 import pytest
 
 ROOT = Path(__file__).parent.parent
@@ -29,7 +31,9 @@ ROOMS = (
     "pipelines/bench",
     "pipelines/paper",
     "pipelines/cli",
+    "pipelines/front",
 )
+FRONT = "pipelines/front"
 OUTSIDE = {"torch", "numpy", "skimage", "safetensors"}  # what neural_fields may import
 LATE = {"torchdiffeq"}  # and what only inside a function that needs it
 LIGHT = "import {}, sys; assert not {{'torch', 'numpy', 'scipy'}} & set(sys.modules), sorted(sys.modules)"
@@ -39,6 +43,11 @@ def sources() -> list[Path]:
     return sorted(
         path for package in ("neural_fields", "datasets", "pipelines") for path in (ROOT / package).rglob("*.py")
     )
+
+
+def package_of(folder: str) -> str:
+    """What a folder is imported as: the front door is ``mplicits`` itself."""
+    return "mplicits" if folder == FRONT else "mplicits." + folder.replace("/", ".")
 
 
 def imports(path: Path, *, nested: bool = True) -> list[tuple[int, str, list[str]]]:
@@ -58,7 +67,9 @@ def imported(path: Path) -> list[Path]:
     found = []
     for level, module, names in imports(path):
         if level == 0:
-            assert module.split(".")[0] != "mplicits", f"{path}: import {module} relatively"
+            # The front door has another name when it is installed, so that relative imports would lead elsewhere.
+            door = path.parent == ROOT / FRONT
+            assert door or module.split(".")[0] != "mplicits", f"{path}: import {module} relatively"
             continue
         folder = path.parents[level - 1]
         assert folder != ROOT.parent, f"{path}: import leads out of mplicits"
@@ -113,7 +124,7 @@ def test_neural_fields_is_light() -> None:
         )
 
 
-@pytest.mark.parametrize("module", ["mplicits.pipelines.cli", "mplicits.pipelines.run.settings"])
+@pytest.mark.parametrize("module", ["mplicits", "mplicits.pipelines.cli", "mplicits.pipelines.run.settings"])
 def test_help_and_settings_do_not_load_torch(module: str) -> None:
     subprocess.run([sys.executable, "-c", LIGHT.format(module)], check=True, cwd="/")
 
@@ -129,7 +140,7 @@ def test_every_folder_with_python_in_it_is_packaged() -> None:
     setuptools = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["setuptools"]
     folders = {path.parent.relative_to(ROOT).as_posix() for path in sources()} | {"configs"}
     assert {package: setuptools["package-dir"][package] for package in setuptools["packages"]} == {
-        "mplicits." + folder.replace("/", "."): folder for folder in folders
+        package_of(folder): folder for folder in folders
     }
     for path in sources():
         assert (path.parent / "__init__.py").is_file(), f"{path.parent} has no __init__.py"
@@ -150,14 +161,46 @@ def test_the_wheel_alone_holds_every_module(tmp_path: Path) -> None:
     (python,) = [*tmp_path.glob("venv/bin/python"), *tmp_path.glob("venv/Scripts/python.exe")]
     run(sys.executable, "-m", "pip", "--python", python, "install", "--quiet", "--no-deps", wheel)
     (site,) = run(python, "-c", "import sysconfig; print(sysconfig.get_path('purelib'))").split()
-    (here,) = run(sys.executable, "-c", "import sysconfig; print(sysconfig.get_path('purelib'))").split()
-    Path(site, "borrowed.pth").write_text(here)  # its packages, but not its own .pth files, so no editable install
-    wanted = sorted("mplicits." + ".".join(path.relative_to(ROOT).with_suffix("").parts) for path in sources())
+    # The packages of this environment, but not its .pth files, so no editable install.
+    Path(site, "borrowed.pth").write_text("\n".join(folder for folder in sys.path if "site-packages" in folder))
+    wanted = sorted(
+        package_of(path.parent.relative_to(ROOT).as_posix()) + ("" if path.stem == "__init__" else f".{path.stem}")
+        for path in sources()
+    )
     code = (
         "import importlib, pathlib, sys\n"
         "for name in sys.argv[1:]:\n"
-        "    file = pathlib.Path(importlib.import_module(name.removesuffix('.__init__')).__file__)\n"
+        "    file = pathlib.Path(importlib.import_module(name).__file__)\n"
         "    assert 'venv' in file.parts, file\n"
         "print('all of them')"
     )
     assert run(python, "-c", code, *wanted) == "all of them\n"
+
+
+def test_the_front_door() -> None:
+    """Every name is there, is what its home has, and costs nothing before it is asked for."""
+    code = (
+        "import sys, mplicits\n"
+        "assert mplicits.__version__ and not {'torch', 'numpy'} & set(sys.modules)\n"
+        "assert all(getattr(mplicits, name) is not None and name in dir(mplicits) for name in mplicits.__all__)\n"
+        "assert {name for names in mplicits.HOMES.values() for name in names} < set(mplicits.__all__)\n"
+        "import mplicits.neural_fields, mplicits.pipelines.fit\n"
+        "assert mplicits.Field is mplicits.neural_fields.Field and mplicits.fit is mplicits.pipelines.fit.fit\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, cwd="/")
+
+
+def test_a_name_that_is_not_there() -> None:
+    with pytest.raises(AttributeError, match="module 'mplicits' has no attribute 'feild'"):
+        mplicits.feild  # noqa: B018
+
+
+def test_a_run_through_the_front_door(tmp_path: Path) -> None:
+    ball = mplicits.WorldField(mplicits.Siren(8, 1), mplicits.Similarity((5.0, 0.0, -1.0), 20.0))
+    mplicits.save(tmp_path / "ball.safetensors", ball)
+    again = mplicits.load(tmp_path / "ball.safetensors")
+    points = np.random.default_rng(0).uniform(-20, 20, (10, 3))
+    assert (again.distance(points) == ball.distance(points)).all()
+    assert again.similarity == ball.similarity
+    with pytest.raises(mplicits.InputError, match="no such run directory or file"):
+        mplicits.load(tmp_path / "other")

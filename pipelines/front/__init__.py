@@ -39,6 +39,8 @@ if TYPE_CHECKING:
     from mplicits.pipelines.fit import FitConfig, Run, fit  # pyright: ignore[reportMissingImports]
     from torch import device as Device  # noqa: N812
 
+    __version__: str
+
 # Which package each name comes from.
 HOMES = {
     "neural_fields": (
