@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from ...datasets import OrientedCloud, PointCloud, prepare_cloud
 from ...datasets.clouds.large import Merging
 from ...datasets.clouds.outliers import agreement
-from ...neural_fields import Field, InputError, MultiscaleSDF, Similarity, Siren
+from ...neural_fields import Field, InputError, MultiscaleSDF, Similarity, Siren, WorldField, save_field
 from ..run.folder import RunFolder, digest_of
 from ..run.machine import choose_device, environment, peak_memory
 from ..run.settings import FitConfig
@@ -60,6 +60,19 @@ class Run:
     directory: Path | None
     record: dict[str, Any]
 
+    @property
+    def world(self) -> WorldField:
+        """The field in the coordinates and units of the cloud: distances, normals, closest points, rays, meshes."""
+        return WorldField(self.field, self.similarity)
+
+    def save(self, path: str | Path) -> None:
+        """Write the field, and where it belongs, to a .safetensors file, whole or not at all.
+
+        Raises:
+            InputError: the file cannot be written.
+        """
+        save_field(path, self.field, similarity=self.similarity, metadata={"run": self.record})
+
 
 def fit(
     cloud: Cloud,
@@ -85,7 +98,7 @@ def fit(
 
     Example:
         >>> run = fit("scan.ply")  # doctest: +SKIP
-        >>> run.field.value(run.similarity.to_unit(points))  # doctest: +SKIP
+        >>> run.world.distance(points)  # of the scan, in its coordinates and units  # doctest: +SKIP
     """
     folder = RunFolder(out, resume=resume)
     config = folder.config(FitConfig, config, thing="fit")

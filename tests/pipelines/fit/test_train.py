@@ -6,6 +6,7 @@ import signal
 from dataclasses import replace
 from pathlib import Path
 
+import mplicits
 import numpy as np
 import pytest
 import torch
@@ -175,3 +176,15 @@ def test_arrays_and_devices() -> None:
 def test_settings_are_checked(change: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         replace(SMALL, **change)  # type: ignore[arg-type]
+
+
+def test_a_run_answers_in_the_coordinates_of_its_cloud(tmp_path: Path) -> None:
+    run = fit(
+        sphere_cloud(), replace(SMALL, widths=(16,), depths=(1,), omegas=(5.0,), steps=(20,), learning_rates=(1e-3,))
+    )
+    points = np.array([[1000.0, -50.0, 14.0], [1000.0, -50.0, 5.0]])
+    unit = torch.from_numpy(run.similarity.to_unit(points)).float()
+    expected = run.similarity.scale * run.field.value(unit).detach().double().numpy()
+    np.testing.assert_allclose(run.world.distance(points), expected, rtol=1e-12)
+    run.save(tmp_path / "ball.safetensors")
+    assert (mplicits.load(tmp_path / "ball.safetensors").distance(points) == run.world.distance(points)).all()
