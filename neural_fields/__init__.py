@@ -6,6 +6,7 @@ from .attributes import Mapped, map_attribute, map_colors, project_to_surface
 from .characteristics import IntegrationError, Solver, Tracks, flow, track, trajectories, transport_error
 from .checkpoint import SavedField, load_field, load_texture, save_field, save_texture
 from .color import ColorSiren, TextureField
+from .cones import cone_starts
 from .errors import InputError
 from .evolution import Law, curvature, key_loss, law_loss, mean_curvature, morph, near_surface, normal_speed, transport
 from .field import Field, Jet, OneLevelField, SecondJet
@@ -18,7 +19,7 @@ from .similarity import Similarity
 from .siren import Siren
 from .spacetime import SpaceTimeJet, SpaceTimeSDF, TimeSlice, at_time, spacetime_jet
 from .sphere_start import fit_sphere
-from .tracing import Hits, cone_starts, sphere_trace
+from .tracing import Hits, sphere_trace
 from .volume_renderer import Rendered, Sampling, render_volume
 from .world import Closest, WorldField, WorldHits
 

@@ -22,19 +22,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from .cones import CONE_LIPSCHITZ, cone_ends, cone_starts
 from .field import Field
 from .spacetime import SpaceTimeSDF, TimeSlice, check_spacetime
-from .tracing import (
-    BOUNDING_RADIUS,
-    CONE_LIPSCHITZ,
-    Expected,
-    Hits,
-    Near,
-    ball_points,
-    cone_ends,
-    cone_starts,
-    trace_expected,
-)
+from .tracing import BOUNDING_RADIUS, Expected, Hits, Near, ball_points, trace_expected
 
 __all__ = ["DynamicTracer", "moment"]
 

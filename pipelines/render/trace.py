@@ -15,7 +15,8 @@ from torch.nn.functional import normalize
 
 from ...datasets.cameras import Camera
 from ...neural_fields import Field, Hits, TextureField, cone_starts, map_colors, sphere_trace
-from ...neural_fields.tracing import BOUNDING_RADIUS, CONE_LIPSCHITZ
+from ...neural_fields.cones import CONE_LIPSCHITZ
+from ...neural_fields.tracing import BOUNDING_RADIUS
 
 __all__ = [
     "Seen",

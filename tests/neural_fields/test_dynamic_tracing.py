@@ -5,8 +5,9 @@ import torch
 from fields import SCREW, Watched, small_multiscale, small_spacetime
 from mplicits.datasets.cameras import look_at
 from mplicits.neural_fields import Field, Moving, RigidMotion, Sphere, TimeSlice, Torus, Union, at_time, sphere_trace
+from mplicits.neural_fields.cones import cone_ends
 from mplicits.neural_fields.dynamic_tracing import DynamicTracer, moment
-from mplicits.neural_fields.tracing import Expected, cone_ends, trace_expected
+from mplicits.neural_fields.tracing import Expected, trace_expected
 from torch import Tensor
 
 TIMES = [0.2 + k / 40 for k in range(10)]

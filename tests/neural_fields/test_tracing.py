@@ -14,7 +14,6 @@ from mplicits.neural_fields import (
     Siren,
     Sphere,
     Torus,
-    cone_starts,
     sphere_trace,
 )
 from mplicits.neural_fields.baselines import BaconSDF
@@ -232,17 +231,6 @@ def test_steep_fields_need_their_lipschitz_constant():
     assert float((hits.depth - expected)[hits.mask].abs().max()) < 1e-5
 
 
-def test_cones_that_find_themselves_behind_the_surface_go_back():
-    across = torch.linspace(-0.1, 0.1, 64, dtype=torch.float64)
-    rows, columns = torch.meshgrid(across, across, indexing="ij")
-    directions = unit(torch.stack((columns, rows, torch.ones_like(rows)), dim=-1))
-    origin = torch.tensor([0.0, 0.0, -2.5], dtype=torch.float64)
-    near = cone_starts(Scaled(Sphere(radius=0.6), 1.3).double(), origin, directions)
-    expected = sphere_depth(origin.expand(64 * 64, 3), directions.reshape(-1, 3), 0.6).reshape(64, 64)
-    assert bool(expected.isfinite().all())
-    assert bool((near < expected).all())
-
-
 def test_without_a_bounding_ball():
     plane = Plane(normal=(0.0, 0.0, 1.0), offset=-3.0).double()
     origin = torch.zeros(3, dtype=torch.float64)
@@ -279,27 +267,6 @@ def test_a_small_budget_leaves_holes_that_the_default_does_not():
     assert int((expected & ~few.mask).sum()) > 20
     enough = sphere_trace(field, origins, directions, budget=(60,), capture=1e-4)
     assert int((expected != enough.mask).sum()) < 5
-
-
-@pytest.mark.parametrize("level", [0, -1])
-@pytest.mark.parametrize("name", ["sphere", "torus", "box", "multiscale-over-sphere"])
-def test_cones_stop_before_the_surface(name, level):
-    field = THREE_D[name]().double().requires_grad_(False)
-    origin = torch.tensor([0.4, 0.3, -3.0], dtype=torch.float64)
-    across = torch.linspace(-0.4, 0.4, 75, dtype=torch.float64)
-    rows, columns = torch.meshgrid(across[:60], across, indexing="ij")
-    directions = unit(torch.stack((columns, rows, torch.ones_like(rows)), dim=-1))
-    near = cone_starts(field, origin, directions, level=level, lipschitz=1.3)
-    hits = sphere_trace(field, origin, directions, level=level, lipschitz=1.3)
-    assert near.shape == (60, 75)
-    assert bool((near <= hits.depth)[hits.mask].all())
-    assert not bool(hits.mask[near.isinf()].any())
-    assert bool(near.isinf().any())
-    assert float((hits.depth - near)[hits.mask].median()) < 0.35
-    again = sphere_trace(field, origin, directions, level=level, near=near, lipschitz=1.3)
-    assert torch.equal(again.mask, hits.mask)
-    assert float((again.depth - hits.depth)[hits.mask].abs().max()) < 2e-5
-    assert int(again.steps.sum()) < int(hits.steps.sum())
 
 
 @pytest.mark.parametrize("shape", [(), (0,), (1,), (4, 3)])

@@ -1,0 +1,201 @@
+"""Cones for tiles of an image: how far whole tiles see nothing, before any ray is traced."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from .field import Field
+from .tracing import BOUNDING_RADIUS, ball_crossing, check_rays, unit_directions
+
+__all__ = ["CONE_LIPSCHITZ", "cone_ends", "cone_starts"]
+
+# Networks are a little steeper than a distance here and there, and a cone that goes too far loses thin parts.
+CONE_LIPSCHITZ = 1.15
+
+
+@torch.no_grad()
+def cone_starts(
+    field: Field,
+    origin: Tensor,
+    directions: Tensor,
+    *,
+    level: int = -1,
+    tiles: Sequence[int] = (32, 8, 4),
+    lipschitz: float = 1.0,
+    radius: float = BOUNDING_RADIUS,
+    max_steps: int = 64,
+    clearance: float = 0.0,
+) -> Tensor:
+    """Depths up to which whole tiles of an image see nothing, by marching one cone for each tile on level 0.
+
+    A cone of spread σ (the largest distance between the directions of a tile and its middle one) holds every point of
+    the tile's rays at depth t within tσ of its axis, so with v = |f_0| on the axis the tile is empty up to
+    t + ((v − δ_0)/L − tσ) / (1 + σ). Tiles are marched from large to small, each starting where the larger one ended.
+
+    Args:
+        field: what to trace, three-dimensional.
+        origin: ``(3,)`` the common origin of all rays.
+        directions: ``(H, W, 3)`` of any length but 0.
+        level: the level that will be traced from there.
+        tiles: sides of the tiles in pixels, each a multiple of the next.
+        lipschitz: see `sphere_trace`.
+        radius: see `sphere_trace`.
+        max_steps: of each cone.
+        clearance: the tiles keep this far from the surface.
+
+    Returns:
+        ``(H, W)`` depths for ``near`` of `sphere_trace`; infinite where there is nothing to be seen.
+
+    Raises:
+        ValueError: shapes do not fit, or the field is not three-dimensional.
+    """
+    level = field.resolve_level(level)
+    _check_image(field, origin, directions, lipschitz)
+    directions, length = unit_directions(directions)
+    depth = torch.zeros_like(length)
+    for tile in tiles:
+        cones = _Cones.of(directions, tile)
+        starts = depth[::tile, ::tile].reshape(-1)
+        free = _march_cones(field, origin, cones, starts, level, lipschitz, radius, max_steps, clearance)
+        depth = free[cones.of_pixel]
+    return depth / length
+
+
+@torch.no_grad()
+def cone_ends(
+    field: Field,
+    origin: Tensor,
+    directions: Tensor,
+    wanted: Tensor,
+    *,
+    level: int = -1,
+    tiles: Sequence[int] = (32, 8),
+    lipschitz: float = 1.0,
+    radius: float = BOUNDING_RADIUS,
+    max_steps: int = 64,
+    clearance: float = 0.0,
+) -> Tensor:
+    """Depths from which on whole tiles of an image see nothing: `cone_starts` from the other side.
+
+    Rays that pass a shape closely would take many steps to get away from it again. From behind, with v = |f_0| at depth
+    t on the axis, the tile is empty from (t − (v − δ_0)/L) / (1 − σ) on.
+
+    Args:
+        field: see `cone_starts`.
+        origin: see there.
+        directions: see there.
+        wanted: ``(H, W)`` bool; tiles without such a pixel are left out.
+        level: see there.
+        tiles: see there.
+        lipschitz: see there.
+        radius: see there.
+        max_steps: see there.
+        clearance: see there.
+
+    Returns:
+        ``(H, W)`` depths for ``far`` of `sphere_trace`, infinite in tiles that were left out.
+
+    Raises:
+        ValueError: shapes do not fit, or the field is not three-dimensional.
+    """
+    level = field.resolve_level(level)
+    _check_image(field, origin, directions, lipschitz)
+    directions, length = unit_directions(directions)
+    reach = origin.norm() + radius
+    depth = torch.full_like(length, torch.inf)
+    delta = clearance + (float(field.deltas[0]) if level else 0.0)
+    for tile in tiles:
+        cones = _Cones.of(directions, tile)
+        count = len(cones.axis)
+        asked = wanted.new_zeros(count, dtype=torch.uint8)
+        asked = asked.scatter_reduce(0, cones.of_pixel.flatten(), wanted.flatten().to(torch.uint8), "amax").bool()
+        entry, leave = ball_crossing(origin.expand_as(cones.axis), cones.axis, radius + cones.spread * reach)
+        ends = torch.minimum(depth[::tile, ::tile].reshape(-1), leave / (1 - cones.spread))
+        active = (asked & (ends > entry)).nonzero()[:, 0]
+        for _ in range(max_steps):
+            if not len(active):
+                break
+            t, sigma = ends[active], cones.spread[active]
+            value = field.value(origin + t[:, None] * cones.axis[active], level=0)
+            closer = (t - ((value.abs() - delta) / lipschitz).clamp(min=0)) / (1 - sigma)
+            ends[active] = torch.minimum(t, closer)
+            active = active[(t - closer > t * sigma) & (closer > entry[active])]
+        depth = torch.where(asked, ends, torch.inf)[cones.of_pixel]
+    return depth / length
+
+
+def _march_cones(
+    field: Field,
+    origin: Tensor,
+    cones: _Cones,
+    starts: Tensor,
+    level: int,
+    lipschitz: float,
+    radius: float,
+    max_steps: int,
+    clearance: float,
+) -> Tensor:
+    """How far each cone is empty; infinite where it leaves the ball of ``radius`` untouched."""
+    axis, spread = cones.axis, cones.spread
+    delta = clearance + (field.deltas[0].to(axis) if level else axis.new_zeros(()))
+    # A ray of the cone may be in the ball where its axis is not; spread · reach is the most that they are apart.
+    reach = origin.norm() + radius
+    entry, leave = ball_crossing(origin.expand_as(axis), axis, radius + spread * reach)
+    depth = torch.maximum(starts, entry).clamp(min=0)
+    depth[depth >= leave] = torch.inf
+    active = depth.isfinite().nonzero()[:, 0]
+    before, value_before = depth.clone(), torch.full_like(depth, torch.nan)
+    for _ in range(max_steps):
+        if not len(active):
+            break
+        t, sigma, old = depth[active], spread[active], before[active]
+        value = field.value(origin + t[:, None] * axis[active], level=0)
+        # Behind the surface? Then the field is steeper than it was said to be: back, and leave it to the rays.
+        passed = value * value_before[active] < 0
+        step = ((value.abs() - delta) / lipschitz - t * sigma) / (1 + sigma)
+        ahead = torch.where(passed, old, t + step.clamp(min=0))
+        before[active], value_before[active] = t, value
+        depth[active] = torch.where(ahead >= leave[active], torch.inf, ahead)
+        # Once a step is shorter than the cone is wide, smaller cones get on better.
+        active = active[(step > t * sigma) & (ahead < leave[active]) & ~passed]
+    return depth
+
+
+class _Cones(NamedTuple):
+    """The tiles of an image, ``C`` of them.
+
+    Attributes:
+        axis: ``(C, 3)`` the direction of the middle pixel of each.
+        spread: ``(C,)`` the largest distance of the directions of its pixels from that.
+        of_pixel: ``(H, W)`` which tile each pixel is in.
+    """
+
+    axis: Tensor
+    spread: Tensor
+    of_pixel: Tensor
+
+    @classmethod
+    def of(cls, directions: Tensor, tile: int) -> _Cones:
+        height, width = directions.shape[:2]
+        rows, columns = (torch.arange(count, device=directions.device) for count in (height, width))
+        across = -(-width // tile)
+        of_pixel = (rows[:, None] // tile) * across + columns // tile
+        middle_row, middle_column = (
+            (count // tile * tile + tile // 2).clamp(max=len(count) - 1) for count in (rows, columns)
+        )
+        axis = directions[middle_row[::tile]][:, middle_column[::tile]].reshape(-1, 3)
+        away = (directions - directions[middle_row][:, middle_column]).norm(dim=-1)
+        spread = away.new_zeros(len(axis)).scatter_reduce(0, of_pixel.flatten(), away.flatten(), "amax")
+        return cls(axis, spread, of_pixel)
+
+
+def _check_image(field: Field, origin: Tensor, directions: Tensor, lipschitz: float) -> None:
+    if origin.shape != (3,) or directions.ndim != 3:
+        raise ValueError(
+            f"origin {tuple(origin.shape)}, directions {tuple(directions.shape)}: expected (3,), (H, W, 3)"
+        )
+    check_rays(field, origin, directions, lipschitz=lipschitz)

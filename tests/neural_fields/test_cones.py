@@ -1,0 +1,42 @@
+"""Cones for tiles of an image: never beyond the surface."""
+
+import pytest
+import torch
+from fields import FIELDS, Scaled
+from mplicits.neural_fields import Sphere, cone_starts, sphere_trace
+from torch.nn.functional import normalize
+
+THREE_D = {name: make for name, make in FIELDS.items() if make().in_dim == 3}
+
+
+def test_cones_that_find_themselves_behind_the_surface_go_back():
+    across = torch.linspace(-0.1, 0.1, 64, dtype=torch.float64)
+    rows, columns = torch.meshgrid(across, across, indexing="ij")
+    directions = normalize(torch.stack((columns, rows, torch.ones_like(rows)), dim=-1), dim=-1)
+    origin = torch.tensor([0.0, 0.0, -2.5], dtype=torch.float64)
+    near = cone_starts(Scaled(Sphere(radius=0.6), 1.3).double(), origin, directions)
+    along = -(directions @ origin)
+    expected = along - (along**2 - origin @ origin + 0.6**2).sqrt()
+    assert bool(expected.isfinite().all())
+    assert bool((near < expected).all())
+
+
+@pytest.mark.parametrize("level", [0, -1])
+@pytest.mark.parametrize("name", ["sphere", "torus", "box", "multiscale-over-sphere"])
+def test_cones_stop_before_the_surface(name, level):
+    field = THREE_D[name]().double().requires_grad_(False)
+    origin = torch.tensor([0.4, 0.3, -3.0], dtype=torch.float64)
+    across = torch.linspace(-0.4, 0.4, 75, dtype=torch.float64)
+    rows, columns = torch.meshgrid(across[:60], across, indexing="ij")
+    directions = normalize(torch.stack((columns, rows, torch.ones_like(rows)), dim=-1), dim=-1)
+    near = cone_starts(field, origin, directions, level=level, lipschitz=1.3)
+    hits = sphere_trace(field, origin, directions, level=level, lipschitz=1.3)
+    assert near.shape == (60, 75)
+    assert bool((near <= hits.depth)[hits.mask].all())
+    assert not bool(hits.mask[near.isinf()].any())
+    assert bool(near.isinf().any())
+    assert float((hits.depth - near)[hits.mask].median()) < 0.35
+    again = sphere_trace(field, origin, directions, level=level, near=near, lipschitz=1.3)
+    assert torch.equal(again.mask, hits.mask)
+    assert float((again.depth - hits.depth)[hits.mask].abs().max()) < 2e-5
+    assert int(again.steps.sum()) < int(hits.steps.sum())
