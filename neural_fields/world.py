@@ -14,7 +14,7 @@ from torch import Tensor
 from ._lattice import Bounds
 from .attributes import project_to_surface
 from .field import Field
-from .meshing import Mesh, extract_mesh
+from .meshing import DEFAULT_BOUNDS, Mesh, extract_mesh
 from .similarity import Similarity
 from .tracing import sphere_trace
 
@@ -24,8 +24,6 @@ Points = TypeVar("Points", NDArray[np.floating], Tensor)
 
 # Points that come as arrays are evaluated so many at a time.
 BATCH = 1 << 18
-# Room around the unit sphere that a fit fills, as in `extract_mesh`.
-MARGIN = 1.02
 
 
 class Closest(NamedTuple):
@@ -186,10 +184,10 @@ class WorldField:
             NoSurfaceError: there is no surface in the box.
             ValueError: see `extract_mesh`.
         """
-        low, high = (
-            (np.full(3, -MARGIN), np.full(3, MARGIN)) if bounds is None else map(self.similarity.to_unit, bounds)
-        )
-        box = ((low[0], low[1], low[2]), (high[0], high[1], high[2]))
+        box = DEFAULT_BOUNDS
+        if bounds is not None:
+            low, high = map(self.similarity.to_unit, bounds)
+            box = ((low[0], low[1], low[2]), (high[0], high[1], high[2]))
         mesh = extract_mesh(self.field, resolution=resolution, level=level, bounds=box, normals=normals)
         return dataclasses.replace(mesh, vertices=self.similarity.to_input(mesh.vertices))
 

@@ -183,7 +183,7 @@ def test_the_front_door() -> None:
         "import sys, mplicits\n"
         "assert mplicits.__version__ and not {'torch', 'numpy'} & set(sys.modules)\n"
         "assert all(getattr(mplicits, name) is not None and name in dir(mplicits) for name in mplicits.__all__)\n"
-        "assert {name for names in mplicits.HOMES.values() for name in names} < set(mplicits.__all__)\n"
+        "assert set(mplicits.OF_FIT) < set(mplicits.__all__)\n"
         "import mplicits.neural_fields, mplicits.pipelines.fit\n"
         "assert mplicits.Field is mplicits.neural_fields.Field and mplicits.fit is mplicits.pipelines.fit.fit\n"
     )

@@ -15,19 +15,7 @@ from typing import TYPE_CHECKING, Any
 from ..run.config import add_config_flags, given_flags, input_error, load_config, preset_names
 from ..run.settings import EvolveConfig, FitConfig, ReconstructConfig, TextureConfig
 from .bench_paper import PAPER
-from .common import (
-    Command,
-    add_fit_settings,
-    add_json,
-    add_settings,
-    check_output,
-    fit_settings,
-    positive,
-    read_settings,
-    typed,
-    whole,
-    write_json,
-)
+from .common import Command, add_flags, add_settings, check_output, positive, read_settings, typed, whole, write_json
 
 if TYPE_CHECKING:
     from ..bench.benchmark import Benchmark
@@ -111,7 +99,7 @@ def _normals_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--device", default="cpu", help="torch device (cpu)")
     _number(parser, "--seed", whole(0), 0, "of points and weights")
     _folder(parser)
-    add_json(parser)
+    add_flags(parser, "--json")
 
 
 def _normals(arguments: argparse.Namespace) -> int:
@@ -127,7 +115,7 @@ def _mesh_arguments(parser: argparse.ArgumentParser) -> None:
     _number(parser, "--reference", whole(8, 1024), 512, "where all are")
     parser.add_argument("--full", action="store_true", help="evaluate the dense peer on the whole lattice: very slow")
     _folder(parser)
-    add_json(parser)
+    add_flags(parser, "--json")
 
 
 def _mesh(arguments: argparse.Namespace) -> int:
@@ -149,12 +137,12 @@ def _fit_arguments(parser: argparse.ArgumentParser) -> None:
     _number(parser, "--poisson-depth", whole(4, 14), 10, "octree depth")
     parser.add_argument("--pictures", type=Path, metavar="DIR", help="write a picture of all methods per shape")
     _folder(parser)
-    add_json(parser)
-    add_fit_settings(parser)
+    add_flags(parser, "--json")
+    add_settings(parser, FitConfig)
 
 
 def _fit(arguments: argparse.Namespace) -> int:
-    config = fit_settings(arguments)
+    config = read_settings(arguments, FitConfig)
     from ..bench.fits import FitBench
 
     bench = FitBench(
@@ -176,12 +164,12 @@ def _render_arguments(parser: argparse.ArgumentParser) -> None:
     _number(parser, "--views", whole(1), 3, "cameras around the shape")
     _number(parser, "--repeats", whole(1), 2, "the best of how many")
     parser.add_argument("--no-naive", action="store_true", help="leave out the naive tracer, which takes minutes")
-    add_json(parser)
-    add_fit_settings(parser)
+    add_flags(parser, "--json")
+    add_settings(parser, FitConfig)
 
 
 def _render(arguments: argparse.Namespace) -> int:
-    config = fit_settings(arguments)
+    config = read_settings(arguments, FitConfig)
     from ..bench.render import RenderBench
     from ..run.machine import choose_device
 
@@ -199,7 +187,7 @@ def _view_arguments(parser: argparse.ArgumentParser, *, views: int) -> None:
     _number(parser, "--size", whole(16, 4096), 512, "of the images")
     parser.add_argument("--up", choices=("y", "z"), default="y", help="the axis that points up (y)")
     _number(parser, "--resolution", whole(8, 2048), 256, "of the coarse surface's mesh")
-    add_json(parser)
+    add_flags(parser, "--json")
 
 
 def _texture_arguments(parser: argparse.ArgumentParser) -> None:
@@ -272,7 +260,7 @@ def _reconstruct_arguments(parser: argparse.ArgumentParser) -> None:
     )
     _measured(parser, 256)
     _number(parser, "--neus-learning-rate", positive, 1e-3, "peak rate of the NeuS rows")
-    add_json(parser)
+    add_flags(parser, "--json")
     add_settings(parser, ReconstructConfig, about="of all rows; the geometry is chosen by the benchmark")
 
 
@@ -315,7 +303,7 @@ def _evolve_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--no-exact", action="store_true", help="leave out the exact cases")
     _number(parser, "--mesh-resolution", whole(8, 2048), 256, "with --meshes and --trace")
     _number(parser, "--eval-samples", whole(1), 500_000, "per surface")
-    add_json(parser)
+    add_flags(parser, "--json")
     add_settings(
         parser,
         EvolveConfig,
@@ -358,12 +346,12 @@ def _scale_arguments(parser: argparse.ArgumentParser) -> None:
     _measured(parser, 256)
     parser.add_argument("--folder", type=Path, metavar="DIR", help="where the clouds are written, and removed")
     _folder(parser)
-    add_json(parser)
-    add_fit_settings(parser)
+    add_flags(parser, "--json")
+    add_settings(parser, FitConfig)
 
 
 def _scale(arguments: argparse.Namespace) -> int:
-    config = fit_settings(arguments)
+    config = read_settings(arguments, FitConfig)
     from ..bench.fits import ScaleBench
 
     options = {name: getattr(arguments, name) for name in ("folder", "shape", "noise", "resolution")}

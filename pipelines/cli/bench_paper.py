@@ -10,7 +10,7 @@ from typing import TypeVar
 
 from ..paper.names import METHODS, PRESETS, TABLES
 from ..run.config import closest, input_error
-from .common import Command, add_json, check_output, typed, whole, write_json
+from .common import Command, add_flags, check_output, typed, whole, write_json
 
 __all__ = ["PAPER"]
 
@@ -40,7 +40,7 @@ def _paper_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--page", type=Path, metavar="FILE.md", help="also write the page there, plots and sheets in a folder beside it"
     )
-    add_json(parser)
+    add_flags(parser, "--json")
 
 
 def _paper(arguments: argparse.Namespace) -> int:

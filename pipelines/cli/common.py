@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from ..run.config import add_config_flags, given_flags, input_error, load_config, preset_names, thing_of
-from ..run.settings import FitConfig
 
 if TYPE_CHECKING:
     from ..run.trainer import Report
@@ -21,15 +20,12 @@ __all__ = [
     "Command",
     "Stopped",
     "add_begin",
-    "add_fit_settings",
     "add_flags",
-    "add_json",
     "add_new_run",
     "add_settings",
     "between",
     "check_output",
     "finite",
-    "fit_settings",
     "positive",
     "read_settings",
     "stoppable",
@@ -136,7 +132,7 @@ AROUND = "degrees around the up axis from the front (30)"
 FLAGS: Mapping[str, dict[str, Any]] = {
     "run": {"metavar": "RUN", "help": "run directory or .safetensors file"},
     "--out": {"required": True, "type": Path, "metavar": "FILE"},
-    "--json": {"type": Path, "metavar": "FILE", "help": "write the figures as JSON as well"},
+    "--json": {"type": Path, "metavar": "FILE", "help": "write the figures as JSON as well"},  # `main` checks it
     "--quiet": {"action": "store_true", "help": "no progress bars"},
     "--level": {"type": whole(0), "metavar": "L", "help": "0 is the coarsest (default: the finest)"},
     "--normal-level": {"type": whole(0), "metavar": "L"},
@@ -168,11 +164,6 @@ def add_flags(parser: argparse.ArgumentParser, *names: str, of: str = "", **chan
         options = {**FLAGS[name], **changed}
         options["help"] = of + options["help"]
         parser.add_argument(*(["-o"] if name == "--out" else []), name, **options)
-
-
-def add_json(parser: argparse.ArgumentParser) -> None:
-    """Add ``--json FILE``; `main` checks that it can be written."""
-    add_flags(parser, "--json")
 
 
 def add_begin(parser: argparse.ArgumentParser, *, resume: str, force: str) -> None:
@@ -212,16 +203,6 @@ def read_settings(arguments: argparse.Namespace, cls: type[T], *, default: str =
 def were_given(arguments: argparse.Namespace, cls: type) -> bool:
     """Whether any setting was given."""
     return bool(arguments.config or arguments.preset or given_flags(arguments, cls))
-
-
-def add_fit_settings(parser: argparse.ArgumentParser) -> None:
-    """Add the settings of a fit."""
-    add_settings(parser, FitConfig)
-
-
-def fit_settings(arguments: argparse.Namespace) -> FitConfig:
-    """What the arguments say of a fit."""
-    return read_settings(arguments, FitConfig)
 
 
 # --- before any work, and after it ---

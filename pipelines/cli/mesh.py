@@ -6,7 +6,7 @@ import argparse
 import time
 
 from ..run.config import given_flags
-from .common import Command, add_flags, add_json, positive, whole
+from .common import Command, add_flags, positive, whole
 
 __all__ = ["EVALUATE", "MESH"]
 
@@ -58,7 +58,7 @@ def _evaluate_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("reference", metavar="REFERENCE", help="the true mesh, or a point cloud")
     add_flags(parser, "--samples", type=whole(1), default=500_000, help="on each surface (500000)")
     add_flags(parser, "--seed", help="of the samples (0)")
-    add_json(parser)
+    add_flags(parser, "--json")
 
 
 def _evaluate(arguments: argparse.Namespace) -> int:

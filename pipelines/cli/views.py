@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 
-from .common import Command, add_flags, add_json, check_output, whole, write_json
+from .common import Command, add_flags, check_output, whole, write_json
 
 __all__ = ["CHECK_CAMERAS", "SCENE"]
 
@@ -16,7 +16,7 @@ def _check_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("data", metavar="DATA", help=what)
     add_flags(parser, "--out", required=False, help=".glb or .ply: the cameras, to look at")
-    add_json(parser)
+    add_flags(parser, "--json")
 
 
 def _check_cameras(arguments: argparse.Namespace) -> int:

@@ -41,29 +41,8 @@ if TYPE_CHECKING:
 
     __version__: str
 
-# Which package each name comes from.
-HOMES = {
-    "neural_fields": (
-        "Field",
-        "FunctionField",
-        "InputError",
-        "Jet",
-        "Mesh",
-        "MultiscaleSDF",
-        "NeuSGeometry",
-        "Similarity",
-        "Siren",
-        "Sphere",
-        "TextureField",
-        "WorldField",
-        "extract_mesh",
-        "load_field",
-        "render_volume",
-        "save_field",
-        "sphere_trace",
-    ),
-    "pipelines.fit": ("FitConfig", "Run", "fit"),
-}
+# Names of `mplicits.pipelines.fit`; what else of ``__all__`` is not defined here is of `mplicits.neural_fields`.
+OF_FIT = ("FitConfig", "Run", "fit")
 PACKAGES = ("configs", "datasets", "neural_fields", "pipelines")
 
 __all__ = [  # noqa: RUF022
@@ -129,9 +108,9 @@ def __getattr__(name: str) -> Any:
         return importlib.import_module("importlib.metadata").version("mplicits")
     if name in PACKAGES:
         return importlib.import_module(f"mplicits.{name}")
-    for home, names in HOMES.items():
-        if name in names:
-            return getattr(importlib.import_module(f"mplicits.{home}"), name)
+    if name in __all__:
+        home = "pipelines.fit" if name in OF_FIT else "neural_fields"
+        return getattr(importlib.import_module(f"mplicits.{home}"), name)
     raise AttributeError(f"module 'mplicits' has no attribute {name!r}")
 
 
