@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from numbers import Real
 from typing import Any, ClassVar, NamedTuple
 
 import torch
@@ -209,9 +210,12 @@ class Field(nn.Module, ABC):
         return x
 
     def _save_to_state_dict(self, destination: Any, prefix: str, keep_vars: bool) -> None:
-        """Note the definition in the metadata that `torch.nn.Module.state_dict` keeps beside the tensors."""
+        """Note the definition in the metadata that `torch.nn.Module.state_dict` keeps beside the tensors.
+
+        In plain types, which ``torch.load(weights_only=True)`` reads.
+        """
         super()._save_to_state_dict(destination, prefix, keep_vars)
-        destination._metadata[prefix[:-1]]["definition"] = dict(self.definition())
+        destination._metadata[prefix[:-1]]["definition"] = _plain(self.definition())
 
     def _load_from_state_dict(
         self,
@@ -227,7 +231,7 @@ class Field(nn.Module, ABC):
 
         Where the metadata has been lost on the way (a plain dict, a safetensors file), there is nothing to compare.
         """
-        here = self.definition()
+        here = _plain(self.definition())
         there = local_metadata.get("definition", here)
         error_msgs += [
             f"{prefix}{name} is {there.get(name)!r} where the tensors come from and {here.get(name)!r} here: "
@@ -238,6 +242,17 @@ class Field(nn.Module, ABC):
         super()._load_from_state_dict(
             state_dict, prefix, local_metadata, strict, missing_keys, unexpected_keys, error_msgs
         )
+
+
+def _plain(value: Any) -> Any:
+    """Numbers, words and what holds them as Python's own, whoever made them; all else as it prints."""
+    if value is None or isinstance(value, bool | int | str):
+        return value
+    if isinstance(value, Real):
+        return float(value)
+    if isinstance(value, Mapping):
+        return {name: _plain(item) for name, item in value.items()}
+    return tuple(map(_plain, value)) if isinstance(value, tuple | list) else repr(value)
 
 
 class OneLevelField(Field):

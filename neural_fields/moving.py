@@ -47,6 +47,10 @@ class RigidMotion:
         self.axis, self.angle = tuple(c / length for c in axis), float(angle)
         self.center, self.drift = center, velocity
 
+    def __repr__(self) -> str:
+        center, velocity = (tuple(map(float, vector)) for vector in (self.center, self.drift))
+        return f"RigidMotion(axis={self.axis}, angle={self.angle}, center={center}, velocity={velocity})"
+
     def forward(self, x: Tensor, t: Tensor | float) -> Tensor:
         """Where points ``(..., 3)`` of time 0 are at time(s) t, ``(...,)`` or a number."""
         center, drift, time = self._terms(x, t)

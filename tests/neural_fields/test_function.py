@@ -1,12 +1,15 @@
 """Any function as a field, and what a field of one's own needs."""
 
+import numpy as np
 import pytest
 import torch
 from mplicits.neural_fields import (
     Field,
     FunctionField,
     Jet,
+    Moving,
     MultiscaleSDF,
+    RigidMotion,
     Siren,
     Sphere,
     Torus,
@@ -115,6 +118,13 @@ def test_the_definition_survives_a_file(tmp_path) -> None:
     Siren(8, 1, omega=9).load_state_dict(state)
     with pytest.raises(RuntimeError, match="omega is 9"):
         Siren(8, 1).load_state_dict(state)
+    motion = RigidMotion(velocity=(0.3, 0.0, 0.0))
+    torch.save(Moving(Siren(8, 1), motion).state_dict(), tmp_path / "moving.pt")
+    state = torch.load(tmp_path / "moving.pt", weights_only=True)
+    Moving(Siren(8, 1), motion).load_state_dict(state)
+    Sphere(radius=np.float64(1.0)).load_state_dict(Sphere(radius=1).state_dict())
+    with pytest.raises(RuntimeError, match=r"motion is .RigidMotion\(.*0\.3"):
+        Moving(Siren(8, 1), RigidMotion()).load_state_dict(state)
 
 
 def test_a_repr_tells_the_function() -> None:
