@@ -25,6 +25,7 @@ from ...neural_fields import Field, Jet, MultiscaleSDF, Siren, levels_of, load_f
 from ...neural_fields.meshing import DEFAULT_BOUNDS, extract_mesh
 from ..run.folder import find_field
 from ..run.machine import best_seconds, peak_memory, sgemm_rate
+from ..run.trainer import seeded
 from .benchmark import Benchmark, Part
 from .cells import Workplace
 from .tables import Column, Figure, Table, tabulated
@@ -97,8 +98,7 @@ class NormalsBench(Benchmark[NormalsRow]):
         """The row of one network."""
         generator = torch.Generator().manual_seed(self.seed)
         x = (2 * torch.rand(self.points, 3, generator=generator) - 1).to(self.device)
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(self.seed)
+        with seeded(self.seed):
             network = Siren(width, depth).to(self.device).requires_grad_(False)
 
         def seconds(way: Callable[[Tensor], object]) -> float:

@@ -8,7 +8,7 @@ from torch import Tensor
 from ...neural_fields import Jet, Siren, SpaceTimeSDF, key_loss, law_loss, spacetime_jet
 from ...neural_fields.losses import eikonal_loss
 from ..run.settings import EvolveConfig
-from ..run.trainer import Group, Objective, Report, Trainer, warm_cosine
+from ..run.trainer import Group, Objective, Report, Trainer, seeded, warm_cosine
 from .problem import Problem
 from .samples import Known, band_points, indices_in_band, uniform_spacetime
 
@@ -123,11 +123,9 @@ class _StillObjective(Objective):
 
 def learn_start(known: Known, config: EvolveConfig, generator: torch.Generator, progress: Report) -> SpaceTimeSDF:
     """A field of one level that stands still: the shape at time 0, learnt in space alone and then lifted."""
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(config.seed)
+    with seeded(config.seed):
         siren = Siren(config.widths[0], config.depths[0], omega=config.omegas[0]).to(known.points)
     objective = _StillObjective(siren, known, config, generator)
     Trainer(objective, stage="first shape", steps=config.start_steps).run(report=progress)
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(config.seed)
+    with seeded(config.seed):
         return SpaceTimeSDF.from_static(siren)

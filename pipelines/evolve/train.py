@@ -12,13 +12,23 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ...neural_fields import InputError, MultiscaleSDF, Similarity, Siren, SpaceTimeSDF
-from ..fit.level import RESIDUAL_GAIN
+from ...neural_fields import InputError, MultiscaleSDF, Similarity, SpaceTimeSDF
+from ..fit.level import new_level
 from ..fit.samples import delta_of
 from ..run.folder import RunFolder, digest_of
 from ..run.machine import choose_device, environment
 from ..run.settings import EvolveConfig
-from ..run.trainer import Interrupted, Progress, Report, StopFlag, Trainer, prefixed, stop_on_signals, without_prefix
+from ..run.trainer import (
+    Interrupted,
+    Progress,
+    Report,
+    StopFlag,
+    Trainer,
+    checkpoint_of,
+    restore_frozen,
+    stop_on_signals,
+    without_prefix,
+)
 from .checks import check_evolution
 from .objective import LONGEST_GRADIENT, EvolveObjective, learn_start
 from .problem import Problem, build_problem
@@ -69,7 +79,7 @@ def evolve(
         >>> run.record["checks"]["warnings"]  # doctest: +SKIP
     """
     folder = RunFolder(out, resume=resume)
-    config = folder.config(EvolveConfig, config, thing="evolve")
+    config = folder.config(EvolveConfig, config)
     choose_device(config.device)
     report, count, shapes = progress or (lambda _: None), len(config.shapes) + 1, []
     for index, text in enumerate(config.shapes):
@@ -182,21 +192,14 @@ class _Evolving:
             return learn_start(self.problem.known.to(self.device), config, generator, self.progress).to(self.device)
         assert self.frozen is not None
         assert delta is not None
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(config.seed * 1009 + level)
-            residual = self.siren(level)
+        residual = new_level(config, level, residual=True, in_dim=4)
         with torch.no_grad():
             residual.layers[0].weight[:, 3] *= config.time_gain  # pyright: ignore[reportIndexIssue]
         return self.frozen.with_level(residual.to(self.device), delta=delta).to(self.device)
 
-    def siren(self, level: int) -> Siren:
-        """An untrained level."""
-        config, gain = self.config, RESIDUAL_GAIN if level else 1.0
-        return Siren(config.widths[level], config.depths[level], omega=config.omegas[level], in_dim=4, output_gain=gain)
-
     def empty(self, levels: int) -> SpaceTimeSDF:
         """Untrained levels, to be filled from a state."""
-        sirens = [self.siren(level) for level in range(levels)]
+        sirens = [new_level(self.config, level, residual=False, in_dim=4) for level in range(levels)]
         return SpaceTimeSDF(MultiscaleSDF(sirens[0], sirens[1:], [1.0] * (levels - 1)))
 
     def next_delta(self) -> float:
@@ -225,9 +228,7 @@ class _Evolving:
 
     def save(self, field: SpaceTimeSDF, trainer: Trainer[EvolveObjective] | None) -> None:
         """Write a usable field and all that `restore` needs."""
-        tensors = {} if trainer is None else prefixed("trainer.", trainer.state())
-        if self.frozen is not None:
-            tensors |= prefixed("frozen.", self.frozen.state_dict())
+        tensors = checkpoint_of(self.frozen, trainer)
         progress = {"fingerprint": self.fingerprint, "stages": self.stages}
         self.folder.save(field, self.problem.similarity, self.record(finished=False), tensors, progress)
 
@@ -238,9 +239,7 @@ class _Evolving:
         tensors, progress = self.folder.restore(self.fingerprint, mismatch)
         self.stages = progress["stages"]
         if self.stages:
-            self.frozen = self.empty(len(self.stages)).to(self.device)
-            self.frozen.load_state_dict(without_prefix("frozen.", tensors))
-            self.frozen.requires_grad_(False)
+            self.frozen = restore_frozen(self.empty(len(self.stages)).to(self.device), tensors)
         self.trainer_state = without_prefix("trainer.", tensors)
 
     def record(self, *, finished: bool) -> dict[str, Any]:

@@ -9,23 +9,22 @@ from torch import Tensor
 
 from ...neural_fields import Siren
 from ...neural_fields.losses import data_loss, eikonal_loss, normal_loss
-from ..run.settings import FitConfig
+from ..run.settings import EvolveConfig, FitConfig
 from ..run.team import my_share, whole_batch
-from ..run.trainer import Group, Objective, warm_cosine
+from ..run.trainer import Group, Objective, seeded, warm_cosine
 from .samples import Source
 
-__all__ = ["RESIDUAL_GAIN", "LevelObjective", "new_level"]
+__all__ = ["LevelObjective", "new_level"]
 
 # A residual starts at a tenth of the usual output scale, close to the level before it.
 RESIDUAL_GAIN = 0.1
 
 
-def new_level(config: FitConfig, level: int, *, residual: bool) -> Siren:
+def new_level(config: FitConfig | EvolveConfig, level: int, *, residual: bool, in_dim: int = 3) -> Siren:
     """The untrained SIREN of a level, whose weights follow from the seed; small where it is added to others."""
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(config.seed * 1009 + level)
-        gain = RESIDUAL_GAIN if residual else 1.0
-        return Siren(config.widths[level], config.depths[level], omega=config.omegas[level], output_gain=gain)
+    width, depth, omega = config.widths[level], config.depths[level], config.omegas[level]
+    with seeded(config.seed * 1009 + level):
+        return Siren(width, depth, omega=omega, in_dim=in_dim, output_gain=RESIDUAL_GAIN if residual else 1.0)
 
 
 class LevelObjective(Objective):

@@ -23,7 +23,17 @@ from ...neural_fields import Field, InputError, MultiscaleSDF, Similarity, Siren
 from ..run.folder import RunFolder, digest_of
 from ..run.machine import choose_device, environment, peak_memory
 from ..run.settings import FitConfig
-from ..run.trainer import Interrupted, Progress, Report, StopFlag, Trainer, prefixed, stop_on_signals, without_prefix
+from ..run.trainer import (
+    Interrupted,
+    Progress,
+    Report,
+    StopFlag,
+    Trainer,
+    checkpoint_of,
+    restore_frozen,
+    stop_on_signals,
+    without_prefix,
+)
 from ..surface.trim import write_support
 from .cloud import CloudDistance, load_cloud
 from .level import LevelObjective, new_level
@@ -101,7 +111,7 @@ def fit(
         >>> run.world.distance(points)  # of the scan, in its coordinates and units  # doctest: +SKIP
     """
     folder = RunFolder(out, resume=resume)
-    config = folder.config(FitConfig, config, thing="fit")
+    config = folder.config(FitConfig, config)
     device = choose_device(config.device)
     raw, merging = load_cloud(_as_cloud(cloud), limit=config.merge_above, isolation=config.isolation, cache=folder.path)
     fitting = _Fitting(prepare(raw, config), raw.source, config, device, folder, progress, merging)
@@ -280,9 +290,7 @@ class _Fitting:
 
     def save(self, field: MultiscaleSDF, trainer: Trainer[LevelObjective] | None) -> None:
         """Write a usable field and all that `restore` needs."""
-        tensors = {} if trainer is None else prefixed("trainer.", trainer.state())
-        if self.frozen is not None:
-            tensors |= prefixed("frozen.", self.frozen.state_dict())
+        tensors = checkpoint_of(self.frozen, trainer)
         progress = {"fingerprint": self.fingerprint, "stages": self.stages}
         self.folder.save(field, self.cloud.similarity, self.record(finished=False), tensors, progress)
 
@@ -293,9 +301,8 @@ class _Fitting:
         self.stages = progress["stages"]
         levels = [new_level(self.config, level, residual=False) for level in range(len(self.stages))]
         if levels:
-            self.frozen = MultiscaleSDF(levels[0], levels[1:], [1.0] * (len(levels) - 1)).to(self.device)
-            self.frozen.load_state_dict(without_prefix("frozen.", tensors))
-            self.frozen.requires_grad_(False)
+            empty = MultiscaleSDF(levels[0], levels[1:], [1.0] * (len(levels) - 1)).to(self.device)
+            self.frozen = restore_frozen(empty, tensors)
             self.review()  # again: it follows from the cloud and level 0
             self.errors = self.values_at_cloud()
         self.trainer_state = without_prefix("trainer.", tensors)

@@ -15,7 +15,7 @@ from ...neural_fields import Field
 from ...neural_fields.baselines import BandLimited, BanfSDF, HashGridSDF
 from ...neural_fields.losses import data_loss, eikonal_loss
 from ..fit.samples import DOMAIN
-from ..run.trainer import Report
+from ..run.trainer import Report, seeded
 from .cells import Preset
 from .recipe import (
     Output,
@@ -27,7 +27,6 @@ from .recipe import (
     differences,
     finished,
     mape_loss,
-    seeded,
     stencil,
 )
 
@@ -50,8 +49,8 @@ class GridSettings:
 
     def field(self, *, seed: int, radius: float | None = None) -> HashGridSDF:
         """An untrained field over the cube in which distances are learnt, without a trace in torch's random state."""
-        return seeded(
-            lambda: HashGridSDF(
+        with seeded(seed):
+            return HashGridSDF(
                 levels=self.levels,
                 table_size=1 << self.table,
                 coarsest=self.coarsest,
@@ -60,9 +59,7 @@ class GridSettings:
                 depth=self.depth,
                 extent=DOMAIN,
                 radius=radius,
-            ),
-            seed,
-        )
+            )
 
 
 @dataclass(frozen=True)

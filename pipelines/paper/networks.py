@@ -13,9 +13,9 @@ from ...neural_fields import Siren
 from ...neural_fields.baselines import BaconSDF, IdfSDF
 from ...neural_fields.baselines.idf import attenuation
 from ..fit.cloud import CloudDistance
-from ..run.trainer import Report
+from ..run.trainer import Report, seeded
 from .cells import Preset
-from .recipe import Output, Recipe, cosine, count, descend, finished, seeded
+from .recipe import Output, Recipe, cosine, count, descend, finished
 
 __all__ = [
     "BaconRecipe",
@@ -156,13 +156,10 @@ class SirenRecipe(Recipe[SirenSettings]):
         self, cloud: OrientedCloud, settings: SirenSettings, *, seed: int, device: str, progress: Report | None
     ) -> tuple[tuple[Output, ...], int]:
         """See `Recipe.learn`."""
-
-        def begin() -> Siren:
+        with seeded(seed):
             field = Siren(settings.width, settings.depth, omega=settings.omega)
             begin_as_sphere(field, settings.sphere_steps)
-            return field
-
-        field = seeded(begin, seed).to(device)
+        field = field.to(device)
         batches = _CloudBatches(cloud, settings.batch, settings.share, seed=seed, device=device)
 
         def loss(step: int) -> Tensor:
@@ -235,9 +232,8 @@ class BaconRecipe(Recipe[BaconSettings]):
         self, cloud: OrientedCloud, settings: BaconSettings, *, seed: int, device: str, progress: Report | None
     ) -> tuple[tuple[Output, ...], int]:
         """See `Recipe.learn`."""
-        field = seeded(lambda: BaconSDF(settings.width, bands=settings.bands, outputs=settings.outputs), seed).to(
-            device
-        )
+        with seeded(seed):
+            field = BaconSDF(settings.width, bands=settings.bands, outputs=settings.outputs).to(device)
         generator = torch.Generator().manual_seed(seed)
         distances = CloudDistance(torch.from_numpy(cloud.points), torch.from_numpy(cloud.normals))
         half = settings.batch // 2
@@ -335,13 +331,10 @@ class IdfRecipe(Recipe[IdfSettings]):
         self, cloud: OrientedCloud, settings: IdfSettings, *, seed: int, device: str, progress: Report | None
     ) -> tuple[tuple[Output, ...], int]:
         """See `Recipe.learn`."""
-
-        def begin() -> IdfSDF:
+        with seeded(seed):
             field = IdfSDF(settings.width, settings.depth, omegas=settings.omegas)
             begin_as_sphere(field.base, settings.sphere_steps)
-            return field
-
-        field = seeded(begin, seed).to(device)
+        field = field.to(device)
         batches = _CloudBatches(cloud, settings.batch, settings.share, seed=seed, device=device)
 
         def loss(step: int) -> Tensor:

@@ -29,7 +29,6 @@ __all__ = [
     "differences",
     "finished",
     "mape_loss",
-    "seeded",
     "stencil",
 ]
 
@@ -165,13 +164,6 @@ class _Descent(Objective):
 def cosine(first: float, last: float, done: float) -> float:
     """From ``first`` to ``last`` along half a cosine, at a fraction ``done`` in [0, 1]."""
     return last + (first - last) * 0.5 * (1 + math.cos(math.pi * done))
-
-
-def seeded(make: Callable[[], F], seed: int) -> F:
-    """What ``make`` builds from torch's random numbers, without a trace in their state."""
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        return make()
 
 
 def finished(field: F) -> F:

@@ -14,6 +14,7 @@ from ...neural_fields import Field, Siren, extract_mesh
 from ..bench.cells import Findings, Method, Record, Workplace
 from ..bench.speed import NormalsBench
 from ..bench.tables import Column, Row, Table, Value
+from ..run.trainer import seeded
 from .base import base_cell, base_of, without_bands
 from .cells import PaperCell, TableSpec, select
 from .judge import protocol_of
@@ -68,8 +69,7 @@ class MarchingCubes(Method[PaperCell]):
         """See `Method.run`: one output per scheme, each with its "seconds"."""
         field = base_of(cell, work, SIZES[cell.preset]).field
         resolution, every = protocol_of(cell.preset).resolution, EVERY[cell.preset]
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(cell.seed)
+        with seeded(cell.seed):
             baseline = Siren(*BASELINE).to(work.device).requires_grad_(False)
         grids = {"baseline": baseline, "without culling": without_bands(field), "with culling": field}
         seconds = {name: grid_seconds(grid, resolution, every=every) for name, grid in grids.items()}

@@ -17,6 +17,7 @@ from ...neural_fields.sphere_start import fit_sphere
 from ...neural_fields.volume import sphere_span
 from ...neural_fields.volume_renderer import Rendered, Sampling, render_volume
 from ..run.settings import ReconstructConfig
+from ..run.trainer import seeded
 
 __all__ = ["RayPool", "Rays", "SceneModel", "build_scene", "camera_rays"]
 
@@ -90,8 +91,7 @@ def build_scene(config: ReconstructConfig, *, has_masks: bool) -> SceneModel:
     background = config.background
     if background == "auto":
         background = "white" if has_masks else "outside"
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(config.seed)
+    with seeded(config.seed):
         if config.geometry == "neus":
             geometry: Field = NeusSDF(radius=config.radius)
             features = 256

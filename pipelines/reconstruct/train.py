@@ -86,7 +86,7 @@ def reconstruct(
         >>> run.record["held_out"]["psnr"]  # doctest: +SKIP
     """
     folder = RunFolder(out, resume=resume)
-    config = folder.config(ReconstructConfig, config, thing="reconstruct")
+    config = folder.config(ReconstructConfig, config)
     device = choose_device(config.device)
     images = data if isinstance(data, PosedImages) else read_posed_images(data, width=config.width)
     training = _Reconstruction(images, config, device, folder, progress or (lambda _: None))

@@ -191,14 +191,14 @@ class RunFolder:
         self.path, self.resume = None if path is None else Path(path), resume
         self.out = self.path if is_leader() else None
 
-    def config(self, kind: type[C], given: C | None, *, thing: str) -> C:
+    def config(self, kind: type[C], given: C | None) -> C:
         """Settings of the run: its own if it is resumed, else those given, else the defaults.
 
         Raises:
             InputError: the record of the run is missing or damaged.
         """
         if self.resume and self.path is not None:
-            return load_config(kind, None, read_record(self.path)["config"], thing=thing)
+            return load_config(kind, None, read_record(self.path)["config"])
         return given or kind()
 
     @contextmanager

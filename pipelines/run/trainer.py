@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
-from typing import Generic, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -27,7 +27,9 @@ __all__ = [
     "Report",
     "StopFlag",
     "Trainer",
-    "prefixed",
+    "checkpoint_of",
+    "restore_frozen",
+    "seeded",
     "stop_on_signals",
     "warm_cosine",
     "without_prefix",
@@ -104,6 +106,14 @@ def stop_on_signals() -> Iterator[StopFlag]:
             signal.signal(number, before[number])
 
 
+@contextmanager
+def seeded(seed: int) -> Iterator[None]:
+    """A block whose random numbers follow from ``seed``, and leave no trace in the state of torch's."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        yield
+
+
 def warm_cosine(peak: float) -> Rate:
     """Learning rates for a schedule done to a fraction in [0, 1]: a warm-up to ``peak``, then a cosine to 0.
 
@@ -155,6 +165,7 @@ class Objective(ABC):
 
 
 O = TypeVar("O", bound=Objective)  # noqa: E741
+F = TypeVar("F", bound=nn.Module)
 
 
 class Trainer(Generic[O]):
@@ -266,9 +277,9 @@ class Trainer(Generic[O]):
     def state(self) -> dict[str, Tensor]:
         """All that `restore` needs to continue as if nothing had happened."""
         objective = self.objective
-        state = prefixed(self._name, objective.network.state_dict())
+        state = _prefixed(self._name, objective.network.state_dict())
         for index, parameter in enumerate(objective.network.parameters()):
-            state |= prefixed(f"adam.{index}.", self.adam.state.get(parameter, {}))
+            state |= _prefixed(f"adam.{index}.", self.adam.state.get(parameter, {}))
         state["generator"] = objective.generator.get_state()
         state["progress"] = torch.tensor([self.step, self.elapsed], dtype=torch.float64)
         return state | objective.kept
@@ -287,7 +298,19 @@ class Trainer(Generic[O]):
         self.step, self.elapsed = int(state["progress"][0]), float(state["progress"][1])
 
 
-def prefixed(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+def checkpoint_of(frozen: nn.Module | None, trainer: Trainer[Any] | None) -> dict[str, Tensor]:
+    """What a training level by level keeps: the levels that are done, and the one under way."""
+    tensors = {} if trainer is None else _prefixed("trainer.", trainer.state())
+    return tensors if frozen is None else tensors | _prefixed("frozen.", frozen.state_dict())
+
+
+def restore_frozen(field: F, tensors: Mapping[str, Tensor]) -> F:
+    """Give ``field`` the levels that are done, of what `checkpoint_of` kept; they are not trained any more."""
+    field.load_state_dict(without_prefix("frozen.", tensors))
+    return field.requires_grad_(False)
+
+
+def _prefixed(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """The tensors, with ``prefix`` before every name."""
     return {prefix + name: tensor for name, tensor in tensors.items()}
 

@@ -30,6 +30,7 @@ from ..run.config import load_config
 from ..run.folder import (
     RECORD_FILE,
     TEXTURE_FILE,
+    chosen_level,
     digest_of,
     find_field,
     load_state,
@@ -41,7 +42,7 @@ from ..run.folder import (
 from ..run.lock import locked
 from ..run.machine import choose_device, environment
 from ..run.settings import TextureConfig
-from ..run.trainer import Group, Objective, Progress, Report, Trainer, stop_on_signals, warm_cosine
+from ..run.trainer import Group, Objective, Progress, Report, Trainer, seeded, stop_on_signals, warm_cosine
 from .samples import BandSamples, ColorSamples, band_directions, match_colors, read_colors
 
 __all__ = ["FittedTexture", "TextureObjective", "default_delta", "fit_texture", "texture_of", "texture_run"]
@@ -115,8 +116,7 @@ def fit_texture(
     samples = match_colors(cloud, geometry, similarity, level=level, delta=delta)
     band = band_directions(samples, geometry, config.samples // 2, level=level, delta=delta, generator=generator)
     mean = samples.colors.mean(dim=0).tolist()
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(config.seed)
+    with seeded(config.seed):
         network = ColorSiren(config.width, config.depth, omega=config.omega, mean=mean).to(samples.points)
     sampling_seconds = time.monotonic() - started
     seconds = None if config.time_budget is None else max(config.time_budget - sampling_seconds, 1e-3)
@@ -185,8 +185,7 @@ def texture_run(
         geometry, similarity, _ = load_field(file)
         if geometry.in_dim == 4:
             geometry = moment(geometry, 0.0)  # from there, colours ride along
-        if level is not None and not 0 <= level < geometry.num_levels:
-            raise InputError(f"--level {level}: {file} has levels 0 to {geometry.num_levels - 1}")
+        trained_level = chosen_level(geometry, file, level)
         cloud = read_colors(source, samples=config.samples, seed=config.seed)
         fingerprint = _fingerprint(cloud, geometry)
         if before is not None and before.fingerprint != fingerprint:
@@ -202,7 +201,7 @@ def texture_run(
             cloud,
             config,
             similarity=similarity,
-            level=-1 if level is None else level,
+            level=trained_level,
             progress=progress,
             save=lambda tensors: save_state(state_file.parent, tensors, about, name=state_file.name),
             state=None if before is None else before.tensors,

@@ -35,7 +35,7 @@ def test_a_checkpoint_is_a_usable_field_and_what_a_resumed_run_finds(tmp_path: P
     assert read_record(tmp_path / "run") == RECORD
     assert not is_fitted(tmp_path / "run")
     again = RunFolder(tmp_path / "run", resume=True)
-    assert again.config(TextureConfig, TextureConfig(width=9), thing="texture") == TextureConfig(width=8)
+    assert again.config(TextureConfig, TextureConfig(width=9)) == TextureConfig(width=8)
     with again.writing():
         tensors, progress = again.restore("f", "other data")
     assert tensors["network.a"].tolist() == [0, 1, 2]
@@ -68,7 +68,7 @@ def test_a_new_run_forgets_what_would_be_taken_for_its_own(tmp_path: Path) -> No
 def test_without_a_directory_nothing_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     folder = RunFolder(None)
-    assert folder.config(FitConfig, None, thing="fit") == FitConfig()
+    assert folder.config(FitConfig, None) == FitConfig()
     with folder.writing():
         folder.begin(RECORD)
         folder.save(BALL, HERE, RECORD, {}, {})
