@@ -10,7 +10,7 @@ import dataclasses
 import json
 import platform
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import UnionType
@@ -26,7 +26,16 @@ from .report import Section, as_csv, as_dict, as_page
 from .run import kept_records, run_cell
 from .tables import Table
 
-__all__ = ["Benchmark", "Part", "from_figures", "machine_words", "one_of_each", "plain", "write_results"]
+__all__ = [
+    "Benchmark",
+    "Part",
+    "from_figures",
+    "machine_words",
+    "network_name",
+    "one_of_each",
+    "plain",
+    "write_results",
+]
 
 R = TypeVar("R")
 
@@ -164,6 +173,16 @@ def from_figures(kind: Any, figures: Any) -> Any:
     return tuple(figures) if get_origin(kind) is tuple else figures
 
 
+def network_name(sizes: Iterable[tuple[int, int]]) -> str:
+    """Widths and depths of levels as the paper writes them.
+
+    Example:
+        >>> network_name([(128, 2), (256, 2)])
+        '(128,2)▷(256,2)'
+    """
+    return "▷".join(f"({width},{depth})" for width, depth in sizes)
+
+
 def one_of_each(names: Sequence[str], what: str) -> None:
     """Refuse two things of one name, which tables could not tell apart.
 
@@ -175,24 +194,24 @@ def one_of_each(names: Sequence[str], what: str) -> None:
 
 
 def write_results(
-    benches: Sequence[Benchmark[Any]], out: Path, *, command: str
+    planned: Sequence[tuple[Benchmark[Any], Sequence[Part]]], out: Path, *, command: str
 ) -> tuple[Sequence[Table], Mapping[str, Any]]:
     """Write the tables of all that is done in a folder, as CSV, JSON and Markdown.
 
     Args:
-        benches: whose cells.
+        planned: the benchmarks, each with its cells.
         out: the folder.
         command: as it will stand on the page.
 
     Returns:
         The tables, and what the JSON file holds; no tables where nothing is done.
     """
-    device = choose_device(benches[0].device)
+    device = choose_device(planned[0][0].device)
     rate = sgemm_rate(256, device=device)
     machine = machine_words(device, rate)
     sections, records = [], []
-    for bench in benches:
-        done = list(kept_records(bench.cells(), out, Catalogue([bench])).values())
+    for bench, cells in planned:
+        done = list(kept_records(cells, out, Catalogue([bench])).values())
         if done:
             sections.append(Section(bench.name, "", bench.source, bench.tables(bench.read(done), sgemm=rate)))
             records += done

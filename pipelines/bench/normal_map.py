@@ -23,6 +23,7 @@ from ..render.shade import ShadeOptions, compose, shade
 from ..render.trace import Seen, trace_view
 from ..run.folder import find_field
 from ..run.machine import choose_device
+from ..run.trainer import parameter_count
 from ..surface.surface import Surface, from_mesh, read_reference
 from .benchmark import Benchmark, Part
 from .cells import Workplace
@@ -149,7 +150,7 @@ class NormalMapBench(Benchmark[NormalMapRow]):
             rows.append(
                 NormalMapRow(
                     method=method.name,
-                    parameters=_parameters(field, method.levels),
+                    parameters=parameter_count(*levels_of(field)[: method.levels]),
                     error=image_error(zip(wanted, drawings, strict=True)),
                     degrees=_degrees([(one, seen) for (one, _), (_, seen, _) in zip(truth, timed, strict=True)]),
                     seconds=sum(seconds for seconds, _, _ in timed) / len(cameras),
@@ -230,11 +231,6 @@ def _best(view: View, camera: Camera, shading: str, repeats: int) -> tuple[float
 
 def _image(seen: Seen, camera: Camera, shading: str) -> Any:
     return compose(seen, shade(seen, shading, camera=camera, options=PLAIN))
-
-
-def _parameters(field: Field, levels: int) -> int:
-    """Of the first ``levels`` levels."""
-    return sum(parameter.numel() for part in levels_of(field)[:levels] for parameter in part.parameters())
 
 
 def _degrees(pairs: Sequence[tuple[Seen, Seen]]) -> float:

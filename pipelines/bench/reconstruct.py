@@ -12,7 +12,6 @@ from typing import Any
 
 import imageio.v3 as iio
 import numpy as np
-from torch import nn
 
 from ...datasets.synthetic.scenes import SCENES, Scene, render_scene, scene_mesh
 from ...datasets.views.images import PosedImage, PosedImages, read_posed_images
@@ -27,11 +26,11 @@ from ..run.config import closest
 from ..run.folder import digest_of
 from ..run.machine import choose_device, environment
 from ..run.settings import ReconstructConfig
-from ..run.trainer import Interrupted, Progress, stop_on_signals
+from ..run.trainer import Interrupted, Progress, parameter_count, stop_on_signals
 from ..surface.measure import Metrics, evaluate_surfaces
 from ..surface.surface import Surface, from_mesh
 from ..surface.trim import in_region, keep_largest
-from .benchmark import Benchmark, Part, one_of_each, plain
+from .benchmark import Benchmark, Part, network_name, one_of_each, plain
 from .cells import Catalogue, Workplace, read_record, record_file
 from .flops import Watched, train_watched
 from .reconstruct_rows import EQUAL_TIME, MULTISCALE, NEUS, ReconstructRow, SurfaceFigures, reconstruct_tables
@@ -243,13 +242,14 @@ def row_of(
     views = [measure(image, view, model.background) for view, image in pairs]
     inside = [figures["psnr_object"] for figures in views if "psnr_object" in figures]
     rays = trainer.step * config.rays
-    neus = isinstance(model.geometry, NeusSDF)
-    sizes = [(model.geometry.width, model.geometry.depth)] if neus else zip(config.widths, config.depths, strict=True)
-    name = "▷".join(f"({width},{depth})" for width, depth in sizes)
+    if isinstance(model.geometry, NeusSDF):
+        network = f"NeuS {network_name([(model.geometry.width, model.geometry.depth)])}"
+    else:
+        network = network_name(zip(config.widths, config.depths, strict=True))
     return ReconstructRow(
         scene=scene.name,
         kind=kind,
-        network=f"NeuS {name}" if neus else name,
+        network=network,
         steps=trainer.step,
         rays=config.rays,
         seconds=trainer.elapsed,
@@ -259,9 +259,9 @@ def row_of(
         psnr=float(np.mean([figures["psnr"] for figures in views])),
         psnr_object=float(np.mean(inside)) if inside else None,
         ssim=float(np.mean([figures["ssim"] for figures in views])),
-        parameters=_size(model.geometry),
-        color_parameters=_size(model.color),
-        outside_parameters=0 if model.outside is None else _size(model.outside),
+        parameters=parameter_count(model.geometry),
+        color_parameters=parameter_count(model.color),
+        outside_parameters=0 if model.outside is None else parameter_count(model.outside),
         geometry_flops=watched.geometry_flops / rays,
         color_flops=watched.color_flops / rays,
         values_per_ray=tuple(rows / rays for rows in watched.values),
@@ -274,10 +274,6 @@ def row_of(
         deltas=tuple(model.geometry.deltas.tolist()),
         device=device,
     )
-
-
-def _size(module: nn.Module) -> int:
-    return sum(parameter.numel() for parameter in module.parameters())
 
 
 def surface_figures(mesh: Mesh, truth: Surface, *, samples: int, columns: int = 512, seed: int = 0) -> SurfaceFigures:

@@ -17,6 +17,7 @@ from ...neural_fields import Field, Siren, levels_of
 from ...neural_fields.tracing import BOUNDING_RADIUS
 from ..render.trace import Seen, trace_view
 from ..run.settings import FitConfig
+from ..run.trainer import parameter_count
 from .benchmark import Benchmark, Part
 from .cells import Workplace
 from .fits import fit_home, kept_fit
@@ -218,7 +219,7 @@ def _time(
         seconds=sum(best for best, _ in timed) / len(cameras),
         speedup=1.0,
         paper_speedup=model.paper_speedup,
-        parameters=sum(p.numel() for level in levels for p in level.parameters()),
+        parameters=parameter_count(*levels),
         evaluations=tuple(v + j for v, j in zip(values, jets, strict=True)),
         flops=per_pixel * pixels / len(cameras),
         agreement=truth.judge(model.network, model.level, model.normal_level, cameras, images),

@@ -24,7 +24,7 @@ from ..run.machine import choose_device
 from ..run.settings import FitConfig, TextureConfig
 from ..surface.surface import Surface, from_mesh
 from ..texture.train import texture_run
-from .benchmark import Benchmark, Part, one_of_each
+from .benchmark import Benchmark, Part, network_name, one_of_each
 from .cells import Workplace
 from .fits import fit_home, kept_fit
 from .tables import Column, Figure, Table, tabulated
@@ -95,8 +95,7 @@ class Fitted:
     @property
     def name(self) -> str:
         """The widths and depths of its levels, as the paper writes them."""
-        sizes = zip(self.record["config"]["widths"], self.record["config"]["depths"], strict=True)
-        return "▷".join(f"({width},{depth})" for width, depth in sizes)
+        return network_name(zip(self.record["config"]["widths"], self.record["config"]["depths"], strict=True))
 
 
 @dataclass(frozen=True)

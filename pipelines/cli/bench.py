@@ -38,7 +38,8 @@ def _run(arguments: argparse.Namespace, benches: Sequence[Benchmark[Any]], *, ou
     from ..run.progress import progress_bars
     from ..run.trainer import Interrupted
 
-    cells = [cell for bench in benches for cell in bench.cells()]
+    planned = [(bench, bench.cells()) for bench in benches]
+    cells = [cell for _, own in planned for cell in own]
     code = 0
     with ExitStack() as stack:
         folder = out or Path(stack.enter_context(tempfile.TemporaryDirectory()))
@@ -53,7 +54,7 @@ def _run(arguments: argparse.Namespace, benches: Sequence[Benchmark[Any]], *, ou
             kept = "; the same command goes on after the last finished cell" if out else ""
             print(f"interrupted{kept}", file=sys.stderr)
             code = 130
-        tables, figures = write_results(benches, folder, command=typed(arguments))
+        tables, figures = write_results(planned, folder, command=typed(arguments))
     if tables:
         print("\n\n".join(map(as_text, tables)))
         print(f"machine: {figures['machine']}")

@@ -10,6 +10,7 @@ import numpy as np
 
 from ...neural_fields import Siren, levels_of, load_field
 from ..run.folder import RECORD_FILE, find_field, is_field
+from ..run.trainer import parameter_count
 from ..surface.surface import Surface, components, is_closed, read_surface
 
 __all__ = ["describe"]
@@ -34,13 +35,12 @@ def _describe_field(path: Path) -> Rows:
     record = metadata.get("run", {})
     if path.is_dir() and (path / RECORD_FILE).is_file():
         record = json.loads((path / RECORD_FILE).read_text(encoding="utf-8"))
-    count = sum(parameter.numel() for parameter in field.parameters())
     rows: Rows = [
         (
             "kind",
             f"{type(field).__name__}, {field.num_levels} level{'s' * (field.num_levels > 1)}, in {field.in_dim}-D",
         ),
-        ("parameters", f"{count:,} ({file.stat().st_size / 1024:,.0f} KiB on disk)"),
+        ("parameters", f"{parameter_count(field):,} ({file.stat().st_size / 1024:,.0f} KiB on disk)"),
     ]
     stages = {stage.get("level"): stage for stage in record.get("stages", [])}
     for index, level in enumerate(levels_of(field)):
@@ -56,8 +56,7 @@ def _describe_field(path: Path) -> Rows:
 def _describe_level(level: Any, stage: dict[str, Any]) -> str:
     text = type(level).__name__
     if isinstance(level, Siren):
-        count = sum(parameter.numel() for parameter in level.parameters())
-        text = f"({level.width}, {level.depth}), ω₀ = {level.omega:g}, {count:,} parameters"
+        text = f"({level.width}, {level.depth}), ω₀ = {level.omega:g}, {parameter_count(level):,} parameters"
     if "training_seconds" in stage:
         text += f"; {stage['steps']:,} steps in {stage['training_seconds']:.1f} s"
     if stage.get("silenced"):

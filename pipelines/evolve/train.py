@@ -25,6 +25,7 @@ from ..run.trainer import (
     StopFlag,
     Trainer,
     checkpoint_of,
+    parameter_count,
     restore_frozen,
     stop_on_signals,
     without_prefix,
@@ -169,7 +170,7 @@ class _Evolving:
         self.stages.append(
             {
                 "level": level,
-                "parameters": sum(p.numel() for p in field.sdf.levels[level].parameters()),
+                "parameters": parameter_count(field.sdf.levels[level]),
                 "delta": delta,
                 "known": len(objective.known),
                 "beginning_seconds": round(beginning_seconds, 3),

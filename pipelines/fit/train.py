@@ -30,6 +30,7 @@ from ..run.trainer import (
     StopFlag,
     Trainer,
     checkpoint_of,
+    parameter_count,
     restore_frozen,
     stop_on_signals,
     without_prefix,
@@ -223,7 +224,7 @@ class _Fitting:
         self.stages.append(
             {
                 "level": level,
-                "parameters": sum(p.numel() for p in siren.parameters()),
+                "parameters": parameter_count(siren),
                 "delta": delta,
                 "band": None if band is None else dataclasses.asdict(band),
                 "samples": {source.name: len(source.samples) for source in sources},

@@ -15,20 +15,9 @@ from ...neural_fields import Field
 from ...neural_fields.baselines import BandLimited, BanfSDF, HashGridSDF
 from ...neural_fields.losses import data_loss, eikonal_loss
 from ..fit.samples import DOMAIN
-from ..run.trainer import Report, seeded
+from ..run.trainer import Report, parameter_count, seeded
 from .cells import Preset
-from .recipe import (
-    Output,
-    Recipe,
-    SignedPools,
-    cosine,
-    count,
-    descend,
-    differences,
-    finished,
-    mape_loss,
-    stencil,
-)
+from .recipe import Output, Recipe, SignedPools, cosine, descend, differences, finished, mape_loss, stencil
 
 __all__ = ["BanfRecipe", "BanfSettings", "GridSettings", "InstantNgpRecipe", "NgpSettings"]
 
@@ -141,7 +130,7 @@ class InstantNgpRecipe(Recipe[NgpSettings]):
             betas=(0.9, 0.99),
             eps=1e-15,
         )
-        return (Output(title, finished(field), -1, count(field)),), settings.steps
+        return (Output(title, finished(field), -1, parameter_count(field)),), settings.steps
 
 
 @dataclass(frozen=True)
@@ -238,7 +227,7 @@ class BanfRecipe(Recipe[BanfSettings]):
             before.append(part.requires_grad_(False))
         field = BanfSDF(networks, settings.resolutions, extent=DOMAIN).cpu()
         outputs = tuple(
-            Output(f"BANF {resolution}", field, level, count(*networks[: level + 1]))
+            Output(f"BANF {resolution}", field, level, parameter_count(*networks[: level + 1]))
             for level, resolution in enumerate(settings.resolutions)
         )
         return outputs, sum(settings.steps)

@@ -21,7 +21,7 @@ from ...neural_fields.multiscale import Parts, walk_levels
 from ..bench.cells import Findings, Method, Record, Workplace
 from ..bench.tables import Column, Row, Table, Value, mean, median
 from ..fit.samples import banded_sources
-from ..run.trainer import Report
+from ..run.trainer import Report, parameter_count
 from .base import (
     Base,
     base_cell,
@@ -163,7 +163,7 @@ def _figures(
     except NoSurfaceError:
         mesh = None
     seconds = time.perf_counter() - started
-    parameters = sum(p.numel() for p in field.parameters())
+    parameters = parameter_count(field)
     return judge.mesh(
         name, mesh, base.similarity, parameters=parameters, train_seconds=train_seconds, mesh_seconds=seconds
     )

@@ -13,9 +13,9 @@ from ...neural_fields import Siren
 from ...neural_fields.baselines import BaconSDF, IdfSDF
 from ...neural_fields.baselines.idf import attenuation
 from ..fit.cloud import CloudDistance
-from ..run.trainer import Report, seeded
+from ..run.trainer import Report, parameter_count, seeded
 from .cells import Preset
-from .recipe import Output, Recipe, cosine, count, descend, finished
+from .recipe import Output, Recipe, cosine, descend, finished
 
 __all__ = [
     "BaconRecipe",
@@ -176,7 +176,7 @@ class SirenRecipe(Recipe[SirenSettings]):
             progress=progress,
             clip=1.0,
         )
-        return (Output("SIREN", finished(field), -1, count(field)),), settings.steps
+        return (Output("SIREN", finished(field), -1, parameter_count(field)),), settings.steps
 
 
 @dataclass(frozen=True)
@@ -362,7 +362,7 @@ class IdfRecipe(Recipe[IdfSettings]):
             progress=progress,
             betas=settings.betas,
         )
-        return (Output("IDF", finished(field), -1, count(field)),), settings.steps
+        return (Output("IDF", finished(field), -1, parameter_count(field)),), settings.steps
 
 
 def displaced(field: IdfSDF, x: Tensor, base: Tensor, slope: Tensor) -> tuple[Tensor, Tensor]:

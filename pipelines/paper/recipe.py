@@ -24,7 +24,6 @@ __all__ = [
     "SignedPools",
     "Trained",
     "cosine",
-    "count",
     "descend",
     "differences",
     "finished",
@@ -169,11 +168,6 @@ def cosine(first: float, last: float, done: float) -> float:
 def finished(field: F) -> F:
     """A trained field, frozen and on the CPU."""
     return field.requires_grad_(False).cpu().eval()
-
-
-def count(*fields: nn.Module) -> int:
-    """Numbers that are trained."""
-    return sum(parameter.numel() for field in fields for parameter in field.parameters())
 
 
 class SignedPools:

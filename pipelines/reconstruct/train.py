@@ -22,7 +22,7 @@ from ..render.picture import write_picture
 from ..run.folder import TEXTURE_FILE, RunFolder, digest_of
 from ..run.machine import choose_device, environment
 from ..run.settings import ReconstructConfig, TextureConfig
-from ..run.trainer import Interrupted, Progress, Report, stop_on_signals
+from ..run.trainer import Interrupted, Progress, Report, parameter_count, stop_on_signals
 from ..surface.surface import from_mesh, sample_points
 from ..surface.trim import in_region
 from ..texture.train import FittedTexture, fit_texture
@@ -220,7 +220,7 @@ class _Reconstruction:
             "region": self.images.region,
             "similarity": dataclasses.asdict(self.images.similarity),
             "config": dataclasses.asdict(self.config),
-            "parameters": {name: sum(p.numel() for p in part.parameters()) for name, part in parts.items()},
+            "parameters": {name: parameter_count(part) for name, part in parts.items()},
             "deltas": model.geometry.deltas.tolist(),
             "inv_std": float(model.inv_std.detach()),
             "steps": trainer.step,

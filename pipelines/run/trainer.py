@@ -28,6 +28,7 @@ __all__ = [
     "StopFlag",
     "Trainer",
     "checkpoint_of",
+    "parameter_count",
     "restore_frozen",
     "seeded",
     "stop_on_signals",
@@ -104,6 +105,11 @@ def stop_on_signals() -> Iterator[StopFlag]:
     finally:
         for number in signals:
             signal.signal(number, before[number])
+
+
+def parameter_count(*modules: nn.Module) -> int:
+    """How many numbers of them are trained, all together."""
+    return sum(parameter.numel() for module in modules for parameter in module.parameters())
 
 
 @contextmanager

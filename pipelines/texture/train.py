@@ -42,7 +42,17 @@ from ..run.folder import (
 from ..run.lock import locked
 from ..run.machine import choose_device, environment
 from ..run.settings import TextureConfig
-from ..run.trainer import Group, Objective, Progress, Report, Trainer, seeded, stop_on_signals, warm_cosine
+from ..run.trainer import (
+    Group,
+    Objective,
+    Progress,
+    Report,
+    Trainer,
+    parameter_count,
+    seeded,
+    stop_on_signals,
+    warm_cosine,
+)
 from .samples import BandSamples, ColorSamples, band_directions, match_colors, read_colors
 
 __all__ = ["FittedTexture", "TextureObjective", "default_delta", "fit_texture", "texture_of", "texture_run"]
@@ -133,7 +143,7 @@ def fit_texture(
         "delta": delta,
         "points": len(samples.points),
         "left_out": samples.left_out,
-        "parameters": sum(parameter.numel() for parameter in network.parameters()),
+        "parameters": parameter_count(network),
         "steps": trainer.step,
         "sampling_seconds": round(sampling_seconds, 3),
         "training_seconds": round(trainer.elapsed, 3),

@@ -108,7 +108,9 @@ def test_results_of_what_is_done(tmp_path: Path) -> None:
     assert "edge -1: failed: no such square" in lines[1]
     with pytest.raises(InputError, match="no such square"):
         bench.rows(tmp_path)
-    tables, figures = write_results([bench, Squares(edges=[7.0])], tmp_path, command="mplicits bench squares")
+    other = Squares(edges=[7.0])
+    planned = [(bench, bench.cells()), (other, other.cells())]
+    tables, figures = write_results(planned, tmp_path, command="mplicits bench squares")
     (table,) = tables
     assert [row.values for row in table.rows] == [(4.0,), (1.0,)]
     written = json.loads((tmp_path / "results.json").read_text())
@@ -128,7 +130,8 @@ def test_results_of_what_is_done(tmp_path: Path) -> None:
         "edge 1   1.0",
         "A note.",
     ]
-    assert write_results([Squares(edges=[7.0])], tmp_path, command="x")[0] == []
+    bench = Squares(edges=[7.0])
+    assert write_results([(bench, bench.cells())], tmp_path, command="x")[0] == []
 
 
 def test_two_of_one_name() -> None:
