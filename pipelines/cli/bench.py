@@ -89,9 +89,9 @@ def _folder(parser: argparse.ArgumentParser, *, required: bool = False) -> None:
     parser.add_argument("-o", "--out", type=Path, metavar="DIR", required=required, help=about)
 
 
-def _measured(parser: argparse.ArgumentParser, resolution: int) -> None:
+def _measured(parser: argparse.ArgumentParser, resolution: int, samples: int = 500_000) -> None:
     _number(parser, "--resolution", whole(8, 2048), resolution, "of the meshes")
-    _number(parser, "--eval-samples", whole(1), 500_000, "points per surface")
+    _number(parser, "--eval-samples", whole(1), samples, "points per surface")
 
 
 def _normals_arguments(parser: argparse.ArgumentParser) -> None:
@@ -360,6 +360,34 @@ def _scale(arguments: argparse.Namespace) -> int:
     return _run(arguments, [bench], out=arguments.out)
 
 
+def _srb_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("folder", metavar="DIR", help="scans and true surfaces of the same names")
+    parser.add_argument(
+        "--rows",
+        nargs="+",
+        choices=("file", "none"),
+        default=("file", "none"),
+        help="fits with the file's normals, and without (both)",
+    )
+    parser.add_argument("--shapes", nargs="+", default=(), metavar="NAME", help="only scans of these surfaces (all)")
+    _measured(parser, 512, 1_000_000)
+    _number(parser, "--poisson-depth", whole(4, 14), 10, "octree depth")
+    _folder(parser)
+    add_flags(parser, "--json")
+    add_settings(parser, FitConfig)
+
+
+def _srb(arguments: argparse.Namespace) -> int:
+    if "normals" in given_flags(arguments, FitConfig):
+        raise input_error("--normals: the benchmark fits with and without them; choose by --rows")
+    config = read_settings(arguments, FitConfig)
+    from ..bench.srb import SrbBench
+
+    options = {name: getattr(arguments, name) for name in ("folder", "shapes", "resolution", "poisson_depth")}
+    bench = SrbBench(config=config, normals=arguments.rows, samples=arguments.eval_samples, **options)
+    return _run(arguments, [bench], out=arguments.out)
+
+
 BENCH_COMMANDS: Mapping[str, Command] = MappingProxyType(
     {
         "bench normals": Command(
@@ -437,6 +465,15 @@ BENCH_COMMANDS: Mapping[str, Command] = MappingProxyType(
             _scale_arguments,
             _scale,
             "Draw clouds of several sizes from one shape, fit and mesh each in a process of its own, and compare.",
+        ),
+        "bench srb": Command(
+            "the surface reconstruction benchmark, beside what papers print",
+            """  mplicits bench srb srb/ -o bench_srb --preset fast
+  mplicits bench srb srb/ -o bench_srb --shapes anchor --rows none --json srb.json""",
+            _srb_arguments,
+            _srb,
+            "Fit the scans of a folder with their normals and without, and measure every level against the true "
+            "surfaces, in raw units and in the unit sphere, by the protocols of the papers.",
         ),
     }
 )
