@@ -11,7 +11,24 @@ from typing import Any
 
 from .errors import InputError
 
-__all__ = ["files_in", "whole_file", "write_json", "write_whole"]
+__all__ = ["check_place", "files_in", "whole_file", "write_json", "write_whole"]
+
+
+def check_place(path: str | Path) -> None:
+    """Whether a file or folder can come to be at ``path``, to be asked before any long work.
+
+    Folders that are missing on the way will be made by what writes there. Nothing is made now.
+
+    Raises:
+        InputError: what shall be a folder on the way is a file, or may not be written.
+    """
+    above = Path(path).absolute().parent
+    while not (above.exists() or above.is_symlink()):  # the root is there at the latest
+        above = above.parent
+    if not above.is_dir():
+        raise InputError(f"{path}: {above} is no folder; choose another place")
+    if not os.access(above, os.W_OK | os.X_OK):
+        raise InputError(f"{path}: the folder {above} may not be written; choose another place")
 
 
 @contextmanager
@@ -19,10 +36,10 @@ def whole_file(path: str | Path) -> Iterator[Path]:
     """A temporary file beside ``path``, for the block to write, that takes its name when the block ends.
 
     It has the extension of ``path``, by which many writers choose the format. After an error or Ctrl-C it is gone, and
-    an older file is as it was.
+    an older file is as it was. Folders that are missing on the way are made.
 
     Raises:
-        InputError: the block, or the renaming, raised an OSError: the disk is full, the folder is gone.
+        InputError: the block, or the renaming, raised an OSError: the disk is full, a folder is a file.
 
     Example:
         >>> with whole_file("mesh.ply") as partial:
@@ -31,13 +48,15 @@ def whole_file(path: str | Path) -> Iterator[Path]:
     path = Path(path)
     partial = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
     try:
-        yield partial
-        partial.replace(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            yield partial
+            partial.replace(path)
+        finally:
+            partial.unlink(missing_ok=True)
     except OSError as error:
         reason = error.strerror or error
         raise InputError(f"{path}: cannot be written ({reason}); choose another place") from error
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def write_whole(path: str | Path, content: str | bytes) -> None:

@@ -9,7 +9,7 @@ import pytest
 from mplicits.datasets import PointCloud
 from mplicits.datasets.clouds.ply import write_cloud_ply
 from mplicits.neural_fields import InputError, Siren, Sphere, extract_mesh, save_field
-from mplicits.neural_fields.files import whole_file, write_whole
+from mplicits.neural_fields.files import check_place, whole_file, write_whole
 from mplicits.pipelines.cli.common import write_json
 from mplicits.pipelines.mesh.files import write_mesh
 from mplicits.pipelines.render.picture import write_picture
@@ -37,6 +37,34 @@ def test_the_name_comes_at_the_end(tmp_path: Path) -> None:
         assert path.read_text() == "older"
     assert path.read_text() == "new"
     assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_missing_folders_are_made(tmp_path: Path, name: str) -> None:
+    path = tmp_path / "not" / "there" / name
+    check_place(path)
+    assert list(tmp_path.iterdir()) == []  # asking makes nothing
+    WRITERS[name](path)
+    assert list(path.parent.iterdir()) == [path]
+
+
+def test_a_file_is_no_folder_to_write_in(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("mine")
+    (tmp_path / "lost").symlink_to(tmp_path / "nowhere")
+    for above in ("file", "lost"):
+        with pytest.raises(InputError, match=rf"a\.txt: .*{above} is no folder; choose another place"):
+            check_place(tmp_path / above / "deeper" / "a.txt")
+        with pytest.raises(InputError, match=r"a\.txt: cannot be written \(.*\); choose another place"):
+            write_whole(tmp_path / above / "a.txt", "text")
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+@pytest.mark.skipif(os.name == "nt" or os.geteuid() == 0, reason="who runs this may write everywhere")
+def test_a_folder_that_may_not_be_written(tmp_path: Path) -> None:
+    closed = tmp_path / "closed"
+    closed.mkdir(mode=0o500)
+    with pytest.raises(InputError, match="closed may not be written; choose another place"):
+        check_place(closed / "deeper" / "a.txt")
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError])

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ...neural_fields import InputError
+from ...neural_fields.files import check_place
 from ..cameras import Camera
 from .images import PosedImage, PosedImages
 
@@ -37,15 +38,14 @@ def check_new_folder(path: str | Path) -> Path:
     """Whether a folder can be made at ``path``, to be asked before any long work.
 
     Raises:
-        InputError: something stands there already (an empty folder may), or there is no such place.
+        InputError: something stands there already (an empty folder may), or none can be made (`check_place`).
     """
     path = Path(path)
     if path.exists() and not path.is_dir():
         raise InputError(f"{path}: is a file; name a folder that does not exist yet")
     if path.is_dir() and any(path.iterdir()):
         raise InputError(f"{path}: is not empty; name a folder that does not exist yet")
-    if not path.absolute().parent.is_dir():
-        raise InputError(f"{path}: the folder {path.absolute().parent} does not exist; make it first")
+    check_place(path)
     return path
 
 
@@ -202,7 +202,7 @@ def _new_folder(folder: str | Path) -> Iterator[Path]:
     folder = check_new_folder(folder)
     partial = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
     try:
-        partial.mkdir()
+        partial.mkdir(parents=True)
         yield partial
         if folder.is_dir():
             folder.rmdir()

@@ -222,15 +222,13 @@ def make_folder(out: Path) -> None:
     """Make the folder of a bench, and see that files can be written there, before the long work.
 
     Raises:
-        InputError: a file stands in its place, its parent does not exist, or it cannot be written.
+        InputError: a file stands in its place, or it cannot be written.
     """
     if out.exists() and not out.is_dir():
         raise InputError(f"{out}: is a file; name a folder")
-    if not out.absolute().parent.is_dir():
-        raise InputError(f"{out}: the folder {out.absolute().parent} does not exist; make it first")
     try:
         for folder in (out, out / "cells", out / "meshes", out / "pictures"):
-            folder.mkdir(exist_ok=True)
+            folder.mkdir(parents=True, exist_ok=True)
         probe = out / f".{os.getpid()}.partial"
         probe.touch()
         probe.unlink()

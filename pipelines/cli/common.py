@@ -212,16 +212,17 @@ def check_output(path: Path | None, suffixes: Sequence[str]) -> None:
     """Refuse an output file that could not be written, before the long work and not after it.
 
     Raises:
-        InputError: another extension, no such folder, or a directory stands in its place.
+        InputError: another extension, a directory stands in its place, or none can come to be there (`check_place`).
     """
     if path is None:
         return
     if path.suffix.lower() not in suffixes:
         raise input_error(f"{path}: unknown extension {path.suffix!r}; known: {', '.join(suffixes)}")
-    if not path.absolute().parent.is_dir():
-        raise input_error(f"{path}: the folder {path.absolute().parent} does not exist; make it first")
     if path.is_dir():
         raise input_error(f"{path}: is a directory; name a file")
+    from ...neural_fields.files import check_place
+
+    check_place(path)
 
 
 def typed(arguments: argparse.Namespace) -> str:

@@ -275,6 +275,7 @@ def _view_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add_flags(parser, "run", "--device")
     add_flags(parser, "--up", default="y")
+    add("--cloud", metavar="FILE", help="what errors are measured from (default: what the run was fitted to)")
     what = "images of about N × N pixels (512)"
     add("--size", type=whole(64, 4096), default=512, metavar="N", help=what)
     add("--host", default="127.0.0.1", help="address to listen on (127.0.0.1: this machine only)")
@@ -291,7 +292,8 @@ def _view(arguments: argparse.Namespace) -> int:
     from ..run.machine import choose_device
     from ..viewer.server import Viewer, open_run
 
-    shown = open_run(arguments.run, side=arguments.size, device=choose_device(arguments.device))
+    device = choose_device(arguments.device)
+    shown = open_run(arguments.run, cloud=arguments.cloud, side=arguments.size, device=device)
     with Viewer(shown, host=arguments.host, port=arguments.port, up=arguments.up) as viewer:
         try:
             print(f"{arguments.run}: open {viewer.url} in a browser; Ctrl-C ends it", flush=True)

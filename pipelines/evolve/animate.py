@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from ...datasets.cameras import Camera
 from ...neural_fields import Field, InputError, Similarity, load_field
 from ...neural_fields.dynamic_tracing import DynamicTracer, moment
+from ...neural_fields.files import check_place
 from ...neural_fields.meshing import NoSurfaceError, extract_mesh
 from ..mesh.files import write_mesh, write_moving
 from ..render.film import ANIMATIONS, write_animation
@@ -81,14 +82,14 @@ def check_sequence_path(path: str | Path) -> Path:
     """Whether a sequence can be written to ``path``, to be asked before any long work.
 
     Raises:
-        InputError: it is a file of another kind, its folder does not exist, or it is a folder that is not empty.
+        InputError: it is a file of another kind, it cannot come to be there (`check_place`), or it is a folder that is
+            not empty.
     """
     path = Path(path)
     if path.suffix and path.suffix.lower() not in (*ANIMATIONS, SHEET, ".glb"):
         films = ", ".join(ANIMATIONS)
         raise InputError(f"{path}: write a film ({films}), a sheet of moments ({SHEET}), a .glb, or a folder of meshes")
-    if not path.absolute().parent.is_dir():
-        raise InputError(f"{path}: the folder {path.absolute().parent} does not exist; make it first")
+    check_place(path)
     if path.suffix and path.is_dir():
         raise InputError(f"{path}: is a folder; give the name of a file in it")
     if not path.suffix and path.exists() and (not path.is_dir() or any(path.iterdir())):
@@ -210,7 +211,7 @@ def _write_series(
     progress: Tell | None,
 ) -> str:
     """frame_0000.ply and so on; a frame without a surface has no file."""
-    folder.mkdir(exist_ok=True)
+    folder.mkdir(parents=True, exist_ok=True)
     digits = max(4, len(str(options.frames - 1)))
     written = 0
     for index, time in enumerate(options.times):

@@ -103,7 +103,7 @@ def fit_many(
         KeyboardInterrupt: Ctrl-C, with several workers.
     """
     check_jobs(jobs)
-    out.mkdir(exist_ok=True)
+    out.mkdir(parents=True, exist_ok=True)
     if planned:
         _keep_settings(out, planned[0].config)
     if jobs > 1 or progress is None:

@@ -20,7 +20,7 @@ from ...datasets import OrientedCloud, PointCloud, prepare_cloud
 from ...datasets.clouds.large import Merging
 from ...datasets.clouds.outliers import agreement
 from ...neural_fields import Field, InputError, MultiscaleSDF, Similarity, Siren, WorldField, save_field
-from ..run.folder import RunFolder, digest_of
+from ..run.folder import RunFolder, digest_of, named_cloud
 from ..run.machine import choose_device, environment, peak_memory
 from ..run.settings import FitConfig
 from ..run.trainer import (
@@ -312,7 +312,7 @@ class _Fitting:
         """What ``run.json`` holds."""
         return {
             "finished": finished,
-            "cloud": self.source,
+            **named_cloud(self.source, self.folder.path),
             "merging": None if self.merging is None else dataclasses.asdict(self.merging),
             "cleaning": dataclasses.asdict(self.cloud.report),
             "similarity": dataclasses.asdict(self.cloud.similarity),

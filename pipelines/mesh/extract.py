@@ -7,7 +7,6 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 from ...datasets import read_cloud
 from ...neural_fields import Field, InputError, Similarity, map_attribute
 from ...neural_fields.meshing import Mesh, NoSurfaceError, extract_mesh, map_normals
-from ..run.folder import chosen_level, find_field, load_still
+from ..run.folder import chosen_level, find_field, fitted_cloud, load_still
 from ..surface.trim import Support, drop_unsupported, in_region, keep_largest, read_support, trim_distance
 from ..texture.riding import Colors, colors_of_run
 from .bake import check_texture_size, textured_mesh
@@ -89,7 +88,7 @@ def mesh_run(
         support = read_support(file, metadata.get("run", {}), level)
     points = None
     if options.trim_distance is not None:
-        cloud = read_cloud(options.cloud or _fitted_cloud(file, metadata))
+        cloud = read_cloud(options.cloud or fitted_cloud(file, metadata, remedy="name it with --cloud FILE"))
         points = similarity.to_unit(cloud.points[np.isfinite(cloud.points).all(axis=1)])
     try:
         mesh = extract_mesh(field, resolution=options.resolution, level=level)
@@ -172,11 +171,3 @@ def _write_textured(
         size=size,
         faces=options.texture_faces,
     )
-
-
-def _fitted_cloud(file: Path, metadata: dict[str, Any]) -> Path:
-    """The file that a checkpoint was fitted to."""
-    source = metadata.get("run", {}).get("cloud")
-    if not source or not Path(source).is_file():
-        raise InputError(f"{file}: its cloud {source or ''!s} is not to be found; name it with --cloud FILE")
-    return Path(source)

@@ -6,7 +6,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 
 from ...datasets import srgb_to_linear
 from ...neural_fields import InputError, Similarity
-from ...neural_fields.files import whole_file
+from ...neural_fields.files import check_place, whole_file
 from ...neural_fields.meshing import Mesh
 from .atlas import Unwrapped, check_unwrap_tools
 from .glb import MATERIAL, Motion, write_glb
@@ -40,17 +39,16 @@ FLOAT32_REACH = 128.0
 TEXT_ROWS = 1 << 16
 
 
-def check_mesh_path(path: str | Path, similarity: Similarity | None = None, *, new_folder: bool = False) -> Path:
+def check_mesh_path(path: str | Path, similarity: Similarity | None = None) -> Path:
     """Whether a mesh can be written to ``path``, to be asked before any long work.
 
     Args:
         path: the file to be; an existing file would be replaced.
         similarity: that of the field, where it is known already.
-        new_folder: whether its folder will be made before the mesh, so that it need not be there yet.
 
     Raises:
-        InputError: the extension is unknown or cannot hold the coordinates, the folder does not exist or may not
-            be written, or ``path`` is a folder.
+        InputError: the extension is unknown or cannot hold the coordinates, ``path`` is a folder, or a file cannot
+            come to be there (`check_place`).
     """
     path = Path(path)
     if path.suffix.lower() not in _WRITERS:
@@ -58,10 +56,7 @@ def check_mesh_path(path: str | Path, similarity: Similarity | None = None, *, n
         raise InputError(f"{path}: unknown mesh format {path.suffix or '(no extension)'!r}; use one of {known}")
     if path.is_dir():
         raise InputError(f"{path}: is a folder; give the name of a file in it")
-    if not new_folder and not path.absolute().parent.is_dir():
-        raise InputError(f"{path}: the folder {path.absolute().parent} does not exist; make it first")
-    if not new_folder and not os.access(path.absolute().parent, os.W_OK):
-        raise InputError(f"{path}: the folder {path.absolute().parent} may not be written; choose another")
+    check_place(path)
     if path.suffix.lower() == ".stl" and similarity is not None and needs_doubles(similarity):
         center = ", ".join(f"{c:.0f}" for c in similarity.center)
         raise InputError(f"{path}: STL keeps seven digits, too few so far from the origin ({center}); use .ply or .obj")

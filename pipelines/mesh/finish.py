@@ -84,7 +84,7 @@ def plan_mesh(out: Path, run: Path, source: Path | DepthInput, *, colors: bool, 
     """Check, before the fit, all that its mesh will need.
 
     Args:
-        out: the mesh file; it may lie in the run's directory, which need not be there yet.
+        out: the mesh file; it may lie in the run's directory.
         run: directory of the run.
         source: what is fitted.
         colors: whether colours are wanted.
@@ -95,8 +95,7 @@ def plan_mesh(out: Path, run: Path, source: Path | DepthInput, *, colors: bool, 
     """
     depth = isinstance(source, DepthInput)
     cloud = run / CLOUD_FILE if depth else source
-    new_folder = out.absolute().parent == run.absolute() and not run.exists()
-    check_mesh_path(out, new_folder=new_folder)
+    check_mesh_path(out)
     if out.absolute().resolve() == cloud.absolute().resolve():
         raise InputError(f"--mesh {out}: is the cloud that is fitted; name another file")
     colors = colors and out.suffix.lower() != COLORLESS
@@ -104,7 +103,7 @@ def plan_mesh(out: Path, run: Path, source: Path | DepthInput, *, colors: bool, 
         return FitMesh(out, run, cloud, colors and source.color is not None, trim=True)
     points = read_cloud(kept_cloud(run) if depth else cloud).points
     finite = points[np.isfinite(points).all(axis=1)]
-    check_mesh_path(out, Similarity.to_unit_sphere(finite), new_folder=new_folder)
+    check_mesh_path(out, Similarity.to_unit_sphere(finite))
     try:
         colored = colors and has_colors(cloud)
     except InputError as error:

@@ -42,15 +42,13 @@ def write_animation(
         progress: called with the number of frames so far after each one.
 
     Raises:
-        InputError: another extension, the folder does not exist, or the file cannot be written.
+        InputError: another extension, or the file cannot be written.
         ValueError: there are no frames, one is no RGB image or of another size than the first, or ``fps`` is not > 0.
     """
     path = Path(path)
     suffix = path.suffix.lower()
     if suffix not in ANIMATIONS:
         raise InputError(f"{path}: animations are written as {' or '.join(ANIMATIONS)}")
-    if not path.absolute().parent.is_dir():
-        raise InputError(f"{path}: the folder {path.absolute().parent} does not exist; make it first")
     if not 0 < fps < float("inf"):
         raise ValueError(f"{path}: fps={fps}; expected a number > 0")
     checked = _checked(path, frames, progress)

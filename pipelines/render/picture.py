@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...neural_fields import InputError
-from ...neural_fields.files import write_whole
+from ...neural_fields.files import check_place, write_whole
 
 __all__ = ["Image", "as_bytes", "check_picture_path", "contact_sheet", "in_rows", "stacked", "write_picture"]
 
@@ -79,15 +79,15 @@ def check_picture_path(path: str | Path, *, transparent: bool = False) -> None:
         transparent: whether it has an alpha channel.
 
     Raises:
-        InputError: the extension is not one of ours or holds no transparency, or the folder does not exist.
+        InputError: the extension is not one of ours or holds no transparency, or the file cannot come to be there
+            (`check_place`).
     """
     path = Path(path)
     if path.suffix.lower() not in (".png", ".jpg", ".jpeg"):
         raise InputError(f"{path}: pictures are written as .png or .jpg")
     if transparent and path.suffix.lower() != ".png":
         raise InputError(f"{path}: JPEG knows no transparency; write a .png, or give a background")
-    if not path.parent.is_dir():
-        raise InputError(f"{path}: the folder {path.parent} does not exist")
+    check_place(path)
 
 
 def write_picture(path: str | Path, image: Image) -> None:

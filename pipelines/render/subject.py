@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any
 
 import numpy as np
 import torch
@@ -19,7 +18,7 @@ from ...neural_fields import Field, InputError, Similarity
 from ...neural_fields.meshing import NoSurfaceError, extract_mesh
 from ...neural_fields.tracing import BOUNDING_RADIUS
 from ..fit.cloud import CloudDistance
-from ..run.folder import chosen_level, find_field, is_field, load_still
+from ..run.folder import chosen_level, find_field, fitted_cloud, is_field, load_still
 from ..surface.surface import read_surface, sample_points
 from ..texture.riding import colors_of_run
 from .rasterise import cloud_view, mesh_view
@@ -71,7 +70,7 @@ class Subject:
         field: what is traced; None for a mesh or a cloud.
         colored: whether it has colours of its own.
         oriented: whether it has normals.
-        fitted_to: name of the file that the field was fitted to, if it is known.
+        fitted_to: finds the cloud that the field was fitted to, or raises an InputError; None for a mesh or a cloud.
         outline: points ``(N, 3)`` that a camera has to have in view.
         view: what the pixels of a camera see.
     """
@@ -82,7 +81,7 @@ class Subject:
     field: Field | None
     colored: bool
     oriented: bool
-    fitted_to: str | None
+    fitted_to: Callable[[], Path] | None
     outline: Callable[[], Float64]
     view: Callable[[Camera, Panel], Seen]
 
@@ -148,7 +147,7 @@ def _field_subject(
         field=field,
         colored=colors is not None,
         oriented=True,
-        fitted_to=_fitted_to(metadata),
+        fitted_to=lambda: fitted_cloud(file, metadata, remedy="name it with --reference FILE"),
         outline=lambda: _outline(file, field),
         view=view,
     )
@@ -157,11 +156,6 @@ def _field_subject(
 def _panel(level: int, normal_level: int) -> Panel:
     mapped = "" if normal_level == level else f" + normals of level {normal_level}"
     return Panel(f"level {level}{mapped}", level, normal_level)
-
-
-def _fitted_to(metadata: dict[str, Any]) -> str | None:
-    source = metadata.get("run", {}).get("cloud")
-    return str(source) if source else None
 
 
 def _outline(file: Path, field: Field) -> Float64:
@@ -232,14 +226,13 @@ def reference_distance(subject: Subject, reference: str | Path | None) -> Callab
     Raises:
         InputError: there is none, or it cannot be read.
     """
-    file = subject.fitted_to if reference is None else reference
-    if file is None:
-        raise InputError(
-            f"{subject.name}: --shading error needs a cloud to measure from; name it with --reference FILE"
-        )
-    if reference is None and not Path(file).is_file():
-        raise InputError(f"{subject.name}: its cloud {file} is not to be found; name it with --reference FILE")
-    surface = read_surface(file)
+    if reference is None:
+        if subject.fitted_to is None:
+            raise InputError(
+                f"{subject.name}: --shading error needs a cloud to measure from; name it with --reference FILE"
+            )
+        reference = subject.fitted_to()
+    surface = read_surface(reference)
     points, normals = surface.vertices, surface.normals
     if len(surface.faces):
         points, normals = sample_points(surface, SAMPLES, np.random.default_rng(0))
@@ -249,7 +242,7 @@ def reference_distance(subject: Subject, reference: str | Path | None) -> Callab
         return lambda places: torch.as_tensor(tree.query(places.cpu().double().numpy(), workers=-1)[0]).to(places)
     known = np.linalg.norm(normals, axis=1) > 0.5
     if known.sum() < 2:
-        raise InputError(f"{file}: fewer than two points with normals; nothing can be measured from it")
+        raise InputError(f"{reference}: fewer than two points with normals; nothing can be measured from it")
     cloud = CloudDistance(torch.from_numpy(points[known]), torch.from_numpy(normals[known]))
     cloud.radii *= WIDER
     return lambda places: cloud.signed(places).abs().to(places)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -18,7 +19,7 @@ from torch import Tensor
 
 from ...neural_fields import Field, InputError, SavedField, Similarity, load_field, save_field
 from ...neural_fields.dynamic_tracing import moment
-from ...neural_fields.files import write_json, write_whole
+from ...neural_fields.files import check_place, write_json, write_whole
 from .config import load_config
 from .lock import check_unlocked, lock_file, locked
 from .team import is_leader
@@ -34,11 +35,13 @@ __all__ = [
     "chosen_level",
     "digest_of",
     "find_field",
+    "fitted_cloud",
     "is_field",
     "is_fitted",
     "kept_cloud",
     "load_state",
     "load_still",
+    "named_cloud",
     "read_record",
     "save_state",
     "texture_state_file",
@@ -140,6 +143,49 @@ def kept_cloud(run: Path) -> Path:
     return kept
 
 
+def named_cloud(source: str, run: Path | None) -> dict[str, str]:
+    """Where a cloud is, for a record: so that `fitted_cloud` finds it from any folder.
+
+    Args:
+        source: its file; what else it may be called stays as it is.
+        run: directory of the run, if there is one.
+
+    Returns:
+        ``cloud``, the absolute path, and ``cloud_from_run``, the path from the run's directory, which holds when both
+        are moved together.
+    """
+    file = Path(source)
+    if not file.is_file():
+        return {"cloud": source}
+    named = {"cloud": str(file.absolute())}
+    if run is not None:
+        with suppress(ValueError):  # Windows: they are on two drives
+            named["cloud_from_run"] = os.path.relpath(file.resolve(), run.resolve())
+    return named
+
+
+def fitted_cloud(file: Path, metadata: Mapping[str, Any], *, remedy: str) -> Path:
+    """The file of the cloud that a field was fitted to.
+
+    Args:
+        file: the field's checkpoint.
+        metadata: what is in it.
+        remedy: what to do where it is not found, for the message.
+
+    Raises:
+        InputError: it is in neither of the places that `named_cloud` noted.
+    """
+    record = metadata.get("run", {})
+    source, from_run = record.get("cloud"), record.get("cloud_from_run")
+    if not source:
+        raise InputError(f"{file}: was not fitted to a cloud; {remedy}")
+    places = [Path(source)] + ([] if from_run is None else [file.parent / from_run])
+    for place in places:
+        if place.is_file():
+            return place
+    raise InputError(f"{file}: its cloud {source} is not to be found; {remedy}")
+
+
 def texture_state_file(texture: Path) -> Path:
     """Where the training of the texture that will be written to ``texture`` is kept."""
     return texture.with_suffix(".resume.safetensors")
@@ -155,9 +201,7 @@ def check_new_run(path: str | Path, *, resume: bool, force: bool) -> Path:
     path = Path(path)
     if path.exists() and not path.is_dir():
         raise InputError(f"{path}: is a file; name a directory for the run")
-    parent = path.absolute().parent
-    if not path.exists() and not parent.is_dir():
-        raise InputError(f"{path}: the folder {parent} does not exist; make it first")
+    check_place(path)
     check_unlocked(path)
     if resume:
         if not (path / STATE_FILE).is_file():

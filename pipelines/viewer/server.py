@@ -8,15 +8,16 @@ import io
 import math
 import socket
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from ...datasets.cameras import UP_AXES
+from ...datasets.clouds.reading import check_cloud_path
 from ...neural_fields import Field, InputError, Similarity, TextureField, load_field
-from ..run.folder import find_field
+from ..run.folder import find_field, fitted_cloud
 from ..texture.riding import start_texture
 from .camera import first_eye
 from .client import Client, Shown
@@ -111,21 +112,35 @@ class Viewer:
             client.fail(error)
 
 
-def open_run(run: str | Path, *, side: int = 512, device: torch.device | str = "cpu") -> Shown:
+def open_run(
+    run: str | Path,
+    *,
+    cloud: str | Path | None = None,
+    side: int = 512,
+    device: torch.device | str = "cpu",
+    say: Callable[[str], object] = print,
+) -> Shown:
     """Load what is to be shown.
 
     Args:
         run: run directory or .safetensors file.
+        cloud: what errors are measured from; by default what the field was fitted to.
         side: images have about ``side``² pixels.
         device: where to evaluate the field.
+        say: called with a line where the cloud that the field was fitted to is not to be found.
 
     Raises:
-        InputError: there is no such run.
+        InputError: there is no such run, or no such cloud.
     """
     path = find_field(run)
     field, similarity, metadata = load_field(path, device=device)
-    source = metadata.get("run", {}).get("cloud")
-    cloud = Path(source) if source and Path(source).is_file() else None
+    if cloud is not None:
+        cloud = check_cloud_path(cloud)
+    elif "cloud" in metadata.get("run", {}):
+        try:
+            cloud = fitted_cloud(path, metadata, remedy="without it no errors are shown; name it with --cloud FILE")
+        except InputError as missing:
+            say(str(missing))
     name = Path(run).resolve().stem if Path(run).is_dir() else path.stem
     return show_field(
         field, name=name, similarity=similarity, cloud=cloud, texture=start_texture(path, field), side=side

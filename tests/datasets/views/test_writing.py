@@ -203,7 +203,7 @@ def test_nothing_is_overwritten_and_nothing_is_left_behind(tmp_path, photographs
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "mine.txt").write_text("mine")
     (tmp_path / "file").write_text("mine")
-    for folder, message in (("full", "is not empty"), ("file", "is a file"), ("no/where", "make it first")):
+    for folder, message in (("full", "is not empty"), ("file", "is a file"), ("file/where", "file is no folder")):
         with pytest.raises(InputError, match=message):
             write_neus(tmp_path / folder, photographs)
     (tmp_path / "empty").mkdir()

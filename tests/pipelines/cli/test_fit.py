@@ -225,8 +225,7 @@ def test_mistakes_are_one_line_before_any_work(
     broken.write_text("mtllib none.mtl\n" + "".join(f"v {i} {i * i} 0\n" for i in range(12)) + "usemtl a\nf 1 2 3\n")
     for words, message in (
         ((cloud, "--mesh", "mesh.foo"), "mesh.foo: unknown mesh format '.foo'"),
-        ((cloud, "--mesh", tmp_path / "none" / "mesh.ply"), "does not exist; make it first"),
-        ((cloud, "--mesh", run / "deeper" / "mesh.ply"), "does not exist; make it first"),
+        ((cloud, "--mesh", broken / "mesh.ply"), "broken.obj is no folder; choose another place"),
         ((cloud, "--mesh", tmp_path), "unknown mesh format"),
         ((cloud, "--mesh", cloud), "is the cloud that is fitted; name another file"),
         ((cloud, "--no-colors"), "--no-colors: is about --mesh FILE"),

@@ -307,9 +307,10 @@ def test_colours_ride_along_the_normals():
 
 
 def test_what_cannot_be_written_is_refused_first(run, still, tmp_path):
+    (tmp_path / "file").write_text("mine")
     for name, message in (
         ("film.avi", r"film\.avi: write a film \(\.mp4, \.gif\), a sheet of moments \(\.png\), a \.glb, or a folder"),
-        ("none/film.mp4", r"the folder .*none does not exist"),
+        ("file/film.mp4", r"file is no folder"),
     ):
         with pytest.raises(InputError, match=message):
             check_sequence_path(tmp_path / name)
@@ -325,7 +326,7 @@ def test_what_cannot_be_written_is_refused_first(run, still, tmp_path):
         animate_run(run, tmp_path / "film.mp4", SequenceOptions(colors=still))
     with pytest.raises(InputError, match=r"--frames 1: a mesh moves in 2 frames or more"):
         animate_run(run, tmp_path / "ball.glb", SequenceOptions(frames=1))
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["full"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "full"]
 
 
 def test_flags_of_films_go_with_films(run, tmp_path):

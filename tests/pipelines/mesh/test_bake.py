@@ -297,8 +297,9 @@ def test_failure_leaves_the_old_files_and_no_others(tmp_path, monkeypatch, suffi
 def test_bad_requests_are_one_line(tmp_path, monkeypatch):
     with pytest.raises(InputError, match=r"ball\.ply: textures are written as \.glb or \.obj"):
         check_textured_path(tmp_path / "ball.ply")
-    with pytest.raises(InputError, match="does not exist; make it first"):
-        check_textured_path(tmp_path / "missing" / "ball.glb")
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(InputError, match=r"file is no folder; choose another place"):
+        check_textured_path(tmp_path / "file" / "ball.glb")
     for size in (0, 8, 20_000):
         with pytest.raises(InputError, match=f"--texture {size}: expected 16 to 16384"):
             check_texture_size(size)

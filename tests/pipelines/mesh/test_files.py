@@ -109,12 +109,13 @@ def test_glb_records_its_origin(tmp_path, mesh):
     [
         ("mesh.xyz", r"unknown mesh format '\.xyz'; use one of \.ply, \.obj, \.stl, \.glb"),
         ("mesh", "no extension"),
-        ("missing/mesh.ply", "does not exist; make it first"),
+        ("file/deeper/mesh.ply", "file is no folder"),
         ("folder.ply", "is a folder"),
     ],
 )
 def test_bad_path_is_one_line_before_any_work(tmp_path, name, words):
     (tmp_path / "folder.ply").mkdir()
+    (tmp_path / "file").write_text("mine")
     with pytest.raises(InputError, match=words) as error:
         check_mesh_path(tmp_path / name)
     assert "\n" not in str(error.value)

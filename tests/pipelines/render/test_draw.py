@@ -405,7 +405,7 @@ def test_it_says_when_nothing_is_in_view(shapes, tmp_path, capsys):
     ("arguments", "message"),
     [
         ("blob.safetensors -o a.bmp", "a.bmp: unknown extension"),
-        ("blob.safetensors -o absent/a.png", "does not exist"),
+        ("blob.safetensors -o plain.obj/a.png", "plain.obj is no folder; choose another place"),
         ("absent -o a.png", "absent"),
         ("absent.safetensors -o a.png", "absent.safetensors: no such run"),
         ("absent.ply -o a.png", "absent.ply: no such file"),

@@ -151,8 +151,6 @@ def test_mistakes_are_named(tmp_path):
     frame = np.zeros((8, 10, 3), np.uint8)
     with pytest.raises(InputError, match=r"a\.avi: animations are written as \.mp4 or \.gif"):
         write_animation(tmp_path / "a.avi", [frame])
-    with pytest.raises(InputError, match=r"absent/a\.mp4: the folder .*absent does not exist; make it first"):
-        write_animation(tmp_path / "absent" / "a.mp4", [frame])
     with pytest.raises(ValueError, match=r"a\.mp4: no frames to write"):
         write_animation(tmp_path / "a.mp4", [])
     with pytest.raises(ValueError, match=r"a\.gif: no frames to write"):

@@ -43,8 +43,8 @@ def test_pictures_are_written_whole_or_not_at_all(channels, tmp_path):
     assert len(list(tmp_path.iterdir())) == 1
     with pytest.raises(InputError, match=r"picture\.bmp: pictures are written as"):
         write_picture(tmp_path / "picture.bmp", image)
-    with pytest.raises(InputError, match="does not exist"):
-        write_picture(tmp_path / "absent" / "picture.png", image)
+    with pytest.raises(InputError, match=r"picture\.png is no folder"):
+        write_picture(tmp_path / "picture.png" / "picture.png", image)
 
 
 def test_transparency_and_jpeg_do_not_go_together(tmp_path):

@@ -1,12 +1,20 @@
 """What a training keeps in its run directory, and what it finds again."""
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
 import torch
 from mplicits.neural_fields import InputError, Similarity, Siren, load_field
-from mplicits.pipelines.run.folder import RunFolder, check_new_run, is_fitted, read_record
+from mplicits.pipelines.run.folder import (
+    RunFolder,
+    check_new_run,
+    fitted_cloud,
+    is_fitted,
+    named_cloud,
+    read_record,
+)
 from mplicits.pipelines.run.settings import FitConfig, TextureConfig
 
 BALL, HERE = Siren(8, 1), Similarity((1.0, 2.0, 3.0), 4.0)
@@ -76,6 +84,44 @@ def test_without_a_directory_nothing_is_kept(tmp_path: Path, monkeypatch: pytest
     assert names(tmp_path) == []
     with pytest.raises(InputError, match="resume: needs the run directory"):
         RunFolder(None, resume=True)
+
+
+def test_missing_folders_above_a_run_are_made(tmp_path: Path) -> None:
+    path = tmp_path / "runs" / "today" / "ball"
+    assert check_new_run(path, resume=False, force=False) == path
+    assert names(tmp_path) == []  # asking makes nothing
+    kept(path)
+    assert read_record(path) == RECORD
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(InputError, match="file is no folder; choose another place"):
+        check_new_run(tmp_path / "file" / "ball", resume=False, force=False)
+
+
+def test_the_cloud_of_a_run_is_found_from_any_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By its own path when the run is moved, and by the way from the run when both are."""
+    scans, field = tmp_path / "a" / "scans", tmp_path / "a" / "runs" / "ball" / "field.safetensors"
+    for folder in (scans, field.parent, tmp_path / "elsewhere"):
+        folder.mkdir(parents=True)
+    (scans / "ball.ply").write_text("points")
+    monkeypatch.chdir(scans)
+    named = {"run": named_cloud("ball.ply", field.parent)}
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    assert fitted_cloud(field, named, remedy="") == scans / "ball.ply"
+    assert fitted_cloud(tmp_path / "field.safetensors", named, remedy="") == scans / "ball.ply"  # moved alone
+    shutil.move(tmp_path / "a", tmp_path / "b")
+    moved = tmp_path / "b" / "runs" / "ball" / "field.safetensors"
+    assert fitted_cloud(moved, named, remedy="").samefile(tmp_path / "b" / "scans" / "ball.ply")
+    with pytest.raises(InputError, match=r"its cloud .*ball\.ply is not to be found; name it$"):
+        fitted_cloud(field, named, remedy="name it")
+
+
+def test_a_cloud_that_is_no_file_keeps_its_name(tmp_path: Path) -> None:
+    named = named_cloud("torus", tmp_path)
+    assert named == {"cloud": "torus"}
+    with pytest.raises(InputError, match="its cloud torus is not to be found"):
+        fitted_cloud(tmp_path / "field.safetensors", {"run": named}, remedy="name it")
+    with pytest.raises(InputError, match="was not fitted to a cloud; name one"):
+        fitted_cloud(tmp_path / "field.safetensors", {"run": {}}, remedy="name one")
 
 
 @pytest.mark.parametrize("text", ["{", "[]", json.dumps({"finished": True}), json.dumps({"config": 3})])

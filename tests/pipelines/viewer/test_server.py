@@ -27,6 +27,7 @@ from mplicits.neural_fields import (
 )
 from mplicits.neural_fields.analytic import Plane
 from mplicits.pipelines.render.trace import trace_view
+from mplicits.pipelines.run.folder import named_cloud
 from mplicits.pipelines.viewer.camera import (
     describe_reading,
     first_eye,
@@ -326,6 +327,28 @@ def test_cloud_comes_in_unit_coordinates_or_not_at_all(tmp_path):
     np.testing.assert_allclose(Shapes(Sphere(), similarity, cloud=file).cloud(), points, atol=1e-6)
     with pytest.raises(InputError, match="not to be found"):
         Shapes(Sphere(), similarity).cloud()
+
+
+def test_a_run_is_shown_with_its_cloud_from_any_folder(tmp_path, monkeypatch):
+    """Without one, a line says that there are no errors to be seen, and what to do about it."""
+    said, run = [], tmp_path / "runs" / "ball"
+    run.mkdir(parents=True)
+    (tmp_path / "ball.xyz").write_text("0 0 1\n0 1 0\n1 0 0\n")
+    monkeypatch.chdir(tmp_path)
+    save_field(run / "field.safetensors", Siren(8, 1), metadata={"run": named_cloud("ball.xyz", run)})
+    monkeypatch.chdir(run)
+    assert "error" in open_run(run, say=said.append).shadings
+    assert said == []
+    (tmp_path / "ball.xyz").rename(tmp_path / "renamed.xyz")
+    assert "error" not in open_run(run, say=said.append).shadings
+    (line,) = said
+    assert "ball.xyz is not to be found; without it no errors are shown; name it with --cloud FILE" in line
+    assert "error" in open_run(run, cloud=tmp_path / "renamed.xyz", say=said.append).shadings
+    with pytest.raises(InputError, match=r"ball\.xyz: no such file"):
+        open_run(run, cloud=tmp_path / "ball.xyz", say=said.append)
+    save_field(tmp_path / "own.safetensors", Siren(8, 1))  # fitted to nothing: nothing is missing
+    open_run(tmp_path / "own.safetensors", say=said.append)
+    assert len(said) == 1
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
