@@ -1,7 +1,8 @@
 """Neural signed distance fields, and the mathematics that evaluates them."""
 
 from .adapters import Deviation, InstantNSRGeometry, NerfstudioField, NeuSGeometry
-from .analytic import Box, Capsule, Plane, Sphere, Torus, Union
+from .algebra import Bounded, Difference, Intersection, Offset, Placed, Shell, Union
+from .analytic import Box, Capsule, Plane, Sphere, Torus
 from .attributes import Mapped, map_attribute, map_colors, project_to_surface
 from .characteristics import IntegrationError, Solver, Tracks, flow, track, trajectories, transport_error
 from .checkpoint import SavedField, load_field, load_texture, save_field, save_texture
@@ -10,7 +11,7 @@ from .cones import cone_starts
 from .errors import InputError
 from .evolution import Law, curvature, key_loss, law_loss, mean_curvature, morph, near_surface, normal_speed, transport
 from .field import Field, Jet, OneLevelField, SecondJet
-from .function import FunctionField
+from .function import FieldLike, FunctionField, as_field
 from .meshing import Mesh, NoSurfaceError, extract_mesh, map_normals
 from .moving import Keyframes, Moving, RigidMotion, ShrinkingSphere
 from .multiscale import MultiscaleSDF, levels_of
@@ -21,20 +22,24 @@ from .spacetime import SpaceTimeJet, SpaceTimeSDF, TimeSlice, at_time, spacetime
 from .sphere_start import fit_sphere
 from .tracing import Hits, sphere_trace
 from .volume_renderer import Rendered, Sampling, render_volume
-from .world import Closest, WorldField, WorldHits
+from .world import Closest, WorldField, WorldHits, in_one_frame
 
 __all__ = [
+    "Bounded",
     "Box",
     "Capsule",
     "Closest",
     "ColorSiren",
     "Deviation",
+    "Difference",
     "Field",
+    "FieldLike",
     "FunctionField",
     "Hits",
     "InputError",
     "InstantNSRGeometry",
     "IntegrationError",
+    "Intersection",
     "Jet",
     "Keyframes",
     "Law",
@@ -45,14 +50,17 @@ __all__ = [
     "NerfstudioField",
     "NeuSGeometry",
     "NoSurfaceError",
+    "Offset",
     "OneLevelField",
     "Outside",
+    "Placed",
     "Plane",
     "Rendered",
     "RigidMotion",
     "Sampling",
     "SavedField",
     "SecondJet",
+    "Shell",
     "ShrinkingSphere",
     "Similarity",
     "Siren",
@@ -68,12 +76,14 @@ __all__ = [
     "ViewColor",
     "WorldField",
     "WorldHits",
+    "as_field",
     "at_time",
     "cone_starts",
     "curvature",
     "extract_mesh",
     "fit_sphere",
     "flow",
+    "in_one_frame",
     "key_loss",
     "law_loss",
     "levels_of",

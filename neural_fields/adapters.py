@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from ._checks import positive
 from ._point_memo import PointMemo
 from .field import Field, Jet
+from .function import FieldLike, as_field
 from .meshing import extract_mesh
 from .volume import neus_alpha
 
@@ -45,10 +46,10 @@ class NeuSGeometry(nn.Module):
         (torch.Size([10, 65]), torch.Size([10, 1, 3]))
     """
 
-    def __init__(self, field: Field, *, scale: float = 1.0) -> None:
+    def __init__(self, field: FieldLike, *, scale: float = 1.0) -> None:
         super().__init__()
         positive(scale=scale)
-        self.field, self.scale = field, float(scale)
+        self.field, self.scale = as_field(field), float(scale)
         self._memo = PointMemo()
 
     def forward(self, x: Tensor) -> Tensor:
@@ -95,12 +96,14 @@ class InstantNSRGeometry(nn.Module):
         ([0.75], [[1.0, 0.0, 0.0]], [[0.75]])
     """
 
-    def __init__(self, field: Field, *, radius: float = 1.0, scale: float | None = None, resolution: int = 512) -> None:
+    def __init__(
+        self, field: FieldLike, *, radius: float = 1.0, scale: float | None = None, resolution: int = 512
+    ) -> None:
         super().__init__()
         positive(radius=radius)
         scale = 1 / radius if scale is None else scale
         positive(scale=scale)
-        self.field, self.radius, self.scale, self.resolution = field, float(radius), float(scale), resolution
+        self.field, self.radius, self.scale, self.resolution = as_field(field), float(radius), float(scale), resolution
 
     def forward(
         self,
@@ -197,11 +200,11 @@ class NerfstudioField(nn.Module):
     """
 
     def __init__(
-        self, field: Field, color: nn.Module, *, heads: Any, scale: float = 1.0, deviation: float = 0.3
+        self, field: FieldLike, color: nn.Module, *, heads: Any, scale: float = 1.0, deviation: float = 0.3
     ) -> None:
         super().__init__()
         positive(scale=scale)
-        self.field, self.color, self.scale = field, color, float(scale)
+        self.field, self.color, self.scale = as_field(field), color, float(scale)
         self.heads = heads
         self.deviation_network = Deviation(deviation)
         self.cos_anneal_ratio = 1.0

@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from ._checks import positive
-from .field import Field, Jet, OneLevelField
+from .field import Jet, OneLevelField
 
-__all__ = ["Box", "Capsule", "Plane", "Sphere", "Torus", "Union"]
+__all__ = ["Box", "Capsule", "Plane", "Sphere", "Torus"]
 
 
 class _Exact(OneLevelField):
@@ -148,21 +148,3 @@ class Capsule(_Exact):
         along = (((x - start) @ axis) / (axis @ axis)).clamp(0, 1)
         length, direction = _norm_and_direction(x - start - along[..., None] * axis)
         return length - self.radius, direction
-
-
-class Union(_Exact):
-    """``min_i f_i(x)``: exact outside every part, a bound inside where parts overlap."""
-
-    def __init__(self, *parts: Field) -> None:
-        if len({part.in_dim for part in parts}) != 1:
-            raise ValueError(f"parts of {[part.in_dim for part in parts]} dimensions; expected at least one, all equal")
-        super().__init__(parts[0].in_dim)
-        self.parts = torch.nn.ModuleList(parts)
-
-    def _evaluate(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        jets = [part.jet(x) for part in self.parts]  # pyright: ignore[reportCallIssue]
-        values = torch.stack([jet.value for jet in jets])
-        value, nearest = values.min(dim=0)
-        gradients = torch.stack([jet.gradient for jet in jets])
-        index = nearest[None, ..., None].expand(1, *x.shape)
-        return value, gradients.gather(0, index)[0]

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from .color import TextureField
 from .field import Field
+from .function import FieldLike, as_field
 
 __all__ = ["Mapped", "map_attribute", "map_colors", "project_to_surface"]
 
@@ -35,14 +36,14 @@ class Mapped(NamedTuple):
 
 @torch.no_grad()
 def project_to_surface(
-    field: Field, points: Tensor, *, level: int = -1, steps: int = 10, tolerance: float = 1e-5
+    field: FieldLike, points: Tensor, *, level: int = -1, steps: int = 10, tolerance: float = 1e-5
 ) -> tuple[Tensor, Tensor]:
     """Move points to the surface, ``x ← x − f(x) ∇f(x) / |∇f(x)|²`` until ``|f(x)|`` is small.
 
     Where f is a signed distance, one step lands on the closest point; elsewhere the points follow ∇f.
 
     Args:
-        field: f.
+        field: f; or any function of points ``(..., 3)`` → ``(...,)``.
         points: ``(..., d)``, in the field's coordinates.
         level: whose surface.
         steps: at most so many evaluations per point; points that have arrived are left alone.
@@ -60,6 +61,7 @@ def project_to_surface(
         >>> project_to_surface(Sphere(radius=0.5), torch.tensor([[0.8, 0.0, 0.0]]))
         (tensor([[0.5000, 0.0000, 0.0000]]), tensor([True]))
     """
+    field = as_field(field)
     moved = field.check_points(points).reshape(-1, field.in_dim).clone()
     arrived = torch.zeros(len(moved), dtype=torch.bool, device=moved.device)
     moving = torch.arange(len(moved), device=moved.device)
@@ -80,7 +82,7 @@ def project_to_surface(
 
 @torch.no_grad()
 def map_attribute(
-    field: Field,
+    field: FieldLike,
     attribute: Callable[[Tensor], Tensor],
     points: Tensor,
     *,
@@ -91,7 +93,7 @@ def map_attribute(
     """The mapping {S, f, g} of the paper at points of any surface S.
 
     Args:
-        field: f.
+        field: f; or a function, as in `project_to_surface`.
         attribute: g, points ``(N, d)`` of the band → attributes ``(N, C)``.
         points: of S, ``(..., d)``, in the field's coordinates.
         delta: half-width of the band, in field units.
@@ -110,6 +112,7 @@ def map_attribute(
         >>> normals.values.shape
         torch.Size([100, 3])
     """
+    field = as_field(field)
     rows = field.check_points(points).reshape(-1, field.in_dim)
     parts = [_map_rows(field, attribute, part, delta, level) for part in rows.split(batch)]
     values, reached = (torch.cat(both) for both in zip(*parts, strict=True))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import json
 import os
@@ -15,10 +16,12 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
+from .algebra import Bounded, Difference, Intersection, Offset, Placed, Shell, Union
+from .analytic import Box, Capsule, Plane, Sphere, Torus
 from .baselines import NeusSDF
 from .color import ColorSiren, TextureField
 from .errors import InputError
-from .field import Field
+from .field import Field, plain
 from .files import write_whole
 from .multiscale import MultiscaleSDF
 from .similarity import Similarity
@@ -27,6 +30,9 @@ from .spacetime import SpaceTimeSDF
 
 __all__ = ["SavedField", "load_field", "load_texture", "save_field", "save_texture"]
 
+# Closed forms are made again of their definition; what is put together of fields, of that and of its parts.
+CLOSED = {cls.__name__: cls for cls in (Box, Capsule, Plane, Sphere, Torus)}
+COMBINED = {cls.__name__: cls for cls in (Bounded, Difference, Intersection, Offset, Placed, Shell, Union)}
 FORMAT = "mplicits-field"
 TEXTURE_FORMAT = "mplicits-texture"
 VERSION = 1
@@ -57,7 +63,8 @@ def save_field(
 
     Args:
         path: where to write.
-        field: a `Siren`, a `MultiscaleSDF` of them, or a `SpaceTimeSDF` of that.
+        field: a `Siren`, a `MultiscaleSDF` of them, a `SpaceTimeSDF` of that, a closed form such as `Sphere`, or what
+            `Union`, `Difference`, `Offset` and the like make of all these.
         similarity: the map from input to unit-sphere coordinates; the identity if there is none.
         metadata: JSON values to keep with the field.
 
@@ -153,7 +160,8 @@ def _digest(field: Field) -> str:
 
 
 def _write(path: Path, state: Mapping[str, Tensor], form: str, header: Mapping[str, Any]) -> None:
-    tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in state.items()}
+    # Cloned: a field that is part of a combination twice has its tensors twice, which safetensors refuses.
+    tensors = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in state.items()}
     # Bytes, not save_file: that makes files nobody else may read, whatever the umask.
     write_whole(path, save(tensors, metadata={form: json.dumps(header)}))
 
@@ -221,8 +229,17 @@ def _describe(field: Field) -> dict[str, Any]:
         return {"type": "MultiscaleSDF", "taper": field.taper, "levels": levels}
     if isinstance(field, SpaceTimeSDF):
         return {"type": "SpaceTimeSDF", "sdf": _describe(field.sdf)}
+    name = type(field).__name__
+    if type(field) is CLOSED.get(name):
+        return {"type": name, **plain(field.definition())}
+    if isinstance(field, tuple(COMBINED.values())):
+        definition = plain(field.definition())
+        if isinstance(field, Placed):
+            definition["similarity"] = dataclasses.asdict(field.similarity)
+        return {"type": name, "parts": [_describe(part) for part in field.fields], **definition}
     raise TypeError(
-        f"a {type(field).__name__} cannot be saved; expected a Siren, a MultiscaleSDF of Sirens or a SpaceTimeSDF"
+        f"a {name} cannot be saved; expected a Siren, a MultiscaleSDF of Sirens, a SpaceTimeSDF, a closed form, or a "
+        "combination of these; a mesh of it can be (extract_mesh)"
     )
 
 
@@ -241,4 +258,14 @@ def _build(description: Mapping[str, Any]) -> Field:
         if not isinstance(sdf, MultiscaleSDF):
             raise ValueError(f"a SpaceTimeSDF of a {type(sdf).__name__}")
         return SpaceTimeSDF(sdf)
+    if description["type"] in CLOSED:
+        return CLOSED[description["type"]](
+            **{key: tuple(value) if isinstance(value, list) else value for key, value in arguments.items()}
+        )
+    if description["type"] in COMBINED:
+        if "similarity" in arguments:
+            center, scale = arguments["similarity"]["center"], arguments["similarity"]["scale"]
+            arguments["similarity"] = Similarity((float(center[0]), float(center[1]), float(center[2])), float(scale))
+        parts = [_build(part) for part in arguments.pop("parts")]
+        return COMBINED[description["type"]](*parts, **arguments)
     raise ValueError(f"unknown field type {description['type']!r}")

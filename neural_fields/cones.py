@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from .field import Field
+from .function import FieldLike, as_field
 from .tracing import BOUNDING_RADIUS, ball_crossing, check_rays, unit_directions
 
 __all__ = ["CONE_LIPSCHITZ", "cone_ends", "cone_starts"]
@@ -19,7 +20,7 @@ CONE_LIPSCHITZ = 1.15
 
 @torch.no_grad()
 def cone_starts(
-    field: Field,
+    field: FieldLike,
     origin: Tensor,
     directions: Tensor,
     *,
@@ -37,7 +38,7 @@ def cone_starts(
     t + ((v − δ_0)/L − tσ) / (1 + σ). Tiles are marched from large to small, each starting where the larger one ended.
 
     Args:
-        field: what to trace, three-dimensional.
+        field: what to trace, three-dimensional; or any function of points.
         origin: ``(3,)`` the common origin of all rays.
         directions: ``(H, W, 3)`` of any length but 0.
         level: the level that will be traced from there.
@@ -53,6 +54,7 @@ def cone_starts(
     Raises:
         ValueError: shapes do not fit, or the field is not three-dimensional.
     """
+    field = as_field(field)
     level = field.resolve_level(level)
     _check_image(field, origin, directions, lipschitz)
     directions, length = unit_directions(directions)
@@ -67,7 +69,7 @@ def cone_starts(
 
 @torch.no_grad()
 def cone_ends(
-    field: Field,
+    field: FieldLike,
     origin: Tensor,
     directions: Tensor,
     wanted: Tensor,
@@ -102,6 +104,7 @@ def cone_ends(
     Raises:
         ValueError: shapes do not fit, or the field is not three-dimensional.
     """
+    field = as_field(field)
     level = field.resolve_level(level)
     _check_image(field, origin, directions, lipschitz)
     directions, length = unit_directions(directions)

@@ -10,7 +10,7 @@ from typing import Any, ClassVar, NamedTuple
 import torch
 from torch import Tensor, nn
 
-__all__ = ["Field", "Jet", "OneLevelField", "SecondJet"]
+__all__ = ["Field", "Jet", "OneLevelField", "SecondJet", "plain"]
 
 
 class Jet(NamedTuple):
@@ -215,7 +215,7 @@ class Field(nn.Module, ABC):
         In plain types, which ``torch.load(weights_only=True)`` reads.
         """
         super()._save_to_state_dict(destination, prefix, keep_vars)
-        destination._metadata[prefix[:-1]]["definition"] = _plain(self.definition())
+        destination._metadata[prefix[:-1]]["definition"] = plain(self.definition())
 
     def _load_from_state_dict(
         self,
@@ -231,7 +231,7 @@ class Field(nn.Module, ABC):
 
         Where the metadata has been lost on the way (a plain dict, a safetensors file), there is nothing to compare.
         """
-        here = _plain(self.definition())
+        here = plain(self.definition())
         there = local_metadata.get("definition", here)
         error_msgs += [
             f"{prefix}{name} is {there.get(name)!r} where the tensors come from and {here.get(name)!r} here: "
@@ -244,15 +244,15 @@ class Field(nn.Module, ABC):
         )
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """Numbers, words and what holds them as Python's own, whoever made them; all else as it prints."""
     if value is None or isinstance(value, bool | int | str):
         return value
     if isinstance(value, Real):
         return float(value)
     if isinstance(value, Mapping):
-        return {name: _plain(item) for name, item in value.items()}
-    return tuple(map(_plain, value)) if isinstance(value, tuple | list) else repr(value)
+        return {name: plain(item) for name, item in value.items()}
+    return tuple(map(plain, value)) if isinstance(value, tuple | list) else repr(value)
 
 
 class OneLevelField(Field):

@@ -9,7 +9,10 @@ from torch import Tensor
 
 from .field import Field, Jet
 
-__all__ = ["FunctionField"]
+__all__ = ["FieldLike", "FunctionField", "as_field"]
+
+# What is taken where a field is expected: a field, or any function of points ``(..., 3)`` → ``(...,)``.
+FieldLike = Field | Callable[[Tensor], Tensor]
 
 
 class FunctionField(Field):
@@ -71,3 +74,21 @@ class FunctionField(Field):
         if not recorded:
             value, gradient = value.detach(), gradient.detach()
         return Jet(value, gradient, x.new_empty((*x.shape[:-1], 0)))
+
+
+def as_field(field: FieldLike) -> Field:
+    """The field itself, or a `FunctionField` of what can be called.
+
+    Raises:
+        TypeError: it is neither.
+
+    Example:
+        >>> import torch
+        >>> as_field(lambda x: x.norm(dim=-1) - 0.5)(torch.ones(1, 3)) > 0
+        tensor([True])
+    """
+    if isinstance(field, Field):
+        return field
+    if not callable(field):
+        raise TypeError(f"field: got a {type(field).__name__}; expected a Field, or a function of points (..., 3)")
+    return FunctionField(field)

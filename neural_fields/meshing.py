@@ -14,7 +14,7 @@ from ._blocks import ActiveCells, NoSurfaceError, active_cells, cull_blocks
 from ._checks import positive
 from ._cube import EDGE_AXIS, EDGE_ENDS, cube_tables
 from ._lattice import Bounds, Lattice, Progress, Sampler
-from .field import Field
+from .function import FieldLike, as_field
 
 __all__ = ["Mesh", "MeshStats", "NoSurfaceError", "extract_mesh", "map_normals"]
 
@@ -64,7 +64,7 @@ class Mesh:
 
 
 def extract_mesh(
-    field: Field,
+    field: FieldLike,
     *,
     resolution: int = 256,
     level: int = -1,
@@ -89,7 +89,8 @@ def extract_mesh(
     slope at the vertices, by one Newton step more along the edge.
 
     Args:
-        field: a three-dimensional field, negative inside; evaluated on the device of its parameters.
+        field: three-dimensional, negative inside, evaluated on the device of its parameters; or any function of points
+            ``(..., 3)`` → ``(...,)``, in torch operations.
         resolution: cells along the longest axis of the box.
         level: the level whose zero set is wanted.
         bounds: lowest and highest corner of the box.
@@ -110,6 +111,7 @@ def extract_mesh(
         >>> bool(abs((mesh.vertices**2).sum(axis=1) ** 0.5 - 0.5).max() < 1e-5)
         True
     """
+    field = as_field(field)
     if field.in_dim != 3:
         raise ValueError(f"field.in_dim={field.in_dim}: expected 3 (fix the time of a field in space-time first)")
     positive(lipschitz=lipschitz, batch=batch)
@@ -149,7 +151,7 @@ def extract_mesh(
 
 
 @torch.no_grad()
-def map_normals(mesh: Mesh, field: Field, *, level: int = -1, batch: int = 1 << 18) -> Mesh:
+def map_normals(mesh: Mesh, field: FieldLike, *, level: int = -1, batch: int = 1 << 18) -> Mesh:
     """Neural normal mapping: the mesh with a field's normals at its vertices (paper Sec. 3).
 
     Each vertex p gets ∇f_j(p) / |∇f_j(p)|. For an f_j that is a distance this is the normal of its surface at the point
@@ -157,13 +159,14 @@ def map_normals(mesh: Mesh, field: Field, *, level: int = -1, batch: int = 1 << 
 
     Args:
         mesh: in the field's own coordinates; of a coarse level, say.
-        field: on the device of its parameters.
+        field: on the device of its parameters; or a function, as in `extract_mesh`.
         level: whose gradient to take.
         batch: points per call of the field.
 
     Raises:
         ValueError: there is no such level.
     """
+    field = as_field(field)
     points = torch.from_numpy(mesh.vertices).to(field.like)
     gradients = [field.jet(part, level=level).gradient for part in points.split(batch)]
     return replace(mesh, normals=normalize(torch.cat(gradients), dim=-1).float().cpu().numpy())

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
 from .field import Field, Jet, OneLevelField
+from .function import FieldLike, as_field
 
 __all__ = ["Keyframes", "Moving", "RigidMotion", "ShrinkingSphere"]
 
@@ -81,14 +83,15 @@ class Moving(Field):
     """A field carried by a rigid motion: f(x, t) = g(x at time 0), a distance at all times if g is one.
 
     Args:
-        field: g, three-dimensional, with any number of levels.
+        field: g, three-dimensional, with any number of levels; or a function of points ``(..., 3)`` → ``(...,)``.
         motion: how it moves.
     """
 
     defined_by = ("motion",)
 
-    def __init__(self, field: Field, motion: RigidMotion) -> None:
+    def __init__(self, field: FieldLike, motion: RigidMotion) -> None:
         super().__init__()
+        field = as_field(field)
         if field.in_dim != 3:
             raise ValueError(f"field.in_dim={field.in_dim}: expected a static field, three-dimensional")
         self.field, self.motion = field, motion
@@ -173,7 +176,7 @@ class Keyframes(OneLevelField):
 
     Args:
         times: strictly increasing.
-        fields: three-dimensional, one for each time; shared, not copied.
+        fields: three-dimensional, one for each time, or functions of points; shared, not copied.
 
     Raises:
         ValueError: there are none, numbers differ, the times do not increase, or a field is not three-dimensional.
@@ -181,8 +184,9 @@ class Keyframes(OneLevelField):
 
     defined_by = ("times",)
 
-    def __init__(self, times: tuple[float, ...] | list[float], fields: tuple[Field, ...] | list[Field]) -> None:
+    def __init__(self, times: tuple[float, ...] | list[float], fields: Sequence[FieldLike]) -> None:
         super().__init__(in_dim=4)
+        fields = [as_field(field) for field in fields]
         if not times or len(times) != len(fields):
             raise ValueError(f"{len(times)} times for {len(fields)} fields; expected one for each, and at least one")
         if any(not a < b for a, b in itertools.pairwise(times)):

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from .field import Field, Jet, SecondJet
+from .function import FieldLike, as_field
 from .siren import Siren
 
 __all__ = ["MultiscaleSDF", "Parts", "levels_of", "walk_levels"]
@@ -29,7 +30,7 @@ class MultiscaleSDF(Field):
     cubic 1 − u²(3 − 2u), which makes value and gradient continuous for renderers that differentiate them.
 
     Args:
-        base: level 0, defined everywhere.
+        base: level 0, defined everywhere; a field, or a function of points ``(..., 3)`` → ``(...,)``.
         residuals: the r_j, finest last; same ``in_dim`` and number of features as the base.
         deltas: half-width δ_j of the band around each level but the last (Eq. 5).
         taper: fraction of the band over which the gate closes, in [0, 1].
@@ -47,9 +48,10 @@ class MultiscaleSDF(Field):
     defined_by = ("taper",)
 
     def __init__(
-        self, base: Field, residuals: Sequence[Field], deltas: Sequence[float] | Tensor, *, taper: float = 0.0
+        self, base: FieldLike, residuals: Sequence[Field], deltas: Sequence[float] | Tensor, *, taper: float = 0.0
     ) -> None:
         super().__init__()
+        base = as_field(base)
         widths = torch.as_tensor(deltas, dtype=torch.get_default_dtype()).reshape(-1)
         if len(widths) != len(residuals):
             raise ValueError(f"deltas has {len(widths)} entries for {len(residuals)} residuals; expected one for each")

@@ -20,6 +20,7 @@ from torch import Tensor
 from ._checks import positive
 from ._march import Expected, Found, Near, Rays, Rule, march, march_budget
 from .field import Field
+from .function import FieldLike, as_field
 from .volume import ball_chord
 
 __all__ = [
@@ -59,7 +60,7 @@ class Hits(NamedTuple):
 
 
 def sphere_trace(
-    field: Field,
+    field: FieldLike,
     origins: Tensor,
     directions: Tensor,
     *,
@@ -98,7 +99,7 @@ def sphere_trace(
     so that dt = −(df + ⟨∇f, do + t dd⟩) / ⟨∇f, d⟩. They grow without bound where rays graze the surface.
 
     Args:
-        field: what to trace, three-dimensional.
+        field: what to trace, three-dimensional; or any function of points ``(..., 3)`` → ``(...,)``.
         origins: ``(..., 3)``.
         directions: ``(..., 3)`` of any length but 0; broadcast with ``origins``.
         level: whose surface to find.
@@ -125,6 +126,7 @@ def sphere_trace(
         >>> bool(hits.mask), round(float(hits.depth), 4)
         (True, 1.5)
     """
+    field = as_field(field)
     if budget is None:
         hits, _, _ = trace_expected(
             field,

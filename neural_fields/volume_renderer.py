@@ -16,6 +16,7 @@ from torch import Tensor
 
 from ._checks import at_least, positive
 from .field import Field, Jet
+from .function import FieldLike, as_field
 from .volume import (
     composite,
     importance_depths,
@@ -96,7 +97,7 @@ class Rendered(NamedTuple):
 
 
 def render_volume(
-    field: Field,
+    field: FieldLike,
     color: RayColor,
     origins: Tensor,
     directions: Tensor,
@@ -113,7 +114,7 @@ def render_volume(
     """Render rays through the unit sphere; differentiable in the parameters of field, colour and ``inv_std``.
 
     Args:
-        field: the geometry, in unit-sphere coordinates.
+        field: the geometry, in unit-sphere coordinates; or any function of points ``(..., 3)`` → ``(...,)``.
         color: for example a `ViewColor`, or ``lambda x, v, jet: texture.colors(x)``.
         origins: ``(R, 3)``.
         directions: ``(R, 3)`` unit vectors.
@@ -143,6 +144,7 @@ def render_volume(
         raise ValueError(
             f"origins {tuple(origins.shape)}, directions {tuple(directions.shape)}: expected (R, 3) for both"
         )
+    field = as_field(field)
     level, sampling = field.resolve_level(level), sampling or Sampling()
     near, far = sphere_span(origins, directions)
     edges = sample_depths(field, origins, directions, near, far, sampling, level=level, generator=generator)

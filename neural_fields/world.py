@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -12,13 +12,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ._lattice import Bounds
+from .algebra import Bounded, Difference, Intersection, Offset, Placed, Shell, Union
 from .attributes import project_to_surface
 from .field import Field
+from .function import FieldLike, as_field
 from .meshing import DEFAULT_BOUNDS, Mesh, extract_mesh
 from .similarity import Similarity
 from .tracing import sphere_trace
 
-__all__ = ["Closest", "WorldField", "WorldHits"]
+__all__ = ["Closest", "WorldField", "WorldHits", "in_one_frame"]
 
 Points = TypeVar("Points", NDArray[np.floating], Tensor)
 
@@ -65,7 +67,7 @@ class WorldField:
     keep their digits.
 
     Args:
-        field: three-dimensional, in its own coordinates.
+        field: three-dimensional, in its own coordinates; or a function of points ``(..., 3)`` → ``(...,)``.
         similarity: from input to the field's coordinates; the identity if there is none.
 
     Raises:
@@ -79,7 +81,8 @@ class WorldField:
         array([2.])
     """
 
-    def __init__(self, field: Field, similarity: Similarity | None = None) -> None:
+    def __init__(self, field: FieldLike, similarity: Similarity | None = None) -> None:
+        field = as_field(field)
         if field.in_dim != 3:
             raise ValueError(f"field.in_dim={field.in_dim}: expected 3 (fix the time of a field in space-time first)")
         self.field, self.similarity = field, similarity or Similarity.identity()
@@ -191,6 +194,56 @@ class WorldField:
         mesh = extract_mesh(self.field, resolution=resolution, level=level, bounds=box, normals=normals)
         return dataclasses.replace(mesh, vertices=self.similarity.to_input(mesh.vertices))
 
+    def union(self, *others: WorldField, smooth: float = 0.0) -> WorldField:
+        """This solid and others as one, wherever each was fitted.
+
+        Args:
+            others: in the same input coordinates.
+            smooth: width of the blend, in input units; see `Union`.
+
+        Returns:
+            A field in a unit sphere around all of them; see `in_one_frame`.
+
+        Raises:
+            ValueError: ``smooth`` is negative.
+
+        Example:
+            >>> from mplicits.neural_fields import Similarity, Sphere, WorldField
+            >>> near, far = (WorldField(Sphere(), Similarity((x, 0.0, 0.0), 10.0)) for x in (0.0, 100.0))
+            >>> near.union(far).distance([[7.0, 0.0, 0.0], [92.0, 0.0, 0.0]]).round(4)
+            array([2., 3.])
+        """
+        fields, frame = in_one_frame([self, *others])
+        return WorldField(Union(*fields, smooth=smooth / frame.scale), frame)
+
+    def intersection(self, *others: WorldField, smooth: float = 0.0) -> WorldField:
+        """What is in this solid and in all others; see `union` and `Intersection`."""
+        fields, frame = in_one_frame([self, *others])
+        return WorldField(Intersection(*fields, smooth=smooth / frame.scale), frame)
+
+    def difference(self, *others: WorldField, smooth: float = 0.0) -> WorldField:
+        """What is in this solid and in none of the others; see `union` and `Difference`."""
+        fields, frame = in_one_frame([self, *others])
+        return WorldField(Difference(*fields, smooth=smooth / frame.scale), frame)
+
+    def offset(self, by: float) -> WorldField:
+        """This solid grown by a length in input units, or shrunk by a negative one; see `Offset`.
+
+        Raises:
+            ValueError: ``by`` is not finite.
+        """
+        fields, frame = in_one_frame([self], margin=max(by, 0.0))
+        return WorldField(Offset(*fields, by=by / frame.scale), frame)
+
+    def shell(self, *, inside: float = 0.0, outside: float = 0.0) -> WorldField:
+        """A wall that reaches so far into the solid and out of it, in input units; see `Shell`.
+
+        Raises:
+            ValueError: one is negative or not finite, or the wall has no thickness.
+        """
+        fields, frame = in_one_frame([self], margin=max(outside, 0.0))
+        return WorldField(Shell(*fields, inside=inside / frame.scale, outside=outside / frame.scale), frame)
+
     def _ask(self, points: Any, function: Callable[..., tuple[Tensor, ...]], *others: Any) -> tuple[Any, ...]:
         """What ``function`` says at points in the field's coordinates, in the kind and shape of the points given.
 
@@ -225,6 +278,50 @@ class WorldField:
     def _to_input(self, points: Tensor) -> Tensor:
         center = torch.tensor(self.similarity.center, dtype=torch.float64, device=points.device)
         return points.double() * self.similarity.scale + center
+
+
+def in_one_frame(shapes: Sequence[WorldField], *, margin: float = 0.0) -> tuple[list[Field], Similarity]:
+    """Fields of different unit spheres, brought into one that holds them all.
+
+    What was learned counts for nothing outside its own unit sphere (`Bounded`); a closed form is asked everywhere.
+
+    Args:
+        shapes: in the same input coordinates.
+        margin: room around them, in input units.
+
+    Returns:
+        The fields, and the similarity from input coordinates to theirs.
+
+    Raises:
+        ValueError: there are no shapes, or ``margin`` is negative or not finite.
+
+    Example:
+        >>> from mplicits.neural_fields import Similarity, Sphere, Union, WorldField, in_one_frame
+        >>> balls = [WorldField(Sphere(), Similarity((x, 0.0, 0.0), 1.0)) for x in (-1.0, 1.0)]
+        >>> fields, frame = in_one_frame(balls)
+        >>> frame
+        Similarity(center=(0.0, 0.0, 0.0), scale=2.0)
+        >>> both = WorldField(Union(*fields), frame)
+    """
+    if not shapes or not 0 <= margin < np.inf:
+        raise ValueError(f"{len(shapes)} shapes, margin={margin}: expected at least one, and a finite number ≥ 0")
+    centers = np.array([shape.similarity.center for shape in shapes], np.float64)
+    scales = np.array([shape.similarity.scale for shape in shapes], np.float64)
+    center = ((centers - scales[:, None]).min(axis=0) + (centers + scales[:, None]).max(axis=0)) / 2
+    if (centers == centers[0]).all():
+        center = centers[0]  # without rounding
+    scale = float((np.linalg.norm(centers - center, axis=1) + scales).max()) + margin
+    frame = Similarity((float(center[0]), float(center[1]), float(center[2])), scale)
+    return [_placed(shape, frame) for shape in shapes], frame
+
+
+def _placed(shape: WorldField, frame: Similarity) -> Field:
+    if shape.similarity == frame:
+        return shape.field
+    x, y, z = (float(c) for c in frame.to_unit(shape.similarity.center))
+    learned = next(shape.field.parameters(), None) is not None
+    field = Bounded(shape.field) if learned else shape.field
+    return Placed(field, Similarity((x, y, z), shape.similarity.scale / frame.scale))
 
 
 def _unit(gradient: Tensor) -> Tensor:

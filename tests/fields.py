@@ -4,18 +4,25 @@ from collections.abc import Callable
 
 import torch
 from mplicits.neural_fields import (
+    Bounded,
     Box,
     Capsule,
+    Difference,
     Field,
     FunctionField,
+    Intersection,
     Jet,
     Keyframes,
     Moving,
     MultiscaleSDF,
+    Offset,
+    Placed,
     Plane,
     RigidMotion,
     SecondJet,
+    Shell,
     ShrinkingSphere,
+    Similarity,
     Siren,
     SpaceTimeSDF,
     Sphere,
@@ -37,6 +44,11 @@ def small_multiscale(taper: float = 0.0) -> MultiscaleSDF:
         num_features=2,
         residual_gain=1.0,
     )
+
+
+def two_levels() -> MultiscaleSDF:
+    """Level 1 refines a closed form, by a lot."""
+    return MultiscaleSDF(Sphere(radius=0.5), [Siren(16, 2, omega=5.0)], [0.1], taper=0.3)
 
 
 def small_spacetime(taper: float = 0.0) -> SpaceTimeSDF:
@@ -114,6 +126,15 @@ FIELDS: dict[str, Callable[[], Field]] = {
     "capsule": lambda: Capsule(start=(-0.3, 0.0, 0.0), end=(0.3, 0.2, 0.1), radius=0.2),
     "union": lambda: Union(Sphere(radius=0.3, center=(-0.3, 0, 0)), Sphere(radius=0.3, center=(0.3, 0, 0))),
     "union-of-moving": lambda: Union(Moving(Sphere(radius=0.3), SCREW), ShrinkingSphere(radius=0.5, alpha=0.05)),
+    "smooth-union": lambda: Union(Sphere(radius=0.4), Box(), Torus(), smooth=0.3),
+    "intersection": lambda: Intersection(Sphere(radius=0.6), Box(half_size=(0.5, 0.5, 0.3)), Plane()),
+    "difference-of-multiscale": lambda: Difference(small_multiscale(0.4), Sphere(radius=0.4), small_multiscale()),
+    "smooth-union-of-multiscale": lambda: Union(two_levels(), small_multiscale(0.4), smooth=0.1),
+    "offset": lambda: Offset(small_multiscale(), -0.05),
+    "shell": lambda: Shell(small_multiscale(0.4), inside=0.1, outside=0.05),
+    "shell-of-moving": lambda: Shell(Moving(small_multiscale(), SCREW), inside=0.1),
+    "placed": lambda: Placed(small_multiscale(0.4), Similarity((0.2, 0.1, -0.1), 0.7)),
+    "bounded": lambda: Bounded(small_multiscale(), radius=0.8),
     "function": lambda: FunctionField(lambda x: x.norm(dim=-1) - 0.5),
     "siren": lambda: Siren(24, 2, omega=4.0),
     "siren-deep-features": lambda: Siren(16, 4, omega=4.0, num_features=3),
@@ -125,7 +146,7 @@ FIELDS: dict[str, Callable[[], Field]] = {
     "banf": lambda: BanfSDF([Torus(major=0.5, minor=0.2)], [12]),
     "multiscale": small_multiscale,
     "multiscale-tapered": lambda: small_multiscale(0.4),
-    "multiscale-over-sphere": lambda: MultiscaleSDF(Sphere(radius=0.5), [Siren(16, 2, omega=5.0)], [0.1], taper=0.3),
+    "multiscale-over-sphere": two_levels,
     "spacetime": small_spacetime,
     "spacetime-tapered": lambda: small_spacetime(0.4),
     "slice": lambda: TimeSlice(small_spacetime(0.4), 0.3),

@@ -16,7 +16,7 @@ import torch
 
 from ...datasets.cameras import UP_AXES
 from ...datasets.clouds.reading import check_cloud_path
-from ...neural_fields import Field, InputError, Similarity, TextureField, load_field
+from ...neural_fields import FieldLike, InputError, Similarity, TextureField, as_field, load_field
 from ..run.folder import find_field, fitted_cloud
 from ..texture.riding import start_texture
 from .camera import first_eye
@@ -148,7 +148,7 @@ def open_run(
 
 
 def show_field(
-    field: Field,
+    field: FieldLike,
     *,
     name: str = "field",
     similarity: Similarity | None = None,
@@ -157,7 +157,7 @@ def show_field(
     side: int = 512,
 ) -> Shown:
     """What a `Viewer` needs to show any field in three dimensions, or in space and time, such as one in a script."""
-    similarity = similarity or Similarity.identity()
+    field, similarity = as_field(field), similarity or Similarity.identity()
     shapes = Shapes(field, similarity, cloud=cloud)
     return Shown(name, field, similarity, shapes, Painter(field, shapes.cloud, texture), side)
 

@@ -7,13 +7,22 @@ from mplicits.neural_fields import (
     Field,
     FunctionField,
     Jet,
+    Keyframes,
     Moving,
     MultiscaleSDF,
+    NeuSGeometry,
     RigidMotion,
+    Similarity,
     Siren,
     Sphere,
     Torus,
+    Union,
+    WorldField,
+    cone_starts,
     extract_mesh,
+    map_normals,
+    project_to_surface,
+    render_volume,
     sphere_trace,
 )
 from torch import Tensor, nn
@@ -21,6 +30,9 @@ from torch import Tensor, nn
 
 def ball(x: Tensor) -> Tensor:
     return x.norm(dim=-1) - 0.5
+
+
+ONE = torch.tensor([1.0, 0.0, 0.0])
 
 
 class Ball(Field):
@@ -45,6 +57,30 @@ def test_both_are_traced_meshed_and_called(field: Field) -> None:
     assert abs((mesh.vertices**2).sum(axis=1) ** 0.5 - 0.5).max() < 1e-3
     residual = MultiscaleSDF(field, [Siren(8, 1, output_gain=0.0)], [0.1])
     torch.testing.assert_close(residual(x), ball(x), rtol=0, atol=0)
+
+
+def test_functions_are_taken_wherever_fields_are() -> None:
+    x = torch.rand(20, 3) + 0.1
+    origin, ahead = torch.tensor([0.0, 0.0, 2.0]), torch.tensor([0.0, 0.0, -1.0])
+    mesh = extract_mesh(ball, resolution=24)
+    assert abs((mesh.vertices**2).sum(axis=1) ** 0.5 - 0.5).max() < 1e-3
+    turned = map_normals(mesh, ball).normals
+    np.testing.assert_allclose(turned, mesh.vertices / 0.5, atol=2e-3)  # within a cell's chord of the sphere
+    assert abs(float(sphere_trace(ball, origin, ahead).depth) - 1.5) < 2e-5
+    assert abs(float(sphere_trace(ball, origin, ahead, budget=[20]).depth) - 1.5) < 2e-3  # `capture`
+    assert bool((cone_starts(ball, origin, ahead.expand(8, 8, 3), tiles=(8,)) <= 1.5).all())
+    feet, reached = project_to_surface(ball, x)
+    assert reached.all()
+    torch.testing.assert_close(feet.norm(dim=1), torch.full((20,), 0.5), rtol=0, atol=1e-5)
+    shade = render_volume(ball, lambda p, v, jet: p, origin[None], ahead[None], inv_std=1000.0)
+    assert abs(float(shade.depth) - 1.5) < 1e-2
+    for field in (MultiscaleSDF(ball, [], []), Union(ball), Keyframes([0.0], [ball]), Moving(ball, RigidMotion())):
+        where = torch.cat((x, torch.zeros(20, field.in_dim - 3)), dim=1)
+        torch.testing.assert_close(field.value(where), ball(x))
+    torch.testing.assert_close(NeuSGeometry(ball)(x)[:, 0], ball(x))
+    torch.testing.assert_close(WorldField(ball, Similarity((1.0, 0.0, 0.0), 2.0)).distance(x), 2 * ball((x - ONE) / 2))
+    with pytest.raises(TypeError, match="field: got a str; expected a Field, or a function of points"):
+        extract_mesh("field.safetensors")
 
 
 def test_the_jet_of_a_function_against_a_closed_form() -> None:

@@ -1,0 +1,304 @@
+"""Solids put together: against set algebra, closed forms, and what a field may never do."""
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+from fields import FIELDS
+from mplicits.neural_fields import (
+    Bounded,
+    Box,
+    Difference,
+    Field,
+    FunctionField,
+    Intersection,
+    Mesh,
+    MultiscaleSDF,
+    Offset,
+    Placed,
+    Plane,
+    Shell,
+    Similarity,
+    Siren,
+    Sphere,
+    Torus,
+    Union,
+    WorldField,
+    extract_mesh,
+    in_one_frame,
+    sphere_trace,
+)
+from torch import Tensor
+
+A = Sphere(radius=0.5, center=(-0.25, 0.0, 0.0))
+B = Sphere(radius=0.4, center=(0.3, 0.0, 0.0))
+C = Box(half_size=(0.2, 0.6, 0.1))
+PARTS = (A, B, C)
+# One rounding of a float64 for each of a handful of operations on numbers up to 2.
+ROUNDING = 16 * 2.0**-53 * 2
+
+
+def points(count: int, size: float = 1.0) -> Tensor:
+    return size * (2 * torch.rand(count, 3, dtype=torch.float64) - 1)
+
+
+def test_membership_is_that_of_sets() -> None:
+    x = points(5000)
+    a, b, c = (part(x) < 0 for part in PARTS)
+    assert torch.equal(Union(*PARTS)(x) < 0, a | b | c)
+    assert torch.equal(Intersection(A, C)(x) < 0, a & c)
+    assert torch.equal(Difference(*PARTS)(x) < 0, a & ~b & ~c)  # no point is on a surface
+    assert torch.equal(Shell(A, inside=0.1, outside=0.05)(x) < 0, (A(x) > -0.1) & (A(x) < 0.05))
+
+
+COMBINED: dict[str, Callable[[], Field]] = {
+    "union": lambda: Union(*PARTS),
+    "intersection": lambda: Intersection(*PARTS),
+    "difference": lambda: Difference(*PARTS),
+    "smooth union": lambda: Union(*PARTS, smooth=0.3),
+    "smooth intersection": lambda: Intersection(*PARTS, smooth=0.3),
+    "smooth difference": lambda: Difference(*PARTS, smooth=0.3),
+    "offset": lambda: Offset(Torus(), -0.1),
+    "shell": lambda: Shell(Box(), inside=0.1, outside=0.2),
+    "placed": lambda: Placed(Torus(), Similarity((0.3, -0.2, 0.1), 0.4)),
+    "bounded": lambda: Bounded(Plane(offset=0.1), radius=0.6),
+    "bounded box": lambda: Bounded(C, radius=0.6),
+}
+
+
+@pytest.mark.parametrize("name", COMBINED)
+def test_none_is_steeper_than_its_parts(name: str) -> None:
+    """|h(x) − h(y)| ≤ |x − y|: with the sign, that makes |h| a bound on the distance, which tracers need."""
+    field = COMBINED[name]()
+    x = points(4000, 1.5)
+    near = x + 0.05 * points(4000)
+    for y in (points(4000, 1.5), near):
+        assert bool(((field(x) - field(y)).abs() <= (x - y).norm(dim=1) + ROUNDING).all())
+    assert bool((field.jet(x).gradient.norm(dim=1) <= 1 + 1e-12).all())
+
+
+@pytest.mark.parametrize("operation", [Union, Intersection, Difference])
+def test_a_blend_is_narrow_and_small(operation: type[Union | Intersection | Difference]) -> None:
+    width = 0.2
+    x = points(20_000)
+    sharp, smooth = operation(A, B)(x), operation(A, B, smooth=width)(x)
+    other = -B(x) if operation is Difference else B(x)
+    beside = (A(x) - other).abs() >= width
+    assert bool(beside.any())
+    assert bool((~beside).any())
+    assert torch.equal(sharp[beside], smooth[beside])
+    grown = sharp - smooth if operation is Union else smooth - sharp
+    assert bool((grown >= -ROUNDING).all())
+    assert bool((grown <= width / 4 + ROUNDING).all())
+    middle = torch.tensor([[-0.25 + (0.55**2 + 0.5**2 - 0.4**2) / 1.1, 0.0, 0.0]], dtype=torch.float64)
+    middle[0, 1] = (0.5**2 - (middle[0, 0] + 0.25) ** 2).sqrt()  # on both spheres
+    if operation is not Difference:
+        assert abs(abs(float(operation(A, B, smooth=width)(middle))) - width / 4) < ROUNDING
+
+
+def test_the_fillet_between_two_walls() -> None:
+    """Two planes at a right angle: the middle of the fillet lies at (k/4, k/4), and its radius is k/√2."""
+    k = 0.3
+    field = Union(Plane(normal=(1, 0, 0)), Plane(normal=(0, 1, 0)), smooth=k)
+    x = torch.tensor([k / 4, k / 4, 0.1], dtype=torch.float64)
+    jet = field.second_jet(x)
+    assert abs(float(jet.value)) < ROUNDING
+    slope = jet.gradient.norm()
+    normal = jet.gradient / slope
+    torch.testing.assert_close(normal, torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64) / 2**0.5)
+    curvature = (jet.hessian.trace() - normal @ jet.hessian @ normal) / slope
+    assert abs(float(curvature) + 2**0.5 / k) < 1e-12  # hollow, seen from outside
+
+
+def volume(mesh: Mesh) -> float:
+    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
+    return float((a * np.cross(b, c)).sum() / 6)
+
+
+def cap(radius: float, height: float) -> float:
+    return math.pi * height**2 * (3 * radius - height) / 3
+
+
+def test_volumes_of_two_balls() -> None:
+    distance, r, s = 0.55, 0.5, 0.4
+    near = (distance**2 + r**2 - s**2) / (2 * distance)  # of the circle where they meet, from the centre of A
+    lens = cap(r, r - near) + cap(s, s - (distance - near))
+    ball, other = 4 / 3 * math.pi * r**3, 4 / 3 * math.pi * s**3
+    step = 2.04 / 96
+    # Triangles lie in cells of diagonal √3 h: chords of spheres sink by at most 3 h² / (8 s); along the circle where
+    # the spheres meet, a cell may be cut off or added.
+    area, rim = 4 * math.pi * (r**2 + s**2), 2 * math.pi * math.sqrt(r**2 - near**2)
+    allowed = area * 3 * step**2 / (8 * s) + 3 * rim * step**2
+    for field, exact in (
+        (Union(A, B), ball + other - lens),
+        (Intersection(A, B), lens),
+        (Difference(A, B), ball - lens),
+    ):
+        found = volume(extract_mesh(field, resolution=96))
+        assert abs(found - exact) < allowed
+        assert allowed < lens / 8  # so that the three cannot be taken for each other
+
+
+def test_offsets_and_shells_of_a_ball() -> None:
+    """Level sets of an exact distance are exact, and so are the walls between them."""
+    grown = extract_mesh(Offset(A, 0.1), resolution=48)
+    radii = np.linalg.norm(grown.vertices - [-0.25, 0, 0], axis=1)
+    np.testing.assert_allclose(radii, 0.6, atol=1e-4)  # the chord of a Newton step in float32
+    wall = extract_mesh(Shell(A, inside=0.1), resolution=48)
+    radii = np.linalg.norm(wall.vertices - [-0.25, 0, 0], axis=1)
+    assert (np.minimum(abs(radii - 0.5), abs(radii - 0.4)) < 1e-4).all()
+    assert {round(radius, 1) for radius in radii.tolist()} == {0.4, 0.5}
+    exact = 4 / 3 * math.pi * (0.5**3 - 0.4**3)
+    chord = 3 * (2.04 / 48) ** 2 / 8 * 4 * math.pi * (0.5 + 0.4)  # area · 3 h² / (8 r), of both sides
+    assert abs(volume(wall) - exact) < chord
+
+
+def violent(field: Field) -> MultiscaleSDF:
+    """Two residuals that change every sign in their bands here and there."""
+    one, two = (FunctionField(lambda x, k=k: (k * x).sin().sum(dim=-1)) for k in (37.0, 53.0))
+    return MultiscaleSDF(field, [one, two], [0.1, 0.07])
+
+
+VIOLENT: dict[str, Callable[[], Field]] = {
+    "union": lambda: Union(violent(A), violent(B), C),
+    "intersection": lambda: Intersection(violent(A), violent(B)),
+    "difference": lambda: Difference(violent(A), violent(B)),
+    "smooth union": lambda: Union(violent(A), violent(B), violent(C), smooth=0.3),
+    "smooth difference": lambda: Difference(violent(A), violent(B), smooth=0.3),
+    "grown": lambda: Offset(violent(A), 0.08),
+    "shrunk": lambda: Offset(violent(A), -0.3),
+    "wall": lambda: Shell(violent(A), inside=0.2, outside=0.1),
+    "small": lambda: Placed(violent(A), Similarity((0.3, 0.0, 0.1), 0.5)),
+    "large": lambda: Placed(violent(A), Similarity((0.3, 0.0, 0.1), 2.0)),
+    "bounded": lambda: Bounded(violent(A), radius=0.7),
+}
+
+
+@pytest.mark.parametrize("name", VIOLENT)
+def test_no_surface_of_a_fine_level_is_lost(name: str) -> None:
+    """The sign is what the finest levels of the parts say, also where a band ends before them; and so is the value."""
+    field = VIOLENT[name]()
+    x = points(50_000)
+    finest = field._join(x, [part(field._home(x)) for part in field.fields])
+    assert torch.equal(field(x) < 0, finest < 0)
+    inside = field.in_band(x, level=field.num_levels - 1)
+    assert torch.equal(field(x)[inside], finest[inside])
+    assert not torch.equal(field(x, level=0) < 0, finest < 0)
+
+
+def rough(center: tuple[float, float, float]) -> MultiscaleSDF:
+    """A ball, and waves of a tenth of its band on it."""
+    waves = FunctionField(lambda x: 0.01 * (20 * x).sin().prod(dim=-1))
+    return MultiscaleSDF(Sphere(radius=0.4, center=center), [waves], [0.1], taper=0.5)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda a, b: Union(a, b),
+        lambda a, b: Difference(a, b, smooth=0.1),
+        lambda a, b: Shell(Union(a, b, smooth=0.1), inside=0.06),
+        lambda a, b: Offset(Intersection(a, b), 0.08),
+        lambda a, b: Union(Placed(a, Similarity((0.2, 0.0, 0.0), 0.5)), Bounded(b, radius=0.6)),
+    ],
+)
+def test_skipping_by_bands_changes_nothing(make: Callable[[Field, Field], Field]) -> None:
+    """Mesh and rays of a field with levels are those of the same function without."""
+    field = make(rough((-0.25, 0.0, 0.0)), rough((0.25, 0.1, 0.0)))
+    plain = FunctionField(lambda x: field(x))
+    assert field.num_levels == 2
+    one, other = extract_mesh(field, resolution=64), extract_mesh(plain, resolution=64)
+    assert one.vertices.shape == other.vertices.shape
+    assert np.array_equal(one.faces, other.faces)
+    np.testing.assert_allclose(one.vertices, other.vertices, atol=1e-6)
+    origins = torch.nn.functional.normalize(torch.randn(300, 3), dim=1) * 2
+    directions = 0.5 * torch.rand(300, 3) - 0.25 - origins
+    with_levels, without = sphere_trace(field, origins, directions), sphere_trace(plain, origins, directions)
+    agreed = with_levels.mask == without.mask
+    assert int((~agreed).sum()) <= 2  # rays that graze within `resolution`
+    both = agreed & without.mask
+    assert int(both.sum()) > 150
+    x = with_levels.position[both].double()
+    assert float((field(x).abs()).max()) < 1e-4
+
+
+def test_a_field_beyond_its_ball() -> None:
+    wild = FunctionField(lambda x: torch.where(x.norm(dim=-1) > 1, -1.0, 0.3 - x[..., 2]))  # garbage beyond 1
+    field = Bounded(wild, radius=1.0)
+    x = points(5000, 2.0)
+    within = x.norm(dim=1) < 1
+    assert torch.equal(field(x)[within] < 0, wild(x)[within] < 0)
+    assert bool((field(x)[~within] > 0).all())
+    ball = Sphere(radius=0.3, center=(0.4, 0.0, 0.0))
+    bound, exact = Bounded(ball, radius=0.8)(x), ball(x)
+    assert bool((bound <= exact + ROUNDING).all())
+    assert torch.equal(bound[x.norm(dim=1) < 0.8], exact[x.norm(dim=1) < 0.8])
+    far = 1000 * torch.nn.functional.normalize(x, dim=1)
+    assert bool((Bounded(ball, radius=0.8)(far) > 999).all())
+
+
+CENTER = np.array([500_000.25, 4_100_000.5, 120.0])
+
+
+def world(offset: tuple[float, float, float], radius: float, scale: float) -> WorldField:
+    x, y, z = CENTER + offset
+    return WorldField(Sphere(radius=radius / scale), Similarity((x, y, z), scale))
+
+
+def test_solids_of_different_unit_spheres() -> None:
+    """Two balls on a map, fitted apart: distances, lengths and volumes are in metres."""
+    a, b = world((0, 0, 0), 10.0, 20.0), world((12, 0, 0), 6.0, 7.0)
+    offsets = np.random.default_rng(0).uniform(-20, 20, (2000, 3))
+    first, second = np.linalg.norm(offsets, axis=1) - 10, np.linalg.norm(offsets - [12, 0, 0], axis=1) - 6
+    rounding = 16 * 2.0**-24 * 60  # float32, in a frame with a diameter below 60 m
+    for shape, exact in (
+        (a.union(b), np.minimum(first, second)),
+        (a.intersection(b), np.maximum(first, second)),
+        (a.difference(b), np.maximum(first, -second)),
+        (a.offset(2.5), first - 2.5),
+        (a.offset(-2.5), first + 2.5),
+        (a.shell(inside=1.0, outside=0.5), np.abs(first + 0.25) - 0.75),
+        (a.union(b).difference(world((0, 0, 0), 3.0, 4.0)), np.maximum(np.minimum(first, second), 3 - (first + 10))),
+    ):
+        np.testing.assert_allclose(shape.distance(CENTER + offsets), exact, atol=rounding)
+    touching = a.union(b, smooth=4.0)
+    on_both = np.array([(10**2 - 6**2 + 12**2) / 24, 0.0, 0.0])
+    on_both[1] = math.sqrt(10**2 - on_both[0] ** 2)
+    assert abs(float(touching.distance(CENTER + on_both)) + 1.0) < rounding  # smooth / 4
+    mesh = a.offset(2.5).mesh(48)
+    np.testing.assert_allclose(np.linalg.norm(mesh.vertices - CENTER, axis=1), 12.5, atol=1e-3)
+
+
+def test_frames_hold_all_and_what_was_learned_ends_at_its_ball() -> None:
+    a, b = world((0, 0, 0), 1.0, 2.0), WorldField(Siren(8, 1), Similarity((*CENTER[:2], 130.0), 3.0))
+    fields, frame = in_one_frame([a, b], margin=0.5)
+    assert frame.center == (*CENTER[:2], (118.0 + 133.0) / 2)
+    assert abs(frame.scale - (7.5 + 0.5)) < 1e-12
+    assert isinstance(fields[0].fields[0], Sphere)
+    assert isinstance(fields[1].fields[0], Bounded)
+    alone, same = in_one_frame([b])
+    assert alone == [b.field]
+    assert same == b.similarity
+    with pytest.raises(ValueError, match="0 shapes"):
+        in_one_frame([])
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (Union, "expected at least one"),
+        (lambda: Difference(A, FIELDS["moving"]()), r"parts of \[3, 4\] dimensions"),
+        (lambda: Union(A, smooth=-1.0), "smooth=-1.0: expected at least 0"),
+        (lambda: Offset(A, math.nan), "by=nan"),
+        (lambda: Shell(A), "not both 0"),
+        (lambda: Shell(A, inside=0.1, outside=-0.1), "two finite numbers"),
+        (lambda: Placed(FIELDS["moving"](), Similarity.identity()), "in_dim=4"),
+        (lambda: Bounded(FIELDS["moving"]()), "in_dim=4"),
+        (lambda: Bounded(A, radius=0.0), "radius=0.0"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(make: Callable[[], Field], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make()
