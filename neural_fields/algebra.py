@@ -27,10 +27,10 @@ from .field import Field, Jet
 from .function import FieldLike, as_field
 from .similarity import Similarity
 
-__all__ = ["Bounded", "Difference", "Intersection", "Offset", "Placed", "Shell", "Union"]
+__all__ = ["Bounded", "Combined", "Difference", "Intersection", "Offset", "Placed", "Shell", "Union"]
 
 
-class _Combined(Field):
+class Combined(Field):
     """A field of fields; a subclass says where they are asked, how values join, and how jets do."""
 
     def __init__(self, *parts: FieldLike) -> None:
@@ -113,7 +113,7 @@ class _Combined(Field):
     def _join_jets(self, x: Tensor, jets: list[Jet]) -> Jet: ...
 
 
-class _Pointwise(_Combined):
+class _Pointwise(Combined):
     """h(x) = w(f(x), g(x), …): the gradient is Σ ∂w/∂f_i ∇f_i."""
 
     @abstractmethod
@@ -313,7 +313,7 @@ class Shell(_Pointwise):
         return away.abs() - (self.outside + self.inside) / 2, [away.sign()]
 
 
-class Placed(_Combined):
+class Placed(Combined):
     """A field moved and scaled: ``scale · f((x − center) / scale)``, a distance if f is one.
 
     Brings fields that were fitted in different unit spheres into one; see `in_one_frame`.
@@ -352,7 +352,7 @@ class Placed(_Combined):
         return Jet(self._join(x, [jets[0].value]), jets[0].gradient, jets[0].features)
 
 
-class Bounded(_Combined):
+class Bounded(Combined):
     """A field that is known in a ball around 0 only, continued beyond it: the solid f < 0 within the ball.
 
     A network says anything where it was not trained. Outside the ball this asks it at the nearest point p = r x / |x|

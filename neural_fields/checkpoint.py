@@ -6,7 +6,7 @@ import dataclasses
 import hashlib
 import json
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,7 +16,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from .algebra import Bounded, Difference, Intersection, Offset, Placed, Shell, Union
+from .algebra import Bounded, Combined, Difference, Intersection, Offset, Placed, Shell, Union
 from .analytic import Box, Capsule, Plane, Sphere, Torus
 from .baselines import NeusSDF
 from .color import ColorSiren, TextureField
@@ -31,8 +31,10 @@ from .spacetime import SpaceTimeSDF
 __all__ = ["SavedField", "load_field", "load_texture", "save_field", "save_texture"]
 
 # Closed forms are made again of their definition; what is put together of fields, of that and of its parts.
-CLOSED = {cls.__name__: cls for cls in (Box, Capsule, Plane, Sphere, Torus)}
-COMBINED = {cls.__name__: cls for cls in (Bounded, Difference, Intersection, Offset, Placed, Shell, Union)}
+CLOSED: Mapping[str, Callable[..., Field]] = {cls.__name__: cls for cls in (Box, Capsule, Plane, Sphere, Torus)}
+COMBINED: Mapping[str, Callable[..., Field]] = {
+    cls.__name__: cls for cls in (Bounded, Difference, Intersection, Offset, Placed, Shell, Union)
+}
 FORMAT = "mplicits-field"
 TEXTURE_FORMAT = "mplicits-texture"
 VERSION = 1
@@ -232,7 +234,7 @@ def _describe(field: Field) -> dict[str, Any]:
     name = type(field).__name__
     if type(field) is CLOSED.get(name):
         return {"type": name, **plain(field.definition())}
-    if isinstance(field, tuple(COMBINED.values())):
+    if isinstance(field, Combined):
         definition = plain(field.definition())
         if isinstance(field, Placed):
             definition["similarity"] = dataclasses.asdict(field.similarity)
