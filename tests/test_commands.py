@@ -1,0 +1,288 @@
+"""Every command that a reader may copy runs: in the order of its page, in an empty folder, at the smallest setting.
+
+The rule: a page's shell blocks are gone through line by line. What a line reads and no line before it has made is put
+there by a stand-in of that name (`STAND_INS`). What `SMALLEST` has for it is appended to the line, where the last of
+two flags counts, and `SMALLER` replaces the values of flags that not every line may have. A line that cannot run
+here is skipped, visibly, with its reason.
+"""
+
+import functools
+import json
+import re
+import shlex
+import shutil
+import subprocess
+import threading
+from collections.abc import Callable, Iterator
+from fnmatch import fnmatch
+from importlib.util import find_spec
+from itertools import pairwise
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from evolutions import few_points
+from mplicits import datasets
+from mplicits.datasets import PointCloud, sample_torus, simulate_scan, write_cloud_ply
+from mplicits.neural_fields import Similarity, Sphere, Torus, extract_mesh
+from mplicits.pipelines.cli import main
+from mplicits.pipelines.mesh import finish
+from mplicits.pipelines.mesh.extract import MeshOptions
+from mplicits.pipelines.mesh.files import write_mesh
+from mplicits.pipelines.run.settings import TextureConfig
+
+ROOT = Path(__file__).parent.parent
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+FIT = (
+    "--widths 16 16 16 --depths 1 1 1 --omegas 5 10 20 --steps 60 5 5 --learning-rates 1e-2 1e-3 1e-3"
+    " --batch 128 --samples 500"
+)
+EVOLVE = (
+    "--widths 16 16 --depths 1 1 --omegas 5 10 --steps 20 10 --learning-rates 5e-3 1e-3 --data-weights 100 300"
+    " --start-steps 60 --batch 128 --samples 500 --frames 2 --resolution 16 --least-delta 0.1"
+)
+RECONSTRUCT = (
+    "--widths 16 16 --depths 1 1 --color-width 16 --color-depth 1 --steps 3 --rays 16 --uniform 8 --importance 4"
+    " --texture-steps 2 --width 16"
+)
+TEXTURE = "--width 16 --depth 1 --steps 5 --batch 64 --band-batch 64 --samples 500"
+SMALLEST = {  # by what a line begins with, or holds
+    "mplicits fit *": f"{FIT} --quiet",
+    "mplicits texture *": f"{TEXTURE} --quiet",
+    "mplicits evolve *": f"{EVOLVE} --quiet",
+    "mplicits reconstruct *": f"{RECONSTRUCT} --quiet",
+    "mplicits mesh *": "--resolution 24",
+    "mplicits render *": "--size 24 --samples 1",
+    "mplicits slice *": "--size 64",
+    "mplicits animate *": "--frames 3",
+    "mplicits animate *.mp4*": "--size 24 --samples 1",
+    "mplicits animate *.png*": "--size 24 --samples 1",
+    "mplicits evaluate *": "--samples 500",
+    "mplicits scene *": "--views 3 --size 16 --samples 1",
+    "mplicits bench reconstruct *": f"{RECONSTRUCT} --views 4 --size 16 --test-every 2 --test-views 1 --no-equal-time"
+    " --resolution 16 --eval-samples 500",
+    "mplicits bench paper *": "--preset smoke --table comparison --methods ours --jobs 1",
+    "mplicits bench srb *": f"{FIT} --resolution 16 --eval-samples 500",
+}
+SMALLER = {"--frames": "2", "--texture": "64", "--jobs": "1"}
+# Flags that name what a command writes.
+WRITTEN = ("-o", "--out", "--mesh", "--json", "--page")
+
+
+def shell_lines(page: Path) -> list[str]:
+    """The lines of a page's shell blocks, without their comments."""
+    blocks = re.findall(r"^```sh\n(.*?)^```", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
+    lines = (line.partition("  #")[0].strip() for block in blocks for line in block.splitlines())
+    return [line for line in lines if line]
+
+
+def smallest(line: str) -> list[str]:
+    """The arguments of a line, at the smallest setting."""
+    words = shlex.split(line)
+    small = [SMALLER.get(before, word) for before, word in zip(["", *words[:-1]], words, strict=True)]
+    return [*small[1:], *(flag for begin, flags in SMALLEST.items() if fnmatch(line, begin) for flag in flags.split())]
+
+
+def read_by(line: str) -> list[str]:
+    """The words of a line that may be files or folders that it reads."""
+    words = shlex.split(line)
+    return [word.rstrip("/") for before, word in pairwise(words) if before not in WRITTEN and not word.startswith("-")]
+
+
+# --- stand-ins: each makes what its name says, as small as it may be -----------------------------------
+
+
+def a_cloud(path: Path) -> None:
+    cloud = sample_torus(400)
+    write_cloud_ply(path, PointCloud(cloud.points, cloud.normals, np.abs(cloud.points).astype(np.float32)))
+
+
+def arrays(path: Path) -> None:
+    cloud = sample_torus(400)
+    assert cloud.normals is not None
+    np.savez(path, points=cloud.points, normals=cloud.normals)
+
+
+def a_mesh(path: Path) -> None:
+    write_mesh(path, extract_mesh(Torus(major=0.5, minor=0.2), resolution=24), Similarity.identity())
+
+
+def meshes(path: Path) -> None:
+    a_mesh(path / "torus.ply")
+
+
+def views(path: Path, *, form: str = "transforms", count: int = 4) -> None:
+    quietly("scene", "painted-sphere", "-o", path, "--format", form, "--views", count, "--size", 16, "--samples", 1)
+
+
+def cameras(path: Path) -> None:
+    views(path.parent / "viewed", count=14)  # docs/rendering.md asks for the one with the number 12
+    shutil.copy(path.parent / "viewed" / path.name, path)
+
+
+def scans_with_truth(path: Path) -> None:
+    for folder in ("scans", "ground_truth"):
+        (path / folder).mkdir(parents=True)
+        cloud = sample_torus(400)
+        assert cloud.normals is not None
+        np.save(path / folder / "anchor.npy", np.concatenate((cloud.points, cloud.normals), axis=1))
+
+
+def a_run(path: Path) -> None:
+    """A fit with colours."""
+    a_cloud(path.parent / "fitted.ply")
+    quietly("fit", path.parent / "fitted.ply", "-o", path, *FIT.split(), "--quiet")
+    quietly("texture", path, path.parent / "fitted.ply", *TEXTURE.split(), "--quiet")
+
+
+def a_motion(path: Path) -> None:
+    """A ball that moves a little, so that its mesh can be followed."""
+    how = ("--kind", "transport", "--velocity", 0.1, 0, 0, *EVOLVE.split(), "--start-steps", 200, "--steps", 100, 10)
+    quietly("evolve", "sphere:0.5", "-o", path, *how, "--quiet")
+
+
+def depth_maps(path: Path) -> None:
+    """Two looks at a ball of radius 1, three units away, from its two sides: depths, pictures, camera and poses."""
+    focal, (height, width) = 60.0, (36, 48)
+    across, down = np.meshgrid(np.arange(width) - 23.5, np.arange(height) - 17.5)
+    slope = (across**2 + down**2) / focal**2 + 1  # |(x, y, 1)|² of the ray with z = 1
+    inside = 9 - slope * 8  # of z² slope - 6 z + 8 = 0
+    depth = np.where(inside > 0, (3 - np.sqrt(inside.clip(0))) / slope, 0)
+    steps, picture = np.rint(depth * 1000).astype(np.uint16), np.full((height, width, 3), (40, 100, 200), np.uint8)
+    lens = {"width": width, "height": height, "fx": focal, "fy": focal, "cx": 23.5, "cy": 17.5, "depth_scale": 1000}
+    turned = np.array([[-1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 6], [0, 0, 0, 1]])
+    lines = []
+    for index, pose in enumerate((np.eye(4), turned)):
+        for kind, image in (("depth", steps), ("color", picture)):
+            (path.parent / kind).mkdir(exist_ok=True)
+            cv2.imwrite(str(path.parent / kind / f"{index}.png"), image)
+            cv2.imwrite(str(path.parent / f"{kind}.png"), image)
+        lines += [f"{index} {index} {index + 1}", *(" ".join(map(repr, map(float, row))) for row in pose)]
+    (path.parent / "trajectory.log").write_text("\n".join(lines))
+    (path.parent / "camera.json").write_text(json.dumps(lens))
+
+
+STAND_INS: dict[str, Callable[[Path], None]] = {
+    "*scan.ply": a_cloud,
+    "scans/*.ply": a_cloud,
+    "ten_million.ply": a_cloud,
+    "*.ply": a_mesh,
+    "*.npz": arrays,
+    "meshes": meshes,
+    "runs/morph": a_motion,
+    "runs/turn": a_motion,
+    "runs/*": a_run,
+    "demo/run": a_run,
+    "photos": views,
+    "srb": scans_with_truth,
+    "lego": views,
+    "dtu_*": functools.partial(views, form="neus"),
+    "transforms.json": cameras,
+    "photos/transforms.json": lambda path: views(path.parent),
+    **dict.fromkeys(("depth.png", "color.png", "depth", "color", "camera.json", "trajectory.log"), depth_maps),
+}
+
+
+def quietly(*words: object) -> None:
+    assert main([str(word) for word in words]) == 0
+
+
+class Maker:
+    """Puts stand-ins where they are asked for; those that take a training are made once."""
+
+    def __init__(self, store: Path) -> None:
+        self.store = store
+
+    def __call__(self, name: str) -> None:
+        """Make what a line reads under this name, if it is one of ours and not there."""
+        make = next((make for pattern, make in STAND_INS.items() if fnmatch(name, pattern)), None)
+        path = Path(name)
+        if make is None or path.exists():
+            return
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if make in (a_run, a_motion):
+            kept = self.store / make.__name__
+            if not kept.exists():
+                make(kept)
+            shutil.copytree(kept, path)
+        else:
+            make(path)
+
+
+@pytest.fixture(scope="module")
+def stand_in(tmp_path_factory: pytest.TempPathFactory) -> Maker:
+    return Maker(tmp_path_factory.mktemp("store"))
+
+
+@pytest.fixture(autouse=True)
+def _small(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What has no flag: the bundled scan, checks, texture and mesh of ``fit --mesh``; and Ctrl-C ends ``view``."""
+    few_points(monkeypatch)
+    scan = functools.partial(simulate_scan, Sphere(radius=0.7), scanners=3, resolution=24, colors=np.abs)
+    monkeypatch.setattr(datasets, "statue_scan", scan)
+    texture = TextureConfig(width=16, depth=1, steps=5, batch=64, band_batch=64, samples=500)
+    monkeypatch.setattr(finish, "TextureConfig", lambda: texture)
+    monkeypatch.setattr(finish, "MeshOptions", functools.partial(MeshOptions, resolution=24))
+    wait = threading.Event.wait
+
+    def leave(self: threading.Event, timeout: float | None = None) -> bool:
+        if threading.current_thread() is threading.main_thread() and timeout == 3600:
+            raise KeyboardInterrupt
+        return wait(self, timeout)
+
+    monkeypatch.setattr(threading.Event, "wait", leave)
+
+
+def reason_to_skip(line: str) -> str | None:
+    """Why a line cannot run here, if it cannot."""
+    words = shlex.split(line)
+    if words[0] == "pip":
+        return "installs from the network"
+    needs = {"view": "viser", "poisson": "pymeshlab", "--texture": "xatlas"}
+    for word, module in needs.items():
+        if word in words and find_spec(module) is None:
+            return f"{module} is not installed"
+    return None
+
+
+def files_of(page: Path) -> Iterator[tuple[str, str]]:
+    """(name, content) of the files that a page shows: blocks that begin with their name in a comment."""
+    for block in re.findall(r"^```yaml\n(.*?)^```", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL):
+        if named := re.match(r"# ([\w.]+)", block):
+            yield named[1], block
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if shell_lines(page)], ids=lambda page: page.stem)
+def test_commands_of_a_page_run(
+    page: Path,
+    stand_in: Maker,
+    subtests: pytest.Subtests,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name, content in files_of(page):
+        Path(name).write_text(content, encoding="utf-8")
+    for line in shell_lines(page):
+        with subtests.test(msg=line):
+            if reason := reason_to_skip(line):
+                pytest.skip(reason)
+            if line.startswith("make "):  # what it would do; the commands themselves are run by other tests
+                subprocess.run([*shlex.split(line), "-n"], cwd=ROOT, check=True, capture_output=True)
+                continue
+            for name in read_by(line):
+                stand_in(name)
+            capsys.readouterr()
+            code = main(smallest(line))
+            assert code == 0, capsys.readouterr().err
+
+
+def test_no_command_hides_in_a_block_of_another_kind() -> None:
+    for page in PAGES:
+        for language, block in re.findall(
+            r"^```(\w*)\n(.*?)^```", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL
+        ):
+            if language != "sh":
+                assert not re.search(r"^mplicits ", block, re.MULTILINE), f"{page.name}: call this block sh:\n{block}"
