@@ -1,51 +1,5 @@
-"""Display colours (sRGB-encoded, what PNG files hold) ↔ linear light, by the exact curves of IEC 61966-2-1."""
+"""Display colours ↔ linear light, as images and meshes hold them."""
 
-from __future__ import annotations
-
-from typing import Any, TypeVar, overload
-
-import numpy as np
-import torch
-from numpy.typing import NDArray
-from torch import Tensor
+from ..neural_fields.color_space import linear_to_srgb, srgb_to_linear
 
 __all__ = ["linear_to_srgb", "srgb_to_linear"]
-
-Floats = TypeVar("Floats", NDArray[np.float32], NDArray[np.float64])
-
-# Where the straight piece near black meets the power curve, on either side.
-KNEE_DISPLAY, KNEE_LINEAR = 0.04045, 0.0031308
-
-
-@overload
-def srgb_to_linear(x: Tensor) -> Tensor: ...
-@overload
-def srgb_to_linear(x: Floats) -> Floats: ...
-def srgb_to_linear(x: Any) -> Any:
-    """Display numbers of any shape → linear light: ``x / 12.92`` up to 0.04045, else ``((x + 0.055) / 1.055)^2.4``.
-
-    Linear light is what may be averaged: half of the light of white is 0.735 on the display, not 0.5.
-
-    Args:
-        x: floating-point numbers in [0, 1]; differentiable where it is a tensor.
-    """
-    if isinstance(x, Tensor):
-        return torch.where(x <= KNEE_DISPLAY, x / 12.92, ((x.clamp(min=KNEE_DISPLAY) + 0.055) / 1.055) ** 2.4)
-    curve = ((np.maximum(x, KNEE_DISPLAY) + 0.055) / 1.055) ** 2.4
-    return np.where(x <= KNEE_DISPLAY, x / 12.92, curve)
-
-
-@overload
-def linear_to_srgb(x: Tensor) -> Tensor: ...
-@overload
-def linear_to_srgb(x: Floats) -> Floats: ...
-def linear_to_srgb(x: Any) -> Any:
-    """Linear light of any shape → display numbers; the inverse of `srgb_to_linear`.
-
-    Args:
-        x: floating-point numbers in [0, 1]; differentiable where it is a tensor.
-    """
-    if isinstance(x, Tensor):
-        return torch.where(x <= KNEE_LINEAR, x * 12.92, 1.055 * x.clamp(min=KNEE_LINEAR) ** (1 / 2.4) - 0.055)
-    curve = 1.055 * np.maximum(x, KNEE_LINEAR) ** (1 / 2.4) - 0.055
-    return np.where(x <= KNEE_LINEAR, x * 12.92, curve)

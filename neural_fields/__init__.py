@@ -12,9 +12,11 @@ from .errors import InputError
 from .evolution import Law, curvature, key_loss, law_loss, mean_curvature, morph, near_surface, normal_speed, transport
 from .field import Field, Jet, OneLevelField, SecondJet
 from .function import FieldLike, FunctionField, as_field
-from .meshing import Mesh, NoSurfaceError, extract_mesh, map_normals
+from .mesh import Mesh
+from .meshing import NoSurfaceError, extract_mesh, map_normals
 from .moving import Keyframes, Moving, RigidMotion, ShrinkingSphere
 from .multiscale import MultiscaleSDF, levels_of
+from .placement import Placement
 from .radiance import Outside, ViewColor
 from .similarity import Similarity
 from .siren import Siren
@@ -54,6 +56,7 @@ __all__ = [
     "OneLevelField",
     "Outside",
     "Placed",
+    "Placement",
     "Plane",
     "Rendered",
     "RigidMotion",

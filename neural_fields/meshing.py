@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -15,6 +15,7 @@ from ._checks import positive
 from ._cube import EDGE_AXIS, EDGE_ENDS, cube_tables
 from ._lattice import Bounds, Lattice, Progress, Sampler
 from .function import FieldLike, as_field
+from .mesh import Mesh, MeshStats
 
 __all__ = ["Mesh", "MeshStats", "NoSurfaceError", "extract_mesh", "map_normals"]
 
@@ -25,42 +26,6 @@ DEFAULT_BOUNDS: Bounds = ((-1.02, -1.02, -1.02), (1.02, 1.02, 1.02))
 # where the radius of curvature is ten cells.
 RENEWED_NORMAL = 0.05
 CELLS_AT_ONCE = 1 << 18
-
-
-@dataclass(frozen=True)
-class MeshStats:
-    """What an extraction cost.
-
-    Attributes:
-        points: how many points were sent to each level (a level may answer a part of them by a coarser one).
-        blocks: surviving blocks of 2³ cells.
-        cells: cells that the surface crosses.
-        seconds: wall time of each stage: "cull", "corners", "triangles", "normals".
-    """
-
-    points: tuple[int, ...]
-    blocks: int
-    cells: int
-    seconds: dict[str, float]
-
-
-@dataclass(frozen=True)
-class Mesh:
-    """A triangle mesh in the field's own coordinates.
-
-    Attributes:
-        vertices: ``(V, 3)`` float64.
-        faces: ``(F, 3)`` int32, counter-clockwise as seen from outside (the positive side).
-        normals: ``(V, 3)`` float32 unit vectors, outward; None where they were not asked for.
-        colors: ``(V, 3)`` float32 in [0, 1], or None.
-        stats: what it cost, for a mesh that `extract_mesh` made.
-    """
-
-    vertices: NDArray[np.float64]
-    faces: NDArray[np.int32]
-    normals: NDArray[np.float32] | None = None
-    colors: NDArray[np.float32] | None = None
-    stats: MeshStats | None = None
 
 
 def extract_mesh(

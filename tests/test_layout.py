@@ -35,7 +35,7 @@ ROOMS = (
 )
 FRONT = "pipelines/front"
 OUTSIDE = {"torch", "numpy", "skimage", "safetensors"}  # what neural_fields may import
-LATE = {"torchdiffeq"}  # and what only inside a function that needs it
+LATE = {"torchdiffeq", "trimesh"}  # and what only inside a function that needs it
 LIGHT = "import {}, sys; assert not {{'torch', 'numpy', 'scipy'}} & set(sys.modules), sorted(sys.modules)"
 
 

@@ -1,5 +1,8 @@
 """GLTF 2.0 and its binary form GLB: triangles, base colours and their textures, placed by the scene's nodes.
 
+Files of our own are y-up and in metres by their node, which also says where the mesh was: they are read back in the
+coordinates of the input that they were made from. Written again by another program, they are where that says.
+
 Format: Khronos, "glTF 2.0 Specification". Read here and not with trimesh, which takes COLOR_0 for display colours
 and loses it beside a material, and forgets how textures go on beyond their sides.
 """
@@ -20,6 +23,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ...neural_fields import InputError
+from ...neural_fields.glb import GENERATOR
 from ..color_space import linear_to_srgb, srgb_to_linear
 from .mesh import Paint, TexturedMesh, Wrap, decode_texture, pack
 
@@ -147,6 +151,7 @@ def _pieces(document: _Document, materials: dict[str, Paint], *, textures: bool)
     roots = range(len(nodes))
     if header.get("scenes"):
         roots = header["scenes"][header.get("scene", 0)].get("nodes", [])
+    ours = header.get("asset", {}).get("generator") == GENERATOR
     open_nodes = [(root, np.eye(4)) for root in roots]
     visits = 0
     while open_nodes:
@@ -155,7 +160,7 @@ def _pieces(document: _Document, materials: dict[str, Paint], *, textures: bool)
         if visits > len(nodes):
             raise ValueError("a node is its own ancestor, or has two parents")
         node = nodes[number]
-        placed = parent @ _transform(node)
+        placed = parent @ _transform(node, ours=ours)
         open_nodes += [(child, placed) for child in node.get("children", [])]
         if "mesh" not in node:
             continue
@@ -167,10 +172,13 @@ def _pieces(document: _Document, materials: dict[str, Paint], *, textures: bool)
                 yield _piece(document, primitive, placed, materials, textures=textures)
 
 
-def _transform(node: dict[str, Any]) -> Float64:
+def _transform(node: dict[str, Any], *, ours: bool) -> Float64:
     if "matrix" in node:
         return np.array(node["matrix"], np.float64).reshape(4, 4).T
     placed = np.eye(4)
+    if ours and "origin" in node.get("extras", {}):  # what positions are relative to, in input coordinates
+        placed[:3, 3] = node["extras"]["origin"]
+        return placed
     placed[:3, :3] = Rotation.from_quat(node.get("rotation", (0, 0, 0, 1))).as_matrix() * np.array(
         node.get("scale", (1, 1, 1)), np.float64
     )

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from ...datasets import STATUE_PLACEMENT, Camera, PointCloud, Statue, orbit, read_cloud, statue_scan, write_cloud_ply
-from ...neural_fields import Field, InputError, Similarity
+from ...neural_fields import Field, InputError, Placement, Similarity
 from ...neural_fields.meshing import Mesh, NoSurfaceError, extract_mesh
 from ..fit.train import Run, fit
 from ..mesh.files import write_mesh
@@ -72,8 +72,10 @@ def demo(
 
     meshes = [_extract(run.field, level, resolution) for level in range(run.field.num_levels)]
     finest = spread_colors(meshes[-1], points, run.similarity)
+    # The mesh in the scan's coordinates, and one for other programs: upright, in metres, at the origin.
+    placement = Placement("z", "mm", center=True) if cloud is None else Placement(up, center=True)
     for name in ("mesh.ply", "mesh.glb"):
-        write_mesh(out / name, finest, run.similarity)
+        write_mesh(out / name, finest, run.similarity, placement if name == "mesh.glb" else None)
     picture = draw_levels(points, run.field, finest, run.similarity, up=up or ("z" if cloud is None else "y"))
     write_picture(out / "picture.png", picture)
     print(_figures(run, meshes, points))

@@ -11,6 +11,7 @@ from .common import Command, add_flags, positive, whole
 __all__ = ["EVALUATE", "MESH"]
 
 MESH_FILES = (".ply", ".obj", ".stl", ".glb")
+UNITS = ("um", "mm", "cm", "m", "km", "in", "ft")
 
 
 def _mesh_arguments(parser: argparse.ArgumentParser) -> None:
@@ -29,6 +30,11 @@ def _mesh_arguments(parser: argparse.ArgumentParser) -> None:
     what = "drop faces further than D (input units) from the points: holes stay holes"
     add("--trim-distance", type=positive, metavar="D", help=what)
     add("--cloud", metavar="FILE", help="the points for --trim-distance (default: those of the fit)")
+    what = "the axis that points up in the input: a GLB is turned y-up (default: y), others are turned if this is given"
+    add_flags(parser, "--up", help=what)
+    what = "of the input: a GLB is in metres (default: m), others are scaled (STL to mm, else to m) if this is given"
+    add("--unit", choices=UNITS, help=what)
+    add("--center", action="store_true", help="put the middle of the mesh at the origin")
 
 
 def _mesh(arguments: argparse.Namespace) -> int:
@@ -46,10 +52,11 @@ MESH = Command(
     "extract a mesh from a fit",
     """  mplicits mesh runs/scan -o scan.ply --resolution 512
   mplicits mesh runs/scan -o coarse.obj --level 0
-  mplicits mesh runs/scan -o scan.glb --keep-largest --trim-distance 0.01""",
+  mplicits mesh runs/scan -o scan.glb --keep-largest --trim-distance 0.01
+  mplicits mesh runs/scan -o scan.glb --up z --unit mm --center""",
     _mesh_arguments,
     _mesh,
-    "Extract a mesh from a fit, in the coordinates of its input.",
+    "Extract a mesh from a fit, in the coordinates of its input; or upright, in metres and at the origin.",
 )
 
 

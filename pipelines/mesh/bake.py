@@ -13,6 +13,7 @@ from scipy.ndimage import distance_transform_edt
 from ...datasets.clouds.point_cloud import unit_rows
 from ...neural_fields import InputError, Similarity
 from ...neural_fields.meshing import Mesh
+from ...neural_fields.placement import Placement
 from ..surface.raster import cover
 from .atlas import Unwrapped, decimate, to_frame, unwrap
 from .files import check_textured_path, write_textured
@@ -122,6 +123,7 @@ def textured_mesh(
     *,
     size: int = 2048,
     faces: int = 50_000,
+    placement: Placement | None = None,
     progress: Progress | None = None,
 ) -> Unwrapped:
     """Decimate, unwrap, bake, and write a textured GLB, or an OBJ with its MTL and PNG files.
@@ -134,6 +136,7 @@ def textured_mesh(
         normals_at: likewise.
         size: texels along each side.
         faces: triangles to keep.
+        placement: see `write_mesh`.
         progress: told the stage ("unwrap", "bake"), how much of it is done, and of how much.
 
     Returns:
@@ -148,5 +151,5 @@ def textured_mesh(
         progress("unwrap", 0, 1)
     unwrapped = unwrap(*decimate(mesh.vertices, mesh.faces, faces), size=size)
     color, normal = bake(unwrapped, colors_at, normals_at, size=size, progress=progress)
-    write_textured(path, unwrapped, similarity, color=color, normal=normal)
+    write_textured(path, unwrapped, similarity, color=color, normal=normal, placement=placement)
     return unwrapped

@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from ...datasets import read_cloud
-from ...neural_fields import Field, InputError, Similarity, map_attribute
+from ...neural_fields import Field, InputError, Placement, Similarity, map_attribute
 from ...neural_fields.meshing import Mesh, NoSurfaceError, extract_mesh, map_normals
 from ..run.folder import chosen_level, find_field, fitted_cloud, load_still
 from ..surface.trim import Support, drop_unsupported, in_region, keep_largest, read_support, trim_distance
@@ -41,6 +41,9 @@ class MeshOptions:
         keep_largest: whether to keep only the component of largest area.
         trim_distance: drop faces further than this from the points, in input units.
         cloud: the points for that; by default the file that was fitted.
+        up: the axis that points up in the input, "y" or "z"; see `Placement`, as for the next two.
+        unit: the length of one input unit: "mm", "cm", "m", ….
+        center: whether the middle of the mesh goes to the origin.
     """
 
     resolution: int = 256
@@ -54,21 +57,37 @@ class MeshOptions:
     keep_largest: bool = False
     trim_distance: float | None = None
     cloud: str | Path | None = None
+    up: str | None = None
+    unit: str | None = None
+    center: bool = False
+
+    @property
+    def placement(self) -> Placement:
+        """What is known of the input's coordinates.
+
+        Raises:
+            InputError: there is no such axis or unit.
+        """
+        try:
+            return Placement(self.up, self.unit, self.center)
+        except ValueError as error:
+            raise InputError(f"--{error}") from error
 
 
 def mesh_run(
     run: str | Path, out: str | Path, options: MeshOptions | None = None, *, say: Callable[[str], None] | None = None
 ) -> Mesh:
-    """Extract the surface of a run and write it in the coordinates of its input.
+    """Extract the surface of a run and write it in the coordinates of its input, or as `Placement` says.
 
     Args:
         run: run directory or .safetensors file.
         out: the mesh file.
         options: how.
-        say: called with a line about what was removed, if anything was.
+        say: called with a line about what was removed, if anything was, and with one about the coordinates of the file
+            where they are not just those of the input.
 
     Returns:
-        The mesh as written, in unit-sphere coordinates.
+        The mesh as written, but in unit-sphere coordinates.
 
     Raises:
         InputError: there is no such run or level, it has no surface, or the file cannot be written.
@@ -76,11 +95,12 @@ def mesh_run(
     options = options or MeshOptions()
     check = check_mesh_path if options.texture is None else check_textured_path
     check(out)
+    placement = options.placement
     if options.texture is not None:
         check_texture_size(options.texture)
     file = find_field(run)
     field, similarity, metadata = load_still(file, options.time)
-    check(out, similarity)  # again: not every format can hold every place
+    check(out, similarity, centered=placement.center)  # again: not every format can hold every place
     level = chosen_level(field, file, options.level)
     normal_level = chosen_level(field, file, options.normal_level, otherwise=level, flag="--normal-level")
     support = None
@@ -107,12 +127,15 @@ def mesh_run(
     if options.keep_largest:
         mesh = keep_largest(mesh)
     colors = colors_of_run(file, field, options.time) if options.colors else None
+    line = placement.describe(Path(out).suffix)
+    if line is not None and say is not None:
+        say(f"coordinates: {line}")
     if options.texture is not None:
         _write_textured(out, mesh, field, colors, similarity, options, options.texture)
         return mesh
     if colors is not None:
         mesh = dataclasses.replace(mesh, colors=_evaluated(colors, mesh.vertices))
-    write_mesh(out, mesh, similarity)
+    write_mesh(out, mesh, similarity, placement)
     return mesh
 
 
@@ -170,4 +193,5 @@ def _write_textured(
         lambda points: normals_near(field, points, level=level),
         size=size,
         faces=options.texture_faces,
+        placement=options.placement,
     )

@@ -73,6 +73,8 @@ class Client:
             shadings=shown.shadings,
             has_cloud=shown.shapes.cloud_file is not None,
             moves=shown.field.in_dim == 4,
+            similarity=shown.similarity,
+            deltas=shown.field.deltas.tolist(),
         )
         scale = shown.similarity.scale
         self._scene = SceneNodes(handle.scene, shown.shapes, self._controls, scale=scale, check=self._check)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from ...neural_fields import Similarity
+from ..render.slice import round_step
 from .frames import Look
 
-__all__ = ["SURFACES", "Controls"]
+__all__ = ["SURFACES", "Controls", "slice_range"]
 
 TRACED, MESH, BOTH, NOTHING = SURFACES = ("traced", "mesh", "traced and wires", "hidden")
 NO_BAND = "none"
@@ -15,7 +18,25 @@ SAME = "same level"
 AXES = ("x", "y", "z")
 # From the start to the end of a motion while it plays; images come as fast as they are drawn.
 TIME_STEP = 1 / 48
+# Of the slider that moves the slice plane, about, from one side of the unit sphere to the other.
+SLICE_STEPS = 200
 NOTHING_READ = "Click on the surface, or on the slice plane."
+
+
+def slice_range(similarity: Similarity, axis: int) -> tuple[float, float, float]:
+    """Where a plane across an axis can stand, in input coordinates: lowest, highest, and the step between.
+
+    The step is 1, 2 or 5 times a power of ten, and both ends are multiples of it, the last ones in the unit sphere.
+
+    Args:
+        similarity: from input to unit-sphere coordinates.
+        axis: 0, 1 or 2.
+    """
+    center, scale = similarity.center[axis], similarity.scale
+    step = round_step(2 * scale / SLICE_STEPS)
+    digits = max(0, -math.floor(math.log10(step) + 1e-9))  # a power of ten is its own
+    low, high = math.ceil((center - scale) / step), math.floor((center + scale) / step)
+    return round(low * step, digits), round(high * step, digits), step
 
 
 class Controls:
@@ -27,10 +48,22 @@ class Controls:
         shadings: the names to choose from, the first one first shown.
         has_cloud: whether there is a cloud to be shown.
         moves: whether the field moves.
+        similarity: from input to unit-sphere coordinates: what the panel says is in input units.
+        deltas: half-widths of the bands, in units of the field.
     """
 
-    def __init__(self, gui: Any, *, levels: int, shadings: Sequence[str], has_cloud: bool, moves: bool = False) -> None:
-        self._levels = levels
+    def __init__(
+        self,
+        gui: Any,
+        *,
+        levels: int,
+        shadings: Sequence[str],
+        has_cloud: bool,
+        moves: bool = False,
+        similarity: Similarity | None = None,
+        deltas: Sequence[float] = (),
+    ) -> None:
+        self._levels, self._similarity = levels, similarity or Similarity.identity()
         names = [str(level) for level in range(levels)]
         self._moves = moves
         with gui.add_folder("Time", visible=moves):
@@ -52,12 +85,17 @@ class Controls:
             )
         with gui.add_folder("Beside it"):
             self._cloud = gui.add_checkbox("Input cloud", False, visible=has_cloud)
-            self._band = gui.add_dropdown(
-                "Band", (NO_BAND, *names[:-1]), hint="shells |f| = δ of a level", visible=levels > 1
-            )
+            widths = ", ".join(f"{delta * self._similarity.scale:.3g}" for delta in deltas)
+            hint = f"shells |f| = δ of a level; δ = {widths} in input units"
+            self._band = gui.add_dropdown("Band", (NO_BAND, *names[:-1]), hint=hint, visible=levels > 1)
             self._slice = gui.add_checkbox("Slice plane", False, hint="choose Show: hidden to see all of it")
             self._axis = gui.add_dropdown("Slice across", AXES)
-            self._position = gui.add_slider("Slice at", min=-1.0, max=1.0, step=0.01, initial_value=0.0)
+            low, high, step = slice_range(self._similarity, 0)
+            hint = "coordinate along that axis, in input units"
+            self._position = gui.add_slider(
+                "Slice at", min=low, max=high, step=step, initial_value=self._beside(0, 0.0), hint=hint
+            )
+            self._axis.on_update(lambda _event: self._turn_slice())
         with gui.add_folder("Under the pointer"):
             self._reading = gui.add_markdown(NOTHING_READ)
         with gui.add_folder("Picture"):
@@ -70,6 +108,22 @@ class Controls:
                 "Save screenshot", hint="all that is in the scene, as it is on the screen"
             )
         self._status = gui.add_markdown("")
+
+    def _beside(self, axis: int, position: float) -> float:
+        """The input coordinate that the slider can show nearest to a position in the unit sphere."""
+        low, high, step = slice_range(self._similarity, axis)
+        wanted = self._similarity.center[axis] + position * self._similarity.scale
+        return min(max(low, round(low + round((wanted - low) / step) * step, 12)), high)
+
+    def _in_sphere(self, axis: int, coordinate: float) -> float:
+        position = (coordinate - self._similarity.center[axis]) / self._similarity.scale
+        return min(max(-1.0, position), 1.0)
+
+    def _turn_slice(self) -> None:
+        """Another axis is chosen: the slider counts along that one, and the plane stands in the middle of it."""
+        axis = AXES.index(self._axis.value)
+        self._position.min, self._position.max, _ = slice_range(self._similarity, axis)
+        self._position.value = self._beside(axis, 0.0)
 
     def on_change(self, look: Callable[[], None], scene: Callable[[], None]) -> None:
         """Call ``look`` when the traced image has to be drawn anew, ``scene`` when what stands beside it changes."""
@@ -130,8 +184,11 @@ class Controls:
 
     @property
     def slice(self) -> tuple[int, float] | None:
-        """Axis (0, 1, 2) and position of the slice plane, if it is shown."""
-        return (AXES.index(self._axis.value), float(self._position.value)) if self._slice.value else None
+        """Axis (0, 1, 2) and position of the slice plane in the unit sphere, if it is shown."""
+        if not self._slice.value:
+            return None
+        axis = AXES.index(self._axis.value)
+        return axis, self._in_sphere(axis, float(self._position.value))
 
     @property
     def picture(self) -> tuple[int, bool]:

@@ -290,5 +290,7 @@ class SceneNodes:
         point, tip = reading.point, reading.point + MARK_LENGTH * reading.normal
         return [
             self._scene.add_icosphere("/mark/point", MARK_RADIUS, MARK_COLOR, position=point),
-            self._scene.add_line_segments("/mark/normal", np.array([[point, tip]]), MARK_COLOR, line_width=3.0),
+            self._scene.add_line_segments(
+                "/mark/normal", np.array([[point, tip]]), MARK_COLOR, thickness=3.0, thickness_units="screen"
+            ),
         ]

@@ -17,6 +17,7 @@ from mplicits.neural_fields import MultiscaleSDF, Similarity, save_field
 from mplicits.pipelines.cli import doctor
 from mplicits.pipelines.cli.commands import COMMANDS
 from mplicits.pipelines.cli.entry import main
+from mplicits.pipelines.surface.surface import read_surface
 
 SMALL = ["--widths", "16", "16", "--depths", "1", "1", "--omegas", "5", "8", "--steps", "300", "100"]
 SMALL += ["--learning-rates", "5e-3", "1e-3", "--batch", "256", "--samples", "2000", "--quiet"]
@@ -234,6 +235,20 @@ def test_mesh_is_in_input_coordinates_and_evaluate_measures_it(capsys, run, tmp_
     assert f"{written['chamfer']:.3e}" in capsys.readouterr().out
 
 
+def test_a_glb_is_in_metres_and_at_the_origin_and_says_what_it_took_for_granted(capsys, run, tmp_path):
+    plain, placed = tmp_path / "plain.glb", tmp_path / "placed.glb"
+    assert main(["mesh", str(run), "-o", str(plain), "--resolution", "24"]) == 0
+    assert "one input unit is taken for 1 m (--unit says what it is)" in capsys.readouterr().out
+    flags = ["--up", "z", "--unit", "cm", "--center"]
+    assert main(["mesh", str(run), "-o", str(placed), "--resolution", "24", *flags]) == 0
+    assert "y up, in m (1 input unit = 0.01 m), centred at the origin" in capsys.readouterr().out
+    before, after = trimesh.load_mesh(plain), trimesh.load_mesh(placed)
+    np.testing.assert_allclose(before.bounds.mean(axis=0), [100, 0, 0], atol=0.3)
+    np.testing.assert_allclose(after.extents, before.extents[[0, 2, 1]] / 100, rtol=1e-5)
+    assert np.abs(after.bounds.sum(axis=0)).max() < 1e-6
+    np.testing.assert_allclose(read_surface(placed).vertices, read_surface(plain).vertices, atol=1e-5)
+
+
 def test_levels_are_meshed_by_number(capsys, run, tmp_path):
     assert main(["mesh", str(run), "-o", str(tmp_path / "a.stl"), "--resolution", "32", "--level", "0"]) == 0
     assert "has levels 0 to 1" in fails(capsys, "mesh", run, "-o", tmp_path / "b.stl", "--level", "2")
@@ -328,7 +343,9 @@ def test_the_demo_writes_meshes_and_a_picture_of_any_cloud(cloud, tmp_path, caps
     assert sorted(path.name for path in out.iterdir()) == ["mesh.glb", "mesh.ply", "picture.png", "run"]
     mesh = trimesh.load_mesh(out / "mesh.ply")
     np.testing.assert_allclose(mesh.bounds.mean(axis=0), [100, 0, 0], atol=0.3)
-    np.testing.assert_allclose(trimesh.load_mesh(out / "mesh.glb").bounds, mesh.bounds, atol=1e-3)
+    middle = mesh.bounds.mean(axis=0)  # the GLB is for other programs: at the origin, in its scene
+    np.testing.assert_allclose(trimesh.load_mesh(out / "mesh.glb").bounds, mesh.bounds - middle, atol=1e-3)
+    np.testing.assert_allclose(read_surface(out / "mesh.glb").vertices, mesh.vertices, atol=1e-4)
     text = capsys.readouterr().out
     assert re.search(r"level 1 +\d", text)
     assert "true error" not in text

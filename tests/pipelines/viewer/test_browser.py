@@ -20,15 +20,16 @@ from selenium.webdriver.common.by import By
 
 WINDOW = ("--window-size=1000,700",)
 PATIENCE = 30.0
+CENTER = (50.0, 60.0, 70.0)
 
 
 @pytest.fixture(scope="module")
 def viewer(tmp_path_factory):
     cloud = tmp_path_factory.mktemp("viewer") / "cloud.xyz"
     points = np.random.default_rng(0).normal(size=(3000, 3))
-    np.savetxt(cloud, 50 + 5 * points / np.linalg.norm(points, axis=1, keepdims=True))
+    np.savetxt(cloud, CENTER + 5 * points / np.linalg.norm(points, axis=1, keepdims=True))
     field = MultiscaleSDF(Sphere(radius=0.5), [Siren(16, 2, omega=8.0)], [0.1], taper=0.3).requires_grad_(False)
-    similarity = Similarity((50.0, 50.0, 50.0), 10.0)
+    similarity = Similarity(CENTER, 10.0)
     with Viewer(show_field(field, name="ball", similarity=similarity, cloud=cloud, side=192)) as running:
         yield running
 
@@ -157,9 +158,33 @@ def test_a_click_reads_the_field(page, browser):
     page.click(0, 0)
     until(lambda: "On the surface, level 1" in page.text())
     position = [float(number) for number in re.findall(r"position ([-\d., ]+)", page.text())[0].split(",")]
-    assert np.linalg.norm(np.subtract(position, 50)) == pytest.approx(5, abs=1)
+    assert np.linalg.norm(np.subtract(position, CENTER)) == pytest.approx(5, abs=1)
     page.click(-300, 150)
     until(lambda: "Nothing is under the pointer." in page.text())
+    assert complaints(browser) == []
+
+
+@pytest.mark.slow
+def test_the_slice_slider_counts_in_input_units(page, browser):
+    """The sphere is around (50, 60, 70) with a radius of 10 input units."""
+    slider = browser.find_element(By.XPATH, "//*[@role='slider'][@aria-valuemax='60']")
+    assert [slider.get_attribute(f"aria-value{name}") for name in ("min", "now")] == ["40", "50"]
+    traced = page.settled()
+    page.tick("Slice plane")
+    page.changes(traced)
+    page.choose("Slice across", "z")
+    slider = until(lambda: browser.find_elements(By.XPATH, "//*[@role='slider'][@aria-valuemax='80']"))[0]
+    assert [slider.get_attribute(f"aria-value{name}") for name in ("min", "now")] == ["60", "70"]
+    page.choose("Show", "hidden")
+    page.settled()
+    for _ in range(3):
+        slider.send_keys("\ue014")  # arrow right: three steps of 0.1
+    until(lambda: slider.get_attribute("aria-valuenow") == "70.3")
+    page.settled()
+    page.click(0, 0)
+    until(lambda: "On the slice plane" in page.text())
+    position = [float(number) for number in re.findall(r"position ([-\d., ]+)", page.text())[0].split(",")]
+    assert position[2] == pytest.approx(70.3, abs=1e-3)
     assert complaints(browser) == []
 
 

@@ -1,3 +1,4 @@
+import contextlib
 import itertools
 import math
 import os
@@ -36,6 +37,7 @@ from mplicits.pipelines.viewer.camera import (
     viser_camera,
     z_buffer,
 )
+from mplicits.pipelines.viewer.controls import Controls, slice_range
 from mplicits.pipelines.viewer.frames import FrameScheduler, Look, View, halvings_in_time
 from mplicits.pipelines.viewer.paint import Moments, Painter
 from mplicits.pipelines.viewer.scene import OffsetField, Shapes, slice_image
@@ -274,6 +276,88 @@ def test_probe_reads_position_normal_and_distances_in_input_coordinates():
     text = describe_reading(reading, similarity.scale)
     assert "position 100.0000, 200.0000, 305.0000" in text
     assert "normal +0.000, +0.000, +1.000" in text
+
+
+@pytest.mark.parametrize(
+    ("similarity", "axis", "expected"),
+    [
+        (Similarity.identity(), 0, (-1.0, 1.0, 0.01)),
+        (Similarity((100.0, 200.0, 300.0), 10.0), 1, (190.0, 210.0, 0.1)),
+        (Similarity((0.0, 0.0, 0.123), 0.0456), 2, (0.0775, 0.1685, 0.0005)),
+        (Similarity((512_345.678, 5_403_210.987, 312.5), 40.0), 1, (5_403_171.0, 5_403_250.5, 0.5)),
+        (Similarity((0.0, 0.0, 0.0), 30_000.0), 0, (-30_000.0, 30_000.0, 200.0)),
+    ],
+)
+def test_slices_stand_at_round_input_coordinates(similarity, axis, expected):
+    low, high, step = slice_range(similarity, axis)
+    assert (low, high) == expected[:2]
+    assert step == pytest.approx(expected[2])
+
+
+class Panel:
+    """A panel without a browser: controls that only hold what they are given."""
+
+    class Control:
+        def __init__(self, value=None, **said):
+            self.value, self.heard = value, []
+            vars(self).update(said)
+
+        def on_update(self, listener):
+            self.heard.append(listener)
+
+        def set(self, value):
+            self.value = value
+            for listener in self.heard:
+                listener(None)
+
+    def __init__(self):
+        self.controls = {}
+
+    def add_folder(self, *_, **__):
+        return contextlib.nullcontext()
+
+    def _add(self, label, value, **said):
+        return self.controls.setdefault(label, self.Control(value, **said))
+
+    def add_slider(self, label, *, initial_value, **said):
+        return self._add(label, initial_value, **said)
+
+    def add_dropdown(self, label, options, initial_value=None, **said):
+        return self._add(label, initial_value or options[0], **said)
+
+    def add_checkbox(self, label, value, **said):
+        return self._add(label, value, **said)
+
+    def add_number(self, label, value, **said):
+        return self._add(label, value, **said)
+
+    def add_button(self, label, **said):
+        return self._add(label, None, **said)
+
+    def add_markdown(self, text):
+        return self._add(text, None, content=text)
+
+
+def test_the_slice_slider_and_the_readout_are_in_the_same_units():
+    panel = Panel()
+    similarity = Similarity((100.0, 200.0, 300.0), 10.0)
+    controls = Controls(panel, levels=2, shadings=["normals"], has_cloud=False, similarity=similarity, deltas=[0.05])
+    slider, axis = panel.controls["Slice at"], panel.controls["Slice across"]
+    assert (slider.min, slider.max, slider.value) == (90.0, 110.0, 100.0)
+    assert controls.slice is None
+    panel.controls["Slice plane"].set(True)
+    slider.set(104.0)
+    assert controls.slice == (0, pytest.approx(0.4))
+    axis.set("z")
+    assert (slider.min, slider.max, slider.value) == (290.0, 310.0, 300.0)
+    assert controls.slice == (2, pytest.approx(0.0))
+    slider.set(307.5)
+    reading = probe(
+        Sphere(radius=0.5), similarity, (0.2, 0.1, 3.0), (0.0, 0.0, -1.0), level=0, surface=False, plane=controls.slice
+    )
+    assert reading is not None
+    assert reading.position[2] == pytest.approx(307.5, abs=1e-5)
+    assert "δ = 0.5 in input units" in panel.controls["Band"].hint
 
 
 def test_probe_finds_the_slice_plane_where_it_is_in_front():

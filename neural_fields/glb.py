@@ -11,7 +11,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["MATERIAL", "Motion", "write_glb"]
+__all__ = ["GENERATOR", "MATERIAL", "Motion", "write_glb"]
+
+GENERATOR = "mplicits"
 
 MATERIAL, ROUGHNESS = "baked", 0.8
 _COMPONENTS = {"<u2": 5123, "<u4": 5125, "<f4": 5126}
@@ -36,7 +38,7 @@ def write_glb(
     attributes: Mapping[str, NDArray[Any]],
     *,
     images: Mapping[str, bytes] | None = None,
-    origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    node: Mapping[str, Any] | None = None,
     motion: Motion | None = None,
 ) -> None:
     """Write a JSON chunk that describes the arrays of a second, binary chunk.
@@ -47,10 +49,10 @@ def write_glb(
         attributes: by glTF's names, POSITION among them, ``(V, 2 | 3 | 4)`` float32 each, or uint16 that stands for
             fractions of 65535.
         images: PNG files of "color" and "normal", where there are any.
-        origin: translation of the node, repeated in its ``extras``: positions are relative to it.
+        node: how the mesh stands in the scene, by glTF's names: translation, rotation, scale, extras.
         motion: of the attributes, played by an animation.
     """
-    images, place = images or {}, {"translation": list(origin), "extras": {"origin": list(origin)}}
+    images = images or {}
     arrays = [faces.astype("<u4").reshape(-1), *attributes.values()]
     still = len(arrays)
     if motion is not None:
@@ -69,10 +71,10 @@ def write_glb(
         view["target"] = _VERTEX_BUFFER if number else _INDEX_BUFFER
     primitive = {"attributes": {name: k for k, name in enumerate(attributes, start=1)}, "indices": 0, "material": 0}
     header: dict[str, Any] = {
-        "asset": {"version": "2.0", "generator": "mplicits"},
+        "asset": {"version": "2.0", "generator": GENERATOR},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"name": "mesh", "mesh": 0, **place}],
+        "nodes": [{"name": "mesh", "mesh": 0, **(node or {})}],
         "meshes": [{"primitives": [primitive]}],
         "materials": [_material(images)],
         "buffers": [{"byteLength": int(ends[-1])}],
