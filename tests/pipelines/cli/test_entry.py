@@ -118,7 +118,7 @@ def test_neither_help_nor_mistakes_wait_for_torch():
         ("fit a.ply -o b --resume --force", "not allowed with"),
         ("mesh run -o mesh.ply --resolution 9000", "got '9000', expected a whole number from 8 to 2048"),
         ("mesh run -o mesh.xyz", "mesh.xyz: unknown mesh format '.xyz'"),
-        ("mesh run -o absent/mesh.ply", "absent does not exist"),
+        ("mesh run -o absent/mesh.ply", "run: no such run directory"),
         ("evaluate a.ply b.ply --json figures.txt", "figures.txt: unknown extension '.txt'"),
         ("sample lion -o a.ply", "'lion'"),
     ],
