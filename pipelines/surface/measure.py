@@ -20,6 +20,7 @@ from scipy.spatial import KDTree
 from ...neural_fields import InputError, Similarity
 from ...neural_fields.files import write_json
 from .raster import cover
+from .roughness import feet_among, roughness
 from .surface import Surface, components, is_closed, read_surface, sample_points
 
 __all__ = [
@@ -38,6 +39,9 @@ Int64 = NDArray[np.int64]
 
 # Where a column stands in its cell. Not the middle: models like to have their edges there.
 OFFSET = (0.5 + 0.0372036, 0.5 - 0.0618034)
+
+# Samples of the mesh that may be the foot of one of the reference.
+FEET = 4
 
 
 @dataclass(frozen=True)
@@ -68,6 +72,14 @@ class Metrics:
         samples: samples on each surface.
         seed: seed of the samples.
         notes: what the reader of the figures should know.
+        flat_share: share of the reference's area that is flat; see `roughness` for this and all that follow. None for
+            a cloud.
+        flat_angle: median angle, in degrees, between the normals on flat places, both without their low frequencies:
+            orange peel. None where no place is flat.
+        flat_angle_90: what nine tenths of those angles are below.
+        edge_angle: the median near the reference's sharp edges. None where there are none.
+        edge_angle_90: what nine tenths of those are below.
+        ripple: the residual noise: median height of the waves on flat places.
     """
 
     chamfer: float
@@ -90,6 +102,12 @@ class Metrics:
     samples: int
     seed: int
     notes: tuple[str, ...]
+    flat_share: float | None = None
+    flat_angle: float | None = None
+    flat_angle_90: float | None = None
+    edge_angle: float | None = None
+    edge_angle_90: float | None = None
+    ripple: float | None = None
 
 
 def evaluate_files(mesh: str | Path, reference: str | Path, *, samples: int = 500_000, seed: int = 0) -> Metrics:
@@ -138,7 +156,9 @@ def evaluate_surfaces(
     target, target_normals = sample_points(reference, samples, of_reference)
 
     forward, nearest = KDTree(target, balanced_tree=False).query(points, workers=-1)
-    backward, nearest_back = KDTree(points, balanced_tree=False).query(target, workers=-1)
+    reach, candidates = KDTree(points, balanced_tree=False).query(target, k=min(FEET, len(points)), workers=-1)
+    candidates = np.asarray(candidates).reshape(len(target), -1)
+    backward, nearest_back = np.asarray(reach).reshape(len(target), -1)[:, 0], candidates[:, 0]
     consistency = None
     if normals is not None and target_normals is not None:
         there = np.abs((normals * target_normals[nearest]).sum(axis=1)).mean()
@@ -146,13 +166,16 @@ def evaluate_surfaces(
         consistency = float(there + back) / 2
 
     notes, closed = [], is_closed(mesh)
-    floor = iou = None
+    floor = iou = rough = None
     if is_cloud:
-        notes.append("the reference is a point cloud: distances are to its points; no floor, no iou")
+        notes.append("the reference is a point cloud: distances are to its points; no floor, no iou, no roughness")
     else:
         floor = sum(chamfer(target, sample_points(reference, samples, of_floor)[0]))
         iou, iou_notes = _iou(mesh, reference, columns, closed=closed)
         notes.extend(iou_notes)
+        if normals is not None and target_normals is not None:
+            feet = feet_among(target, points, normals, candidates)
+            rough = roughness(target, target_normals, points[feet], normals[feet], reference)
     precision, recall = float((forward < threshold).mean()), float((backward < threshold).mean())
     accuracy, completeness = float((forward**2).mean()), float((backward**2).mean())
     return Metrics(
@@ -176,6 +199,7 @@ def evaluate_surfaces(
         samples=samples,
         seed=seed,
         notes=tuple(notes),
+        **({} if rough is None else rough._asdict()),
     )
 
 
@@ -221,6 +245,10 @@ def format_metrics(metrics: Metrics) -> str:
     def optional(value: float | None, form: str) -> str:
         return "n/a" if value is None else format(value, form)
 
+    def below(median: float | None, most: float | None, where: str) -> tuple[str, str]:
+        return optional(median, ".2f"), where if most is None else f"{where}, degrees; nine tenths below {most:.2f}"
+
+    flat = "flat places" if m.flat_share is None else f"flat places ({m.flat_share:.0%})"
     lines = [
         ("chamfer (squared L2, both ways)", f"{m.chamfer:.3e}", f"sampling floor {optional(m.chamfer_floor, '.3e')}"),
         ("  mesh → reference", f"{m.accuracy:.3e}", ""),
@@ -228,6 +256,9 @@ def format_metrics(metrics: Metrics) -> str:
         ("hausdorff (squared)", f"{m.hausdorff:.3e}", ""),
         ("f_score", f"{m.f_score:.4f}", f"within {m.threshold:g}"),
         ("normal_consistency", optional(m.normal_consistency, ".4f"), "mean |n·n'|"),
+        ("high-frequency normal error", *below(m.flat_angle, m.flat_angle_90, flat)),
+        ("", *below(m.edge_angle, m.edge_angle_90, "near sharp edges")),
+        ("ripple", optional(m.ripple, ".2e"), "height of the waves on flat places"),
         ("iou", optional(m.iou, ".4f"), "of volumes"),
         ("shell_iou", f"{m.shell_iou:.4f}", f"of surface voxels of {m.voxel:g}"),
         ("components", f"{m.components}", "closed" if m.closed else "with open edges"),
