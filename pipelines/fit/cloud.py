@@ -124,10 +124,22 @@ class CloudDistance:
         cell: edge of the cells in which points are merged into dipoles for the winding number; dipoles
             are used only further than ``2 · cell`` from the surface, where their error is below 0.05.
         noise: standard deviation of the noise that was smoothed off the points.
+        given: how many of the points are the cloud's own, the first ones; None for all. The others fill it in.
+        gap: the spacing of those; None for that of all.
+        repaired: how many normals of points on edges were replaced by one side's.
     """
 
     def __init__(
-        self, points: Tensor, normals: Tensor, *, neighbors: int = 6, cell: float = 0.05, noise: float = 0.0
+        self,
+        points: Tensor,
+        normals: Tensor,
+        *,
+        neighbors: int = 6,
+        cell: float = 0.05,
+        noise: float = 0.0,
+        given: int | None = None,
+        gap: float | None = None,
+        repaired: int = 0,
     ) -> None:
         self.points: Float32 = points.cpu().numpy()
         self.normals: Float32 = normals.cpu().numpy()
@@ -142,6 +154,8 @@ class CloudDistance:
         self.areas: Float32 = np.minimum(areas, LARGEST_AREA * np.median(areas)).astype(np.float32)
         self.radii: Float32 = np.sqrt(self.areas / math.pi)
         self.spacing = float(np.median(np.sqrt(self.areas)))
+        self.given, self.repaired = len(points) if given is None else given, repaired
+        self.gap = self.spacing if gap is None else gap
 
     def nearest(self, x: NDArray[np.floating]) -> NDArray[np.float64]:
         """Distance from each of ``(M, 3)`` to the nearest point of the cloud → ``(M,)``."""

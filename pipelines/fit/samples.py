@@ -282,7 +282,7 @@ def empty_samples(
     assert tried.value is not None
     distance = cloud.nearest(points)
     # Between its points a surface is about a spacing away from them.
-    far = np.flatnonzero(distance - tried.value.abs().cpu().numpy() > max(delta, 4 * cloud.spacing))
+    far = np.flatnonzero(distance - tried.value.abs().cpu().numpy() > max(delta, 4 * cloud.gap))
     depth = cloud.winding_number(points[far], cell=cloud.cell / 2) - 0.5
     sure = np.abs(depth) > SURE
     found = tried.take(torch.from_numpy(far[sure]).to(device))

@@ -36,6 +36,7 @@ from ..run.trainer import (
     without_prefix,
 )
 from ..surface.trim import write_support
+from .between import dense_distance
 from .cloud import CloudDistance, load_cloud
 from .level import LevelObjective, new_level
 from .samples import Band, band_of, banded_sources, first_sources
@@ -196,11 +197,11 @@ class _Fitting:
         self.progress(Progress(f"level {level}: samples", 0, config.steps[level], 0.0, {}))
         band = None if self.frozen is None else self.next_band()
         delta = None if band is None else band.delta
-        self.index = self.index or CloudDistance(self.points, self.normals, noise=self.cloud.noise)
+        self.index = index = self.index or self.distances()
         if self.frozen is None or delta is None:
-            sources = first_sources(self.index, config, generator=generator, device=self.device)
+            sources = first_sources(index, config, generator=generator, device=self.device)
         else:
-            sources = banded_sources(self.index, self.frozen, delta, config, generator=generator, name=self.source)
+            sources = banded_sources(index, self.frozen, delta, config, generator=generator, name=self.source)
         sampling_seconds = time.monotonic() - started
         trainer = Trainer(
             LevelObjective(siren, sources, learning_rate=config.learning_rates[level], generator=generator),
@@ -227,6 +228,8 @@ class _Fitting:
                 "parameters": parameter_count(siren),
                 "delta": delta,
                 "band": None if band is None else dataclasses.asdict(band),
+                "between": len(index.points) - index.given,
+                "repaired_normals": index.repaired,
                 "samples": {source.name: len(source.samples) for source in sources},
                 "sampling_seconds": round(sampling_seconds, 3),
                 "training_seconds": round(trainer.elapsed, 3),
@@ -239,6 +242,16 @@ class _Fitting:
             }
         )
         self.save(self.frozen, None)
+
+    def distances(self) -> CloudDistance:
+        """The points, and where they are sparse for the finest level, what they say of the places between them."""
+        config, noise = self.config, self.cloud.noise
+        if not config.between:
+            return CloudDistance(self.points, self.normals, noise=noise)
+        omega = max(config.omegas[: config.num_levels])
+        return dense_distance(
+            self.points, self.normals, omega=omega, count=config.samples, noise=noise, seed=config.seed
+        )
 
     def next_band(self) -> Band:
         """The band around the last frozen level (Eq. 5)."""

@@ -74,6 +74,9 @@ class FitConfig(Settings):
     smooth_noise: bool = setting(
         True, "move points along their normals to where their neighbours agree, if there is more noise than spacing"
     )
+    between: bool = setting(
+        True, "learn between the points too, where neighbouring points and their normals agree on the surface"
+    )
     time_budget: float | None = setting(
         None, "end training after about this many seconds, all levels together", above=0
     )

@@ -1,0 +1,232 @@
+"""Points between the points of a cloud: what holds a level down where nothing was measured.
+
+A network may do what it likes between its samples, and a residual one does: a smooth cloud comes out dimpled like an
+orange. A cloud with normals says more than its points do. A point p_i and the normals of its neighbours make a patch,
+
+    f_i(x) = ⟨n_i, d⟩ + ½ dᵀ S_i d,  d = x − p_i,
+
+whose shape operator S_i fits n_j − n_i ≈ S_i (p_j − p_i) best, over the neighbours on an arc of circle with it:
+½(n_i + n_j)·(p_j − p_i) ≈ 0 whatever the curvature. New points lie where the patches around them, blended as in moving
+least squares surfaces (Kolluri, "Provably good moving least squares", SODA 2005), are zero. Only patches whose normals
+agree are blended, as in robust ones (Öztireli, Guennebaud and Gross, "Feature preserving point set surfaces based on
+non-linear kernel regression", 2009), and a place beyond an edge is left empty: edges stay sharp. So is one where
+patches contradict each other: the wider the noise, the fewer points there are.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from .cloud import CloudDistance
+
+__all__ = ["Densified", "dense_distance", "densified"]
+
+Float64 = NDArray[np.float64]
+Rows = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+NEIGHBORS = 16  # that a patch is fitted to
+BLENDED = 8  # patches that a place is asked of
+BLOCK = 1 << 15  # rows handled at once, to bound memory
+# Cosine between the normals of a point and of a neighbour on the same smooth surface, and how far from an arc of
+# circle they may be: |½(n_i + n_j)·(p_j − p_i)| over the distance, 0.35 for a corner's mean normal and a side's.
+ALIKE, MIRRORED = 0.85, 0.08
+# Between the normals of patches at one place, which their curvature has turned towards each other.
+AGREED = 0.9
+# Of a patch's neighbours: how many must agree with it, the second over the first eigenvalue of their spread, and the
+# sum of weights that must be across it. The points along an edge have each other's mean normals: a line is no patch.
+COMPANY, WIDE, ENOUGH = 4, 0.1, 0.2
+RIDGE = 0.02  # of that fit, in the same units
+# All in units of the distance to the fourth nearest point: how much patches may differ at a new point, how far one may
+# be beyond another's plane, and how near two must pass to a point of an edge.
+SPREAD, BEYOND, THROUGH = 0.05, 0.03, 0.1
+LARGEST_AREA = 100.0  # that a point stands for, over the median
+
+
+# Radians that the finest level's frequency may turn through between two points: of a cloud that is denser there is
+# nothing to be filled in.
+TURN = 1.0
+
+
+class Densified(NamedTuple):
+    """What a cloud says of its surface.
+
+    Attributes:
+        normals: ``(N, 3)`` of the cloud; those on an edge, which no side has, are one side's.
+        repaired: how many of them.
+        points: ``(M, 3)`` new points.
+        new_normals: ``(M, 3)`` theirs.
+    """
+
+    normals: Float64
+    repaired: int
+    points: Float64
+    new_normals: Float64
+
+
+def dense_distance(
+    points: Tensor, normals: Tensor, *, omega: float, count: int, noise: float = 0.0, seed: int = 0
+) -> CloudDistance:
+    """Distances to a cloud, and where it is sparse for a network of frequency ``omega``, to what fills it in.
+
+    Args:
+        points: ``(N, 3)`` points in the unit sphere.
+        normals: ``(N, 3)`` outward unit normals.
+        omega: the highest frequency that will be fitted to it.
+        count: points of the cloud and places tried between them, all together.
+        noise: see `CloudDistance`.
+        seed: of the places.
+    """
+    index = CloudDistance(points, normals, noise=noise)
+    if index.spacing * omega <= TURN or count <= len(points):
+        return index
+    found = densified(index.points, index.normals, count - len(points), seed=seed)
+    new_points, new_normals = (torch.from_numpy(a.astype(np.float32)) for a in (found.points, found.new_normals))
+    own_normals = torch.from_numpy(found.normals.astype(np.float32))
+    dense = torch.cat((points.cpu(), new_points)), torch.cat((own_normals, new_normals))
+    return CloudDistance(*dense, noise=noise, given=len(points), gap=index.spacing, repaired=found.repaired)
+
+
+def densified(points: NDArray[np.floating], normals: NDArray[np.floating], count: int, *, seed: int = 0) -> Densified:
+    """Find points of the surface between those of a cloud.
+
+    Args:
+        points: ``(N, 3)``, around the origin.
+        normals: ``(N, 3)`` unit normals.
+        count: how many places are tried, uniform by area; most of them become points where the cloud is sound.
+        seed: of the places.
+    """
+    if len(points) <= NEIGHBORS:  # too few for a neighbourhood that is not the whole
+        return Densified(normals.astype(np.float64), 0, np.empty((0, 3)), np.empty((0, 3)))
+    patches = _Patches(points.astype(np.float64), normals.astype(np.float64))
+    able = np.flatnonzero(patches.sound)
+    fixed, repaired = _repaired(patches)
+    found = [(np.empty((0, 3)), np.empty((0, 3)))]
+    if len(able):
+        random = np.random.default_rng(seed)
+        area = np.minimum(patches.reach**2, LARGEST_AREA * np.median(patches.reach) ** 2)[able]
+        parents = np.sort(random.choice(able, count, p=area / area.sum()))  # in order: neighbours are near in memory
+        for start in range(0, count, BLOCK):
+            found.append(_placed(patches, parents[start : start + BLOCK], random))
+    new = [np.concatenate(columns) for columns in zip(*found, strict=True)]
+    return Densified(fixed, repaired, new[0], new[1])
+
+
+class _Patches:
+    """The patch of every point.
+
+    Attributes:
+        points: ``(N, 3)``.
+        normals: ``(N, 3)``.
+        shape: ``(N, 3, 3)`` S_i.
+        reach: ``(N,)`` distance to the sixth neighbour.
+        sound: ``(N,)`` whether neighbours on all sides agree with it.
+    """
+
+    def __init__(self, points: Float64, normals: Float64) -> None:
+        self.points, self.normals = points, normals
+        self.tree = KDTree(points, balanced_tree=False)
+        self.shape, self.reach = np.zeros((len(points), 3, 3)), np.zeros(len(points))
+        self.sound: Mask = np.zeros(len(points), bool)
+        for start in range(0, len(points), BLOCK):
+            self._fit(np.arange(start, min(start + BLOCK, len(points))))
+
+    def _fit(self, rows: Rows) -> None:
+        distance, found = self._nearest(self.points[rows], NEIGHBORS + 1)
+        distance, found = distance[:, 1:], found[:, 1:]  # not the point itself
+        own, theirs = self.normals[rows][:, None], self.normals[found]
+        edge = self.points[found] - self.points[rows][:, None]
+        mirrored = np.abs(0.5 * ((own + theirs) * edge).sum(axis=2)) < MIRRORED * distance
+        scale = np.maximum(np.median(distance, axis=1), 1e-300)[:, None]
+        weight = mirrored & ((own * theirs).sum(axis=2) > ALIKE)
+        company = weight.sum(axis=1)
+        weight = weight * np.exp(-((distance / scale) ** 2) / 2)
+        across = (edge - (edge * own).sum(axis=2, keepdims=True) * own) / scale[..., None]
+        turn = theirs - (theirs * own).sum(axis=2, keepdims=True) * own
+        weighted = (weight[..., None] * across).transpose(0, 2, 1)  # (n, 3, k)
+        spread, mixed = weighted @ across, weighted @ turn
+        values = np.linalg.eigvalsh(spread)  # the first is across the plane: 0
+        self.sound[rows] = (values[:, 1] > np.maximum(WIDE * values[:, 2], ENOUGH)) & (company >= COMPANY)
+        solved = np.linalg.solve(spread + RIDGE * np.eye(3), mixed)
+        self.shape[rows] = 0.5 * (solved + solved.transpose(0, 2, 1)) / scale[..., None]
+        self.reach[rows] = distance[:, 5]
+
+    def _nearest(self, x: Float64, count: int) -> tuple[Float64, Rows]:
+        distance, found = self.tree.query(x, count, workers=-1)
+        return np.asarray(distance, np.float64), np.asarray(found, np.int64)
+
+    def at(self, x: Float64, count: int) -> tuple[Float64, Rows, Float64, Float64, Float64]:
+        """The patches of the nearest points at ``(m, 3)`` places.
+
+        Returns:
+            Distances and rows of the points ``(m, k)``, vectors from them ``(m, k, 3)``, and the patches' values
+            ``(m, k)`` and unit normals ``(m, k, 3)``.
+        """
+        distance, found = self._nearest(x, count)
+        offset = x[:, None] - self.points[found]
+        bent = np.einsum("mkab,mkb->mka", self.shape[found], offset)
+        own = self.normals[found]
+        value = ((own + 0.5 * bent) * offset).sum(axis=2)
+        return distance, found, offset, value, _unit(own + bent)
+
+
+def _repaired(patches: _Patches) -> tuple[Float64, int]:
+    """The normals, those of points on an edge replaced by one side's, and how many were.
+
+    On an edge is a point through which sound patches of two sides pass, and that is part of no sound one itself.
+    """
+    fixed, odd = patches.normals.copy(), np.flatnonzero(~patches.sound)
+    if not len(odd):
+        return fixed, 0
+    distance, found, _, value, normal = patches.at(patches.points[odd], NEIGHBORS)
+    through = patches.sound[found] & (np.abs(value) < THROUGH * distance[:, 4:5])
+    first = through.argmax(axis=1)  # the nearest
+    side = normal[np.arange(len(odd)), first]
+    other = through & ((normal * side[:, None]).sum(axis=2) < ALIKE)
+    torn = other.any(axis=1) & ((side * fixed[odd]).sum(axis=1) < ALIKE**0.25)
+    fixed[odd[torn]] = side[torn]
+    return fixed, int(torn.sum())
+
+
+def _placed(patches: _Patches, parents: Rows, random: np.random.Generator) -> tuple[Float64, Float64]:
+    """New points and their normals, at most one beside each of ``parents``."""
+    normal = patches.normals[parents]
+    step = random.normal(size=(len(parents), 3))
+    step = _unit(step - (step * normal).sum(axis=1, keepdims=True) * normal)
+    step *= (0.8 * patches.reach[parents] * np.sqrt(random.random(len(parents))))[:, None]
+    bent = np.einsum("mab,mb->ma", patches.shape[parents], step)
+    x = patches.points[parents] + step - 0.5 * (bent * step).sum(axis=1, keepdims=True) * normal
+    normal, good = _unit(normal + bent), np.ones(len(parents), bool)
+    for _ in range(2):  # patches are flat across a spacing: the second move is a hundredth of the first
+        moved, normal, good = _blended(patches, x, normal)
+        x = x + moved
+    return x[good], normal[good]
+
+
+def _blended(patches: _Patches, x: Float64, normal: Float64) -> tuple[Float64, Float64, Mask]:
+    """What moves places ``(m, 3)`` onto the blend of patches with their normals; normals there; which are good."""
+    distance, found, offset, value, theirs = patches.at(x, BLENDED)
+    scale, sound = distance[:, 3:4], patches.sound[found]
+    cosine = (theirs * normal[:, None]).sum(axis=2)
+    weight = sound * np.exp(-((distance / scale) ** 2)) * np.clip((cosine - AGREED) / (1 - AGREED), 0, 1) ** 2
+    total = weight.sum(axis=1, keepdims=True)
+    weight /= np.maximum(total, 1e-300)
+    mean = (weight * value).sum(axis=1, keepdims=True)
+    blend = _unit((weight[..., None] * theirs).sum(axis=1))
+    spread = np.sqrt((weight * (value - mean) ** 2).sum(axis=1, keepdims=True))
+    # Two points of a surface are both behind or both before the plane of the other, on arcs as on edges.
+    above, below = -(offset * blend[:, None]).sum(axis=2), (offset * patches.normals[found]).sum(axis=2)
+    beyond = sound & (cosine < AGREED) & (above * below < 0)
+    beyond &= np.minimum(np.abs(above), np.abs(below)) > BEYOND * scale
+    good = (total[:, 0] > ENOUGH) & (spread < SPREAD * scale)[:, 0] & ~beyond.any(axis=1)
+    return -mean * blend, blend, good
+
+
+def _unit(vectors: Float64) -> Float64:
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-300)

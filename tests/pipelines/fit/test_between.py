@@ -1,0 +1,133 @@
+"""Points between those of a cloud, against surfaces that are known exactly."""
+
+import numpy as np
+import pytest
+import torch
+from mplicits.datasets.synthetic.samples import sample_sphere, sample_torus
+from mplicits.neural_fields import Torus
+from mplicits.pipelines.fit.between import TURN, dense_distance, densified
+from mplicits.pipelines.fit.cloud import CloudDistance
+
+Float64 = np.ndarray
+
+
+def box(count: int, half: float = 0.5) -> tuple[Float64, Float64]:
+    """Points uniform on a cube, with the exact normals of its faces."""
+    random = np.random.default_rng(2)
+    axis, sign = random.integers(0, 3, count), random.choice([-half, half], count)
+    points = random.uniform(-half, half, (count, 3))
+    points[np.arange(count), axis] = sign
+    normals = np.zeros((count, 3))
+    normals[np.arange(count), axis] = np.sign(sign)
+    return points, normals
+
+
+def cube_grid(cells: int, half: float = 0.5) -> tuple[Float64, Float64, np.ndarray]:
+    """The vertices of a cube cut into squares, with the mean normals of their faces; how many faces each is on."""
+    line = np.linspace(-half, half, cells + 1)
+    points = np.stack(np.meshgrid(line, line, line, indexing="ij"), axis=-1).reshape(-1, 3)
+    on = np.abs(points) == half
+    points, on = points[on.any(axis=1)], on[on.any(axis=1)]
+    normals = np.sign(points) * on
+    return points, normals / np.linalg.norm(normals, axis=1, keepdims=True), on.sum(axis=1)
+
+
+def test_a_plane_is_filled_exactly() -> None:
+    random = np.random.default_rng(0)
+    turn = np.linalg.qr(random.normal(size=(3, 3)))[0]
+    points = random.uniform(-1, 1, (2000, 3)) * [1, 1, 0] @ turn
+    normals = np.broadcast_to(turn[2], points.shape)
+    found = densified(points, normals, 5000)
+    assert len(found.points) > 4500  # but for some beyond the rim, where there are too few neighbours
+    assert np.abs(found.points @ turn[2]).max() < 1e-14
+    assert np.abs(found.new_normals - turn[2]).max() < 1e-14
+    assert found.repaired == 0
+
+
+def test_a_sphere_is_filled_to_second_order() -> None:
+    radius, count = 0.6, 2000
+    cloud = sample_sphere(count, radius=radius, seed=3)
+    assert cloud.normals is not None
+    found = densified(cloud.points, cloud.points / radius, 5000)
+    spacing = (4 * np.pi * radius**2 / count) ** 0.5
+    assert len(found.points) > 4500
+    # The planes of the points alone would be off by the sagitta of a spacing; their curvature takes most of it off.
+    sagitta = spacing**2 / (2 * radius)
+    height = np.linalg.norm(found.points, axis=1) - radius
+    assert np.sqrt((height**2).mean()) < 0.05 * sagitta
+    assert np.abs(height).max() < 0.5 * sagitta
+    cosine = (found.new_normals * found.points).sum(axis=1) / np.linalg.norm(found.points, axis=1)
+    assert np.quantile(np.arccos(np.clip(cosine, -1, 1)), 0.9) < 0.1 * spacing / radius
+
+
+def test_saddles_are_filled_too() -> None:
+    cloud = sample_torus(4000, seed=1)
+    assert cloud.normals is not None
+    found = densified(cloud.points, cloud.normals, 5000)
+    height = Torus().value(torch.from_numpy(found.points)).numpy()  # both have radii of 0.5 and 0.2
+    spacing = (4 * np.pi**2 * 0.5 * 0.2 / 4000) ** 0.5
+    assert len(found.points) > 4500
+    assert np.sqrt((height**2).mean()) < 0.1 * spacing**2 / (2 * 0.2)
+
+
+def test_edges_stay_sharp() -> None:
+    points, normals = box(6000)
+    found = densified(points, normals, 20_000)
+    assert len(found.points) > 15_000
+    assert np.abs(found.new_normals).max(axis=1).min() == pytest.approx(1)  # no normal but those of the faces
+    face = np.abs(found.new_normals).argmax(axis=1)
+    assert np.abs(np.abs(found.points[np.arange(len(face)), face]) - 0.5).max() < 1e-12
+    spacing = (6 / 6000) ** 0.5
+    beyond = np.abs(found.points).max(axis=1) - 0.5
+    assert (beyond > 0.1 * spacing).mean() < 0.002  # where no point of the other face is among the nearest
+    near = np.sort(np.abs(found.points), axis=1)[:, 1] > 0.5 - 0.2 * spacing  # the second largest coordinate
+    assert near.mean() > 0.5 * 2 * 0.2 * spacing * 2  # 4 rims of each face, and most of them are filled
+
+
+def test_the_mean_normals_of_edges_become_those_of_a_side() -> None:
+    points, normals, faces = cube_grid(24)
+    found = densified(points, normals, 20_000)
+    assert found.repaired == (faces > 1).sum()
+    assert (found.normals[faces == 1] == normals[faces == 1]).all()
+    assert np.abs(found.normals).max(axis=1).min() > 1 - 1e-9
+    assert (found.normals * normals).sum(axis=1).min() > 3**-0.5 - 1e-9  # of a side that the point is on
+    assert np.abs(found.new_normals).max(axis=1).min() > 1 - 1e-9
+    # Points at random have their own face's normal, also beside an edge, and keep it.
+    points, normals = box(6000)
+    kept = (densified(points, normals, 0).normals == normals).all(axis=1)
+    assert kept.mean() > 0.998
+
+
+def test_contradictions_are_not_filled() -> None:
+    points = sample_sphere(2000).points
+    random = np.random.default_rng(4).normal(size=points.shape)
+    found = densified(points, random / np.linalg.norm(random, axis=1, keepdims=True), 5000)
+    assert len(found.points) < 50
+    few = densified(points[:10], points[:10] / 0.5, 100)
+    assert len(few.points) == 0
+
+
+def test_the_same_seed_finds_the_same_points() -> None:
+    points, normals = box(1000)
+    first, again, other = (densified(points, normals, 500, seed=seed).points for seed in (1, 1, 2))
+    assert np.array_equal(first, again)
+    assert len(first) != len(other) or not np.array_equal(first, other)
+
+
+def test_dense_clouds_are_left_as_they_are() -> None:
+    points = torch.from_numpy(sample_sphere(3000).points).float()
+    normals = 2 * points
+    plain = CloudDistance(points, normals)
+    enough = 0.99 * TURN / plain.spacing
+    for omega, count in ((enough, 10_000), (80.0, 3000)):
+        index = dense_distance(points, normals, omega=omega, count=count)
+        assert (index.given, len(index.points), index.gap) == (3000, 3000, index.spacing)
+    index = dense_distance(points, normals, omega=1.1 * enough, count=10_000)
+    assert index.given == 3000
+    assert len(index.points) > 9000
+    assert np.array_equal(index.points[:3000], points.numpy())
+    assert index.gap == plain.spacing > index.spacing
+    # What fills it in lies on the sphere: distances are nearer to the truth than those to the discs of the points.
+    x = 2 * torch.rand(2000, 3, generator=torch.Generator().manual_seed(0)) - 1
+    truth = x.norm(dim=1) - 0.5
+    assert (index.signed(x) - truth).abs().mean() < 0.5 * (plain.signed(x) - truth).abs().mean()
