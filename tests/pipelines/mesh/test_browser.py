@@ -6,8 +6,7 @@ An orthographic camera looks down −z at a sphere, so that every pixel of the p
 import functools
 import http.server
 import io
-import shutil
-import subprocess
+import json
 import threading
 import time
 
@@ -16,17 +15,17 @@ import numpy as np
 import pytest
 import trimesh
 from browser import CHROMEDRIVER, CHROMIUM, FLAGS
-from mplicits.neural_fields import Similarity
+from mplicits.neural_fields import Capsule, Placement, Similarity, Sphere, Union, extract_mesh
 from mplicits.neural_fields.meshing import Mesh
 from mplicits.pipelines.mesh.bake import textured_mesh
 from mplicits.pipelines.mesh.files import write_mesh
+from npm import THREE, fetch
 
 pytest.importorskip("xatlas", reason="the extra mplicits[texture] is not installed")
 pytest.importorskip("selenium")
 
 from selenium import webdriver
 
-THREE = "three@0.180.0"
 WINDOW = (
     "--force-device-scale-factor=1",
     "--window-size=800,800",
@@ -36,6 +35,9 @@ SIDE = 400  # pixels
 RADIUS = 0.8  # of the sphere, in units of its similarity
 UTM = Similarity((512_345.678, 5_403_210.987, 312.5), 40.0)
 NEAR = Similarity((10.0, -20.0, 30.0), 2.0)  # OBJ has no node to be placed by, and three.js reads it into float32
+
+# A figure as scanners have it: z-up, in millimetres, a metre and a half from the origin.
+MILLIMETRES = Similarity((-1100.0, 1250.0, 400.0), 1000.0)
 
 PAGE = """<!doctype html><html><head><link rel="icon" href="data:,">
 <style>body { margin: 0 } canvas { display: block }</style>
@@ -88,7 +90,16 @@ if (mode === 'lit') {
   camera.position.set(x + 0.9 * half, y + 0.5 * half, z + 1.8 * half);
   camera.lookAt(x, y, z);
 }
-renderer.render(scene, camera);
+if (mode === 'upright') {  // from four metres away, three.js' up being up: where the file stands is what is asked
+  const person = new THREE.PerspectiveCamera(40, 1, 0.01, 100);
+  person.position.set(0, 0, 4);
+  scene.add(new THREE.HemisphereLight(0xffffff, 0x444444, 2));
+  renderer.render(scene, person);
+} else {
+  renderer.render(scene, camera);
+}
+const box = new THREE.Box3().setFromObject(loaded, true);
+document.body.dataset.box = JSON.stringify([box.min.toArray(), box.max.toArray()]);
 document.title = 'drawn';
 </script></body></html>"""
 
@@ -104,24 +115,20 @@ def bumpy(points):
     return normals / np.linalg.norm(normals, axis=1, keepdims=True)
 
 
+def figure():
+    """A rod of 1.8 field units along z, with a ball of radius 0.25 at its upper end, and a small one at its right."""
+    rod = Capsule(start=(0.0, 0.0, -0.85), end=(0.0, 0.0, 0.85), radius=0.05)
+    head, hand = Sphere(radius=0.25, center=(0.0, 0.0, 0.65)), Sphere(radius=0.12, center=(0.3, 0.0, 0.0))
+    return extract_mesh(Union(rod, head, hand), resolution=64)
+
+
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):
     """A folder with three.js and baked spheres, served at an address of this machine."""
     if CHROMIUM is None or CHROMEDRIVER is None:
         pytest.skip("no chromium and chromedriver on this machine")
-    npm = shutil.which("npm")
-    if npm is None:
-        pytest.skip("no npm on this machine to fetch three.js with")
     folder = tmp_path_factory.mktemp("site")
-    flags = ("--no-save", "--ignore-scripts", "--no-audit", "--no-fund", "--prefer-offline", "--fetch-retries=0")
-    try:
-        fetched = subprocess.run(
-            [npm, "install", "--prefix", str(folder), *flags, THREE], capture_output=True, timeout=60, check=False
-        )
-    except subprocess.TimeoutExpired:
-        pytest.skip(f"{THREE} is not to be had from npm: no answer")
-    if fetched.returncode:
-        pytest.skip(f"{THREE} is not to be had from npm: {fetched.stderr[-200:].decode(errors='replace')}")
+    fetch(folder, THREE)
     (folder / "index.html").write_text(PAGE.replace("SIDE", str(SIDE)))
     ball = trimesh.creation.icosphere(3, radius=RADIUS)
     mesh = Mesh(np.asarray(ball.vertices), np.asarray(ball.faces, np.int32))
@@ -131,6 +138,7 @@ def site(tmp_path_factory):
     vertices = np.asarray(fine.vertices)
     colored = Mesh(vertices, np.asarray(fine.faces, np.int32), None, painting(vertices).astype(np.float32))
     write_mesh(folder / "colored.glb", colored, UTM)
+    write_mesh(folder / "figure.glb", figure(), MILLIMETRES, Placement("z", "mm", center=True))
 
     class Quiet(http.server.SimpleHTTPRequestHandler):
         def log_message(self, *_):
@@ -207,3 +215,23 @@ def test_normals_on_the_screen_are_those_baked(browser, site, mode):
     assert np.percentile(angle, 95) < 4
     bare = points / RADIUS
     assert np.degrees(np.arccos((bumpy(points) * bare).sum(axis=1).clip(-1, 1))).mean() > 10
+
+
+def test_a_scan_stands_upright_to_scale_at_the_origin(browser, site):
+    """What three.js makes of a z-up scan in millimetres, far from the origin: the box in metres, and a look at it."""
+    image = drawn(browser, site, "figure.glb", "upright")
+    low, high = json.loads(browser.find_element("css selector", "body").get_attribute("data-box"))
+    # From the head at the left, −0.25, to the hand at the right, 0.42; 1.8 m tall. A cell is 0.032 m.
+    np.testing.assert_allclose(np.subtract(high, low), [0.67, 1.8, 0.5], atol=0.032)
+    np.testing.assert_allclose(np.add(high, low), 0, atol=1e-5)
+    seen = image.max(axis=2) > 30
+    metre = SIDE / 2 / (4 * np.tan(np.radians(20)))  # pixels; what is nearer by 0.25 m is larger by a fifteenth
+    rows = np.flatnonzero(seen.any(axis=1))
+    np.testing.assert_allclose(rows[[0, -1]], [SIDE / 2 - 0.9 * metre, SIDE / 2 + 0.9 * metre], atol=0.07 * metre)
+    middle = -(0.42 - 0.25) / 2  # where the rod is, now that the box is centred
+    head, hand, foot = (int(SIDE / 2 - height * metre) for height in (0.65, 0.0, -0.6))
+    width = seen.sum(axis=1) / metre
+    np.testing.assert_allclose(width[[head, foot]], [0.5, 0.1], rtol=0.15)
+    columns = (np.flatnonzero(seen[hand]) - SIDE / 2) / metre
+    assert columns.min() == pytest.approx(middle - 0.05, abs=0.03)
+    assert columns.max() == pytest.approx(middle + 0.42, abs=0.05)  # to the right, not mirrored

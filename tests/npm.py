@@ -1,0 +1,26 @@
+"""Packages of npm that tests use: fetched into a folder; tests skip where they are not to be had."""
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+THREE = "three@0.180.0"
+VALIDATOR = "gltf-validator@2.0.0-dev.3.10"
+FLAGS = ("--no-save", "--ignore-scripts", "--no-audit", "--no-fund", "--prefer-offline", "--fetch-retries=0")
+
+
+def fetch(folder: Path, package: str) -> None:
+    """Install a package into ``folder/node_modules``, or skip the test that wants it."""
+    npm = shutil.which("npm")
+    if npm is None:
+        pytest.skip(f"no npm on this machine to fetch {package} with")
+    try:
+        fetched = subprocess.run(
+            [npm, "install", "--prefix", str(folder), *FLAGS, package], capture_output=True, timeout=60, check=False
+        )
+    except subprocess.TimeoutExpired:
+        pytest.skip(f"{package} is not to be had from npm: no answer")
+    if fetched.returncode:
+        pytest.skip(f"{package} is not to be had from npm: {fetched.stderr[-200:].decode(errors='replace')}")
