@@ -4,12 +4,18 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 CLOUD ?=
 OUT ?= demo
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
 .PHONY: demo test test-all lint docs clean
 
+# What using it needs; the stamps below add what developing it and its site need.
 $(VENV)/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	$(PIP) -e .
+	touch $@
+
+$(VENV)/.dev: $(VENV)/.installed
+	$(PIP) -e '.[dev]'
 	touch $@
 
 demo: $(VENV)/.installed
@@ -21,18 +27,18 @@ test: lint
 test-all: lint
 	$(BIN)/python -m pytest -m ''
 
-lint: $(VENV)/.installed
+lint: $(VENV)/.dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/basedpyright --pythonpath $(BIN)/python
 
 $(VENV)/.docs: $(VENV)/.installed
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'
+	$(PIP) -e '.[docs]'
 	touch $@
 
 docs: $(VENV)/.docs
 	rm -rf build site
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --target build/api .
+	$(PIP) --no-deps --target build/api .
 	$(BIN)/mkdocs build
 
 clean:

@@ -4,10 +4,13 @@ Files import from rooms below their own, or from their own, and no two files imp
 """
 
 import ast
+import re
+import shutil
 import subprocess
 import sys
 import tomllib
 from graphlib import TopologicalSorter
+from importlib.metadata import packages_distributions
 from pathlib import Path
 
 import mplicits
@@ -34,7 +37,7 @@ ROOMS = (
     "pipelines/front",
 )
 FRONT = "pipelines/front"
-OUTSIDE = {"torch", "numpy", "skimage", "safetensors"}  # what neural_fields may import
+OUTSIDE = {"torch", "numpy", "safetensors"}  # what neural_fields may import
 LATE = {"torchdiffeq", "trimesh"}  # and what only inside a function that needs it
 LIGHT = "import {}, sys; assert not {{'torch', 'numpy', 'scipy'}} & set(sys.modules), sorted(sys.modules)"
 
@@ -144,6 +147,42 @@ def test_every_folder_with_python_in_it_is_packaged() -> None:
     }
     for path in sources():
         assert (path.parent / "__init__.py").is_file(), f"{path.parent} has no __init__.py"
+
+
+def plain(name: str) -> str:
+    """A distribution's name as indexes compare it."""
+    return re.sub(r"[-_.]+", "-", name).lower()
+
+
+def test_dependencies_are_those_that_are_imported() -> None:
+    """Each carries weight, in the package or in what an extra is for; and nothing is imported by way of another."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    extras = project["optional-dependencies"]
+    homes = {module: [plain(home) for home in there] for module, there in packages_distributions().items()}
+
+    def names(requirements: list[str]) -> set[str]:
+        return {plain(re.split(r"[^\w-]", line)[0]) for line in requirements}
+
+    used = {name.split(".")[0] for path in sources() for level, name, _ in imports(path) if level == 0}
+    used -= {"mplicits", *sys.stdlib_module_names}
+    needed = names(project["dependencies"])
+    optional = set().union(*(names(lines) for extra, lines in extras.items() if extra not in ("dev", "docs")))
+    unknown = {name for name in used if not {*homes.get(name, [name])} & (needed | optional | {"imageio-ffmpeg"})}
+    assert not unknown, f"imported, but in no list of pyproject.toml: {sorted(unknown)}"
+    found = {home for name in used for home in homes.get(name, [name])}
+    assert needed <= found, f"in pyproject.toml, but never imported: {sorted(needed - found)}"
+
+
+def test_the_demo_installs_nothing_but_the_package() -> None:
+    make = shutil.which("make")
+    if make is None:
+        pytest.skip("there is no make")
+    for target, expected in (("demo", ["-e ."]), ("lint", ["-e .", "-e '.[dev]'"])):
+        words = [make, "-n", target, "VENV=none"]
+        lines = subprocess.run(words, check=True, cwd=ROOT, capture_output=True, text=True).stdout.splitlines()
+        installed = [line for line in lines if " pip install " in line]
+        assert [line[line.index("-e ") :] for line in installed] == expected
+        assert all(" -c constraints.txt " in line for line in installed)
 
 
 @pytest.mark.slow

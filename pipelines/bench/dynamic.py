@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from skimage.measure import marching_cubes
 
 from ...datasets.cameras import Camera, orbit
 from ...neural_fields import Field, Hits, InputError, SpaceTimeSDF, extract_mesh, load_field, sphere_trace
@@ -19,7 +18,7 @@ from ..run.folder import find_field
 from .benchmark import Benchmark, Part
 from .cells import Workplace
 from .evolve import MorphBench
-from .speed import counted, evaluate_slabs
+from .speed import counted, evaluate_slabs, peer_mesher
 from .tables import Column, Figure, Table, tabulated
 
 __all__ = ["DynamicBench", "DynamicRow", "dynamic_rows"]
@@ -84,6 +83,7 @@ class DynamicBench(Benchmark[DynamicRow]):
 
     def cells(self) -> list[Part]:
         """One; see `Benchmark.cells`."""
+        peer_mesher()  # it is there, before the long work
         if self.morph is not None:
             return [Part(self.name, "the morph, traced", tuple(map(Path, self.morph.meshes)))]
         assert self.run_file is not None
@@ -197,7 +197,7 @@ def _dense_mesh(field: Field, cells: int, level: int) -> None:
     """Marching cubes as in the paper: level 0 on every vertex, finer levels in their bands."""
     values = np.empty((cells + 1,) * 3, np.float32)
     evaluate_slabs(field, values, range(cells + 1), level=level)
-    marching_cubes(values, 0.0, gradient_direction="descent")
+    peer_mesher()(values, 0.0, gradient_direction="descent")
 
 
 def _run(

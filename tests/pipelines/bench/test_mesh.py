@@ -1,3 +1,5 @@
+import sys
+
 import pytest
 import torch
 from mplicits.neural_fields import InputError, MultiscaleSDF, Siren, save_field
@@ -20,6 +22,7 @@ def sphere_like():
 
 
 def test_rows_ratios_and_distance(tmp_path):
+    pytest.importorskip("skimage", reason="the extra mplicits[bench] is not installed")
     save_field(tmp_path / "ball.safetensors", sphere_like())
     bench = MeshBench(run_file=tmp_path / "ball.safetensors", resolutions=(64, 128), reference=64)
     rows = bench.rows(tmp_path / "out")
@@ -50,6 +53,14 @@ def test_the_table_says_growth_and_ratios():
     assert "256³ → 512³: ×4.10 in time, ×4.00 in evaluations" in text
     assert "10.0× faster than peer at 512³" in text
     assert "4.00 M + 2.00 M" in text
+
+
+def test_a_missing_peer_is_an_input_error_before_any_work(tmp_path, monkeypatch):
+    save_field(tmp_path / "ball.safetensors", Siren(8, 1))
+    for name in ("skimage", "skimage.measure"):
+        monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(InputError, match=r"scikit-image's; pip install 'mplicits\[bench\]'"):
+        MeshBench(run_file=tmp_path / "ball.safetensors").cells()
 
 
 def test_missing_run_is_an_input_error(tmp_path):
