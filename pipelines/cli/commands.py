@@ -17,6 +17,7 @@ from .common import Command, add_flags, add_settings, check_output, read_setting
 from .draw import ANIMATE, RENDER, SLICE, VIEW
 from .fit import FIT
 from .mesh import EVALUATE, MESH
+from .solids import BOOLEAN, OFFSET
 from .train import EVOLVE, RECONSTRUCT, TEXTURE
 from .views import CHECK_CAMERAS, SCENE
 
@@ -79,6 +80,8 @@ COMMANDS: Mapping[str, Command] = MappingProxyType(
     {
         "fit": FIT,
         "mesh": MESH,
+        "boolean": BOOLEAN,
+        "offset": OFFSET,
         "texture": TEXTURE,
         "reconstruct": RECONSTRUCT,
         "evolve": EVOLVE,

@@ -51,8 +51,8 @@ class _Parser(argparse.ArgumentParser):
             formatter_class=argparse.RawDescriptionHelpFormatter,
             allow_abbrev=False,
         )
-        # argparse takes -1e-3 for a flag; coordinates and tolerances are written so.
-        self._negative_number_matcher = re.compile(r"^-(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$")
+        # argparse takes -1e-3 for a flag; coordinates and tolerances are written so, and lengths as -2mm.
+        self._negative_number_matcher = re.compile(r"^-(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?[a-z]*$")
         command.add_arguments(self)
 
     def error(self, message: str) -> NoReturn:

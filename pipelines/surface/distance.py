@@ -49,22 +49,40 @@ class MeshDistance:
 
     def signed(self, points: Float64) -> Float64:
         """Distances ``(M,)`` of points ``(M, 3)``."""
-        result = np.empty(len(points))
+        return self.with_slope(points)[0]
+
+    def with_slope(self, points: Float64, *, certain: bool = True) -> tuple[Float64, Float64]:
+        """Distances ``(M,)`` of points ``(M, 3)``, and their gradients ``(M, 3)``: away from the nearest point.
+
+        On the surface that is the pseudo-normal.
+
+        Args:
+            points: ``(M, 3)``.
+            certain: whether the search widens until no other face can be nearer, which costs much far from the surface.
+                Otherwise it ends after the eight pieces of faces whose centres are nearest: a distance may be too long
+                by the radius of a piece, and is right wherever the nearest face is among theirs.
+        """
+        if not certain:
+            nearest = np.reshape(self.tree.query(points, k=min(8, len(self.owner)), workers=-1)[1], (len(points), -1))
+            parts = np.array_split(np.arange(len(points)), 1 + nearest.size // PAIRS_AT_ONCE)
+            found = [self._nearest_of(points[part], self.owner[nearest[part]]) for part in parts]
+            return np.concatenate([signed for signed, _ in found]), np.concatenate([slope for _, slope in found])
+        result, slopes = np.empty(len(points)), np.empty((len(points), 3))
         rows, count = np.arange(len(points)), min(16, len(self.owner))
         while len(rows):
             unsure = []
             for part in np.array_split(rows, 1 + len(rows) * count // PAIRS_AT_ONCE):
                 reach, nearest = self.tree.query(points[part], k=count, workers=-1)
                 reach, nearest = np.reshape(reach, (len(part), -1)), np.reshape(nearest, (len(part), -1))
-                result[part] = self._nearest_of(points[part], self.owner[nearest])
+                result[part], slopes[part] = self._nearest_of(points[part], self.owner[nearest])
                 # Every piece that was not looked at is at least this far away.
                 unsure.append(part[np.abs(result[part]) > reach[:, -1] - self.radius])
             rows = np.concatenate(unsure) if count < len(self.owner) else rows[:0]
             count = min(4 * count, len(self.owner))
-        return result
+        return result, slopes
 
-    def _nearest_of(self, points: Float64, faces: Int64) -> Float64:
-        """Signed distance ``(M,)`` to the nearest of each point's own faces ``(M, k)``."""
+    def _nearest_of(self, points: Float64, faces: Int64) -> tuple[Float64, Float64]:
+        """Signed distance ``(M,)`` to the nearest of each point's own faces ``(M, k)``, and its gradient ``(M, 3)``."""
         corners = self.corners[faces]  # (M, k, 3, 3)
         weights = barycentric_of_nearest(points[:, None], corners)
         offset = points[:, None] - (weights[..., None] * corners).sum(axis=2)
@@ -72,8 +90,11 @@ class MeshDistance:
         best = distance.argmin(axis=1)
         row = np.arange(len(points))
         feature = (weights[row, best] > 0) @ np.array([1, 2, 4])
-        side = (offset[row, best] * self.pseudo_normals[faces[row, best], feature]).sum(axis=1)
-        return np.where(side < 0, -distance[row, best], distance[row, best])
+        outward, away = self.pseudo_normals[faces[row, best], feature], offset[row, best]
+        signed = np.where((away * outward).sum(axis=1) < 0, -distance[row, best], distance[row, best])
+        outward = outward / np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-300)
+        there = (signed == 0)[:, None]
+        return signed, np.where(there, outward, away / np.where(there, 1.0, signed[:, None]))
 
 
 def barycentric_of_nearest(points: Float64, corners: Float64) -> Float64:

@@ -1,0 +1,332 @@
+"""Solids from fields: fits and closed meshes joined, offset and hollowed, as watertight meshes."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ...neural_fields import (
+    Difference,
+    Field,
+    InputError,
+    Intersection,
+    Offset,
+    Shell,
+    Similarity,
+    Union,
+    WorldField,
+    in_one_frame,
+    save_field,
+)
+from ...neural_fields.meshing import Mesh, NoSurfaceError, extract_mesh
+from ...neural_fields.placement import METRES, Placement
+from ..run.folder import chosen_level, find_field, is_field, load_still
+from ..surface.solid import MeshField
+from ..surface.surface import Surface, from_mesh, is_closed, read_surface
+from ..surface.trim import Support, drop_unsupported, read_support
+from .files import check_mesh_path, write_mesh
+
+__all__ = ["OPERATIONS", "Made", "SolidOptions", "boolean", "length_in", "offset"]
+
+FIELD_SUFFIX = ".safetensors"
+OPERATIONS: dict[str, type[Union | Intersection | Difference]] = {
+    "union": Union,
+    "intersection": Intersection,
+    "difference": Difference,
+}
+# Vertices at which the distance to the original is measured.
+MEASURED = 5000
+LENGTH = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([a-z]*)")
+
+
+@dataclass(frozen=True)
+class SolidOptions:
+    """How to make a solid.
+
+    Attributes:
+        resolution: cells along each side of the cube around all operands.
+        time: the moment, for operands that move.
+        level: counted from 0, the coarsest; None is the finest. Operands with fewer levels stay at their finest.
+        keep_unsupported: whether to keep components that no input points of the runs support.
+        up: see `Placement`, as for the next two.
+        unit: the length of one input unit, which lengths with a unit are measured in.
+        center: whether the middle of the mesh goes to the origin.
+    """
+
+    resolution: int = 256
+    time: float | None = None
+    level: int | None = None
+    keep_unsupported: bool = False
+    up: str | None = None
+    unit: str | None = None
+    center: bool = False
+
+    @property
+    def placement(self) -> Placement:
+        """What is known of the input's coordinates.
+
+        Raises:
+            InputError: there is no such axis or unit.
+        """
+        try:
+            return Placement(self.up, self.unit, self.center)
+        except ValueError as error:
+            raise InputError(f"--{error}") from error
+
+
+@dataclass(frozen=True)
+class Made:
+    """What was made.
+
+    Attributes:
+        mesh: in input coordinates.
+        closed: whether it is watertight.
+        volume: what it encloses, in cubic input units.
+        distances: the least and the greatest distance of its vertices from the original, negative inside, for an offset;
+            None for a boolean.
+    """
+
+    mesh: Mesh
+    closed: bool
+    volume: float
+    distances: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True)
+class Operand:
+    """A fit or a mesh.
+
+    Attributes:
+        name: what the user called it.
+        shape: its field, and where it is.
+        support: the points that a run rests on, in the coordinates of its field; None where all of it is trusted.
+    """
+
+    name: str
+    shape: WorldField
+    support: Support | None
+
+
+def length_in(text: str, unit: str | None, flag: str) -> float:
+    """A length in input units.
+
+    Args:
+        text: a number of input units, or a number and a unit: "2mm".
+        unit: the length of one input unit, a key of `METRES`, if it is known.
+        flag: what messages call the length.
+
+    Raises:
+        InputError: it is no length, or the length of an input unit would have to be known.
+
+    Example:
+        >>> length_in("2mm", "cm", "--by"), length_in("-0.5", None, "--by")
+        (0.2, -0.5)
+    """
+    found = LENGTH.fullmatch(text.strip())
+    if not found or (found[2] and found[2] not in METRES) or not math.isfinite(float(found[1])):
+        raise InputError(f"{flag} {text}: expected a number of input units, or one with a unit ({', '.join(METRES)})")
+    if not found[2]:
+        return float(found[1])
+    if unit is None:
+        raise InputError(f"{flag} {text}: how long is a unit of the input? say so with --unit ({', '.join(METRES)})")
+    if unit not in METRES:
+        raise InputError(f"--unit {unit}: expected one of {', '.join(METRES)}")
+    return float(found[1]) * METRES[found[2]] / METRES[unit]
+
+
+def boolean(
+    parts: Sequence[str | Path],
+    operation: str,
+    out: str | Path,
+    options: SolidOptions | None = None,
+    *,
+    smooth: str = "0",
+    say: Callable[[str], None] | None = None,
+) -> Made:
+    """Join runs, checkpoints and closed meshes that lie in the same input coordinates.
+
+    Args:
+        parts: two or more; of a difference the others are taken from the first.
+        operation: a key of `OPERATIONS`.
+        out: a mesh file; or a .safetensors file for the field itself, where no part is a mesh.
+        options: how.
+        smooth: width of the blend, see `length_in` and `Union`.
+        say: called with a line about what was removed, if anything was.
+
+    Returns:
+        The mesh, also where the field was written.
+
+    Raises:
+        InputError: a part cannot be read or is not closed, nothing is left, or the file cannot be written.
+    """
+    options = options or SolidOptions()
+    width = length_in(smooth, options.unit, "--smooth")
+    if width < 0:
+        raise InputError(f"--smooth {smooth}: expected a length ≥ 0")
+    if len(parts) < 2:
+        raise InputError(f"{parts[0] if parts else 'boolean'}: expected two runs or meshes at least")
+    out = Path(out)
+    as_field = out.suffix.lower() == FIELD_SUFFIX
+    check_mesh_path(out.with_suffix(".ply") if as_field else out)
+    operands = [_read(part, options) for part in parts]
+    meshes = [operand.name for operand in operands if isinstance(operand.shape.field, MeshField)]
+    if as_field and meshes:
+        raise InputError(f"{out}: {meshes[0]} is a mesh, which a {FIELD_SUFFIX} file cannot hold; write a mesh instead")
+    fields, frame = in_one_frame([operand.shape for operand in operands])
+    field = OPERATIONS[operation](*fields, smooth=width / frame.scale)
+    if not as_field:
+        check_mesh_path(out, frame, centered=options.center)
+    what = f"{operation} of {' and '.join(operand.name for operand in operands)}"
+    mesh = _extracted(field, options, what)
+    if not options.keep_unsupported:
+        mesh = _supported(mesh, operands, fields, frame, say)
+    if as_field:
+        save_field(out, field, similarity=frame)
+        return _made(mesh, frame)
+    return _written(out, mesh, frame, options, say)
+
+
+def offset(
+    part: str | Path,
+    by: str,
+    out: str | Path,
+    options: SolidOptions | None = None,
+    *,
+    shell: bool = False,
+    say: Callable[[str], None] | None = None,
+) -> Made:
+    """Grow or shrink a run or a closed mesh by a length, or keep the wall between it and that.
+
+    The distance is that to the mesh of the finest level, not what the field says so far from its surface: a
+    `MultiscaleSDF` is its coarsest level there.
+
+    Args:
+        part: a run, a checkpoint or a closed mesh.
+        by: how far, outwards; negative is inwards. See `length_in`.
+        out: the mesh file.
+        options: how.
+        shell: whether to keep only what lies between the surface and where it went.
+        say: called with a line about what was removed, if anything was.
+
+    Raises:
+        InputError: the part cannot be read or is not closed, nothing is left, or the file cannot be written.
+    """
+    options = options or SolidOptions()
+    length = length_in(by, options.unit, "--by")
+    if length == 0:
+        raise InputError(f"--by {by}: expected a length other than 0")
+    check_mesh_path(out)
+    operand = _read(part, options)
+    shape = _measured(operand, options, say)
+    fields, frame = in_one_frame([shape], margin=max(length, 0.0))
+    check_mesh_path(out, frame, centered=options.center)
+    reach = length / frame.scale
+    field = Shell(*fields, inside=max(-reach, 0.0), outside=max(reach, 0.0)) if shell else Offset(*fields, by=reach)
+    mesh = _extracted(field, options, f"{operand.name} by {by}", level=0)
+    made = _written(out, mesh, frame, options, say)
+    rows = np.random.default_rng(0).permutation(len(made.mesh.vertices))[:MEASURED]
+    exact = shape.field
+    assert isinstance(exact, MeshField)
+    away = exact.distance.signed(shape.similarity.to_unit(made.mesh.vertices[rows])) * shape.similarity.scale
+    return dataclasses.replace(made, distances=(float(away.min()), float(away.max())))
+
+
+def _read(part: str | Path, options: SolidOptions) -> Operand:
+    """A run, a checkpoint or a closed mesh."""
+    name = str(part)
+    if is_field(part):
+        file = find_field(part)
+        field, similarity, metadata = load_still(file, options.time)
+        level = chosen_level(field, file, options.level)
+        support = None
+        if not options.keep_unsupported and options.time is None:
+            support = read_support(file, metadata.get("run", {}), level)
+        return Operand(name, WorldField(field, similarity), support)
+    surface = read_surface(part)
+    if not len(surface.faces):
+        raise InputError(f"{part}: a cloud has no inside; fit it first (mplicits fit {part} -o RUN)")
+    if not is_closed(surface):
+        raise InputError(f"{part}: is not closed, so that it has no inside; fit it first (mplicits fit {part} -o RUN)")
+    return Operand(name, _as_solid(surface, Similarity.to_unit_sphere(surface.used_vertices()), name), None)
+
+
+def _as_solid(surface: Surface, similarity: Similarity, name: str) -> WorldField:
+    try:
+        return WorldField(MeshField(surface.moved(similarity)), similarity)
+    except ValueError as error:
+        raise InputError(f"{name}: {str(error).removeprefix('surface: ')}") from error
+
+
+def _measured(operand: Operand, options: SolidOptions, say: Callable[[str], None] | None) -> WorldField:
+    """The exact distance to the surface of an operand, in its own frame."""
+    if isinstance(operand.shape.field, MeshField):
+        return operand.shape
+    mesh = _extracted(operand.shape.field, options, operand.name)
+    mesh = _supported(mesh, [operand], [operand.shape.field], operand.shape.similarity, say)
+    similarity = operand.shape.similarity
+    return _as_solid(dataclasses.replace(from_mesh(mesh), vertices=similarity.to_input(mesh.vertices)), similarity, operand.name)
+
+
+def _extracted(field: Field, options: SolidOptions, what: str, level: int | None = None) -> Mesh:
+    """The mesh of a level, in the coordinates of the field."""
+    level = options.level if level is None else level
+    level = field.num_levels - 1 if level is None else min(level, field.num_levels - 1)
+    try:
+        return extract_mesh(field, resolution=options.resolution, level=level)
+    except NoSurfaceError as error:
+        raise InputError(f"{what}: nothing is left ({error})") from error
+
+
+def _supported(
+    mesh: Mesh, operands: Sequence[Operand], fields: Sequence[Field], frame: Similarity, say: Callable[[str], None] | None
+) -> Mesh:
+    """The mesh without the blobs of runs; what is on the surface of an operand without support rests on that."""
+    points: list[NDArray[np.float64]] = []
+    radius = 0.0
+    for operand in operands:
+        if operand.support is not None:
+            unit = operand.shape.similarity
+            points.append(frame.to_unit(unit.to_input(operand.support.points)))
+            radius = max(radius, operand.support.radius * unit.scale / frame.scale)
+    if not points:
+        return mesh
+    away = np.stack([_distances(field, mesh.vertices) for field in fields])
+    trusted = np.array([operand.support is None for operand in operands])
+    points.append(mesh.vertices[trusted[away.argmin(axis=0)]])
+    left = drop_unsupported(mesh, np.concatenate(points), radius=radius)
+    if left.dropped and say is not None:
+        parts = f"{left.dropped:,} component{'s' * (left.dropped > 1)}"
+        say(f"removed {parts} that no points support ({left.area:.2g} of the area); --keep-unsupported keeps them")
+    return left.mesh
+
+
+@torch.no_grad()
+def _distances(field: Field, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    rows = torch.from_numpy(points).to(field.like)
+    return torch.cat([field.value(part).abs().double() for part in rows.split(1 << 18)]).numpy()
+
+
+def _made(mesh: Mesh, frame: Similarity) -> Made:
+    """The mesh in input coordinates, and what is said about it."""
+    vertices = frame.to_input(mesh.vertices)
+    corners = (vertices - np.asarray(frame.center))[mesh.faces]
+    volume = float((corners[:, 0] * np.cross(corners[:, 1], corners[:, 2])).sum() / 6)
+    return Made(dataclasses.replace(mesh, vertices=vertices), is_closed(from_mesh(mesh)), volume)
+
+
+def _written(
+    out: str | Path, mesh: Mesh, frame: Similarity, options: SolidOptions, say: Callable[[str], None] | None
+) -> Made:
+    line = options.placement.describe(Path(out).suffix)
+    if line is not None and say is not None:
+        say(f"coordinates: {line}")
+    write_mesh(out, mesh, frame, options.placement)
+    return _made(mesh, frame)
