@@ -58,9 +58,7 @@ def _boolean(arguments: argparse.Namespace) -> int:
 
     started = time.monotonic()
     options = SolidOptions(**given_flags(arguments, SolidOptions))
-    made = boolean(
-        arguments.parts, arguments.operation, arguments.out, options, smooth=arguments.smooth, say=print
-    )
+    made = boolean(arguments.parts, arguments.operation, arguments.out, options, smooth=arguments.smooth, say=print)
     _report(arguments, made, started)
     return 0
 
@@ -95,7 +93,10 @@ def _offset(arguments: argparse.Namespace) -> int:
     _report(arguments, made, started)
     if made.distances is not None:
         low, high = made.distances
-        print(f"its vertices lie {low:.6g} to {high:.6g} from the surface of {arguments.run} (input units, negative inside)")
+        print(
+            f"its vertices lie {low:.6g} to {high:.6g} from the surface of {arguments.run} "
+            "(input units, negative inside)"
+        )
     return 0
 
 
@@ -106,5 +107,5 @@ OFFSET = Command(
   mplicits offset part.stl --by -2mm --shell --unit mm -o hollow.stl""",
     _offset_arguments,
     _offset,
-    "Grow or shrink a fit or a closed mesh by a length, measured from its surface, or hollow it; writes a watertight mesh.",
+    "Grow or shrink a fit or a closed mesh by a length measured from its surface, or hollow it: a watertight mesh.",
 )

@@ -26,7 +26,7 @@ from ...neural_fields import (
     in_one_frame,
     save_field,
 )
-from ...neural_fields.meshing import Mesh, NoSurfaceError, extract_mesh
+from ...neural_fields.meshing import DEFAULT_BOUNDS, Mesh, NoSurfaceError, extract_mesh
 from ...neural_fields.placement import METRES, Placement
 from ..run.folder import chosen_level, find_field, is_field, load_still
 from ..surface.solid import MeshField
@@ -42,6 +42,8 @@ OPERATIONS: dict[str, type[Union | Intersection | Difference]] = {
     "intersection": Intersection,
     "difference": Difference,
 }
+# Fewest cells across a wall: with less than a cell's diagonal, holes open where no corner lies in it.
+CELLS_IN_WALL = 2
 # Vertices at which the distance to the original is measured.
 MEASURED = 5000
 LENGTH = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([a-z]*)")
@@ -90,8 +92,8 @@ class Made:
         mesh: in input coordinates.
         closed: whether it is watertight.
         volume: what it encloses, in cubic input units.
-        distances: the least and the greatest distance of its vertices from the original, negative inside, for an offset;
-            None for a boolean.
+        distances: for an offset, the least and the greatest distance of its vertices from the original, negative
+            inside; None for a boolean.
     """
 
     mesh: Mesh
@@ -217,7 +219,8 @@ def offset(
         say: called with a line about what was removed, if anything was.
 
     Raises:
-        InputError: the part cannot be read or is not closed, nothing is left, or the file cannot be written.
+        InputError: the part cannot be read or is not closed, nothing is left, a wall is thinner than two cells, or the
+            file cannot be written.
     """
     options = options or SolidOptions()
     length = length_in(by, options.unit, "--by")
@@ -225,6 +228,14 @@ def offset(
         raise InputError(f"--by {by}: expected a length other than 0")
     check_mesh_path(out)
     operand = _read(part, options)
+    size = operand.shape.similarity.scale + max(length, 0.0)
+    low, high = (corner[0] * size for corner in DEFAULT_BOUNDS)
+    cells = abs(length) * options.resolution / (high - low)
+    if shell and cells < CELLS_IN_WALL:
+        enough = math.ceil(CELLS_IN_WALL * (high - low) / abs(length))
+        raise InputError(
+            f"--by {by}: a wall of {cells:.2f} cells, too few to be closed; take --resolution {enough} or more"
+        )
     shape = _measured(operand, options, say)
     fields, frame = in_one_frame([shape], margin=max(length, 0.0))
     check_mesh_path(out, frame, centered=options.center)
@@ -272,7 +283,9 @@ def _measured(operand: Operand, options: SolidOptions, say: Callable[[str], None
     mesh = _extracted(operand.shape.field, options, operand.name)
     mesh = _supported(mesh, [operand], [operand.shape.field], operand.shape.similarity, say)
     similarity = operand.shape.similarity
-    return _as_solid(dataclasses.replace(from_mesh(mesh), vertices=similarity.to_input(mesh.vertices)), similarity, operand.name)
+    return _as_solid(
+        dataclasses.replace(from_mesh(mesh), vertices=similarity.to_input(mesh.vertices)), similarity, operand.name
+    )
 
 
 def _extracted(field: Field, options: SolidOptions, what: str, level: int | None = None) -> Mesh:
@@ -286,7 +299,11 @@ def _extracted(field: Field, options: SolidOptions, what: str, level: int | None
 
 
 def _supported(
-    mesh: Mesh, operands: Sequence[Operand], fields: Sequence[Field], frame: Similarity, say: Callable[[str], None] | None
+    mesh: Mesh,
+    operands: Sequence[Operand],
+    fields: Sequence[Field],
+    frame: Similarity,
+    say: Callable[[str], None] | None,
 ) -> Mesh:
     """The mesh without the blobs of runs; what is on the surface of an operand without support rests on that."""
     points: list[NDArray[np.float64]] = []

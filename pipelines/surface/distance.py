@@ -46,6 +46,7 @@ class MeshDistance:
         self.pseudo_normals = _pseudo_normals(whole, normals, self.corners)
         centers, self.owner, self.radius = _pieces(self.corners, float(areas.sum()))
         self.tree = KDTree(centers, balanced_tree=False)
+        self.rounding = 64 * float(np.finfo(np.float64).eps) * float(np.abs(self.corners).max())
 
     def signed(self, points: Float64) -> Float64:
         """Distances ``(M,)`` of points ``(M, 3)``."""
@@ -93,7 +94,8 @@ class MeshDistance:
         outward, away = self.pseudo_normals[faces[row, best], feature], offset[row, best]
         signed = np.where((away * outward).sum(axis=1) < 0, -distance[row, best], distance[row, best])
         outward = outward / np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-300)
-        there = (signed == 0)[:, None]
+        # A way as short as its rounding leads nowhere.
+        there = (np.abs(signed) <= self.rounding)[:, None]
         return signed, np.where(there, outward, away / np.where(there, 1.0, signed[:, None]))
 
 
