@@ -319,8 +319,8 @@ def _placed(shape: WorldField, frame: Similarity) -> Field:
     if shape.similarity == frame:
         return shape.field
     x, y, z = (float(c) for c in frame.to_unit(shape.similarity.center))
-    learned = next(shape.field.parameters(), None) is not None
-    field = Bounded(shape.field) if learned else shape.field
+    field, learned = shape.field, next(shape.field.parameters(), None) is not None
+    field = Bounded(field) if learned and not isinstance(field, Bounded) else field
     return Placed(field, Similarity((x, y, z), shape.similarity.scale / frame.scale))
 
 

@@ -59,6 +59,9 @@ SMALLEST = {  # by what a line begins with, or holds
     "mplicits animate *.mp4*": "--size 24 --samples 1",
     "mplicits animate *.png*": "--size 24 --samples 1",
     "mplicits evaluate *": "--samples 500",
+    "mplicits boolean *": "--resolution 24",
+    "mplicits offset *": "--resolution 24",
+    "mplicits offset * --shell *": "--by -0.25",  # more than two of these cells
     "mplicits scene *": "--views 3 --size 16 --samples 1",
     "mplicits bench reconstruct *": f"{RECONSTRUCT} --views 4 --size 16 --test-every 2 --test-views 1 --no-equal-time"
     " --resolution 16 --eval-samples 500",

@@ -14,6 +14,7 @@ import torch
 from numpy.typing import NDArray
 
 from ...neural_fields import (
+    Bounded,
     Difference,
     Field,
     InputError,
@@ -26,7 +27,7 @@ from ...neural_fields import (
     in_one_frame,
     save_field,
 )
-from ...neural_fields.meshing import DEFAULT_BOUNDS, Mesh, NoSurfaceError, extract_mesh
+from ...neural_fields.meshing import Mesh, NoSurfaceError, extract_mesh
 from ...neural_fields.placement import METRES, Placement
 from ..run.folder import chosen_level, find_field, is_field, load_still
 from ..surface.solid import MeshField
@@ -42,6 +43,8 @@ OPERATIONS: dict[str, type[Union | Intersection | Difference]] = {
     "intersection": Intersection,
     "difference": Difference,
 }
+# Half a side of the box around all: what was learned ends, closed, on the sphere of `Bounded`, 1.05 scales in radius.
+HALF_BOX = 1.07
 # Fewest cells across a wall: with less than a cell's diagonal, holes open where no corner lies in it.
 CELLS_IN_WALL = 2
 # Vertices at which the distance to the original is measured.
@@ -229,10 +232,9 @@ def offset(
     check_mesh_path(out)
     operand = _read(part, options)
     size = operand.shape.similarity.scale + max(length, 0.0)
-    low, high = (corner[0] * size for corner in DEFAULT_BOUNDS)
-    cells = abs(length) * options.resolution / (high - low)
+    cells = abs(length) * options.resolution / (2 * HALF_BOX * size)
     if shell and cells < CELLS_IN_WALL:
-        enough = math.ceil(CELLS_IN_WALL * (high - low) / abs(length))
+        enough = math.ceil(CELLS_IN_WALL * 2 * HALF_BOX * size / abs(length))
         raise InputError(
             f"--by {by}: a wall of {cells:.2f} cells, too few to be closed; take --resolution {enough} or more"
         )
@@ -260,7 +262,8 @@ def _read(part: str | Path, options: SolidOptions) -> Operand:
         support = None
         if not options.keep_unsupported and options.time is None:
             support = read_support(file, metadata.get("run", {}), level)
-        return Operand(name, WorldField(field, similarity), support)
+        learned = next(field.parameters(), None) is not None
+        return Operand(name, WorldField(Bounded(field) if learned else field, similarity), support)
     surface = read_surface(part)
     if not len(surface.faces):
         raise InputError(f"{part}: a cloud has no inside; fit it first (mplicits fit {part} -o RUN)")
@@ -293,7 +296,8 @@ def _extracted(field: Field, options: SolidOptions, what: str, level: int | None
     level = options.level if level is None else level
     level = field.num_levels - 1 if level is None else min(level, field.num_levels - 1)
     try:
-        return extract_mesh(field, resolution=options.resolution, level=level)
+        box = ((-HALF_BOX, -HALF_BOX, -HALF_BOX), (HALF_BOX, HALF_BOX, HALF_BOX))
+        return extract_mesh(field, resolution=options.resolution, level=level, bounds=box)
     except NoSurfaceError as error:
         raise InputError(f"{what}: nothing is left ({error})") from error
 

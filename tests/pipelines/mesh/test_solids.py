@@ -58,8 +58,8 @@ def test_two_balls(balls: Path, operation: str, exact: float) -> None:
     assert cli.main(words.split()) == 0
     mesh = trimesh.load_mesh("out.ply")
     assert mesh.is_watertight
-    # Of the frame around both: cells of 2.04 · 68 / 64; see test_algebra.test_volumes_of_two_balls.
-    step = 2.04 * 0.5 * (2 * (RADIUS + OTHER) / 1.6 + APART) / RESOLUTION
+    # Of the frame around both: cells of 2.14 scales / resolution; see test_algebra.test_volumes_of_two_balls.
+    step = 2.14 * 0.5 * (2 * (RADIUS + OTHER) / 1.6 + APART) / RESOLUTION
     near = (APART**2 + RADIUS**2 - OTHER**2) / (2 * APART)
     rim = 2 * math.pi * math.sqrt(RADIUS**2 - near**2)
     allowed = 4 * math.pi * (RADIUS**2 + OTHER**2) * 3 * step**2 / (8 * OTHER) + 3 * rim * step**2
@@ -98,7 +98,7 @@ def test_a_ball_is_grown_and_shrunk(
     assert mesh.is_watertight
     expected = RADIUS - 2 if by.startswith("-") else RADIUS + 2
     # The distance is that to a mesh, which is nearer to the centre by up to the chord of a cell: 3 h² / (8 r).
-    step = 2.04 * (RADIUS / 0.8) / RESOLUTION
+    step = 2.14 * (RADIUS / 0.8) / RESOLUTION
     chord = 3 * step**2 / (8 * RADIUS)
     radii = np.linalg.norm(mesh.vertices - AT, axis=1)
     assert expected - 2 * chord < radii.min()
@@ -115,7 +115,7 @@ def test_a_hollow_ball(balls: Path, by: str, inner: float, outer: float) -> None
     mesh = trimesh.load_mesh("out.stl")
     assert mesh.is_watertight
     assert mesh.body_count == 2  # the wall's two sides
-    step = 2.04 * (RADIUS / 0.8 + 5) / 40
+    step = 2.14 * (RADIUS / 0.8 + 5) / 40
     exact = 4 / 3 * math.pi * (outer**3 - inner**3)
     assert abs(mesh.volume - exact) < 2 * 4 * math.pi * (outer**2 + inner**2) * 3 * step**2 / (8 * inner)
 
@@ -162,8 +162,8 @@ def test_lengths(text: str, unit: str | None, expected: float) -> None:
         ("offset a.safetensors --by 2parsec -o o.stl", "--by 2parsec: expected a number of input units"),
         ("offset a.safetensors --by 0 -o o.stl", "--by 0: expected a length other than 0"),
         ("offset a.safetensors --by -40 -o o.stl --resolution 16", "nothing is left"),
-        ("offset a.safetensors --by 2 --shell -o o.stl --resolution 40", "of 0.99 cells, too few to be closed; "),
-        ("offset a.safetensors --by -2 --shell -o o.stl --resolution 40", "--resolution 77 or more"),
+        ("offset a.safetensors --by 2 --shell -o o.stl --resolution 40", "of 0.95 cells, too few to be closed; "),
+        ("offset a.safetensors --by -2 --shell -o o.stl --resolution 40", "--resolution 81 or more"),
         ("offset a.safetensors --by 2 --time 0.5 -o o.stl", "does not move"),
     ],
 )
