@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import time
 
 from ..run.config import given_flags
-from .common import Command, add_flags, positive, whole
+from .common import Command, add_flags, positive, whole, write_json
 
 __all__ = ["EVALUATE", "MESH"]
 
@@ -25,6 +26,8 @@ def _mesh_arguments(parser: argparse.ArgumentParser) -> None:
     what = "unwrap, and bake colours and fine normals into N × N images (.glb, .obj; needs mplicits[texture])"
     add("--texture", type=whole(16, 16384), metavar="N", help=what)
     add("--texture-faces", type=whole(4), metavar="N", help="triangles to keep with --texture (50000)")
+    what = "about how many triangles to keep, with the distance to the full mesh stated (needs mplicits[texture])"
+    add("--faces", type=whole(4), metavar="N", help=what)
     add("--keep-unsupported", action="store_true", help="keep components that no input points support, too")
     add("--keep-largest", action="store_true", help="keep only the component of largest area")
     what = "drop faces further than D (input units) from the points: holes stay holes"
@@ -35,16 +38,26 @@ def _mesh_arguments(parser: argparse.ArgumentParser) -> None:
     what = "of the input: a GLB is in metres (default: m), others are scaled (STL to mm, else to m) if this is given"
     add("--unit", choices=UNITS, help=what)
     add("--center", action="store_true", help="put the middle of the mesh at the origin")
+    what = "look at it as a printer would: closed, parts, volume, thinnest part, overhang (default: for .stl)"
+    add("--report", action=argparse.BooleanOptionalAction, help=what)
+    add_flags(parser, "--json", help="write the figures as JSON (implies --report)")
 
 
 def _mesh(arguments: argparse.Namespace) -> int:
-    from ..mesh.extract import MeshOptions, mesh_run
+    from ..mesh.extract import MeshOptions, export_run
+    from ..mesh.printing import format_report
 
     started = time.monotonic()
     options = MeshOptions(**given_flags(arguments, MeshOptions))
-    mesh = mesh_run(arguments.run, arguments.out, options, say=print)
+    if arguments.json and options.report is None and options.texture is None:
+        options = dataclasses.replace(options, report=True)
+    done = export_run(arguments.run, arguments.out, options, say=print)
     seconds = time.monotonic() - started
-    print(f"{arguments.out}: {len(mesh.vertices):,} vertices, {len(mesh.faces):,} faces, in {seconds:.1f} s")
+    counts = f"{len(done.mesh.vertices):,} vertices, {len(done.mesh.faces):,} faces"
+    print(f"{arguments.out}: {counts}, in {seconds:.1f} s")
+    if done.printing is not None:
+        print(format_report(done.printing))
+    write_json(arguments.json, done.record())
     return 0
 
 
@@ -53,7 +66,9 @@ MESH = Command(
     """  mplicits mesh runs/scan -o scan.ply --resolution 512
   mplicits mesh runs/scan -o coarse.obj --level 0
   mplicits mesh runs/scan -o scan.glb --keep-largest --trim-distance 0.01
-  mplicits mesh runs/scan -o scan.glb --up z --unit mm --center""",
+  mplicits mesh runs/scan -o scan.glb --up z --unit mm --center
+  mplicits mesh runs/scan -o small.ply --faces 20000
+  mplicits mesh runs/scan -o scan.stl --up z --unit mm --json print.json""",
     _mesh_arguments,
     _mesh,
     "Extract a mesh from a fit, in the coordinates of its input; or upright, in metres and at the origin.",

@@ -7,21 +7,26 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from ...datasets import read_cloud
+from ...datasets.clouds.meshes import vertex_normals
+from ...datasets.clouds.point_cloud import unit_rows
 from ...neural_fields import Field, InputError, Placement, Similarity, map_attribute
 from ...neural_fields.meshing import Mesh, NoSurfaceError, extract_mesh, map_normals
 from ..run.folder import chosen_level, find_field, fitted_cloud, load_still
 from ..surface.trim import Support, drop_unsupported, in_region, keep_largest, read_support, trim_distance
 from ..texture.riding import Colors, colors_of_run
 from .bake import check_texture_size, textured_mesh
+from .decimation import Decimation, check_decimation_tool, decimated
 from .files import check_mesh_path, check_textured_path, write_mesh
+from .printing import PrintReport, print_report
 
-__all__ = ["MeshOptions", "mesh_run", "normals_near"]
+__all__ = ["Exported", "MeshOptions", "export_run", "mesh_run", "normals_near"]
 
 
 @dataclass(frozen=True)
@@ -37,6 +42,8 @@ class MeshOptions:
         texture: unwrap the mesh and bake colours and the normals of the finest level into images of so many texels
             along each side (.glb or .obj); None leaves the colours at the vertices.
         texture_faces: triangles to keep of a mesh that is unwrapped.
+        faces: triangles to keep of one that is not; None keeps all.
+        report: whether to look at the mesh as a printer would; None does so for STL.
         keep_unsupported: whether to keep components that no input points support.
         keep_largest: whether to keep only the component of largest area.
         trim_distance: drop faces further than this from the points, in input units.
@@ -53,6 +60,8 @@ class MeshOptions:
     colors: bool = True
     texture: int | None = None
     texture_faces: int = 50_000
+    faces: int | None = None
+    report: bool | None = None
     keep_unsupported: bool = False
     keep_largest: bool = False
     trim_distance: float | None = None
@@ -74,23 +83,51 @@ class MeshOptions:
             raise InputError(f"--{error}") from error
 
 
+class Exported(NamedTuple):
+    """A mesh that was written, and what is known of it.
+
+    Attributes:
+        mesh: as written, but in unit-sphere coordinates.
+        decimation: what leaving out triangles has cost, in input units; None where none were left out.
+        printing: what a printer asks; None where it was not asked.
+    """
+
+    mesh: Mesh
+    decimation: Decimation | None = None
+    printing: PrintReport | None = None
+
+    def record(self) -> dict[str, Any]:
+        """The figures, for JSON."""
+        parts = {"decimation": self.decimation, "printing": self.printing}
+        counts = {"vertices": len(self.mesh.vertices), "faces": len(self.mesh.faces)}
+        return counts | {name: None if part is None else dataclasses.asdict(part) for name, part in parts.items()}
+
+
 def mesh_run(
     run: str | Path, out: str | Path, options: MeshOptions | None = None, *, say: Callable[[str], None] | None = None
 ) -> Mesh:
+    """The mesh that `export_run` writes, in unit-sphere coordinates; arguments and errors are the same."""
+    return export_run(run, out, options, say=say).mesh
+
+
+def export_run(
+    run: str | Path, out: str | Path, options: MeshOptions | None = None, *, say: Callable[[str], None] | None = None
+) -> Exported:
     """Extract the surface of a run and write it in the coordinates of its input, or as `Placement` says.
 
     Args:
         run: run directory or .safetensors file.
         out: the mesh file.
         options: how.
-        say: called with a line about what was removed, if anything was, and with one about the coordinates of the file
-            where they are not just those of the input.
+        say: called with a line about what was removed, if anything was, with one about the coordinates of the file
+            where they are not just those of the input, and with one about triangles left out.
 
     Returns:
-        The mesh as written, but in unit-sphere coordinates.
+        The mesh, and what was asked about it.
 
     Raises:
-        InputError: there is no such run or level, it has no surface, or the file cannot be written.
+        InputError: there is no such run or level, it has no surface, the file cannot be written, or an option does not
+            go with another.
     """
     options = options or MeshOptions()
     check = check_mesh_path if options.texture is None else check_textured_path
@@ -98,6 +135,11 @@ def mesh_run(
     placement = options.placement
     if options.texture is not None:
         check_texture_size(options.texture)
+        if options.faces is not None or options.report:
+            given = "--faces" if options.faces is not None else "--report"
+            raise InputError(f"{given}: goes with a mesh without --texture; --texture-faces says how many it keeps")
+    if options.faces is not None:
+        check_decimation_tool()
     file = find_field(run)
     field, similarity, metadata = load_still(file, options.time)
     check(out, similarity, centered=placement.center)  # again: not every format can hold every place
@@ -126,17 +168,27 @@ def mesh_run(
         mesh = trim_distance(mesh, points, options.trim_distance / similarity.scale)
     if options.keep_largest:
         mesh = keep_largest(mesh)
+    decimation = None
+    if options.faces is not None:
+        mesh, cost = decimated(mesh, options.faces)
+        mesh = dataclasses.replace(mesh, normals=_unit_normals(field, mesh, level=normal_level))
+        decimation = cost.times(similarity.scale)
+        if say is not None:
+            say(decimation.describe(options.unit or "input units"))
     colors = colors_of_run(file, field, options.time) if options.colors else None
     line = placement.describe(Path(out).suffix)
     if line is not None and say is not None:
         say(f"coordinates: {line}")
     if options.texture is not None:
         _write_textured(out, mesh, field, colors, similarity, options, options.texture)
-        return mesh
+        return Exported(mesh)
     if colors is not None:
         mesh = dataclasses.replace(mesh, colors=_evaluated(colors, mesh.vertices))
     write_mesh(out, mesh, similarity, placement)
-    return mesh
+    suffix, printing = Path(out).suffix.lower(), None
+    if options.report or (options.report is None and suffix == ".stl"):
+        printing = print_report(mesh, field, similarity, placement, suffix, level=level)
+    return Exported(mesh, decimation, printing)
 
 
 def _supported(mesh: Mesh, support: Support, say: Callable[[str], None] | None) -> Mesh:
@@ -172,6 +224,14 @@ def normals_near(field: Field, points: NDArray[np.float64], *, level: int) -> ND
     rows = torch.from_numpy(points).float()
     mapped = map_attribute(field, lambda x: field.jet(x, level=level).gradient, rows, delta=delta, level=level)
     return mapped.values.numpy()
+
+
+def _unit_normals(field: Field, mesh: Mesh, *, level: int) -> NDArray[np.float32]:
+    """The field's normals at the vertices of a mesh near its surface; those of the faces where it has none."""
+    normals = normals_near(field, mesh.vertices, level=level)
+    lost = ~normals.any(axis=1)
+    normals[lost] = vertex_normals(mesh.vertices, mesh.faces.astype(np.int64))[lost]
+    return unit_rows(normals).astype(np.float32)
 
 
 def _write_textured(

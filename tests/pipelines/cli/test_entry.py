@@ -249,6 +249,46 @@ def test_a_glb_is_in_metres_and_at_the_origin_and_says_what_it_took_for_granted(
     np.testing.assert_allclose(read_surface(placed).vertices, read_surface(plain).vertices, atol=1e-5)
 
 
+def test_a_mesh_with_fewer_triangles_says_how_far_it_is_from_the_full_one(capsys, run, tmp_path):
+    pytest.importorskip("fast_simplification", reason="the extra mplicits[texture] is not installed")
+    out, figures = tmp_path / "small.ply", tmp_path / "small.json"
+    flags = ["--resolution", "48", "--faces", "500", "--unit", "cm", "--json", str(figures)]
+    assert main(["mesh", str(run), "-o", str(out), *flags]) == 0
+    text = capsys.readouterr().out
+    cost = json.loads(figures.read_text())["decimation"]
+    assert cost["faces"] == len(trimesh.load_mesh(out).faces) <= 500
+    assert f"{cost['faces_before']:,} → {cost['faces']:,} faces, at most {cost['largest']:.3g} cm" in text
+    assert 0 < cost["mean"] < cost["largest"] < 1  # of a ball of radius 3
+    assert "still watertight" in text
+    normals = np.stack(
+        [trimesh.load_mesh(out, process=False).metadata["_ply_raw"]["vertex"]["data"][n] for n in ("nx", "ny", "nz")]
+    )
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=0), 1, atol=1e-6)
+    assert "--texture-faces" in fails(
+        capsys, "mesh", run, "-o", tmp_path / "a.glb", "--texture", "64", "--faces", "500"
+    )
+    assert "--texture" in fails(capsys, "mesh", run, "-o", tmp_path / "a.glb", "--texture", "64", "--report")
+
+
+def test_an_stl_comes_with_what_a_printer_asks(capsys, run, tmp_path):
+    out, figures = tmp_path / "print.stl", tmp_path / "print.json"
+    flags = ["--resolution", "48", "--keep-largest", "--up", "z", "--unit", "cm", "--center"]
+    assert main(["mesh", str(run), "-o", str(out), *flags, "--json", str(figures)]) == 0
+    text = capsys.readouterr().out
+    assert re.search(r"watertight +yes", text)
+    found = json.loads(figures.read_text())["printing"]
+    mesh = trimesh.load_mesh(out)  # in millimetres
+    assert found["unit"] == "mm"
+    assert found["shells"]["parts"] == 1
+    assert found["shells"]["volume"] == pytest.approx(mesh.volume, rel=1e-5)
+    np.testing.assert_allclose(found["size"], mesh.extents, rtol=1e-5)
+    assert found["thinnest"] == pytest.approx(60, rel=0.1)  # a ball of radius 3 cm, fitted in a moment
+    assert main(["mesh", str(run), "-o", str(out), "--resolution", "24", "--no-report"]) == 0
+    assert "watertight" not in capsys.readouterr().out
+    assert main(["mesh", str(run), "-o", str(tmp_path / "a.ply"), "--resolution", "24"]) == 0
+    assert "watertight" not in capsys.readouterr().out
+
+
 def test_levels_are_meshed_by_number(capsys, run, tmp_path):
     assert main(["mesh", str(run), "-o", str(tmp_path / "a.stl"), "--resolution", "32", "--level", "0"]) == 0
     assert "has levels 0 to 1" in fails(capsys, "mesh", run, "-o", tmp_path / "b.stl", "--level", "2")

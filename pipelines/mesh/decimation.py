@@ -1,0 +1,116 @@
+"""Fewer triangles, and how far they are from those before."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...neural_fields import InputError
+from ...neural_fields.meshing import Mesh
+from ..surface.distance import MeshDistance
+from ..surface.surface import Surface, is_closed
+from .atlas import decimate
+
+__all__ = ["Decimated", "Decimation", "check_decimation_tool", "decimated", "deviation"]
+
+Float64 = NDArray[np.float64]
+
+# Points at which each way is measured; more would take seconds and change little.
+MEASURED = 50_000
+
+
+@dataclass(frozen=True)
+class Decimation:
+    """What a decimation has cost, in the units of the mesh.
+
+    The distance from each mesh to the other is measured exactly: at the vertices of the full one, and at the vertices,
+    edge midpoints and face centres of the other, evenly thinned to `MEASURED` points each way.
+
+    Attributes:
+        faces_before: triangles of the full mesh.
+        faces: triangles that are left.
+        largest: greatest distance found, either way.
+        mean: of all distances, the mean of both ways.
+        closed_before: whether the full mesh was watertight.
+        closed: whether what is left is.
+    """
+
+    faces_before: int
+    faces: int
+    largest: float
+    mean: float
+    closed_before: bool
+    closed: bool
+
+    def times(self, scale: float) -> Decimation:
+        """The same in other units, of which one of these is ``scale``."""
+        return dataclasses.replace(self, largest=self.largest * scale, mean=self.mean * scale)
+
+    def describe(self, unit: str) -> str:
+        """One line, for people."""
+        line = f"{self.faces_before:,} → {self.faces:,} faces, at most {self.largest:.3g} {unit} from the full mesh"
+        line += f" (mean {self.mean:.2g})"
+        if self.closed_before:
+            return f"{line}; {'still watertight' if self.closed else 'NO LONGER WATERTIGHT: keep more faces'}"
+        return f"{line}; not watertight, as before"
+
+
+class Decimated(NamedTuple):
+    """A mesh with fewer triangles, without normals and colours, and what that has cost."""
+
+    mesh: Mesh
+    cost: Decimation
+
+
+def check_decimation_tool() -> None:
+    """Ask, before any long work, whether there is something to decimate with.
+
+    Raises:
+        InputError: the extra ``mplicits[texture]`` is not installed.
+    """
+    try:
+        import fast_simplification  # noqa: F401
+    except ImportError as error:
+        raise InputError(f"--faces needs {error.name}; pip install 'mplicits[texture]'") from error
+
+
+def decimated(mesh: Mesh, faces: int) -> Decimated:
+    """Collapse edges by their quadric error, and measure how far that has led.
+
+    Args:
+        mesh: in any coordinates; a mesh of no more triangles stays as it is.
+        faces: about how many triangles to keep.
+    """
+    full = Surface(mesh.vertices, mesh.faces.astype(np.int64))
+    closed = is_closed(full)
+    if len(mesh.faces) <= faces:
+        bare = dataclasses.replace(mesh, normals=None, colors=None)
+        return Decimated(bare, Decimation(len(mesh.faces), len(mesh.faces), 0.0, 0.0, closed, closed))
+    vertices, corners = decimate(mesh.vertices, mesh.faces, faces)
+    left = Surface(vertices, corners)
+    largest, mean = deviation(full, left)
+    cost = Decimation(len(mesh.faces), len(corners), largest, mean, closed, is_closed(left))
+    return Decimated(Mesh(vertices, corners.astype(np.int32)), cost)
+
+
+def deviation(full: Surface, left: Surface) -> tuple[float, float]:
+    """Largest and mean distance between two meshes, both ways; where it is measured says `Decimation`."""
+    there = np.abs(MeshDistance(left).signed(_thinned(full.used_vertices())))
+    back = np.abs(MeshDistance(full).signed(_thinned(_probes(left))))
+    return float(max(there.max(), back.max())), float(there.mean() + back.mean()) / 2
+
+
+def _probes(surface: Surface) -> Float64:
+    """Vertices, edge midpoints and face centres."""
+    corners = surface.vertices[surface.faces]  # (F, 3, 3)
+    ends = np.concatenate([surface.faces[:, [k, (k + 1) % 3]] for k in range(3)])
+    edges = np.unique(np.sort(ends, axis=1), axis=0)
+    return np.concatenate((surface.used_vertices(), surface.vertices[edges].mean(axis=1), corners.mean(axis=1)))
+
+
+def _thinned(points: Float64) -> Float64:
+    return points[:: -(-len(points) // MEASURED)]
