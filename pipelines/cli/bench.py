@@ -45,7 +45,7 @@ def _run(arguments: argparse.Namespace, benches: Sequence[Benchmark[Any]], *, ou
         folder = out or Path(stack.enter_context(tempfile.TemporaryDirectory()))
         make_folder(folder)
         try:
-            with progress_bars() as bars:
+            with progress_bars(whole=False) as bars:
                 ran = run_cells(
                     cells, folder, Catalogue(benches), device=benches[0].device, say=_say, progress=bars, tell=_say
                 )

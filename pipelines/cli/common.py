@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import shlex
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from ..run.config import add_config_flags, given_flags, input_error, load_config, preset_names, thing_of
 
 if TYPE_CHECKING:
-    from ..run.trainer import Report
+    from ..run.schedule import Schedule
 
 __all__ = [
     "Command",
@@ -29,6 +30,7 @@ __all__ = [
     "positive",
     "read_settings",
     "stoppable",
+    "tell_budget",
     "training",
     "typed",
     "were_given",
@@ -85,12 +87,19 @@ def stoppable(kept: str = "", *, at_any_time: bool = False) -> Iterator[None]:
 
 
 @contextmanager
-def training(kept: str = "", *, quiet: bool = False, at_any_time: bool = False) -> Iterator[Report | None]:
+def training(kept: str = "", *, quiet: bool = False, at_any_time: bool = False) -> Iterator[Schedule | None]:
     """`stoppable` work with progress bars; None if it is to be ``quiet``."""
     from ..run.progress import progress_bars
 
     with stoppable(kept, at_any_time=at_any_time), nullcontext() if quiet else progress_bars() as report:
         yield report
+
+
+def tell_budget(record: Mapping[str, Any], name: str = "") -> None:
+    """Warn, on stderr, of what a time budget has changed, as ``record``, a part of ``run.json``, has it."""
+    budget = record.get("budget", {})
+    for note in budget.get("notes", []):
+        print(f"warning: --time-budget {budget['seconds']:g}: {name}{note}", file=sys.stderr)
 
 
 # --- converters for argparse ---

@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..run.config import given_flags, input_error
+from ..run.config import given_flags, input_error, load_config
 from ..run.settings import FitConfig
 from .common import (
     Command,
@@ -18,6 +18,7 @@ from .common import (
     positive,
     read_settings,
     stoppable,
+    tell_budget,
     training,
     were_given,
     whole,
@@ -85,8 +86,8 @@ def _fit(arguments: argparse.Namespace) -> int:
 def _fit_one(arguments: argparse.Namespace, cloud: str, config: FitConfig | None) -> int:
     from ..fit.depth import fit_depth, trim_suggestion
     from ..fit.train import fit
-    from ..run.folder import TEXTURE_FILE, check_new_run, is_fitted
-    from ..run.machine import peak_memory
+    from ..run.folder import TEXTURE_FILE, check_new_run, is_fitted, read_record
+    from ..run.machine import choose_device, peak_memory, speed
     from .info import describe
 
     directory, depth = arguments.out, _depth_input(arguments, cloud)
@@ -98,14 +99,21 @@ def _fit_one(arguments: argparse.Namespace, cloud: str, config: FitConfig | None
     again = f"to continue: mplicits fit {cloud} -o {directory} --resume"
     if mesh is not None:
         again += f" --mesh {mesh.out}" + " --no-colors" * arguments.no_colors
-    texture = None
+    texture, made, said, started = None, None, list[str](), time.monotonic()
     with training(again, quiet=arguments.quiet) as report:
+        if mesh is not None and report is not None:
+            used = config or load_config(FitConfig, None, read_record(directory)["config"])
+            report.follow(mesh.stages(used, speed(choose_device(used.device))))
         if not fitted and depth is None:
             fit(cloud, config, out=directory, resume=arguments.resume, progress=report)
         elif not fitted and depth is not None:
             fit_depth(depth, config, out=directory, resume=arguments.resume, progress=report, say=print)
         if mesh is not None:
             texture = mesh.texture(refit=not fitted, progress=report)
+            if texture is None or texture.record["finished"]:
+                with stoppable(f"fit and texture are finished; {again}", at_any_time=True):
+                    made = mesh.extract(say=said.append, progress=report)
+    tell_budget(read_record(directory))
     print(describe(directory))
     memory = peak_memory()
     if memory is not None:
@@ -117,12 +125,11 @@ def _fit_one(arguments: argparse.Namespace, cloud: str, config: FitConfig | None
         return 0
     if texture is not None:
         tell_texture(directory / TEXTURE_FILE, texture, again)
-    started = time.monotonic()
-    with stoppable(f"fit and texture are finished; {again}", at_any_time=True):
-        made = mesh.extract(say=print)
+    assert made is not None
+    print("\n".join(said), end="\n" * bool(said))
     facts = [f"{len(made.vertices):,} vertices", f"{len(made.faces):,} faces"]
     facts += ["with colours"] * mesh.colored + ([trim.strip()] if trim else [])
-    print(f"{mesh.out}: {', '.join(facts)}, in {time.monotonic() - started:.1f} s")
+    print(f"{mesh.out}: {', '.join(facts)}, {time.monotonic() - started:.1f} s in all")
     return 0
 
 

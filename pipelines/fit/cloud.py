@@ -14,6 +14,7 @@ import dataclasses
 import json
 import math
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,7 @@ from ...datasets.clouds.large import Merging, merge_cloud
 from ...datasets.clouds.reading import check_cloud, open_stream
 from ...datasets.clouds.stream import MemoryStream
 from ...neural_fields.files import whole_file
+from ..run.costs import queries, windings
 
 __all__ = ["MERGED_FILE", "CloudDistance", "load_cloud"]
 
@@ -38,6 +40,8 @@ MERGED_FILE = "merged_cloud.npz"
 VERSION = 1
 # Area of a point's disc over the median one: scans are this much sparser where they graze the surface, hardly more.
 LARGEST_AREA = 100.0
+# Queries at a time: between two of them a progress display is told.
+ROWS = 1 << 15
 
 
 def load_cloud(
@@ -127,6 +131,9 @@ class CloudDistance:
         given: how many of the points are the cloud's own, the first ones; None for all. The others fill it in.
         gap: the spacing of those; None for that of all.
         repaired: how many normals of points on edges were replaced by one side's.
+
+    Attributes:
+        watch: told of work as it is done, in the units of :mod:`..run.costs`.
     """
 
     def __init__(
@@ -141,6 +148,7 @@ class CloudDistance:
         gap: float | None = None,
         repaired: int = 0,
     ) -> None:
+        self.watch: Callable[[float], None] = lambda _: None
         self.points: Float32 = points.cpu().numpy()
         self.normals: Float32 = normals.cpu().numpy()
         self.tree = KDTree(self.points, compact_nodes=False, balanced_tree=False)
@@ -159,13 +167,13 @@ class CloudDistance:
 
     def nearest(self, x: NDArray[np.floating]) -> NDArray[np.float64]:
         """Distance from each of ``(M, 3)`` to the nearest point of the cloud → ``(M,)``."""
-        return np.asarray(self.tree.query(x, workers=-1)[0])
+        return np.concatenate([self._query(x[start : start + ROWS], 1)[0] for start in _starts(len(x))])
 
     def signed(self, x: Tensor) -> Tensor:
         """Signed distance of ``(M, 3)`` points → ``(M,)`` on the CPU, negative inside."""
         query = x.cpu().numpy()
-        found, index = self.tree.query(query, k=self.neighbors, workers=-1)
-        distance = np.asarray(found)
+        parts = [self._query(query[start : start + ROWS], self.neighbors) for start in _starts(len(query))]
+        distance, index = (np.concatenate(part) for part in zip(*parts, strict=True))
         offset = query[:, None] - self.points[index]  # (M, k, 3)
         along = np.einsum("mkd,mkd->mk", offset, self.normals[index])
         across = np.sqrt(np.maximum(distance**2 - along**2, 0))
@@ -179,6 +187,12 @@ class CloudDistance:
             if some.any():
                 side[some] = 0.5 - self.winding_number(query[some], cell=cell)
         return torch.from_numpy(np.where(side < 0, -magnitude, magnitude).astype(np.float32))
+
+    def _query(self, x: NDArray[np.floating], k: int) -> tuple[NDArray[np.float64], NDArray[np.integer]]:
+        """Distances to the k nearest points, and their indices."""
+        distance, index = self.tree.query(x, k=k, workers=-1)
+        self.watch(queries(len(x), len(self.points)))
+        return np.asarray(distance), np.asarray(index)
 
     def winding_number(self, x: Float32, *, cell: float | None = None, chunk: int = 1024) -> NDArray[np.float64]:
         """Generalised winding number at ``(M, 3)`` points: about 1 inside, 0 outside, in between near holes.
@@ -201,6 +215,7 @@ class CloudDistance:
             d2 = torch.addmm(squares, part, centers.t(), alpha=-2).add_((part**2).sum(dim=1)[:, None])
             inverse = d2.clamp_(min=1e-8).rsqrt_()
             result[start : start + chunk] = flux.mul_(inverse).mul_(inverse).mul_(inverse).sum(dim=1)
+            self.watch(windings(len(part), len(centers)))
         return (result / (4 * math.pi)).double().numpy()
 
     def _dipoles(self, cell: float) -> tuple[Tensor, Tensor]:
@@ -211,3 +226,8 @@ class CloudDistance:
         center = np.stack([np.bincount(owner, self.areas * self.points[:, i]) for i in range(3)], 1) / area[:, None]
         moment = np.stack([np.bincount(owner, self.areas * self.normals[:, i]) for i in range(3)], 1)
         return torch.from_numpy(center.astype(np.float32)), torch.from_numpy(moment.astype(np.float32))
+
+
+def _starts(count: int) -> range:
+    """Where the parts of so many queries begin; of none there is one."""
+    return range(0, max(count, 1), ROWS)

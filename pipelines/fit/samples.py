@@ -148,6 +148,7 @@ def banded_sources(
     generator: torch.Generator,
     weights: Weights | None = None,
     name: str = "cloud",
+    watch: Callable[[int], None] | None = None,
 ) -> list[Source]:
     """A residual level's: the cloud, its offsets and dithered points, inside the band (Sec. 3.2); and empty places.
 
@@ -159,6 +160,7 @@ def banded_sources(
         generator: draws the samples.
         weights: other weights than the fit's own.
         name: what messages call the cloud.
+        watch: told after each part of the points at how many of them ``previous`` was evaluated.
 
     Raises:
         InputError: one kind of samples is empty.
@@ -167,7 +169,7 @@ def banded_sources(
     offset = offset_samples(index, delta, config.samples, generator=generator)
     band = band_samples(index, delta, config.samples, generator=generator)
     kept = {
-        kind: with_previous(samples, previous, delta, device=device)
+        kind: with_previous(samples, previous, delta, device=device, watch=watch)
         for kind, samples in (("surface", surface_samples(index)), ("offset", offset), ("band", band))
     }
     for kind, samples in kept.items():
@@ -183,7 +185,7 @@ def banded_sources(
     sources = [Source(kind, samples, third, *terms) for kind, samples in kept.items()]
     # Of its own generator: a cloud without such places is fitted as if nobody had looked for them.
     own = torch.Generator().manual_seed(generator.initial_seed() + 1)
-    empty = empty_samples(index, previous, delta, config.samples, generator=own, device=device)
+    empty = empty_samples(index, previous, delta, config.samples, generator=own, device=device, watch=watch)
     if len(empty) >= FEWEST:
         sources.append(Source("empty", empty, third // 4, terms[0], 0.0, 0.0))
     return sources
@@ -257,7 +259,14 @@ def distance_samples(cloud: CloudDistance, count: int, *, generator: torch.Gener
 
 @torch.no_grad()
 def empty_samples(
-    cloud: CloudDistance, field: Field, delta: float, count: int, *, generator: torch.Generator, device: torch.device
+    cloud: CloudDistance,
+    field: Field,
+    delta: float,
+    count: int,
+    *,
+    generator: torch.Generator,
+    device: torch.device,
+    watch: Callable[[int], None] | None = None,
 ) -> Samples:
     """Points of the band around ``field`` that are far from every point of the cloud, and surely in- or outside.
 
@@ -273,11 +282,12 @@ def empty_samples(
         count: how many points are tried, spread as for level 0.
         generator: draws them.
         device: where the field is.
+        watch: see `banded_sources`.
 
     Returns:
         Samples with distances, values and gradients, on ``device``; often none.
     """
-    tried = with_previous(Samples(_spread(cloud, count, generator)), field, delta, device=device)
+    tried = with_previous(Samples(_spread(cloud, count, generator)), field, delta, device=device, watch=watch)
     points = tried.points.cpu().numpy()
     assert tried.value is not None
     distance = cloud.nearest(points)
@@ -353,10 +363,24 @@ def band_samples(cloud: CloudDistance, delta: float, count: int, *, generator: t
 
 
 @torch.no_grad()
-def with_previous(samples: Samples, field: Field, delta: float, *, device: torch.device) -> Samples:
-    """Add the frozen levels' value and gradient, and reject the samples outside ``|f| < delta`` or a coarser band."""
+def with_previous(
+    samples: Samples,
+    field: Field,
+    delta: float,
+    *,
+    device: torch.device,
+    watch: Callable[[int], None] | None = None,
+) -> Samples:
+    """Add the frozen levels' value and gradient, and reject the samples outside ``|f| < delta`` or a coarser band.
+
+    ``watch`` is told after each part how many points it had.
+    """
     points = samples.points.to(device)
-    jets = [field.jet(part) for part in points.split(1 << 16)]
+    jets = []
+    for part in points.split(1 << 16):
+        jets.append(field.jet(part))
+        if watch is not None:
+            watch(len(part))
     jet = Jet(*(torch.cat(parts) for parts in zip(*jets, strict=True)))
     size = jet.value.abs()
     kept = size < delta

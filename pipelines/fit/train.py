@@ -25,7 +25,6 @@ from ..run.machine import choose_device, environment, peak_memory
 from ..run.settings import FitConfig
 from ..run.trainer import (
     Interrupted,
-    Progress,
     Report,
     StopFlag,
     Trainer,
@@ -39,7 +38,9 @@ from ..surface.trim import write_support
 from .between import dense_distance
 from .cloud import CloudDistance, load_cloud
 from .level import LevelObjective, new_level
+from .plan import Share
 from .samples import Band, band_of, banded_sources, first_sources
+from .timing import Timing
 
 __all__ = ["FitConfig", "Review", "Run", "fit", "prepare", "review_points"]
 
@@ -115,8 +116,13 @@ def fit(
     folder = RunFolder(out, resume=resume)
     config = folder.config(FitConfig, config)
     device = choose_device(config.device)
-    raw, merging = load_cloud(_as_cloud(cloud), limit=config.merge_above, isolation=config.isolation, cache=folder.path)
-    fitting = _Fitting(prepare(raw, config), raw.source, config, device, folder, progress, merging)
+    timing, points = Timing(config, progress, device), _as_cloud(cloud)
+    timing.begin(points)
+    raw, merging = load_cloud(points, limit=config.merge_above, isolation=config.isolation, cache=folder.path)
+    timing.has_read(len(raw))
+    prepared = prepare(raw, config)
+    timing.has_prepared()
+    fitting = _Fitting(prepared, raw.source, config, device, folder, timing, merging)
     with folder.writing(), stop_on_signals() as flag:
         if resume:
             fitting.restore()
@@ -160,12 +166,12 @@ class _Fitting:
         config: FitConfig,
         device: torch.device,
         folder: RunFolder,
-        progress: Report | None,
+        timing: Timing,
         merging: Merging | None,
     ) -> None:
         self.cloud, self.source, self.config = cloud, source, config
         self.device, self.folder, self.merging = device, folder, merging
-        self.progress = progress or (lambda _: None)
+        self.timing, self.preparation_seconds = timing, time.monotonic() - timing.started
         self.fingerprint = digest_of((cloud.points, cloud.normals))
         self.points, self.normals = torch.from_numpy(cloud.points), torch.from_numpy(cloud.normals)
         self.index: CloudDistance | None = None  # of the points above
@@ -173,12 +179,16 @@ class _Fitting:
         self.errors = torch.empty(0)  # of the last frozen level, at the input points
         self.stages: list[dict[str, Any]] = []
         self.trainer_state: dict[str, Tensor] = {}
+        self.samples: int | None = None  # of the level under way, where a time budget leaves it fewer
 
     def run(self, flag: StopFlag) -> Run:
         self.folder.begin(self.record(finished=False))
         self.keep_support()
         for level in range(len(self.stages), self.config.num_levels):
-            self.train_level(level, flag)
+            share = self.share(level)
+            if share is None:
+                break
+            self.train_level(level, share, flag)
         assert self.frozen is not None
         record = self.record(finished=True)
         self.folder.finish(self.frozen, self.cloud.similarity, record)
@@ -189,30 +199,51 @@ class _Fitting:
         if self.folder.out is not None:
             write_support(self.folder.out, self.points.numpy())
 
-    def train_level(self, level: int, flag: StopFlag) -> None:
+    def share(self, level: int) -> Share | None:
+        """Samples of a level, and seconds for it all in the time budget; None if none are left that are worth it."""
+        share = self.timing.share(level, self.indexed, begun=bool(self.trainer_state))
+        if share is not None and self.trainer_state:  # it goes on with what it has learnt from, and the time it took
+            took = float(self.trainer_state["progress"][1])
+            share = Share(share.seconds + took, self.samples or share.samples)
+        self.samples = None if share is None else share.samples
+        return share
+
+    def indexed(self) -> CloudDistance:
+        """`distances`, made once."""
+        self.index = self.index or self.distances()
+        return self.index
+
+    def train_level(self, level: int, share: Share, flag: StopFlag) -> None:
         """Make the samples of one level, train it, freeze it."""
-        config, started = self.config, time.monotonic()
+        config, started = dataclasses.replace(self.config, samples=share.samples), time.monotonic()
         generator = torch.Generator().manual_seed(config.seed * 1009 + level)
         siren = new_level(config, level, residual=level > 0).to(self.device)
-        self.progress(Progress(f"level {level}: samples", 0, config.steps[level], 0.0, {}))
+        work = self.timing.sampling(level, share.samples)
         band = None if self.frozen is None else self.next_band()
         delta = None if band is None else band.delta
-        self.index = index = self.index or self.distances()
+        index = self.indexed()
+        index.watch = work.points
         if self.frozen is None or delta is None:
             sources = first_sources(index, config, generator=generator, device=self.device)
         else:
-            sources = banded_sources(index, self.frozen, delta, config, generator=generator, name=self.source)
+            sources = banded_sources(
+                index, self.frozen, delta, config, generator=generator, name=self.source, watch=work.looked
+            )
+        work.end()
         sampling_seconds = time.monotonic() - started
+        seconds = None if config.time_budget is None else share.seconds - sampling_seconds
         trainer = Trainer(
             LevelObjective(siren, sources, learning_rate=config.learning_rates[level], generator=generator),
             stage=f"level {level}",
             steps=config.steps[level],
-            seconds=self.seconds_for(level, sampling_seconds),
+            seconds=None if seconds is None else max(seconds, self.timing.least_seconds(level)),
         )
         if self.trainer_state:
             trainer.restore(self.trainer_state)
             self.trainer_state = {}
-        if not trainer.run(flag, report=self.progress, save=lambda: self.save(self.grown(siren, delta), trainer)):
+        if not trainer.run(
+            flag, report=self.timing.schedule, save=lambda: self.save(self.grown(siren, delta), trainer)
+        ):
             raise Interrupted(self.folder.out)
         self.frozen = self.grown(siren, delta).requires_grad_(False)
         review = self.review() if level == 0 else None
@@ -288,14 +319,6 @@ class _Fitting:
         scale = self.cloud.similarity.scale
         return {"rms_at_points": _rms(self.errors) * scale, "max_at_points": float(self.errors.abs().max()) * scale}
 
-    def seconds_for(self, level: int, sampling_seconds: float) -> float | None:
-        """How long this level may train within the time budget."""
-        if self.config.time_budget is None:
-            return None
-        spent = sum(stage["sampling_seconds"] + stage["training_seconds"] for stage in self.stages)
-        left = max(self.config.time_budget - spent - sampling_seconds, 1e-3)
-        return left * self.config.share_of_time(level)
-
     def grown(self, siren: Siren, delta: float | None) -> MultiscaleSDF:
         """The frozen levels and one more."""
         if self.frozen is None or delta is None:
@@ -305,14 +328,16 @@ class _Fitting:
     def save(self, field: MultiscaleSDF, trainer: Trainer[LevelObjective] | None) -> None:
         """Write a usable field and all that `restore` needs."""
         tensors = checkpoint_of(self.frozen, trainer)
-        progress = {"fingerprint": self.fingerprint, "stages": self.stages}
+        kept = {"samples": self.samples, "notes": self.timing.notes}
+        progress = {"fingerprint": self.fingerprint, "stages": self.stages, **kept}
         self.folder.save(field, self.cloud.similarity, self.record(finished=False), tensors, progress)
 
     def restore(self) -> None:
         """Take up an interrupted run; see `RunFolder.restore`."""
         mismatch = f"{self.source}: not the cloud that {self.folder.path} was fitted to; resume with that cloud"
         tensors, progress = self.folder.restore(self.fingerprint, mismatch)
-        self.stages = progress["stages"]
+        self.stages, self.samples = progress["stages"], progress.get("samples")
+        self.timing.notes = progress.get("notes", [])
         levels = [new_level(self.config, level, residual=False) for level in range(len(self.stages))]
         if levels:
             empty = MultiscaleSDF(levels[0], levels[1:], [1.0] * (len(levels) - 1)).to(self.device)
@@ -320,6 +345,8 @@ class _Fitting:
             self.review()  # again: it follows from the cloud and level 0
             self.errors = self.values_at_cloud()
         self.trainer_state = without_prefix("trainer.", tensors)
+        took = sum(stage["sampling_seconds"] + stage["training_seconds"] for stage in self.stages)
+        self.timing.before = took + (float(self.trainer_state["progress"][1]) if self.trainer_state else 0.0)
 
     def record(self, *, finished: bool) -> dict[str, Any]:
         """What ``run.json`` holds."""
@@ -333,7 +360,9 @@ class _Fitting:
             "stages": self.stages,
             "parameters": sum(stage["parameters"] for stage in self.stages),
             "deltas": [stage["delta"] for stage in self.stages if stage["delta"] is not None],
+            "preparation_seconds": round(self.preparation_seconds, 3),
             "training_seconds": round(sum(s["sampling_seconds"] + s["training_seconds"] for s in self.stages), 3),
+            **self.timing.record(),
             "peak_memory": peak_memory(),
             "environment": environment(self.device),
         }

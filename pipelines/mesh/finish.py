@@ -13,13 +13,15 @@ from ...datasets import read_cloud
 from ...neural_fields import InputError, Similarity
 from ...neural_fields.meshing import Mesh
 from ..fit.depth import DepthInput, trim_suggestion
+from ..run.costs import Net, Speed
 from ..run.folder import CLOUD_FILE, TEXTURE_FILE, kept_cloud, read_record, texture_state_file
-from ..run.settings import TextureConfig
-from ..run.trainer import Progress
+from ..run.schedule import Progress, Stage
+from ..run.settings import FitConfig, TextureConfig
 from ..texture.samples import has_colors
-from ..texture.train import FittedTexture, texture_run
+from ..texture.train import FittedTexture, texture_run, texture_stages
 from .extract import MeshOptions, mesh_run
 from .files import check_mesh_path
+from .plan import mesh_stage, meshing
 
 __all__ = ["FitMesh", "plan_mesh"]
 
@@ -36,6 +38,7 @@ class FitMesh:
         source: what holds the colours, a cloud or a mesh in the coordinates of the fit.
         colored: whether there are colours, and they are wanted.
         trim: whether what the fit closes behind a depth map is cut off.
+        points: of the source; a guess where that is made only then.
     """
 
     out: Path
@@ -43,6 +46,7 @@ class FitMesh:
     source: Path
     colored: bool
     trim: bool
+    points: int = 100_000
 
     def texture(self, *, refit: bool, progress: Callable[[Progress], None] | None = None) -> FittedTexture | None:
         """Train the texture with the default settings, on the device and with the seed of the fit.
@@ -66,18 +70,34 @@ class FitMesh:
         config = dataclasses.replace(TextureConfig(), device=fitted["device"], seed=fitted["seed"])
         return texture_run(self.run, self.source, config, resume=resume, progress=progress)
 
-    def extract(self, say: Callable[[str], None] | None = None) -> Mesh:
+    def stages(self, config: FitConfig, speed: Speed) -> list[Stage]:
+        """What `texture` and `extract` will do, and about how long that takes.
+
+        Args:
+            config: of the fit.
+            speed: of the machine.
+        """
+        nets = [Net.siren(width, depth) for width, depth in zip(config.widths, config.depths, strict=True)]
+        nets = nets[: config.num_levels]
+        colors = texture_stages(TextureConfig(), self.points, nets, speed) if self.colored else []
+        return [*colors, mesh_stage(nets, speed)]
+
+    def extract(
+        self, say: Callable[[str], None] | None = None, *, progress: Callable[[Progress], None] | None = None
+    ) -> Mesh:
         """Extract and write the mesh, as `mesh_run` does by default, trimmed where it shall be.
 
         Args:
             say: see `mesh_run`.
+            progress: told when it begins and ends.
 
         Raises:
             InputError: see `mesh_run`.
         """
         trim = trim_suggestion(self.run) if self.trim else None
         options = MeshOptions(colors=self.colored, trim_distance=trim, cloud=self.source if self.trim else None)
-        return mesh_run(self.run, self.out, options, say=say)
+        with meshing(progress):
+            return mesh_run(self.run, self.out, options, say=say)
 
 
 def plan_mesh(out: Path, run: Path, source: Path | DepthInput, *, colors: bool, resume: bool) -> FitMesh:
@@ -108,4 +128,4 @@ def plan_mesh(out: Path, run: Path, source: Path | DepthInput, *, colors: bool, 
         colored = colors and has_colors(cloud)
     except InputError as error:
         raise InputError(f"{error} (or leave the colours out: --no-colors)") from error
-    return FitMesh(out, run, cloud, colored, trim=depth)
+    return FitMesh(out, run, cloud, colored, trim=depth, points=len(finite))

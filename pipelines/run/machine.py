@@ -14,12 +14,15 @@ from typing import Any
 import torch
 
 from ...neural_fields import InputError
+from .costs import Speed
 
-__all__ = ["best_seconds", "environment", "format_table", "peak_memory", "sgemm_rate"]
+__all__ = ["best_seconds", "environment", "format_table", "peak_memory", "sgemm_rate", "speed"]
 
 # Linux keeps the high-water mark of a process here. Not getrusage: its maximum survives exec, so that a child would
 # report what its parent held when it was born.
 STATUS = Path("/proc/self/status")
+# Seconds of the smallest training step: on a CPU the calls from Python, on a GPU those and the launches of kernels.
+LEAST_STEP = {"cpu": 1.5e-3, "cuda": 3e-3}
 
 
 def best_seconds(work: Callable[[], object], *, repeats: int = 5) -> float:
@@ -41,10 +44,20 @@ def best_seconds(work: Callable[[], object], *, repeats: int = 5) -> float:
 @torch.inference_mode()
 def sgemm_rate(width: int = 512, *, rows: int = 2048, device: torch.device | str = "cpu", repeats: int = 20) -> float:
     """Measured float32 matrix-product rate ``(rows, width) @ (width, width)``, in FLOP/s: the limit of any SIREN."""
-    a = torch.randn(rows, width, device=device)
-    b = torch.randn(width, width, device=device)
+    random = torch.Generator(device).manual_seed(0)  # of its own: who measures in between draws the same afterwards
+    a = torch.randn(rows, width, device=device, generator=random)
+    b = torch.randn(width, width, device=device, generator=random)
     out = torch.empty(rows, width, device=device)
     return 2 * rows * width * width / best_seconds(lambda: torch.mm(a, b, out=out), repeats=repeats)
+
+
+def speed(device: torch.device | str = "cpu") -> Speed:
+    """How fast this machine is, measured in a tenth of a second: what predictions of times begin with."""
+    device = torch.device(device)
+    cpu = sgemm_rate(repeats=3)
+    if device.type == "cpu":
+        return Speed(cpu, cpu, LEAST_STEP["cpu"])
+    return Speed(cpu, sgemm_rate(device=device, repeats=3), LEAST_STEP.get(device.type, LEAST_STEP["cuda"]))
 
 
 def format_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -103,14 +103,6 @@ class FitConfig(Settings):
         """
         return self.residual_data_weight / max(mean_square, noise**2, 1e-10)
 
-    def share_of_time(self, level: int) -> float:
-        """The part of a time budget left before ``level`` that this level may use, by the cost of its steps."""
-        cost = [
-            steps * (width**2 * depth + 4096)
-            for steps, width, depth in zip(self.steps, self.widths, self.depths, strict=True)
-        ]
-        return cost[level] / sum(cost[level : self.num_levels])
-
 
 @dataclass(frozen=True)
 class TextureConfig(Settings):

@@ -9,7 +9,6 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 from typing import Any, Generic, NamedTuple, TypeVar
@@ -17,6 +16,7 @@ from typing import Any, Generic, NamedTuple, TypeVar
 import torch
 from torch import Tensor, nn
 
+from .schedule import Progress, Report
 from .team import agreed, average_gradients, is_alone
 
 __all__ = [
@@ -37,28 +37,6 @@ __all__ = [
 ]
 
 Rate = Callable[[float], float]
-
-
-@dataclass(frozen=True)
-class Progress:
-    """What a progress display is told.
-
-    Attributes:
-        stage: name of the stage.
-        step: steps done.
-        steps: steps planned.
-        fraction: of the stage, in [0, 1]; not step / steps when a time budget may end it earlier.
-        losses: unweighted loss terms of the last reported step.
-    """
-
-    stage: str
-    step: int
-    steps: int
-    fraction: float
-    losses: Mapping[str, float]
-
-
-Report = Callable[[Progress], None]
 
 
 class Interrupted(Exception):  # noqa: N818  what happened is no error
@@ -235,21 +213,27 @@ class Trainer(Generic[O]):
         report: Report | None = None,
         save: Callable[[], None] | None = None,
         report_every: int = 20,
+        report_seconds: float = 1.0,
         save_every: float = 20.0,
     ) -> bool:
         """Train until the schedule ends → True, or until somebody asks to stop → False.
 
         Args:
             flag: see `stop_on_signals`.
-            report: called every ``report_every`` steps, and at the end, with fresh losses.
+            report: called at the beginning and, with fresh losses, every ``report_every`` steps, every
+                ``report_seconds``, and at the end.
             save: called every ``save_every`` seconds, and before a stop.
             report_every: steps between reports; reading the losses makes a GPU wait.
+            report_seconds: no more than about so many seconds between reports.
             save_every: seconds between checkpoints.
         """
         flag, report, save = flag or StopFlag(), report or (lambda _: None), save or (lambda: None)
         start, saved = time.monotonic() - self.elapsed, time.monotonic()
+        told = saved
         device = self.trained[0].device
         stop, self.elapsed = agreed(flag.requested, self.elapsed, device)
+        if self.fraction < 1:
+            report(self.progress)  # so that displays know when it began
         while self.fraction < 1:
             if stop:
                 save()
@@ -257,9 +241,11 @@ class Trainer(Generic[O]):
             terms = self._step()
             # A team agrees here, so that its clocks tell all alike whether this was the last step.
             stop, self.elapsed = agreed(flag.requested, time.monotonic() - start, device)
-            if self.step % report_every == 0 or self.fraction >= 1:
+            late = time.monotonic() - told > report_seconds
+            if self.step % report_every == 0 or self.fraction >= 1 or late:
                 self.losses = {name: float(term) for name, term in terms.items()}
                 report(self.progress)
+                told = time.monotonic()
             if time.monotonic() - saved > save_every:
                 save()
                 saved = time.monotonic()

@@ -5,11 +5,12 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -20,6 +21,7 @@ from ...neural_fields import (
     InputError,
     Similarity,
     TextureField,
+    levels_of,
     load_field,
     load_texture,
     save_texture,
@@ -27,6 +29,7 @@ from ...neural_fields import (
 from ...neural_fields.dynamic_tracing import moment
 from ...neural_fields.losses import color_loss, tangential_loss
 from ..run.config import load_config
+from ..run.costs import Net, Speed, jets, training
 from ..run.folder import (
     RECORD_FILE,
     TEXTURE_FILE,
@@ -40,13 +43,12 @@ from ..run.folder import (
     write_record,
 )
 from ..run.lock import locked
-from ..run.machine import choose_device, environment
+from ..run.machine import choose_device, environment, speed
+from ..run.schedule import Progress, Report, Schedule, Stage
 from ..run.settings import TextureConfig
 from ..run.trainer import (
     Group,
     Objective,
-    Progress,
-    Report,
     Trainer,
     parameter_count,
     seeded,
@@ -55,12 +57,23 @@ from ..run.trainer import (
 )
 from .samples import BandSamples, ColorSamples, band_directions, match_colors, read_colors
 
-__all__ = ["FittedTexture", "TextureObjective", "default_delta", "fit_texture", "texture_of", "texture_run"]
+__all__ = [
+    "FittedTexture",
+    "TextureObjective",
+    "default_delta",
+    "fit_texture",
+    "texture_of",
+    "texture_run",
+    "texture_stages",
+]
 
 # A band at least this wide (in units of the field) holds decimated meshes, and the surfaces of small networks.
 LEAST_DELTA = 0.02
 # The default for a field of one level, which has no band of its own that says how near it is to its points.
 SINGLE_LEVEL_DELTA = 0.05
+# Of a time budget, what samples may take, and what the steps get in any case.
+SAMPLING_SHARE, LEAST_SHARE = 1 / 3, 0.1
+FEWEST = 2_000  # points that are left where time is short
 # Points of the pool at which the final error is measured.
 JUDGED = 100_000
 
@@ -78,6 +91,25 @@ class FittedTexture:
     record: dict[str, Any]
 
 
+def texture_stages(config: TextureConfig, points: int, nets: Sequence[Net], speed: Speed) -> list[Stage]:
+    """What `fit_texture` will do, and about how long that takes.
+
+    Args:
+        config: its settings.
+        points: with colours.
+        nets: sizes of the levels of the geometry.
+        speed: of the machine.
+    """
+    network = Net.siren(config.width, config.depth)
+    # Without gradients a step costs about half of one with them; the change along a direction is a jet.
+    work = training(config.steps, config.batch / 2 + config.band_batch, [network])
+    looked = jets(points + config.samples // 2, nets)
+    return [
+        Stage("texture: samples", "texture samples", speed.networks(looked)),
+        Stage("texture", "texture", speed.networks(work, steps=config.steps)),
+    ]
+
+
 def fit_texture(
     geometry: Field,
     cloud: PointCloud,
@@ -88,6 +120,7 @@ def fit_texture(
     progress: Report | None = None,
     save: Callable[[dict[str, Tensor]], None] | None = None,
     state: Mapping[str, Tensor] | None = None,
+    started: float | None = None,
 ) -> FittedTexture:
     """Train a texture field by the paper's 𝒯(φ): the colours at points, and none of their change along ∇f.
 
@@ -103,6 +136,7 @@ def fit_texture(
         progress: called now and then with how far the training is.
         save: called now and then, and when the training is interrupted, with what ``state`` takes.
         state: of an interrupted training of the same cloud and settings, to be continued to the same result.
+        started: when the time budget began, by `time.monotonic`; None is now.
 
     Raises:
         InputError: the cloud has no colours, or lies somewhere else than the surface.
@@ -114,28 +148,40 @@ def fit_texture(
         >>> run = fit("scan.ply")  # doctest: +SKIP
         >>> fit_texture(run.field, read_cloud("scan.ply"), similarity=run.similarity)  # doctest: +SKIP
     """
+    started = time.monotonic() if started is None else started
     config, similarity = config or TextureConfig(), similarity or Similarity.identity()
-    device, started = choose_device(config.device), time.monotonic()
+    device = choose_device(config.device)
     level = geometry.resolve_level(level)
     delta = config.delta or default_delta(geometry)
-    if progress is not None:
-        progress(Progress("texture: samples", 0, config.steps, 0.0, {}))
+    schedule, budget, notes = Schedule.of(progress), config.time_budget, list[str]()
+    band_samples = config.samples // 2
+    if progress is not None or budget is not None:
+        nets = [Net.about(parameter_count(each)) for each in levels_of(geometry)]
+        left = None if budget is None else max(budget - (time.monotonic() - started), 0.0)
+        making, learning = texture_stages(config, len(cloud), nets, speed(device))
+        if left is not None and schedule.predicted(making) > SAMPLING_SHARE * left:
+            share = SAMPLING_SHARE * left / schedule.predicted(making)
+            cloud, band_samples = _thinned(cloud, share, config.seed), max(int(share * band_samples), FEWEST)
+            notes.append(f"learns from {len(cloud):,} points and {band_samples:,} of the band, for want of time")
+        schedule.plan([making, learning], budget=left)
+    schedule(Progress("texture: samples", 0, 0, 0.0, {}))
     generator = torch.Generator().manual_seed(config.seed)
     home = geometry.like.device
     geometry = geometry.to(device)
     samples = match_colors(cloud, geometry, similarity, level=level, delta=delta)
-    band = band_directions(samples, geometry, config.samples // 2, level=level, delta=delta, generator=generator)
+    band = band_directions(samples, geometry, band_samples, level=level, delta=delta, generator=generator)
     mean = samples.colors.mean(dim=0).tolist()
     with seeded(config.seed):
         network = ColorSiren(config.width, config.depth, omega=config.omega, mean=mean).to(samples.points)
+    schedule(Progress("texture: samples", 0, 0, 1.0, {}))
     sampling_seconds = time.monotonic() - started
-    seconds = None if config.time_budget is None else max(config.time_budget - sampling_seconds, 1e-3)
+    seconds = None if budget is None else max(budget - sampling_seconds, LEAST_SHARE * budget)
     objective = TextureObjective(network, samples, band, config, delta=delta, generator=generator)
     trainer = Trainer(objective, stage="texture", steps=config.steps, seconds=seconds)
     if state is not None:
         trainer.restore(state)
     with stop_on_signals() as flag:
-        finished = trainer.run(flag, report=progress, save=None if save is None else lambda: save(trainer.state()))
+        finished = trainer.run(flag, report=schedule, save=None if save is None else lambda: save(trainer.state()))
     record = {
         "finished": finished,
         "source": cloud.source,
@@ -143,6 +189,7 @@ def fit_texture(
         "delta": delta,
         "points": len(samples.points),
         "left_out": samples.left_out,
+        **({} if budget is None else {"budget": {"seconds": budget, "notes": notes}}),
         "parameters": parameter_count(network),
         "steps": trainer.step,
         "sampling_seconds": round(sampling_seconds, 3),
@@ -183,6 +230,7 @@ def texture_run(
     Raises:
         InputError: there is no such run or level, the source cannot be used, or there is nothing to resume.
     """
+    started = time.monotonic()
     file = find_field(run)
     target = file.with_name(TEXTURE_FILE) if out is None else Path(out)
     beside = target == file.with_name(TEXTURE_FILE)
@@ -215,6 +263,7 @@ def texture_run(
             progress=progress,
             save=lambda tensors: save_state(state_file.parent, tensors, about, name=state_file.name),
             state=None if before is None else before.tensors,
+            started=started,
         )
         save_texture(target, fitted.texture, metadata={"texture": fitted.record})
         if beside and file.with_name(RECORD_FILE).is_file():
@@ -222,6 +271,14 @@ def texture_run(
         if fitted.record["finished"]:
             state_file.unlink(missing_ok=True)
         return fitted
+
+
+def _thinned(cloud: PointCloud, share: float, seed: int) -> PointCloud:
+    """That share of the points, but at least `FEWEST`, drawn by the seed."""
+    count = min(len(cloud), max(int(share * len(cloud)), FEWEST))
+    kept = np.sort(np.random.default_rng(seed).permutation(len(cloud))[:count])
+    normals, colors = (None if rows is None else rows[kept] for rows in (cloud.normals, cloud.colors))
+    return dataclasses.replace(cloud, points=cloud.points[kept], normals=normals, colors=colors)
 
 
 class _Before(NamedTuple):

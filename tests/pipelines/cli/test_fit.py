@@ -14,7 +14,7 @@ from mplicits.datasets import DepthCamera, PointCloud, read_cloud, write_cloud_p
 from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.mesh import finish as fit_mesh
 from mplicits.pipelines.mesh.extract import MeshOptions
-from mplicits.pipelines.run.progress import _Lines
+from mplicits.pipelines.run.progress import Lines
 from mplicits.pipelines.run.settings import TextureConfig
 from mplicits.pipelines.surface.surface import Surface, read_surface
 from scipy.spatial import KDTree
@@ -160,11 +160,11 @@ def test_a_depth_map_without_a_picture_gives_a_bare_mesh(frame: list[object], tm
 def interrupt_at(stage: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Press Ctrl-C at the first report of a stage that has begun."""
 
-    def stop(self: _Lines, progress: object, /) -> None:
+    def stop(self: Lines, progress: object, /) -> None:
         if progress.stage == stage and progress.step > 0:  # type: ignore[attr-defined]
             os.kill(os.getpid(), signal.SIGINT)
 
-    monkeypatch.setattr(_Lines, "__call__", stop)
+    monkeypatch.setattr(Lines, "__call__", stop)
 
 
 @pytest.mark.parametrize(("kind", "stage"), [("cloud", "level 0"), ("cloud", "texture"), ("depth map", "texture")])

@@ -144,7 +144,9 @@ def test_resume_refuses_another_cloud_or_nothing(tmp_path: Path, fitted: Path) -
 def test_levels_and_time_budget() -> None:
     assert fit(sphere_cloud(), replace(SMALL, levels=1, steps=(5, 5))).field.num_levels == 1
     run = fit(sphere_cloud(), replace(SMALL, steps=(10**6, 10**6), time_budget=2.0))
-    assert [stage["ended_by_time_budget"] for stage in run.record["stages"]] == [True, True]
+    stages = run.record["stages"]
+    assert all(stage["ended_by_time_budget"] for stage in stages)
+    assert len(stages) + len(run.record["budget"]["left_out"]) == 2  # a machine with more to do than this leaves one out
     assert run.record["training_seconds"] < 4.0
 
 

@@ -28,7 +28,7 @@ from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.cli.train import TEXTURE as COMMAND
 from mplicits.pipelines.run.config import load_config
 from mplicits.pipelines.run.folder import TEXTURE_FILE, texture_state_file
-from mplicits.pipelines.run.progress import _Lines
+from mplicits.pipelines.run.progress import Lines
 from mplicits.pipelines.run.settings import TextureConfig
 from mplicits.pipelines.run.trainer import Progress, Trainer
 from mplicits.pipelines.texture.samples import read_colors
@@ -157,13 +157,12 @@ def test_ctrl_c_leaves_what_was_learnt() -> None:
 
     def stop(progress: object) -> None:
         steps.append(progress.step)  # type: ignore[attr-defined]
-        if len(steps) == 3:
+        if steps[-1] >= 20:
             os.kill(os.getpid(), signal.SIGINT)
 
     fitted = fit_texture(Sphere(radius=0.5), sphere_cloud(), replace(SMALL, steps=10_000), progress=stop)
     assert not fitted.record["finished"]
-    assert steps == [0, 20, 40]
-    assert fitted.record["steps"] == 40
+    assert steps[-1] == max(steps) == fitted.record["steps"]
     assert fitted.texture.value(torch.tensor([[0.5, 0.0, 0.0]])).isfinite().all()
 
 
@@ -270,7 +269,7 @@ def test_levels_that_are_not_there(run: Path, cloud: Path) -> None:
 
 
 def press_ctrl_c(progress: Progress) -> None:
-    if progress.stage == "texture":
+    if progress.stage == "texture" and progress.step >= 20:
         os.kill(os.getpid(), signal.SIGINT)
 
 
@@ -280,7 +279,7 @@ def test_an_interrupted_training_leaves_a_usable_texture_and_continues_to_the_sa
     texture_run(run, cloud, config, progress=press_ctrl_c)
     record = json.loads((run / "run.json").read_text())["texture"]
     assert not record["finished"]
-    assert record["steps"] == 20
+    assert 20 <= record["steps"] < 60
     partial = texture_of(run, load_field(run / "field.safetensors").field)
     assert partial is not None
     x = torch.rand(100, 3) * torch.tensor([1.0, 1.0, 0.05])
@@ -401,7 +400,7 @@ def test_the_command_resumes(
         command(run, cloud, "--resume")
     words = ("--steps", "60", "--width", "16", "--depth", "1", "--samples", "1000")
     with monkeypatch.context() as patch:
-        patch.setattr(_Lines, "__call__", lambda self, progress, /: press_ctrl_c(progress))
+        patch.setattr(Lines, "__call__", lambda self, progress, /: press_ctrl_c(progress))
         assert main(["texture", str(run), str(cloud), *words]) == 130
     said = capsys.readouterr().err
     assert f"to continue: mplicits texture {run} {cloud} --resume" in said

@@ -1,0 +1,72 @@
+"""What is printed of a progress, with and without a terminal."""
+
+import io
+import subprocess
+import sys
+
+import pytest
+from mplicits.pipelines.run import progress as module
+from mplicits.pipelines.run.progress import Lines, counter_bar, progress_bars, time_words
+from mplicits.pipelines.run.schedule import Progress, Schedule, Stage
+from rich.console import Console
+
+
+def test_times_in_words() -> None:
+    said = [time_words(seconds) for seconds in (0.2, 59.4, 59.6, 65.1, 594.0, 596.0, 3599.0, 7260.0)]
+    assert said == ["0 s", "59 s", "1 min", "1 min 10 s", "9 min 50 s", "10 min", "1 h 00 min", "2 h 01 min"]
+
+
+def test_lines_now_and_then(capsys: pytest.CaptureFixture[str]) -> None:
+    """A line for each stage that ends, and one for each half minute between; each with the time left of the whole."""
+    now = [0.0]
+    schedule = Schedule(Lines(clock=lambda: now[0]), clock=lambda: now[0])
+    schedule.plan([Stage("samples", "samples", 10.0), Stage("level 0", "steps", 190.0)])
+    for second in range(11):
+        now[0] = float(second)
+        schedule(Progress("samples", 0, 0, second / 10, {}))
+    for second in range(191):
+        now[0] = 10.0 + second
+        schedule(Progress("level 0", second, 190, second / 190, {"data": 1e-3}))
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0] == "samples: done; about 3 min 10 s left of the whole"
+    assert lines[1] == "level 0: 16%; about 2 min 40 s left of the whole"
+    assert lines[-1] == "level 0: 190 steps; data 1.0e-03"
+    assert len(lines) == 1 + 190 // 30 + 1
+
+
+def interrupted(now: list[float]) -> None:
+    with progress_bars(clock=lambda: now[0]) as schedule:
+        schedule.plan([Stage("samples", "samples", 90.0), Stage("level 0", "steps", 210.0)])
+        schedule(Progress("samples", 0, 0, 0.0, {}))
+        now[0] = 45.0
+        schedule(Progress("samples", 0, 0, 0.5, {}))
+        raise KeyboardInterrupt
+
+
+def test_bars_show_the_whole_and_its_time_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where a stage is silent, and where messages are further apart than rich remembers."""
+    screen, now = io.StringIO(), [0.0]
+    console = Console(file=screen, force_terminal=True, width=100, color_system=None)
+    monkeypatch.setattr(module, "Console", lambda **_: console)
+    with pytest.raises(KeyboardInterrupt):
+        interrupted(now)  # the last that is drawn is the state in between
+    lines = screen.getvalue().splitlines()[-4:]  # below them are the losses
+    assert "whole" in lines[0]
+    assert "about 4 min 20 s left" in lines[0]  # 255 s
+    assert "samples" in lines[1]
+    assert "about 45 s left" in lines[1]
+
+
+def test_a_counter_without_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    now = [0.0]
+    with counter_bar("scan", clock=lambda: now[0]) as count:
+        for done in range(5):
+            count(done, 4)
+            now[0] += 20.0
+    assert capsys.readouterr().err.splitlines() == ["scan: 50%; about 40 s left"]
+
+
+def test_no_torch() -> None:
+    """A bar may be shown before anything heavy is loaded."""
+    code = "import sys, mplicits.pipelines.run.progress; assert not {'torch', 'numpy'} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True)
