@@ -18,6 +18,7 @@ from .common import (
     add_settings,
     check_output,
     read_settings,
+    tell_budget,
     training,
     were_given,
 )
@@ -88,6 +89,7 @@ def tell_texture(target: Path, fitted: FittedTexture, again: str) -> None:
         Stopped: it is not finished; ``again`` says how to continue.
     """
     record, config = fitted.record, fitted.record["config"]
+    tell_budget(record, "the texture ")
     if record["left_out"]:
         everything = record["points"] + record["left_out"]
         print(
@@ -187,6 +189,7 @@ def _evolve(arguments: argparse.Namespace) -> int:
     directory = check_new_run(arguments.out, resume=arguments.resume, force=arguments.force)
     with training(f"to continue: mplicits evolve -o {directory} --resume", quiet=arguments.quiet) as report:
         run = evolve(config, out=directory, resume=arguments.resume, progress=report)
+    tell_budget(run.record)
     _tell_evolution(run.record)
     print(f"{directory}: field.safetensors, run.json")
     return 0

@@ -121,11 +121,16 @@ class _StillObjective(Objective):
         return {"known": loss}, loss
 
 
-def learn_start(known: Known, config: EvolveConfig, generator: torch.Generator, progress: Report) -> SpaceTimeSDF:
-    """A field of one level that stands still: the shape at time 0, learnt in space alone and then lifted."""
+def learn_start(
+    known: Known, config: EvolveConfig, generator: torch.Generator, progress: Report, *, seconds: float | None = None
+) -> SpaceTimeSDF:
+    """A field of one level that stands still: the shape at time 0, learnt in space alone and then lifted.
+
+    It takes ``start_steps``, but no longer than ``seconds``.
+    """
     with seeded(config.seed):
         siren = Siren(config.widths[0], config.depths[0], omega=config.omegas[0]).to(known.points)
     objective = _StillObjective(siren, known, config, generator)
-    Trainer(objective, stage="first shape", steps=config.start_steps).run(report=progress)
+    Trainer(objective, stage="first shape", steps=config.start_steps, seconds=seconds).run(report=progress)
     with seeded(config.seed):
         return SpaceTimeSDF.from_static(siren)

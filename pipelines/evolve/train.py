@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,12 +17,11 @@ from ...neural_fields import InputError, MultiscaleSDF, Similarity, SpaceTimeSDF
 from ..fit.level import new_level
 from ..fit.samples import delta_of
 from ..run.folder import RunFolder, digest_of
-from ..run.machine import choose_device, environment
+from ..run.machine import choose_device, environment, speed
+from ..run.schedule import Progress, Report, Schedule
 from ..run.settings import EvolveConfig
 from ..run.trainer import (
     Interrupted,
-    Progress,
-    Report,
     StopFlag,
     Trainer,
     checkpoint_of,
@@ -32,10 +32,14 @@ from ..run.trainer import (
 )
 from .checks import check_evolution
 from .objective import LONGEST_GRADIENT, EvolveObjective, learn_start
+from .plan import FEWEST_STEPS, EvolvePlan, within
 from .problem import Problem, build_problem
 from .shapes import StaticShape, read_shape
 
 __all__ = ["Evolution", "evolve", "train_evolution"]
+
+# Of a time budget, what the start may take; and what is left for a level where all is spent.
+STARTING_SHARE, LEAST_SECONDS = 0.2, 0.5
 
 
 @dataclass(frozen=True)
@@ -79,16 +83,24 @@ def evolve(
         >>> run = evolve(EvolveConfig(shapes=("runs/spot", "runs/bob")), out="runs/morph")  # doctest: +SKIP
         >>> run.record["checks"]["warnings"]  # doctest: +SKIP
     """
-    folder = RunFolder(out, resume=resume)
+    started, folder = time.monotonic(), RunFolder(out, resume=resume)
     config = folder.config(EvolveConfig, config)
-    choose_device(config.device)
-    report, count, shapes = progress or (lambda _: None), len(config.shapes) + 1, []
+    device, schedule = choose_device(config.device), Schedule.of(progress)
+    machine, notes = speed(device), list[str]()
+    plan, count, shapes = EvolvePlan(config, machine), len(config.shapes), []
+    schedule.plan([plan.shapes(), plan.known(), *plan.stages()], budget=config.time_budget)
     for index, text in enumerate(config.shapes):
-        report(Progress("shapes", index, count, index / count, {}))
+        schedule(Progress("shapes", index, count, index / count, {}))
         shapes.append(read_shape(text))
-    report(Progress("shapes", count - 1, count, 1 - 1 / count, {}))
+    schedule(Progress("shapes", count, count, 1.0, {}))
+    if config.time_budget is not None and not resume:  # what is resumed has its settings
+        config, notes = within(config, machine, max(config.time_budget - (time.monotonic() - started), 0.0))
+    schedule(Progress("known samples", 0, 0, 0.0, {}))
     problem = build_problem(shapes, config)
-    return train_evolution(problem, config, shapes=shapes, out=out, resume=resume, progress=progress)
+    schedule(Progress("known samples", 0, 0, 1.0, {}))
+    return train_evolution(
+        problem, config, shapes=shapes, out=out, resume=resume, progress=schedule, started=started, notes=notes
+    )
 
 
 def train_evolution(
@@ -99,10 +111,18 @@ def train_evolution(
     out: str | Path | None = None,
     resume: bool = False,
     progress: Report | None = None,
+    started: float | None = None,
+    notes: Sequence[str] = (),
 ) -> Evolution:
-    """`evolve` for a problem that was put together by hand; see there."""
+    """`evolve` for a problem that was put together by hand; see there.
+
+    The time budget counts from ``started``, by `time.monotonic`, or from now; ``notes`` say what it has changed so far.
+    """
     names, folder = [shape.name for shape in shapes or []], RunFolder(out, resume=resume)
-    training = _Evolving(problem, names, config, choose_device(config.device), folder, progress or (lambda _: None))
+    device, schedule = choose_device(config.device), Schedule.of(progress)
+    training = _Evolving(problem, names, config, device, folder, schedule)
+    training.started = time.monotonic() if started is None else started
+    training.notes = list(notes)
     with folder.writing(), stop_on_signals() as flag:
         if resume:
             training.restore()
@@ -119,10 +139,13 @@ class _Evolving:
         config: EvolveConfig,
         device: torch.device,
         folder: RunFolder,
-        progress: Report,
+        schedule: Schedule,
     ) -> None:
         self.problem, self.names, self.config, self.device = problem, names, config, device
-        self.folder, self.progress = folder, progress
+        self.folder, self.schedule = folder, schedule
+        self.plan, self.started, self.before = EvolvePlan(config, speed(device)), time.monotonic(), 0.0
+        self.notes: list[str] = []  # what the time budget changed
+        self.left_out: list[int] = []
         self.fingerprint = digest_of(part.numpy() for part in vars(problem.known).values())
         self.frozen: SpaceTimeSDF | None = None
         self.stages: list[dict[str, Any]] = []
@@ -131,14 +154,20 @@ class _Evolving:
     def run(self, flag: StopFlag) -> Evolution:
         self.folder.begin(self.record(finished=False))
         for level in range(len(self.stages), self.config.num_levels):
+            self.schedule.plan(self.plan.stages(level, begun=bool(self.trainer_state)), budget=self.left())
+            if not self.trainer_state and not self.is_worth(level):
+                self.leave_out(level)
+                break
             self.train_level(level, flag)
+        self.schedule.plan([self.plan.checking()])
         assert self.frozen is not None
         field = self.frozen.cpu()
         record = self.record(finished=True)
 
         def count(done: int, total: int) -> None:
-            self.progress(Progress("checks", done, total, done / total, {}))
+            self.schedule(Progress("checks", done, total, done / total, {}))
 
+        count(0, 1)
         record["checks"] = check_evolution(
             field, self.problem.ends, frames=self.config.frames, resolution=self.config.resolution, count=count
         )
@@ -158,12 +187,12 @@ class _Evolving:
             raise InputError(
                 f"{error}; train the level before longer (--steps), or widen the band (--epsilon)"
             ) from error
-        seconds, steps = self.seconds_for(level, beginning_seconds), config.steps[level]
+        seconds, steps = self.seconds_for(level), config.steps[level]
         trainer = Trainer(objective, stage=f"level {level}", steps=steps, seconds=seconds, clip=LONGEST_GRADIENT)
         if self.trainer_state:
             trainer.restore(self.trainer_state)
             self.trainer_state = {}
-        if not trainer.run(flag, report=self.progress, save=lambda: self.save(field, trainer)):
+        if not trainer.run(flag, report=self.schedule, save=lambda: self.save(field, trainer)):
             raise Interrupted(self.folder.out)
         self.frozen = field.requires_grad_(False)
         errors = self.errors_at_ends()
@@ -190,7 +219,10 @@ class _Evolving:
         if level == 0:
             if self.trainer_state:
                 return self.empty(1).to(self.device)
-            return learn_start(self.problem.known.to(self.device), config, generator, self.progress).to(self.device)
+            left = self.left()
+            seconds = None if left is None else max(STARTING_SHARE * left, LEAST_SECONDS)
+            known = self.problem.known.to(self.device)
+            return learn_start(known, config, generator, self.schedule, seconds=seconds).to(self.device)
         assert self.frozen is not None
         assert delta is not None
         residual = new_level(config, level, residual=True, in_dim=4)
@@ -215,22 +247,45 @@ class _Evolving:
         rows = [torch.nn.functional.pad(end.points, (0, 1), value=end.time) for end in self.problem.ends]
         return torch.cat([self.frozen.value(part.to(self.device)).cpu() for part in torch.cat(rows).split(1 << 16)])
 
-    def seconds_for(self, level: int, beginning: float) -> float | None:
-        """How long this level may train within the time budget: by the work that its steps are."""
-        config = self.config
-        if config.time_budget is None:
+    def left(self) -> float | None:
+        """Seconds of the time budget that are left for levels: all but the checks at the end."""
+        budget = self.config.time_budget
+        if budget is None:
             return None
-        spent = sum(stage["beginning_seconds"] + stage["training_seconds"] for stage in self.stages)
-        work = [
-            steps * width**2 * depth
-            for steps, width, depth in zip(config.steps, config.widths, config.depths, strict=True)
-        ]
-        return max(config.time_budget - spent - beginning, 1e-3) * work[level] / math.fsum(work[level:])
+        left = budget - self.before - (time.monotonic() - self.started)
+        return max(left - min(self.schedule.predicted(self.plan.checking()), left / 2), LEAST_SECONDS)
+
+    def seconds_for(self, level: int) -> float | None:
+        """How long this level may train within the time budget: by the work that its steps are, if it is too little."""
+        left = self.left()
+        if left is None:
+            return None
+        work = [self.plan.level(each).seconds for each in range(level, self.config.num_levels)]
+        while len(work) > 1 and left * work[-1] / sum(work) < self.least_seconds(level + len(work) - 1):
+            work.pop()  # it will be left out
+        took = float(self.trainer_state["progress"][1]) if self.trainer_state else 0.0
+        return left * work[0] / math.fsum(work) + took
+
+    def least_seconds(self, level: int) -> float:
+        """Training that makes a level worth beginning."""
+        steps = min(FEWEST_STEPS, -(-self.config.steps[level] // 4))
+        return steps * self.plan.step_seconds(level) * self.schedule.slowness("steps")
+
+    def is_worth(self, level: int) -> bool:
+        """Whether a level is to be trained; level 0 is in any case."""
+        left = self.left()
+        return left is None or level == 0 or left >= self.least_seconds(level)
+
+    def leave_out(self, first: int) -> None:
+        """Say that levels are not trained."""
+        self.left_out = list(range(first, self.config.num_levels))
+        names = f"level {first} is" if len(self.left_out) == 1 else f"levels {first} to {self.left_out[-1]} are"
+        self.notes.append(f"{names} left out: too little time for {FEWEST_STEPS} steps")
 
     def save(self, field: SpaceTimeSDF, trainer: Trainer[EvolveObjective] | None) -> None:
         """Write a usable field and all that `restore` needs."""
         tensors = checkpoint_of(self.frozen, trainer)
-        progress = {"fingerprint": self.fingerprint, "stages": self.stages}
+        progress = {"fingerprint": self.fingerprint, "stages": self.stages, "notes": self.notes}
         self.folder.save(field, self.problem.similarity, self.record(finished=False), tensors, progress)
 
     def restore(self) -> None:
@@ -238,14 +293,18 @@ class _Evolving:
         names = ", ".join(self.names)
         mismatch = f"{names}: not the shapes that {self.folder.path} was trained on; bring those back"
         tensors, progress = self.folder.restore(self.fingerprint, mismatch)
-        self.stages = progress["stages"]
+        self.stages, self.notes = progress["stages"], progress.get("notes", [])
         if self.stages:
             self.frozen = restore_frozen(self.empty(len(self.stages)).to(self.device), tensors)
         self.trainer_state = without_prefix("trainer.", tensors)
+        took = sum(stage["beginning_seconds"] + stage["training_seconds"] for stage in self.stages)
+        self.before = took + (float(self.trainer_state["progress"][1]) if self.trainer_state else 0.0)
 
     def record(self, *, finished: bool) -> dict[str, Any]:
         """What ``run.json`` holds."""
         seconds = sum(stage["beginning_seconds"] + stage["training_seconds"] for stage in self.stages)
+        limit = self.config.time_budget
+        budget = {"seconds": limit, "left_out": self.left_out, "notes": self.notes}
         return {
             "finished": finished,
             "kind": self.config.kind,
@@ -259,5 +318,6 @@ class _Evolving:
             "parameters": sum(stage["parameters"] for stage in self.stages),
             "deltas": [stage["delta"] for stage in self.stages if stage["delta"] is not None],
             "training_seconds": round(seconds, 3),
+            **({} if limit is None else {"budget": budget}),
             "environment": environment(self.device),
         }

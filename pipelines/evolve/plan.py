@@ -1,0 +1,105 @@
+"""What an evolution will do, and how long that should take: for its progress display, and within its time budget.
+
+Without a budget nothing of this changes what is computed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from ..run.costs import Net, Speed, jets, training, values
+from ..run.schedule import Stage
+from ..run.settings import EvolveConfig
+
+__all__ = ["FEWEST_STEPS", "EvolvePlan", "within"]
+
+# Steps of a field of space-time over those of a field of space with as many parameters, by the law's derivatives.
+ORDER_ONE, ORDER_TWO = 1.6, 2.8
+USUAL = Net.siren(256, 2)  # a shape that is given as a field: what its coarse levels cost
+MESHED = 128  # cells along the meshes of shapes
+ENDS_MESHED = 192
+JUDGING = 1.0e11  # FLOPs that take as long as the Chamfer distance of an end
+# A level is not worth fewer steps, or fewer than a quarter of its own.
+FEWEST_STEPS = 40
+FEWEST_SAMPLES, FEWEST_FRAMES = 5_000, 3
+# Of a budget that is too small, what known samples and the checks at the end may take.
+SAMPLING_SHARE, CHECKING_SHARE = 0.25, 0.25
+
+
+@dataclass(frozen=True)
+class EvolvePlan:
+    """The stages of an evolution, with the seconds that they should take.
+
+    Attributes:
+        config: settings of the evolution.
+        speed: of the machine.
+    """
+
+    config: EvolveConfig
+    speed: Speed
+
+    def stages(self, first: int = 0, *, begun: bool = False) -> list[Stage]:
+        """Training from a level on, which has ``begun`` if its start is learnt; and the checks."""
+        config, start = self.config, [self.starting()] if first == 0 and not begun else []
+        return [*start, *(self.level(level) for level in range(first, config.num_levels)), self.checking()]
+
+    def shapes(self) -> Stage:
+        """Reading and meshing the shapes."""
+        work = len(self.config.shapes) * values(4 * MESHED**2, [USUAL])
+        return Stage("shapes", "mesh", self.speed.points(work))
+
+    def known(self) -> Stage:
+        """Samples at which the field is known, and bounds."""
+        config = self.config
+        points = 4.5 * config.samples + 1e5 * max(len(config.shapes), 1)
+        return Stage("known samples", "samples", self.speed.points(jets(points, [USUAL])))
+
+    def starting(self) -> Stage:
+        """Learning the shape at time 0."""
+        steps = self.config.start_steps
+        work = training(steps, self.config.batch / 2, [self._net(0, inputs=3)])
+        return Stage("first shape", "steps", self.speed.networks(work, steps=steps))
+
+    def level(self, level: int) -> Stage:
+        """All steps of a level."""
+        steps = self.config.steps[level]
+        return Stage(f"level {level}", "steps", steps * self.step_seconds(level))
+
+    def step_seconds(self, level: int) -> float:
+        """One step of a level."""
+        config, order = self.config, ORDER_TWO if self.config.kind == "smooth" else ORDER_ONE
+        before = jets(config.batch, [self._net(each) for each in range(level)])
+        return self.speed.networks(order * training(1, config.batch, [self._net(level)]) + before, steps=1)
+
+    def checking(self) -> Stage:
+        """Meshes of frames and ends."""
+        config, nets = self.config, [self._net(level) for level in range(self.config.num_levels)]
+        ends = 2 if config.kind == "transport" else max(len(config.shapes), 1)
+        cells = config.frames * config.resolution**2 + ends * ENDS_MESHED**2
+        work = values(4 * cells, nets) + jets(2 * cells, nets) + ends * JUDGING
+        return Stage("checks", "mesh", self.speed.points(work))
+
+    def _net(self, level: int, *, inputs: int = 4) -> Net:
+        return Net.siren(self.config.widths[level], self.config.depths[level], inputs=inputs)
+
+
+def within(config: EvolveConfig, speed: Speed, seconds: float) -> tuple[EvolveConfig, list[str]]:
+    """The settings that a time budget leaves, and sentences on what it changed: fewer known samples, fewer checks.
+
+    Args:
+        config: settings.
+        speed: of the machine.
+        seconds: that are left.
+    """
+    plan, notes = EvolvePlan(config, speed), list[str]()
+    share = SAMPLING_SHARE * seconds / plan.known().seconds
+    if share < 1 and config.samples > FEWEST_SAMPLES:
+        samples = max(int(share * config.samples), FEWEST_SAMPLES)
+        notes.append(f"{samples:,} known samples instead of {config.samples:,}")
+        config = replace(config, samples=samples)
+    share = CHECKING_SHARE * seconds / plan.checking().seconds
+    if share < 1 and config.frames > FEWEST_FRAMES:
+        frames = max(int(share * config.frames), FEWEST_FRAMES)
+        notes.append(f"{frames} frames are checked instead of {config.frames}")
+        config = replace(config, frames=frames)
+    return config, notes
