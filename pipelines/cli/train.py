@@ -135,15 +135,22 @@ def _reconstruct(arguments: argparse.Namespace) -> int:
     if arguments.resume and were_given(arguments, ReconstructConfig):
         raise input_error("--resume: continues with the run's own settings; leave out --preset, --config and the rest")
     config = None if arguments.resume else read_settings(arguments, ReconstructConfig)
-    from ..mesh.extract import mesh_run
+    from ..mesh.extract import mesh_run, mesh_stage
     from ..reconstruct.train import HELD_OUT_FILE, reconstruct
-    from ..run.folder import check_new_run
+    from ..run.costs import Net
+    from ..run.folder import check_new_run, read_record
+    from ..run.machine import choose_device, speed
 
     directory = check_new_run(arguments.out, resume=arguments.resume, force=arguments.force)
     again = f"to continue: mplicits reconstruct {arguments.data} -o {directory} --resume"
     with training(again, quiet=arguments.quiet) as report:
+        if report is not None:
+            used = config or load_config(ReconstructConfig, None, read_record(directory)["config"])
+            nets = [Net.siren(*size) for size in zip(used.widths, used.depths, strict=True)]
+            report.follow([mesh_stage(nets, speed(choose_device(used.device)))])
         run = reconstruct(arguments.data, config, out=directory, resume=arguments.resume, progress=report)
-    mesh = mesh_run(directory, directory / MESH_FILE)
+        mesh = mesh_run(directory, directory / MESH_FILE, progress=report)
+    tell_budget(run.record)
     views, held_out = run.record["views"], run.record["held_out"]
     print(
         f"{run.record['data']}: {views['trained']} views, {run.record['steps']:,} steps in "

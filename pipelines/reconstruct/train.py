@@ -6,6 +6,7 @@ Colours are learnt by direction; at the end a texture learns those seen head-on,
 from __future__ import annotations
 
 import dataclasses
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,15 +20,18 @@ from ...datasets import PointCloud
 from ...datasets.views.images import PosedImage, PosedImages, read_posed_images
 from ...neural_fields import InputError, Jet, NoSurfaceError, TextureField, extract_mesh, save_texture
 from ..render.picture import write_picture
+from ..run.costs import Speed
 from ..run.folder import TEXTURE_FILE, RunFolder, digest_of
-from ..run.machine import choose_device, environment
+from ..run.machine import choose_device, environment, speed
+from ..run.schedule import Progress, Report, Schedule, Stage
 from ..run.settings import ReconstructConfig, TextureConfig
-from ..run.trainer import Interrupted, Progress, Report, parameter_count, stop_on_signals
+from ..run.trainer import Interrupted, parameter_count, stop_on_signals
 from ..surface.surface import from_mesh, sample_points
 from ..surface.trim import in_region
 from ..texture.train import FittedTexture, fit_texture
 from .model import RayPool, SceneModel, build_scene
 from .objective import scene_trainer
+from .plan import SPHERE, ReconstructPlan, level_stage
 from .views import ViewImage, comparison_sheet, held_out, measure, render_image
 
 __all__ = ["HELD_OUT_FILE", "PREVIEW_FILE", "Reconstruction", "reconstruct", "scene_texture", "surface_colors"]
@@ -39,6 +43,9 @@ SHEET_VIEWS = 4  # rows of the sheet of held-out views
 TEXTURE_RESOLUTION = 128  # of the mesh whose points are coloured: finer than the texture's band is wide
 TEXTURE_SAMPLES = 100_000
 BATCH = 1 << 15
+# Of pictures that are not read yet.
+USUAL_PIXELS, USUAL_HELD_OUT, USUAL_READING = 60_000, 6, 2.0
+LEAST_SECONDS = 0.5  # of training, where a time budget leaves none
 
 
 @dataclass(frozen=True)
@@ -85,11 +92,17 @@ def reconstruct(
         >>> run = reconstruct("data/dtu_scan24")  # doctest: +SKIP
         >>> run.record["held_out"]["psnr"]  # doctest: +SKIP
     """
-    folder = RunFolder(out, resume=resume)
+    started, folder = time.monotonic(), RunFolder(out, resume=resume)
     config = folder.config(ReconstructConfig, config)
-    device = choose_device(config.device)
+    device, schedule = choose_device(config.device), Schedule.of(progress)
+    machine = speed(device)
+    plan = ReconstructPlan(config, machine, USUAL_PIXELS, USUAL_HELD_OUT, texture_settings(config))
+    reading = Stage("reading the pictures", "reading", USUAL_READING)
+    schedule.plan([reading, *plan.before(), *plan.levels(), *plan.after()], budget=config.time_budget)
+    schedule(Progress(reading.name, 0, 0, 0.0, {}))
     images = data if isinstance(data, PosedImages) else read_posed_images(data, width=config.width)
-    training = _Reconstruction(images, config, device, folder, progress or (lambda _: None))
+    schedule(Progress(reading.name, 0, 0, 1.0, {}))
+    training = _Reconstruction(images, config, device, folder, schedule, machine=machine, started=started)
     with folder.writing(HELD_OUT_FILE):
         if resume:
             training.restore()
@@ -105,19 +118,40 @@ class _Reconstruction:
         config: ReconstructConfig,
         device: torch.device,
         folder: RunFolder,
-        progress: Report,
+        schedule: Schedule,
+        *,
+        machine: Speed,
+        started: float,
     ) -> None:
         self.images, self.config, self.device = images, config, device
-        self.folder, self.progress = folder, progress
+        self.folder, self.schedule, self.started = folder, schedule, started
+        self.notes: list[str] = []  # what the time budget changed
         self.train_views, self.test_views = held_out(images.views, config.test_every)
+        pixels = round(np.mean([view.color.shape[0] * view.color.shape[1] for view in images.views]))
+        self.plan = ReconstructPlan(config, machine, pixels, len(self.test_views), texture_settings(config))
+        schedule.plan([*self.plan.before(), *self.plan.levels(), *self.plan.after()], budget=self.left())
         pool = RayPool(self.train_views, images.similarity, device)
-        progress(Progress("reconstruct: a sphere to begin with", 0, config.steps, 0.0, {}))
+        schedule(Progress(SPHERE, 0, 0, 0.0, {}))
         self.model = build_scene(config, has_masks=pool.has_masks).to(device)
-        self.trainer = scene_trainer(self.model, pool, config, seconds=config.time_budget)
+        schedule(Progress(SPHERE, 0, 0, 1.0, {}))
+        self.trainer = scene_trainer(self.model, pool, config, seconds=self.training_seconds())
         # Of the training pixels, their masks and the cameras.
         seen = (pool.colors, pool.eyes, pool.axes, pool.lens, *([] if pool.masks is None else [pool.masks]))
         self.fingerprint = digest_of(tensor.cpu().numpy() for tensor in seen)
         self.shown = 0
+
+    def left(self) -> float | None:
+        """Seconds left of the time budget."""
+        budget = self.config.time_budget
+        return None if budget is None else max(budget - (time.monotonic() - self.started), 0.0)
+
+    def training_seconds(self) -> float | None:
+        """How long the training may take within the time budget: all but what comes after it, but half at least."""
+        left = self.left()
+        if left is None:
+            return None
+        after = sum(self.schedule.predicted(stage) for stage in self.plan.after())
+        return max(left - min(after, left / 2), LEAST_SECONDS)
 
     @property
     def level(self) -> int:
@@ -148,7 +182,9 @@ class _Reconstruction:
         return Reconstruction(self.model, texture, self.images, out, record)
 
     def _report(self, progress: Progress) -> None:
-        self.progress(dataclasses.replace(progress, stage=f"reconstruct, level {self.level}"))
+        begin, end = ([*self.plan.starts(), 1.0][self.level + ahead] for ahead in (0, 1))
+        within = (progress.fraction - begin) / (end - begin)
+        self.schedule(dataclasses.replace(progress, stage=level_stage(self.level), fraction=min(max(within, 0.0), 1.0)))
         done = progress.fraction
         if self.folder.out is not None and done * (PREVIEWS + 1) >= self.shown + 1 and done < 1:
             self.shown = int(done * (PREVIEWS + 1))
@@ -162,11 +198,18 @@ class _Reconstruction:
         return render_image(self.model, view, self.images.similarity, self.trainer.objective.sampling, level=self.level)
 
     def _render_held_out(self) -> list[tuple[PosedImage, ViewImage]]:
-        pairs = []
+        pairs, count, limit = [], len(self.test_views), self.left()
+        begun = time.monotonic()
+        self.schedule.plan(self.plan.after(), budget=limit)
+        if count:
+            self.schedule(Progress("held-out views", 0, count, 0.0, {}))
         for index, view in enumerate(self.test_views):
+            # Half of what is left of a time budget is for the texture.
+            if pairs and limit is not None and time.monotonic() - begun > limit / 2:
+                self.notes.append(f"{index} of {count} held-out views are measured")
+                break
             pairs.append((view, self._image(view)))
-            count = len(self.test_views)
-            self.progress(Progress("held-out views", index + 1, count, (index + 1) / count, {}))
+            self.schedule(Progress("held-out views", index + 1, count, (index + 1) / count, {}))
         return pairs
 
     def _figures(self, pairs: Sequence[tuple[PosedImage, ViewImage]]) -> dict[str, Any] | None:
@@ -184,7 +227,7 @@ class _Reconstruction:
         if self.config.texture_steps == 0:
             return None, None
         try:
-            fitted = scene_texture(self.model, self.images, self.config, progress=self.progress)
+            fitted = scene_texture(self.model, self.images, self.config, progress=self.schedule, seconds=self.left())
         except NoSurfaceError as error:
             raise InputError(
                 f"{self.images.source}: the training found no surface ({error}); see `mplicits check-cameras`, "
@@ -211,7 +254,7 @@ class _Reconstruction:
 
     def _record(self, *, finished: bool) -> dict[str, Any]:
         """What ``run.json`` holds."""
-        model, trainer = self.model, self.trainer
+        model, trainer, limit = self.model, self.trainer, self.config.time_budget
         parts = {"geometry": model.geometry, "color": model.color}
         return {
             "finished": finished,
@@ -225,6 +268,7 @@ class _Reconstruction:
             "inv_std": float(model.inv_std.detach()),
             "steps": trainer.step,
             "training_seconds": round(trainer.elapsed, 3),
+            **({} if limit is None else {"budget": {"seconds": limit, "notes": self.notes}}),
             "losses": trainer.losses,
             "environment": environment(self.device),
         }
@@ -246,6 +290,7 @@ def scene_texture(
     config: ReconstructConfig,
     *,
     progress: Report | None = None,
+    seconds: float | None = None,
 ) -> FittedTexture:
     """Train a `TextureField` on the head-on colours of a scene's surface.
 
@@ -254,17 +299,30 @@ def scene_texture(
         images: of it; for the coordinates and the name.
         config: the reconstruction's; ``texture_steps``, seed and device are used.
         progress: see `fit_texture`.
+        seconds: a time budget; None for none.
 
     Raises:
         NoSurfaceError: the geometry has no surface.
     """
+    started, report = time.monotonic(), progress or (lambda _: None)
+    report(Progress("texture: surface", 0, 0, 0.0, {}))
     mesh = in_region(extract_mesh(model.geometry, resolution=TEXTURE_RESOLUTION))
     if mesh is None:
         raise NoSurfaceError("all of it is outside the region of interest")
     points, _ = sample_points(from_mesh(mesh), TEXTURE_SAMPLES, np.random.default_rng(config.seed))
     colors = surface_colors(model, torch.from_numpy(points).float()).numpy()
     cloud = PointCloud(images.similarity.to_input(points), colors=colors, source=str(images.source))
-    settings = TextureConfig(
-        steps=config.texture_steps, samples=TEXTURE_SAMPLES, seed=config.seed, device=config.device
+    report(Progress("texture: surface", 0, 0, 1.0, {}))
+    settings = texture_settings(config)
+    if seconds is not None:
+        settings = dataclasses.replace(settings, time_budget=max(seconds, LEAST_SECONDS))
+    return fit_texture(
+        model.geometry, cloud, settings, similarity=images.similarity, progress=progress, started=started
     )
-    return fit_texture(model.geometry, cloud, settings, similarity=images.similarity, progress=progress)
+
+
+def texture_settings(config: ReconstructConfig) -> TextureConfig:
+    """Settings of the texture that a reconstruction ends with; one step of it, where there is none."""
+    return TextureConfig(
+        steps=max(config.texture_steps, 1), samples=TEXTURE_SAMPLES, seed=config.seed, device=config.device
+    )

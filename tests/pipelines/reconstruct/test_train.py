@@ -221,7 +221,7 @@ def test_pictures_on_the_way(data: Path, tmp_path: Path) -> None:
 
     seen: list[Progress] = []
     reconstruct(data, replace(TINY, texture_steps=0), out=tmp_path, progress=report)
-    assert [progress.step for progress in seen] == [1, 2]
+    assert [progress.step for progress in seen] == [0, 1, 2]
     assert not (tmp_path / "preview.png").exists()
 
 
