@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from ..run.costs import Net, Speed, jets, preparation, queries, training, values, windings
+from ..run.costs import Net, Speed, densifying, jets, preparation, queries, training, values, windings
 from ..run.schedule import Stage
 from ..run.settings import FitConfig
 
@@ -74,9 +74,11 @@ class FitPlan:
     def sampling_seconds(self, level: int, samples: int | None = None) -> float:
         """`sampling`, of so many samples instead of those of the settings."""
         count = self.config.samples if samples is None else samples
-        points = queries(2 * count if level else count, self.points) + windings(count / 2 if not level else 0, DIPOLES)
-        points += queries(self.points, self.points)  # an index, and how far apart its points are
-        return self.speed.points(points) + self.looking_seconds(level, self.points + 3 * count)
+        filled = max(self.points, count) if self.config.between else self.points  # of a sparse cloud, at most
+        points = queries(2 * count if level else count, filled) + windings(count / 2 if not level else 0, DIPOLES)
+        if not level:  # an index, how far apart its points are, and what is between them
+            points += queries(filled, filled) + densifying(filled - self.points)
+        return self.speed.points(points) + self.looking_seconds(level, filled + 3 * count)
 
     def looking_seconds(self, level: int, points: int) -> float:
         """The levels before ``level`` at so many points."""

@@ -73,6 +73,11 @@ class Timing:
         """The cloud is prepared."""
         self._at("preparing the cloud", 1.0)
 
+    def first_samples(self) -> int:
+        """How many samples a level may have, before anything is measured; without a budget all."""
+        left = self._left()
+        return self.config.samples if left is None else self.plan.shares(0, max(left, 0.0))[0].samples
+
     def share(self, level: int, index: Callable[[], CloudDistance], *, begun: bool = False) -> Share | None:
         """What the budget leaves for a level; None where that is not worth training. Then the rest is left out.
 

@@ -281,7 +281,7 @@ class _Fitting:
             return CloudDistance(self.points, self.normals, noise=noise)
         omega = max(config.omegas[: config.num_levels])
         return dense_distance(
-            self.points, self.normals, omega=omega, count=config.samples, noise=noise, seed=config.seed
+            self.points, self.normals, omega=omega, count=self.timing.first_samples(), noise=noise, seed=config.seed
         )
 
     def next_band(self) -> Band:

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-__all__ = ["Net", "Speed", "jets", "preparation", "queries", "reading_seconds", "training", "values", "windings"]
+__all__ = ["Net", "Speed", "densifying", "jets", "preparation", "queries", "reading_seconds", "training", "values", "windings"]
 
 # FLOPs per parameter and per neuron (a sine, its derivatives, and the memory they go through) of a point:
 # a value, a value with its gradient, and these in a training step, forward, backward and Adam.
@@ -20,6 +20,7 @@ VALUE, JET, STEP = (2.0, 190.0), (3.7, 400.0), (14.0, 1260.0)
 QUERY, QUERY_GROWTH = 180e3, 0.7
 WINDING = 330.0  # of one dipole at one point
 PREPARED = 1.0e6  # of one point, from its file to the unit sphere
+DENSIFIED = 1.2e6  # of one place tried between the points of a sparse cloud
 BYTES_PER_SECOND = 2e7  # of a file that is read
 
 
@@ -104,9 +105,15 @@ def preparation(cloud: int) -> float:
     return cloud * PREPARED
 
 
+def densifying(places: float) -> float:
+    """FLOPs that take as long as looking for the surface at places between the points of a sparse cloud."""
+    return places * DENSIFIED
+
+
 def reading_seconds(size: int) -> float:
     """Seconds to read a file of ``size`` bytes."""
-    return size / BYTES_PER_SECOND
+    return size / DENSIFIED = 1.2e6  # of one place tried between the points of a sparse cloud
+BYTES_PER_SECOND
 
 
 def _of(nets: Sequence[Net], cost: tuple[float, float]) -> float:

@@ -266,3 +266,24 @@ def test_the_bundled_presets_are_valid(name: str) -> None:
 
 def test_the_defaults_are_the_default_preset() -> None:
     assert load_config(EvolveConfig, "default", thing="evolve") == EvolveConfig()
+
+
+def test_stages_are_those_that_are_announced() -> None:
+    said: list[Progress] = []
+    evolve(BRIEF, progress=said.append)
+    stages = ["shapes", "known samples", "first shape", "level 0", "level 1", "checks"]
+    assert list(dict.fromkeys(progress.stage for progress in said)) == stages
+    assert all(progress.left is not None for progress in said)
+    assert said[-1].whole == 1.0
+
+
+def test_a_budget_that_is_too_small_leaves_out_levels_and_samples(tmp_path: Path) -> None:
+    """A tenth of a second is less than sixty steps of a (512, 4) level take, and less than these checks."""
+    config = replace(BRIEF, widths=(16, 512), depths=(1, 4), samples=400_000, frames=40, batch=4096, time_budget=0.1)
+    record = evolve(config, out=tmp_path / "run").record
+    assert record["budget"]["left_out"] == [1]
+    assert len(record["stages"]) == 1
+    assert record["stages"][0]["steps"] > 0
+    assert record["config"]["samples"] < config.samples
+    assert len(record["checks"]["frames"]) < config.frames
+    assert len(record["budget"]["notes"]) == 3

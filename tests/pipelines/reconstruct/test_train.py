@@ -413,3 +413,34 @@ def test_a_painted_sphere_is_recovered_from_its_pictures(tmp_path: Path) -> None
     assert sum(chamfer(here, sample_scene(scene, 20_000).points)) < 3e-4
     assert run.record["held_out"]["psnr"] > 27
     assert run.record["inv_std"] > 100
+
+
+def test_stages_are_those_that_are_announced(data: Path) -> None:
+    said: list[Progress] = []
+    reconstruct(data, TINY, progress=said.append)
+    assert list(dict.fromkeys(progress.stage for progress in said)) == [
+        "reading the pictures",
+        "a sphere to begin with",
+        "reconstruct, level 0",
+        "reconstruct, level 1",
+        "held-out views",
+        "texture: surface",
+        "texture: samples",
+        "texture",
+    ]
+    assert all(progress.left is not None for progress in said)
+    assert said[-1].whole == 1.0
+    shares = [progress.fraction for progress in said if progress.stage == "reconstruct, level 1"]
+    assert shares == sorted(shares)
+    assert shares[-1] == 1.0
+
+
+def test_a_budget_counts_all_but_leaves_half_for_the_training(data: Path, tmp_path: Path) -> None:
+    """The texture alone would take longer: it gets what is left."""
+    config = replace(TINY, steps=10**6, texture_steps=10**6, time_budget=2.0)
+    record = reconstruct(data, config, out=tmp_path / "run").record
+    assert record["budget"]["seconds"] == 2.0
+    assert record["training_seconds"] < 2.0
+    assert record["steps"] < config.steps
+    assert record["texture"]["steps"] < config.texture_steps
+    assert record["texture"]["budget"]["seconds"] < 2.0
