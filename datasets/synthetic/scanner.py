@@ -23,16 +23,18 @@ STATUE_PLACEMENT = Similarity((1250.0, -840.0, 930.0), 480.0)
 """Where the bundled scan stands: in millimetres, as if measured in the hall of a museum."""
 
 _RELAX = 0.75  # steps are this much shorter than the field says, because a field may be steeper than a distance
+_STEPS = 96  # of a ray at most
 _ELEVATIONS = (12.0, 38.0, -30.0, 22.0)  # degrees; scanner after scanner, over again
 
 
-def statue_scan(*, seed: int = 0) -> PointCloud:
+def statue_scan(*, seed: int = 0, progress: Callable[[int, int], None] | None = None) -> PointCloud:
     """Scan the :class:`Statue` with eight scanners: the bundled sample, some 90,000 points in millimetres.
 
-    ``STATUE_PLACEMENT.to_unit(points)`` leads back to the coordinates of ``Statue().exact_distance``.
+    ``STATUE_PLACEMENT.to_unit(points)`` leads back to the coordinates of ``Statue().exact_distance``. Of
+    ``progress`` see `simulate_scan`.
     """
     statue = Statue()
-    return simulate_scan(statue, colors=statue.colors, placement=STATUE_PLACEMENT, seed=seed)
+    return simulate_scan(statue, colors=statue.colors, placement=STATUE_PLACEMENT, seed=seed, progress=progress)
 
 
 def simulate_scan(
@@ -44,6 +46,7 @@ def simulate_scan(
     colors: Callable[[Float64], NDArray[np.float32]] | None = None,
     placement: Similarity | None = None,
     seed: int = 0,
+    progress: Callable[[int, int], None] | None = None,
 ) -> PointCloud:
     """Scan the zero set of ``field``, which lies in the unit sphere, with a ring of range scanners.
 
@@ -60,6 +63,7 @@ def simulate_scan(
         colors: the colour at points ``(N, 3)``, in the field's units.
         placement: from the field's coordinates to those of the scan; none leaves them as they are.
         seed: of the random numbers.
+        progress: told how many steps are done, and of how many: those of the rays, and one for each scanner.
 
     Raises:
         ValueError: ``scanners`` or ``resolution`` is too small, or no ray hits anything.
@@ -70,9 +74,15 @@ def simulate_scan(
     views = [_view(index, scanners, resolution, random) for index in range(scanners)]
     # all rays at once: late steps, with few rays left, cost as much as early ones
     origins = np.concatenate([np.broadcast_to(view.position, view.rays.shape).reshape(-1, 3) for view in views])
-    ranges = _trace(field, origins, np.concatenate([view.rays.reshape(-1, 3) for view in views]))
+    total, tell = _STEPS + scanners, progress or (lambda _done, _total: None)
+    tell(0, total)
+    rays = np.concatenate([view.rays.reshape(-1, 3) for view in views])
+    ranges = _trace(field, origins, rays, tell=lambda step: tell(step, total))
     split = np.split(ranges, np.cumsum([view.rays[..., 0].size for view in views])[:-1])
-    parts = [_measure(field, view, each, noise, random) for view, each in zip(views, split, strict=True)]
+    parts = []
+    for view, each in zip(views, split, strict=True):
+        parts.append(_measure(field, view, each, noise, random))
+        tell(_STEPS + len(parts), total)
     points, normals, exact = (np.concatenate([part[k] for part in parts]) for k in range(3))
     if len(points) == 0:
         raise ValueError("field: no ray of any scanner hits its surface; expected one in the unit sphere")
@@ -144,7 +154,9 @@ class _EmptySpace:
         return self._clearance[(index[:, 0] * self._cells + index[:, 1]) * self._cells + index[:, 2]]
 
 
-def _trace(field: Field, origins: Float64, rays: Float64, *, steps: int = 96, tolerance: float = 2e-4) -> Float64:
+def _trace(
+    field: Field, origins: Float64, rays: Float64, *, tell: Callable[[int], None], tolerance: float = 2e-4
+) -> Float64:
     """Sphere tracing inside the unit sphere: range ``(R,)`` along each unit ray ``(R, 3)``, NaN for a miss.
 
     The field is evaluated only where :class:`_EmptySpace` cannot promise a step; two Newton steps along the ray then
@@ -158,7 +170,8 @@ def _trace(field: Field, origins: Float64, rays: Float64, *, steps: int = 96, to
     ranges, last = middle - half_chord, middle + half_chord
     active = np.flatnonzero(half_chord > 0)
     hits: list[NDArray[np.int64]] = []
-    for _ in range(steps):
+    for step_number in range(_STEPS):
+        tell(step_number)
         points = origins[active] + ranges[active, None] * rays[active]
         step = empty.clearance(points)
         near = step <= 0

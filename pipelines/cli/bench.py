@@ -388,6 +388,23 @@ def _srb(arguments: argparse.Namespace) -> int:
     return _run(arguments, [bench], out=arguments.out)
 
 
+def _eta_arguments(parser: argparse.ArgumentParser) -> None:
+    what = "fit, reconstruct or evolve (all three)"
+    parser.add_argument("works", nargs="*", metavar="WORK", help=what)
+    _number(parser, "--share", positive, 1.0, "factor on the steps of the fast presets")
+    _number(parser, "--points", whole(100), 50_000, "of the cloud that is fitted")
+    parser.add_argument("--device", default="cpu", help="torch device (cpu)")
+    _folder(parser)
+    add_flags(parser, "--json")
+
+
+def _eta(arguments: argparse.Namespace) -> int:
+    from ..bench.eta import WORKS, EtaBench
+
+    options = {name: getattr(arguments, name) for name in ("share", "points", "device")}
+    return _run(arguments, [EtaBench(works=tuple(arguments.works) or WORKS, **options)], out=arguments.out)
+
+
 BENCH_COMMANDS: Mapping[str, Command] = MappingProxyType(
     {
         "bench normals": Command(
@@ -395,6 +412,14 @@ BENCH_COMMANDS: Mapping[str, Command] = MappingProxyType(
             "  mplicits bench normals\n  mplicits bench normals --points 65536 --json normals.json",
             _normals_arguments,
             _normals,
+        ),
+        "bench eta": Command(
+            "what progress bars say of the time left, and what is true",
+            "  mplicits bench eta\n  mplicits bench eta fit --share 0.5 --json eta.json",
+            _eta_arguments,
+            _eta,
+            "Do a fit, a reconstruction and a morph, and compare the time that they take with what was said after five "
+            "seconds, a quarter and half of it.",
         ),
         "bench mesh": Command(
             "what extraction costs: adaptive, the paper's, dense",

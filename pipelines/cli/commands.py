@@ -54,8 +54,10 @@ def _sample_arguments(parser: argparse.ArgumentParser) -> None:
 def _sample(arguments: argparse.Namespace) -> int:
     check_output(arguments.out, (".ply",))
     from ...datasets import statue_scan, write_cloud_ply
+    from ..run.progress import counter_bar
 
-    cloud = statue_scan(seed=arguments.seed)
+    with counter_bar("scan") as progress:
+        cloud = statue_scan(seed=arguments.seed, progress=progress)
     write_cloud_ply(arguments.out, cloud)
     print(f"{arguments.out}: {len(cloud):,} points; fit it with: mplicits fit {arguments.out} -o RUN")
     return 0

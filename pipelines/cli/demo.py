@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,17 +15,22 @@ from scipy.spatial import KDTree
 from ...datasets import STATUE_PLACEMENT, Camera, PointCloud, Statue, orbit, read_cloud, statue_scan, write_cloud_ply
 from ...neural_fields import Field, InputError, Placement, Similarity
 from ...neural_fields.meshing import Mesh, NoSurfaceError, extract_mesh
+from ..fit.plan import FitPlan
 from ..fit.train import Run, fit
+from ..mesh.extract import mesh_stage
 from ..mesh.files import write_mesh
 from ..render.picture import contact_sheet, write_picture
 from ..render.rasterise import picture_of
 from ..render.shade import ShadeOptions, compose, shade
 from ..render.trace import trace_view
 from ..run.config import load_config
-from ..run.machine import format_table
+from ..run.costs import Net, values
+from ..run.machine import choose_device, format_table, speed
 from ..run.progress import progress_bars
+from ..run.schedule import Progress, Schedule, Stage
 from ..run.settings import FitConfig
 from ..surface.surface import from_cloud, from_mesh
+from .common import tell_budget
 
 __all__ = ["demo", "distances_to_surface", "draw_levels", "spread_colors"]
 
@@ -34,6 +39,9 @@ Float64 = NDArray[np.float64]
 TRAINING_SECONDS = 150.0  # with what else the demo does, under four minutes on two cores
 CHECKED = 3_000  # vertices and points whose exact distance to the statue is worked out
 TILE = (480, 640)
+# Stages, and what they cost: FLOPs of the scan and of exact distances to the statue, values for each traced pixel.
+SCAN, MESHES, PICTURE, FIGURES = "scan", "meshes", "picture", "figures"
+SCANNED, JUDGED, DRAWN = 4e11, 5e11, 40
 
 
 def demo(
@@ -61,28 +69,59 @@ def demo(
     out = Path(out)
     if out.exists() and not out.is_dir():
         raise InputError(f"{out}: is a file; name a directory for the demo")
-    points = statue_scan() if cloud is None else read_cloud(cloud)  # before anything is made
-    out.mkdir(parents=True, exist_ok=True)
-    file = out / "scan.ply" if cloud is None else Path(cloud)
-    if cloud is None:
-        write_cloud_ply(file, points)
-    print(f"{file}: {len(points):,} points")
+    said: list[str] = []  # once the bars are gone
     with progress_bars() as report:
+        _plan(report, config, resolution, scan=cloud is None)
+        # Before anything is made.
+        points = statue_scan(progress=_counter(report, SCAN)) if cloud is None else read_cloud(cloud)
+        out.mkdir(parents=True, exist_ok=True)
+        file = out / "scan.ply" if cloud is None else Path(cloud)
+        if cloud is None:
+            write_cloud_ply(file, points)
+        said.append(f"{file}: {len(points):,} points")
         run = fit(file, config, out=out / "run", progress=report)
 
-    meshes = [_extract(run.field, level, resolution) for level in range(run.field.num_levels)]
-    finest = spread_colors(meshes[-1], points, run.similarity)
-    # The mesh in the scan's coordinates, and one for other programs: upright, in metres, at the origin.
-    placement = Placement("z", "mm", center=True) if cloud is None else Placement(up, center=True)
-    for name in ("mesh.ply", "mesh.glb"):
-        write_mesh(out / name, finest, run.similarity, placement if name == "mesh.glb" else None)
-    picture = draw_levels(points, run.field, finest, run.similarity, up=up or ("z" if cloud is None else "y"))
-    write_picture(out / "picture.png", picture)
-    print(_figures(run, meshes, points))
-    if cloud is None:
-        print(_true_errors(points, meshes, run.similarity))
+        meshes, levels = [], run.field.num_levels
+        mesh_count, picture_count = _counter(report, MESHES), _counter(report, PICTURE)
+        for level in range(levels):
+            mesh_count(level, levels)
+            meshes.append(_extract(run.field, level, resolution))
+        finest = spread_colors(meshes[-1], points, run.similarity)
+        # The mesh in the scan's coordinates, and one for other programs: upright, in metres, at the origin.
+        placement = Placement("z", "mm", center=True) if cloud is None else Placement(up, center=True)
+        for name in ("mesh.ply", "mesh.glb"):
+            write_mesh(out / name, finest, run.similarity, placement if name == "mesh.glb" else None)
+        mesh_count(levels, levels)
+        up = up or ("z" if cloud is None else "y")
+        picture = draw_levels(points, run.field, finest, run.similarity, up=up, progress=picture_count)
+        write_picture(out / "picture.png", picture)
+        _counter(report, FIGURES)(0, 1)
+        said.append(_figures(run, meshes, points))
+        if cloud is None:
+            said.append(_true_errors(points, meshes, run.similarity))
+        _counter(report, FIGURES)(1, 1)
+    tell_budget(run.record)
+    print("\n".join(said))
     print(f"{out / 'mesh.ply'}, mesh.glb, picture.png, run/: {time.monotonic() - started:.0f} s in all")
     return 0
+
+
+def _plan(schedule: Schedule, config: FitConfig, resolution: int, *, scan: bool) -> None:
+    """Say what the demo will do beside the fit, and about how long that takes."""
+    machine = speed(choose_device(config.device))
+    nets = [Net.siren(width, depth) for width, depth in zip(config.widths, config.depths, strict=True)]
+    levels = [nets[: level + 1] for level in range(config.num_levels)]
+    meshed = sum(mesh_stage(each, machine, resolution=resolution).seconds for each in levels)
+    drawn = sum(machine.points(values(DRAWN * TILE[0] * TILE[1], each)) for each in levels)
+    if scan:
+        schedule.plan([Stage(SCAN, "scan", machine.points(SCANNED)), *FitPlan(config, 100_000, machine).levels()])
+    after = [Stage(MESHES, "mesh", meshed), Stage(PICTURE, "picture", drawn)]
+    schedule.follow([*after, Stage(FIGURES, "figures", machine.points(JUDGED if scan else 0.0))])
+
+
+def _counter(schedule: Schedule, stage: str) -> Callable[[int, int], None]:
+    """Tells that so many parts of a stage are done, and of how many."""
+    return lambda done, total: schedule(Progress(stage, done, total, done / total, {}))
 
 
 def _extract(field: Field, level: int, resolution: int) -> Mesh:
@@ -111,7 +150,15 @@ def spread_colors(mesh: Mesh, cloud: PointCloud, similarity: Similarity, *, neig
     return dataclasses.replace(mesh, colors=colors.astype(np.float32))
 
 
-def draw_levels(cloud: PointCloud, field: Field, mesh: Mesh, similarity: Similarity, *, up: str) -> NDArray[np.uint8]:
+def draw_levels(
+    cloud: PointCloud,
+    field: Field,
+    mesh: Mesh,
+    similarity: Similarity,
+    *,
+    up: str,
+    progress: Callable[[int, int], None] | None = None,
+) -> NDArray[np.uint8]:
     """The cloud and each level side by side, all from one camera; with the mesh, where that has colours.
 
     Args:
@@ -120,11 +167,16 @@ def draw_levels(cloud: PointCloud, field: Field, mesh: Mesh, similarity: Similar
         mesh: of the finest, in unit-sphere coordinates.
         similarity: from input to unit-sphere coordinates.
         up: "y" or "z".
+        progress: told how many levels are drawn, and of how many.
     """
+    tell, levels = progress or (lambda _done, _total: None), field.num_levels
+    tell(0, levels)
     points = from_cloud(cloud).moved(similarity)
     camera = orbit(points.vertices, up=up, width=TILE[0], height=TILE[1])
     pictures = [(f"input: {len(points.vertices):,} points", picture_of(points, camera))]
-    pictures += [(f"level {level}, traced", _traced(field, camera, level)) for level in range(field.num_levels)]
+    for level in range(levels):
+        pictures.append((f"level {level}, traced", _traced(field, camera, level)))
+        tell(level + 1, levels)
     if mesh.colors is not None:
         pictures.append((f"mesh: {len(mesh.faces):,} faces", picture_of(from_mesh(mesh), camera)))
     return contact_sheet(pictures)

@@ -369,7 +369,7 @@ def test_output_into_a_closed_pipe_is_no_traceback(box):
 
 def test_the_sample_is_written_and_read_again(monkeypatch, tmp_path, capsys):
     # Fewer rays than the real scan, which takes seconds: the command, not the scanner, is tested here.
-    monkeypatch.setattr("mplicits.datasets.statue_scan", lambda *, seed: sample_sphere(50, seed=seed))
+    monkeypatch.setattr("mplicits.datasets.statue_scan", lambda *, seed, progress: sample_sphere(50, seed=seed))
     assert main(["sample", "-o", str(tmp_path / "scan.ply")]) == 0
     assert "50 points" in capsys.readouterr().out
     assert main(["info", str(tmp_path / "scan.ply")]) == 0
