@@ -11,7 +11,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-__all__ = ["Net", "Speed", "densifying", "jets", "preparation", "queries", "reading_seconds", "training", "values", "windings"]
+__all__ = [
+    "Net",
+    "Speed",
+    "densifying",
+    "jets",
+    "preparation",
+    "queries",
+    "reading_seconds",
+    "training",
+    "values",
+    "windings",
+]
 
 # FLOPs per parameter and per neuron (a sine, its derivatives, and the memory they go through) of a point:
 # a value, a value with its gradient, and these in a training step, forward, backward and Adam.
@@ -112,8 +123,7 @@ def densifying(places: float) -> float:
 
 def reading_seconds(size: int) -> float:
     """Seconds to read a file of ``size`` bytes."""
-    return size / DENSIFIED = 1.2e6  # of one place tried between the points of a sparse cloud
-BYTES_PER_SECOND
+    return size / BYTES_PER_SECOND
 
 
 def _of(nets: Sequence[Net], cost: tuple[float, float]) -> float:
