@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from ..run.config import add_config_flags, given_flags, input_error, load_config, preset_names, thing_of
 
 if TYPE_CHECKING:
-    from ..run.schedule import Schedule
+    from ..run.schedule import Progress, Report, Schedule
 
 __all__ = [
     "Command",
@@ -24,6 +24,7 @@ __all__ = [
     "add_flags",
     "add_new_run",
     "add_settings",
+    "add_tensorboard",
     "between",
     "check_output",
     "finite",
@@ -31,6 +32,7 @@ __all__ = [
     "read_settings",
     "stoppable",
     "tell_budget",
+    "tensorboard",
     "training",
     "typed",
     "were_given",
@@ -87,12 +89,53 @@ def stoppable(kept: str = "", *, at_any_time: bool = False) -> Iterator[None]:
 
 
 @contextmanager
-def training(kept: str = "", *, quiet: bool = False, at_any_time: bool = False) -> Iterator[Schedule | None]:
-    """`stoppable` work with progress bars; None if it is to be ``quiet``."""
-    from ..run.progress import progress_bars
+def training(
+    kept: str = "", *, quiet: bool = False, at_any_time: bool = False, heard: Sequence[Report] = ()
+) -> Iterator[Schedule | None]:
+    """`stoppable` work with progress bars, unless it is to be ``quiet``.
 
-    with stoppable(kept, at_any_time=at_any_time), nullcontext() if quiet else progress_bars() as report:
-        yield report
+    Args:
+        kept: see `stoppable`.
+        quiet: no bars.
+        at_any_time: see `stoppable`.
+        heard: others that are told of all progress.
+    """
+    from ..run.progress import progress_bars
+    from ..run.schedule import Schedule
+
+    with stoppable(kept, at_any_time=at_any_time), nullcontext() if quiet else progress_bars() as bars:
+        if not heard:
+            yield bars
+            return
+        listeners = [*heard, *([] if bars is None else [bars.report])]
+
+        def tell(progress: Progress, /) -> None:
+            for listener in listeners:
+                listener(progress)
+
+        yield Schedule(tell)
+
+
+def add_tensorboard(parser: argparse.ArgumentParser) -> None:
+    """The flag for `tensorboard`."""
+    what = "write the losses for TensorBoard into this folder; needs mplicits[tensorboard]"
+    parser.add_argument("--tensorboard", type=Path, metavar="DIR", help=what)
+
+
+@contextmanager
+def tensorboard(directory: Path | None) -> Iterator[list[Report]]:
+    """Who writes what TensorBoard shows, if a ``directory`` is named: for `training`.
+
+    Raises:
+        InputError: see `tensorboard_log`.
+    """
+    if directory is None:
+        yield []
+        return
+    from ..run.tensorboard import tensorboard_log
+
+    with tensorboard_log(directory) as log:
+        yield [log]
 
 
 def tell_budget(record: Mapping[str, Any], name: str = "") -> None:

@@ -17,8 +17,8 @@ from ...neural_fields import Field, InputError, Placement, Similarity
 from ...neural_fields.meshing import Mesh, NoSurfaceError, extract_mesh
 from ..fit.plan import FitPlan
 from ..fit.train import Run, fit
-from ..mesh.extract import mesh_stage
 from ..mesh.files import write_mesh
+from ..mesh.plan import mesh_stage
 from ..render.picture import contact_sheet, write_picture
 from ..render.rasterise import picture_of
 from ..render.shade import ShadeOptions, compose, shade
@@ -41,7 +41,7 @@ CHECKED = 3_000  # vertices and points whose exact distance to the statue is wor
 TILE = (480, 640)
 # Stages, and what they cost: FLOPs of the scan and of exact distances to the statue, values for each traced pixel.
 SCAN, MESHES, PICTURE, FIGURES = "scan", "meshes", "picture", "figures"
-SCANNED, JUDGED, DRAWN = 4e11, 5e11, 40
+SCANNED, JUDGED, DRAWN = 4e11, 5e11, 15
 
 
 def demo(

@@ -15,10 +15,12 @@ from .common import (
     Command,
     add_new_run,
     add_settings,
+    add_tensorboard,
     positive,
     read_settings,
     stoppable,
     tell_budget,
+    tensorboard,
     training,
     were_given,
     whole,
@@ -47,6 +49,7 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     what = "then learn the colours, if there are any, and write the mesh (.ply, .obj, .stl, .glb)"
     add("--mesh", type=Path, metavar="FILE", help=what)
     add("--no-colors", action="store_true", help="leave the colours out of --mesh")
+    add_tensorboard(parser)
     add_settings(parser, FitConfig)
     _depth_arguments(parser)
 
@@ -100,7 +103,10 @@ def _fit_one(arguments: argparse.Namespace, cloud: str, config: FitConfig | None
     if mesh is not None:
         again += f" --mesh {mesh.out}" + " --no-colors" * arguments.no_colors
     texture, made, said, started = None, None, list[str](), time.monotonic()
-    with training(again, quiet=arguments.quiet) as report:
+    with (
+        tensorboard(arguments.tensorboard) as heard,
+        training(again, quiet=arguments.quiet, heard=heard) as report,
+    ):
         if mesh is not None and report is not None:
             used = config or load_config(FitConfig, None, read_record(directory)["config"])
             report.follow(mesh.stages(used, speed(choose_device(used.device))))
@@ -158,6 +164,8 @@ def _follow(arguments: argparse.Namespace, cloud: str, config: FitConfig | None)
 
 def _fit_many(arguments: argparse.Namespace, config: FitConfig | None) -> int:
     """A run for each cloud; a failed one leaves the others alone, and exit code 1."""
+    if arguments.tensorboard is not None:
+        raise input_error("--tensorboard: is for one cloud; fit them one by one, without --jobs")
     if arguments.mesh is not None:
         raise input_error("--mesh: is for one cloud; leave it out, and mesh the runs afterwards")
     for cloud in arguments.clouds:

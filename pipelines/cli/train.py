@@ -16,9 +16,11 @@ from .common import (
     add_flags,
     add_new_run,
     add_settings,
+    add_tensorboard,
     check_output,
     read_settings,
     tell_budget,
+    tensorboard,
     training,
     were_given,
 )
@@ -128,6 +130,7 @@ def _reconstruct_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("data", metavar="DATA", help=what)
     add_new_run(parser)
+    add_tensorboard(parser)
     add_settings(parser, ReconstructConfig)
 
 
@@ -135,7 +138,8 @@ def _reconstruct(arguments: argparse.Namespace) -> int:
     if arguments.resume and were_given(arguments, ReconstructConfig):
         raise input_error("--resume: continues with the run's own settings; leave out --preset, --config and the rest")
     config = None if arguments.resume else read_settings(arguments, ReconstructConfig)
-    from ..mesh.extract import mesh_run, mesh_stage
+    from ..mesh.extract import mesh_run
+    from ..mesh.plan import mesh_stage, meshing
     from ..reconstruct.train import HELD_OUT_FILE, reconstruct
     from ..run.costs import Net
     from ..run.folder import check_new_run, read_record
@@ -143,13 +147,17 @@ def _reconstruct(arguments: argparse.Namespace) -> int:
 
     directory = check_new_run(arguments.out, resume=arguments.resume, force=arguments.force)
     again = f"to continue: mplicits reconstruct {arguments.data} -o {directory} --resume"
-    with training(again, quiet=arguments.quiet) as report:
+    with (
+        tensorboard(arguments.tensorboard) as heard,
+        training(again, quiet=arguments.quiet, heard=heard) as report,
+    ):
         if report is not None:
             used = config or load_config(ReconstructConfig, None, read_record(directory)["config"])
             nets = [Net.siren(*size) for size in zip(used.widths, used.depths, strict=True)]
             report.follow([mesh_stage(nets, speed(choose_device(used.device)))])
         run = reconstruct(arguments.data, config, out=directory, resume=arguments.resume, progress=report)
-        mesh = mesh_run(directory, directory / MESH_FILE, progress=report)
+        with meshing(report):
+            mesh = mesh_run(directory, directory / MESH_FILE)
     tell_budget(run.record)
     views, held_out = run.record["views"], run.record["held_out"]
     print(
@@ -185,6 +193,7 @@ def _evolve_arguments(parser: argparse.ArgumentParser) -> None:
     what = "runs or .safetensors files of `mplicits fit`, exact shapes such as sphere:0.4@0.2,0,0, or one YAML file"
     parser.add_argument("inputs", nargs="*", metavar="SHAPE|CONFIG", help=what)
     add_new_run(parser)
+    add_tensorboard(parser)
     add_settings(parser, EvolveConfig)
 
 
@@ -194,7 +203,11 @@ def _evolve(arguments: argparse.Namespace) -> int:
     from ..run.folder import check_new_run
 
     directory = check_new_run(arguments.out, resume=arguments.resume, force=arguments.force)
-    with training(f"to continue: mplicits evolve -o {directory} --resume", quiet=arguments.quiet) as report:
+    again = f"to continue: mplicits evolve -o {directory} --resume"
+    with (
+        tensorboard(arguments.tensorboard) as heard,
+        training(again, quiet=arguments.quiet, heard=heard) as report,
+    ):
         run = evolve(config, out=directory, resume=arguments.resume, progress=report)
     tell_budget(run.record)
     _tell_evolution(run.record)

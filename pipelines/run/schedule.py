@@ -39,6 +39,7 @@ class Progress:
         losses: unweighted loss terms of the last reported step.
         whole: fraction of the whole work, by time, in [0, 1]; None where nobody keeps a `Schedule`.
         left: seconds that the whole work will still take; None where that is not known.
+        elapsed: seconds that it took so far; None where nobody keeps a `Schedule`.
     """
 
     stage: str
@@ -48,6 +49,7 @@ class Progress:
     losses: Mapping[str, float]
     whole: float | None = None
     left: float | None = None
+    elapsed: float | None = None
 
 
 Report = Callable[[Progress], None]
@@ -85,7 +87,7 @@ class Schedule:
     """A `Report` that knows what is still to come, and says so in what it hands on.
 
     Args:
-        report: told every `Progress`, with `Progress.whole` and `Progress.left`.
+        report: told every `Progress`, with `Progress.whole`, `Progress.left` and `Progress.elapsed`.
         clock: seconds, from any origin.
 
     Example:
@@ -149,7 +151,7 @@ class Schedule:
             self._finish(under)
             left = self.left()
         self._whole = max(self._whole, self.fraction())
-        self.report(replace(progress, whole=self._whole, left=left))
+        self.report(replace(progress, whole=self._whole, left=left, elapsed=now - self.begun))
 
     def left(self) -> float | None:
         """Seconds that the whole will still take, as far as is known now; None if nothing is known."""
