@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from ...datasets.cameras import Camera
-from ...neural_fields import Field, InputError, Similarity, load_field
+from ...neural_fields import Field, InputError, Placement, Similarity, load_field
 from ...neural_fields.dynamic_tracing import DynamicTracer, moment
 from ...neural_fields.files import check_place
 from ...neural_fields.meshing import NoSurfaceError, extract_mesh
@@ -260,6 +260,7 @@ def _write_moving_mesh(
         seconds=np.arange(options.frames) / options.fps,
         similarity=similarity,
         colors=colors,
+        placement=Placement(options.orbit.up),
     )
     size = math.ceil(out.stat().st_size / 1e6)
     return f"{tracked.vertices.shape[1]:,} vertices in {options.frames} frames, {size} MB"

@@ -36,6 +36,7 @@ from mplicits.pipelines.evolve.animate import SequenceOptions, animate_run, chec
 from mplicits.pipelines.evolve.follow import follow_mesh
 from mplicits.pipelines.mesh.extract import MeshOptions, mesh_run
 from mplicits.pipelines.render.draw import RenderOptions, render_run
+from mplicits.pipelines.render.subject import Orbit
 from mplicits.pipelines.run.folder import load_still
 from mplicits.pipelines.surface.surface import read_surface
 from mplicits.pipelines.texture.riding import RidingColors, borrowed_texture
@@ -240,6 +241,13 @@ def test_colours_of_a_moving_mesh_are_those_of_its_start(run, tmp_path):
     attributes = header["meshes"][0]["primitives"][0]["attributes"]
     colors = linear_to_srgb(arrays[attributes["COLOR_0"]][:, :3] / 65535)
     np.testing.assert_allclose(colors, read_surface(tmp_path / "start.ply").colors, atol=2 / 255)
+
+
+def test_a_moving_mesh_of_a_z_up_run_is_turned_y_up(run, tmp_path):
+    for up in ("y", "z"):
+        animate_run(run, tmp_path / f"{up}.glb", SequenceOptions(frames=2, resolution=16, orbit=Orbit(up=up)))
+    turned, plain = (trimesh.load_mesh(tmp_path / f"{up}.glb", process=False).vertices for up in ("z", "y"))
+    np.testing.assert_allclose(turned, plain[:, [0, 2, 1]] * (1, 1, -1), atol=1e-6 * np.abs(plain).max())
 
 
 @pytest.mark.parametrize(("speed", "when"), [(0.4, 0.6), (0.0, None)])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 from mplicits.datasets import read_textured, sample_textured
-from mplicits.neural_fields import InputError, MultiscaleSDF, Plane, Similarity, Sphere
+from mplicits.neural_fields import InputError, MultiscaleSDF, Placement, Plane, Similarity, Sphere
 from mplicits.neural_fields.meshing import Mesh, extract_mesh
 from mplicits.pipelines.mesh import atlas as unwrap_module
 from mplicits.pipelines.mesh.atlas import decimate, from_frame, to_frame, unwrap, vertex_tangents
@@ -180,6 +180,22 @@ def test_baked_colours_are_read_back(tmp_path, suffix):
     assert error.max() < 2 * texel * 0.45 * 5 + 1 / 255  # two texels, at the steepest
     assert len(read_surface(path).faces) == len(faces)
     assert len(written.faces) == len(faces)
+
+
+def test_a_baked_mesh_is_placed_for_other_programs(tmp_path):
+    """Upright, in metres, at the origin; read back where it was, if there is a node to say so."""
+    vertices, faces = ball()
+    source = Mesh(vertices * (0.2, 0.3, 0.5), faces.astype(np.int32))
+    placement = Placement("z", "cm", center=True)
+    for name in ("ball.glb", "ball.obj"):
+        textured_mesh(tmp_path / name, source, UTM, painting, None, size=64, placement=placement)
+        seen = trimesh.load_mesh(tmp_path / name)
+        np.testing.assert_allclose(seen.extents, np.array([0.4, 1.0, 0.6]) * UTM.scale / 100, rtol=1e-5)
+        assert np.abs(seen.bounds.sum(axis=0)).max() < 1e-6
+        assert seen.volume > 0
+    back = UTM.to_unit(read_surface(tmp_path / "ball.glb").vertices)
+    np.testing.assert_allclose(np.ptp(back, axis=0), [0.4, 0.6, 1.0], rtol=1e-5)
+    assert np.abs(back.mean(axis=0)).max() < 0.05
 
 
 def test_gutter_holds_the_nearest_colour():

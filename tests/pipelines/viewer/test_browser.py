@@ -103,7 +103,7 @@ class Page:
     def pixels(self):
         image = iio.imread(io.BytesIO(self.browser.get_screenshot_as_png()))[..., :3]
         height, width = image.shape[:2]
-        return image[height // 3 :, : width // 2].astype(int)  # below the notice of software rendering
+        return image[height * 2 // 5 :, : width // 2].astype(int)  # below the notice of software rendering
 
     def control(self, label):
         found = self.browser.find_element(By.XPATH, f"//label[normalize-space()='{label}']")
