@@ -16,6 +16,7 @@ from .orientation import estimate_normals, nearest, openness, orient_normals, ou
 from .outliers import inspect_points
 from .point_cloud import PointCloud, unit_rows
 from .reading import MIN_POINTS
+from .winding import orient_by_winding
 
 __all__ = ["CleaningReport", "OrientedCloud", "prepare_cloud"]
 
@@ -38,7 +39,9 @@ class CleaningReport:
         turned_normals: normals turned round because their neighbours' point the other way.
         normals_source: "file", "mesh" (from the file's faces) or "estimated".
         flipped: whether all normals pointed inward and were turned round.
-        pieces: connected pieces oriented one by one; 0 if normals were not estimated, or a sensor oriented them.
+        pieces: connected pieces of the cloud; 0 if normals were not estimated, or a sensor oriented them.
+        oriented_by: what gave estimated normals their signs: "winding" numbers, "propagation" from point to point in
+            each piece, or the "sensor"; None for those of a file.
         smoothed_noise: standard deviation, in input units, of the noise along the normals that the points were moved
             back by; 0 if they were left where they are.
     """
@@ -56,13 +59,19 @@ class CleaningReport:
     flipped: bool
     pieces: int
     smoothed_noise: float = 0.0
+    oriented_by: Literal["winding", "propagation", "sensor"] | None = None
 
     def summary(self) -> str:
         """One line for people."""
         source = {"file": "from the file", "mesh": "of the mesh", "estimated": "estimated"}[self.normals_source]
         parts = [f"{self.kept:,} of {self.read:,} points", f"normals {source}"]
-        if self.pieces > 1:
-            parts.append(f"oriented in {self.pieces:,} separate pieces")
+        ways = {
+            "winding": "by winding numbers",
+            "propagation": "from point to point" + f" in {self.pieces:,} separate pieces" * (self.pieces > 1),
+            "sensor": "towards the sensor",
+        }
+        if self.oriented_by:
+            parts.append(f"oriented {ways[self.oriented_by]}")
         if self.flipped:
             parts.append("all normals pointed inward and were flipped (--normals file keeps them)")
         counts = {
@@ -190,14 +199,14 @@ def prepare_cloud(
     points = similarity.to_unit(places[sound])
 
     source: Literal["file", "mesh", "estimated"] = cloud.normals_source
-    flipped, pieces = False, 0
+    flipped, pieces, oriented_by = False, 0, None
     if unit is not None:
         unit = np.where(found.flipped[:, None], -unit, unit)[sound]
         flipped = normals == "auto" and _plainly_inward(points, unit)
         unit = -unit if flipped else unit
     else:
         source = "estimated"
-        unit, pieces = _estimate(points, neighbors, similarity, sensor_origin)
+        unit, pieces, oriented_by = _estimate(points, neighbors, similarity, sensor_origin)
         if smooth_noise:
             points, noise = _smoothed(points, unit)
             noise *= similarity.scale
@@ -215,6 +224,7 @@ def prepare_cloud(
         flipped=flipped,
         pieces=pieces,
         smoothed_noise=noise,
+        oriented_by=oriented_by,
     )
     colors = None if cloud.colors is None else cloud.colors[kept]
     return OrientedCloud(points.astype(np.float32), unit.astype(np.float32), colors, similarity, report)
@@ -279,12 +289,16 @@ def _plainly_inward(
 
 def _estimate(
     points: Float64, neighbors: int, similarity: Similarity, sensor_origin: tuple[float, float, float] | None
-) -> tuple[Float64, int]:
+) -> tuple[Float64, int, Literal["winding", "propagation", "sensor"]]:
     near, normals, spread = _planes(points, neighbors)
-    if sensor_origin is None:
-        return orient_normals(points, normals, spread, near)
-    towards = similarity.to_unit(np.asarray(sensor_origin, np.float64)) - points
-    return np.where((normals * towards).sum(axis=1, keepdims=True) < 0, -normals, normals), 0
+    if sensor_origin is not None:
+        towards = similarity.to_unit(np.asarray(sensor_origin, np.float64)) - points
+        return np.where((normals * towards).sum(axis=1, keepdims=True) < 0, -normals, normals), 0, "sensor"
+    propagated, pieces = orient_normals(points, normals, spread, near)
+    oriented = orient_by_winding(points, propagated)
+    if oriented is None:
+        return propagated, pieces, "propagation"
+    return oriented, pieces, "winding"
 
 
 def _planes(
