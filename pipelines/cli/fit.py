@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -50,6 +51,8 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     add("--mesh", type=Path, metavar="FILE", help=what)
     add("--no-colors", action="store_true", help="leave the colours out of --mesh")
     add_tensorboard(parser)
+    what = "show the growing field in the browser, checkpoint by checkpoint; needs mplicits[view]"
+    add("--watch", action="store_true", help=what)
     add_settings(parser, FitConfig)
     _depth_arguments(parser)
 
@@ -104,6 +107,7 @@ def _fit_one(arguments: argparse.Namespace, cloud: str, config: FitConfig | None
         again += f" --mesh {mesh.out}" + " --no-colors" * arguments.no_colors
     texture, made, said, started = None, None, list[str](), time.monotonic()
     with (
+        _watched(arguments),
         tensorboard(arguments.tensorboard) as heard,
         training(again, quiet=arguments.quiet, heard=heard) as report,
     ):
@@ -139,6 +143,15 @@ def _fit_one(arguments: argparse.Namespace, cloud: str, config: FitConfig | None
     return 0
 
 
+def _watched(arguments: argparse.Namespace) -> AbstractContextManager[object]:
+    """The run in the browser while it grows, if that is asked for."""
+    if not arguments.watch:
+        return nullcontext()
+    from ..viewer.watch import Watcher
+
+    return Watcher(arguments.out, resume=arguments.resume, say=lambda line: print(line, file=sys.stderr))
+
+
 def _planned(arguments: argparse.Namespace, source: Path | DepthInput) -> FitMesh | None:
     """The mesh that shall follow, checked; None if there is to be none."""
     if arguments.mesh is None:
@@ -164,6 +177,8 @@ def _follow(arguments: argparse.Namespace, cloud: str, config: FitConfig | None)
 
 def _fit_many(arguments: argparse.Namespace, config: FitConfig | None) -> int:
     """A run for each cloud; a failed one leaves the others alone, and exit code 1."""
+    if arguments.watch:
+        raise input_error("--watch: is for one cloud; fit them one by one, without --jobs")
     if arguments.tensorboard is not None:
         raise input_error("--tensorboard: is for one cloud; fit them one by one, without --jobs")
     if arguments.mesh is not None:

@@ -157,6 +157,8 @@ class Client:
             self._send(last)
 
     def _read(self, event: Any) -> None:
+        if self._gone.is_set():
+            return
         reading = probe(
             self._shown.shapes.moments.at(self._controls.time),
             self._shown.similarity,

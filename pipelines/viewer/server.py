@@ -25,7 +25,7 @@ from .frames import Frame, FrameScheduler
 from .paint import Painter
 from .scene import Shapes
 
-__all__ = ["FIRST_PORT", "Viewer", "free_port", "open_run", "show_field"]
+__all__ = ["FIRST_PORT", "Viewer", "free_port", "import_viser", "open_run", "show_field"]
 
 FIRST_PORT = 8080
 PORTS = 100
@@ -46,12 +46,12 @@ class Viewer:
     """
 
     def __init__(self, shown: Shown, *, host: str = "127.0.0.1", port: int | None = None, up: str = "y") -> None:
-        viser = _import_viser()
+        viser = import_viser()
         port = free_port(host, port)
         shown.painter.warm_up()
         self._clients: dict[int, Client] = {}
         self._lock = threading.Lock()
-        self._shapes = shown.shapes
+        self._shown = shown
         self._scheduler = FrameScheduler(shown.painter, self._deliver, self._fail)
         with _silent():
             self._server: Any = viser.ViserServer(host=host, port=port, label=shown.name, verbose=False)
@@ -65,9 +65,8 @@ class Viewer:
 
         @self._server.on_client_connect
         def _(handle: Any) -> None:
-            client = Client(handle, shown, self._scheduler)
             with self._lock:
-                self._clients[handle.client_id] = client
+                self._clients[handle.client_id] = Client(handle, self._shown, self._scheduler)
             if handle.client_id not in self._server.get_clients():
                 self._leave(handle.client_id)  # gone before it was here
 
@@ -80,11 +79,27 @@ class Viewer:
         """How many browsers are connected."""
         return len(self._clients)
 
+    def show(self, shown: Shown) -> None:
+        """Show something else to all browsers, from where they stand; their controls begin anew."""
+        scheduler = FrameScheduler(shown.painter, self._deliver, self._fail)
+        with self._lock:
+            before, self._shown = (self._shown, self._scheduler), shown
+            self._scheduler = scheduler
+            clients = self._server.get_clients()
+            for name, client in list(self._clients.items()):
+                client.leave()
+                if name in clients:
+                    clients[name].gui.reset()
+                    clients[name].scene.reset()
+                    self._clients[name] = Client(clients[name], shown, scheduler)
+        before[0].shapes.close()
+        before[1].close()
+
     def close(self) -> None:
         """Stop drawing and serving."""
         for client in list(self._clients):
             self._leave(client)
-        self._shapes.close()
+        self._shown.shapes.close()
         self._scheduler.close()
         with _silent():
             self._server.stop()
@@ -162,7 +177,12 @@ def show_field(
     return Shown(name, field, similarity, shapes, Painter(field, shapes.cloud, texture), side)
 
 
-def _import_viser() -> Any:
+def import_viser() -> Any:
+    """The package that serves the browser.
+
+    Raises:
+        InputError: it is not installed.
+    """
     try:
         import viser
     except ModuleNotFoundError as error:

@@ -225,3 +225,23 @@ def test_pictures_are_saved_under_new_names(page, browser):
     page.press("Save screenshot")
     shot = until(lambda: list(browser.downloads.glob("ball-002.png")))[0]
     assert iio.imread(shot).std() > 5
+
+
+def test_another_field_is_shown_from_where_one_stands(browser):
+    """As a fit that grows: first a ball alone, then a smaller one of three levels; the controls work on."""
+    grown = MultiscaleSDF(Sphere(radius=0.3), [Siren(8, 1, omega=1.0) for _ in range(2)], [0.1, 0.05])
+    with Viewer(show_field(Sphere(radius=0.6), side=96)) as watched:
+        browser.get(watched.url)
+        page = Page(browser)
+        first = page.rest()
+        watched.show(show_field(grown.requires_grad_(False), side=96))
+        second = page.changes(first)
+        assert ((first - second).max(axis=2) > 12).mean() < ((second - first).max(axis=2) > 12).mean()  # more is white
+        page.rest()
+        page.choose("Shading", "normals")
+        page.changes(second, share=0.003)
+        page.choose("Level", "2")
+        assert watched.num_clients == 1
+        assert complaints(browser) == []
+        browser.get("about:blank")
+        until(lambda: watched.num_clients == 0)
