@@ -28,13 +28,25 @@ _ELEVATIONS = (12.0, 38.0, -30.0, 22.0)  # degrees; scanner after scanner, over 
 
 
 def statue_scan(*, seed: int = 0, progress: Callable[[int, int], None] | None = None) -> PointCloud:
-    """Scan the :class:`Statue` with eight scanners: the bundled sample, some 90,000 points in millimetres.
+    """Scan the :class:`Statue` from twelve places: the bundled sample, some 100,000 points in millimetres.
+
+    The ranges have a tenth of a millimetre of noise, as those of hand-held structured-light scanners, and points are
+    1.6 mm apart: there is detail for every level to find. Nothing is seen of the face that the statue stands on, and
+    little of the owl from below.
 
     ``STATUE_PLACEMENT.to_unit(points)`` leads back to the coordinates of ``Statue().exact_distance``. Of
     ``progress`` see `simulate_scan`.
     """
     statue = Statue()
-    return simulate_scan(statue, colors=statue.colors, placement=STATUE_PLACEMENT, seed=seed, progress=progress)
+    return simulate_scan(
+        statue,
+        scanners=12,
+        noise=2e-4,
+        colors=statue.colors,
+        placement=STATUE_PLACEMENT,
+        seed=seed,
+        progress=progress,
+    )
 
 
 def simulate_scan(

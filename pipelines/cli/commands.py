@@ -13,7 +13,7 @@ from types import MappingProxyType
 
 from ..run.settings import FitConfig
 from .bench import BENCH_COMMANDS
-from .common import Command, add_flags, add_settings, check_output, read_settings, were_given
+from .common import Command, add_flags, add_settings, check_output, read_settings
 from .draw import ANIMATE, RENDER, SLICE, VIEW
 from .fit import FIT
 from .mesh import EVALUATE, MESH
@@ -24,6 +24,7 @@ from .views import CHECK_CAMERAS, SCENE
 __all__ = ["COMMANDS"]
 
 SAMPLES = ("statue",)
+DEMO_PRESET = "fast"  # with all that the demo does beside the fit, about two minutes on two cores
 
 
 def _info_arguments(parser: argparse.ArgumentParser) -> None:
@@ -68,11 +69,11 @@ def _demo_arguments(parser: argparse.ArgumentParser) -> None:
     add_flags(parser, "--out", required=False, default=Path("demo"), metavar="DIR", help="directory (demo)")
     add_flags(parser, "--resolution", default=320, help="of the meshes (320)")
     add_flags(parser, "--up", help="the axis that points up in the picture")
-    add_settings(parser, FitConfig)
+    add_settings(parser, FitConfig, default=DEMO_PRESET)
 
 
 def _demo(arguments: argparse.Namespace) -> int:
-    config = read_settings(arguments, FitConfig) if were_given(arguments, FitConfig) else None
+    config = read_settings(arguments, FitConfig, default=DEMO_PRESET)
     from .demo import demo
 
     return demo(arguments.cloud, arguments.out, config=config, up=arguments.up, resolution=arguments.resolution)

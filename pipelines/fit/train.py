@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -55,6 +56,7 @@ AGAINST = -0.7  # cosine between a normal and the gradient of level 0, below whi
 OPPOSED = -0.3  # and the mean of its neighbours', along its own
 
 Cloud = PointCloud | str | Path | NDArray[np.floating]
+LevelDone = Callable[[MultiscaleSDF, Similarity], object]
 
 
 @dataclass(frozen=True)
@@ -94,6 +96,7 @@ def fit(
     out: str | Path | None = None,
     resume: bool = False,
     progress: Report | None = None,
+    level_done: LevelDone | None = None,
 ) -> Run:
     """Fit a multiscale SDF to a point cloud.
 
@@ -104,6 +107,8 @@ def fit(
             there stays until the cloud has been read and found to be usable.
         resume: continue the interrupted run in ``out`` with its own settings; ``config`` is then ignored.
         progress: called now and then with how far the training is.
+        level_done: called with the field of all levels so far when one is finished, to show it, say; and with the
+            similarity to input coordinates.
 
     Raises:
         InputError: the cloud cannot be read or used, or there is nothing to resume.
@@ -123,6 +128,7 @@ def fit(
     prepared = prepare(raw, config)
     timing.has_prepared()
     fitting = _Fitting(prepared, raw.source, config, device, folder, timing, merging)
+    fitting.level_done = level_done
     with folder.writing(), stop_on_signals() as flag:
         if resume:
             fitting.restore()
@@ -179,6 +185,7 @@ class _Fitting:
         self.errors = torch.empty(0)  # of the last frozen level, at the input points
         self.stages: list[dict[str, Any]] = []
         self.trainer_state: dict[str, Tensor] = {}
+        self.level_done: LevelDone | None = None
         self.samples: int | None = None  # of the level under way, where a time budget leaves it fewer
 
     def run(self, flag: StopFlag) -> Run:
@@ -273,6 +280,8 @@ class _Fitting:
             }
         )
         self.save(self.frozen, None)
+        if self.level_done is not None:
+            self.level_done(self.frozen, self.cloud.similarity)
 
     def distances(self) -> CloudDistance:
         """The points, and where they are sparse for the finest level, what they say of the places between them."""

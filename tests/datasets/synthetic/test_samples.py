@@ -148,8 +148,8 @@ def test_statue_scan(statue):
     assert scan.points.max() > 1000  # millimetres in a hall, not the unit sphere
     some = STATUE_PLACEMENT.to_unit(scan.points[::40])
     distance = statue.exact_distance(some)
-    assert np.abs(distance).max() < 0.01
-    assert 0.0003 < distance.std() < 0.001
+    assert np.abs(distance).max() < 6 * 2e-4
+    assert 1e-4 < distance.std() < 2e-4  # the ranges' noise is 2e-4, along rays that meet the surface at up to 84°
     cloud = prepare_cloud(scan)
     assert cloud.report.repaired_normals > 100
     assert cloud.report.kept > 0.995 * len(scan)

@@ -116,6 +116,13 @@ def test_a_level_that_is_worse_than_none_adds_nothing(fitted: Path, tmp_path: Pa
     assert not any(stage["silenced"] for stage in read_record(fitted)["stages"])
 
 
+def test_levels_are_handed_out_as_they_are_finished() -> None:
+    config = replace(SMALL, steps=(3, 2))
+    seen: list[tuple[int, float]] = []
+    run = fit(sphere_cloud(), config, level_done=lambda field, place: seen.append((field.num_levels, place.scale)))
+    assert seen == [(1, run.similarity.scale), (2, run.similarity.scale)]
+
+
 def test_signal_handlers_are_put_back() -> None:
     before = signal.getsignal(signal.SIGINT)
     fit(sphere_cloud(200), replace(SMALL, steps=(2, 2), samples=100, batch=32))
