@@ -116,6 +116,8 @@ class FitRow:
 class FitBench(Benchmark[FitRow]):
     """Fits of the vertices of meshes with their area-weighted normals, measured against the meshes themselves.
 
+    Or of points drawn uniformly on them, with the normals of their faces: sharp edges have no vertices then.
+
     The protocol is the paper's: unit sphere, ``resolution``³ marching cubes, ``samples`` points on each surface.
     Noise moves the points along their normals, which stay as they were (the paper's Tab. 3).
 
@@ -123,6 +125,7 @@ class FitBench(Benchmark[FitRow]):
         shapes: mesh files.
         config: settings of the fits.
         noise: see `FitRow`.
+        points: how many are drawn on each mesh; None takes its vertices.
         resolution: cells along each side of the extraction box.
         samples: points drawn on each surface.
         poisson_depth: octree depth of screened Poisson, which runs if its extra is installed.
@@ -136,6 +139,7 @@ class FitBench(Benchmark[FitRow]):
     shapes: Sequence[str | Path]
     config: FitConfig
     noise: float = 0.0
+    points: int | None = None
     resolution: int = 512
     samples: int = 500_000
     poisson_depth: int = 10
@@ -151,12 +155,14 @@ class FitBench(Benchmark[FitRow]):
     def measure(self, cell: Part, work: Workplace) -> list[FitRow]:
         """See `Benchmark.measure`."""
         (path,), seed = cell.files, self.config.seed
-        cloud, reference = read_cloud(path), read_reference(path)
+        reference = read_reference(path)
+        cloud = read_cloud(path) if self.points is None else _drawn(path, reference, self.points, seed)
         if self.noise:
             cloud = add_noise(cloud, self.noise, seed=seed)
         rows: list[FitRow] = []
         drawn: list[tuple[str, Surface]] = [("input", from_cloud(cloud))]
-        home = fit_home(work.out, path, self.config, noise=self.noise)
+        drawing = {} if self.points is None else {"points": self.points}
+        home = fit_home(work.out, path, self.config, noise=self.noise, **drawing)
         for method, seconds, mesh_seconds, mesh in self.reconstructions(cloud, home, work.stage(path.stem)):
             metrics = None
             if mesh is not None:
@@ -217,6 +223,12 @@ class FitBench(Benchmark[FitRow]):
         ]
         items = [(f"{row.shape}{f' + noise {row.noise:g}' if row.noise else ''}", row) for row in rows]
         return (tabulated(self.name, "How near fits come", "shape", figures, items),)
+
+
+def _drawn(path: Path, reference: Surface, count: int, seed: int) -> PointCloud:
+    points, normals = sample_points(reference, count, np.random.default_rng(seed))
+    assert normals is not None
+    return PointCloud(points, normals.astype(np.float32), None, str(path))
 
 
 def timed_mesh(run: Run, resolution: int, level: int = -1) -> tuple[Mesh | None, float]:

@@ -134,6 +134,7 @@ def _mesh(arguments: argparse.Namespace) -> int:
 def _fit_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("shapes", nargs="+", metavar="SHAPE", help="mesh files")
     _number(parser, "--noise", positive, None, "move points by up to X bounding-box diagonals")
+    _number(parser, "--points", whole(100), None, "draw so many points with exact normals, and leave the vertices")
     _measured(parser, 512)
     _number(parser, "--poisson-depth", whole(4, 14), 10, "octree depth")
     parser.add_argument("--pictures", type=Path, metavar="DIR", help="write a picture of all methods per shape")
@@ -150,6 +151,7 @@ def _fit(arguments: argparse.Namespace) -> int:
         shapes=arguments.shapes,
         config=config,
         noise=arguments.noise or 0.0,
+        points=arguments.points,
         resolution=arguments.resolution,
         samples=arguments.eval_samples,
         poisson_depth=arguments.poisson_depth,

@@ -23,7 +23,8 @@ from .views import CHECK_CAMERAS, SCENE
 
 __all__ = ["COMMANDS"]
 
-SAMPLES = ("statue",)
+SOLIDS = ("box", "cylinder", "gear")
+SAMPLES = ("statue", *SOLIDS)
 DEMO_PRESET = "fast"  # with all that the demo does beside the fit, about two minutes on two cores
 
 
@@ -54,6 +55,8 @@ def _sample_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _sample(arguments: argparse.Namespace) -> int:
     check_output(arguments.out, (".ply",))
+    if arguments.name in SOLIDS:
+        return _solid(arguments)
     from ...datasets import statue_scan, write_cloud_ply
     from ..run.progress import counter_bar
 
@@ -61,6 +64,17 @@ def _sample(arguments: argparse.Namespace) -> int:
         cloud = statue_scan(seed=arguments.seed, progress=progress)
     write_cloud_ply(arguments.out, cloud)
     print(f"{arguments.out}: {len(cloud):,} points; fit it with: mplicits fit {arguments.out} -o RUN")
+    return 0
+
+
+def _solid(arguments: argparse.Namespace) -> int:
+    from ...datasets.synthetic.prisms import PRISMS
+    from ...neural_fields import Similarity
+    from ..mesh.files import Triangles, write_triangles
+
+    vertices, faces = PRISMS[arguments.name]()
+    write_triangles(arguments.out, Triangles(vertices, faces, None, None), Similarity.identity())
+    print(f"{arguments.out}: an exact mesh; draw points on it with: mplicits bench fit {arguments.out} --points 12000")
     return 0
 
 
@@ -107,8 +121,8 @@ COMMANDS: Mapping[str, Command] = MappingProxyType(
             _doctor,
         ),
         "sample": Command(
-            "write the bundled scan of a statue",
-            "  mplicits sample -o scan.ply",
+            "write the bundled scan of a statue, or the mesh of a solid with sharp edges",
+            "  mplicits sample -o scan.ply\n  mplicits sample gear -o gear.ply",
             _sample_arguments,
             _sample,
         ),

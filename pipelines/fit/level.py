@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -12,12 +13,14 @@ from ...neural_fields.losses import data_loss, eikonal_loss, normal_loss
 from ..run.settings import EvolveConfig, FitConfig
 from ..run.team import my_share, whole_batch
 from ..run.trainer import Group, Objective, seeded, warm_cosine
+from .heldout import LOOKS, Judge, Verdict
 from .samples import Source
 
 __all__ = ["LevelObjective", "new_level"]
 
 # A residual starts at a tenth of the usual output scale, close to the level before it.
 RESIDUAL_GAIN = 0.1
+BEST = "best."  # before the names of the weights that did best
 
 
 def new_level(config: FitConfig | EvolveConfig, level: int, *, residual: bool, in_dim: int = 3) -> Siren:
@@ -35,16 +38,28 @@ class LevelObjective(Objective):
         sources: what it learns from.
         learning_rate: the peak rate.
         generator: CPU generator that draws the batches.
+        judge: points that are not among the sources; the weights that do best there are kept.
     """
 
     def __init__(
-        self, siren: Siren, sources: Sequence[Source], *, learning_rate: float, generator: torch.Generator
+        self,
+        siren: Siren,
+        sources: Sequence[Source],
+        *,
+        learning_rate: float,
+        generator: torch.Generator,
+        judge: Judge | None = None,
     ) -> None:
         super().__init__(siren, [Group(list(siren.parameters()), warm_cosine(learning_rate))], generator)
-        self.siren, self.sources = siren, sources
+        self.siren, self.sources, self.judge = siren, sources, judge
+        if judge is not None:  # in the checkpoints too
+            best = {BEST + name: tensor.clone() for name, tensor in siren.state_dict().items()}
+            self.kept = {"looks": torch.zeros(1), "least": torch.full((1,), math.inf), "at": torch.ones(1), **best}
 
     def losses(self, step: int, done: float) -> tuple[dict[str, Tensor], Tensor]:
         """See `Objective.losses`: the mean of every term of every source."""
+        if self.judge is not None and int(done * LOOKS) > int(self.kept["looks"]):
+            self.look(done)
         batches = [source.samples.take(self._draw(source)) for source in self.sources]
         jet = self.siren.jet(torch.cat([batch.points for batch in batches]))
         lengths = [len(batch) for batch in batches]
@@ -64,6 +79,26 @@ class LevelObjective(Objective):
                 total = total + weight * mean
                 terms[f"{source.name}.{name}"] = mean
         return terms, total
+
+    def look(self, done: float) -> None:
+        """Ask the judge, and keep the weights if they are the best so far."""
+        if self.judge is None:
+            return
+        self.kept["looks"].fill_(int(done * LOOKS))
+        loss = self.judge.loss(self.siren)
+        if loss < float(self.kept["least"]):
+            self.kept["least"].fill_(loss)
+            self.kept["at"].fill_(done)
+            for name, tensor in self.siren.state_dict().items():
+                self.kept[BEST + name].copy_(tensor)
+
+    def take_best(self) -> Verdict | None:
+        """Look once more, and go back to the best weights → what was found; None without a judge."""
+        if self.judge is None:
+            return None
+        self.look(1.0)
+        self.siren.load_state_dict({name: self.kept[BEST + name] for name in self.siren.state_dict()})
+        return Verdict(self.judge.count, self.judge.before, float(self.kept["least"]), float(self.kept["at"]))
 
     def _draw(self, source: Source) -> Tensor:
         index = torch.randint(len(source.samples), (whole_batch(source.batch),), generator=self.generator)

@@ -197,13 +197,25 @@ class Band:
 
     Attributes:
         delta: its half-width.
-        rule: "quantile" where one was asked for, "maximum" over all points, or "maximum but for strays".
+        rule: "quantile" where one was asked for, "maximum" over all points, or "maximum but for strays"; or "no wider
+            than the band before", see `within`.
         outside: input points that it does not hold.
     """
 
     delta: float
     rule: str
     outside: int
+
+    def within(self, before: float | None, errors: Tensor) -> Band:
+        """This band, or where the one ``before`` it is narrower, that: bands nest.
+
+        Args:
+            before: half-width of the band around the level before; None if there is none.
+            errors: ``(n,)`` values at the input points.
+        """
+        if before is None or self.delta <= before:
+            return self
+        return Band(before, "no wider than the band before", int((errors.abs() >= before).sum()))
 
 
 def band_of(errors: Tensor, *, epsilon: float, quantile: float | None) -> Band:

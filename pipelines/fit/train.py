@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from ...datasets import OrientedCloud, PointCloud, prepare_cloud
+from ...datasets import OrientedCloud, PointCloud, prepare_cloud, spacing_of
 from ...datasets.clouds.large import Merging
 from ...datasets.clouds.outliers import agreement
 from ...neural_fields import Field, InputError, MultiscaleSDF, Similarity, Siren, WorldField, save_field
@@ -38,9 +38,10 @@ from ..run.trainer import (
 from ..surface.trim import write_support
 from .between import dense_distance
 from .cloud import CloudDistance, load_cloud
+from .heldout import FEWEST, Judge, held_out
 from .level import LevelObjective, new_level
 from .plan import Share
-from .samples import Band, band_of, banded_sources, first_sources
+from .samples import Band, Source, band_of, banded_sources, first_sources
 from .timing import Timing
 
 __all__ = ["FitConfig", "Review", "Run", "fit", "prepare", "review_points"]
@@ -181,6 +182,7 @@ class _Fitting:
         self.fingerprint = digest_of((cloud.points, cloud.normals))
         self.points, self.normals = torch.from_numpy(cloud.points), torch.from_numpy(cloud.normals)
         self.index: CloudDistance | None = None  # of the points above
+        self.held = torch.zeros(len(self.points), dtype=torch.bool)  # those of them that it leaves out
         self.frozen: MultiscaleSDF | None = None
         self.errors = torch.empty(0)  # of the last frozen level, at the input points
         self.stages: list[dict[str, Any]] = []
@@ -236,11 +238,14 @@ class _Fitting:
             sources = banded_sources(
                 index, self.frozen, delta, config, generator=generator, name=self.source, watch=work.looked
             )
+        judge = None if delta is None else self.judge(delta, sources[0])
         work.end()
         sampling_seconds = time.monotonic() - started
         seconds = None if config.time_budget is None else share.seconds - sampling_seconds
+        rate = config.learning_rates[level]
+        objective = LevelObjective(siren, sources, learning_rate=rate, generator=generator, judge=judge)
         trainer = Trainer(
-            LevelObjective(siren, sources, learning_rate=config.learning_rates[level], generator=generator),
+            objective,
             stage=f"level {level}",
             steps=config.steps[level],
             seconds=None if seconds is None else max(seconds, self.timing.least_seconds(level)),
@@ -252,10 +257,12 @@ class _Fitting:
             flag, report=self.timing.schedule, save=lambda: self.save(self.grown(siren, delta), trainer)
         ):
             raise Interrupted(self.folder.out)
+        verdict = objective.take_best()
         self.frozen = self.grown(siren, delta).requires_grad_(False)
         review = self.review() if level == 0 else None
         before, self.errors = self.errors, self.values_at_cloud()
         silenced = level > 0 and _rms(self.errors) > WORSE * _rms(before)
+        silenced |= verdict is not None and not verdict.better
         if silenced:
             nn.init.zeros_(siren.output.weight)
             nn.init.zeros_(siren.output.bias)
@@ -274,6 +281,7 @@ class _Fitting:
                 "steps": trainer.step,
                 "ended_by_time_budget": trainer.ended_early,
                 "silenced": silenced,
+                "held_out": None if verdict is None else {**verdict._asdict(), "verdict": verdict.words()},
                 "losses": trainer.losses,
                 **({} if review is None else {"review": review}),
                 **self.surface_errors(),
@@ -284,18 +292,30 @@ class _Fitting:
             self.level_done(self.frozen, self.cloud.similarity)
 
     def distances(self) -> CloudDistance:
-        """The points, and where they are sparse for the finest level, what they say of the places between them."""
-        config, noise = self.config, self.cloud.noise
+        """The points that are trained on, and where they are sparse, what they say of the places between them."""
+        config, noise, all_points = self.config, self.cloud.noise, self.points.numpy()
+        spacing = spacing_of(all_points.astype(np.float64))
+        self.held = torch.from_numpy(held_out(all_points, spacing, config.hold_out, seed=config.seed))
+        points, normals = self.points[~self.held], self.normals[~self.held]
         if not config.between:
-            return CloudDistance(self.points, self.normals, noise=noise)
+            return CloudDistance(points, normals, noise=noise)
         omega = max(config.omegas[: config.num_levels])
-        return dense_distance(
-            self.points, self.normals, omega=omega, count=self.timing.first_samples(), noise=noise, seed=config.seed
-        )
+        count = self.timing.first_samples()
+        return dense_distance(points, normals, omega=omega, count=count, noise=noise, seed=config.seed)
 
     def next_band(self) -> Band:
-        """The band around the last frozen level (Eq. 5)."""
-        return band_of(self.errors, epsilon=self.config.epsilon, quantile=self.config.quantile)
+        """The band around the last frozen level (Eq. 5), inside the one before: under noise it could be wider."""
+        band = band_of(self.errors, epsilon=self.config.epsilon, quantile=self.config.quantile)
+        return band.within(self.stages[-1]["delta"], self.errors)
+
+    def judge(self, delta: float, surface: Source) -> Judge | None:
+        """What judges a residual level, by the weights of its loss on the surface; None if no point was held out."""
+        if not self.held.any():
+            return None
+        assert self.frozen is not None
+        points, normals = self.points[self.held], self.normals[self.held]
+        judge = Judge(points, normals, self.frozen, delta, data=surface.data, normal=surface.normal)
+        return judge if judge.count >= FEWEST / 2 else None
 
     def review(self) -> dict[str, Any]:
         """Take out of the data what level 0 shows to be wrong with it → counts for the record."""

@@ -77,6 +77,12 @@ class FitConfig(Settings):
     between: bool = setting(
         True, "learn between the points too, where neighbouring points and their normals agree on the surface"
     )
+    hold_out: float = setting(
+        0.03,
+        "share of the points that are held out: they say when a level was best, and whether it is kept; 0 for none",
+        at_least=0,
+        at_most=0.1,
+    )
     time_budget: float | None = setting(
         None, "end training after about this many seconds, all levels together", above=0
     )

@@ -1,0 +1,140 @@
+"""Held-out points: drawn by voxels, and a level that is worse at them is not kept."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from mplicits.datasets import PointCloud
+from mplicits.datasets.synthetic.samples import sample_sphere
+from mplicits.neural_fields import Siren, Sphere
+from mplicits.pipelines.fit.heldout import FEWEST, VOXEL, Judge, Verdict, held_out
+from mplicits.pipelines.fit.level import LevelObjective
+from mplicits.pipelines.fit.samples import Band, Samples, Source, with_previous
+from mplicits.pipelines.fit.train import fit
+from mplicits.pipelines.run.settings import FitConfig
+from mplicits.pipelines.run.trainer import Trainer
+
+CPU = torch.device("cpu")
+RADIUS, OFF = 0.5, 0.02
+
+
+def points(count: int) -> torch.Tensor:
+    return torch.from_numpy(sample_sphere(count, radius=RADIUS).points).float()
+
+
+def judge_of(sphere: float, *, data: float = 100.0, normal: float = 3.0) -> Judge:
+    """Of a sphere's points, by a frozen sphere of another radius."""
+    x = points(1000)
+    return Judge(x, x / RADIUS, Sphere(radius=sphere), 0.1, data=data, normal=normal)
+
+
+def zero_siren(bias: float) -> Siren:
+    """A residual that is constant."""
+    siren = Siren(8, 2, omega=10.0)
+    torch.nn.init.zeros_(siren.output.weight)
+    torch.nn.init.constant_(siren.output.bias, bias)
+    return siren
+
+
+def test_whole_voxels_are_held_out() -> None:
+    x = np.random.default_rng(0).uniform(-1, 1, (20_000, 3)).astype(np.float32)
+    spacing = 0.1
+    held = held_out(x, spacing, 0.03)
+    size = np.bincount(np.unique(np.floor(x / (VOXEL * spacing)), axis=0, return_inverse=True)[1].reshape(-1))
+    assert 600 <= held.sum() <= 600 + size.max()
+    cells = np.floor(x.astype(np.float64) / (VOXEL * spacing)).astype(np.int64)
+    inside, outside = ({tuple(cell) for cell in cells[rows].tolist()} for rows in (held, ~held))
+    assert not inside & outside
+    assert (held_out(x, spacing, 0.03) == held).all()
+    assert (held_out(x, spacing, 0.03, seed=1) != held).any()
+    assert held_out(x[:3000], spacing, 0.01).sum() >= FEWEST  # fewer tell nothing
+    for few, share in ((x, 0.0), (x[: 10 * FEWEST - 1], 0.03)):
+        assert not held_out(few, spacing, share).any()
+
+
+def test_the_loss_at_held_out_points_is_that_of_equation_4() -> None:
+    judge = judge_of(RADIUS - OFF)
+    assert judge.count == 1000
+    assert judge.before == pytest.approx(100 * OFF**2, rel=1e-4)  # the normals agree
+    assert judge.loss(zero_siren(-OFF)) == pytest.approx(0, abs=1e-6)  # 3 (1 − cos), in float32
+    assert judge.loss(zero_siren(OFF)) == pytest.approx(100 * (2 * OFF) ** 2, rel=1e-4)
+    x = points(1000)
+    against = Judge(x, -x, Sphere(radius=RADIUS), 0.1, data=1.0, normal=3.0)
+    assert against.before == pytest.approx(2 * 3.0, rel=1e-6)
+    assert Judge(x, x, Sphere(radius=0.1), 0.1, data=1.0, normal=1.0).count == 0  # all outside the band
+
+
+def objective(judge: Judge, target: float) -> LevelObjective:
+    """Learns a constant ``target`` everywhere."""
+    x = points(2000)
+    samples = with_previous(Samples(x, torch.full((2000,), target)), Sphere(radius=RADIUS - OFF), 0.1, device=CPU)
+    source = Source("surface", samples, 256, 1e4, 0.0, 0.0)
+    generator = torch.Generator().manual_seed(0)
+    return LevelObjective(zero_siren(0.0), [source], learning_rate=1e-2, generator=generator, judge=judge)
+
+
+def test_the_best_weights_are_kept_and_checkpoints_keep_them() -> None:
+    # Before: f = OFF at the points. The level learns f = −3 OFF there, and passes by the truth on its way.
+    level = objective(judge_of(RADIUS - OFF), -3 * OFF)
+    trainer = Trainer(level, stage="level 1", steps=80)
+    trainer.run()
+    last = level.judge.loss(level.siren)  # type: ignore[union-attr]
+    other = objective(judge_of(RADIUS - OFF), -3 * OFF)
+    resumed = Trainer(other, stage="level 1", steps=80)
+    resumed.restore(trainer.state())
+    verdict = level.take_best()
+    assert verdict is not None
+    assert verdict.after < last
+    assert 0 < verdict.at < 1
+    assert level.judge.loss(level.siren) == pytest.approx(verdict.after, rel=1e-5)  # type: ignore[union-attr]
+    assert other.take_best() == verdict
+    assert objective(judge_of(RADIUS - OFF), 0.0).judge is not None
+
+
+def test_a_verdict_in_words() -> None:
+    kept, late, worse = Verdict(500, 2.0, 1.0, 1.0), Verdict(500, 2.0, 1.0, 0.5), Verdict(500, 1.0, 1.5, 1.0)
+    assert kept.better
+    assert kept.words() == "kept, for the loss at 500 points that it has not seen is 2 without it, 1 with"
+    assert "after 50% of its steps" in late.words()
+    assert not worse.better
+    assert worse.words().startswith("set to zero, for")
+
+
+def test_bands_nest() -> None:
+    errors = torch.tensor([0.01, -0.05, 0.02])
+    band = Band(0.065, "maximum", 0)
+    assert band.within(None, errors) is band
+    assert band.within(0.07, errors) is band
+    assert band.within(0.04, errors) == Band(0.04, "no wider than the band before", 1)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.02])
+def test_no_level_of_a_fit_is_worse_at_held_out_points_than_the_one_before(noise: float) -> None:
+    random = np.random.default_rng(1)
+    directions = sample_sphere(4000, radius=1.0, seed=2).points
+    x = directions * (0.5 + noise * random.normal(size=(4000, 1)))
+    tilted = directions + 10 * noise * random.normal(size=(4000, 3))  # of noisy points the normals are noisy too
+    normals = tilted / np.linalg.norm(tilted, axis=1, keepdims=True)
+    config = FitConfig(
+        widths=(24, 64),
+        depths=(2, 2),
+        omegas=(8.0, 80.0),
+        steps=(150, 60),
+        learning_rates=(4e-3, 4e-3),
+        batch=1024,
+        samples=5000,
+        smooth_noise=False,
+        drop_outliers=False,
+    )
+    run = fit(PointCloud(x, normals.astype(np.float32), None, "ball"), config)
+    stage = run.record["stages"][1]
+    judged = stage["held_out"]
+    assert judged["points"] >= FEWEST / 2
+    assert math.isfinite(judged["before"])
+    assert stage["silenced"] == (judged["after"] >= judged["before"])
+    assert judged["verdict"].startswith("set to zero" if stage["silenced"] else "kept")
+    if noise:  # a sphere and noise: there is nothing that waves of this frequency could add to it
+        assert stage["silenced"]
+        x = torch.rand(500, 3) - 0.5
+        assert torch.equal(run.field.value(x), run.field.value(x, level=0))
