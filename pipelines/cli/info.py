@@ -59,8 +59,9 @@ def _describe_level(level: Any, stage: dict[str, Any]) -> str:
         text = f"({level.width}, {level.depth}), ω₀ = {level.omega:g}, {parameter_count(level):,} parameters"
     if "training_seconds" in stage:
         text += f"; {stage['steps']:,} steps in {stage['training_seconds']:.1f} s"
-    if stage.get("held_out"):
-        text += f"; {stage['held_out']['verdict']}"
+    judged = stage.get("held_out")
+    if judged and stage["silenced"] == (judged["after"] >= judged["before"]):
+        text += f"; {judged['verdict']}"
     elif stage.get("silenced"):
         text += "; set to zero, for it was further from the points than the level before it"
     if "rms_at_points" in stage:

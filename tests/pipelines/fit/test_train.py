@@ -105,7 +105,8 @@ def test_an_interrupted_run_resumes_to_the_same_result(
 
 
 def test_a_level_that_is_worse_than_none_adds_nothing(fitted: Path, tmp_path: Path) -> None:
-    run = fit(sphere_cloud(), replace(SMALL, steps=(150, 5), learning_rates=(3e-3, 3.0)), out=tmp_path / "run")
+    config = replace(SMALL, steps=(150, 5), learning_rates=(3e-3, 3.0), hold_out=0.0)
+    run = fit(sphere_cloud(), config, out=tmp_path / "run")
     first, second = run.record["stages"]
     assert (first["silenced"], second["silenced"]) == (False, True)
     assert second["rms_at_points"] == first["rms_at_points"]
