@@ -78,7 +78,7 @@ class FitConfig(Settings):
         True, "learn between the points too, where neighbouring points and their normals agree on the surface"
     )
     hold_out: float = setting(
-        0.03,
+        0.01,
         "share of the points that are held out: they say when a level was best, and whether it is kept; 0 for none",
         at_least=0,
         at_most=0.1,
