@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -19,6 +20,7 @@ from .function import FieldLike, as_field
 from .meshing import DEFAULT_BOUNDS, Mesh, extract_mesh
 from .similarity import Similarity
 from .tracing import sphere_trace
+from .upward import upward
 
 __all__ = ["Closest", "WorldField", "WorldHits", "in_one_frame"]
 
@@ -193,6 +195,53 @@ class WorldField:
             box = ((low[0], low[1], low[2]), (high[0], high[1], high[2]))
         mesh = extract_mesh(self.field, resolution=resolution, level=level, bounds=box, normals=normals)
         return dataclasses.replace(mesh, vertices=self.similarity.to_input(mesh.vertices))
+
+    def render(
+        self,
+        path: str | Path | None = None,
+        *,
+        size: int | tuple[int, int] = 640,
+        level: int = -1,
+        up: str = "y",
+        azimuth: float = 30.0,
+        elevation: float = 15.0,
+    ) -> NDArray[np.uint8]:
+        """A picture of the surface, traced, with the light of ``mplicits render``.
+
+        Args:
+            path: a .png or .jpg file to write as well.
+            size: pixels along each side, or width and height.
+            level: see `distance`.
+            up: the axis that points up, "y" or "z".
+            azimuth: degrees around that axis, from the front.
+            elevation: degrees above the horizon.
+
+        Returns:
+            ``(H, W, 3)`` display RGB.
+
+        Raises:
+            InputError: there is no surface, or the file cannot be written.
+        """
+        return upward("render")(self, path, size=size, level=level, up=up, azimuth=azimuth, elevation=elevation)
+
+    def show(self, *, up: str = "y", block: bool = True, browser: bool = True) -> Any:
+        """Look at the surface: in the browser, or in a notebook as a picture.
+
+        In a script the viewer opens in the browser (it needs ``mplicits[view]``), and this returns when its page is
+        closed, or at Ctrl-C.
+
+        Args:
+            up: the axis that points up, "y" or "z".
+            block: whether to wait; otherwise the running `Viewer` is returned, for the caller to close.
+            browser: whether to open one; otherwise only the address is printed.
+
+        Returns:
+            The `Viewer`, or None once it is closed; in a notebook what shows the picture there.
+
+        Raises:
+            InputError: viser is not installed, or there is no surface.
+        """
+        return upward("show")(self, up=up, block=block, browser=browser)
 
     def union(self, *others: WorldField, smooth: float = 0.0) -> WorldField:
         """This solid and others as one, wherever each was fitted.

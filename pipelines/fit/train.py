@@ -89,6 +89,14 @@ class Run:
         """
         save_field(path, self.field, similarity=self.similarity, metadata={"run": self.record})
 
+    def show(self, *, up: str = "y", block: bool = True, browser: bool = True) -> Any:
+        """Look at the fit, in the browser or in a notebook; see `WorldField.show`.
+
+        Raises:
+            InputError: viser is not installed.
+        """
+        return self.world.show(up=up, block=block, browser=browser)
+
 
 def fit(
     cloud: Cloud,

@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ...datasets.cameras import Camera
-from ...neural_fields import InputError
+from ...neural_fields import InputError, WorldField
 from ..run.machine import choose_device
 from .film import ANIMATIONS, write_animation
 from .legend import with_color_bar
 from .light import load_matcap
 from .picture import Image, check_picture_path, contact_sheet, write_picture
 from .shade import ShadeOptions, compose, default_shading, downsample, measure, shade, value_limits
-from .subject import Orbit, Panel, Subject, open_subject, orbit_cameras, posed_cameras, reference_distance
+from .subject import Orbit, Panel, Subject, open_subject, orbit_cameras, posed_cameras, reference_distance, subject_of
 from .trace import Seen, fine_strips
 
 __all__ = ["RenderOptions", "render_run"]
@@ -128,6 +128,35 @@ def render_run(
     else:
         write_picture(out, next(artist.pictures(cameras, progress)))
     return artist.caption(cameras)
+
+
+def render_shape(
+    shape: WorldField,
+    path: str | Path | None = None,
+    *,
+    size: int | tuple[int, int] = 640,
+    level: int = -1,
+    up: str = "y",
+    azimuth: float = 30.0,
+    elevation: float = 15.0,
+) -> Image:
+    """Draw a field that need not be in any file; see `WorldField.render`.
+
+    Raises:
+        InputError: there is no surface, or the file cannot be written.
+        ValueError: there is no such level.
+    """
+    if path is not None:
+        check_picture_path(path)
+    level = shape.field.resolve_level(level)
+    panels = [Panel(f"level {level}", level, level)]
+    subject = subject_of(shape.field, shape.similarity, name=Path(path or "shape"), panels=panels)
+    orbit = Orbit(azimuth=azimuth, elevation=elevation, up=up)
+    options = RenderOptions(size=size if isinstance(size, tuple) else (size,), orbit=orbit)
+    picture = next(_Artist(subject, options).pictures(_cameras(subject, options, film=False), None))
+    if path is not None:
+        write_picture(path, picture)
+    return picture
 
 
 def _cameras(subject: Subject, options: RenderOptions, *, film: bool) -> list[Camera]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -20,7 +21,7 @@ from ...neural_fields.tracing import BOUNDING_RADIUS
 from ..fit.cloud import CloudDistance
 from ..run.folder import chosen_level, find_field, fitted_cloud, is_field, load_still
 from ..surface.surface import read_surface, sample_points
-from ..texture.riding import colors_of_run
+from ..texture.riding import Colors, colors_of_run
 from .rasterise import cloud_view, mesh_view
 from .trace import Seen, trace_view
 
@@ -130,10 +131,32 @@ def _field_subject(
     finest = field.num_levels - 1
     level = chosen_level(field, file, level)
     normal_level = chosen_level(field, file, normal_level, otherwise=level, flag="--normal-level")
-    colors = colors_of_run(file, field, time)
     panels = [_panel(level, normal_level)]
     if levels:
         panels = [_panel(index, index) for index in range(finest + 1)] + ([_panel(0, finest)] if finest else [])
+    subject = subject_of(field, similarity, name=file, panels=panels, colors=colors_of_run(file, field, time))
+    source = lambda: fitted_cloud(file, metadata, remedy="name it with --reference FILE")  # noqa: E731
+    return dataclasses.replace(subject, fitted_to=source)
+
+
+def subject_of(
+    field: Field,
+    similarity: Similarity,
+    *,
+    name: Path,
+    panels: Sequence[Panel],
+    colors: Colors | None = None,
+) -> Subject:
+    """A field to draw.
+
+    Args:
+        field: three-dimensional, on the device where it shall be evaluated.
+        similarity: from input coordinates to those of the field.
+        name: for messages.
+        panels: what to draw of it.
+        colors: of points of its surface, if it has some.
+    """
+    device = field.like.device
 
     def view(camera: Camera, panel: Panel) -> Seen:
         return trace_view(
@@ -141,14 +164,14 @@ def _field_subject(
         )
 
     return Subject(
-        name=file,
+        name=name,
         similarity=similarity,
         panels=tuple(panels),
         field=field,
         colored=colors is not None,
         oriented=True,
-        fitted_to=lambda: fitted_cloud(file, metadata, remedy="name it with --reference FILE"),
-        outline=lambda: _outline(file, field),
+        fitted_to=None,
+        outline=lambda: _outline(name, field),
         view=view,
     )
 
