@@ -128,16 +128,17 @@ def test_nothing_thin_is_lost():
 
 def nested(field: Field) -> Field:
     """Residuals small enough to keep each surface within the band before it, as training leaves them."""
-    if isinstance(field, MultiscaleSDF):
-        with torch.no_grad():
-            for residual in field.levels[1:]:
-                assert isinstance(residual, Siren)
-                residual.output.weight.mul_(0.1)
-                residual.output.bias.mul_(0.1)
-    if isinstance(field, BaconSDF):  # an untrained product of sines is far steeper than any distance
-        with torch.no_grad():
-            for parameter in field.heads.parameters():
-                parameter.mul_(0.02)
+    for part in field.modules():  # of a field of fields, all
+        if isinstance(part, MultiscaleSDF):
+            with torch.no_grad():
+                for residual in part.levels[1:]:
+                    assert isinstance(residual, Siren)
+                    residual.output.weight.mul_(0.1)
+                    residual.output.bias.mul_(0.1)
+        if isinstance(part, BaconSDF):  # an untrained product of sines is far steeper than any distance
+            with torch.no_grad():
+                for parameter in part.heads.parameters():
+                    parameter.mul_(0.02)
     return field
 
 
