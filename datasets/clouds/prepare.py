@@ -16,6 +16,7 @@ from .orientation import estimate_normals, nearest, openness, orient_normals, ou
 from .outliers import inspect_points
 from .point_cloud import PointCloud, unit_rows
 from .reading import MIN_POINTS
+from .reestimate import denoise
 from .winding import orient_by_winding
 
 __all__ = ["CleaningReport", "OrientedCloud", "prepare_cloud"]
@@ -150,7 +151,8 @@ def prepare_cloud(
         turn_normals: whether single normals of the file that point the other way than their neighbours' are turned
             round; with ``normals="file"`` none is.
         smooth_noise: whether points are moved along their normals to where their neighbours agree, if the noise is
-            wide enough for that to be told (see :mod:`.noise`).
+            wide enough for that to be told (see :mod:`.noise`); estimated normals are then fitted once more to the
+            moved points (see :mod:`.reestimate`).
 
     Raises:
         InputError: too few points are left, or ``normals="file"`` and there are none.
@@ -208,7 +210,7 @@ def prepare_cloud(
         source = "estimated"
         unit, pieces, oriented_by = _estimate(points, neighbors, similarity, sensor_origin)
         if smooth_noise:
-            points, noise = _smoothed(points, unit)
+            points, unit, noise = denoise(points, unit)
             noise *= similarity.scale
     report = CleaningReport(
         read=len(cloud),

@@ -1,0 +1,79 @@
+"""Normals fitted again: exact where they must not change, better where noise made them bad, edges kept."""
+
+import numpy as np
+import pytest
+import torch
+from bounds import unit_roundoff
+from mplicits.datasets import PointCloud, prepare_cloud, sample_sphere, sample_surface
+from mplicits.datasets.clouds.reestimate import denoise, refit_normals
+from mplicits.neural_fields import Box
+
+RNG = np.random.default_rng(0)
+DOUBLE = 64 * unit_roundoff(torch.float64)
+
+
+def angles(normals: np.ndarray, exact: np.ndarray) -> np.ndarray:
+    """In degrees ``(N,)``."""
+    return np.degrees(np.arccos(np.einsum("nd,nd->n", normals, exact).clip(-1, 1)))
+
+
+def test_a_plane_keeps_its_normal_and_its_sign():
+    points = np.column_stack((RNG.uniform(-1, 1, (500, 2)), np.zeros(500)))
+    down = np.tile([0.0, 0.0, -1.0], (500, 1))
+    tilted = down + RNG.normal(0, 0.1, (500, 3))
+    tilted /= np.linalg.norm(tilted, axis=1, keepdims=True)
+    # Eigenvectors are as exact as rounding beside the gap between eigenvalues, which is the size of the largest.
+    assert np.abs(refit_normals(points, tilted, 0.3) - down).max() < 100 * DOUBLE
+
+
+def test_the_sides_of_a_thin_plate_do_not_see_each_other():
+    """Neighbourhoods are twenty times as wide as the plate is thick."""
+    points = RNG.uniform(-1, 1, (4000, 3))
+    side = np.where(np.arange(4000) < 2000, 1.0, -1.0)
+    points[:, 2] = 0.01 * side
+    exact = side[:, None] * np.array([0.0, 0.0, 1.0])
+    assert np.abs(refit_normals(points, exact, 0.2) - exact).max() < 100 * DOUBLE
+
+
+def test_an_edge_stays_sharp():
+    """Sides at a right angle weigh nothing in each other's planes, once normals tell them apart."""
+    cloud = sample_surface(Box(half_size=(0.5, 0.4, 0.3)), 8000, shell=0.002)
+    assert cloud.normals is not None
+    exact = cloud.normals.astype(np.float64)
+    flat = np.abs(exact).max(axis=1) > 1 - 1e-6
+    assert flat.mean() > 0.95
+    noisy = exact + RNG.normal(0, 0.05, exact.shape)
+    noisy /= np.linalg.norm(noisy, axis=1, keepdims=True)
+    after = angles(refit_normals(cloud.points, noisy, 0.08), exact)[flat]
+    # 1e-3 of the points' exactness over a neighbourhood of 0.05 is a degree.
+    assert np.quantile(after, 0.9) < 1
+
+
+def test_noise_equal_in_all_directions_is_taken_off_points_and_normals():
+    sphere = sample_sphere(12000)
+    exact, sigma = 2 * sphere.points, 0.01
+    noisy = sphere.points + RNG.normal(0, sigma, (12000, 3))
+    first = exact + RNG.normal(0, 0.2, exact.shape)  # eleven degrees off along each axis
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    moved, normals, level = denoise(noisy, first)
+    assert level == pytest.approx(sigma, rel=0.3)
+    assert np.median(angles(normals, exact)) < np.median(angles(first, exact)) / 2
+    left = np.linalg.norm(moved, axis=1) - 0.5
+    assert np.sqrt((left**2).mean()) < 0.4 * sigma
+
+
+def test_without_noise_nothing_changes():
+    sphere = sample_sphere(3000)
+    exact = 2 * sphere.points
+    moved, normals, level = denoise(sphere.points, exact)
+    assert level == 0
+    assert moved is sphere.points
+    assert normals is exact
+
+
+def test_estimated_normals_are_fitted_again_where_noise_is_smoothed():
+    sphere = sample_sphere(8000)
+    cloud = PointCloud(sphere.points + RNG.normal(0, 0.008, (8000, 3)))
+    exact = 2 * sphere.points
+    left, smoothed = (prepare_cloud(cloud, smooth_noise=choice) for choice in (False, True))
+    assert np.median(angles(smoothed.normals, exact)) < 0.7 * np.median(angles(left.normals, exact))
