@@ -17,7 +17,9 @@ from pathlib import Path
 import mplicits
 import numpy as np
 import pytest
+import torch
 from mplicits.neural_fields import upward
+from mplicits.pipelines.run.machine import environment
 
 ROOT = Path(__file__).parent.parent
 # From the ground up. A room imports from those above it in this list, never from those below.
@@ -181,6 +183,8 @@ def test_dependencies_are_those_that_are_imported() -> None:
     assert not unknown, f"imported, but in no list of pyproject.toml: {sorted(unknown)}"
     found = {home for name in used for home in homes.get(name, [name])}
     assert needed <= found, f"in pyproject.toml, but never imported: {sorted(needed - found)}"
+    recorded = set(environment(torch.device("cpu"))["versions"]) - {"mplicits"}
+    assert recorded <= needed, f"the record of a run asks for versions of {sorted(recorded - needed)}"
 
 
 def test_the_demo_installs_nothing_but_the_package() -> None:

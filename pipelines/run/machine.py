@@ -107,7 +107,7 @@ def choose_device(name: str) -> torch.device:
 
 def environment(device: torch.device) -> dict[str, Any]:
     """What the figures of a run depend on: versions, threads, machine."""
-    names = ("mplicits", "torch", "numpy", "scipy", "scikit-image", "safetensors")
+    names = ("mplicits", "torch", "numpy", "scipy", "safetensors")
     return {
         "versions": {name: importlib.metadata.version(name) for name in names},
         "python": platform.python_version(),
