@@ -1,6 +1,6 @@
 """From photographs to a coloured mesh.
 
-    python photographs.py                  # drawn ones, with exact cameras; tens of minutes at the default size
+    python photographs.py                  # drawn ones, with exact cameras; minutes, more on a small machine
     python photographs.py photos/          # yours: COLMAP, transforms.json or NeuS folders
     python photographs.py --small          # seconds; shows the way, not the quality
 

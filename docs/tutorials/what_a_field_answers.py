@@ -47,20 +47,23 @@ bar = fitted(Box(half_size=(0.7, 0.2, 0.12)), 50.0)  # 70 by 20 by 12 mm, so tha
 # %% [markdown]
 # ## How far, and which way
 #
-# Numpy in, numpy out. Negative is inside. A field knows what it was trained on: the box around the unit
-# sphere of its points. Further away ask where a ray or a path enters that, or put the shape into a larger
-# frame (below).
+# Numpy in, numpy out. Negative is inside. A field knows what it was trained on: the box around the unit sphere of
+# its points. Near the surface it is right; where several points of the surface are equally near, as in the core of
+# the tube or the middle of its hole, a distance has a ridge, and a small network rounds it off. It says too little
+# there, which is the safe side for a ray and for a robot.
 
 # %%
-places = np.array([[30.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 25.0]])
-print("distances:", ring.distance(places).round(1), "mm; the truth: -10, 20, 29.1")
-print("nearest points:", ring.closest(places[[0, 2]]).position.round(1).tolist())
+places = np.array([[30.0, 0.0, 14.0], [17.0, 0.0, 0.0], [0.0, 28.0, -9.0], [0.0, 0.0, 0.0], [30.0, 0.0, 0.0]])
+truth = np.hypot(np.hypot(places[:, 0], places[:, 1]) - 30, places[:, 2]) - 10
+for place, distance, exact in zip(places, ring.distance(places), truth, strict=True):
+    print(f"{place}: {distance:6.2f} mm; the truth is {exact:6.2f}" + (", on a ridge" if abs(exact) >= 10 else ""))
+print("nearest to the first two:", ring.closest(places[:2]).position.round(1).tolist(), "mm")
 
 # %% [markdown]
 # ## Do they collide?
 #
-# Points on one surface, asked of the other field: the most negative answer is how deep they overlap. No
-# search over pairs of triangles; a thousand points are one evaluation.
+# Points on one surface, asked of the other field: the most negative answer is how deep they overlap, short on
+# ridges as above. No search over pairs of triangles; a thousand points are one evaluation.
 
 # %%
 surface_of_bar = bar.mesh(resolution=32).vertices
@@ -101,7 +104,7 @@ for name, shape in (("ring", ring), ("bar", bar), ("joined", joined), ("slotted"
 # %%
 wall = ring.shell(inside=3.0)
 print(f"hollow, with walls of 3 mm: {volume(wall.mesh(resolution)) / 1000:.1f} cm³ instead of "
-      f"{volume(ring.mesh(resolution)) / 1000:.1f}")  # fmt: skip
+      f"{volume(ring.mesh(resolution)) / 1000:.1f}; the truth is 30.2 and 59.2")  # fmt: skip
 
 # %% [markdown]
 # ## How thick is it?
