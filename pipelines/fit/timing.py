@@ -17,6 +17,7 @@ from ..run.schedule import Progress, Report, Schedule, Stage
 from ..run.settings import FitConfig
 from ..run.team import agreed
 from .cloud import CloudDistance
+from .level import new_level
 from .plan import FEWEST_STEPS, FitPlan, Share
 from .samples import DOMAIN
 
@@ -28,6 +29,7 @@ USUAL_POINTS = 100_000
 UNKNOWN_SPEED = Speed(1e11, 1e11, 1e-3)
 # How many signed distances tell how fast samples are made, and for how many of those that counts.
 PROBE, PROBED = 2048, 20
+PROBE_STEPS = 4
 TELL_EVERY = 0.25  # seconds
 ALMOST = 0.99  # of samples of which more had to be tried than was thought
 
@@ -141,7 +143,7 @@ class Timing:
         return self.config.time_budget - self.before - (time.monotonic() - self.started)
 
     def _probe(self, index: CloudDistance) -> None:
-        """Measure how fast samples are made on this cloud."""
+        """Measure how fast samples are made on this cloud, and steps are taken: how many levels there is time for."""
         points = (2 * torch.rand(PROBE, 3, generator=torch.Generator().manual_seed(0)) - 1) * DOMAIN
         work: list[float] = []
         index.watch = work.append
@@ -150,6 +152,17 @@ class Timing:
         self.schedule.learn(
             "samples", self.plan.speed.points(math.fsum(work)) * PROBED, PROBED * (time.monotonic() - started)
         )
+
+        siren = new_level(self.config, 0, residual=False).to(self.device)
+        batch = points.repeat(-(-self.config.batch // PROBE), 1)[: self.config.batch].to(self.device)
+        started = time.monotonic()
+        for _ in range(PROBE_STEPS):
+            jet = siren.jet(batch)
+            loss = jet.value.square().mean() + jet.gradient.square().mean()
+            float(loss.detach())  # a GPU is waited for
+            loss.backward()
+        expected = PROBE_STEPS * self.plan.step_seconds(0)
+        self.schedule.learn("steps", PROBED * expected, PROBED * (time.monotonic() - started))
 
     def _tell(self, stages: list[Stage], budget: float | None) -> None:
         self.schedule.plan(stages, budget=budget)
