@@ -6,6 +6,7 @@ Without a budget nothing of this changes what is computed.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 from ..run.costs import Net, Speed, jets, training, values
 from ..run.schedule import Stage
@@ -15,7 +16,8 @@ __all__ = ["FEWEST_STEPS", "EvolvePlan", "within"]
 
 # Steps of a field of space-time over those of a field of space with as many parameters, by the law's derivatives.
 ORDER_ONE, ORDER_TWO = 1.6, 2.8
-USUAL = Net.siren(256, 2)  # a shape that is given as a field: what its coarse levels cost
+# A shape that is given as a field: what its coarse levels cost; and one that is a formula.
+USUAL, EXACT = Net.siren(256, 2), Net(2000, 60)
 MESHED = 128  # cells along the meshes of shapes
 ENDS_MESHED = 192
 JUDGING = 1.0e11  # FLOPs that take as long as the Chamfer distance of an end
@@ -45,14 +47,14 @@ class EvolvePlan:
 
     def shapes(self) -> Stage:
         """Reading and meshing the shapes."""
-        work = len(self.config.shapes) * values(4 * MESHED**2, [USUAL])
-        return Stage("shapes", "mesh", self.speed.points(work))
+        work = values(4 * MESHED**2, self._given())
+        return Stage("shapes", "shapes", self.speed.points(work))
 
     def known(self) -> Stage:
         """Samples at which the field is known, and bounds."""
         config = self.config
-        points = 4.5 * config.samples + 1e5 * max(len(config.shapes), 1)
-        return Stage("known samples", "samples", self.speed.points(jets(points, [USUAL])))
+        points = 4.5 * config.samples / max(len(config.shapes), 1) + 1e5
+        return Stage("known samples", "samples", self.speed.points(jets(points, self._given())))
 
     def starting(self) -> Stage:
         """Learning the shape at time 0."""
@@ -78,6 +80,10 @@ class EvolvePlan:
         cells = config.frames * config.resolution**2 + ends * ENDS_MESHED**2
         work = values(4 * cells, nets) + jets(2 * cells, nets) + ends * JUDGING
         return Stage("checks", "mesh", self.speed.points(work))
+
+    def _given(self) -> list[Net]:
+        """The shapes' fields; exact ones, as "sphere:0.5", cost next to nothing."""
+        return [USUAL if Path(shape).exists() else EXACT for shape in self.config.shapes]
 
     def _net(self, level: int, *, inputs: int = 4) -> Net:
         return Net.siren(self.config.widths[level], self.config.depths[level], inputs=inputs)

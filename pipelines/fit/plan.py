@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from ..run.costs import Net, Speed, densifying, jets, preparation, queries, training, values, windings
+from ..run.costs import Net, Speed, densifying, jets, preparation, queries, training, windings
 from ..run.schedule import Stage
 from ..run.settings import FitConfig
 
@@ -16,6 +16,9 @@ __all__ = ["FEWEST_SAMPLES", "FEWEST_STEPS", "FitPlan", "Share"]
 
 # Cells of 0.05 that the surface of a shape in the unit sphere goes through: dipoles of the winding number.
 DIPOLES = 4000
+# Queries of a residual level are near the surface, where a few points are looked at; so many of a far one, per sample.
+NEAR = 0.25
+IN_BAND = 0.5  # of the points at which a level is asked, those that the next one is
 # A level that gets fewer steps than this, or than a quarter of its own where those are fewer, is not begun: the warm-up
 # of its learning rate would hardly be over.
 FEWEST_STEPS = 60
@@ -75,14 +78,22 @@ class FitPlan:
         """`sampling`, of so many samples instead of those of the settings."""
         count = self.config.samples if samples is None else samples
         filled = max(self.points, count) if self.config.between else self.points  # of a sparse cloud, at most
-        points = queries(2 * count if level else count, filled) + windings(count / 2 if not level else 0, DIPOLES)
-        if not level:  # an index, how far apart its points are, and what is between them
-            points += queries(filled, filled) + densifying(filled - self.points)
-        return self.speed.points(points) + self.looking_seconds(level, filled + 3 * count)
+        if level:
+            return self.speed.points(queries(NEAR * count, filled)) + self.looking_seconds(level, filled + 3 * count)
+        points = queries(count, filled) + windings(count / 2, DIPOLES)
+        return self.speed.points(points + self._index(filled))
+
+    def index_seconds(self, samples: int) -> float:
+        """The index of the points, with what is between them; a part of the samples of level 0."""
+        return self.speed.points(self._index(max(self.points, samples) if self.config.between else self.points))
+
+    def _index(self, filled: int) -> float:
+        return queries(filled, filled) + densifying(filled - self.points)
 
     def looking_seconds(self, level: int, points: int) -> float:
-        """The levels before ``level`` at so many points."""
-        return self.speed.networks(jets(points, self.nets[:level]) + values(self.points, self.nets[:level]))
+        """The levels before ``level`` at so many points; all but the first at those in their bands."""
+        first, others = self.nets[:1], self.nets[1:level]
+        return self.speed.networks(jets(points, first) + jets(IN_BAND * points, others))
 
     def shares(
         self,

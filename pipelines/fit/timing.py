@@ -182,10 +182,15 @@ class SamplingWork:
     """
 
     def __init__(self, plan: FitPlan, level: int, samples: int, schedule: Schedule) -> None:
-        self.plan, self.level, self.schedule = plan, level, schedule
+        self.plan, self.level, self.samples, self.schedule = plan, level, samples, schedule
         self.stage = plan.sampling(level, samples)
         self.seconds, self.told = 0.0, -math.inf
         self.points(0.0)
+
+    def indexed(self) -> None:
+        """The index is made, of the first level."""
+        if self.level == 0:
+            self._done(self.plan.index_seconds(self.samples))
 
     def points(self, work: float) -> None:
         """More work on points is done, in the units of :mod:`..run.costs`."""

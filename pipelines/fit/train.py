@@ -239,6 +239,7 @@ class _Fitting:
         band = None if self.frozen is None else self.next_band()
         delta = None if band is None else band.delta
         index = self.indexed()
+        work.indexed()
         index.watch = work.points
         if self.frozen is None or delta is None:
             sources = first_sources(index, config, generator=generator, device=self.device)
