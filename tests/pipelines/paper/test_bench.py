@@ -160,7 +160,7 @@ def test_mistakes(
 
 
 def test_mistakes_in_places(ball: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for place, message in ((ball, "is a file; name a folder"), (tmp_path / "no" / "bench", "does not exist")):
+    for place, message in ((ball, "is a file; name a folder"), (ball / "bench", "cannot be written")):
         assert main(["bench", "paper", str(ball), "-o", str(place)]) == 2
         assert message in capsys.readouterr().err
     assert main(["bench", "paper", str(tmp_path / "gone.ply"), "-o", str(tmp_path / "bench")]) == 2
