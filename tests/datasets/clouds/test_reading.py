@@ -307,12 +307,13 @@ def test_bad_npy(tmp_path):
 
 
 def test_failed_write_leaves_nothing(tmp_path, cloud):
+    (tmp_path / "file").touch()
     with pytest.raises(InputError, match="cannot be written"):
-        write_cloud_ply(tmp_path / "missing" / "cloud.ply", cloud)
+        write_cloud_ply(tmp_path / "file" / "cloud.ply", cloud)
     (tmp_path / "taken").mkdir()
     with pytest.raises(InputError, match="cannot be written"):
         write_cloud_ply(tmp_path / "taken", cloud)
-    assert [path.name for path in tmp_path.iterdir()] == ["taken"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "taken"]
 
 
 def test_point_cloud_checks_its_shapes():

@@ -352,6 +352,7 @@ def test_descent_minimises_with_a_rate_for_each_group() -> None:
     assert 0.03 < slower.item() < 0.06
     assert still.item() == 0.0
     assert [(report.stage, report.step, report.fraction) for report in reports] == [
+        ("stage", 0, 0.0),
         ("stage", 30, 0.6),
         ("stage", 50, 1),
     ]

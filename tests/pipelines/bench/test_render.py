@@ -18,7 +18,7 @@ SMALL = {
     "128x2_256x2_400x2": ((24, 2, 8.0, 300, 5e-3), (24, 1, 12.0, 60, 1e-3), (24, 1, 16.0, 40, 1e-3)),
     "128x2_400x2": ((24, 2, 8.0, 300, 5e-3), (24, 1, 16.0, 60, 1e-3)),
 }
-CONFIG = FitConfig(batch=1024, samples=4000, device="cpu")
+CONFIG = FitConfig(batch=1024, samples=4000, between=False, device="cpu")
 
 
 @pytest.fixture(scope="module")

@@ -54,10 +54,12 @@ def level(trainer: Trainer[SceneObjective]) -> int:
 
 
 def train(trainer: Trainer[SceneObjective], *, until: int | None = None) -> list[tuple[int, int]]:
-    """Train, to the end or until so many steps are done → (steps done, level) of every report."""
-    flag, seen = StopFlag(), []
+    """Train, to the end or until so many steps are done → (steps done, level) after every step."""
+    flag, seen, begun = StopFlag(), [], trainer.step
 
     def report(progress: Progress) -> None:
+        if progress.step == begun:
+            return
         seen.append((progress.step, level(trainer)))
         flag.requested = progress.step == until
 

@@ -388,7 +388,7 @@ def test_the_command_draws_and_says_what(run, capsys):
     ("arguments", "message"),
     [
         ("a.pnm", r"a\.pnm: unknown extension"),
-        ("absent/a.png", "absent does not exist"),
+        ("field.safetensors/a.png", "field.safetensors is no folder"),
         ("a.mp4 --at 5", "--at: a film goes through the whole shape"),
         ("a.gif --normal 0 0 1 --point 0 0 0", "--point: a film goes"),
         ("a.png --normal 0 0 1 --at 3", "--at: is a place on an axis"),
