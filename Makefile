@@ -22,11 +22,12 @@ $(VENV)/.dev: $(VENV)/.installed
 demo: $(VENV)/.installed
 	$(BIN)/mplicits demo $(CLOUD) -o $(OUT)
 
+# Two processes of one thread each: most tests are too small to share.
 test: lint
-	$(BIN)/python -m pytest
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
 
 test-all: lint
-	$(BIN)/python -m pytest -m ''
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 -m ''
 
 lint: $(VENV)/.dev
 	$(BIN)/ruff check .
