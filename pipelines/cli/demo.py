@@ -48,7 +48,7 @@ __all__ = ["demo", "distances_to_surface", "draw_levels", "spread_colors"]
 Float64 = NDArray[np.float64]
 
 CHECKED = 3_000  # vertices of the mesh whose exact distance to the statue is worked out
-EVEN = 20_000  # points spread evenly over the statue
+EVEN = 8_000  # points spread evenly over the statue
 TILE = (480, 640)
 # Stages, and what they cost: FLOPs of the scan and of exact distances to the statue, values for each traced pixel.
 SCAN, MESHES, PICTURE, FIGURES = "scan", "meshes", "picture", "figures"
@@ -252,7 +252,7 @@ def _true_errors(cloud: PointCloud, field: Field, mesh: Mesh, similarity: Simila
     statue, place = Statue(), STATUE_PLACEMENT
     scan = place.to_unit(cloud.points)
     measured = feet_and_normals(statue, scan)[0]
-    tree, spread = KDTree(measured), sample_surface(statue, EVEN).points
+    tree, spread = KDTree(measured), sample_surface(statue, EVEN, block=1 << 15).points
     reach = 2 * float(np.median(tree.query(measured, k=2, workers=-1)[0][:, 1]))
     near = tree.query(spread, workers=-1)[0] < reach
     places = {"at the scan's points": measured, f"within {reach * place.scale:.1f} mm of them": spread[near]}
