@@ -21,7 +21,7 @@ _STAFF_FOOT: Vector = (0.235, -0.265, -0.38)
 _STAFF_HEAD: Vector = (0.330, -0.300, 0.68)
 _STAFF_RADIUS = 0.022
 _EYE: Vector = (0.105, -0.225, 0.435)
-_BLOCK = 16384  # rows evaluated at once: enough to share between threads, few enough for the temporaries to stay in cache
+_BLOCK = 16384  # rows evaluated at once: enough for threads to share, few enough for the temporaries to stay in cache
 
 
 class Statue(OneLevelField):

@@ -55,9 +55,9 @@ def check_evolution(
         ends: the surfaces that it should have met.
         frames: at how many times it is meshed.
         resolution: of those meshes; ends are meshed finer.
-        count: told how many frames and ends are done, and of how many.
+        count: told how many frames, ends and slopes are done, and of how many.
     """
-    total = frames + len(ends)
+    total = frames + len(ends) + 1
     count = count or (lambda _done, _total: None)
     shown, met = [], []
     for time in torch.linspace(0, 1, frames).tolist():
@@ -66,11 +66,9 @@ def check_evolution(
     for end in ends:
         met.append(end_figures(field, end))
         count(frames + len(met), total)
-    checks = {
-        "ends": met,
-        "slopes": slope_figures(field),
-        "frames": [vars(frame) for frame in shown],
-    }
+    slopes = slope_figures(field)
+    count(total, total)
+    checks = {"ends": met, "slopes": slopes, "frames": [vars(frame) for frame in shown]}
     return checks | {"warnings": warnings(checks)}
 
 

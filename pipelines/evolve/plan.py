@@ -20,7 +20,9 @@ ORDER_ONE, ORDER_TWO = 1.6, 2.8
 USUAL, EXACT = Net.siren(256, 2), Net(2000, 60)
 MESHED = 128  # cells along the meshes of shapes
 ENDS_MESHED = 192
-JUDGING = 1.0e11  # FLOPs that take as long as the Chamfer distance of an end
+# FLOPs that take as long as the Chamfer distance of an end; and as a mesh beside its values, by its resolution squared:
+# networks of an evolution are small, so that signs and triangles cost more than they do.
+JUDGING, SQUARE = 2.0e10, 0.9e6
 # A level is not worth fewer steps, or fewer than a quarter of its own.
 FEWEST_STEPS = 40
 FEWEST_SAMPLES, FEWEST_FRAMES = 5_000, 3
@@ -78,7 +80,7 @@ class EvolvePlan:
         config, nets = self.config, [self._net(level) for level in range(self.config.num_levels)]
         ends = 2 if config.kind == "transport" else max(len(config.shapes), 1)
         cells = config.frames * config.resolution**2 + ends * ENDS_MESHED**2
-        work = values(4 * cells, nets) + jets(2 * cells, nets) + ends * JUDGING
+        work = values(4 * cells, nets) + jets(2 * cells, nets) + SQUARE * cells + ends * JUDGING
         return Stage("checks", "mesh", self.speed.points(work))
 
     def _given(self) -> list[Net]:

@@ -153,6 +153,17 @@ def no_bounds() -> Bounds:
     return Bounds(torch.empty(0, 4), torch.empty(0), torch.empty(0))
 
 
+def _first_near(field: Field, points: Tensor, count: int, width: float) -> Tensor:
+    """The first ``count`` of ``points`` with |f| < ``width`` at the coarsest level; later ones are not asked."""
+    near, found = [points[:0]], 0
+    for part in points.split(1 << 14):
+        near.append(part[field.value(part, level=0).abs() < width])
+        found += len(near[-1])
+        if found >= count:
+            break
+    return torch.cat(near)[:count]
+
+
 @torch.no_grad()
 def band_points(
     field: Field, count: int, width: float, generator: torch.Generator, *, level: int = -1, reach: float = 0.1
@@ -172,8 +183,7 @@ def band_points(
     """
     level, device = field.resolve_level(level), field.deltas.device
     points = uniform_spacetime(CANDIDATES * count, generator).to(device)
-    value = torch.cat([field.value(part, level=0) for part in points.split(1 << 17)])
-    points = points[value.abs() < max(reach, width)][:count]
+    points = _first_near(field, points, count, max(reach, width))
     value, gradient, _ = field.jet(points, level=level)
     slope = gradient[:, :3].square().sum(dim=1).clamp(min=0.25)
     goal = width * (2 * torch.rand(len(points), generator=generator).to(device) - 1)

@@ -85,6 +85,8 @@ def evolve(
     """
     started, folder = time.monotonic(), RunFolder(out, resume=resume)
     config = folder.config(EvolveConfig, config)
+    # PyTorch's first optimiser loads its compiler, for two seconds: here, so that no stage's forecast bears them.
+    torch.optim.Adam([torch.zeros(1, requires_grad=True)])
     device, schedule = choose_device(config.device), Schedule.of(progress)
     machine, notes = speed(device), list[str]()
     plan, count, shapes = EvolvePlan(config, machine), len(config.shapes), []
