@@ -10,8 +10,16 @@ from .depth.camera import DepthCamera, read_intrinsics
 from .depth.cloud import DepthReport, DepthSettings, frame_cloud, fuse_frames
 from .depth.frame import RgbdFrame, read_frame, read_poses, read_trajectory
 from .depth.images import is_depth_file, read_color, read_depth
-from .synthetic.samples import add_noise, add_outliers, sample_sphere, sample_surface, sample_torus
-from .synthetic.scanner import STATUE_PLACEMENT, simulate_scan, statue_scan
+from .synthetic.faults import ScanFaults
+from .synthetic.samples import (
+    add_isotropic_noise,
+    add_noise,
+    add_outliers,
+    sample_sphere,
+    sample_surface,
+    sample_torus,
+)
+from .synthetic.scanner import STATUE_PLACEMENT, SimulatedScan, scan_with_truth, simulate_scan, statue_scan
 from .synthetic.scenes import SCENES, Scene, render_scene, sample_scene, scene_mesh
 from .synthetic.statue import Statue
 from .textured.reading import TexturedMesh, colors_at, read_textured, sample_textured
@@ -33,9 +41,12 @@ __all__ = [
     "PosedImage",
     "PosedImages",
     "RgbdFrame",
+    "ScanFaults",
     "Scene",
+    "SimulatedScan",
     "Statue",
     "TexturedMesh",
+    "add_isotropic_noise",
     "add_noise",
     "add_outliers",
     "colors_at",
@@ -65,6 +76,7 @@ __all__ = [
     "sample_surface",
     "sample_textured",
     "sample_torus",
+    "scan_with_truth",
     "scene_mesh",
     "simulate_scan",
     "spacing_of",

@@ -12,6 +12,7 @@ from ...neural_fields import Field, Similarity
 from ..clouds.point_cloud import PointCloud, unit_rows
 
 __all__ = [
+    "add_isotropic_noise",
     "add_noise",
     "add_outliers",
     "distinct_starts",
@@ -150,6 +151,26 @@ def add_noise(cloud: PointCloud, amplitude: float, *, seed: int = 0) -> PointClo
     diagonal = float(np.linalg.norm(np.ptp(cloud.points, axis=0)))
     shift = np.random.default_rng(seed).uniform(-1, 1, (len(cloud), 1)) * amplitude * diagonal
     return replace(cloud, points=cloud.points + shift * unit_rows(cloud.normals))
+
+
+def add_isotropic_noise(cloud: PointCloud, amplitude: float, *, seed: int = 0) -> PointCloud:
+    """Move points by N(0, σ²) in each coordinate, σ = ``amplitude``·(diagonal of the bounding box)/√3; normals stay.
+
+    Along any direction that is as strong as `add_noise` of the same ``amplitude`` is along the normals.
+
+    Raises:
+        ValueError: ``amplitude`` is negative.
+
+    Example:
+        >>> cloud = sample_sphere(10_000)  # a diagonal of √3
+        >>> bool(abs((add_isotropic_noise(cloud, 0.01).points - cloud.points).std() - 0.01) < 5e-4)
+        True
+    """
+    if not amplitude >= 0:
+        raise ValueError(f"amplitude={amplitude}: expected a fraction of the diagonal, 0 or more")
+    sigma = amplitude * float(np.linalg.norm(np.ptp(cloud.points, axis=0))) / 3**0.5
+    shift = np.random.default_rng(seed).normal(0, sigma, cloud.points.shape)
+    return replace(cloud, points=cloud.points + shift)
 
 
 def add_outliers(cloud: PointCloud, fraction: float, *, seed: int = 0) -> PointCloud:

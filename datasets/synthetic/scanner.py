@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -12,22 +13,32 @@ from numpy.typing import NDArray
 from ...neural_fields import Field, Similarity
 from ..clouds.point_cloud import PointCloud, unit_rows
 from ..depth.cleaning import both_sides
+from .faults import ScanFaults, kept_unevenly, quantised, rigid_motion, smeared
 from .samples import jet_at
 from .statue import Statue
 
-__all__ = ["STATUE_PLACEMENT", "simulate_scan", "statue_scan"]
+__all__ = ["STATUE_NOISE", "STATUE_PLACEMENT", "SimulatedScan", "scan_with_truth", "simulate_scan", "statue_scan"]
 
 Float64 = NDArray[np.float64]
 
 STATUE_PLACEMENT = Similarity((1250.0, -840.0, 930.0), 480.0)
 """Where the bundled scan stands: in millimetres, as if measured in the hall of a museum."""
 
+STATUE_NOISE = 2e-4
+"""Standard deviation of the bundled scan's ranges in units of the statue: about a tenth of a millimetre."""
+
 _RELAX = 0.75  # steps are this much shorter than the field says, because a field may be steeper than a distance
 _STEPS = 96  # of a ray at most
 _ELEVATIONS = (12.0, 38.0, -30.0, 22.0)  # degrees; scanner after scanner, over again
 
 
-def statue_scan(*, seed: int = 0, progress: Callable[[int, int], None] | None = None) -> PointCloud:
+def statue_scan(
+    *,
+    noise: float = STATUE_NOISE,
+    faults: ScanFaults | None = None,
+    seed: int = 0,
+    progress: Callable[[int, int], None] | None = None,
+) -> PointCloud:
     """Scan the :class:`Statue` from twelve places: the bundled sample, some 100,000 points in millimetres.
 
     The ranges have a tenth of a millimetre of noise, as those of hand-held structured-light scanners, and points are
@@ -35,15 +46,16 @@ def statue_scan(*, seed: int = 0, progress: Callable[[int, int], None] | None = 
     little of the owl from below.
 
     ``STATUE_PLACEMENT.to_unit(points)`` leads back to the coordinates of ``Statue().exact_distance``. Of
-    ``progress`` see `simulate_scan`.
+    ``noise``, ``faults`` (none unless given) and ``progress`` see `simulate_scan`.
     """
     statue = Statue()
     return simulate_scan(
         statue,
         scanners=12,
-        noise=2e-4,
+        noise=noise,
         colors=statue.colors,
         placement=STATUE_PLACEMENT,
+        faults=faults,
         seed=seed,
         progress=progress,
     )
@@ -57,6 +69,7 @@ def simulate_scan(
     noise: float = 0.0008,
     colors: Callable[[Float64], NDArray[np.float32]] | None = None,
     placement: Similarity | None = None,
+    faults: ScanFaults | None = None,
     seed: int = 0,
     progress: Callable[[int, int], None] | None = None,
 ) -> PointCloud:
@@ -74,14 +87,79 @@ def simulate_scan(
         noise: standard deviation of the ranges, in the field's units.
         colors: the colour at points ``(N, 3)``, in the field's units.
         placement: from the field's coordinates to those of the scan; none leaves them as they are.
+        faults: what else goes wrong; nothing by default. Their random numbers are their own: the same seed gives the
+            same rays, losses and noise with any of them.
         seed: of the random numbers.
         progress: told how many steps are done, and of how many: those of the rays, and one for each scanner.
 
     Raises:
-        ValueError: ``scanners`` or ``resolution`` is too small, or no ray hits anything.
+        ValueError: ``scanners`` or ``resolution`` is too small, ``noise`` is negative, or no ray hits anything.
+    """
+    return scan_with_truth(
+        field,
+        scanners=scanners,
+        resolution=resolution,
+        noise=noise,
+        colors=colors,
+        placement=placement,
+        faults=faults,
+        seed=seed,
+        progress=progress,
+    ).cloud
+
+
+@dataclass(frozen=True)
+class SimulatedScan:
+    """A scan, and the truth behind each of its points; all in the coordinates of the cloud.
+
+    The point ``x`` of scanner ``s`` was measured at ``motions[s]⁻¹ x``, on the ray from ``positions[s]`` through
+    ``exact`` but for isotropic noise.
+
+    Attributes:
+        cloud: what the scanners say.
+        exact: ``(N, 3)`` where each point's ray meets the surface: to rounding, and to 4e-5 of the unit sphere where it
+            grazes it.
+        exact_normals: ``(N, 3)`` unit normals of the surface there.
+        scanner: ``(N,)`` which scanner it was.
+        smeared: ``(N,)`` whether the reading is a mixture with that of a neighbour.
+        positions: ``(S, 3)`` where the scanners stood.
+        motions: ``(S, 4, 4)`` registration errors: rigid motions from where points were measured to where they are.
+    """
+
+    cloud: PointCloud
+    exact: Float64
+    exact_normals: Float64
+    scanner: NDArray[np.int64]
+    smeared: NDArray[np.bool_]
+    positions: Float64
+    motions: Float64
+
+
+def scan_with_truth(
+    field: Field,
+    *,
+    scanners: int = 8,
+    resolution: int = 216,
+    noise: float = 0.0008,
+    colors: Callable[[Float64], NDArray[np.float32]] | None = None,
+    placement: Similarity | None = None,
+    faults: ScanFaults | None = None,
+    seed: int = 0,
+    progress: Callable[[int, int], None] | None = None,
+) -> SimulatedScan:
+    """As `simulate_scan`, with the exact point of every reading and all that was done to it.
+
+    Example:
+        >>> from mplicits.neural_fields import Sphere
+        >>> scan = scan_with_truth(Sphere(radius=0.7), scanners=2, resolution=16, faults=ScanFaults(misalign=0.01))
+        >>> bool(abs((scan.exact**2).sum(axis=1) - 0.49).max() < 1e-6)
+        True
     """
     if scanners < 1 or resolution < 8:
         raise ValueError(f"scanners={scanners}, resolution={resolution}: expected at least 1 and 8")
+    if not noise >= 0:
+        raise ValueError(f"noise={noise}: expected a length, 0 or more")
+    faults, place = faults or ScanFaults(), placement or Similarity.identity()
     random = np.random.default_rng(seed)
     views = [_view(index, scanners, resolution, random) for index in range(scanners)]
     # all rays at once: late steps, with few rays left, cost as much as early ones
@@ -91,20 +169,51 @@ def simulate_scan(
     rays = np.concatenate([view.rays.reshape(-1, 3) for view in views])
     ranges = _trace(field, origins, rays, tell=lambda step: tell(step, total))
     split = np.split(ranges, np.cumsum([view.rays[..., 0].size for view in views])[:-1])
-    parts = []
-    for view, each in zip(views, split, strict=True):
-        parts.append(_measure(field, view, each, noise, random))
+    thin_side = np.random.default_rng((seed, scanners + 1)).normal(size=3)
+    parts: list[_Readings] = []
+    for index, (view, each) in enumerate(zip(views, split, strict=True)):
+        extra = np.random.default_rng((seed, index + 1))  # faults leave the other numbers as they are
+        parts.append(_measure(field, view, each, noise, faults, thin_side / np.linalg.norm(thin_side), random, extra))
         tell(_STEPS + len(parts), total)
-    points, normals, exact = (np.concatenate([part[k] for part in parts]) for k in range(3))
-    if len(points) == 0:
+    counts = [len(part.points) for part in parts]
+    if not sum(counts):
         raise ValueError("field: no ray of any scanner hits its surface; expected one in the unit sphere")
+    exact = np.concatenate([part.exact for part in parts])
     shades = None
     if colors is not None:
-        exposure = np.concatenate([np.full(len(part[0]), random.normal(1, 0.03)) for part in parts])
-        measured = colors(exact) * exposure[:, None] + random.normal(0, 0.01, (len(points), 3))
+        exposure = np.concatenate([np.full(count, random.normal(1, 0.03)) for count in counts])
+        measured = colors(exact) * exposure[:, None] + random.normal(0, 0.01, (len(exact), 3))
         shades = measured.clip(0, 1).astype(np.float32)
-    placed = (placement or Similarity.identity()).to_input(points)
-    return PointCloud(placed, normals.astype(np.float32), shades, f"simulated scan of {type(field).__name__}")
+    placed = place.to_input(np.concatenate([part.points for part in parts]))
+    normals = np.concatenate([part.normals for part in parts])
+    return SimulatedScan(
+        PointCloud(placed, normals.astype(np.float32), shades, f"simulated scan of {type(field).__name__}"),
+        place.to_input(exact),
+        np.concatenate([part.exact_normals for part in parts]),
+        np.repeat(np.arange(scanners), counts),
+        np.concatenate([part.smeared for part in parts]),
+        place.to_input(np.stack([view.position for view in views])),
+        np.stack([_in_place(part.motion, place) for part in parts]),
+    )
+
+
+def _in_place(motion: Float64, place: Similarity) -> Float64:
+    """A rigid motion of the field's coordinates as one of the scan's."""
+    moved = motion.copy()
+    middle = place.to_input(np.zeros((1, 3)))[0]
+    moved[:3, 3] = place.to_input(motion[None, :3, 3])[0] - motion[:3, :3] @ middle
+    return moved
+
+
+class _Readings(NamedTuple):
+    """What one scanner keeps, in the field's units; see `SimulatedScan`."""
+
+    points: Float64
+    normals: Float64
+    exact: Float64
+    exact_normals: Float64
+    smeared: NDArray[np.bool_]
+    motion: Float64
 
 
 class _View(NamedTuple):
@@ -122,21 +231,36 @@ def _view(index: int, scanners: int, resolution: int, random: np.random.Generato
 
 
 def _measure(
-    field: Field, view: _View, ranges: Float64, noise: float, random: np.random.Generator
-) -> tuple[Float64, Float64, Float64]:
-    """One scanner's noisy points, their normals, and the points without noise; each ``(M, 3)``."""
+    field: Field,
+    view: _View,
+    ranges: Float64,
+    noise: float,
+    faults: ScanFaults,
+    thin_side: Float64,
+    random: np.random.Generator,
+    extra: np.random.Generator,
+) -> _Readings:
+    """One scanner's points, with all that goes wrong; ``extra`` draws for the faults, ``random`` for the rest."""
     position, rays = view
     ranges = ranges.reshape(rays.shape[:2])  # NaN: nothing hit
     exact = position + ranges[..., None] * rays
     hit = np.isfinite(ranges)
-    facing = np.zeros_like(ranges)
-    facing[hit] = -(_unit_gradient(field, exact[hit]) * rays[hit]).sum(axis=1)
+    upright, facing = np.zeros_like(rays), np.zeros_like(ranges)
+    upright[hit] = _unit_gradient(field, exact[hit])
+    facing[hit] = -(upright[hit] * rays[hit]).sum(axis=1)
     # a surface seen at 84° or flatter returns nothing, from 66° on everything comes back
     hit &= random.uniform(0, 1, hit.shape) < (facing - 0.1) / 0.3
-    ranges = np.where(hit, ranges + random.normal(0, noise, ranges.shape), np.nan)
-    points = position + ranges[..., None] * rays
+    mixed, smears = smeared(ranges, rays, faults.smear, extra)
+    ranges = np.where(hit, mixed + random.normal(0, noise, ranges.shape), np.nan)
+    points = position + quantised(ranges, faults.quantise)[..., None] * rays
+    points += extra.normal(0, 1, points.shape) * faults.isotropic
     normals = _range_normals(points, rays)
-    return points[hit], normals[hit], exact[hit]
+    hit &= kept_unevenly(exact, thin_side, faults.uneven, extra)
+    motion = rigid_motion(faults.misalign, extra)
+    turn, shift = motion[:3, :3], motion[:3, 3]
+    if faults.misalign:
+        points, normals = points @ turn.T + shift, normals @ turn.T
+    return _Readings(points[hit], normals[hit], exact[hit], upright[hit], smears[hit], motion)
 
 
 def _grid_of_rays(position: Float64, side: int) -> Float64:

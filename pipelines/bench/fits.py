@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from ...datasets import OrientedCloud, PointCloud, add_noise, orbit, read_cloud
+from ...datasets import OrientedCloud, PointCloud, add_isotropic_noise, add_noise, orbit, read_cloud
 from ...datasets.synthetic.statue import Statue
 from ...neural_fields import InputError, MultiscaleSDF, Similarity, load_field
 from ...neural_fields.meshing import Mesh, NoSurfaceError, extract_mesh
@@ -98,10 +98,11 @@ class FitRow:
         shape: name of the file.
         noise: half-width of the uniform displacement, as a fraction of the bounding box's diagonal.
         method: "level 0" to the finest, "screened Poisson", or "screened Poisson, smoothed" on the cloud that ours has
-            smoothed the noise off.
+            smoothed the noise off, or "screened Poisson, MeshLab's normals" where normals are estimated.
         seconds: training up to and with this level, its sampling included; reconstruction for Poisson.
         mesh_seconds: extraction; 0 for Poisson, whose result is a mesh.
         metrics: against the shape; None where the method found no surface.
+        isotropic: whether the noise has no direction: Gaussian, along the normals as strong as the other.
     """
 
     shape: str
@@ -110,6 +111,7 @@ class FitRow:
     seconds: float
     mesh_seconds: float
     metrics: Metrics | None
+    isotropic: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,12 +121,13 @@ class FitBench(Benchmark[FitRow]):
     Or of points drawn uniformly on them, with the normals of their faces: sharp edges have no vertices then.
 
     The protocol is the paper's: unit sphere, ``resolution``³ marching cubes, ``samples`` points on each surface.
-    Noise moves the points along their normals, which stay as they were (the paper's Tab. 3).
+    Noise moves the points along their normals, which stay as they were (the paper's Tab. 3), or in all directions.
 
     Attributes:
         shapes: mesh files.
         config: settings of the fits.
         noise: see `FitRow`.
+        isotropic: see `FitRow`.
         points: how many are drawn on each mesh; None takes its vertices.
         resolution: cells along each side of the extraction box.
         samples: points drawn on each surface.
@@ -139,6 +142,7 @@ class FitBench(Benchmark[FitRow]):
     shapes: Sequence[str | Path]
     config: FitConfig
     noise: float = 0.0
+    isotropic: bool = False
     points: int | None = None
     resolution: int = 512
     samples: int = 500_000
@@ -158,22 +162,23 @@ class FitBench(Benchmark[FitRow]):
         reference = read_reference(path)
         cloud = read_cloud(path) if self.points is None else _drawn(path, reference, self.points, seed)
         if self.noise:
-            cloud = add_noise(cloud, self.noise, seed=seed)
+            cloud = (add_isotropic_noise if self.isotropic else add_noise)(cloud, self.noise, seed=seed)
         rows: list[FitRow] = []
         drawn: list[tuple[str, Surface]] = [("input", from_cloud(cloud))]
-        drawing = {} if self.points is None else {"points": self.points}
+        drawing: dict[str, Any] = {} if self.points is None else {"points": self.points}
+        drawing |= {"isotropic": True} if self.isotropic else {}
         home = fit_home(work.out, path, self.config, noise=self.noise, **drawing)
         for method, seconds, mesh_seconds, mesh in self.reconstructions(cloud, home, work.stage(path.stem)):
             metrics = None
             if mesh is not None:
                 metrics = evaluate_surfaces(mesh, reference, samples=self.samples, seed=seed)
                 drawn.append((method, mesh))
-            rows.append(FitRow(path.stem, self.noise, method, seconds, mesh_seconds, metrics))
+            rows.append(FitRow(path.stem, self.noise, method, seconds, mesh_seconds, metrics, self.isotropic))
         if self.pictures is not None:
             self.pictures.mkdir(parents=True, exist_ok=True)
             camera = orbit(reference.vertices)
             tiles = [(label, picture_of(surface, camera)) for label, surface in [*drawn, ("reference", reference)]]
-            damage = f"-noise-{self.noise:g}" if self.noise else ""
+            damage = f"{'-isotropic' * self.isotropic}-noise-{self.noise:g}" if self.noise else ""
             write_picture(self.pictures / f"{path.stem}{damage}.png", contact_sheet(tiles))
         return rows
 
@@ -198,6 +203,12 @@ class FitBench(Benchmark[FitRow]):
             started = time.perf_counter()
             surface = screened_poisson(oriented, depth=self.poisson_depth)
             yield method, time.perf_counter() - started, 0.0, _in_input(surface, oriented.similarity)
+        if run.record["cleaning"]["normals_source"] == "estimated":
+            oriented = prepare(cloud, dataclasses.replace(self.config, smooth_noise=False))
+            started = time.perf_counter()
+            surface = screened_poisson(oriented, depth=self.poisson_depth, own_normals=True)
+            seconds = time.perf_counter() - started
+            yield "screened Poisson, MeshLab's normals", seconds, 0.0, _in_input(surface, oriented.similarity)
 
     def tables(self, rows: Sequence[FitRow], *, sgemm: float) -> tuple[Table, ...]:
         """See `Benchmark.tables`."""
@@ -221,7 +232,8 @@ class FitBench(Benchmark[FitRow]):
             (Column("fit, s", ".1f"), lambda row: row.seconds),
             (Column("mesh, s", ".1f"), lambda row: row.mesh_seconds or None),
         ]
-        items = [(f"{row.shape}{f' + noise {row.noise:g}' if row.noise else ''}", row) for row in rows]
+        kinds = {False: "noise", True: "isotropic noise"}
+        items = [(f"{row.shape}{f' + {kinds[row.isotropic]} {row.noise:g}' if row.noise else ''}", row) for row in rows]
         return (tabulated(self.name, "How near fits come", "shape", figures, items),)
 
 
@@ -414,7 +426,7 @@ def has_poisson() -> bool:
     return importlib.util.find_spec("pymeshlab") is not None
 
 
-def screened_poisson(cloud: OrientedCloud, *, depth: int = 10, trim: float = 0.0) -> Surface:
+def screened_poisson(cloud: OrientedCloud, *, depth: int = 10, trim: float = 0.0, own_normals: bool = False) -> Surface:
     """Reconstruct a cloud, with MeshLab's defaults except for the octree's depth (10 in the paper).
 
     Args:
@@ -422,6 +434,7 @@ def screened_poisson(cloud: OrientedCloud, *, depth: int = 10, trim: float = 0.0
         depth: of the octree.
         trim: vertices whose density is below this quantile are cut away with their faces, as the example code of
             Open3D does it (the paper's supplement, 1 %); 0 cuts nothing.
+        own_normals: whether MeshLab estimates and orients normals (32 neighbours), in place of the cloud's.
 
     Returns:
         The mesh, in unit-sphere coordinates.
@@ -438,6 +451,8 @@ def screened_poisson(cloud: OrientedCloud, *, depth: int = 10, trim: float = 0.0
     points, normals = cloud.points.astype(np.float64), cloud.normals.astype(np.float64)
     mesh = pymeshlab.Mesh(vertex_matrix=points, v_normals_matrix=normals)  # pyright: ignore[reportAttributeAccessIssue]
     meshes.add_mesh(mesh)
+    if own_normals:
+        meshes.compute_normal_for_point_clouds(k=32)
     # Its threads wait for each other by spinning: more than there are cores for them, and they take ten times as long.
     meshes.generate_surface_reconstruction_screened_poisson(depth=depth, threads=torch.get_num_threads())
     mesh = meshes.current_mesh()

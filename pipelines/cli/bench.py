@@ -134,6 +134,8 @@ def _mesh(arguments: argparse.Namespace) -> int:
 def _fit_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("shapes", nargs="+", metavar="SHAPE", help="mesh files")
     _number(parser, "--noise", positive, None, "move points by up to X bounding-box diagonals")
+    what = "noise in all directions (Gaussian), as strong along the normals; --normals estimate leaves those out"
+    parser.add_argument("--isotropic", action="store_true", help=what)
     _number(parser, "--points", whole(100), None, "draw so many points with exact normals, and leave the vertices")
     _measured(parser, 512)
     _number(parser, "--poisson-depth", whole(4, 14), 10, "octree depth")
@@ -145,12 +147,15 @@ def _fit_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _fit(arguments: argparse.Namespace) -> int:
     config = read_settings(arguments, FitConfig)
+    if arguments.isotropic and not arguments.noise:
+        raise input_error("--isotropic: how much noise? add --noise, 0.01 for one per cent of the diagonal")
     from ..bench.fits import FitBench
 
     bench = FitBench(
         shapes=arguments.shapes,
         config=config,
         noise=arguments.noise or 0.0,
+        isotropic=arguments.isotropic,
         points=arguments.points,
         resolution=arguments.resolution,
         samples=arguments.eval_samples,

@@ -8,6 +8,7 @@ import torch
 from mplicits.datasets import (
     STATUE_PLACEMENT,
     Statue,
+    add_isotropic_noise,
     add_noise,
     add_outliers,
     prepare_cloud,
@@ -56,6 +57,21 @@ def test_noise_moves_points_along_their_normals():
     assert 0.99 * bound < np.abs(shift).max() <= bound * (1 + 1e-6)
     assert abs(shift.std() - bound / 3**0.5) < 0.02 * bound
     assert noisy.normals is cloud.normals
+
+
+def test_isotropic_noise_is_as_strong_along_the_normals_and_across():
+    """Of a Gaussian the covariances' standard errors are σ² √((1 + δ_ij)/N); five of them are allowed."""
+    cloud = sample_sphere(20000, radius=1.0)
+    noisy = add_isotropic_noise(cloud, 0.01, seed=1)
+    sigma = 0.01 * np.linalg.norm(np.ptp(cloud.points, axis=0)) / 3**0.5
+    shift = noisy.points - cloud.points
+    bound = 5 * sigma**2 * np.sqrt((1 + np.eye(3)) / 20000)
+    assert (np.abs(shift.T @ shift / 20000 - sigma**2 * np.eye(3)) < bound).all()
+    along = np.square((shift * cloud.normals).sum(axis=1)).mean()
+    assert abs(along - sigma**2) < 5 * sigma**2 * (2 / 20000) ** 0.5
+    assert noisy.normals is cloud.normals
+    with pytest.raises(ValueError, match="amplitude=-1"):
+        add_isotropic_noise(cloud, -1)
 
 
 def test_outliers_fill_the_ball():

@@ -1,9 +1,11 @@
 """The fit benchmark on a small shape: every level has a row, noise is applied, Poisson joins when it is there."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from mplicits.datasets import add_isotropic_noise, read_cloud
 from mplicits.neural_fields import InputError, Similarity, Sphere, extract_mesh
 from mplicits.pipelines.bench import fits as module
 from mplicits.pipelines.bench.fits import FitBench
@@ -60,6 +62,27 @@ def test_noise_reaches_the_fit(ball: Path, tmp_path: Path, monkeypatch: pytest.M
     diagonal = 28.0 * 3**0.5
     assert seen[0] < 0.02
     assert 0.9 * 0.01 * diagonal < seen[1] < 1.01 * 0.01 * diagonal + 0.02
+
+
+def test_isotropic_noise_reaches_the_fit(ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = []
+    monkeypatch.setattr(
+        FitBench, "reconstructions", lambda _, cloud, *__: seen.append(cloud) or [("level 0", 1, 1, None)]
+    )
+    bench = FitBench(shapes=[ball], config=SMALL, noise=0.01, isotropic=True)
+    rows = bench.rows(tmp_path)
+    assert np.array_equal(seen[0].points, add_isotropic_noise(read_cloud(ball), 0.01).points)
+    assert "ball + isotropic noise 0.01" in as_text(*bench.tables(rows, sgemm=1e9))
+
+
+def test_poisson_has_normals_of_its_own_where_ours_are_estimated(ball: Path, tmp_path: Path) -> None:
+    pytest.importorskip("pymeshlab", reason="the extra mplicits[poisson] is not installed")
+    config = replace(SMALL, normals="estimate")
+    rows = FitBench(shapes=[ball], config=config, resolution=32, samples=5000, poisson_depth=6).rows(tmp_path)
+    assert [row.method for row in rows[2:]] == ["screened Poisson", "screened Poisson, MeshLab's normals"]
+    assert rows[-1].metrics is not None
+    assert rows[-1].metrics.iou is not None
+    assert rows[-1].metrics.iou > 0.95
 
 
 def test_screened_poisson_when_installed(ball: Path, tmp_path: Path) -> None:

@@ -121,6 +121,13 @@ def test_neither_help_nor_mistakes_wait_for_torch():
         ("mesh run -o absent/mesh.ply", "run: no such run directory"),
         ("evaluate a.ply b.ply --json figures.txt", "figures.txt: unknown extension '.txt'"),
         ("sample lion -o a.ply", "'lion'"),
+        ("sample -o a.ply --noise much", "--noise much: expected a number of input units, or one with a unit"),
+        ("sample -o a.ply --misalign -1mm", "--misalign -1mm: expected a length ≥ 0"),
+        ("sample -o a.ply --quantise 3miles", "--quantise 3miles: expected a number"),
+        ("sample -o a.ply --smear 2", "--smear: got '2', expected a number from 0 to 1"),
+        ("sample -o a.ply --uneven 0", "--uneven: got '0', expected a number from 1"),
+        ("bench fit a.ply --isotropic", "--isotropic: how much noise? add --noise"),
+        ("sample gear -o a.ply --noise 0.1mm", "--noise: is of scans, and gear is an exact mesh"),
     ],
 )
 def test_mistakes_in_the_arguments(capsys, monkeypatch, tmp_path, arguments, message):
@@ -374,6 +381,22 @@ def test_the_sample_is_written_and_read_again(monkeypatch, tmp_path, capsys):
     assert "50 points" in capsys.readouterr().out
     assert main(["info", str(tmp_path / "scan.ply")]) == 0
     assert "x -0." in capsys.readouterr().out
+
+
+def test_the_faults_of_the_sample_are_lengths_of_its_millimetres(monkeypatch, tmp_path):
+    asked = {}
+
+    def scan(*, seed, progress, **options):
+        asked.update(options)
+        return sample_sphere(50, seed=seed)
+
+    monkeypatch.setattr("mplicits.datasets.statue_scan", scan)
+    words = "--noise 0.48 --isotropic-noise 960um --quantise 0.048cm --misalign 0 --smear 0.25 --uneven 3"
+    assert main(["sample", "-o", str(tmp_path / "scan.ply"), *words.split()]) == 0
+    assert asked["noise"] == pytest.approx(1e-3)  # the statue's unit is 480 mm
+    faults = asked["faults"]
+    assert (faults.isotropic, faults.quantise) == pytest.approx((2e-3, 1e-3))
+    assert (faults.misalign, faults.smear, faults.uneven) == (0, 0.25, 3)
 
 
 def test_the_demo_writes_meshes_and_a_picture_of_any_cloud(cloud, tmp_path, capsys):
