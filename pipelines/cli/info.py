@@ -44,7 +44,13 @@ def _describe_field(path: Path) -> Rows:
     ]
     stages = {stage.get("level"): stage for stage in record.get("stages", [])}
     for index, level in enumerate(levels_of(field)):
-        rows.append((f"level {index}", _describe_level(level, stages.get(index, {}))))
+        stage = stages.get(index, {})
+        rows.append((f"level {index}", _describe_level(level, stage)))
+        judged = stage.get("held_out")
+        if judged and stage["silenced"] == (judged["after"] >= judged["before"]):
+            rows.append(("  held out", judged["verdict"]))
+        elif stage.get("silenced"):
+            rows.append(("  held out", f"level {index} set to zero: further from the points than the level before it"))
         if index < len(field.deltas):
             delta = float(field.deltas[index])
             rows.append((f"  band {index}", f"δ = {delta:.5g} ({delta * similarity.scale:.5g} input units)"))
@@ -59,11 +65,6 @@ def _describe_level(level: Any, stage: dict[str, Any]) -> str:
         text = f"({level.width}, {level.depth}), ω₀ = {level.omega:g}, {parameter_count(level):,} parameters"
     if "training_seconds" in stage:
         text += f"; {stage['steps']:,} steps in {stage['training_seconds']:.1f} s"
-    judged = stage.get("held_out")
-    if judged and stage["silenced"] == (judged["after"] >= judged["before"]):
-        text += f"; {judged['verdict']}"
-    elif stage.get("silenced"):
-        text += "; set to zero, for it was further from the points than the level before it"
     if "rms_at_points" in stage:
         text += f"; rms at the points {stage['rms_at_points']:.4g} input units"
     return text

@@ -8,7 +8,7 @@ loss falls at those and rises here.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -19,7 +19,7 @@ from ...neural_fields import Field, Siren
 from ...neural_fields.losses import data_loss, normal_loss
 from .samples import Samples, with_previous
 
-__all__ = ["FEWEST", "LOOKS", "Judge", "Verdict", "held_out"]
+__all__ = ["FEWEST", "LOOKS", "Error", "Judge", "Verdict", "held_out"]
 
 FEWEST = 200  # whose mean square is known to a tenth
 MOST = 0.1  # of the points; a cloud that would have to spare more spares none
@@ -52,38 +52,68 @@ def held_out(points: NDArray[np.float32], spacing: float, share: float, *, seed:
     return drawn[owner]
 
 
+class Error(NamedTuple):
+    """How far a field is off at held-out points.
+
+    Attributes:
+        loss: that of the level that is judged.
+        distance: root mean square of f, in the unit sphere.
+        angle: median angle between gradient and normal, in degrees.
+    """
+
+    loss: float
+    distance: float
+    angle: float
+
+
 class Verdict(NamedTuple):
     """What held-out points say of a level.
 
     Attributes:
         points: how many there are in its band.
-        before: their loss without it.
-        after: their loss with it, at its best.
+        before: the error there without it.
+        after: the error with it, at its best.
         at: fraction of its schedule at which that was.
     """
 
     points: int
-    before: float
-    after: float
+    before: Error
+    after: Error
     at: float
 
     @property
     def better(self) -> bool:
         """Whether the level is worth having."""
-        return self.after < self.before
+        return self.after.loss < self.before.loss
 
-    def words(self) -> str:
-        """One line for people."""
-        losses = f"{self.before:.3g} without it, {self.after:.3g} with"
-        said = f"the loss at {self.points:,} points that it has not seen is {losses}"
+    def words(self, level: int, *, scale: float = 1.0) -> str:
+        """One line for people, of the ``level`` with this number; ``scale`` takes distances to input units."""
         if not self.better:
-            return f"set to zero, for {said}"
-        when = "" if self.at == 1 else f", as it was best: after {self.at:.0%} of its steps"
-        return f"kept{when}, for {said}"
+            judged = "set to zero"
+        elif self.at == 1:
+            judged = "kept"
+        else:
+            judged = f"kept as it was after {self.at:.0%} of its steps"
+        pairs = zip(self.before, self.after, (1.0, scale, 1.0), strict=True)
+        loss, distance, angle = (f"{b * unit:.3g} → {a * unit:.3g}" for b, a, unit in pairs)
+        errors = f"loss {loss}, rms distance {distance}, median angle {angle}°"
+        return f"level {level} {judged}: without it → with it, at {self.points:,} points that it has not seen: {errors}"
+
+    def record(self, level: int, *, scale: float = 1.0) -> dict[str, Any]:
+        """For ``run.json``: the losses, and the other errors in input units and degrees."""
+        return {
+            "points": self.points,
+            "before": self.before.loss,
+            "after": self.after.loss,
+            "at": self.at,
+            "distance": [error.distance * scale for error in (self.before, self.after)],
+            "angle": [error.angle for error in (self.before, self.after)],
+            "verdict": self.words(level, scale=scale),
+        }
 
 
 class Judge:
-    """The loss of a level at points that it has not seen.
+    """The error of a level at points that it has not seen.
 
     Args:
         points: ``(n, 3)`` held-out points.
@@ -102,20 +132,23 @@ class Judge:
         self.data, self.normal, self.count = data, normal, len(self.samples)
         assert self.samples.value is not None
         assert self.samples.gradient is not None
-        self.before = self._loss(self.samples.value, self.samples.gradient)
+        self.before = self._error(self.samples.value, self.samples.gradient)
 
     @torch.no_grad()
-    def loss(self, siren: Siren) -> float:
+    def error(self, siren: Siren) -> Error:
         """With the residual ``siren`` added to the levels before; ``before`` is without it."""
         value, gradient = self.samples.value, self.samples.gradient
         assert value is not None
         assert gradient is not None
         jet = siren.jet(self.samples.points)
-        return self._loss(value + jet.value, gradient + jet.gradient)
+        return self._error(value + jet.value, gradient + jet.gradient)
 
-    def _loss(self, value: Tensor, gradient: Tensor) -> float:
+    def _error(self, value: Tensor, gradient: Tensor) -> Error:
         distance, normal = self.samples.distance, self.samples.normal
         assert distance is not None
         assert normal is not None
         data, turn = data_loss(value, distance).mean(), normal_loss(gradient, normal).mean()
-        return float(self.data * data + self.normal * turn)
+        # The chord, for the cosine of a small angle rounds to 1.
+        chord = (torch.nn.functional.normalize(gradient, dim=1) - normal).norm(dim=1)
+        angle = torch.rad2deg(2 * (chord.quantile(0.5).clamp(max=2) / 2).asin()) if len(chord) else chord.sum()
+        return Error(float(self.data * data + self.normal * turn), float(data.sqrt()), float(angle))

@@ -13,7 +13,7 @@ from ...neural_fields.losses import data_loss, eikonal_loss, normal_loss
 from ..run.settings import EvolveConfig, FitConfig
 from ..run.team import my_share, whole_batch
 from ..run.trainer import Group, Objective, seeded, warm_cosine
-from .heldout import LOOKS, Judge, Verdict
+from .heldout import LOOKS, Error, Judge, Verdict
 from .samples import Source
 
 __all__ = ["LevelObjective", "new_level"]
@@ -54,7 +54,7 @@ class LevelObjective(Objective):
         self.siren, self.sources, self.judge = siren, sources, judge
         if judge is not None:  # in the checkpoints too
             best = {BEST + name: tensor.clone() for name, tensor in siren.state_dict().items()}
-            self.kept = {"looks": torch.zeros(1), "least": torch.full((1,), math.inf), "at": torch.ones(1), **best}
+            self.kept = {"looks": torch.zeros(1), "least": torch.full((3,), math.inf), "at": torch.ones(1), **best}
 
     def losses(self, step: int, done: float) -> tuple[dict[str, Tensor], Tensor]:
         """See `Objective.losses`: the mean of every term of every source."""
@@ -85,9 +85,9 @@ class LevelObjective(Objective):
         if self.judge is None:
             return
         self.kept["looks"].fill_(int(done * LOOKS))
-        loss = self.judge.loss(self.siren)
-        if loss < float(self.kept["least"]):
-            self.kept["least"].fill_(loss)
+        error = self.judge.error(self.siren)
+        if error.loss < float(self.kept["least"][0]):
+            self.kept["least"].copy_(torch.tensor(error))
             self.kept["at"].fill_(done)
             for name, tensor in self.siren.state_dict().items():
                 self.kept[BEST + name].copy_(tensor)
@@ -98,7 +98,7 @@ class LevelObjective(Objective):
             return None
         self.look(1.0)
         self.siren.load_state_dict({name: self.kept[BEST + name] for name in self.siren.state_dict()})
-        return Verdict(self.judge.count, self.judge.before, float(self.kept["least"]), float(self.kept["at"]))
+        return Verdict(self.judge.count, self.judge.before, Error(*self.kept["least"].tolist()), float(self.kept["at"]))
 
     def _draw(self, source: Source) -> Tensor:
         index = torch.randint(len(source.samples), (whole_batch(source.batch),), generator=self.generator)

@@ -290,7 +290,7 @@ class _Fitting:
                 "steps": trainer.step,
                 "ended_by_time_budget": trainer.ended_early,
                 "silenced": silenced,
-                "held_out": None if verdict is None else {**verdict._asdict(), "verdict": verdict.words()},
+                "held_out": None if verdict is None else verdict.record(level, scale=self.cloud.similarity.scale),
                 "losses": trainer.losses,
                 **({} if review is None else {"review": review}),
                 **self.surface_errors(),

@@ -1,6 +1,7 @@
 """Held-out points: drawn by voxels, and a level that is worse at them is not kept."""
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,7 +9,8 @@ import torch
 from mplicits.datasets import PointCloud
 from mplicits.datasets.synthetic.samples import sample_sphere
 from mplicits.neural_fields import Siren, Sphere
-from mplicits.pipelines.fit.heldout import FEWEST, VOXEL, Judge, Verdict, held_out
+from mplicits.pipelines.cli.info import describe
+from mplicits.pipelines.fit.heldout import FEWEST, VOXEL, Error, Judge, Verdict, held_out
 from mplicits.pipelines.fit.level import LevelObjective
 from mplicits.pipelines.fit.samples import Band, Samples, Source, with_previous
 from mplicits.pipelines.fit.train import fit
@@ -56,12 +58,29 @@ def test_whole_voxels_are_held_out() -> None:
 def test_the_loss_at_held_out_points_is_that_of_equation_4() -> None:
     judge = judge_of(RADIUS - OFF)
     assert judge.count == 1000
-    assert judge.before == pytest.approx(100 * OFF**2, rel=1e-4)  # the normals agree
-    assert judge.loss(zero_siren(-OFF)) == pytest.approx(0, abs=1e-6)  # 3 (1 − cos), in float32
-    assert judge.loss(zero_siren(OFF)) == pytest.approx(100 * (2 * OFF) ** 2, rel=1e-4)
+    assert judge.before.loss == pytest.approx(100 * OFF**2, rel=1e-4)  # the normals agree
+    assert judge.before.distance == pytest.approx(OFF, rel=1e-4)
+    assert judge.before.angle == pytest.approx(0, abs=1e-4)  # degrees, in float32
+    assert judge.error(zero_siren(-OFF)).loss == pytest.approx(0, abs=1e-6)  # 3 (1 − cos), in float32
+    assert judge.error(zero_siren(OFF)).loss == pytest.approx(100 * (2 * OFF) ** 2, rel=1e-4)
     x = points(1000)
-    against = Judge(x, -x, Sphere(radius=RADIUS), 0.1, data=1.0, normal=3.0)
-    assert against.before == pytest.approx(2 * 3.0, rel=1e-6)
+    against = Judge(x, -x / RADIUS, Sphere(radius=RADIUS), 0.1, data=1.0, normal=3.0)
+    assert against.before.loss == pytest.approx(2 * 3.0, rel=1e-6)
+    assert against.before.angle == pytest.approx(180, abs=0.1)
+
+
+def test_the_angle_at_held_out_points_is_their_median() -> None:
+    x = points(1001)
+    normals = x / RADIUS
+    across = torch.nn.functional.normalize(torch.linalg.cross(normals, torch.tensor([[0.3, 0.5, -0.8]])), dim=1)
+    angle = torch.deg2rad(torch.linspace(0, 8, 1001))[:, None]
+    judge = Judge(x, angle.cos() * normals + angle.sin() * across, Sphere(radius=RADIUS), 0.1, data=1.0, normal=1.0)
+    assert judge.before.angle == pytest.approx(4, rel=1e-3)
+    assert judge.before.loss == pytest.approx(float((1 - angle.cos()).mean()), rel=1e-3)
+
+
+def test_no_points_have_no_error() -> None:
+    x = points(1000)
     assert Judge(x, x, Sphere(radius=0.1), 0.1, data=1.0, normal=1.0).count == 0  # all outside the band
 
 
@@ -79,26 +98,39 @@ def test_the_best_weights_are_kept_and_checkpoints_keep_them() -> None:
     level = objective(judge_of(RADIUS - OFF), -3 * OFF)
     trainer = Trainer(level, stage="level 1", steps=80)
     trainer.run()
-    last = level.judge.loss(level.siren)  # type: ignore[union-attr]
+    last = level.judge.error(level.siren)  # type: ignore[union-attr]
     other = objective(judge_of(RADIUS - OFF), -3 * OFF)
     resumed = Trainer(other, stage="level 1", steps=80)
     resumed.restore(trainer.state())
     verdict = level.take_best()
     assert verdict is not None
-    assert verdict.after < last
+    assert verdict.after.loss < last.loss
     assert 0 < verdict.at < 1
-    assert level.judge.loss(level.siren) == pytest.approx(verdict.after, rel=1e-5)  # type: ignore[union-attr]
+    assert level.judge.error(level.siren).loss == pytest.approx(verdict.after.loss, rel=1e-5)  # type: ignore[union-attr]
     assert other.take_best() == verdict
     assert objective(judge_of(RADIUS - OFF), 0.0).judge is not None
 
 
 def test_a_verdict_in_words() -> None:
-    kept, late, worse = Verdict(500, 2.0, 1.0, 1.0), Verdict(500, 2.0, 1.0, 0.5), Verdict(500, 1.0, 1.5, 1.0)
+    good, bad = Error(1.0, 0.002, 1.5), Error(2.0, 0.01, 3.0)
+    kept, late, worse = Verdict(500, bad, good, 1.0), Verdict(500, bad, good, 0.5), Verdict(500, good, bad, 1.0)
     assert kept.better
-    assert kept.words() == "kept, for the loss at 500 points that it has not seen is 2 without it, 1 with"
-    assert "after 50% of its steps" in late.words()
+    assert kept.words(2, scale=10.0) == (
+        "level 2 kept: without it → with it, at 500 points that it has not seen: "
+        "loss 2 → 1, rms distance 0.1 → 0.02, median angle 3 → 1.5°"
+    )
+    assert late.words(1).startswith("level 1 kept as it was after 50% of its steps: ")
     assert not worse.better
-    assert worse.words().startswith("set to zero, for")
+    assert worse.words(1).startswith("level 1 set to zero: ")
+    assert worse.record(1, scale=10.0) == {
+        "points": 500,
+        "before": 1.0,
+        "after": 2.0,
+        "at": 1.0,
+        "distance": [0.02, 0.1],
+        "angle": [1.5, 3.0],
+        "verdict": worse.words(1, scale=10.0),
+    }
 
 
 def test_bands_nest() -> None:
@@ -110,7 +142,7 @@ def test_bands_nest() -> None:
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.02])
-def test_no_level_of_a_fit_is_worse_at_held_out_points_than_the_one_before(noise: float) -> None:
+def test_no_level_of_a_fit_is_worse_at_held_out_points_than_the_one_before(noise: float, tmp_path: Path) -> None:
     random = np.random.default_rng(1)
     directions = sample_sphere(4000, radius=1.0, seed=2).points
     x = directions * (0.5 + noise * random.normal(size=(4000, 1)))
@@ -127,13 +159,14 @@ def test_no_level_of_a_fit_is_worse_at_held_out_points_than_the_one_before(noise
         smooth_noise=False,
         drop_outliers=False,
     )
-    run = fit(PointCloud(x, normals.astype(np.float32), None, "ball"), config)
+    run = fit(PointCloud(x, normals.astype(np.float32), None, "ball"), config, out=tmp_path / "run")
     stage = run.record["stages"][1]
     judged = stage["held_out"]
     assert judged["points"] >= FEWEST / 2
     assert math.isfinite(judged["before"])
     assert stage["silenced"] == (judged["after"] >= judged["before"])
-    assert judged["verdict"].startswith("set to zero" if stage["silenced"] else "kept")
+    assert judged["verdict"].startswith(f"level 1 {'set to zero' if stage['silenced'] else 'kept'}")
+    assert judged["verdict"] in describe(tmp_path / "run")
     if noise:  # a sphere and noise: there is nothing that waves of this frequency could add to it
         assert stage["silenced"]
         x = torch.rand(500, 3) - 0.5

@@ -113,7 +113,7 @@ def test_a_level_that_is_worse_than_none_adds_nothing(fitted: Path, tmp_path: Pa
     x = 2 * torch.rand(2000, 3) - 1
     assert torch.equal(run.field.value(x), run.field.value(x, level=0))
     assert torch.equal(run.field.jet(x).gradient, run.field.jet(x, level=0).gradient)
-    assert "set to zero, for it was further" in describe(tmp_path / "run")
+    assert "level 1 set to zero: further from the points" in describe(tmp_path / "run")
     assert not any(stage["silenced"] for stage in read_record(fitted)["stages"])
 
 
