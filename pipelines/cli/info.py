@@ -65,6 +65,10 @@ def _describe_level(level: Any, stage: dict[str, Any]) -> str:
         text = f"({level.width}, {level.depth}), ω₀ = {level.omega:g}, {parameter_count(level):,} parameters"
     if "training_seconds" in stage:
         text += f"; {stage['steps']:,} steps in {stage['training_seconds']:.1f} s"
+    review = stage.get("review", {})
+    for name, what in (("dropped_outliers", "strays dropped"), ("turned_normals", "normals turned round")):
+        if review.get(name):
+            text += f"; by it {review[name]:,} {what}"
     if "rms_at_points" in stage:
         text += f"; rms at the points {stage['rms_at_points']:.4g} input units"
     return text

@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,8 +19,7 @@ from torch import Tensor, nn
 
 from ...datasets import OrientedCloud, PointCloud, prepare_cloud, spacing_of
 from ...datasets.clouds.large import Merging
-from ...datasets.clouds.outliers import agreement
-from ...neural_fields import Field, InputError, MultiscaleSDF, Similarity, Siren, WorldField, save_field
+from ...neural_fields import InputError, MultiscaleSDF, Similarity, Siren, WorldField, save_field
 from ..run.folder import RunFolder, digest_of, named_cloud
 from ..run.machine import choose_device, environment, peak_memory
 from ..run.settings import FitConfig
@@ -41,6 +40,7 @@ from .cloud import CloudDistance, load_cloud
 from .heldout import FEWEST, Judge, held_out
 from .level import LevelObjective, new_level
 from .plan import Share
+from .review import Review, review_points
 from .samples import Band, Source, band_of, banded_sources, first_sources
 from .timing import Timing
 
@@ -49,12 +49,6 @@ __all__ = ["FitConfig", "Review", "Run", "fit", "prepare", "review_points"]
 # A level whose error at the points is so many times that of the level before it is worse than none: set to zero, it is
 # that level. Where data contradict themselves, as the sides of a part do that is thinner than their noise, it happens.
 WORSE = 2.0
-# Largest |f_0| in units of its robust scale: half of a sound cloud's errors are below 0.67, and what a coarse level
-# misses of fine parts is above 8; so is every stray that is worth finding.
-FAR = 8.0
-MAD = 1.4826  # a Gaussian's standard deviation over its median magnitude
-AGAINST = -0.7  # cosine between a normal and the gradient of level 0, below which the normal may be flipped
-OPPOSED = -0.3  # and the mean of its neighbours', along its own
 
 Cloud = PointCloud | str | Path | NDArray[np.floating]
 LevelDone = Callable[[MultiscaleSDF, Similarity], object]
@@ -327,8 +321,9 @@ class _Fitting:
         return judge if judge.count >= FEWEST / 2 else None
 
     def review(self) -> dict[str, Any]:
-        """Take out of the data what level 0 shows to be wrong with it → counts for the record."""
+        """Take out of the data, and turn round in it, what level 0 shows to be wrong with it → counts for the record."""
         config = self.config
+        turn = config.turn_normals and config.normals != "file"
         assert self.frozen is not None
         found = review_points(
             self.points,
@@ -336,7 +331,8 @@ class _Fitting:
             self.frozen,
             device=self.device,
             outliers=config.drop_outliers,
-            turn=config.turn_normals and config.normals == "auto",
+            turn=turn,
+            patches=turn and self.cloud.report.oriented_by in ("winding", "propagation"),
         )
         if found.dropped.any() or found.turned.any():
             kept, turned = torch.from_numpy(~found.dropped), torch.from_numpy(found.turned)
@@ -408,70 +404,3 @@ class _Fitting:
 
 def _rms(errors: Tensor) -> float:
     return float(errors.square().mean().sqrt())
-
-
-class Review(NamedTuple):
-    """Which points of a cloud the next levels must not see as they are; each ``(N,)``.
-
-    Attributes:
-        dropped: outliers.
-        turned: kept points whose normals are to be turned round.
-        scale: the robust scale of |f_0| at the points.
-    """
-
-    dropped: NDArray[np.bool_]
-    turned: NDArray[np.bool_]
-    scale: float
-
-    def record(self) -> dict[str, Any]:
-        """Counts for ``run.json``."""
-        return {
-            "dropped_outliers": int(self.dropped.sum()),
-            "turned_normals": int(self.turned.sum()),
-            "scale": self.scale,
-        }
-
-
-@torch.no_grad()
-def review_points(
-    points: Tensor,
-    normals: Tensor,
-    coarse: Field,
-    *,
-    device: torch.device,
-    outliers: bool,
-    turn: bool,
-) -> Review:
-    """Judge a cloud by the level that was fitted to it.
-
-    A small network with a few hundred steps does not bend to single points. An outlier is one that it passes at more
-    than `FAR` times the robust scale, that has another normal than the field there, and that fewer than half of its
-    neighbours support: fine parts that the level misses support themselves. A flipped normal opposes the field's
-    gradient and its neighbours' mean normal, which the gradient follows.
-
-    Args:
-        points: ``(N, 3)``.
-        normals: ``(N, 3)``.
-        coarse: its level 0 judges.
-        device: where the field is.
-        outliers: whether to look for outliers.
-        turn: whether to look for flipped normals.
-    """
-    jets = [coarse.jet(part.to(device), level=0) for part in points.split(1 << 16)]
-    value = torch.cat([jet.value for jet in jets]).cpu()
-    gradient = torch.nn.functional.normalize(torch.cat([jet.gradient for jet in jets]).cpu(), dim=1)
-    cosine = (gradient * normals).sum(dim=1)
-    scale = MAD * float(value.abs().median())
-    places, directions = points.double().numpy(), normals.double().numpy()
-    dropped, turned = np.zeros((2, len(points)), bool)
-    if outliers:
-        far = ((value.abs() > FAR * scale) & (cosine < 0.5)).nonzero()[:, 0].numpy()
-        support, _ = agreement(places, directions, far)
-        dropped[far] = support < 0.5
-    if turn:
-        against = ((cosine < AGAINST) & torch.from_numpy(~dropped)).nonzero()[:, 0].numpy()
-        _, means = agreement(places, directions, against)
-        opposed = (means * directions[against]).sum(axis=1) < OPPOSED
-        followed = (means * gradient.double().numpy()[against]).sum(axis=1) > -OPPOSED
-        turned[against] = opposed & followed
-    return Review(dropped, turned, scale)

@@ -7,10 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from mplicits.datasets import PointCloud, add_outliers, sample_sphere
-from mplicits.neural_fields import InputError, MultiscaleSDF, Siren, Sphere
+from mplicits.datasets import OrientedCloud, PointCloud, add_outliers, sample_sphere, sample_torus
+from mplicits.neural_fields import InputError, MultiscaleSDF, Plane, Siren, Sphere, Torus
 from mplicits.neural_fields.meshing import Mesh, extract_mesh
-from mplicits.pipelines.fit.train import fit, review_points
+from mplicits.pipelines.fit.review import review_points
+from mplicits.pipelines.fit.train import fit, prepare
 from mplicits.pipelines.mesh.extract import MeshOptions, mesh_run
 from mplicits.pipelines.run.settings import FitConfig
 from mplicits.pipelines.surface.trim import SUPPORT_FILE, read_support
@@ -68,6 +69,67 @@ def test_a_part_that_the_level_misses_is_no_outlier() -> None:
     assert len(rod) == 400
     assert found.dropped.sum() <= 4
     assert not found.turned.any()
+
+
+def patch_of(points: torch.Tensor, radius: float) -> torch.Tensor:
+    """Which points are within ``radius`` of the first."""
+    return (points - points[0]).norm(dim=1) < radius
+
+
+def test_a_patch_of_guessed_normals_that_all_round_it_contradict_is_turned() -> None:
+    points, normals = tensors(sample_torus(6000))
+    patch = patch_of(points, 0.15)
+    assert 100 < patch.sum() < 600
+    wrong = torch.where(patch[:, None], -normals, normals)
+    coarse = Torus(minor=0.19)  # a level misses all points by a little
+    found = review_points(points, wrong, coarse, device=CPU, outliers=False, turn=True, patches=True)
+    assert found.turned.tolist() == patch.tolist()
+    measured = review_points(points, wrong, coarse, device=CPU, outliers=False, turn=True)
+    assert measured.turned.sum() < patch.sum() / 2  # its inner points have none but each other beside them
+    right = review_points(points, normals, coarse, device=CPU, outliers=False, turn=True, patches=True)
+    assert not right.turned.any()
+
+
+def test_a_patch_that_the_level_has_followed_is_left_alone() -> None:
+    """A separate part that is inside out by itself: the field follows it, or nobody beside it says otherwise."""
+    points, normals = tensors(sample_torus(6000))
+    inside_out = review_points(points, -normals, Torus(minor=0.19), device=CPU, outliers=False, turn=True, patches=True)
+    assert not inside_out.turned.any()
+
+
+@pytest.mark.parametrize("thickness", [1e-4, 0.01, 0.1])
+def test_the_far_side_of_a_plate_that_the_level_takes_for_one_sheet(thickness: float) -> None:
+    """All of its normals oppose the gradient, and all are right."""
+    random = np.random.default_rng(0)
+    places = random.uniform(-0.5, 0.5, (4000, 3))
+    side = np.where(np.arange(4000) % 2, 1.0, -1.0)
+    places[:, 2] = side * thickness / 2
+    points = torch.from_numpy(places).float()
+    normals = torch.from_numpy(np.outer(side, [0.0, 0.0, 1.0])).float()
+    found = review_points(points, normals, Plane(), device=CPU, outliers=False, turn=False, patches=True)
+    assert not found.turned.any()
+
+
+def test_a_fit_turns_what_its_first_level_contradicts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Levels above learn from the turned normals, and the run says how many there were."""
+    raw = sample_torus(4000)
+    cloud = PointCloud(raw.points)
+
+    def spoilt(cloud: PointCloud, config: FitConfig) -> OrientedCloud:
+        good = prepare(cloud, config)
+        patch = patch_of(torch.from_numpy(good.points), 0.2).numpy()
+        counts.append(int(patch.sum()))
+        return dataclasses.replace(good, normals=np.where(patch[:, None], -good.normals, good.normals))
+
+    counts: list[int] = []
+    monkeypatch.setattr("mplicits.pipelines.fit.train.prepare", spoilt)
+    run = fit(cloud, SMALL)
+    review = run.record["stages"][0]["review"]
+    assert counts[0] > 40
+    assert abs(review["turned_normals"] - counts[0]) <= 0.1 * counts[0]
+    assert raw.normals is not None
+    gradient = run.world.normals(raw.points)
+    assert (np.einsum("nd,nd->n", gradient, raw.normals) > 0).all()
 
 
 @pytest.fixture(scope="module")
