@@ -321,7 +321,7 @@ class _Fitting:
         return judge if judge.count >= FEWEST / 2 else None
 
     def review(self) -> dict[str, Any]:
-        """Take out of the data, and turn round in it, what level 0 shows to be wrong with it → counts for the record."""
+        """Take out of the data, or turn round, what level 0 shows to be wrong → counts for the record."""
         config = self.config
         turn = config.turn_normals and config.normals != "file"
         assert self.frozen is not None
