@@ -145,7 +145,7 @@ def _patches(points: Float64, normals: Float64, against: Mask) -> Mask:
     return turned
 
 
-def _joined(rows: Rows, near: Rows, linked: Mask, count: int) -> NDArray[np.int32]:
+def _joined(rows: Rows, near: Rows, linked: Mask, count: int) -> NDArray[np.intp]:
     """The patch ``(m,)`` of each of ``rows``, which ``linked`` neighbours ``near`` ``(m, k)`` join."""
     start, end = np.repeat(rows, near.shape[1])[linked.ravel()], near[linked]
     graph = coo_array((np.ones(len(start), np.int8), (start, end)), shape=(count, count))
