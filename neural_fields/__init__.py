@@ -18,10 +18,11 @@ from .moving import Keyframes, Moving, RigidMotion, ShrinkingSphere
 from .multiscale import MultiscaleSDF, levels_of
 from .placement import Placement
 from .radiance import Outside, ViewColor
+from .rates import parameter_groups, share_rate
 from .similarity import Similarity
 from .siren import Siren
 from .spacetime import SpaceTimeJet, SpaceTimeSDF, TimeSlice, at_time, spacetime_jet
-from .sphere_start import fit_sphere
+from .sphere_start import fit_sphere, solve_sphere
 from .tracing import Hits, sphere_trace
 from .volume_renderer import Rendered, Sampling, render_volume
 from .world import Closest, WorldField, WorldHits, in_one_frame
@@ -99,10 +100,13 @@ __all__ = [
     "morph",
     "near_surface",
     "normal_speed",
+    "parameter_groups",
     "project_to_surface",
     "render_volume",
     "save_field",
     "save_texture",
+    "share_rate",
+    "solve_sphere",
     "spacetime_jet",
     "sphere_trace",
     "track",

@@ -7,24 +7,22 @@ imported; what they pass in is used by the names of its attributes. How to chang
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from ._checks import positive
+from ._hosted import Box, Hosted, as_bounds, cube, joined, mark
 from ._point_memo import PointMemo
-from .field import Field, Jet
-from .function import FieldLike, as_field
-from .meshing import extract_mesh
+from .function import FieldLike
+from .rates import HOST_RATE
 from .volume import neus_alpha
 
 __all__ = ["Deviation", "InstantNSRGeometry", "NerfstudioField", "NeuSGeometry"]
 
 
-class NeuSGeometry(nn.Module):
+class NeuSGeometry(Hosted):
     """NeuS's ``SDFNetwork`` (Wang et al. 2021, ``models/fields.py``) around any field.
 
     NeuS's renderer calls ``forward`` and then ``gradient`` on the same tensor of points. Both come from one jet: the
@@ -32,10 +30,14 @@ class NeuSGeometry(nn.Module):
 
     Args:
         field: signed distance, negative inside; with F features for a colour network that takes F.
-        scale: NeuS's own argument: points are multiplied by it, distances divided by it.
+        scale: NeuS's own argument: points are multiplied by it, distances divided by it. 1 by default, or with
+            ``bounds`` what brings their farthest corner onto the field's unit sphere.
+        bounds: box of the mesh, ``(2, 3)``; from -1.01 to 1.01 by default, as in NeuS.
+        learning_rate: at which NeuS trains all its networks alike; the parameters of the field are then kept in units
+            in which this rate suits them (`share_rate`). None leaves them alone.
 
     Raises:
-        ValueError: the scale is not positive.
+        ValueError: a number is not positive, or the bounds are none.
 
     Example:
         >>> import torch
@@ -46,14 +48,24 @@ class NeuSGeometry(nn.Module):
         (torch.Size([10, 65]), torch.Size([10, 1, 3]))
     """
 
-    def __init__(self, field: FieldLike, *, scale: float = 1.0) -> None:
-        super().__init__()
-        positive(scale=scale)
-        self.field, self.scale = as_field(field), float(scale)
+    def __init__(
+        self,
+        field: FieldLike,
+        *,
+        scale: float | None = None,
+        bounds: Box | None = None,
+        learning_rate: float | None = None,
+    ) -> None:
+        if bounds is None:
+            scale = 1.0 if scale is None else scale
+        box = cube(1.01) if bounds is None else as_bounds(bounds)
+        super().__init__(field, scale=scale, bounds=box, learning_rate=learning_rate)
         self._memo = PointMemo()
 
     def forward(self, x: Tensor) -> Tensor:
-        """Distance and features at ``x`` ``(N, 3)`` → ``(N, 1 + F)``."""
+        """Distance and features at ``x`` ``(N, 3)`` → ``(N, 1 + F)``; without a graph they cost a value only."""
+        if not torch.is_grad_enabled():  # nor could the host ask for a gradient, which it takes by autograd
+            return self._value_features(x)
         return self._memo.ask("value", x, self.field, lambda: self._evaluate(x))
 
     def sdf_hidden_appearance(self, x: Tensor) -> Tensor:
@@ -62,19 +74,19 @@ class NeuSGeometry(nn.Module):
 
     def sdf(self, x: Tensor) -> Tensor:
         """Distance at ``x`` ``(N, 3)`` → ``(N, 1)``; costs a value only."""
-        return _value(self.field, x, self.scale)[..., None]
+        return self._value(x)[..., None]
 
     def gradient(self, x: Tensor) -> Tensor:
         """Gradient at ``x`` ``(N, 3)`` → ``(N, 1, 3)``, with its graph; like NeuS, leaves ``x`` requiring gradients."""
         gradient = self._memo.ask("gradient", x, self.field, lambda: self._evaluate(x))
-        return _mark(x, gradient)
+        return mark(x, gradient)
 
     def _evaluate(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        jet = _jet(self.field, x, self.scale)
-        return _joined(jet), jet.gradient.unsqueeze(-2)
+        jet = self._jet(x)
+        return joined(jet), jet.gradient.unsqueeze(-2)
 
 
-class InstantNSRGeometry(nn.Module):
+class InstantNSRGeometry(Hosted):
     """instant-nsr-pl's ``VolumeSDF`` (``models/geometry.py``) around any field.
 
     Args:
@@ -83,6 +95,7 @@ class InstantNSRGeometry(nn.Module):
         scale: points are multiplied by it, distances divided by it; 1 / radius by default, which leaves the corners
             of the host's cube outside the field's unit sphere; 1 / (√3 radius) takes them in.
         resolution: cells along each axis of the mesh that ``isosurface`` extracts.
+        learning_rate: of the host's group ``geometry``; see `NeuSGeometry`.
 
     Raises:
         ValueError: a number is not positive.
@@ -97,13 +110,18 @@ class InstantNSRGeometry(nn.Module):
     """
 
     def __init__(
-        self, field: FieldLike, *, radius: float = 1.0, scale: float | None = None, resolution: int = 512
+        self,
+        field: FieldLike,
+        *,
+        radius: float = 1.0,
+        scale: float | None = None,
+        resolution: int = 512,
+        learning_rate: float | None = None,
     ) -> None:
-        super().__init__()
         positive(radius=radius)
         scale = 1 / radius if scale is None else scale
-        positive(scale=scale)
-        self.field, self.radius, self.scale, self.resolution = as_field(field), float(radius), float(scale), resolution
+        super().__init__(field, scale=scale, bounds=cube(radius), learning_rate=learning_rate)
+        self.radius, self.resolution = float(radius), resolution
 
     def forward(
         self,
@@ -125,39 +143,38 @@ class InstantNSRGeometry(nn.Module):
             ray_indices: unused, likewise.
 
         Returns:
-            ``sdf`` ``(...,)``, alone or first in the list. Value and gradient come from one jet; the distance alone
-            costs a value only. A graph is recorded while training, as the host does, and only where gradients
+            ``sdf`` ``(...,)``, alone or first in the list. Value and gradient come from one jet; without the gradient
+            a value is all it costs. A graph is recorded while training, as the host does, and only where gradients
             are enabled.
         """
         with torch.set_grad_enabled(self.training and torch.is_grad_enabled()):
             if not (with_grad or with_feature or with_laplace):
-                return _value(self.field, points, self.scale)
+                return self._value(points)
+            if not (with_grad or with_laplace):
+                feature = self._value_features(points)
+                return [feature[..., 0], feature]
             if with_laplace:
-                with _full_precision(points):
-                    value, slope, features, hessian = self.field.second_jet(points * self.scale)
-                jet = Jet(value / self.scale, slope, features)
-                laplacian = [self.scale * hessian.diagonal(dim1=-2, dim2=-1).sum(dim=-1)]
+                jet, trace = self._second_jet(points)
+                laplacian = [trace]
             else:
-                jet, laplacian = _jet(self.field, points, self.scale), []
+                jet, laplacian = self._jet(points), []
             gradient = [jet.gradient] if with_grad else []
-            feature = [_joined(jet)] if with_feature else []
+            feature = [joined(jet)] if with_feature else []
             return [jet.value, *gradient, *feature, *laplacian]
 
     def forward_level(self, points: Tensor) -> Tensor:
         """Distance ``(...,)`` at ``points`` ``(..., 3)``, for the host's marching cubes; a value only."""
-        return _value(self.field, points, self.scale)
+        return self._value(points)
 
     @torch.no_grad()
     def isosurface(self) -> dict[str, Tensor]:
-        """The mesh, by `extract_mesh`, in the host's form: ``v_pos`` ``(V, 3)`` and ``t_pos_idx`` ``(T, 3)``."""
-        reach = self.radius * self.scale
-        bounds = ((-reach, -reach, -reach), (reach, reach, reach))
-        mesh = extract_mesh(self.field, resolution=self.resolution, bounds=bounds, normals=False)
-        vertices = torch.as_tensor(mesh.vertices, dtype=torch.float32) / self.scale
+        """The mesh in the host's form: ``v_pos`` ``(V, 3)`` and ``t_pos_idx`` ``(T, 3)``."""
+        mesh = self.mesh(self.resolution, normals=False)
+        vertices = torch.as_tensor(mesh.vertices, dtype=torch.float32)
         return {"v_pos": vertices, "t_pos_idx": torch.as_tensor(mesh.faces, dtype=torch.int64)}
 
     def update_step(self, epoch: int, global_step: int) -> None:
-        """Called by the host before every step; there is nothing to schedule."""
+        """Called by the host before every step, without what the bands depend on; see ``follow``."""
 
     def regularizations(self, out: object) -> dict[str, Tensor]:
         """Extra losses that the host adds: none."""
@@ -184,7 +201,7 @@ class Deviation(nn.Module):
         return self.get_variance().expand(len(x), 1)
 
 
-class NerfstudioField(nn.Module):
+class NerfstudioField(Hosted):
     """nerfstudio's and sdfstudio's ``SDFField`` (``nerfstudio/fields/sdf_field.py``) for their NeuS models.
 
     Args:
@@ -192,20 +209,32 @@ class NerfstudioField(nn.Module):
         color: called as ``color(x, direction, jet)`` with ``(..., 3)``, ``(..., 3)`` and the field's `Jet` there, in
             the host's units; gives RGB ``(..., 3)``. `ViewColor` is one.
         heads: the host's ``FieldHeadNames``, whose members are the keys of the outputs.
-        scale: points are multiplied by it, distances divided by it.
+        scale: points are multiplied by it, distances divided by it. 1 by default, or with ``bounds`` what brings their
+            farthest corner onto the field's unit sphere.
+        bounds: the host's ``scene_box.aabb`` ``(2, 3)``, box of the mesh too; from -1 to 1 by default.
         deviation: initial value of the deviation network, the host's ``beta_init``.
+        learning_rate: of the host's group ``fields``; see `NeuSGeometry`. It is the geometry alone that changes units.
 
     Raises:
-        ValueError: the scale is not positive.
+        ValueError: a number is not positive, or the bounds are none.
     """
 
     def __init__(
-        self, field: FieldLike, color: nn.Module, *, heads: Any, scale: float = 1.0, deviation: float = 0.3
+        self,
+        field: FieldLike,
+        color: nn.Module,
+        *,
+        heads: Any,
+        scale: float | None = None,
+        bounds: Box | None = None,
+        deviation: float = 0.3,
+        learning_rate: float | None = None,
     ) -> None:
-        super().__init__()
-        positive(scale=scale)
-        self.field, self.color, self.scale = as_field(field), color, float(scale)
-        self.heads = heads
+        if bounds is None:
+            scale = 1.0 if scale is None else scale
+        box = cube(1.0) if bounds is None else as_bounds(bounds)
+        super().__init__(field, scale=scale, bounds=box, learning_rate=learning_rate)
+        self.color, self.heads = color, heads
         self.deviation_network = Deviation(deviation)
         self.cos_anneal_ratio = 1.0
         self._memo = PointMemo()
@@ -215,16 +244,18 @@ class NerfstudioField(nn.Module):
         self.cos_anneal_ratio = float(anneal)
 
     def forward_geonetwork(self, inputs: Tensor) -> Tensor:
-        """Distance and features at ``inputs`` ``(..., 3)`` → ``(..., 1 + F)``."""
+        """Distance and features at ``inputs`` ``(..., 3)`` → ``(..., 1 + F)``; without a graph a value only."""
+        if not torch.is_grad_enabled():  # as the host's exporters ask, who want the distance
+            return self._value_features(inputs)
         return self._memo.ask("value", inputs, self.field, lambda: self._evaluate(inputs))
 
     def gradient(self, x: Tensor) -> Tensor:
         """Gradient at ``x`` ``(..., 3)`` → ``(..., 3)``, with its graph; free after `forward_geonetwork`."""
-        return _mark(x, self._memo.ask("gradient", x, self.field, lambda: self._evaluate(x)))
+        return mark(x, self._memo.ask("gradient", x, self.field, lambda: self._evaluate(x)))
 
     def get_sdf(self, ray_samples: Any) -> Tensor:
         """Distance at the starts of the samples ``(R, S)`` → ``(R, S, 1)``; costs a value only."""
-        return _value(self.field, ray_samples.frustums.get_start_positions(), self.scale)[..., None]
+        return self._value(ray_samples.frustums.get_start_positions())[..., None]
 
     def get_alpha(self, ray_samples: Any, sdf: Tensor | None = None, gradients: Tensor | None = None) -> Tensor:
         """Opacity of the samples ``(R, S)`` → ``(R, S, 1)``.
@@ -235,7 +266,7 @@ class NerfstudioField(nn.Module):
             gradients: ``(R, S, 3)`` if known; where one of the two is missing, both come from one jet.
         """
         if sdf is None or gradients is None:
-            jet = _jet(self.field, ray_samples.frustums.get_start_positions(), self.scale)
+            jet = self._jet(ray_samples.frustums.get_start_positions())
             sdf, gradients = jet.value[..., None], jet.gradient
         return neus_alpha(
             sdf,
@@ -257,7 +288,7 @@ class NerfstudioField(nn.Module):
         """
         frustums = ray_samples.frustums
         points = frustums.get_start_positions()
-        jet = _jet(self.field, points, self.scale)
+        jet = self._jet(points)
         sdf = jet.value[..., None]
         outputs = {
             self.heads.RGB: self.color(points, frustums.directions, jet),
@@ -275,59 +306,19 @@ class NerfstudioField(nn.Module):
         """See `get_outputs`; normals are always among the outputs."""
         return self.get_outputs(ray_samples, return_alphas=return_alphas)
 
+    def follow(self, inv_s: Tensor | float | None = None, **widths: float) -> None:
+        """See `Hosted.follow`; the deviation is this field's own by default."""
+        super().follow(self.deviation_network.get_variance() if inv_s is None else inv_s, **widths)
+
+    def parameter_groups(self, lr: float = HOST_RATE) -> list[dict[str, Any]]:
+        """See `Hosted.parameter_groups`; colours and deviation have ``lr`` itself."""
+        others = [*self.color.parameters(), *self.deviation_network.parameters()]
+        return [*super().parameter_groups(lr), {"params": others, "lr": lr}]
+
     def _normal_head(self) -> Any:
         """What the host calls normals: NORMALS in nerfstudio, NORMAL in sdfstudio."""
         return self.heads.NORMALS if hasattr(self.heads, "NORMALS") else self.heads.NORMAL
 
     def _evaluate(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        jet = _jet(self.field, x, self.scale)
-        return _joined(jet), jet.gradient
-
-
-def _value(field: Field, x: Tensor, scale: float) -> Tensor:
-    with _full_precision(x):
-        return field.value(x * scale) / scale
-
-
-def _jet(field: Field, x: Tensor, scale: float) -> Jet:
-    """The jet of f(s x) / s, in a graph that reaches ``x``."""
-    with _full_precision(x), _reaching(x) as reached:
-        value, gradient, features = field.jet(reached * scale)
-        return Jet(value / scale, gradient, features)
-
-
-def _joined(jet: Jet) -> Tensor:
-    """Distance and features in one tensor ``(..., 1 + F)``."""
-    return torch.cat((jet.value[..., None], jet.features), dim=-1)
-
-
-def _full_precision(x: Tensor) -> torch.autocast:
-    """Hosts train in half precision, in which a distance near the surface has no digits left."""
-    return torch.autocast(x.device.type, enabled=False)
-
-
-@contextmanager
-def _reaching(x: Tensor) -> Iterator[Tensor]:
-    """``x`` for an evaluation whose graph reaches it, with its own flag as it was afterwards.
-
-    The hosts evaluate first and mark the points as requiring gradients later, inside ``gradient``. Whoever then
-    differentiates the gradient by the points (curvature) needs a graph that knew them. While the flag is
-    off, autograd passes such points by.
-    """
-    if not torch.is_grad_enabled() or x.requires_grad:
-        yield x
-    elif x.is_inference():
-        yield x.clone()  # autograd cannot save inference tensors
-    else:
-        x.requires_grad_(True)
-        try:
-            yield x
-        finally:
-            x.requires_grad_(False)
-
-
-def _mark(x: Tensor, gradient: Tensor) -> Tensor:
-    """Return ``gradient``, with ``x`` requiring gradients from now on."""
-    if torch.is_grad_enabled() and not x.is_inference():
-        x.requires_grad_(True)
-    return gradient
+        jet = self._jet(x)
+        return joined(jet), jet.gradient

@@ -103,6 +103,17 @@ class Field(nn.Module, ABC):
             ValueError: the last dimension of ``x`` is not ``in_dim``, or there is no such level.
         """
 
+    def value_features(self, x: Tensor, *, level: int = -1) -> tuple[Tensor, Tensor]:
+        """Value ``(...,)`` and features ``(..., F)`` at ``x`` ``(..., d)``, where nobody asks for the gradient.
+
+        This default takes them from a jet; networks have them for the price of a value.
+
+        Raises:
+            ValueError: as in `value`.
+        """
+        jet = self.jet(x, level=level)
+        return jet.value, jet.features
+
     def forward(self, x: Tensor, *, level: int = -1) -> Tensor:
         """See `value`."""
         return self.value(x, level=level)

@@ -18,7 +18,7 @@ from .siren import Siren
 
 __all__ = ["MultiscaleSDF", "Parts", "levels_of", "walk_levels"]
 
-# The tensors of a jet of any order, the value first; ``(N,)`` alone is a jet of order 0.
+# The tensors of a jet of any order, the value first; ``(N,)``, alone or with features, is a jet of order 0.
 Parts = tuple[Tensor, ...]
 
 
@@ -127,6 +127,12 @@ class MultiscaleSDF(Field):
         (f,) = deque(self._walk(x, level, _value), maxlen=1).pop()
         return f
 
+    def value_features(self, x: Tensor, *, level: int = -1) -> tuple[Tensor, Tensor]:
+        """See `Field.value_features`; without gradients at any level."""
+        walk = self._walk(x, level, lambda part, points: part.value_features(points))
+        value, features = deque(walk, maxlen=1).pop()
+        return value, features
+
     def level_values(self, x: Tensor, *, level: int = -1) -> list[Tensor]:
         """See `Field.level_values`; every level is evaluated once, and only inside the bands before it."""
         return [f for (f,) in self._walk(x, level, _value)]
@@ -151,7 +157,7 @@ class MultiscaleSDF(Field):
         f, r = before[0], own[0]
         gate, *slopes = self._gate(f, delta, order=max(0, len(own) - 2))
         if not slopes:
-            return (f + gate * r,)
+            return f + gate * r, *(a + gate[:, None] * b for a, b in zip(before[1:], own[1:], strict=True))
         steeper = 1 + slopes[0] * r
         gradient = steeper[:, None] * before[1] + gate[:, None] * own[1]
         value = f + gate * r

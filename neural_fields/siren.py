@@ -51,6 +51,9 @@ class Siren(OneLevelField):
         output_gain: factor on the initial output weights; a residual starts small with 0.1.
         feature_gain: the same for the features; with ω₀ they begin with unit variance, as who reads them expects.
 
+    Attributes:
+        units: of the sine layers' parameters and of the output's; see `set_units`.
+
     Raises:
         ValueError: an argument is out of range.
 
@@ -83,7 +86,10 @@ class Siren(OneLevelField):
         sizes = [in_dim] + [width] * depth
         self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in itertools.pairwise(sizes))
         self.output = nn.Linear(width, 1 + num_features)
+        self.units = (1.0, 1.0)
         self._initialise(output_gain, feature_gain)
+        self.register_state_dict_post_hook(_without_units)
+        self.register_load_state_dict_pre_hook(_into_units)
 
     @torch.no_grad()
     def _initialise(self, output_gain: float, feature_gain: float) -> None:
@@ -96,20 +102,56 @@ class Siren(OneLevelField):
             self.output.weight[rows] *= gain
             self.output.bias[rows] *= gain
 
+    @torch.no_grad()
+    def set_units(self, sines: float = 1.0, output: float = 1.0) -> None:
+        """Keep the parameters in other units: their numbers change, the function and its jets do not, not by one bit.
+
+        A weight W is stored as W / unit. Adam moves a stored number by the learning rate, and so W by unit times as
+        much: layers that want different rates can be trained with one. State dicts hold W under its own name, whatever
+        the units, so that any of them fits any other.
+
+        Args:
+            sines: of the sine layers' weights and biases.
+            output: of those of the output.
+
+        Raises:
+            ValueError: a unit is not a power of two, with which nothing is rounded.
+        """
+        for name, unit in (("sines", sines), ("output", output)):
+            if not 0 < unit < math.inf or math.frexp(unit)[0] != 0.5:
+                raise ValueError(f"{name}={unit}: expected a power of two")
+        before = dict(self._unit_of_each())
+        self.units = (float(sines), float(output))
+        for name, unit in self._unit_of_each():
+            self.get_parameter(name).mul_(before[name] / unit)
+
+    def _unit_of_each(self) -> Iterator[tuple[str, float]]:
+        """The parameters by name, each with its unit."""
+        for name, _ in self.named_parameters():
+            yield name, self.units[name.startswith("output.")]
+
     def value(self, x: Tensor, *, level: int = -1) -> Tensor:
         """See `Field.value`; ``x`` may have any leading shape, N = 0 included."""
+        return self._outputs(x, level, 1)[:, 0].reshape(x.shape[:-1])
+
+    def value_features(self, x: Tensor, *, level: int = -1) -> tuple[Tensor, Tensor]:
+        """See `Field.value_features`; as many products as a value costs."""
+        output, shape = self._outputs(x, level, 1 + self.num_features), x.shape[:-1]
+        return output[:, 0].reshape(shape), output[:, 1:].reshape(*shape, self.num_features)
+
+    def _outputs(self, x: Tensor, level: int, channels: int) -> Tensor:
+        """The first outputs ``(N, channels)`` at points ``(..., d)``."""
         self.resolve_level(level)
         rows = self.check_points(x).reshape(-1, self.in_dim)
         parameters = self.folded()
         if needs_graph(rows, parameters):
-            output = forward(rows, parameters)[0][:, 0]
-        else:
-            output = rows.new_empty(len(rows))
-            block = self.block_rows(rows.device)
-            buffers = [rows.new_empty(min(block, len(rows)), self.width) for _ in range(2)]
-            for start in range(0, len(rows), block):
-                _value_into(output[start : start + block], rows[start : start + block], parameters, buffers)
-        return output.reshape(x.shape[:-1])
+            return forward(rows, parameters)[0][:, :channels]
+        output = rows.new_empty(len(rows), channels)
+        block = self.block_rows(rows.device)
+        buffers = [rows.new_empty(min(block, len(rows)), self.width) for _ in range(2)]
+        for start in range(0, len(rows), block):
+            _outputs_into(output[start : start + block], rows[start : start + block], parameters, buffers)
+        return output
 
     def jet(self, x: Tensor, *, level: int = -1) -> Jet:
         """See `Field.jet`; the gradient comes from one reverse sweep of matrix products, without autograd.
@@ -158,13 +200,15 @@ class Siren(OneLevelField):
         )
 
     def folded(self) -> list[Tensor]:
-        """Weights and biases with ω₀ folded in: [W_1, b_1, …, W_d, b_d, W_out, b_out]."""
+        """Weights and biases with units and ω₀ folded in: [W_1, b_1, …, W_d, b_d, W_out, b_out]."""
         parameters: list[Tensor] = []
+        frequency, out = self.omega * self.units[0], self.units[1]
         for layer in self._sine_layers():
-            parameters += [layer.weight * self.omega, layer.bias * self.omega]
+            parameters += [layer.weight * frequency, layer.bias * frequency]
         # The sweep back ends in a product with three columns; BLAS does it three times faster if they are contiguous.
         parameters[0] = parameters[0].t().contiguous().t()
-        return [*parameters, self.output.weight, self.output.bias]
+        last = [self.output.weight, self.output.bias]
+        return [*parameters, *(last if out == 1 else [part * out for part in last])]
 
     def _sine_layers(self) -> Iterator[nn.Linear]:
         for layer in self.layers:
@@ -226,13 +270,30 @@ def _plain_second_jet(x: Tensor, parameters: Sequence[Tensor], dims: int) -> tup
     return output, g, hessian
 
 
-def _value_into(value: Tensor, x: Tensor, parameters: Sequence[Tensor], buffers: Sequence[Tensor]) -> None:
-    """Write f(x) of one block into ``value``, ping-ponging between two buffers."""
-    h = x
+def _without_units(siren: Siren, state: dict[str, Any], prefix: str, metadata: object) -> None:
+    """Put the weights themselves into a state dict."""
+    for name, unit in siren._unit_of_each():
+        if unit != 1:
+            state[prefix + name] = state[prefix + name] * unit
+
+
+def _into_units(siren: Siren, state: dict[str, Any], prefix: str, *_: object) -> None:
+    """Take the weights of a state dict into the units of this network."""
+    for name, unit in siren._unit_of_each():
+        if unit != 1 and prefix + name in state:
+            state[prefix + name] = state[prefix + name] / unit
+
+
+def _outputs_into(output: Tensor, x: Tensor, parameters: Sequence[Tensor], buffers: Sequence[Tensor]) -> None:
+    """Write the first outputs of one block into ``output`` ``(N, channels)``, ping-ponging between two buffers."""
+    h, channels = x, output.shape[1]
     for index in range(len(parameters) // 2 - 1):
         z = buffers[index % 2][: len(x)]
         h = torch.addmm(parameters[2 * index + 1], h, parameters[2 * index].t(), out=z).sin_()
-    torch.addmv(parameters[-1][:1].expand(len(x)), h, parameters[-2][0], out=value)
+    if channels == 1:
+        torch.addmv(parameters[-1][:1].expand(len(x)), h, parameters[-2][0], out=output[:, 0])
+    else:
+        torch.addmm(parameters[-1][:channels], h, parameters[-2][:channels].t(), out=output)
 
 
 def _jet_into(

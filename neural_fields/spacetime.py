@@ -294,7 +294,8 @@ def _slice(field: Field, t: float) -> Field:
 @torch.no_grad()
 def _lift(siren: Siren, extra: int, time_gain: float) -> Siren:
     """The same function of (x, y, z, t), with unheard neurons added to its layers."""
-    width = siren.width
+    siren, width = copy.deepcopy(siren), siren.width
+    siren.set_units()
     lifted = Siren(width + extra, siren.depth, omega=siren.omega, in_dim=4, num_features=siren.num_features)
     pairs = zip([*lifted.layers, lifted.output], [*siren.layers, siren.output], strict=True)
     for index, (new, old) in enumerate(pairs):

@@ -46,6 +46,21 @@ def test_jet_agrees_with_value_and_autograd(field: Field, dtype: torch.dtype, de
         assert_within(jet.gradient, gradient, 2 * slope_off)
 
 
+def test_features_without_gradients_are_those_of_the_jet(
+    field: Field, dtype: torch.dtype, device: torch.device
+) -> None:
+    x = points(field, (200,), dtype=dtype, device=device)
+    for level in range(field.num_levels):
+        off, _, feature_off = rounding(field, x, lambda field, x, level=level: field.jet(x, level=level))
+        jet = field.jet(x, level=level)
+        for graph in (True, False):
+            with torch.set_grad_enabled(graph):
+                value, features = field.value_features(x.reshape(2, 100, -1), level=level)
+            assert features.shape == (2, 100, jet.features.shape[-1])
+            assert_within(value.flatten(), jet.value, 2 * off)
+            assert_within(features.flatten(0, 1), jet.features, 2 * feature_off)
+
+
 def test_points_can_be_brought_to_a_field(field: Field, dtype: torch.dtype, device: torch.device) -> None:
     assert (field.like.dtype, field.like.device.type) == (dtype, device.type)
     half = torch.zeros(1, field.in_dim, dtype=torch.float16).to(field.like)

@@ -435,6 +435,11 @@ class Counted(Field):
         self.values += x.shape[:-1].numel()
         return self.inner.value(x, level=level)
 
+    def value_features(self, x: Tensor, *, level: int = -1) -> tuple[Tensor, Tensor]:
+        """See `Field.value_features`."""
+        self.values += x.shape[:-1].numel()
+        return self.inner.value_features(x, level=level)
+
     def jet(self, x: Tensor, *, level: int = -1) -> Jet:
         """See `Field.jet`."""
         self.jets += x.shape[:-1].numel()

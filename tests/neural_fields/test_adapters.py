@@ -7,7 +7,15 @@ import torch
 from bounds import assert_within, rounding
 from fields import small_multiscale
 from hosts import Heads, NeuSHost, OldHeads, Separate, points, ray_samples, rays
-from mplicits.neural_fields import InstantNSRGeometry, MultiscaleSDF, NerfstudioField, NeuSGeometry, Siren, Sphere
+from mplicits.neural_fields import (
+    InstantNSRGeometry,
+    MultiscaleSDF,
+    NerfstudioField,
+    NeuSGeometry,
+    Siren,
+    Sphere,
+    parameter_groups,
+)
 from mplicits.neural_fields.radiance import ViewColor
 from mplicits.neural_fields.volume import transmittance_weights
 from mplicits.pipelines.bench.speed import Counted, counted
@@ -145,7 +153,7 @@ def test_instant_nsr_returns_what_the_flags_ask_for() -> None:
         found = geometry(x, with_grad=flags[0], with_feature=flags[1])
         assert [tuple(tensor.shape) for tensor in found] == shapes
         torch.testing.assert_close(found[0], sdf)
-    assert field.jets == 150
+    assert (field.values, field.jets) == (100, 100)  # features alone cost a value
     value, gradient, feature, laplace = geometry(x, with_grad=True, with_feature=True, with_laplace=True)
     assert torch.equal(feature[:, 0], value)
     assert laplace.shape == (50,)
@@ -308,3 +316,89 @@ def test_band_is_respected_inside_a_shell() -> None:
     output, gradient = shell(x), shell.gradient(x)
     assert len(output) == len(gradient) == levels[0].jets == 500
     assert 0 < levels[1].jets == int(((x.norm(dim=-1) - 0.5).abs() < 0.1).sum()) < 300
+
+
+# What all of them have
+
+
+def shells(
+    field: MultiscaleSDF | Sphere, **options: float
+) -> list[NeuSGeometry | InstantNSRGeometry | NerfstudioField]:
+    return [
+        NeuSGeometry(field, **options),
+        InstantNSRGeometry(field, **options),
+        NerfstudioField(field, ViewColor(0, width=8, depth=1), heads=Heads, **options),
+    ]
+
+
+def test_without_a_graph_features_cost_a_value() -> None:
+    x = points()
+    for shell, field, ask in (
+        (*neus(), lambda shell: shell(x)),
+        (*studio(), lambda shell: shell.forward_geonetwork(x)),
+    ):
+        expected = ask(shell).detach()
+        field.values = field.jets = 0
+        with torch.no_grad():
+            found = ask(shell)
+        assert (field.values, field.jets) == (50, 0)
+        off, feature_off = rounding(field, x, lambda field, x: field.value_features(x))
+        assert_within(found, expected, 2 * torch.cat((off[:, None], feature_off), dim=1))
+
+
+def test_scale_comes_from_the_box() -> None:
+    box = torch.tensor([[-1.0, -2.0, -2.0], [0.5, 1.0, 2.0]])
+    for shell in (
+        NeuSGeometry(Sphere(), bounds=box),
+        NerfstudioField(Sphere(), ViewColor(0, width=8, depth=1), heads=Heads, bounds=box),
+    ):
+        assert shell.scale == pytest.approx(1 / 3, rel=1e-15)  # its farthest corner is (-1, -2, ±2)
+        assert shell.bounds == ((-1.0, -2.0, -2.0), (0.5, 1.0, 2.0))
+        with pytest.raises(ValueError, match=r"\(2, 3\)"):
+            shell.mesh(8, bounds=box.flip(0))
+    assert NeuSGeometry(Sphere(), bounds=box, scale=0.7).scale == 0.7
+
+
+def test_meshes_are_in_the_hosts_units_within_its_box() -> None:
+    """Marching cubes with a Newton step on a sphere: no vertex is farther off than the sagitta of a cell."""
+    resolution, radius = 32, 0.5 / 0.7
+    for shell in shells(Sphere(radius=0.5), scale=0.7):
+        mesh = shell.mesh(resolution)
+        cell = (shell.bounds[1][0] - shell.bounds[0][0]) / resolution
+        off = abs((mesh.vertices**2).sum(axis=1) ** 0.5 - radius)
+        assert off.max() < cell**2 / radius
+        half = shell.mesh(resolution, bounds=[(-1, -1, 0), (1, 1, 1)]).vertices
+        assert half[:, 2].min() >= 0
+        assert abs(shell.world.distance([[0.0, 0.0, 1.0]]) - (1 - radius)) < 1e-6
+
+
+def test_bands_follow_the_uncertainty_of_the_surface() -> None:
+    for shell in shells(MultiscaleSDF(Sphere(), [Siren(8, 1), Siren(8, 1)], [0.3, 0.3]), scale=0.5):
+        for inv_s, delta in ((2.0, 0.3), (torch.full((3, 1), 40.0), 0.05), (1e4, 0.02)):
+            shell.follow(inv_s)
+            assert shell.field.deltas.tolist() == pytest.approx([delta, delta])
+        shell.follow(1e4, least=0.001, band=8.0)
+        assert shell.field.deltas.tolist() == pytest.approx([0.001, 0.001])
+        with pytest.raises(ValueError, match="least=0"):
+            shell.follow(1.0, least=0.0)
+    shell, _ = studio()
+    shell.follow()
+    assert shell.field.deltas.tolist() == pytest.approx([4 / 20.0855] * 2, rel=1e-4)
+    for plain in shells(Sphere()):
+        plain.follow(10.0)  # nothing to narrow
+
+
+def test_rates_are_those_of_the_field_and_of_the_colours() -> None:
+    field = small_multiscale(0.5)
+    shell = NeuSGeometry(field)
+    assert [group["lr"] for group in shell.parameter_groups(5e-4)] == [
+        group["lr"] for group in parameter_groups(field, 5e-4)
+    ]
+    studio_shell, _ = studio()
+    found = {id(parameter) for group in studio_shell.parameter_groups(1e-3) for parameter in group["params"]}
+    assert found == set(map(id, studio_shell.parameters()))
+    x = points(20)
+    before = field.value(x)
+    shared = NeuSGeometry(field, learning_rate=5e-4)
+    assert torch.equal(shared(x)[:, 0], before)
+    assert all(siren.units != (1.0, 1.0) for siren in field.levels)  # pyright: ignore[reportAttributeAccessIssue]

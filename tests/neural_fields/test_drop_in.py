@@ -1,6 +1,7 @@
 """The changes of docs/drop-in.md, made to hosts that consist of stubs."""
 
 import functools
+import os
 import re
 import sys
 import textwrap
@@ -8,10 +9,10 @@ from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from hosts import Heads, points, ray_samples
-from mplicits import neural_fields
 from torch import nn
 
 DOCUMENT = Path(__file__).parents[2] / "docs" / "drop-in.md"
@@ -38,11 +39,6 @@ def apply(section: str, names: dict[str, Any]) -> dict[str, Any]:
     return names
 
 
-@pytest.fixture(autouse=True)
-def _short_start(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(neural_fields, "fit_sphere", functools.partial(neural_fields.fit_sphere, steps=2, batch=16))
-
-
 def provide(monkeypatch: pytest.MonkeyPatch, module: str, *names: str) -> None:
     """Make ``from module import names`` work."""
     stub = ModuleType(module)
@@ -53,34 +49,60 @@ def provide(monkeypatch: pytest.MonkeyPatch, module: str, *names: str) -> None:
     monkeypatch.setitem(sys.modules, module, stub)
 
 
-def test_neus(monkeypatch: pytest.MonkeyPatch) -> None:
+class Step(SimpleNamespace):
+    """A Lightning module whose step is the forward pass alone."""
+
+    def __init__(self, model: SimpleNamespace) -> None:
+        super().__init__(model=model)
+
+    def __call__(self, batch: None) -> None:
+        return batch
+
+
+def test_neus(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     provide(monkeypatch, "models.fields", "RenderingNetwork", "SDFNetwork", "SingleVarianceNetwork", "NeRF")
-    runner = SimpleNamespace(device="cpu", optimizer=SimpleNamespace(step=lambda: None))
-    apply("NeuS", {"self": runner})
+    runner = SimpleNamespace(
+        device="cpu", optimizer=SimpleNamespace(step=lambda: None), learning_rate=5e-4, base_exp_dir=str(tmp_path)
+    )
+    (tmp_path / "checkpoints").mkdir()
+    torch.save({"lr": np.float64(5e-4)}, tmp_path / "checkpoints" / "last.pth")  # NeuS's rates are NumPy's
+    names = {
+        "self": runner,
+        "render_out": {"s_val": torch.full((4, 1), 0.05)},
+        "os": os,
+        "torch": torch,
+        "checkpoint_name": "last.pth",
+    }
+    assert apply("NeuS", names)["checkpoint"] == {"lr": 5e-4}
     x = points(10)
     assert runner.sdf_network(x).shape == (10, 33)
     assert runner.sdf_network.gradient(x).shape == (10, 1, 3)
-    for uncertainty, delta in ((1.0, 0.3), (0.05, 0.14), (1e-4, 0.02)):
-        apply("Settings", {"self": runner, "s_val": torch.full((4, 1), uncertainty)})
-        assert runner.sdf_network.field.deltas.tolist() == pytest.approx([delta])
+    assert runner.sdf_network.field.deltas.tolist() == pytest.approx([4 * 0.05 * 0.7])
 
 
 def test_instant_nsr_pl() -> None:
     registry: dict[str, Any] = {}
     models = SimpleNamespace(register=lambda name: functools.partial(registry.setdefault, name))
-    apply("instant-nsr-pl", {"models": models})
+    found = apply("instant-nsr-pl", {"models": models})
     config = SimpleNamespace(feature_dim=13, radius=1.5, isosurface=SimpleNamespace(resolution=64))
     geometry = registry["multiscale-sdf"](config)
     sdf, gradient, feature = geometry(points(10), with_grad=True, with_feature=True)
     assert (sdf.shape, gradient.shape, feature.shape) == ((10,), (10, 3), (10, 13))
     corner = torch.full((1, 3), 1.5)
     assert (corner * geometry.scale).norm() == pytest.approx(1)
+    model = SimpleNamespace(geometry=geometry, variance=SimpleNamespace(inv_s=torch.tensor(40.0)))
+    found["training_step"](Step(model), None, 0)
+    assert geometry.field.deltas.tolist() == pytest.approx([4 / 40 * geometry.scale])
 
 
 def test_nerfstudio(monkeypatch: pytest.MonkeyPatch) -> None:
     provide(monkeypatch, "nerfstudio.field_components.field_heads", "FieldHeadNames")
-    model = SimpleNamespace(config=SimpleNamespace(sdf_field=SimpleNamespace(beta_init=0.1)))
-    apply("nerfstudio and sdfstudio", {"self": model})
+    box = SimpleNamespace(aabb=torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
+    model = SimpleNamespace(config=SimpleNamespace(sdf_field=SimpleNamespace(beta_init=0.1)), scene_box=box)
+    apply("nerfstudio and sdfstudio", {"self": model, "anneal": 0.5})
+    assert model.field.scale == pytest.approx(3**-0.5)
+    assert model.field.cos_anneal_ratio == 0.5
+    assert model.field.field.deltas.tolist() == pytest.approx([0.3])  # s is e at first: as wide as a band gets
     outputs = model.field(ray_samples(torch.ones(2, 3)), return_alphas=True)
     assert outputs[Heads.RGB].shape == (2, 3, 3)
     assert set(outputs) == set(Heads)
