@@ -108,8 +108,9 @@ def test_an_evaluation_without_graph_does_not_serve_a_training_step() -> None:
     with torch.no_grad():
         output = shell(x)
         assert not output.requires_grad
+    assert field.jets == 0  # a value was enough
     gradient = shell.gradient(x)
-    assert field.jets == 100
+    assert field.jets == 50
     assert gradient.requires_grad
     graph = shell(x)
     with torch.no_grad():
@@ -235,7 +236,7 @@ def test_inference_tensors_have_no_version_and_are_evaluated_each_time() -> None
     shell, field = counting()
     with torch.inference_mode():
         x = points()
-        shell(x)
+        shell.gradient(x)
         shell.gradient(x)
     assert field.jets == 100
     shell(x).sum().backward()
