@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
-__all__ = ["color_loss", "data_loss", "eikonal_loss", "normal_loss", "tangential_loss"]
+__all__ = ["color_loss", "data_loss", "eikonal_loss", "normal_loss", "pseudo_huber", "tangential_loss"]
 
 
 def data_loss(value: Tensor, target: Tensor | float = 0.0) -> Tensor:
@@ -20,6 +22,20 @@ def normal_loss(gradient: Tensor, normal: Tensor, *, eps: float = 1e-8) -> Tenso
     the cosine asks for the direction only and leaves the length to the eikonal term.
     """
     return 1 - torch.nn.functional.cosine_similarity(gradient, normal, dim=-1, eps=eps)
+
+
+def pseudo_huber(loss: Tensor, scale: float) -> Tensor:
+    """``s (√(1 + 2 c / s) − 1)`` of losses c that grow with a square: c itself where c ≪ s, ``√(2 s c)`` where c ≫ s.
+
+    Of ``c = 1 − cos a`` it is a²/2 for small angles a and √s a for large ones, so that a few large ones, which nothing
+    can be done about, do not outweigh many small ones (Charbonnier et al., "Two deterministic half-quadratic
+    regularization algorithms for computed imaging", ICIP 1994).
+
+    Args:
+        loss: ``(...,)`` losses, 0 or more.
+        scale: s, positive; infinity leaves the losses as they are.
+    """
+    return loss if scale == math.inf else scale * ((1 + 2 * loss / scale).sqrt() - 1)
 
 
 def eikonal_loss(gradient: Tensor, *, eps: float = 1e-12) -> Tensor:

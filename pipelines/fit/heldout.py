@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ...neural_fields import Field, Siren
-from ...neural_fields.losses import data_loss, normal_loss
+from ...neural_fields.losses import data_loss, normal_loss, pseudo_huber
 from .samples import Samples, with_previous
 
 __all__ = ["FEWEST", "LOOKS", "Error", "Judge", "Verdict", "held_out"]
@@ -122,14 +122,23 @@ class Judge:
         delta: half-width of the band around the finest of them; points outside it do not count.
         data: weight of f(x)².
         normal: weight of 1 − cos(∇f, N).
+        turn: the scale of `pseudo_huber` around it.
     """
 
     def __init__(
-        self, points: Tensor, normals: Tensor, previous: Field, delta: float, *, data: float, normal: float
+        self,
+        points: Tensor,
+        normals: Tensor,
+        previous: Field,
+        delta: float,
+        *,
+        data: float,
+        normal: float,
+        turn: float = math.inf,
     ) -> None:
         samples = Samples(points, distance=torch.zeros(len(points)), normal=normals)
         self.samples = with_previous(samples, previous, delta, device=previous.like.device)
-        self.data, self.normal, self.count = data, normal, len(self.samples)
+        self.data, self.normal, self.turn, self.count = data, normal, turn, len(self.samples)
         assert self.samples.value is not None
         assert self.samples.gradient is not None
         self.before = self._error(self.samples.value, self.samples.gradient)
@@ -147,7 +156,7 @@ class Judge:
         distance, normal = self.samples.distance, self.samples.normal
         assert distance is not None
         assert normal is not None
-        data, turn = data_loss(value, distance).mean(), normal_loss(gradient, normal).mean()
+        data, turn = data_loss(value, distance).mean(), pseudo_huber(normal_loss(gradient, normal), self.turn).mean()
         # The chord, for the cosine of a small angle rounds to 1.
         chord = (torch.nn.functional.normalize(gradient, dim=1) - normal).norm(dim=1)
         angle = torch.rad2deg(2 * (chord.quantile(0.5).clamp(max=2) / 2).asin()) if len(chord) else chord.sum()

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ...neural_fields import Siren
-from ...neural_fields.losses import data_loss, eikonal_loss, normal_loss
+from ...neural_fields.losses import data_loss, eikonal_loss, normal_loss, pseudo_huber
 from ..run.settings import EvolveConfig, FitConfig
 from ..run.team import my_share, whole_batch
 from ..run.trainer import Group, Objective, seeded, warm_cosine
@@ -18,8 +18,8 @@ from .samples import Source
 
 __all__ = ["LevelObjective", "new_level"]
 
-# A residual starts at a tenth of the usual output scale, close to the level before it.
-RESIDUAL_GAIN = 0.1
+# Of an evolution, a residual starts at a tenth of the usual output scale, close to the level before it.
+EVOLVING_GAIN = 0.1
 BEST = "best."  # before the names of the weights that did best
 
 
@@ -27,7 +27,8 @@ def new_level(config: FitConfig | EvolveConfig, level: int, *, residual: bool, i
     """The untrained SIREN of a level, whose weights follow from the seed; small where it is added to others."""
     width, depth, omega = config.widths[level], config.depths[level], config.omegas[level]
     with seeded(config.seed * 1009 + level):
-        return Siren(width, depth, omega=omega, in_dim=in_dim, output_gain=RESIDUAL_GAIN if residual else 1.0)
+        small = config.residual_gain if isinstance(config, FitConfig) else EVOLVING_GAIN
+        return Siren(width, depth, omega=omega, in_dim=in_dim, output_gain=small if residual else 1.0)
 
 
 class LevelObjective(Objective):
@@ -73,7 +74,8 @@ class LevelObjective(Objective):
             if batch.distance is not None:
                 parts.append(("data", source.data, data_loss(value, batch.distance)))
             if batch.normal is not None:
-                parts.append(("normal", source.normal, normal_loss(gradient, batch.normal)))
+                turned = pseudo_huber(normal_loss(gradient, batch.normal), source.turn)
+                parts.append(("normal", source.normal, turned))
             for name, weight, loss in parts:
                 mean = loss.mean()
                 total = total + weight * mean

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ...neural_fields import Field, InputError, Jet
+from ...neural_fields.losses import normal_loss
 from ..run.settings import FitConfig
 from .cloud import CloudDistance
 
@@ -37,6 +38,7 @@ __all__ = [
     "free_lengths",
     "offset_samples",
     "surface_samples",
+    "usual_turn",
     "with_previous",
 ]
 
@@ -49,6 +51,8 @@ STRAY = 4.0
 TAIL = 20.0
 # How far a winding number must be from one half to say in or out: it is off by less than 0.05 where it is asked.
 SURE = 0.4
+# The least scale of 1 − cos, which float32 rounds to 6e-8: it is that of 0.08°.
+LEAST_TURN = 1e-6
 # So few places that the level before gets wrong far from the cloud are not worth a share of the batch.
 FEWEST = 32
 
@@ -94,7 +98,17 @@ class Samples(Rows):
 
 @dataclass(frozen=True)
 class Source:
-    """Samples, how many of them go into each batch, and the weights of their terms."""
+    """Samples, how many of them go into each batch, and the weights of their terms.
+
+    Attributes:
+        name: in reports.
+        samples: what batches are drawn from.
+        batch: how many of them go into each.
+        data: weight of (f(x) − d)².
+        normal: weight of 1 − cos(∇f, N).
+        eikonal: weight of (|∇f| − 1)².
+        turn: the scale of `pseudo_huber` around 1 − cos(∇f, N); infinity leaves it as it is.
+    """
 
     name: str
     samples: Samples
@@ -102,6 +116,7 @@ class Source:
     data: float
     normal: float
     eikonal: float
+    turn: float = math.inf
 
 
 @dataclass(frozen=True)
@@ -178,17 +193,29 @@ def banded_sources(
                 f"{name}: no {kind} samples within {delta:.2g} of the level before; train it longer "
                 "(--steps) or widen the band (--epsilon)"
             )
-    before = kept["surface"].value
-    assert before is not None
-    terms = (weights or Weights()).resolved(config, before, index.noise)
+    surface = kept["surface"]
+    assert surface.value is not None
+    terms = (weights or Weights()).resolved(config, surface.value, index.noise)
     third = config.batch // 3
-    sources = [Source(kind, samples, third, *terms) for kind, samples in kept.items()]
+    turn = usual_turn(surface) if config.robust_normals else math.inf
+    sources = [Source(kind, samples, third, *terms, turn) for kind, samples in kept.items()]
     # Of its own generator: a cloud without such places is fitted as if nobody had looked for them.
     own = torch.Generator().manual_seed(generator.initial_seed() + 1)
     empty = empty_samples(index, previous, delta, config.samples, generator=own, device=device, watch=watch)
     if len(empty) >= FEWEST:
         sources.append(Source("empty", empty, third // 4, terms[0], 0.0, 0.0))
     return sources
+
+
+def usual_turn(surface: Samples) -> float:
+    """The median of 1 − cos(∇f, N) of the levels before: what is usual on smooth places, of which there are most.
+
+    Nothing turns at once at a sharp edge. The angles that are left there are ten times those of the faces, their
+    squares a hundred times, and a level would learn of nothing else.
+    """
+    assert surface.gradient is not None
+    assert surface.normal is not None
+    return max(float(normal_loss(surface.gradient, surface.normal).quantile(0.5)), LEAST_TURN)
 
 
 @dataclass(frozen=True)

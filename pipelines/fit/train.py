@@ -317,7 +317,8 @@ class _Fitting:
             return None
         assert self.frozen is not None
         points, normals = self.points[self.held], self.normals[self.held]
-        judge = Judge(points, normals, self.frozen, delta, data=surface.data, normal=surface.normal)
+        weights = {"data": surface.data, "normal": surface.normal, "turn": surface.turn}
+        judge = Judge(points, normals, self.frozen, delta, **weights)
         return judge if judge.count >= FEWEST / 2 else None
 
     def review(self) -> dict[str, Any]:

@@ -41,6 +41,12 @@ class FitConfig(Settings):
     normal_weight: float = setting(
         300.0, "weight of 1 - cos(grad f, N) where the normal N is known (Eq. 4)", at_least=0
     )
+    robust_normals: bool = setting(
+        True, "residual levels: angles far above the usual count as they are, not squared: edges do not outweigh faces"
+    )
+    residual_gain: float = setting(
+        0.01, "residual levels begin with so much of the usual output scale: 0.1 tilts normals by degrees", above=0
+    )
     eikonal_weight: float = setting(50.0, "weight of (|grad f| - 1)^2 (Eq. 4)", at_least=0)
     domain_weight: float = setting(0.1, "factor on data_weight for level 0's distances away from the cloud", at_least=0)
     epsilon: float = setting(0.3, "margin of the bands (Eq. 5)", above=0)

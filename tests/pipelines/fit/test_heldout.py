@@ -79,6 +79,13 @@ def test_the_angle_at_held_out_points_is_their_median() -> None:
     assert judge.before.loss == pytest.approx(float((1 - angle.cos()).mean()), rel=1e-3)
 
 
+def test_large_angles_count_as_the_level_counts_them() -> None:
+    x = points(1000)
+    turn = 1e-3
+    judge = Judge(x, -x / RADIUS, Sphere(radius=RADIUS), 0.1, data=1.0, normal=3.0, turn=turn)
+    assert judge.before.loss == pytest.approx(3 * turn * ((1 + 4 / turn) ** 0.5 - 1), rel=1e-5)  # 1 − cos = 2
+
+
 def test_no_points_have_no_error() -> None:
     x = points(1000)
     assert Judge(x, x, Sphere(radius=0.1), 0.1, data=1.0, normal=1.0).count == 0  # all outside the band

@@ -6,6 +6,7 @@ import torch
 from mplicits.neural_fields import MultiscaleSDF, Siren, Sphere, Torus, Union
 from mplicits.pipelines.fit.cloud import CloudDistance
 from mplicits.pipelines.fit.samples import (
+    LEAST_TURN,
     Samples,
     band_of,
     band_samples,
@@ -15,6 +16,7 @@ from mplicits.pipelines.fit.samples import (
     empty_samples,
     free_lengths,
     offset_samples,
+    usual_turn,
     with_previous,
 )
 from mplicits.pipelines.paper.base import train_level
@@ -233,3 +235,20 @@ def test_the_next_level_takes_an_invented_surface_away(cloud: CloudDistance) -> 
     assert previous.value(outside).abs().max() < 1e-5
     assert field.value(outside).min() > 0.02
     assert field.value(torch.from_numpy(cloud.points)).square().mean().sqrt() < 0.01
+
+
+def test_the_usual_turn_is_that_of_the_median_angle() -> None:
+    points, normals = sphere_points(1001)
+    across = torch.nn.functional.normalize(torch.linalg.cross(normals, torch.tensor([[0.3, 0.5, -0.8]])), dim=1)
+    angle = torch.deg2rad(torch.linspace(0, 8, 1001))
+    angle[angle > np.deg2rad(6)] = np.deg2rad(40)  # a quarter of them, as beside edges: the median stays
+    tilted = angle.cos()[:, None] * normals + angle.sin()[:, None] * across
+    surface = with_previous(Samples(points, torch.zeros(1001), tilted), Sphere(radius=RADIUS), 0.1, device=CPU)
+    assert usual_turn(surface) == pytest.approx(1 - np.cos(np.deg2rad(4)), rel=2e-3)  # float32 rounds by 6e-8 of 2e-3
+
+
+@pytest.mark.parametrize("robust", [True, False])
+def test_the_scale_of_angles_is_that_of_the_level_before(cloud: CloudDistance, robust: bool) -> None:
+    config = FitConfig(samples=2000, robust_normals=robust)
+    sources = banded_sources(cloud, Sphere(radius=RADIUS - 0.01), 0.05, config, generator=generator())
+    assert [source.turn for source in sources] == [LEAST_TURN if robust else np.inf] * 3  # spheres have one normal
