@@ -165,6 +165,11 @@ class CloudDistance:
         self.given, self.repaired = len(points) if given is None else given, repaired
         self.gap = self.spacing if gap is None else gap
 
+    @property
+    def filled(self) -> bool:
+        """Whether there are points between those of the cloud, which was too sparse for what is fitted to it."""
+        return len(self.points) > self.given
+
     def nearest(self, x: NDArray[np.floating]) -> NDArray[np.float64]:
         """Distance from each of ``(M, 3)`` to the nearest point of the cloud → ``(M,)``."""
         return np.concatenate([self._query(x[start : start + ROWS], 1)[0] for start in _starts(len(x))])

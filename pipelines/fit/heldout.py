@@ -19,11 +19,12 @@ from ...neural_fields import Field, Siren
 from ...neural_fields.losses import data_loss, normal_loss, pseudo_huber
 from .samples import Samples, with_previous
 
-__all__ = ["FEWEST", "LOOKS", "Error", "Judge", "Verdict", "held_out"]
+__all__ = ["FEWEST", "LOOKS", "Error", "Judge", "Verdict", "held_out", "surely_less"]
 
 FEWEST = 200  # whose mean square is known to a tenth
 MOST = 0.1  # of the points; a cloud that would have to spare more spares none
 VOXEL = 2.0  # edge of a voxel in spacings: about four points, whose neighbours can still fill the gap
+SURELY = 2.0  # standard errors
 LOOKS = 8  # how often a level is judged while it trains
 
 
@@ -72,8 +73,8 @@ class Verdict(NamedTuple):
     Attributes:
         points: how many there are in its band.
         before: the error there without it.
-        after: the error with it, at its best.
-        at: fraction of its schedule at which that was.
+        after: the error with it.
+        at: fraction of its schedule after which its weights were kept.
     """
 
     points: int
@@ -141,23 +142,37 @@ class Judge:
         self.data, self.normal, self.turn, self.count = data, normal, turn, len(self.samples)
         assert self.samples.value is not None
         assert self.samples.gradient is not None
-        self.before = self._error(self.samples.value, self.samples.gradient)
+        self.before, _ = self._errors(self.samples.value, self.samples.gradient)
 
-    @torch.no_grad()
     def error(self, siren: Siren) -> Error:
         """With the residual ``siren`` added to the levels before; ``before`` is without it."""
+        return self.errors(siren)[0]
+
+    @torch.no_grad()
+    def errors(self, siren: Siren) -> tuple[Error, Tensor]:
+        """`error`, and the loss of every point ``(count,)``."""
         value, gradient = self.samples.value, self.samples.gradient
         assert value is not None
         assert gradient is not None
         jet = siren.jet(self.samples.points)
-        return self._error(value + jet.value, gradient + jet.gradient)
+        return self._errors(value + jet.value, gradient + jet.gradient)
 
-    def _error(self, value: Tensor, gradient: Tensor) -> Error:
+    def _errors(self, value: Tensor, gradient: Tensor) -> tuple[Error, Tensor]:
         distance, normal = self.samples.distance, self.samples.normal
         assert distance is not None
         assert normal is not None
-        data, turn = data_loss(value, distance).mean(), pseudo_huber(normal_loss(gradient, normal), self.turn).mean()
+        data, turn = data_loss(value, distance), pseudo_huber(normal_loss(gradient, normal), self.turn)
+        each = self.data * data + self.normal * turn
         # The chord, for the cosine of a small angle rounds to 1.
         chord = (torch.nn.functional.normalize(gradient, dim=1) - normal).norm(dim=1)
         angle = torch.rad2deg(2 * (chord.quantile(0.5).clamp(max=2) / 2).asin()) if len(chord) else chord.sum()
-        return Error(float(self.data * data + self.normal * turn), float(data.sqrt()), float(angle))
+        return Error(float(each.mean()), float(data.mean().sqrt()), float(angle)), each
+
+
+def surely_less(first: Tensor, second: Tensor) -> bool:
+    """Whether the losses ``(n,)`` of the same points are less in the mean, by more than chance makes them.
+
+    That is twice the standard error of the mean of their differences.
+    """
+    apart = second - first
+    return bool(apart.mean() > SURELY * apart.std() / math.sqrt(len(apart)))

@@ -13,22 +13,23 @@ from ...neural_fields.losses import data_loss, eikonal_loss, normal_loss, pseudo
 from ..run.settings import EvolveConfig, FitConfig
 from ..run.team import my_share, whole_batch
 from ..run.trainer import Group, Objective, seeded, warm_cosine
-from .heldout import LOOKS, Error, Judge, Verdict
+from .heldout import LOOKS, Error, Judge, Verdict, surely_less
 from .samples import Source
 
-__all__ = ["LevelObjective", "new_level"]
+__all__ = ["RESIDUAL_GAIN", "LevelObjective", "new_level"]
 
-# Of an evolution, a residual starts at a tenth of the usual output scale, close to the level before it.
-EVOLVING_GAIN = 0.1
+# A residual starts at a tenth of the usual output scale, close to the level before it.
+RESIDUAL_GAIN = 0.1
 BEST = "best."  # before the names of the weights that did best
 
 
-def new_level(config: FitConfig | EvolveConfig, level: int, *, residual: bool, in_dim: int = 3) -> Siren:
-    """The untrained SIREN of a level, whose weights follow from the seed; small where it is added to others."""
+def new_level(
+    config: FitConfig | EvolveConfig, level: int, *, residual: bool, in_dim: int = 3, gain: float = RESIDUAL_GAIN
+) -> Siren:
+    """The untrained SIREN of a level, whose weights follow from the seed; small by ``gain`` where it is a residual."""
     width, depth, omega = config.widths[level], config.depths[level], config.omegas[level]
     with seeded(config.seed * 1009 + level):
-        small = config.residual_gain if isinstance(config, FitConfig) else EVOLVING_GAIN
-        return Siren(width, depth, omega=omega, in_dim=in_dim, output_gain=small if residual else 1.0)
+        return Siren(width, depth, omega=omega, in_dim=in_dim, output_gain=gain if residual else 1.0)
 
 
 class LevelObjective(Objective):
@@ -39,7 +40,8 @@ class LevelObjective(Objective):
         sources: what it learns from.
         learning_rate: the peak rate.
         generator: CPU generator that draws the batches.
-        judge: points that are not among the sources; the weights that do best there are kept.
+        judge: points that are not among the sources. Where they say for sure that the level was better on its way than
+            at its end, it goes back to that.
     """
 
     def __init__(
@@ -55,7 +57,13 @@ class LevelObjective(Objective):
         self.siren, self.sources, self.judge = siren, sources, judge
         if judge is not None:  # in the checkpoints too
             best = {BEST + name: tensor.clone() for name, tensor in siren.state_dict().items()}
-            self.kept = {"looks": torch.zeros(1), "least": torch.full((3,), math.inf), "at": torch.ones(1), **best}
+            self.kept = {
+                "looks": torch.zeros(1),
+                "least": torch.full((3,), math.inf),
+                "at": torch.ones(1),
+                "each": torch.full((judge.count,), math.inf),
+                **best,
+            }
 
     def losses(self, step: int, done: float) -> tuple[dict[str, Tensor], Tensor]:
         """See `Objective.losses`: the mean of every term of every source."""
@@ -87,17 +95,25 @@ class LevelObjective(Objective):
         if self.judge is None:
             return
         self.kept["looks"].fill_(int(done * LOOKS))
-        error = self.judge.error(self.siren)
+        error, each = self.judge.errors(self.siren)
         if error.loss < float(self.kept["least"][0]):
             self.kept["least"].copy_(torch.tensor(error))
+            self.kept["each"].copy_(each)
             self.kept["at"].fill_(done)
             for name, tensor in self.siren.state_dict().items():
                 self.kept[BEST + name].copy_(tensor)
 
     def take_best(self) -> Verdict | None:
-        """Look once more, and go back to the best weights → what was found; None without a judge."""
+        """Look once more, and go back to the best weights if they are surely better → what was found; None without.
+
+        The rates have fallen to nothing at the end, and with them the waves that the batches left; a few hundred points
+        hardly see those. So the last weights stay, unless they are worse by more than chance, or worse than none.
+        """
         if self.judge is None:
             return None
+        last, each = self.judge.errors(self.siren)
+        if last.loss < self.judge.before.loss and not surely_less(self.kept["each"].to(each), each):
+            return Verdict(self.judge.count, self.judge.before, last, 1.0)
         self.look(1.0)
         self.siren.load_state_dict({name: self.kept[BEST + name] for name in self.siren.state_dict()})
         return Verdict(self.judge.count, self.judge.before, Error(*self.kept["least"].tolist()), float(self.kept["at"]))

@@ -197,7 +197,7 @@ def banded_sources(
     assert surface.value is not None
     terms = (weights or Weights()).resolved(config, surface.value, index.noise)
     third = config.batch // 3
-    turn = usual_turn(surface) if config.robust_normals else math.inf
+    turn = usual_turn(surface) if config.robust_normals and index.filled else math.inf
     sources = [Source(kind, samples, third, *terms, turn) for kind, samples in kept.items()]
     # Of its own generator: a cloud without such places is fitted as if nobody had looked for them.
     own = torch.Generator().manual_seed(generator.initial_seed() + 1)

@@ -38,7 +38,7 @@ from ..surface.trim import write_support
 from .between import dense_distance
 from .cloud import CloudDistance, load_cloud
 from .heldout import FEWEST, Judge, held_out
-from .level import LevelObjective, new_level
+from .level import RESIDUAL_GAIN, LevelObjective, new_level
 from .plan import Share
 from .review import Review, review_points
 from .samples import Band, Source, band_of, banded_sources, first_sources
@@ -49,6 +49,9 @@ __all__ = ["FitConfig", "Review", "Run", "fit", "prepare", "review_points"]
 # A level whose error at the points is so many times that of the level before it is worse than none: set to zero, it is
 # that level. Where data contradict themselves, as the sides of a part do that is thinner than their noise, it happens.
 WORSE = 2.0
+# Of a sparse cloud, a residual begins so small: at a tenth of the usual its waves tilt the normals of the level before
+# by degrees, on flat places too.
+SMALL_GAIN = 0.01
 
 Cloud = PointCloud | str | Path | NDArray[np.floating]
 LevelDone = Callable[[MultiscaleSDF, Similarity], object]
@@ -228,11 +231,12 @@ class _Fitting:
         """Make the samples of one level, train it, freeze it."""
         config, started = dataclasses.replace(self.config, samples=share.samples), time.monotonic()
         generator = torch.Generator().manual_seed(config.seed * 1009 + level)
-        siren = new_level(config, level, residual=level > 0).to(self.device)
         work = self.timing.sampling(level, share.samples)
         band = None if self.frozen is None else self.next_band()
         delta = None if band is None else band.delta
         index = self.indexed()
+        gain = SMALL_GAIN if index.filled and config.robust_normals else RESIDUAL_GAIN
+        siren = new_level(config, level, residual=level > 0, gain=gain).to(self.device)
         work.indexed()
         index.watch = work.points
         if self.frozen is None or delta is None:

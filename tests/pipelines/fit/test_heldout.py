@@ -10,7 +10,7 @@ from mplicits.datasets import PointCloud
 from mplicits.datasets.synthetic.samples import sample_sphere
 from mplicits.neural_fields import Siren, Sphere
 from mplicits.pipelines.cli.info import describe
-from mplicits.pipelines.fit.heldout import FEWEST, VOXEL, Error, Judge, Verdict, held_out
+from mplicits.pipelines.fit.heldout import FEWEST, VOXEL, Error, Judge, Verdict, held_out, surely_less
 from mplicits.pipelines.fit.level import LevelObjective
 from mplicits.pipelines.fit.samples import Band, Samples, Source, with_previous
 from mplicits.pipelines.fit.train import fit
@@ -116,6 +116,35 @@ def test_the_best_weights_are_kept_and_checkpoints_keep_them() -> None:
     assert level.judge.error(level.siren).loss == pytest.approx(verdict.after.loss, rel=1e-5)  # type: ignore[union-attr]
     assert other.take_best() == verdict
     assert objective(judge_of(RADIUS - OFF), 0.0).judge is not None
+
+
+def test_what_chance_may_have_done_is_not_sure() -> None:
+    losses = torch.zeros(100)
+    # Means of 1 and 0.5 with standard errors of 0.1 and 0.95.
+    assert surely_less(losses, torch.tensor([0.0, 2.0]).repeat(50))
+    assert not surely_less(losses, torch.tensor([-9.0, 10.0]).repeat(50))
+    assert surely_less(losses, losses + 1)
+    assert not surely_less(losses, losses)
+    assert not surely_less(losses + 1, losses)
+
+
+@pytest.mark.parametrize("chance", [True, False])
+def test_the_last_weights_stay_unless_others_were_surely_better(chance: bool) -> None:
+    level = objective(judge_of(RADIUS - OFF), 0.0)
+    assert level.judge is not None
+    torch.nn.init.constant_(level.siren.output.bias, -0.9 * OFF)  # nine tenths of the way
+    last, each = level.judge.errors(level.siren)
+    assert last.loss == pytest.approx(100 * (0.1 * OFF) ** 2, rel=1e-3)
+    # Less by a tenth, exactly or with a standard error of a tenth.
+    spread = 1000**0.5 * (-1.0) ** torch.arange(1000) if chance else torch.zeros(1000)
+    better = 0.1 * last.loss * (spread - 1)
+    level.kept["least"].copy_(torch.tensor([0.9 * last.loss, 0.0, 0.0]))
+    level.kept["each"].copy_(each + better)
+    level.kept["at"].fill_(0.5)
+    verdict = level.take_best()
+    assert verdict is not None
+    expected = (1.0, last.loss) if chance else (0.5, 0.9 * last.loss)
+    assert (verdict.at, verdict.after.loss) == pytest.approx(expected)
 
 
 def test_a_verdict_in_words() -> None:
