@@ -306,6 +306,11 @@ class NerfstudioField(Hosted):
         """See `get_outputs`; normals are always among the outputs."""
         return self.get_outputs(ray_samples, return_alphas=return_alphas)
 
+    def frontal_colors(self, x: Tensor) -> Tensor:
+        """Colours ``(..., 3)`` of points of the surface ``(..., 3)``, each seen against its normal."""
+        jet = self._jet(x)
+        return self.color(x, -nn.functional.normalize(jet.gradient, dim=-1), jet)
+
     def follow(self, inv_s: Tensor | float | None = None, **widths: float) -> None:
         """See `Hosted.follow`; the deviation is this field's own by default."""
         super().follow(self.deviation_network.get_variance() if inv_s is None else inv_s, **widths)

@@ -1,0 +1,99 @@
+"""``ns-mplicits-export``: the surface of a nerfstudio training as a mesh with colours, where its data are."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+
+from ...neural_fields import InputError, Mesh, NerfstudioField, NoSurfaceError
+
+__all__ = ["colored_mesh", "export_mesh", "in_data_coordinates", "main"]
+
+BATCH = 1 << 14
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command; 0 when the file is written, 2 with one line for what was wrong."""
+    parser = argparse.ArgumentParser("ns-mplicits-export", description=__doc__)
+    parser.add_argument("--load-config", type=Path, required=True, help="config.yml of the training")
+    parser.add_argument("--output-path", type=Path, required=True, help="PLY, OBJ, STL or GLB")
+    parser.add_argument("--resolution", type=int, default=512, help="cells along the longest side of the scene box")
+    parser.add_argument("--level", type=int, default=-1, help="of detail, 0 the coarsest, -1 the finest")
+    options = parser.parse_args(arguments)
+    try:
+        mesh = export_mesh(options.load_config, options.output_path, options.resolution, level=options.level)
+    except (InputError, NoSurfaceError, ValueError) as error:
+        print(f"ns-mplicits-export: error: {error}", file=sys.stderr)
+        return 2
+    print(f"{options.output_path}: {len(mesh.vertices):,} vertices, {len(mesh.faces):,} triangles")
+    return 0
+
+
+def export_mesh(config: Path, path: Path, resolution: int = 512, *, level: int = -1) -> Mesh:
+    """Mesh the last checkpoint of a training, colour it and write it, in the coordinates of the data set.
+
+    Args:
+        config: ``config.yml`` of the training.
+        path: the file; its extension chooses the format.
+        resolution: cells along the longest side of the scene box.
+        level: of detail.
+
+    Raises:
+        InputError: there is no such training, it is not one of ours, or the file cannot be written.
+        NoSurfaceError: there is no surface in the scene box.
+        ValueError: there is no such level.
+    """
+    if not config.is_file():
+        raise InputError(f"{config}: no such file; expected the config.yml that ns-train wrote")
+    from nerfstudio.utils.eval_utils import eval_setup  # pyright: ignore[reportMissingImports]
+
+    _, pipeline, _, _ = eval_setup(config, test_mode="inference")
+    field = pipeline.model.field
+    if not isinstance(field, NerfstudioField):
+        raise InputError(f"{config}: trained by another method; expected mplicits or mplicits-facto")
+    outputs = pipeline.datamanager.train_dataparser_outputs
+    mesh = colored_mesh(field, resolution, level=level)
+    mesh = in_data_coordinates(mesh, outputs.dataparser_transform, outputs.dataparser_scale)
+    mesh.export(path)
+    return mesh
+
+
+@torch.no_grad()
+def colored_mesh(field: NerfstudioField, resolution: int, *, level: int = -1) -> Mesh:
+    """The surface in nerfstudio's coordinates, with the colours that it has when it is seen from the front.
+
+    Raises:
+        NoSurfaceError: there is none in the scene box.
+        ValueError: there is no such level.
+    """
+    mesh = field.mesh(resolution, level=level)
+    points = torch.from_numpy(mesh.vertices).to(field.field.like)
+    colors = torch.cat([field.frontal_colors(part) for part in points.split(BATCH)])
+    return dataclasses.replace(mesh, colors=colors.float().cpu().numpy())
+
+
+def in_data_coordinates(mesh: Mesh, transform: ArrayLike, scale: float) -> Mesh:
+    """Undo x ↦ scale · (R x + t), by which nerfstudio has moved the data's cameras.
+
+    Args:
+        mesh: in nerfstudio's coordinates.
+        transform: ``(3, 4)``, R a rotation and t beside it.
+        scale: a number above 0.
+    """
+    matrix = np.asarray(transform, np.float64)
+    rotation, shift = matrix[:, :3], matrix[:, 3]
+    # Rows: R⁻¹ (x − t) is (x − t) R for a rotation.
+    vertices = (mesh.vertices / float(scale) - shift) @ rotation
+    normals = None if mesh.normals is None else (mesh.normals @ rotation).astype(np.float32)
+    return dataclasses.replace(mesh, vertices=vertices, normals=normals)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
