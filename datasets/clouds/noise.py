@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-__all__ = ["noise_level", "smooth_along_normals"]
+__all__ = ["noise_deviation", "noise_level", "smooth_along_normals"]
 
 Float64 = NDArray[np.float64]
 Rows = NDArray[np.integer]
@@ -29,6 +29,10 @@ THICK = 0.2
 # The same of a neighbourhood so much wider than the noise that it holds nearly all of the layer; yet wider ones hold
 # other parts of a fine structure.
 THIN = 0.35
+# The same of neighbourhoods, five standard deviations in radius and more, whose middle may be at the layer's rim.
+WHOLE = 0.25
+# Of the area that a neighbourhood shows at the height of its middle: less counts as this much.
+LEAST_SEEN = 0.1
 # Half the thickness of the layer that a point looks through, in standard deviations; after a round less is left.
 LAYER, LAYER_LEFT = 3.0, 2.0
 
@@ -48,26 +52,56 @@ class _Neighbors(NamedTuple):
 
 
 def noise_level(points: Float64, normals: Float64, *, seed: int = 0) -> float:
-    """The standard deviation of the noise along the normals, or 0 where the spacing is wider than that.
+    """How thick the layer of points is along the normals, or 0 where the spacing is wider than that.
+
+    It is what smoothing measures in, and less than the noise's standard deviation, the more so the wider its
+    distribution: that is `noise_deviation`.
 
     Args:
         points: ``(N, 3)``, around the origin.
         normals: ``(N, 3)`` unit normals.
         seed: of the points that are asked.
     """
+    return _measured(points, normals, seed)[0]
+
+
+def noise_deviation(points: Float64, normals: Float64, *, seed: int = 0) -> float:
+    """The standard deviation of the noise along the normals, or 0 where the spacing is wider than that.
+
+    Whatever direction the noise has: what it does across the normals moves points within the surface, and is not
+    seen. Of noise along the rays of a sensor, this is its part along the normals where half of the cloud has more.
+
+    In each of many neighbourhoods the heights ½(n_i + n_j)·(p_j − p_i) have the variance of the noise about their mean,
+    which holds the noise of the point in the middle. A ball of radius R around that shows those at a height h only
+    within ``R² − h²`` beside it, so that each counts with the inverse of this area (Horvitz and Thompson 1952). The
+    median over neighbourhoods is that of a χ² distribution with k − 1 degrees of freedom, whose ratio to the mean is
+    ``(1 − 2/(9 (k − 1)))³`` (Wilson and Hilferty 1931).
+
+    Args:
+        points: ``(N, 3)``, around the origin.
+        normals: ``(N, 3)`` unit normals.
+        seed: of the points that are asked.
+    """
+    level, near = _measured(points, normals, seed, thin=WHOLE)
+    return _deviation(near) if level and near is not None else 0.0
+
+
+def _measured(points: Float64, normals: Float64, seed: int, *, thin: float = THIN) -> tuple[float, _Neighbors | None]:
+    """The layer's thickness, in neighbourhoods ``1/thin`` times as wide, and those; 0 and None if it is no layer."""
     order = np.random.default_rng(seed).permutation(len(points))
     layer = _Layer(points, normals, order)
     if not _thickness(layer.around(order[:ASKED], 8))[0] > THICK:
-        return 0.0
-    level = 0.0
+        return 0.0, None
+    level, near = 0.0, None
     while len(order) > 32:  # fewer and fewer points show wider and wider neighbourhoods, at the same cost
-        ratio, height = _thickness(layer.around(order[:ASKED], 16))
+        near = layer.around(order[:ASKED], 16)
+        ratio, height = _thickness(near)
         level = height / 2**0.5  # of a difference of two
-        if ratio < THIN:
+        if ratio < thin:
             break
         order = order[: len(order) // 2]
         layer = _Layer(points, normals, order)
-    return level
+    return level, near
 
 
 def smooth_along_normals(points: Float64, normals: Float64, level: float, *, rounds: int = 2, seed: int = 0) -> Float64:
@@ -136,6 +170,24 @@ def _thickness(near: _Neighbors) -> tuple[float, float]:
     if not some.any():
         return 0.0, 0.0
     return float(np.median(height[some] / radius[some])), float(np.median(height[some]))
+
+
+def _deviation(near: _Neighbors) -> float:
+    """See `noise_deviation`."""
+    alike = near.cosine > 0.5
+    count = alike.sum(axis=1)
+    radius = np.nanmax(near.distance, axis=1, keepdims=True)
+    some = (count > 3) & (radius[:, 0] > 0)
+    if not some.any():
+        return 0.0
+    height = np.where(alike, near.height, 0.0)[some]
+    seen = np.maximum(1 - (height / radius[some]) ** 2, LEAST_SEEN)
+    weight = alike[some] / seen
+    total = weight.sum(axis=1, keepdims=True)
+    mean = (weight * height).sum(axis=1, keepdims=True) / total
+    freedom = count[some] - 1
+    variance = (weight * (height - mean) ** 2).sum(axis=1) / total[:, 0] * count[some] / freedom
+    return float(np.sqrt(np.median(variance / (1 - 2 / (9 * freedom)) ** 3)))
 
 
 def _spacing(points: Float64, normals: Float64, order: Rows) -> float:

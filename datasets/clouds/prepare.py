@@ -10,13 +10,14 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from ...neural_fields import InputError, Similarity
+from .judging import layer_level, neighborly, worse_normals
 from .meshes import weld
-from .noise import noise_level, smooth_along_normals
+from .noise import noise_deviation, noise_level, smooth_along_normals
 from .orientation import estimate_normals, nearest, openness, orient_normals, outwardness
 from .outliers import inspect_points
 from .point_cloud import PointCloud, unit_rows
 from .reading import MIN_POINTS
-from .reestimate import denoise
+from .reestimate import denoise, refit_normals
 from .winding import orient_by_winding
 
 __all__ = ["CleaningReport", "OrientedCloud", "prepare_cloud"]
@@ -43,8 +44,10 @@ class CleaningReport:
         pieces: connected pieces of the cloud; 0 if normals were not estimated, or a sensor oriented them.
         oriented_by: what gave estimated normals their signs: "winding" numbers, "propagation" from point to point in
             each piece, or the "sensor"; None for those of a file.
-        smoothed_noise: standard deviation, in input units, of the noise along the normals that the points were moved
-            back by; 0 if they were left where they are.
+        smoothed_noise: thickness, in input units, of the layer that the points were moved together from, along the
+            normals (see `noise_level`); 0 if they were left where they are.
+        noise_deviation: standard deviation, in input units, of that noise (see `noise_deviation`).
+        reestimated_normals: normals of the file that were worse than planes through the points, and were replaced.
     """
 
     read: int
@@ -61,6 +64,8 @@ class CleaningReport:
     pieces: int
     smoothed_noise: float = 0.0
     oriented_by: Literal["winding", "propagation", "sensor"] | None = None
+    noise_deviation: float = 0.0
+    reestimated_normals: int = 0
 
     def summary(self) -> str:
         """One line for people."""
@@ -85,11 +90,17 @@ class CleaningReport:
         dropped = ", ".join(f"{count:,} {what}" for what, count in counts.items() if count)
         if self.repaired_normals:
             parts.append(f"{self.repaired_normals:,} normals repaired")
+        if self.reestimated_normals:
+            parts.append(
+                f"{self.reestimated_normals:,} normals disagreed with the points and were estimated again "
+                "(--normals file keeps them)"
+            )
         if self.turned_normals:
             parts.append(f"{self.turned_normals:,} normals turned round (--no-turn-normals keeps them)")
         if self.smoothed_noise:
             parts.append(
-                f"noise of about {self.smoothed_noise:.2g} along the normals smoothed (--no-smooth-noise keeps it)"
+                f"noise of about {self.noise_deviation or self.smoothed_noise:.2g} along the normals smoothed "
+                "(--no-smooth-noise keeps it)"
             )
         return "; ".join([*parts, *([f"dropped {dropped}"] if dropped else [])])
 
@@ -152,7 +163,8 @@ def prepare_cloud(
             round; with ``normals="file"`` none is.
         smooth_noise: whether points are moved along their normals to where their neighbours agree, if the noise is
             wide enough for that to be told (see :mod:`.noise`); estimated normals are then fitted once more to the
-            moved points (see :mod:`.reestimate`).
+            moved points (see :mod:`.reestimate`). With ``normals="auto"`` those of a file are judged by the points
+            first, and replaced, with their sign, where they are worse than what the points say (see :mod:`.judging`).
 
     Raises:
         InputError: too few points are left, or ``normals="file"`` and there are none.
@@ -184,9 +196,11 @@ def prepare_cloud(
         unit, kept = unit[decided], distinct[decided]
         _check_enough(len(kept), cloud, "have a usable normal; use --normals estimate")
     dropped_normals = len(distinct) - len(kept)
-    places, noise = cloud.points[kept], 0.0
+    places, noise, deviation, reestimated = cloud.points[kept], 0.0, 0.0, 0
+    if unit is not None and normals == "auto" and smooth_noise and cloud.normals_source == "file":
+        unit, reestimated = _agreeing(places, unit)
     if unit is not None and smooth_noise:  # before the rest: noise mixes up the sides of thin parts
-        places, noise = _smoothed(places, unit, flips=turn_normals and normals == "auto")
+        places, noise, deviation = _smoothed(places, unit, flips=turn_normals and normals == "auto")
     found = inspect_points(
         places,
         unit,
@@ -210,7 +224,9 @@ def prepare_cloud(
         source = "estimated"
         unit, pieces, oriented_by = _estimate(points, neighbors, similarity, sensor_origin)
         if smooth_noise:
-            points, unit, noise = denoise(points, unit)
+            noisy = points
+            points, unit, noise = denoise(noisy, unit)
+            deviation = noise_deviation(noisy, unit) * similarity.scale if noise else 0.0
             noise *= similarity.scale
     report = CleaningReport(
         read=len(cloud),
@@ -227,6 +243,8 @@ def prepare_cloud(
         pieces=pieces,
         smoothed_noise=noise,
         oriented_by=oriented_by,
+        noise_deviation=deviation,
+        reestimated_normals=reestimated,
     )
     colors = None if cloud.colors is None else cloud.colors[kept]
     return OrientedCloud(points.astype(np.float32), unit.astype(np.float32), colors, similarity, report)
@@ -239,18 +257,40 @@ def _check_enough(count: int, cloud: PointCloud, why: str) -> None:
         )
 
 
-def _smoothed(points: Float64, normals: Float64, *, flips: bool = False) -> tuple[Float64, float]:
-    """Points without the noise along their normals, and its standard deviation.
+def _agreeing(points: Float64, normals: Float64) -> tuple[Float64, int]:
+    """Normals of a file, those that are worse than planes through the points replaced, and how many were.
+
+    Where the points are noisy as well, planes are fitted in turns with smoothing, as for normals that are estimated,
+    and replace all.
+    """
+    centred = points - points.mean(axis=0)
+    level = layer_level(centred, normals)
+    worse = worse_normals(centred, normals, level)
+    if not worse.any():
+        return normals, 0
+    guides = neighborly(centred, normals)
+    if level:
+        return denoise(centred, guides)[1], len(normals)
+    fitted = refit_normals(centred, guides, 0.0, neighbors=16)
+    return np.where(worse[:, None], fitted, normals), int(worse.sum())
+
+
+def _smoothed(points: Float64, normals: Float64, *, flips: bool = False) -> tuple[Float64, float, float]:
+    """Points without the noise along their normals, how thick their layer was, and its standard deviation.
 
     Where ``flips`` may be among the normals of a thin part, one side passes for noise about the other: what is no noise
     once they are turned round is none.
     """
     middle = points.mean(axis=0)
-    level = noise_level(points - middle, normals)
+    level, sound = noise_level(points - middle, normals), normals
     if level and flips:
         flipped = inspect_points(points, normals, outliers=False).flipped
-        level = noise_level(points - middle, np.where(flipped[:, None], -normals, normals))
-    return (smooth_along_normals(points - middle, normals, level) + middle if level else points), level
+        sound = np.where(flipped[:, None], -normals, normals)
+        level = noise_level(points - middle, sound)
+    if not level:
+        return points, 0.0, 0.0
+    deviation = noise_deviation(points - middle, sound)
+    return smooth_along_normals(points - middle, normals, level) + middle, level, deviation
 
 
 def _repair(

@@ -19,6 +19,7 @@ from .noise import noise_level, smooth_along_normals
 __all__ = ["denoise", "refit_normals"]
 
 Float64 = NDArray[np.float64]
+Rows = NDArray[np.integer]
 
 BLOCK = 1 << 13  # points fitted at once, to bound memory
 NEIGHBORS = 64
@@ -50,7 +51,15 @@ def denoise(points: Float64, normals: Float64, *, rounds: int = ROUNDS) -> tuple
     return moved, refit_normals(moved, normals, reach), level
 
 
-def refit_normals(points: Float64, normals: Float64, reach: float, *, neighbors: int = NEIGHBORS) -> Float64:
+def refit_normals(
+    points: Float64,
+    normals: Float64,
+    reach: float,
+    *,
+    neighbors: int = NEIGHBORS,
+    rows: Rows | None = None,
+    among: Rows | None = None,
+) -> Float64:
     """Normals of planes through neighbours with like normals.
 
     Weights are ``(1 − d²/r²)² max(0, (c − c₀)/(1 − c₀))²``, d being the distance, c the cosine between the normals, r
@@ -62,21 +71,30 @@ def refit_normals(points: Float64, normals: Float64, reach: float, *, neighbors:
         normals: ``(N, 3)`` unit normals, whose signs the new ones keep.
         reach: in the units of the points.
         neighbors: nearest points that are asked.
+        rows: ``(m,)`` points whose normals are wanted; None for all.
+        among: ``(n,)`` points that planes are fitted to; None for all. A point without a like one keeps its normal.
+
+    Returns:
+        ``(m, 3)`` unit normals.
     """
-    count = min(neighbors, len(points))
-    tree, fitted = KDTree(points), np.empty_like(normals)
-    for rows in np.array_split(np.arange(len(points)), -(-len(points) // BLOCK)):
-        found = tree.query(points[rows], k=count, workers=-1)
-        distance, near = np.asarray(found[0]), np.asarray(found[1])
+    asked = np.arange(len(points)) if rows is None else rows
+    others = np.arange(len(points)) if among is None else among
+    count = min(neighbors, len(others))
+    tree, fitted = KDTree(points[others]), np.empty((len(asked), 3))
+    for part in np.array_split(np.arange(len(asked)), -(-len(asked) // BLOCK)):
+        here = asked[part]
+        found = tree.query(points[here], k=count, workers=-1)
+        distance, near = np.asarray(found[0]), others[np.asarray(found[1])]
         radius = np.clip(reach, distance[:, min(16, count - 1)], distance[:, -1] * 1.001)[:, None]
-        cosine = np.einsum("md,mkd->mk", normals[rows], normals[near])
+        cosine = np.einsum("md,mkd->mk", normals[here], normals[near])
         alike = ((cosine - ALIKE) / (1 - ALIKE)).clip(min=0)
         weight = (1 - (distance / radius) ** 2).clip(min=0) ** 2 * alike**2
-        offset = points[near] - points[rows][:, None]
+        offset = points[near] - points[here][:, None]
         total = weight.sum(axis=1)[:, None]
-        offset -= (np.einsum("mk,mkd->md", weight, offset) / total)[:, None]
+        offset -= (np.einsum("mk,mkd->md", weight, offset) / np.maximum(total, 1e-300))[:, None]
         weighted = offset * weight[:, :, None]
         normal = np.linalg.eigh(weighted.transpose(0, 2, 1) @ offset)[1][:, :, 0]
-        turned = np.einsum("md,md->m", normal, normals[rows]) < 0
-        fitted[rows] = np.where(turned[:, None], -normal, normal)
+        turned = np.einsum("md,md->m", normal, normals[here]) < 0
+        normal = np.where(turned[:, None], -normal, normal)
+        fitted[part] = np.where(total > 0, normal, normals[here])
     return fitted

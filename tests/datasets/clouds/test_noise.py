@@ -5,7 +5,7 @@ import pytest
 import torch
 from bounds import unit_roundoff
 from mplicits.datasets import PointCloud, add_noise, add_outliers, prepare_cloud, sample_sphere, sample_surface
-from mplicits.datasets.clouds.noise import noise_level, smooth_along_normals
+from mplicits.datasets.clouds.noise import noise_deviation, noise_level, smooth_along_normals
 from mplicits.neural_fields import Box, Torus
 from mplicits.pipelines.fit.cloud import CloudDistance
 from mplicits.pipelines.fit.train import FitConfig, fit
@@ -53,6 +53,42 @@ def test_the_level_is_measured(count, amplitude):
     points, normals = sphere(count)
     noisy = points + RNG.uniform(-amplitude, amplitude, (count, 1)) * normals
     assert noise_level(noisy, normals) == pytest.approx(amplitude / np.sqrt(3), rel=0.2)
+
+
+def along_normals(points: np.ndarray, normals: np.ndarray, sigma: float) -> np.ndarray:
+    return RNG.normal(0, sigma, (len(points), 1)) * normals
+
+
+def in_all_directions(points: np.ndarray, normals: np.ndarray, sigma: float) -> np.ndarray:
+    return RNG.normal(0, sigma, points.shape)
+
+
+def along_rays(points: np.ndarray, normals: np.ndarray, sigma: float) -> np.ndarray:
+    """From a sensor so far away that rays are parallel, as strong along the normals everywhere."""
+    ray = np.array([1.0, 0.0, 0.0])
+    return RNG.normal(0, sigma, (len(points), 1)) / np.abs(normals @ ray)[:, None] * ray
+
+
+@pytest.mark.parametrize("noise", [along_normals, in_all_directions, along_rays])
+@pytest.mark.parametrize(("count", "sigma"), [(8000, 0.0115), (60000, 0.03)])
+def test_the_deviation_is_that_along_the_normals_whatever_the_direction(noise, count, sigma):
+    """Neighbourhoods of 16 are at most 8 σ in radius: wider ones, halved once less, would have been thin enough.
+
+    At least area/(π 64 σ²) of them are independent. Each variance is off by √(2/15), their median's standard error is
+    1.25 of the mean's, and the deviation is off by half of that.
+    """
+    points, normals = sphere(count)
+    seen = normals[:, 0] > 0.5 if noise is along_rays else np.ones(count, bool)  # rays that graze move too far
+    points, normals = points[seen], normals[seen]
+    area = 4 * np.pi * 0.7**2 * (0.25 if noise is along_rays else 1.0)
+    error = 0.5 * 1.25 * np.sqrt(2 / 15) / np.sqrt(area / (64 * np.pi * sigma**2))
+    found = noise_deviation(points + noise(points, normals, sigma), normals)
+    assert abs(found / sigma - 1) < 4 * error
+
+
+def test_the_deviation_of_what_is_thin_is_zero():
+    assert noise_deviation(*sphere(3000)) == 0
+    assert noise_deviation(*plate(4000, thickness=0.005)) == 0
 
 
 @pytest.mark.parametrize(("count", "gain"), [(8000, 5), (60000, 7)])

@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 from mplicits.datasets import PointCloud, prepare_cloud, sample_sphere, sample_surface
-from mplicits.datasets.clouds.winding import layer_thickness, misfit, orient_by_winding, winding_normals
+from mplicits.datasets.clouds.winding import SIZES, layer_thickness, misfit, orient_by_winding, winding_normals
 from mplicits.neural_fields import Box
+from scipy.optimize import brentq
 from scipy.spatial import KDTree
+from scipy.stats import norm
 
 RNG = np.random.default_rng(0)
 
@@ -49,11 +51,45 @@ def test_misfit_of_shapes_where_it_is_known():
     )  # a plane sees nothing of itself
 
 
+def expected_thickness(density: float, sigma: float, *, flat: float = 0.25) -> tuple[float, int]:
+    """What `layer_thickness` should find of a plane under Gaussian noise, and of how many neighbours.
+
+    The k nearest of a point at the height e fill a ball of radius R, in which ``density`` φ(z) π (R² − (z − e)²) points
+    lie at the height z: that, summed up, is k, and its second moment about its mean the variance that they have. The
+    plane through them takes 3 of k degrees of freedom. What is left out are terms of the order 1/k.
+    """
+    z = np.linspace(-5, 5, 2001) * sigma
+    share = np.exp(-((z / sigma) ** 2) / 2) / np.exp(-((z / sigma) ** 2) / 2).sum()
+    levels = norm.ppf((np.arange(100) + 0.5) / 100) * sigma  # of the points in the middle
+    for size in SIZES:
+        spreads, radii = [], []
+        for level in levels:
+
+            def beyond(radius: float, level: float = level, size: int = size) -> float:
+                return density * (share * np.pi * (radius**2 - (z - level) ** 2).clip(min=0)).sum() - size
+
+            radius = float(brentq(beyond, 1e-3 * sigma, 100 * sigma))  # pyright: ignore[reportArgumentType]
+            weight = density * share * np.pi * (radius**2 - (z - level) ** 2).clip(min=0) / size
+            variance = (weight * z**2).sum() - (weight * z).sum() ** 2
+            spreads.append(np.sqrt(variance * (1 - 3 / size)))
+            radii.append(radius)
+        if np.median(np.array(spreads) / radii) < flat:
+            return float(np.median(spreads)), size
+    raise AssertionError("no neighbourhood looks flat")
+
+
 def test_thickness_is_the_noise_where_neighbourhoods_are_wide_enough():
-    sphere = sample_sphere(20000)
+    """Balls cut the outskirts of the layer off; how much is known.
+
+    Terms of the order 1/k are left out, and the median of the variances of N/k neighbourhoods, each with the relative
+    deviation √(2/k), has the standard error 1.25 √(2/N); the thickness, half of it.
+    """
+    sphere, sigma, count = sample_sphere(20000, seed=1), 0.015, 20000  # 64 neighbours: others are far from flat
     assert layer_thickness(sphere.points) < 1e-3
-    # Less than all of it: neighbourhoods four deviations in radius are balls, which cut the layer's outskirts off.
-    assert 0.006 < layer_thickness(sphere.points + RNG.normal(0, 0.01, (20000, 3))) < 0.0105
+    expected, size = expected_thickness(count / np.pi, sigma)
+    found = layer_thickness(sphere.points + np.random.default_rng(2).normal(0, sigma, (count, 3)))
+    assert abs(found / expected - 1) < 1 / size + 5 * 0.5 * 1.25 * np.sqrt(2 / count)
+    assert expected < sigma
 
 
 @pytest.mark.parametrize("shape", [blade, legs])
