@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 import torch
@@ -24,6 +24,7 @@ from .cloud import CloudDistance
 
 __all__ = [
     "Band",
+    "Remote",
     "Rows",
     "Samples",
     "Source",
@@ -37,6 +38,7 @@ __all__ = [
     "first_sources",
     "free_lengths",
     "offset_samples",
+    "remote_samples",
     "surface_samples",
     "usual_turn",
     "with_previous",
@@ -165,7 +167,7 @@ def banded_sources(
     name: str = "cloud",
     watch: Callable[[int], None] | None = None,
 ) -> list[Source]:
-    """A residual level's: the cloud, its offsets and dithered points, inside the band (Sec. 3.2); and empty places.
+    """A residual level's: the cloud, its offsets and dithered points, inside the band (Sec. 3.2); and remote places.
 
     Args:
         index: the cloud.
@@ -201,9 +203,10 @@ def banded_sources(
     sources = [Source(kind, samples, third, *terms, turn) for kind, samples in kept.items()]
     # Of its own generator: a cloud without such places is fitted as if nobody had looked for them.
     own = torch.Generator().manual_seed(generator.initial_seed() + 1)
-    empty = empty_samples(index, previous, delta, config.samples, generator=own, device=device, watch=watch)
-    if len(empty) >= FEWEST:
-        sources.append(Source("empty", empty, third // 4, terms[0], 0.0, 0.0))
+    remote = remote_samples(index, previous, delta, config.samples, generator=own, device=device, watch=watch)
+    for kind, samples in remote._asdict().items():
+        if len(samples) >= FEWEST:
+            sources.append(Source(kind, samples, third // 4, terms[0], 0.0, 0.0))
     return sources
 
 
@@ -296,7 +299,18 @@ def distance_samples(cloud: CloudDistance, count: int, *, generator: torch.Gener
     return Samples(points, distance=cloud.signed(points))
 
 
-@torch.no_grad()
+class Remote(NamedTuple):
+    """Places of a band that are far from every point of the cloud; see `remote_samples`.
+
+    Attributes:
+        empty: those that are surely in- or outside, with the distance to the nearest point, up to ±2δ.
+        unseen: the others, with the value that the levels before have there.
+    """
+
+    empty: Samples
+    unseen: Samples
+
+
 def empty_samples(
     cloud: CloudDistance,
     field: Field,
@@ -307,18 +321,34 @@ def empty_samples(
     device: torch.device,
     watch: Callable[[int], None] | None = None,
 ) -> Samples:
-    """Points of the band around ``field`` that are far from every point of the cloud, and surely in- or outside.
+    """The empty places of `remote_samples`; often none."""
+    return remote_samples(cloud, field, delta, count, generator=generator, device=device, watch=watch).empty
+
+
+@torch.no_grad()
+def remote_samples(
+    cloud: CloudDistance,
+    field: Field,
+    delta: float,
+    count: int,
+    *,
+    generator: torch.Generator,
+    device: torch.device,
+    watch: Callable[[int], None] | None = None,
+) -> Remote:
+    """Points of the band around ``field`` that are far from every point of the cloud.
 
     What a coarse level makes of a thin part may be a sheet of surface beside it, through places where it is wrong by
-    more than δ. They get the distance to the nearest point, up to ±2δ, which takes them out of the next level's band.
-    Where the winding number is in doubt, in the holes of a scan, there are none: there a surface may well be far from
-    all points.
+    more than δ: they are empty, for the winding number says that they are surely in- or outside. They get the distance
+    to the nearest point, up to ±2δ, which takes them out of the next level's band. Where the winding number is in
+    doubt, in the holes of a scan, a surface may well be far from all points. Nothing has been seen of it, and a finer
+    level has nothing to add to the coarse one's guess: it shall leave the value that is there.
 
     Args:
         cloud: the points.
         field: the frozen levels.
         delta: half-width of the band around the finest.
-        count: how many points are tried, spread as for level 0.
+        count: how many points are tried, spread as for level 0; as many again around unseen ones, if there are some.
         generator: draws them.
         device: where the field is.
         watch: see `banded_sources`.
@@ -326,18 +356,28 @@ def empty_samples(
     Returns:
         Samples with distances, values and gradients, on ``device``; often none.
     """
-    tried = with_previous(Samples(_spread(cloud, count, generator)), field, delta, device=device, watch=watch)
-    points = tried.points.cpu().numpy()
-    assert tried.value is not None
-    distance = cloud.nearest(points)
-    # Between its points a surface is about a spacing away from them.
-    far = np.flatnonzero(distance - tried.value.abs().cpu().numpy() > max(delta, 4 * cloud.gap))
-    depth = cloud.winding_number(points[far], cell=cloud.cell / 2) - 0.5
-    sure = np.abs(depth) > SURE
-    found = tried.take(torch.from_numpy(far[sure]).to(device))
-    length = np.minimum(distance[far[sure]], 2 * delta)
-    signed = np.where(depth[sure] > 0, -length, length).astype(np.float32)
-    return replace(found, distance=torch.from_numpy(signed).to(device))
+
+    def found(tried: Tensor) -> Remote:
+        samples = with_previous(Samples(tried), field, delta, device=device, watch=watch)
+        points = samples.points.cpu().numpy()
+        assert samples.value is not None
+        distance = cloud.nearest(points)
+        # Between its points a surface is about a spacing away from them.
+        far = np.flatnonzero(distance - samples.value.abs().cpu().numpy() > max(delta, 4 * cloud.gap))
+        depth = cloud.winding_number(points[far], cell=cloud.cell / 2) - 0.5
+        sure = np.abs(depth) > SURE
+        empty, unseen = (samples.take(torch.from_numpy(far[some]).to(device)) for some in (sure, ~sure))
+        length = np.minimum(distance[far[sure]], 2 * delta)
+        signed = np.where(depth[sure] > 0, -length, length).astype(np.float32)
+        empty = replace(empty, distance=torch.from_numpy(signed).to(device))
+        return Remote(empty, replace(unseen, distance=unseen.value))
+
+    remote = found(_spread(cloud, count, generator))
+    if len(remote.unseen) < FEWEST:
+        return remote
+    seeds = remote.unseen.points.cpu()[torch.randint(len(remote.unseen), (count,), generator=generator)]
+    beside = seeds + (2 * torch.rand(count, 3, generator=generator) - 1) * 2 * delta
+    return Remote(remote.empty, found(beside.clamp(-DOMAIN, DOMAIN)).unseen)
 
 
 def _spread(cloud: CloudDistance, count: int, generator: torch.Generator) -> Tensor:

@@ -16,6 +16,7 @@ from mplicits.pipelines.fit.samples import (
     empty_samples,
     free_lengths,
     offset_samples,
+    remote_samples,
     usual_turn,
     with_previous,
 )
@@ -214,10 +215,48 @@ def test_empty_places_are_where_a_level_invents_a_surface(cloud: CloudDistance) 
     assert (exact - found.value.abs() > 0.045).all()
 
 
-def test_a_hole_of_a_scan_is_no_empty_place() -> None:
+def with_hole() -> CloudDistance:
+    """A sphere whose cap above z = 0.8 of its radius was not scanned."""
     points, normals = sphere_points(20_000)
     seen = normals[:, 2] < 0.8
-    assert len(empty(CloudDistance(points[seen], normals[seen]), Sphere(radius=RADIUS))) == 0
+    return CloudDistance(points[seen], normals[seen])
+
+
+def test_a_hole_of_a_scan_is_no_empty_place() -> None:
+    assert len(empty(with_hole(), Sphere(radius=RADIUS))) == 0
+
+
+def test_a_level_is_to_keep_what_nobody_has_seen(cloud: CloudDistance) -> None:
+    """In the hole, and only there, more than δ from its rim, with the value of the level before."""
+    level, delta = Sphere(radius=RADIUS - 0.01), 0.05
+    found = remote_samples(with_hole(), level, delta, 40_000, generator=generator(), device=CPU).unseen
+    assert len(found) > 1000
+    assert found.distance is not None
+    assert torch.equal(found.distance, level.value(found.points))
+    up = found.points[:, 2] / found.points.norm(dim=1)
+    rim = np.cos(np.arccos(0.8) - np.arcsin(delta / (RADIUS + delta)))  # δ away from it, outside at the most
+    assert (up > rim - 0.01).all()
+    assert up.max() > 0.999
+    whole = remote_samples(cloud, level, delta, 40_000, generator=generator(), device=CPU)
+    assert len(whole.unseen) == len(whole.empty) == 0
+
+
+def test_the_next_level_leaves_the_closing_of_a_hole_as_it_is() -> None:
+    config = FitConfig(
+        widths=(8, 48), depths=(1, 1), omegas=(30.0, 40.0), steps=(1, 100), learning_rates=(1e-3, 2e-3), batch=1500
+    )
+    cloud, delta = with_hole(), 0.05
+    previous = MultiscaleSDF(Sphere(radius=RADIUS + 0.02), [], [])  # wrong by 0.02 where there are points
+    sources = banded_sources(cloud, previous, delta, config, generator=generator())
+    assert [source.name for source in sources] == ["surface", "offset", "band", "unseen"]
+    torch.manual_seed(0)
+    field = previous.with_level(train_level(1, sources, config, generator=generator()), delta=delta)
+    cap = torch.nn.functional.normalize(
+        torch.randn(500, 3, generator=generator()) * torch.tensor([0.1, 0.1, 0.0]), dim=1
+    )
+    cap = torch.nn.functional.normalize(torch.tensor([0.0, 0.0, 1.0]) + 0.2 * torch.rand(500, 1) * cap, dim=1)
+    assert (field.value(cap * (RADIUS + 0.02))).abs().max() < 0.005
+    assert field.value(torch.from_numpy(cloud.points)).abs().mean() < 0.005
 
 
 def test_the_next_level_takes_an_invented_surface_away(cloud: CloudDistance) -> None:
