@@ -167,6 +167,8 @@ class SrbRow:
         floor: ``chamfer`` between two samplings of the truth.
         scan_chamfer: mean distance from the scan's points to the mesh, raw.
         scan_hausdorff: the largest of those.
+        scan_error: mean distance from the scan's points to the truth, raw: noise, and how far the scan as a whole is
+            beside the truth, which no method can know.
         normalised: sum of the two mean distances, of 100,000 samples in the truth's unit sphere.
         normalised_hausdorff: the largest distance there.
         normalised_floor: ``normalised`` between two samplings of the truth.
@@ -185,6 +187,7 @@ class SrbRow:
     floor: float
     scan_chamfer: float | None
     scan_hausdorff: float | None
+    scan_error: float
     normalised: float | None
     normalised_hausdorff: float | None
     normalised_floor: float
@@ -300,6 +303,7 @@ class SrbBench(Benchmark[SrbRow]):
             (Column("floor", ".3f"), lambda row: row.floor),
             (Column("scan → mesh", ".3f"), lambda row: row.scan_chamfer),
             (Column("largest", ".2f"), lambda row: row.scan_hausdorff),
+            (Column("scan → truth", ".3f"), lambda row: row.scan_error),
             (Column("normalised", ".4f"), lambda row: row.normalised),
             (Column("largest, normalised", ".4f"), lambda row: row.normalised_hausdorff),
             (Column("floor, normalised", ".4f"), lambda row: row.normalised_floor),
@@ -349,6 +353,7 @@ class _Judge:
         self.points, self.few = self._drawn(truth, 0)
         again, few = self._drawn(truth, 1)
         self.floor = distances(again, self.points).half_sum
+        self.scan_error = float(KDTree(self.points, balanced_tree=False).query(self.scan, workers=-1)[0].mean())
         apart = distances(few, self.few)
         self.normalised_floor = apart.there + apart.back
         self.near: tuple[Float64, Float64] | None = None
@@ -367,7 +372,7 @@ class _Judge:
         """All that `SrbRow` says of a mesh in the scan's coordinates."""
         names = ("chamfer", "hausdorff", "scan_chamfer", "scan_hausdorff", "normalised", "normalised_hausdorff")
         found: dict[str, Any] = dict.fromkeys((*names, "parts", "closed"))
-        found |= {"floor": self.floor, "normalised_floor": self.normalised_floor}
+        found |= {"floor": self.floor, "normalised_floor": self.normalised_floor, "scan_error": self.scan_error}
         if mesh is None:
             return found
         points, few = self._drawn(mesh, 1)

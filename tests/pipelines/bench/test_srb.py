@@ -104,6 +104,7 @@ def test_rows_in_both_units(folder: Path, tmp_path: Path, monkeypatch: pytest.Mo
         assert 0.9 * row.floor < row.chamfer < row.floor + 0.02 * truth_radius
         assert row.chamfer <= row.hausdorff  # type: ignore[operator]
         assert row.scan_chamfer < row.floor + 0.02 * truth_radius
+        assert row.scan_error == pytest.approx(row.floor, rel=0.05)  # its points are on the sphere
         # Means of nearest distances fall as 1 / √samples: 5,000 in the unit sphere against 20,000 in raw units.
         assert row.normalised_floor == pytest.approx(2 * row.floor / truth_radius * 2, rel=0.05)
         assert row.sdf_error < 0.02
