@@ -205,7 +205,7 @@ def fit_config(preset: Preset) -> FitConfig:
 
     Trained as the paper and its peers are: on all points of the cloud, and on no others.
     """
-    alike = {"between": False, "hold_out": 0.0, "robust_normals": False}
+    alike = {"between": False, "hold_out": 0.0}
     if preset == "smoke":
         return FitConfig(
             widths=(32, 32, 32),

@@ -42,7 +42,7 @@ class FitConfig(Settings):
         300.0, "weight of 1 - cos(grad f, N) where the normal N is known (Eq. 4)", at_least=0
     )
     robust_normals: bool = setting(
-        True,
+        False,
         "residual levels of sparse clouds: angles far above the usual one count as they are, not squared, so that "
         "sharp edges do not outweigh faces",
     )
