@@ -5,6 +5,7 @@ import importlib
 import pkgutil
 import re
 import shlex
+from importlib.util import find_spec
 from pathlib import Path
 
 import mplicits.datasets
@@ -16,10 +17,12 @@ from mplicits.pipelines.cli.commands import COMMANDS
 
 ROOT = Path(__file__).parent.parent
 DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+PLUGIN = "mplicits.pipelines.nerfstudio."  # whose modules, but for the export, load where nerfstudio is installed only
 MODULES = [
     module.name
     for package in (mplicits.neural_fields, mplicits.datasets, mplicits.pipelines)
     for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}.")
+    if find_spec("nerfstudio") or not module.name.startswith(PLUGIN) or module.name == f"{PLUGIN}export"
 ]
 
 
