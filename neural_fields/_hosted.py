@@ -19,7 +19,7 @@ from .rates import HOST_RATE, parameter_groups, share_rate
 from .similarity import Similarity
 from .world import WorldField
 
-__all__ = ["Box", "Hosted", "as_bounds", "cube", "joined", "mark"]
+__all__ = ["Box", "Hosted", "as_bounds", "joined", "mark"]
 
 # The corners of a box, lowest and highest: a tensor or an array ``(2, 3)``, or two triples.
 Box = Tensor | Sequence[Sequence[float]]
@@ -30,20 +30,26 @@ class Hosted(nn.Module):
 
     Args:
         field: signed distance, negative inside.
-        scale: s; None for the one with which the farthest corner of the box lies on the field's unit sphere.
-        bounds: lowest and highest corner of what the host samples and meshes, in its own units.
+        scale: s; None for 1, or with ``bounds`` for what brings their farthest corner onto the field's unit sphere.
+        bounds: lowest and highest corner of what the host samples and meshes, in its own units ``(2, 3)``; None for
+            the box from −half to half on each axis.
+        half: of that box, in the host's units.
         learning_rate: see `share_rate`; None leaves the parameters in their own units.
 
     Raises:
         ValueError: a number is not positive, or the bounds are none.
     """
 
-    def __init__(self, field: FieldLike, *, scale: float | None, bounds: Bounds, learning_rate: float | None) -> None:
+    def __init__(
+        self, field: FieldLike, *, scale: float | None, bounds: Box | None, half: float, learning_rate: float | None
+    ) -> None:
         super().__init__()
+        box = _cube(half) if bounds is None else as_bounds(bounds)
         if scale is None:
-            scale = 1 / math.hypot(*(max(abs(low), abs(high)) for low, high in zip(*bounds, strict=True)))
+            corner = (max(abs(low), abs(high)) for low, high in zip(*box, strict=True))
+            scale = 1.0 if bounds is None else 1 / math.hypot(*corner)
         positive(scale=scale)
-        self.field, self.scale, self.bounds = as_field(field), float(scale), bounds
+        self.field, self.scale, self.bounds = as_field(field), float(scale), box
         if learning_rate is not None:
             share_rate(self.field, learning_rate)
 
@@ -130,7 +136,7 @@ def as_bounds(box: Box) -> Bounds:
     return (low[0], low[1], low[2]), (high[0], high[1], high[2])
 
 
-def cube(half: float) -> Bounds:
+def _cube(half: float) -> Bounds:
     """The box from −half to half on each axis."""
     return (-half, -half, -half), (half, half, half)
 

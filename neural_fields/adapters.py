@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from ._checks import positive
-from ._hosted import Box, Hosted, as_bounds, cube, joined, mark
+from ._hosted import Box, Hosted, joined, mark
 from ._point_memo import PointMemo
 from .function import FieldLike
 from .rates import HOST_RATE
@@ -56,10 +56,7 @@ class NeuSGeometry(Hosted):
         bounds: Box | None = None,
         learning_rate: float | None = None,
     ) -> None:
-        if bounds is None:
-            scale = 1.0 if scale is None else scale
-        box = cube(1.01) if bounds is None else as_bounds(bounds)
-        super().__init__(field, scale=scale, bounds=box, learning_rate=learning_rate)
+        super().__init__(field, scale=scale, bounds=bounds, half=1.01, learning_rate=learning_rate)
         self._memo = PointMemo()
 
     def forward(self, x: Tensor) -> Tensor:
@@ -120,7 +117,7 @@ class InstantNSRGeometry(Hosted):
     ) -> None:
         positive(radius=radius)
         scale = 1 / radius if scale is None else scale
-        super().__init__(field, scale=scale, bounds=cube(radius), learning_rate=learning_rate)
+        super().__init__(field, scale=scale, bounds=None, half=radius, learning_rate=learning_rate)
         self.radius, self.resolution = float(radius), resolution
 
     def forward(
@@ -230,10 +227,7 @@ class NerfstudioField(Hosted):
         deviation: float = 0.3,
         learning_rate: float | None = None,
     ) -> None:
-        if bounds is None:
-            scale = 1.0 if scale is None else scale
-        box = cube(1.0) if bounds is None else as_bounds(bounds)
-        super().__init__(field, scale=scale, bounds=box, learning_rate=learning_rate)
+        super().__init__(field, scale=scale, bounds=bounds, half=1.0, learning_rate=learning_rate)
         self.color, self.heads = color, heads
         self.deviation_network = Deviation(deviation)
         self.cos_anneal_ratio = 1.0
