@@ -15,6 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from ..depth.cleaning import both_sides
+
 __all__ = ["STEEPEST", "ScanFaults", "depth_jumps", "kept_unevenly", "quantised", "rigid_motion", "smeared"]
 
 Float64 = NDArray[np.float64]
@@ -102,10 +104,8 @@ def smeared(ranges: Float64, rays: Float64, share: float, random: np.random.Gene
     step, size = np.zeros_like(ranges), np.zeros_like(ranges)
     for axis in (0, 1):
         change = np.where(depth_jumps(ranges, rays, axis), np.diff(ranges, axis=axis), 0.0)
-        for side in (0, 1):  # the neighbour after a pixel, and the one before it
-            pad = [(0, 0), (0, 0)]
-            pad[axis] = (side, 1 - side)
-            towards = np.pad(change if side == 0 else -change, pad)
+        after, before = both_sides(change, axis)
+        for towards in (after, -before):
             larger = np.abs(towards) > size
             step, size = np.where(larger, towards, step), np.where(larger, np.abs(towards), size)
     chosen, way = random.uniform(size=(2, *ranges.shape))
