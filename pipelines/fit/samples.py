@@ -34,7 +34,6 @@ __all__ = [
     "banded_sources",
     "delta_of",
     "distance_samples",
-    "empty_samples",
     "first_sources",
     "free_lengths",
     "offset_samples",
@@ -309,20 +308,6 @@ class Remote(NamedTuple):
 
     empty: Samples
     unseen: Samples
-
-
-def empty_samples(
-    cloud: CloudDistance,
-    field: Field,
-    delta: float,
-    count: int,
-    *,
-    generator: torch.Generator,
-    device: torch.device,
-    watch: Callable[[int], None] | None = None,
-) -> Samples:
-    """The empty places of `remote_samples`; often none."""
-    return remote_samples(cloud, field, delta, count, generator=generator, device=device, watch=watch).empty
 
 
 @torch.no_grad()

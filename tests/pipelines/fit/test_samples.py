@@ -13,7 +13,6 @@ from mplicits.pipelines.fit.samples import (
     banded_sources,
     delta_of,
     distance_samples,
-    empty_samples,
     free_lengths,
     offset_samples,
     remote_samples,
@@ -194,7 +193,7 @@ PHANTOM = Sphere(radius=0.1, center=(0.85, 0.0, 0.0))
 
 
 def empty(cloud: CloudDistance, field: Sphere | Union, delta: float = 0.05) -> Samples:
-    return empty_samples(cloud, field, delta, 40_000, generator=generator(), device=CPU)
+    return remote_samples(cloud, field, delta, 40_000, generator=generator(), device=CPU).empty
 
 
 def test_a_sound_level_has_no_empty_places_in_its_band(cloud: CloudDistance) -> None:
