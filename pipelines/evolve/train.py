@@ -25,6 +25,7 @@ from ..run.trainer import (
     StopFlag,
     Trainer,
     checkpoint_of,
+    load_compiler,
     parameter_count,
     restore_frozen,
     stop_on_signals,
@@ -85,8 +86,6 @@ def evolve(
     """
     started, folder = time.monotonic(), RunFolder(out, resume=resume)
     config = folder.config(EvolveConfig, config)
-    # PyTorch's first optimiser loads its compiler, for two seconds: here, so that no stage's forecast bears them.
-    torch.optim.Adam([torch.zeros(1, requires_grad=True)])
     device, schedule = choose_device(config.device), Schedule.of(progress)
     machine, notes = speed(device), list[str]()
     plan, count, shapes = EvolvePlan(config, machine), len(config.shapes), []
@@ -95,6 +94,7 @@ def evolve(
         schedule(Progress("shapes", index, count, index / count, {}))
         shapes.append(read_shape(text))
     schedule(Progress("shapes", count, count, 1.0, {}))
+    load_compiler()
     if config.time_budget is not None and not resume:  # what is resumed has its settings
         config, notes = within(config, machine, max(config.time_budget - (time.monotonic() - started), 0.0))
     schedule(Progress("known samples", 0, 0, 0.0, {}))

@@ -29,6 +29,7 @@ from ..run.trainer import (
     StopFlag,
     Trainer,
     checkpoint_of,
+    load_compiler,
     parameter_count,
     restore_frozen,
     stop_on_signals,
@@ -133,6 +134,7 @@ def fit(
     timing.has_read(len(raw))
     prepared = prepare(raw, config)
     timing.has_prepared()
+    load_compiler()
     fitting = _Fitting(prepared, raw.source, config, device, folder, timing, merging)
     fitting.level_done = level_done
     with folder.writing(), stop_on_signals() as flag:
@@ -321,8 +323,7 @@ class _Fitting:
             return None
         assert self.frozen is not None
         points, normals = self.points[self.held], self.normals[self.held]
-        weights = {"data": surface.data, "normal": surface.normal, "turn": surface.turn}
-        judge = Judge(points, normals, self.frozen, delta, **weights)
+        judge = Judge(points, normals, self.frozen, delta, data=surface.data, normal=surface.normal, turn=surface.turn)
         return judge if judge.count >= FEWEST / 2 else None
 
     def review(self) -> dict[str, Any]:

@@ -25,7 +25,7 @@ from ..run.folder import TEXTURE_FILE, RunFolder, digest_of
 from ..run.machine import choose_device, environment, speed
 from ..run.schedule import Progress, Report, Schedule, Stage
 from ..run.settings import ReconstructConfig, TextureConfig
-from ..run.trainer import Interrupted, parameter_count, stop_on_signals
+from ..run.trainer import Interrupted, load_compiler, parameter_count, stop_on_signals
 from ..surface.surface import from_mesh, sample_points
 from ..surface.trim import in_region
 from ..texture.train import FittedTexture, fit_texture
@@ -102,6 +102,7 @@ def reconstruct(
     schedule(Progress(reading.name, 0, 0, 0.0, {}))
     images = data if isinstance(data, PosedImages) else read_posed_images(data, width=config.width)
     schedule(Progress(reading.name, 0, 0, 1.0, {}))
+    load_compiler()
     training = _Reconstruction(images, config, device, folder, schedule, machine=machine, started=started)
     with folder.writing(HELD_OUT_FILE):
         if resume:

@@ -28,6 +28,7 @@ __all__ = [
     "StopFlag",
     "Trainer",
     "checkpoint_of",
+    "load_compiler",
     "parameter_count",
     "restore_frozen",
     "seeded",
@@ -83,6 +84,14 @@ def stop_on_signals() -> Iterator[StopFlag]:
     finally:
         for number in signals:
             signal.signal(number, before[number])
+
+
+def load_compiler() -> None:
+    """Load PyTorch's compiler, as its first optimiser does, for two seconds: to be called between two stages.
+
+    Within a stage those seconds would count as slowness of its kind of work, and all forecasts would bear them.
+    """
+    torch.optim.Adam([torch.zeros(1, requires_grad=True)])
 
 
 def parameter_count(*modules: nn.Module) -> int:
