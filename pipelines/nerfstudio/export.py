@@ -13,6 +13,7 @@ import torch
 from numpy.typing import ArrayLike
 
 from ...neural_fields import InputError, Mesh, NerfstudioField, NoSurfaceError
+from ...neural_fields.mesh_files import check_mesh_path
 
 __all__ = ["colored_mesh", "export_mesh", "in_data_coordinates", "main"]
 
@@ -46,12 +47,14 @@ def export_mesh(config: Path, path: Path, resolution: int = 512, *, level: int =
         level: of detail.
 
     Raises:
-        InputError: there is no such training, it is not one of ours, or the file cannot be written.
+        InputError: there is no such training, it is not one of ours, or the file cannot be written, which is found
+            before the training is read.
         NoSurfaceError: there is no surface in the scene box.
         ValueError: there is no such level.
     """
     if not config.is_file():
         raise InputError(f"{config}: no such file; expected the config.yml that ns-train wrote")
+    check_mesh_path(path)
     from nerfstudio.utils.eval_utils import eval_setup  # pyright: ignore[reportMissingImports]
 
     _, pipeline, _, _ = eval_setup(config, test_mode="inference")

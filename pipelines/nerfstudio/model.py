@@ -128,14 +128,20 @@ class _Multiscale:
 
 
 @dataclass
-class MultiscaleModelConfig(NeuSModelConfig):
-    """The NeuS of nerfstudio with our field."""
+class _MultiscaleConfig:
+    """The settings that both models have in place of nerfstudio's; to be mixed in before its own."""
 
-    _target: Type = field(default_factory=lambda: MultiscaleModel)  # noqa: UP006
     sdf_field: MultiscaleFieldConfig = field(default_factory=MultiscaleFieldConfig)
     """Geometry and colours."""
     anneal_end: int = 4000
     """Step from which slopes are taken as they are; NeuS's cosine annealing."""
+
+
+@dataclass
+class MultiscaleModelConfig(_MultiscaleConfig, NeuSModelConfig):
+    """The NeuS of nerfstudio with our field."""
+
+    _target: Type = field(default_factory=lambda: MultiscaleModel)  # noqa: UP006
 
 
 class MultiscaleModel(_Multiscale, NeuSModel):
@@ -143,14 +149,10 @@ class MultiscaleModel(_Multiscale, NeuSModel):
 
 
 @dataclass
-class MultiscaleFactoModelConfig(NeuSFactoModelConfig):
+class MultiscaleFactoModelConfig(_MultiscaleConfig, NeuSFactoModelConfig):
     """The NeuS-facto of nerfstudio, which samples by proposal networks, with our field."""
 
     _target: Type = field(default_factory=lambda: MultiscaleFactoModel)  # noqa: UP006
-    sdf_field: MultiscaleFieldConfig = field(default_factory=MultiscaleFieldConfig)
-    """Geometry and colours."""
-    anneal_end: int = 4000
-    """Step from which slopes are taken as they are; NeuS's cosine annealing."""
 
 
 class MultiscaleFactoModel(_Multiscale, NeuSFactoModel):

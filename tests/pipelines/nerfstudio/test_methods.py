@@ -157,6 +157,8 @@ def test_what_cannot_be_exported(
     config, _ = exported(monkeypatch, tmp_path, nn.Identity())
     with pytest.raises(InputError, match="trained by another method"):
         export_mesh(config, tmp_path / "mesh.ply")
+    with pytest.raises(InputError, match="unknown mesh format"):  # said before the training is read, which is none
+        export_mesh(config, tmp_path / "mesh.png")
     away = NerfstudioField(Sphere(radius=3.0), ViewColor(0, width=8, depth=1), heads=Heads)
     exported(monkeypatch, tmp_path, away)
     words = ["--load-config", str(config), "--output-path", str(tmp_path / "mesh.ply"), "--resolution", "8"]
