@@ -1,8 +1,10 @@
 """Points that a level does not see, and that judge it: how long it trains, and whether it is kept.
 
-Neighbouring points share what a network overfits, so whole voxels are held out. They judge every level but the first
-by its own loss there, Eq. 4 without the eikonal term: where a level follows the noise of the points that it sees, its
-loss falls at those and rises here.
+Neighbouring points share what a network overfits, so whole voxels are held out. While a level but the first trains,
+they judge it by its own loss there, Eq. 4 without the eikonal term: where a level follows the noise of the points that
+it sees, its loss falls at those and rises here. In the end it must have made distances or the angles of normals surely
+less, and neither surely more. A loss of squares would not do for that: it is mostly that of the few points on sharp
+edges, and a level that mends a little there pays for the roughness of all faces with it.
 """
 
 from __future__ import annotations
@@ -17,9 +19,9 @@ from torch import Tensor
 
 from ...neural_fields import Field, Siren
 from ...neural_fields.losses import data_loss, normal_loss, pseudo_huber
-from .samples import Samples, with_previous
+from .samples import SQUARES, Samples, Usual, with_previous
 
-__all__ = ["FEWEST", "LOOKS", "Error", "Judge", "Verdict", "held_out", "surely_less"]
+__all__ = ["FEWEST", "LOOKS", "Error", "Fall", "Judge", "Verdict", "held_out", "standard_errors", "voxels_of"]
 
 FEWEST = 200  # whose mean square is known to a tenth
 MOST = 0.1  # of the points; a cloud that would have to spare more spares none
@@ -43,9 +45,7 @@ def held_out(points: NDArray[np.float32], spacing: float, share: float, *, seed:
     count = max(FEWEST, math.ceil(share * len(points)))
     if not share or count > MOST * len(points) or not spacing > 0:
         return np.zeros(len(points), bool)
-    cells = np.floor(points.astype(np.float64) / (VOXEL * spacing)).astype(np.int64)
-    _, owner = np.unique(cells @ np.array([1 << 42, 1 << 21, 1]), return_inverse=True)
-    owner = owner.reshape(-1)
+    owner = voxels_of(points, spacing)
     order = np.random.default_rng(seed).permutation(int(owner.max()) + 1)
     total = np.cumsum(np.bincount(owner)[order])
     drawn = np.zeros(len(order), bool)
@@ -53,16 +53,56 @@ def held_out(points: NDArray[np.float32], spacing: float, share: float, *, seed:
     return drawn[owner]
 
 
+def voxels_of(points: NDArray[np.float32], spacing: float) -> NDArray[np.int64]:
+    """The voxel of twice ``spacing``'s edge that each of the points ``(N, 3)`` is in → ``(N,)`` numbers from 0 on."""
+    cells = np.floor(points.astype(np.float64) / (VOXEL * spacing)).astype(np.int64)
+    owner = np.unique(cells @ np.array([1 << 42, 1 << 21, 1]), return_inverse=True)[1]
+    return owner.reshape(-1).astype(np.int64)
+
+
+def standard_errors(falls: Tensor, voxels: Tensor) -> float:
+    """The mean of ``falls`` ``(n,)``, counted in its own standard errors: above 2 it is hardly chance.
+
+    Points of one voxel are off together. So what is independent is not the points but the K voxels (cluster-robust
+    standard error, Liang and Zeger, Biometrika 1986): with the mean m and the sum e_v of a voxel's falls − m, it is
+    ``√(K / (K − 1) Σ_v e_v²) / n``.
+
+    Args:
+        falls: what each point has gained.
+        voxels: ``(n,)`` the voxel of each, numbered from 0.
+    """
+    if not len(falls):
+        return 0.0
+    falls = falls.double().cpu()
+    mean = falls.mean()
+    sums = torch.zeros(int(voxels.max()) + 1, dtype=torch.float64).index_add_(0, voxels.cpu(), falls - mean)
+    count = len(voxels.unique())
+    error = float((sums.square().sum() * count / max(count - 1, 1)).sqrt()) / len(falls)
+    return float(mean) / error if error > 0 else math.copysign(math.inf, mean) if mean else 0.0
+
+
 class Error(NamedTuple):
     """How far a field is off at held-out points.
 
     Attributes:
         loss: that of the level that is judged.
-        distance: root mean square of f, in the unit sphere.
-        angle: median angle between gradient and normal, in degrees.
+        distance: mean of |f|, in the unit sphere.
+        angle: mean angle between gradient and normal, in degrees.
     """
 
     loss: float
+    distance: float
+    angle: float
+
+
+class Fall(NamedTuple):
+    """By how many standard errors a level has made the mean errors at held-out points less; below 0 more.
+
+    Attributes:
+        distance: of |f|.
+        angle: of the angle between gradient and normal.
+    """
+
     distance: float
     angle: float
 
@@ -75,17 +115,19 @@ class Verdict(NamedTuple):
         before: the error there without it.
         after: the error with it.
         at: fraction of its schedule after which its weights were kept.
+        fall: how sure the difference is.
     """
 
     points: int
     before: Error
     after: Error
     at: float
+    fall: Fall
 
     @property
     def better(self) -> bool:
-        """Whether the level is worth having."""
-        return self.after.loss < self.before.loss
+        """Whether the level is worth having: one error is surely less, and the other not surely more."""
+        return max(self.fall) > SURELY and min(self.fall) > -SURELY
 
     def words(self, level: int, *, scale: float = 1.0) -> str:
         """One line for people, of the ``level`` with this number; ``scale`` takes distances to input units."""
@@ -95,13 +137,14 @@ class Verdict(NamedTuple):
             judged = "kept"
         else:
             judged = f"kept as it was after {self.at:.0%} of its steps"
-        pairs = zip(self.before, self.after, (1.0, scale, 1.0), strict=True)
-        loss, distance, angle = (f"{b * unit:.3g} → {a * unit:.3g}" for b, a, unit in pairs)
-        errors = f"loss {loss}, rms distance {distance}, median angle {angle}°"
+        (_, *before), (_, *after) = self.before, self.after
+        pairs = zip(before, after, self.fall, (scale, 1.0), strict=True)
+        distance, angle = (f"{b * unit:.3g} → {a * unit:.3g}{{}} ({_sure(fall)})" for b, a, fall, unit in pairs)
+        errors = f"mean distance {distance.format('')}, mean angle of the normals {angle.format('°')}"
         return f"level {level} {judged}: without it → with it, at {self.points:,} points that it has not seen: {errors}"
 
     def record(self, level: int, *, scale: float = 1.0) -> dict[str, Any]:
-        """For ``run.json``: the losses, and the other errors in input units and degrees."""
+        """For ``run.json``: the losses, the other errors in input units and degrees, and how sure their falls are."""
         return {
             "points": self.points,
             "before": self.before.loss,
@@ -109,8 +152,26 @@ class Verdict(NamedTuple):
             "at": self.at,
             "distance": [error.distance * scale for error in (self.before, self.after)],
             "angle": [error.angle for error in (self.before, self.after)],
+            "fall_in_standard_errors": self.fall._asdict(),
             "verdict": self.words(level, scale=scale),
         }
+
+
+def _sure(fall: float) -> str:
+    if abs(fall) <= SURELY:
+        return "no sure difference"
+    return "surely less" if fall > 0 else "surely more"
+
+
+class Each(NamedTuple):
+    """Errors of every held-out point, ``(count,)`` each; their means are an `Error`."""
+
+    loss: Tensor
+    distance: Tensor
+    angle: Tensor
+
+    def mean(self) -> Error:
+        return Error(*(float(error.mean()) for error in self))
 
 
 class Judge:
@@ -121,9 +182,10 @@ class Judge:
         normals: ``(n, 3)`` their normals.
         previous: the frozen levels.
         delta: half-width of the band around the finest of them; points outside it do not count.
+        spacing: of the cloud; see `voxels_of`.
         data: weight of f(x)².
         normal: weight of 1 − cos(∇f, N).
-        turn: the scale of `pseudo_huber` around it.
+        usual: the scales of `pseudo_huber` around them.
     """
 
     def __init__(
@@ -133,46 +195,46 @@ class Judge:
         previous: Field,
         delta: float,
         *,
+        spacing: float,
         data: float,
         normal: float,
-        turn: float = math.inf,
+        usual: Usual = SQUARES,
     ) -> None:
         samples = Samples(points, distance=torch.zeros(len(points)), normal=normals)
         self.samples = with_previous(samples, previous, delta, device=previous.like.device)
-        self.data, self.normal, self.turn, self.count = data, normal, turn, len(self.samples)
+        self.data, self.normal, self.usual, self.count = data, normal, usual, len(self.samples)
+        self.voxels = torch.from_numpy(voxels_of(self.samples.points.cpu().numpy(), spacing))
         assert self.samples.value is not None
         assert self.samples.gradient is not None
-        self.before, _ = self._errors(self.samples.value, self.samples.gradient)
-
-    def error(self, siren: Siren) -> Error:
-        """With the residual ``siren`` added to the levels before; ``before`` is without it."""
-        return self.errors(siren)[0]
+        self.without = self._errors(self.samples.value, self.samples.gradient)
+        self.before = self.without.mean()
 
     @torch.no_grad()
-    def errors(self, siren: Siren) -> tuple[Error, Tensor]:
-        """`error`, and the loss of every point ``(count,)``."""
+    def errors(self, siren: Siren) -> Each:
+        """Those of every point, with the residual ``siren`` added to the levels before; `without` is without it."""
         value, gradient = self.samples.value, self.samples.gradient
         assert value is not None
         assert gradient is not None
         jet = siren.jet(self.samples.points)
         return self._errors(value + jet.value, gradient + jet.gradient)
 
-    def _errors(self, value: Tensor, gradient: Tensor) -> tuple[Error, Tensor]:
+    def surely_less(self, first: Each, second: Each) -> bool:
+        """Whether the first losses are less in the mean, by more than chance makes them."""
+        return standard_errors(second.loss - first.loss, self.voxels) > SURELY
+
+    def verdict(self, each: Each, at: float) -> Verdict:
+        """On a level with these errors; see `Verdict`."""
+        pairs = zip(self.without[1:], each[1:], strict=True)
+        fall = Fall(*(standard_errors(before - after, self.voxels) for before, after in pairs))
+        return Verdict(self.count, self.before, each.mean(), at, fall)
+
+    def _errors(self, value: Tensor, gradient: Tensor) -> Each:
         distance, normal = self.samples.distance, self.samples.normal
         assert distance is not None
         assert normal is not None
-        data, turn = data_loss(value, distance), pseudo_huber(normal_loss(gradient, normal), self.turn)
-        each = self.data * data + self.normal * turn
+        data, turn = data_loss(value, distance), normal_loss(gradient, normal)
         # The chord, for the cosine of a small angle rounds to 1.
         chord = (torch.nn.functional.normalize(gradient, dim=1) - normal).norm(dim=1)
-        angle = torch.rad2deg(2 * (chord.quantile(0.5).clamp(max=2) / 2).asin()) if len(chord) else chord.sum()
-        return Error(float(each.mean()), float(data.mean().sqrt()), float(angle)), each
-
-
-def surely_less(first: Tensor, second: Tensor) -> bool:
-    """Whether the losses ``(n,)`` of the same points are less in the mean, by more than chance makes them.
-
-    That is twice the standard error of the mean of their differences.
-    """
-    apart = second - first
-    return bool(apart.mean() > SURELY * apart.std() / math.sqrt(len(apart)))
+        angle = torch.rad2deg(2 * (chord.clamp(max=2) / 2).asin())
+        loss = self.data * pseudo_huber(data, self.usual.data) + self.normal * pseudo_huber(turn, self.usual.normal)
+        return Each(loss, data.sqrt(), angle)

@@ -13,7 +13,7 @@ from ...neural_fields.losses import data_loss, eikonal_loss, normal_loss, pseudo
 from ..run.settings import EvolveConfig, FitConfig
 from ..run.team import my_share, whole_batch
 from ..run.trainer import Group, Objective, seeded, warm_cosine
-from .heldout import LOOKS, Error, Judge, Verdict, surely_less
+from .heldout import LOOKS, Judge, Verdict
 from .samples import Source
 
 __all__ = ["RESIDUAL_GAIN", "LevelObjective", "new_level"]
@@ -59,9 +59,8 @@ class LevelObjective(Objective):
             best = {BEST + name: tensor.clone() for name, tensor in siren.state_dict().items()}
             self.kept = {
                 "looks": torch.zeros(1),
-                "least": torch.full((3,), math.inf),
+                "least": torch.full((1,), math.inf),
                 "at": torch.ones(1),
-                "each": torch.full((judge.count,), math.inf),
                 **best,
             }
 
@@ -78,14 +77,14 @@ class LevelObjective(Objective):
         for source, batch, value, gradient in pieces:
             if batch.value is not None and batch.gradient is not None:
                 value, gradient = value + batch.value, gradient + batch.gradient
-            parts = [("eikonal", source.eikonal, eikonal_loss(gradient))]
+            usual = source.usual
+            parts = [("eikonal", source.eikonal, eikonal_loss(gradient), usual.eikonal)]
             if batch.distance is not None:
-                parts.append(("data", source.data, data_loss(value, batch.distance)))
+                parts.append(("data", source.data, data_loss(value, batch.distance), usual.data))
             if batch.normal is not None:
-                turned = pseudo_huber(normal_loss(gradient, batch.normal), source.turn)
-                parts.append(("normal", source.normal, turned))
-            for name, weight, loss in parts:
-                mean = loss.mean()
+                parts.append(("normal", source.normal, normal_loss(gradient, batch.normal), usual.normal))
+            for name, weight, loss, scale in parts:
+                mean = pseudo_huber(loss, scale).mean()
                 total = total + weight * mean
                 terms[f"{source.name}.{name}"] = mean
         return terms, total
@@ -95,10 +94,9 @@ class LevelObjective(Objective):
         if self.judge is None:
             return
         self.kept["looks"].fill_(int(done * LOOKS))
-        error, each = self.judge.errors(self.siren)
-        if error.loss < float(self.kept["least"][0]):
-            self.kept["least"].copy_(torch.tensor(error))
-            self.kept["each"].copy_(each)
+        loss = self.judge.errors(self.siren).mean().loss
+        if loss < float(self.kept["least"]):
+            self.kept["least"].fill_(loss)
             self.kept["at"].fill_(done)
             for name, tensor in self.siren.state_dict().items():
                 self.kept[BEST + name].copy_(tensor)
@@ -111,12 +109,15 @@ class LevelObjective(Objective):
         """
         if self.judge is None:
             return None
-        last, each = self.judge.errors(self.siren)
-        if last.loss < self.judge.before.loss and not surely_less(self.kept["each"].to(each), each):
-            return Verdict(self.judge.count, self.judge.before, last, 1.0)
+        weights = {name: tensor.clone() for name, tensor in self.siren.state_dict().items()}
+        last = self.judge.errors(self.siren)
         self.look(1.0)
-        self.siren.load_state_dict({name: self.kept[BEST + name] for name in self.siren.state_dict()})
-        return Verdict(self.judge.count, self.judge.before, Error(*self.kept["least"].tolist()), float(self.kept["at"]))
+        self.siren.load_state_dict({name: self.kept[BEST + name] for name in weights})
+        best = self.judge.errors(self.siren)
+        if last.mean().loss < self.judge.before.loss and not self.judge.surely_less(best, last):
+            self.siren.load_state_dict(weights)
+            return self.judge.verdict(last, 1.0)
+        return self.judge.verdict(best, float(self.kept["at"]))
 
     def _draw(self, source: Source) -> Tensor:
         index = torch.randint(len(source.samples), (whole_batch(source.batch),), generator=self.generator)

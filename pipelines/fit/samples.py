@@ -18,16 +18,18 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ...neural_fields import Field, InputError, Jet
-from ...neural_fields.losses import normal_loss
+from ...neural_fields.losses import data_loss, eikonal_loss, normal_loss
 from ..run.settings import FitConfig
 from .cloud import CloudDistance
 
 __all__ = [
+    "SQUARES",
     "Band",
     "Remote",
     "Rows",
     "Samples",
     "Source",
+    "Usual",
     "Weights",
     "band_of",
     "band_samples",
@@ -39,7 +41,7 @@ __all__ = [
     "offset_samples",
     "remote_samples",
     "surface_samples",
-    "usual_turn",
+    "usual_errors",
     "with_previous",
 ]
 
@@ -52,8 +54,6 @@ STRAY = 4.0
 TAIL = 20.0
 # How far a winding number must be from one half to say in or out: it is off by less than 0.05 where it is asked.
 SURE = 0.4
-# The least scale of 1 − cos, which float32 rounds to 6e-8: it is that of 0.08°.
-LEAST_TURN = 1e-6
 # So few places that the level before gets wrong far from the cloud are not worth a share of the batch.
 FEWEST = 32
 
@@ -97,6 +97,25 @@ class Samples(Rows):
     gradient: Tensor | None = None
 
 
+class Usual(NamedTuple):
+    """What is usual of each term of Eq. 4: the scales of `pseudo_huber` around them; infinity leaves a term as it is.
+
+    Attributes:
+        data: of (f(x) − d)².
+        normal: of 1 − cos(∇f, N).
+        eikonal: of (|∇f| − 1)².
+    """
+
+    data: float = math.inf
+    normal: float = math.inf
+    eikonal: float = math.inf
+
+
+SQUARES = Usual()  # all terms as they are
+# The least of each: float32 rounds f to about 1e-7 and cosines to 6e-8; 1e-6 of these is that of 0.08°.
+LEAST = Usual(1e-12, 1e-6, 1e-6)
+
+
 @dataclass(frozen=True)
 class Source:
     """Samples, how many of them go into each batch, and the weights of their terms.
@@ -108,7 +127,7 @@ class Source:
         data: weight of (f(x) − d)².
         normal: weight of 1 − cos(∇f, N).
         eikonal: weight of (|∇f| − 1)².
-        turn: the scale of `pseudo_huber` around 1 − cos(∇f, N); infinity leaves it as it is.
+        usual: what is above it counts less than squared.
     """
 
     name: str
@@ -117,7 +136,7 @@ class Source:
     data: float
     normal: float
     eikonal: float
-    turn: float = math.inf
+    usual: Usual = SQUARES
 
 
 @dataclass(frozen=True)
@@ -198,8 +217,8 @@ def banded_sources(
     assert surface.value is not None
     terms = (weights or Weights()).resolved(config, surface.value, index.noise)
     third = config.batch // 3
-    turn = usual_turn(surface) if config.robust_normals and index.filled else math.inf
-    sources = [Source(kind, samples, third, *terms, turn) for kind, samples in kept.items()]
+    usual = usual_errors(surface, kept["band"]) if config.robust_normals and index.filled else SQUARES
+    sources = [Source(kind, samples, third, *terms, usual) for kind, samples in kept.items()]
     # Of its own generator: a cloud without such places is fitted as if nobody had looked for them.
     own = torch.Generator().manual_seed(generator.initial_seed() + 1)
     remote = remote_samples(index, previous, delta, config.samples, generator=own, device=device, watch=watch)
@@ -209,15 +228,28 @@ def banded_sources(
     return sources
 
 
-def usual_turn(surface: Samples) -> float:
-    """The median of 1 − cos(∇f, N) of the levels before: what is usual on smooth places, of which there are most.
+def usual_errors(surface: Samples, band: Samples) -> Usual:
+    """The medians of the terms for the levels before: what is usual on smooth places, of which there are most.
 
-    Nothing turns at once at a sharp edge. The angles that are left there are ten times those of the faces, their
-    squares a hundred times, and a level would learn of nothing else.
+    Nothing turns at once at a sharp edge. The angles that are left there are ten times those of the faces, and so are
+    distances, and lengths of gradients beside it; their squares are a hundred times those, and a level would learn of
+    nothing else, and leave waves on the faces.
+
+    Args:
+        surface: samples with distances and normals.
+        band: samples whose lengths of gradients stand for all.
     """
+    assert surface.value is not None
+    assert surface.distance is not None
     assert surface.gradient is not None
     assert surface.normal is not None
-    return max(float(normal_loss(surface.gradient, surface.normal).quantile(0.5)), LEAST_TURN)
+    assert band.gradient is not None
+    losses = (
+        data_loss(surface.value, surface.distance),
+        normal_loss(surface.gradient, surface.normal),
+        eikonal_loss(band.gradient),
+    )
+    return Usual(*(max(float(loss.quantile(0.5)), least) for loss, least in zip(losses, LEAST, strict=True)))
 
 
 @dataclass(frozen=True)

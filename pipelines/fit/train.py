@@ -190,6 +190,7 @@ class _Fitting:
         self.points, self.normals = torch.from_numpy(cloud.points), torch.from_numpy(cloud.normals)
         self.index: CloudDistance | None = None  # of the points above
         self.held = torch.zeros(len(self.points), dtype=torch.bool)  # those of them that it leaves out
+        self.spacing = 0.0  # of all of them
         self.frozen: MultiscaleSDF | None = None
         self.errors = torch.empty(0)  # of the last frozen level, at the input points
         self.stages: list[dict[str, Any]] = []
@@ -303,8 +304,8 @@ class _Fitting:
     def distances(self) -> CloudDistance:
         """The points that are trained on, and where they are sparse, what they say of the places between them."""
         config, noise, all_points = self.config, self.cloud.noise, self.points.numpy()
-        spacing = spacing_of(all_points.astype(np.float64))
-        self.held = torch.from_numpy(held_out(all_points, spacing, config.hold_out, seed=config.seed))
+        self.spacing = spacing_of(all_points.astype(np.float64))
+        self.held = torch.from_numpy(held_out(all_points, self.spacing, config.hold_out, seed=config.seed))
         points, normals = self.points[~self.held], self.normals[~self.held]
         if not config.between:
             return CloudDistance(points, normals, noise=noise)
@@ -323,7 +324,8 @@ class _Fitting:
             return None
         assert self.frozen is not None
         points, normals = self.points[self.held], self.normals[self.held]
-        judge = Judge(points, normals, self.frozen, delta, data=surface.data, normal=surface.normal, turn=surface.turn)
+        terms = {"data": surface.data, "normal": surface.normal, "usual": surface.usual}
+        judge = Judge(points, normals, self.frozen, delta, spacing=self.spacing, **terms)
         return judge if judge.count >= FEWEST / 2 else None
 
     def review(self) -> dict[str, Any]:

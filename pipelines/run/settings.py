@@ -42,9 +42,9 @@ class FitConfig(Settings):
         300.0, "weight of 1 - cos(grad f, N) where the normal N is known (Eq. 4)", at_least=0
     )
     robust_normals: bool = setting(
-        False,
-        "residual levels of sparse clouds: angles far above the usual one count as they are, not squared, so that "
-        "sharp edges do not outweigh faces",
+        True,
+        "residual levels of sparse clouds: errors of angles, distances and lengths far above the usual ones count as "
+        "they are, not squared, so that sharp edges do not outweigh faces",
     )
     eikonal_weight: float = setting(50.0, "weight of (|grad f| - 1)^2 (Eq. 4)", at_least=0)
     domain_weight: float = setting(0.1, "factor on data_weight for level 0's distances away from the cloud", at_least=0)

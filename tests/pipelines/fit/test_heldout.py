@@ -10,15 +10,27 @@ from mplicits.datasets import PointCloud
 from mplicits.datasets.synthetic.samples import sample_sphere
 from mplicits.neural_fields import Siren, Sphere
 from mplicits.pipelines.cli.info import describe
-from mplicits.pipelines.fit.heldout import FEWEST, VOXEL, Error, Judge, Verdict, held_out, surely_less
+from mplicits.pipelines.fit.heldout import (
+    FEWEST,
+    VOXEL,
+    Each,
+    Error,
+    Fall,
+    Judge,
+    Verdict,
+    held_out,
+    standard_errors,
+    voxels_of,
+)
 from mplicits.pipelines.fit.level import LevelObjective
-from mplicits.pipelines.fit.samples import Band, Samples, Source, with_previous
+from mplicits.pipelines.fit.samples import Band, Samples, Source, Usual, with_previous
 from mplicits.pipelines.fit.train import fit
 from mplicits.pipelines.run.settings import FitConfig
 from mplicits.pipelines.run.trainer import Trainer
 
 CPU = torch.device("cpu")
 RADIUS, OFF = 0.5, 0.02
+SPACING = 0.05  # of the thousand points below
 
 
 def points(count: int) -> torch.Tensor:
@@ -28,7 +40,7 @@ def points(count: int) -> torch.Tensor:
 def judge_of(sphere: float, *, data: float = 100.0, normal: float = 3.0) -> Judge:
     """Of a sphere's points, by a frozen sphere of another radius."""
     x = points(1000)
-    return Judge(x, x / RADIUS, Sphere(radius=sphere), 0.1, data=data, normal=normal)
+    return Judge(x, x / RADIUS, Sphere(radius=sphere), 0.1, spacing=SPACING, data=data, normal=normal)
 
 
 def zero_siren(bias: float) -> Siren:
@@ -61,34 +73,40 @@ def test_the_loss_at_held_out_points_is_that_of_equation_4() -> None:
     assert judge.before.loss == pytest.approx(100 * OFF**2, rel=1e-4)  # the normals agree
     assert judge.before.distance == pytest.approx(OFF, rel=1e-4)
     assert judge.before.angle == pytest.approx(0, abs=1e-4)  # degrees, in float32
-    assert judge.error(zero_siren(-OFF)).loss == pytest.approx(0, abs=1e-6)  # 3 (1 − cos), in float32
-    assert judge.error(zero_siren(OFF)).loss == pytest.approx(100 * (2 * OFF) ** 2, rel=1e-4)
+    assert judge.errors(zero_siren(-OFF)).mean().loss == pytest.approx(0, abs=1e-6)  # 3 (1 − cos), in float32
+    assert judge.errors(zero_siren(OFF)).mean().loss == pytest.approx(100 * (2 * OFF) ** 2, rel=1e-4)
     x = points(1000)
-    against = Judge(x, -x / RADIUS, Sphere(radius=RADIUS), 0.1, data=1.0, normal=3.0)
+    against = Judge(x, -x / RADIUS, Sphere(radius=RADIUS), 0.1, spacing=SPACING, data=1.0, normal=3.0)
     assert against.before.loss == pytest.approx(2 * 3.0, rel=1e-6)
     assert against.before.angle == pytest.approx(180, abs=0.1)
 
 
-def test_the_angle_at_held_out_points_is_their_median() -> None:
+def test_the_angle_at_held_out_points_is_their_mean() -> None:
     x = points(1001)
     normals = x / RADIUS
     across = torch.nn.functional.normalize(torch.linalg.cross(normals, torch.tensor([[0.3, 0.5, -0.8]])), dim=1)
-    angle = torch.deg2rad(torch.linspace(0, 8, 1001))[:, None]
-    judge = Judge(x, angle.cos() * normals + angle.sin() * across, Sphere(radius=RADIUS), 0.1, data=1.0, normal=1.0)
-    assert judge.before.angle == pytest.approx(4, rel=1e-3)
+    angle = torch.deg2rad(torch.linspace(0, 8, 1001) ** 2 / 8)[:, None]
+    tilted = angle.cos() * normals + angle.sin() * across
+    judge = Judge(x, tilted, Sphere(radius=RADIUS), 0.1, spacing=SPACING, data=1.0, normal=1.0)
+    assert judge.before.angle == pytest.approx(8 / 3, rel=1e-3)
     assert judge.before.loss == pytest.approx(float((1 - angle.cos()).mean()), rel=1e-3)
 
 
-def test_large_angles_count_as_the_level_counts_them() -> None:
+def test_large_errors_count_as_the_level_counts_them() -> None:
     x = points(1000)
-    turn = 1e-3
-    judge = Judge(x, -x / RADIUS, Sphere(radius=RADIUS), 0.1, data=1.0, normal=3.0, turn=turn)
-    assert judge.before.loss == pytest.approx(3 * turn * ((1 + 4 / turn) ** 0.5 - 1), rel=1e-5)  # 1 − cos = 2
+    usual = Usual(data=1e-5, normal=1e-3)
+    judge = Judge(
+        x, -x / RADIUS, Sphere(radius=RADIUS - OFF), 0.1, spacing=SPACING, data=100.0, normal=3.0, usual=usual
+    )
+    turned, away = 1e-3 * ((1 + 4 / 1e-3) ** 0.5 - 1), 1e-5 * ((1 + 2 * OFF**2 / 1e-5) ** 0.5 - 1)  # 1 − cos = 2
+    assert judge.before.loss == pytest.approx(3 * turned + 100 * away, rel=1e-4)
 
 
 def test_no_points_have_no_error() -> None:
     x = points(1000)
-    assert Judge(x, x, Sphere(radius=0.1), 0.1, data=1.0, normal=1.0).count == 0  # all outside the band
+    judge = Judge(x, x, Sphere(radius=0.1), 0.1, spacing=SPACING, data=1.0, normal=1.0)  # all outside the band
+    assert judge.count == 0
+    assert not judge.verdict(judge.without, 1.0).better
 
 
 def objective(judge: Judge, target: float) -> LevelObjective:
@@ -105,7 +123,7 @@ def test_the_best_weights_are_kept_and_checkpoints_keep_them() -> None:
     level = objective(judge_of(RADIUS - OFF), -3 * OFF)
     trainer = Trainer(level, stage="level 1", steps=80)
     trainer.run()
-    last = level.judge.error(level.siren)  # type: ignore[union-attr]
+    last = level.judge.errors(level.siren).mean()  # type: ignore[union-attr]
     other = objective(judge_of(RADIUS - OFF), -3 * OFF)
     resumed = Trainer(other, stage="level 1", steps=80)
     resumed.restore(trainer.state())
@@ -113,58 +131,115 @@ def test_the_best_weights_are_kept_and_checkpoints_keep_them() -> None:
     assert verdict is not None
     assert verdict.after.loss < last.loss
     assert 0 < verdict.at < 1
-    assert level.judge.error(level.siren).loss == pytest.approx(verdict.after.loss, rel=1e-5)  # type: ignore[union-attr]
+    assert level.judge.errors(level.siren).mean() == verdict.after  # type: ignore[union-attr]
     assert other.take_best() == verdict
     assert objective(judge_of(RADIUS - OFF), 0.0).judge is not None
 
 
 def test_what_chance_may_have_done_is_not_sure() -> None:
-    losses = torch.zeros(100)
-    # Means of 1 and 0.5 with standard errors of 0.1 and 0.95.
-    assert surely_less(losses, torch.tensor([0.0, 2.0]).repeat(50))
-    assert not surely_less(losses, torch.tensor([-9.0, 10.0]).repeat(50))
-    assert surely_less(losses, losses + 1)
-    assert not surely_less(losses, losses)
-    assert not surely_less(losses + 1, losses)
+    falls, apart = torch.tensor([0.0, 2.0]).repeat(50), torch.arange(100)
+    # Their mean is 1, and their standard deviation √(100 / 99).
+    assert standard_errors(falls, apart) == pytest.approx(1 / (100 / 99) ** 0.5 * 10, rel=1e-6)
+    assert standard_errors(-falls, apart) == pytest.approx(-standard_errors(falls, apart))
+    assert standard_errors(torch.ones(100), apart) == math.inf
+    assert standard_errors(-torch.ones(100), apart) == -math.inf
+    assert standard_errors(torch.zeros(100), apart) == 0
+    assert standard_errors(torch.zeros(0), torch.zeros(0, dtype=torch.int64)) == 0
+
+
+def test_points_of_one_voxel_count_once() -> None:
+    falls = torch.from_numpy(np.random.default_rng(0).normal(0.3, 1.0, 100))
+    alone = standard_errors(falls, torch.arange(100))
+    assert standard_errors(falls.repeat(4), torch.arange(100).repeat(4)) == pytest.approx(alone, rel=1e-12)
+    assert standard_errors(falls.repeat(4), torch.arange(400)) == pytest.approx(alone * (399 / 99) ** 0.5, rel=1e-12)
+    # In one voxel, a wave cancels itself.
+    waves = 0.1 + torch.tensor([1.0, -1.0], dtype=torch.float64).repeat(50)
+    assert standard_errors(waves, torch.arange(100) // 2) > 1e6 > 2 > standard_errors(waves, torch.arange(100))
+
+
+def test_voxels_are_of_two_spacings() -> None:
+    x = np.array([[0.05, 0.05, 0.05], [0.15, 0.19, 0.01], [0.21, 0.05, 0.05], [-0.01, 0.05, 0.05]], np.float32)
+    voxels = voxels_of(x, 0.1)
+    assert voxels[0] == voxels[1]
+    assert len(set(voxels.tolist())) == 3
+    assert voxels.min() == 0
+    assert voxels.max() == 2
 
 
 @pytest.mark.parametrize("chance", [True, False])
 def test_the_last_weights_stay_unless_others_were_surely_better(chance: bool) -> None:
     level = objective(judge_of(RADIUS - OFF), 0.0)
-    assert level.judge is not None
+    judge = level.judge
+    assert judge is not None
     torch.nn.init.constant_(level.siren.output.bias, -0.9 * OFF)  # nine tenths of the way
-    last, each = level.judge.errors(level.siren)
-    assert last.loss == pytest.approx(100 * (0.1 * OFF) ** 2, rel=1e-3)
+    last = judge.errors(level.siren)
+    assert last.mean().loss == pytest.approx(100 * (0.1 * OFF) ** 2, rel=1e-3)
     # Less by a tenth, exactly or with a standard error of a tenth.
     spread = 1000**0.5 * (-1.0) ** torch.arange(1000) if chance else torch.zeros(1000)
-    better = 0.1 * last.loss * (spread - 1)
-    level.kept["least"].copy_(torch.tensor([0.9 * last.loss, 0.0, 0.0]))
-    level.kept["each"].copy_(each + better)
-    level.kept["at"].fill_(0.5)
+    judge.voxels = torch.arange(1000)
+    best = last._replace(loss=last.loss + 0.1 * last.mean().loss * (spread - 1))
+    assert judge.surely_less(best, last) != chance
+    assert not judge.surely_less(last, best)
+
+
+def test_a_level_goes_back_to_what_was_surely_better() -> None:
+    level = objective(judge_of(RADIUS - OFF), 0.0)
+    for bias, done in ((-0.99 * OFF, 0.5), (-0.9 * OFF, 1.0)):
+        torch.nn.init.constant_(level.siren.output.bias, bias)
+        level.look(done)
     verdict = level.take_best()
     assert verdict is not None
-    expected = (1.0, last.loss) if chance else (0.5, 0.9 * last.loss)
-    assert (verdict.at, verdict.after.loss) == pytest.approx(expected)
+    assert verdict.at == 0.5
+    assert float(level.siren.output.bias.detach()) == pytest.approx(-0.99 * OFF, rel=1e-6)
+    assert verdict.after.distance == pytest.approx(0.01 * OFF, rel=1e-3)
+
+
+def verdict_of(distance: float, angle: float, at: float = 1.0) -> Verdict:
+    """With falls of so many standard errors."""
+    return Verdict(500, Error(2.0, 0.01, 3.0), Error(1.0, 0.002, 1.5), at, Fall(distance, angle))
+
+
+def test_a_level_is_kept_if_it_is_surely_better() -> None:
+    assert verdict_of(3.0, 3.0).better
+    assert verdict_of(3.0, -1.0).better  # distances, and angles are about the same
+    assert verdict_of(-1.0, 3.0).better
+    assert not verdict_of(1.5, 1.5).better  # by chance
+    assert not verdict_of(5.0, -3.0).better  # faces are rougher
+    assert not verdict_of(-3.0, 5.0).better
+    assert verdict_of(math.inf, 0.0).better
+
+
+def test_roughness_of_faces_is_not_paid_for_at_edges() -> None:
+    # A tenth of the points, at edges, is off by 20°, which becomes 19°; the others by 1°, which becomes 2°.
+    x = points(1000)
+    angle, after = torch.full((1000,), 1.0), torch.full((1000,), 2.0)
+    angle[::10], after[::10] = 20.0, 19.0
+    judge = judge_of(RADIUS)
+    zeros = torch.zeros(len(x))
+    judge.without = Each(angle**2, zeros, angle)
+    verdict = judge.verdict(Each(after**2, zeros, after), 1.0)
+    assert verdict.after.loss < judge.without.mean().loss  # by squares it would be
+    assert not verdict.better
 
 
 def test_a_verdict_in_words() -> None:
-    good, bad = Error(1.0, 0.002, 1.5), Error(2.0, 0.01, 3.0)
-    kept, late, worse = Verdict(500, bad, good, 1.0), Verdict(500, bad, good, 0.5), Verdict(500, good, bad, 1.0)
-    assert kept.better
+    kept, late, worse = verdict_of(3.0, 2.5), verdict_of(3.0, 0.0, 0.5), verdict_of(3.0, -3.0)
     assert kept.words(2, scale=10.0) == (
         "level 2 kept: without it → with it, at 500 points that it has not seen: "
-        "loss 2 → 1, rms distance 0.1 → 0.02, median angle 3 → 1.5°"
+        "mean distance 0.1 → 0.02 (surely less), mean angle of the normals 3 → 1.5° (surely less)"
     )
     assert late.words(1).startswith("level 1 kept as it was after 50% of its steps: ")
-    assert not worse.better
+    assert late.words(1).endswith("1.5° (no sure difference)")
     assert worse.words(1).startswith("level 1 set to zero: ")
+    assert worse.words(1).endswith("1.5° (surely more)")
     assert worse.record(1, scale=10.0) == {
         "points": 500,
-        "before": 1.0,
-        "after": 2.0,
+        "before": 2.0,
+        "after": 1.0,
         "at": 1.0,
-        "distance": [0.02, 0.1],
-        "angle": [1.5, 3.0],
+        "distance": [0.1, 0.02],
+        "angle": [3.0, 1.5],
+        "fall_in_standard_errors": {"distance": 3.0, "angle": -3.0},
         "verdict": worse.words(1, scale=10.0),
     }
 
@@ -200,7 +275,8 @@ def test_no_level_of_a_fit_is_worse_at_held_out_points_than_the_one_before(noise
     judged = stage["held_out"]
     assert judged["points"] >= FEWEST / 2
     assert math.isfinite(judged["before"])
-    assert stage["silenced"] == (judged["after"] >= judged["before"])
+    falls = judged["fall_in_standard_errors"].values()
+    assert stage["silenced"] == (max(falls) <= 2 or min(falls) < -2)
     assert judged["verdict"].startswith(f"level 1 {'set to zero' if stage['silenced'] else 'kept'}")
     assert judged["verdict"] in describe(tmp_path / "run")
     if noise:  # a sphere and noise: there is nothing that waves of this frequency could add to it

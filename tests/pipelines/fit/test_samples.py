@@ -6,7 +6,8 @@ import torch
 from mplicits.neural_fields import MultiscaleSDF, Siren, Sphere, Torus, Union
 from mplicits.pipelines.fit.cloud import CloudDistance
 from mplicits.pipelines.fit.samples import (
-    LEAST_TURN,
+    LEAST,
+    SQUARES,
     Samples,
     band_of,
     band_samples,
@@ -16,7 +17,7 @@ from mplicits.pipelines.fit.samples import (
     free_lengths,
     offset_samples,
     remote_samples,
-    usual_turn,
+    usual_errors,
     with_previous,
 )
 from mplicits.pipelines.paper.base import train_level
@@ -275,20 +276,26 @@ def test_the_next_level_takes_an_invented_surface_away(cloud: CloudDistance) -> 
     assert field.value(torch.from_numpy(cloud.points)).square().mean().sqrt() < 0.01
 
 
-def test_the_usual_turn_is_that_of_the_median_angle() -> None:
+def test_usual_errors_are_those_of_the_smooth_places() -> None:
     points, normals = sphere_points(1001)
     across = torch.nn.functional.normalize(torch.linalg.cross(normals, torch.tensor([[0.3, 0.5, -0.8]])), dim=1)
-    angle = torch.deg2rad(torch.linspace(0, 8, 1001))
-    angle[angle > np.deg2rad(6)] = np.deg2rad(40)  # a quarter of them, as beside edges: the median stays
+    angle, off = torch.deg2rad(torch.linspace(0, 8, 1001)), torch.linspace(0, 0.02, 1001)
+    # A quarter of them, as beside edges: the medians stay.
+    angle[751:], off[751:] = np.deg2rad(40), 0.09
     tilted = angle.cos()[:, None] * normals + angle.sin()[:, None] * across
-    surface = with_previous(Samples(points, torch.zeros(1001), tilted), Sphere(radius=RADIUS), 0.1, device=CPU)
-    assert usual_turn(surface) == pytest.approx(1 - np.cos(np.deg2rad(4)), rel=2e-3)  # float32 rounds by 6e-8 of 2e-3
+    surface = with_previous(Samples(points, off, tilted), Sphere(radius=RADIUS), 0.1, device=CPU)
+    band = Samples(points, gradient=normals * (1 + torch.linspace(0, 0.2, 1001))[:, None])
+    usual = usual_errors(surface, band)
+    assert usual.data == pytest.approx(0.01**2, rel=1e-3)
+    assert usual.normal == pytest.approx(1 - np.cos(np.deg2rad(4)), rel=2e-3)  # float32 rounds by 6e-8 of 2e-3
+    assert usual.eikonal == pytest.approx(0.1**2, rel=1e-3)
 
 
 @pytest.mark.parametrize(("robust", "given"), [(True, 1000), (False, 1000), (True, 2000)])
-def test_the_scale_of_angles_is_that_of_the_level_before(robust: bool, given: int) -> None:
+def test_the_scales_of_errors_are_those_of_the_level_before(robust: bool, given: int) -> None:
     index = CloudDistance(*sphere_points(2000), given=given)
     config = FitConfig(samples=2000, robust_normals=robust)
     sources = banded_sources(index, Sphere(radius=RADIUS - 0.01), 0.05, config, generator=generator())
-    expected = LEAST_TURN if robust and given < 2000 else np.inf  # the spheres' normals are the same
-    assert [source.turn for source in sources] == [expected] * 3
+    # The spheres' normals are the same, and the lengths of their gradients are 1.
+    expected = (pytest.approx(1e-4, rel=1e-4), *LEAST[1:]) if robust and given < 2000 else SQUARES
+    assert [tuple(source.usual) for source in sources] == [tuple(expected)] * 3
