@@ -132,7 +132,7 @@ class FitBench(Benchmark[FitRow]):
         resolution: cells along each side of the extraction box.
         samples: points drawn on each surface.
         poisson_depth: octree depth of screened Poisson, which runs if its extra is installed.
-        pictures: folder for one contact sheet per shape.
+        pictures: folder for two contact sheets per shape, the second under a raking light.
     """
 
     name = "fit"
@@ -177,9 +177,12 @@ class FitBench(Benchmark[FitRow]):
         if self.pictures is not None:
             self.pictures.mkdir(parents=True, exist_ok=True)
             camera = orbit(reference.vertices)
-            tiles = [(label, picture_of(surface, camera)) for label, surface in [*drawn, ("reference", reference)]]
+            drawn.append(("reference", reference))
             damage = f"{'-isotropic' * self.isotropic}-noise-{self.noise:g}" if self.noise else ""
+            tiles = [(label, picture_of(surface, camera)) for label, surface in drawn]
             write_picture(self.pictures / f"{path.stem}{damage}.png", contact_sheet(tiles))
+            raked = [(label, picture_of(surface, camera, shading="raking")) for label, surface in drawn[1:]]
+            write_picture(self.pictures / f"{path.stem}{damage}-raking.png", contact_sheet(raked))
         return rows
 
     def reconstructions(

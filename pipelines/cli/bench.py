@@ -139,7 +139,7 @@ def _fit_arguments(parser: argparse.ArgumentParser) -> None:
     _number(parser, "--points", whole(100), None, "draw so many points with exact normals, and leave the vertices")
     _measured(parser, 512)
     _number(parser, "--poisson-depth", whole(4, 14), 10, "octree depth")
-    parser.add_argument("--pictures", type=Path, metavar="DIR", help="write a picture of all methods per shape")
+    parser.add_argument("--pictures", type=Path, metavar="DIR", help="write two pictures of all methods per shape")
     _folder(parser)
     add_flags(parser, "--json")
     add_settings(parser, FitConfig)

@@ -179,7 +179,12 @@ def _nearest_points(xy: Float64, z: Float64, size: tuple[int, int], diameter: fl
 
 
 def picture_of(
-    surface: Surface, camera: Camera, *, point_size: float | None = None, samples: int = SUPERSAMPLING
+    surface: Surface,
+    camera: Camera,
+    *,
+    point_size: float | None = None,
+    samples: int = SUPERSAMPLING,
+    shading: str | None = None,
 ) -> Image:
     """Draw a mesh, its back faces reddish, or a cloud as discs, on white, as ``mplicits render`` does by default.
 
@@ -188,13 +193,14 @@ def picture_of(
         camera: from where, and how large; in the surface's coordinates.
         point_size: diameter of a cloud's discs in pixels; by default such that they touch.
         samples: per pixel and direction.
+        shading: one of `SHADINGS` that needs no field; None is "lambert", or what the surface can show.
     """
     fine, solid = camera.resized(camera.width * samples, camera.height * samples), bool(len(surface.faces))
     if solid:
         seen = mesh_view(surface, fine)
     else:
         seen = cloud_view(surface, fine, point_size=samples * point_size if point_size else None)
-    shading = default_shading(oriented=solid or surface.normals is not None, colored=surface.colors is not None)
+    usual = default_shading(oriented=solid or surface.normals is not None, colored=surface.colors is not None)
     # A point of a cloud has no back: its normal may be anything, and seeing far ones between near ones is normal.
-    colors = shade(seen, shading, camera=fine, options=ShadeOptions(back_faces=solid))
+    colors = shade(seen, shading or usual, camera=fine, options=ShadeOptions(back_faces=solid))
     return downsample(compose(seen, colors), samples)

@@ -5,6 +5,7 @@ Fields, meshes and clouds, in pictures, films and the viewer, all stand under th
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import cv2
@@ -41,6 +42,8 @@ GAMMA = 2.2  # between display values, in which images are stored, and light, wh
 # Directions to the lamps in the camera's axes: right, up, towards the eye.
 KEY_LAMP = (-0.55, 0.70, 0.60)
 FILL_LAMP = (0.75, 0.05, 0.65)
+# Twelve degrees above a face that looks at the camera, which a wave of one degree then makes a twelfth brighter.
+RAKING_LAMP = (-math.cos(math.radians(12)), 0.0, math.sin(math.radians(12)))
 # Their light, and that of sky and ground, on a surface that faces them; a little warm against a little cool.
 KEY_LIGHT = (0.96, 0.93, 0.88)
 FILL_LIGHT = (0.17, 0.18, 0.20)
@@ -121,6 +124,8 @@ def shade(
     if shading == "headlight":
         light = 0.05 + 0.95 * _facing(seen) ** 2  # the square, because cosines alone leave shapes flat
         return _to_display(_albedo(seen, options) * light[:, None])
+    if shading == "raking":
+        return _raking(seen, camera, options)
     if shading == "normals":
         return (seen.normal + 1) / 2
     if shading == "color":
@@ -274,6 +279,14 @@ def _lambert(seen: Seen, camera: Camera, field: Field | None, level: int, option
         rest = rest * open_[:, None]
     light = torch.addcmul(rest, key[:, None], _light(KEY_LIGHT, normal))
     return _to_display(_albedo(seen, options) * light)
+
+
+def _raking(seen: Seen, camera: Camera, options: ShadeOptions) -> Tensor:
+    """Albedo times the light of a lamp at the left: half of it on what faces the camera, all at twice its cosine."""
+    normal = _towards_viewer(seen)
+    axes = torch.stack((camera.right, -camera.down, -camera.forward)).to(normal)
+    light = normal @ (normal.new_tensor(RAKING_LAMP) @ axes) / (2 * RAKING_LAMP[2])
+    return _to_display(_albedo(seen, options) * light.clamp(0.02, 1)[:, None])
 
 
 def _towards_viewer(seen: Seen) -> Tensor:

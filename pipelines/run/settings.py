@@ -282,6 +282,7 @@ _SIZES = {"velocity": 3, "axis": 3, "center": 3, "angle": 1, "twist": 1}
 SHADINGS: dict[str, str] = {
     "lambert": "clay, or the surface's own colour, under a lamp above left of the camera",
     "headlight": "clay, or the surface's own colour, under a lamp at the camera",
+    "raking": "clay, or the surface's own colour, under a lamp at the left that grazes what faces the camera",
     "normals": "the normal as a colour, (n + 1) / 2, in world axes",
     "depth": "distance from the camera, near light and far dark",
     "matcap": "the picture of a lit sphere wrapped over the normals",

@@ -106,7 +106,21 @@ def test_the_headlight_is_brightest_in_the_middle_and_the_key_lamp_above_left():
         assert light.max() < 3
 
 
-@pytest.mark.parametrize("shading", ["lambert", "headlight", "matcap", "depth"])
+def test_a_raking_light_shows_a_degree():
+    """Of a face that looks at the camera the display value is that of half the albedo, and its turn by 1° shows."""
+    camera, one = camera_at(), torch.ones(1)
+    front = -camera.forward.float()
+    seen = Seen((SIZE, SIZE), torch.zeros(1, dtype=torch.int64), one, front[None], front[None], -front[None])
+    options = ShadeOptions(clay=(1.0, 1.0, 1.0))
+    for degrees in (0.0, 1.0, -1.0, 8.0, 60.0, -60.0):
+        turn, lamp = np.radians(degrees), np.radians(12)
+        normal = np.cos(turn) * front - np.sin(turn) * camera.right.float()  # towards the lamp
+        expected = np.clip(np.sin(lamp + turn) / (2 * np.sin(lamp)), 0.02, 1) ** (1 / 2.2)
+        rgb = shade(dataclasses.replace(seen, normal=normal.float()[None]), "raking", camera=camera, options=options)
+        torch.testing.assert_close(rgb, torch.full((1, 3), float(expected)), atol=2e-5, rtol=0)
+
+
+@pytest.mark.parametrize("shading", ["lambert", "headlight", "raking", "matcap", "depth"])
 def test_lamps_and_matcaps_turn_with_the_camera(shading):
     """A sphere looks the same from everywhere."""
     pictures = []
