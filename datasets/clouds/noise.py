@@ -33,8 +33,9 @@ THIN = 0.35
 WHOLE = 0.25
 # Of the area that a neighbourhood shows at the height of its middle: less counts as this much.
 LEAST_SEEN = 0.1
-# Half the thickness of the layer that a point looks through, in standard deviations; after a round less is left.
-LAYER, LAYER_LEFT = 3.0, 2.0
+# Half the thickness of the layer that a point looks through, in units of `noise_level`; after a round less is left. A
+# point at its rim must see past the middle: of a layer of three standard deviations one at two would be moved by half.
+LAYER, LAYER_LEFT = 4.0, 3.0
 
 
 class _Neighbors(NamedTuple):

@@ -55,6 +55,25 @@ def test_the_level_is_measured(count, amplitude):
     assert noise_level(noisy, normals) == pytest.approx(amplitude / np.sqrt(3), rel=0.2)
 
 
+def test_points_at_the_rim_of_a_layer_come_back_as_far_as_those_in_its_middle():
+    """The level of a plane is above 0.75 σ, so that a point at z = 3 σ looks through more than 3 σ: down to the middle.
+
+    What is above the middle has the mean 0.8 σ; there the first round leaves the point, and the second, which looks
+    through 2.25 σ at points that hardly have heights any more, leaves it where they are. Through 3 and then 2 levels
+    it would see what is above 0.7 σ only, be left there or higher, and not come down.
+    """
+    sigma, count = 0.02, 30000
+    heights = RNG.normal(0, sigma, count)
+    points = np.column_stack((RNG.uniform(-0.7, 0.7, (count, 2)), heights))
+    normals = np.tile([0.0, 0.0, 1.0], (count, 1))
+    level = noise_level(points, normals)
+    assert 0.75 * sigma < level <= sigma
+    left = smooth_along_normals(points, normals, level)[:, 2]
+    inner = np.abs(points[:, :2]).max(axis=1) < 0.7 - 2 * 3 * sigma  # what is voted on, and what votes, is whole
+    rim = inner & (np.abs(heights) > 2.8 * sigma) & (np.abs(heights) < 3.2 * sigma)
+    assert rms(left[rim]) < 2 * rms(left[inner])
+
+
 def along_normals(points: np.ndarray, normals: np.ndarray, sigma: float) -> np.ndarray:
     return RNG.normal(0, sigma, (len(points), 1)) * normals
 
