@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from ...datasets import OrientedCloud, PointCloud, add_isotropic_noise, add_noise, orbit, read_cloud
+from ...datasets import Camera, OrientedCloud, PointCloud, add_isotropic_noise, add_noise, orbit, read_cloud
 from ...datasets.synthetic.statue import Statue
 from ...neural_fields import InputError, MultiscaleSDF, Similarity, load_field
 from ...neural_fields.meshing import Mesh, NoSurfaceError, extract_mesh
@@ -32,7 +32,7 @@ from ..run.machine import peak_memory
 from ..run.settings import FitConfig
 from ..run.trainer import Report
 from ..surface.measure import Metrics, evaluate_surfaces
-from ..surface.surface import Surface, from_cloud, from_mesh, read_reference, read_surface, sample_points
+from ..surface.surface import Surface, face_normals, from_cloud, from_mesh, read_reference, read_surface, sample_points
 from .benchmark import Benchmark, Part, plain
 from .cells import Workplace, key_of
 from .tables import Column, Figure, Table, tabulated
@@ -48,6 +48,10 @@ __all__ = [
     "screened_poisson",
     "write_noisy_cloud",
 ]
+
+
+SIDES = 8  # steps of a coordinate of a normal from 0 to 1: about 7° are one side
+STEEPEST = 85.0  # degrees above or below the horizon, so that the picture has an upright
 
 
 def fit_home(out: Path, source: Path, config: FitConfig, **more: Any) -> Path:
@@ -132,7 +136,7 @@ class FitBench(Benchmark[FitRow]):
         resolution: cells along each side of the extraction box.
         samples: points drawn on each surface.
         poisson_depth: octree depth of screened Poisson, which runs if its extra is installed.
-        pictures: folder for two contact sheets per shape, the second under a raking light.
+        pictures: folder for two contact sheets per shape, the second facing its widest face under a raking light.
     """
 
     name = "fit"
@@ -181,7 +185,8 @@ class FitBench(Benchmark[FitRow]):
             damage = f"{'-isotropic' * self.isotropic}-noise-{self.noise:g}" if self.noise else ""
             tiles = [(label, picture_of(surface, camera)) for label, surface in drawn]
             write_picture(self.pictures / f"{path.stem}{damage}.png", contact_sheet(tiles))
-            raked = [(label, picture_of(surface, camera, shading="raking")) for label, surface in drawn[1:]]
+            facing = facing_camera(reference)
+            raked = [(label, picture_of(surface, facing, shading="raking")) for label, surface in drawn[1:]]
             write_picture(self.pictures / f"{path.stem}{damage}-raking.png", contact_sheet(raked))
         return rows
 
@@ -238,6 +243,17 @@ class FitBench(Benchmark[FitRow]):
         kinds = {False: "noise", True: "isotropic noise"}
         items = [(f"{row.shape}{f' + {kinds[row.isotropic]} {row.noise:g}' if row.noise else ''}", row) for row in rows]
         return (tabulated(self.name, "How near fits come", "shape", figures, items),)
+
+
+def facing_camera(surface: Surface) -> Camera:
+    """A camera that looks at the side of a mesh with most area in one direction, or nearly, a little from above."""
+    normals, areas = face_normals(surface)
+    owner = np.unique(np.round(SIDES * normals), axis=0, return_inverse=True)[1].reshape(-1)
+    widest = owner == np.bincount(owner, areas).argmax()
+    side = (areas[widest, None] * normals[widest]).sum(axis=0)
+    x, y, z = side / np.linalg.norm(side)
+    elevation = np.clip(np.degrees(np.arcsin(y)), -STEEPEST, STEEPEST)
+    return orbit(surface.vertices, azimuth=float(np.degrees(np.arctan2(x, z))), elevation=float(elevation))
 
 
 def _drawn(path: Path, reference: Surface, count: int, seed: int) -> PointCloud:

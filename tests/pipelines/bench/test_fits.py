@@ -5,13 +5,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from mplicits.datasets import add_isotropic_noise, read_cloud
+from mplicits.datasets.synthetic.prisms import PRISMS
 from mplicits.neural_fields import InputError, Similarity, Sphere, extract_mesh
 from mplicits.pipelines.bench import fits as module
-from mplicits.pipelines.bench.fits import FitBench
+from mplicits.pipelines.bench.fits import STEEPEST, FitBench, facing_camera
 from mplicits.pipelines.bench.report import as_text
 from mplicits.pipelines.mesh.files import write_mesh
 from mplicits.pipelines.run.settings import FitConfig
+from mplicits.pipelines.surface.surface import Surface, face_normals
 
 SMALL = FitConfig(
     widths=(32, 32),
@@ -115,3 +118,14 @@ def test_a_cloud_is_no_reference(tmp_path: Path) -> None:
     np.savetxt(tmp_path / "cloud.xyz", np.random.default_rng(0).random((50, 3)))
     with pytest.raises(InputError, match="has no faces"):
         FitBench(shapes=[tmp_path / "cloud.xyz"], config=SMALL).cells()
+
+
+def test_the_camera_faces_the_widest_side() -> None:
+    gear = Surface(*PRISMS["gear"]())  # the two flat sides
+    normals, areas = face_normals(gear)
+    flat = normals[((normals @ normals.T > 0.999) @ areas).argmax()]
+    assert float(facing_camera(gear).forward @ torch.from_numpy(flat)) == pytest.approx(-1, abs=1e-6)
+    # Of a slab that lies the camera stands a little before it, not in its axis: up would have no direction.
+    slab = Surface(np.array([[-2.0, 0, -1], [2, 0, -1], [2, 0, 1], [-2, 0, 1]]), np.array([[0, 2, 1], [0, 3, 2]]))
+    down = facing_camera(slab).forward
+    assert float(down[1]) == pytest.approx(-np.sin(np.radians(STEEPEST)), abs=1e-6)
