@@ -181,7 +181,7 @@ class FitBench(Benchmark[FitRow]):
         if self.pictures is not None:
             self.pictures.mkdir(parents=True, exist_ok=True)
             camera = orbit(reference.vertices)
-            drawn.append(("reference", reference))
+            drawn.append(("reference", _faceted(reference)))
             damage = f"{'-isotropic' * self.isotropic}-noise-{self.noise:g}" if self.noise else ""
             tiles = [(label, picture_of(surface, camera)) for label, surface in drawn]
             write_picture(self.pictures / f"{path.stem}{damage}.png", contact_sheet(tiles))
@@ -254,6 +254,14 @@ def facing_camera(surface: Surface) -> Camera:
     x, y, z = side / np.linalg.norm(side)
     elevation = np.clip(np.degrees(np.arcsin(y)), -STEEPEST, STEEPEST)
     return orbit(surface.vertices, azimuth=float(np.degrees(np.arctan2(x, z))), elevation=float(elevation))
+
+
+def _faceted(surface: Surface) -> Surface:
+    """The mesh with every face on its own: no normal is a mean of those of two sides of an edge."""
+    corners = surface.faces.ravel()
+    normals = np.repeat(face_normals(surface)[0], 3, axis=0)
+    colors = None if surface.colors is None else surface.colors[corners]
+    return Surface(surface.vertices[corners], np.arange(len(corners)).reshape(-1, 3), normals, colors)
 
 
 def _drawn(path: Path, reference: Surface, count: int, seed: int) -> PointCloud:
