@@ -218,6 +218,8 @@ def banded_sources(
     terms = (weights or Weights()).resolved(config, surface.value, index.noise)
     third = config.batch // 3
     usual = usual_errors(surface, kept["band"]) if config.robust_normals and index.filled else SQUARES
+    if previous.num_levels == 1:  # corners and thin parts that a coarse level has missed are far: squares reach them
+        usual = usual._replace(data=math.inf)
     sources = [Source(kind, samples, third, *terms, usual) for kind, samples in kept.items()]
     # Of its own generator: a cloud without such places is fitted as if nobody had looked for them.
     own = torch.Generator().manual_seed(generator.initial_seed() + 1)

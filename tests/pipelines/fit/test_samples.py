@@ -296,6 +296,12 @@ def test_the_scales_of_errors_are_those_of_the_level_before(robust: bool, given:
     index = CloudDistance(*sphere_points(2000), given=given)
     config = FitConfig(samples=2000, robust_normals=robust)
     sources = banded_sources(index, Sphere(radius=RADIUS - 0.01), 0.05, config, generator=generator())
-    # The spheres' normals are the same, and the lengths of their gradients are 1.
-    expected = (pytest.approx(1e-4, rel=1e-4), *LEAST[1:]) if robust and given < 2000 else SQUARES
+    # The normals of the spheres are the same, their gradients of length 1. Distances count squared in the first residual.
+    expected = (np.inf, *LEAST[1:]) if robust and given < 2000 else SQUARES
     assert [tuple(source.usual) for source in sources] == [tuple(expected)] * 3
+    nothing = Siren(8, 2, omega=10.0)
+    torch.nn.init.zeros_(nothing.output.weight)
+    torch.nn.init.zeros_(nothing.output.bias)
+    two = MultiscaleSDF(Sphere(radius=RADIUS - 0.01), [nothing], [0.05])
+    sources = banded_sources(index, two, 0.05, config, generator=generator())
+    assert sources[0].usual.data == (pytest.approx(1e-4, rel=1e-4) if robust and given < 2000 else np.inf)
