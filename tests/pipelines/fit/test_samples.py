@@ -296,7 +296,7 @@ def test_the_scales_of_errors_are_those_of_the_level_before(robust: bool, given:
     index = CloudDistance(*sphere_points(2000), given=given)
     config = FitConfig(samples=2000, robust_normals=robust)
     sources = banded_sources(index, Sphere(radius=RADIUS - 0.01), 0.05, config, generator=generator())
-    # The normals of the spheres are the same, their gradients of length 1. Distances count squared in the first residual.
+    # The normals of the spheres are alike, their gradients of length 1. The first residual squares its distances.
     expected = (np.inf, *LEAST[1:]) if robust and given < 2000 else SQUARES
     assert [tuple(source.usual) for source in sources] == [tuple(expected)] * 3
     nothing = Siren(8, 2, omega=10.0)
