@@ -183,7 +183,11 @@ class Camera:
 
     def slopes_at(self, pixels: Float64) -> Float64:
         """Where pixels ``(N, 2)`` look, with the lens undone: x / z and y / z in camera coordinates ``(N, 2)``."""
-        found = cv2.undistortPoints(pixels[:, None], *self.for_opencv, criteria=UNDISTORTION)
+        matrix, lens = self.for_opencv
+        if of_opencv_4 := getattr(cv2, "undistortPointsIter", None):  # whose undistortPoints stops after five steps
+            found = of_opencv_4(pixels[:, None], matrix, lens, None, None, UNDISTORTION)
+        else:
+            found = cv2.undistortPoints(pixels[:, None], matrix, lens, criteria=UNDISTORTION)
         return np.asarray(found, np.float64).reshape(-1, 2)
 
     def pixels_at(self, slopes: Float64) -> Float64:

@@ -47,7 +47,7 @@ def examine(folder: Path | None = None) -> list[Finding]:
     """
     return [
         _python(),
-        *(_requirement(line) for line in importlib.metadata.requires(PACKAGE) or [] if not re.search(DEVELOPERS, line)),
+        *(_requirement(line) for line in importlib.metadata.requires(PACKAGE) or [] if _is_asked_of_users(line)),
         _cv2(),
         _threads(),
         _cuda(),
@@ -79,6 +79,11 @@ def _installed(name: str) -> str | None:
         return None
 
 
+def _is_asked_of_users(requirement: str) -> bool:
+    """Not what developers need, nor the versions that a host has pinned, which `_cv2` judges."""
+    return not re.search(DEVELOPERS, requirement) and "==" not in requirement.split(";")[0]
+
+
 def _requirement(requirement: str) -> Finding:
     """What is there of ``name[extras]>=1.2; extra == "plot"``: the needed, and what can be done without."""
     match = re.match(r"([A-Za-z0-9._-]+)(?:\[[^\]]*\])?(?:>=([0-9.]+))?", requirement)
@@ -104,6 +109,8 @@ def _numbers(version: str) -> tuple[int, ...]:
 
 def _cv2() -> Finding:
     others = [name for name in OTHER_CV2 if _installed(name)]
+    if others and len({_installed(name) for name in (*others, OWN_CV2)}) == 1:
+        return Finding("ok", "cv2", f"{len(others) + 1} wheels of one version")
     if others:
         names = " ".join(others)
         fix = f"pip uninstall {names} {OWN_CV2}, then pip install {OWN_CV2}"

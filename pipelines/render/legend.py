@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from .picture import Image, as_bytes
 from .slice import FADE, FINEST, LINE, TINT, Color, Slice, distance_color, level_color, round_step
+from .text import text_mask, text_width
 
 __all__ = ["with_color_bar", "with_legend"]
 
@@ -62,7 +61,7 @@ def with_color_bar(
         low, high = limits
         x = margin + round((value - low) / (high - low) * (length - 1))
         strip[bottom : bottom + text // 3, x : x + max(1, text // 8)] = (*ink, 1)
-        half = _text_width(label, text) // 2
+        half = text_width(label, text) // 2
         left = min(max(x - half, margin // 2), max(margin // 2, width - 2 * half - margin // 2))
         _write(strip, label, (left, round(4.3 * text)), text, ink)
     return np.concatenate((picture, as_bytes(strip[..., : picture.shape[2]])))
@@ -106,7 +105,7 @@ def with_legend(
     text = round(float(np.clip(width / 48, 9, 40)))
     entries = _entries(taken, text, width, caption=caption, iso_step=iso_step, unit=unit, bands=bands)
     margin, gap, row = text, round(1.6 * text), round(1.9 * text)
-    room = [max(entry.least, entry.width + text // 2 + _text_width(entry.words, text)) for entry in entries]
+    room = [max(entry.least, entry.width + text // 2 + text_width(entry.words, text)) for entry in entries]
     places, x, line = [], margin, 0
     for needed in room:
         if x > margin and x + needed > width - margin:
@@ -175,19 +174,7 @@ def _swatch(area: Floats, color: Color) -> None:
     inner[:] = (1 - TINT) * distance_color(distance, reach=20.0, slope=0.1) + np.multiply(TINT, color)
 
 
-def _text_width(words: str, text: int) -> int:
-    return int(cv2.getTextSize((0, 0), words, (0, 0), _font(), text)[2])
-
-
 def _write(strip: Floats, words: str, place: tuple[int, int], text: int, ink: Color) -> None:
-    """Words from ``place``, the middle of their left side; cv2 draws them on bytes, which serve as a mask."""
-    mask = np.zeros((*strip.shape[:2], 3), np.uint8)
-    cv2.putText(mask, words, (place[0], place[1] + round(0.36 * text)), (255, 255, 255), _font(), text)
-    cover = mask[..., :1].astype(np.float32) / 255
+    """Words from ``place``, the middle of their left side."""
+    cover = text_mask(strip.shape[:2], words, place, text)[..., None]
     strip += cover * (np.array((*ink, 1)[: strip.shape[2]], np.float32) - strip)
-
-
-@functools.cache
-def _font() -> cv2.FontFace:
-    """OpenCV's own sans-serif, which has all of Unicode that we write."""
-    return cv2.FontFace("uni")

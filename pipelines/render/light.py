@@ -199,10 +199,10 @@ def load_matcap(name: str | Path) -> Tensor:
     if not path.is_file():
         raise InputError(f"matcap {path}: no such file; name a PNG or JPEG of a sphere, or one of {', '.join(MATCAPS)}")
     data = np.frombuffer(path.read_bytes(), np.uint8)
-    image = cv2.imdecode(data, cv2.IMREAD_COLOR_RGB) if len(data) else None
+    image = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
     if image is None:
         raise InputError(f"matcap {path}: cannot be read as an image; expected a PNG or JPEG of a sphere")
-    return torch.from_numpy(image.astype(np.float32) / 255)
+    return torch.from_numpy(image[..., ::-1].astype(np.float32) / 255)
 
 
 def sample_matcap(matcap: Tensor, normals: Tensor) -> Tensor:

@@ -447,6 +447,18 @@ def test_doctor_knows_all_extras(monkeypatch, tmp_path):
     assert "xatlas" in report
 
 
+def test_opencv_under_several_names_is_fine_in_one_version_only(monkeypatch, tmp_path):
+    versions = {"opencv-contrib-python-headless": "4.10.0.84", "opencv-python-headless": "4.10.0.84"}
+    monkeypatch.setattr(doctor, "_installed", versions.get)
+    found = [finding for finding in doctor.examine(tmp_path) if "cv2" in finding.topic or "opencv" in finding.topic]
+    assert [(finding.level, finding.topic) for finding in found] == [
+        ("ok", "opencv-contrib-python-headless"),
+        ("ok", "cv2"),
+    ]
+    versions["opencv-python"] = "5.0.0"
+    assert doctor._cv2().level == "warning"
+
+
 def test_doctor_names_what_is_missing_and_what_clashes(monkeypatch, tmp_path):
     versions = {"torch": "2.1.0", "opencv-contrib-python-headless": "5.0.0", "opencv-python": "4.9"}
     monkeypatch.setattr(doctor, "_installed", versions.get)

@@ -1,7 +1,6 @@
-"""nerfstudio's methods: on its stand-in here, and in nerfstudio itself where that is installed."""
+"""nerfstudio's methods on its stand-in; tests/hosts/test_nerfstudio.py runs them in nerfstudio itself."""
 
 import importlib
-import subprocess
 import sys
 import tomllib
 from pathlib import Path
@@ -165,27 +164,3 @@ def test_what_cannot_be_exported(
     assert main(words) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("ns-mplicits-export: error: ")
-
-
-@pytest.mark.slow
-def test_nerfstudio_itself_trains_resumes_and_exports(tmp_path: Path) -> None:
-    """``ns-train`` on the CPU on a scene of ours, then the same again from its checkpoint, then the mesh."""
-    pytest.importorskip("nerfstudio", reason="nerfstudio is not installed: pip install mplicits[nerfstudio]")
-    tools = Path(sys.executable).parent
-    scene = tmp_path / "scene"
-    train = [
-        *(tools / "ns-train", "mplicits", "--machine.device-type", "cpu", "--data", scene, "--vis", "tensorboard"),
-        *("--output-dir", tmp_path / "runs", "--experiment-name", "scene", "--timestamp", "now"),
-        *("--pipeline.datamanager.train-num-rays-per-batch", 64, "--steps-per-save", 30),
-        *("--pipeline.model.background-model", "none"),
-    ]
-    run = tmp_path / "runs" / "scene" / "mplicits" / "now"
-    for words in (
-        [tools / "mplicits", "scene", "painted-sphere", "-o", scene, "--format", "transforms", "--views", 8],
-        [*train, "--max-num-iterations", 61],
-        [*train, "--max-num-iterations", 5, "--load-dir", run / "nerfstudio_models"],
-        [tools / "ns-mplicits-export", "--load-config", run / "config.yml", "--output-path", tmp_path / "mesh.ply"],
-    ):
-        done = subprocess.run([str(word) for word in words], capture_output=True, text=True, check=False)
-        assert done.returncode == 0, done.stdout + done.stderr
-    assert (tmp_path / "mesh.ply").stat().st_size > 0
