@@ -41,7 +41,7 @@ def text_mask(shape: tuple[int, int], words: str, place: tuple[int, int], size: 
         cv2.putText(mask, words, base, white, _font(), size)
     else:
         cv2.putText(mask, plain(words), base, cv2.FONT_HERSHEY_SIMPLEX, size / STROKES, white, 1, cv2.LINE_AA)
-    return mask[..., 0].astype(np.float32) / 255
+    return mask[..., 0].astype(np.float32) / np.float32(255)
 
 
 def plain(words: str) -> str:
