@@ -78,6 +78,8 @@ def standard_errors(falls: Tensor, voxels: Tensor) -> float:
     sums = torch.zeros(int(voxels.max()) + 1, dtype=torch.float64).index_add_(0, voxels.cpu(), falls - mean)
     count = len(voxels.unique())
     error = float((sums.square().sum() * count / max(count - 1, 1)).sqrt()) / len(falls)
+    if math.isnan(error):  # what has diverged has not gained
+        return -math.inf
     return float(mean) / error if error > 0 else math.copysign(math.inf, mean) if mean else 0.0
 
 

@@ -144,6 +144,7 @@ def test_what_chance_may_have_done_is_not_sure() -> None:
     assert standard_errors(torch.ones(100), apart) == math.inf
     assert standard_errors(-torch.ones(100), apart) == -math.inf
     assert standard_errors(torch.zeros(100), apart) == 0
+    assert standard_errors(torch.full((100,), math.nan), apart) == -math.inf
     assert standard_errors(torch.zeros(0), torch.zeros(0, dtype=torch.int64)) == 0
 
 
