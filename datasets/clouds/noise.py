@@ -105,7 +105,9 @@ def _measured(points: Float64, normals: Float64, seed: int, *, thin: float = THI
     return level, near
 
 
-def smooth_along_normals(points: Float64, normals: Float64, level: float, *, rounds: int = 2, seed: int = 0) -> Float64:
+def smooth_along_normals(
+    points: Float64, normals: Float64, level: float, *, rounds: int = 2, alike: float = ALIKE, seed: int = 0
+) -> Float64:
     """Move points along their normals to where those neighbours agree whose normals are like their own.
 
     The move is the weighted mean of ½(n_i + n_j)·(p_j − p_i) over the point itself and its neighbours. Weights fall to
@@ -117,6 +119,7 @@ def smooth_along_normals(points: Float64, normals: Float64, level: float, *, rou
         normals: ``(N, 3)`` unit normals.
         level: the noise's standard deviation, see `noise_level`.
         rounds: how often.
+        alike: smallest cosine between normals that count; the better they are, the more it can ask for.
         seed: of the neighbours that are asked, where more than `VOTERS` are within reach.
 
     Returns:
@@ -134,9 +137,9 @@ def smooth_along_normals(points: Float64, normals: Float64, level: float, *, rou
         for rows in np.array_split(np.arange(len(points)), -(-len(points) // BLOCK)):
             near = others.around(rows, VOTERS, within=float(np.hypot(reach, layer)))
             beside = (near.distance**2 - near.height**2) / reach**2
-            alike = (near.cosine - ALIKE) / (1 - ALIKE)
-            seen = (beside < 1) & (np.abs(near.height) < layer) & (alike > 0)
-            weight = np.where(seen, (1 - beside) ** 2 * alike, 0)
+            likeness = (near.cosine - alike) / (1 - alike)
+            seen = (beside < 1) & (np.abs(near.height) < layer) & (likeness > 0)
+            weight = np.where(seen, (1 - beside) ** 2 * likeness, 0)
             offset[rows] = np.where(seen, weight * near.height, 0).sum(axis=1) / (1 + weight.sum(axis=1))
         moved += offset[:, None] * normals
     return moved
