@@ -450,6 +450,8 @@ def test_doctor_knows_all_extras(monkeypatch, tmp_path):
 
 def test_opencv_under_several_names_is_fine_in_one_version_only(monkeypatch, tmp_path):
     versions = {"opencv-contrib-python-headless": "4.10.0.84", "opencv-python-headless": "4.10.0.84"}
+    asked = ["opencv-contrib-python-headless>=4.10", 'opencv-python==4.10.0.84; extra == "nerfstudio"']
+    monkeypatch.setattr(doctor.importlib.metadata, "requires", lambda name: asked)
     monkeypatch.setattr(doctor, "_installed", versions.get)
     found = [finding for finding in doctor.examine(tmp_path) if "cv2" in finding.topic or "opencv" in finding.topic]
     assert [(finding.level, finding.topic) for finding in found] == [
