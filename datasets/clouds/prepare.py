@@ -43,7 +43,7 @@ class CleaningReport:
         flipped: whether all normals pointed inward and were turned round.
         pieces: connected pieces of the cloud; 0 if normals were not estimated, or a sensor oriented them.
         oriented_by: what gave estimated normals their signs: "winding" numbers, "propagation" from point to point in
-            each piece, or the "sensor"; None for those of a file.
+            each piece, the "sensor", or the first "level" of a fit; None for those of a file.
         smoothed_noise: thickness, in input units, of the layer that the points were moved together from, along the
             normals (see `noise_level`); 0 if they were left where they are.
         noise_deviation: standard deviation, in input units, of that noise (see `noise_deviation`).
@@ -63,7 +63,7 @@ class CleaningReport:
     flipped: bool
     pieces: int
     smoothed_noise: float = 0.0
-    oriented_by: Literal["winding", "propagation", "sensor"] | None = None
+    oriented_by: Literal["winding", "propagation", "sensor", "level"] | None = None
     noise_deviation: float = 0.0
     reestimated_normals: int = 0
 
@@ -75,6 +75,7 @@ class CleaningReport:
             "winding": "by winding numbers",
             "propagation": "from point to point" + f" in {self.pieces:,} separate pieces" * (self.pieces > 1),
             "sensor": "towards the sensor",
+            "level": "by level 0, which was not told",
         }
         if self.oriented_by:
             parts.append(f"oriented {ways[self.oriented_by]}")

@@ -85,6 +85,9 @@ def _describe_record(record: dict[str, Any]) -> Rows:
             if cleaning.get(name):
                 points += f", {cleaning[name]:,} {what}"
         rows.append(("points", points))
+    signs = record.get("signs")
+    if signs:
+        rows.append(("signs", _describe_signs(signs, cleaning.get("kept", 0))))
     rows.append(("state", "finished" if record.get("finished") else "unfinished: --resume continues it"))
     if "training_seconds" in record:
         rows.append(("time", f"{record['training_seconds']:.1f} s"))
@@ -95,6 +98,14 @@ def _describe_record(record: dict[str, Any]) -> Rows:
     if "seed" in record.get("config", {}):
         rows.append(("seed", str(record["config"]["seed"])))
     return rows
+
+
+def _describe_signs(signs: dict[str, Any], count: int) -> str:
+    if signs["clear"]:
+        what = f"level 0, which was not told, turned {signs['turned_normals']:,} of {count:,} normals"
+    else:
+        what = "level 0, which was not told, saw no in- and outside: normals stay as they were oriented"
+    return f"{what} (slope along them {signs['slope']:.2f})"
 
 
 def _describe_surface(surface: Surface) -> Rows:

@@ -40,6 +40,7 @@ __all__ = [
     "free_lengths",
     "offset_samples",
     "remote_samples",
+    "spread_points",
     "surface_samples",
     "usual_errors",
     "with_previous",
@@ -328,7 +329,7 @@ def distance_samples(cloud: CloudDistance, count: int, *, generator: torch.Gener
     The near half is Gaussian around cloud points, with deviations from twice the point spacing to 0.1, so that
     the coarse level sees every scale that it can represent.
     """
-    points = _spread(cloud, count, generator)
+    points = spread_points(cloud, count, generator)
     return Samples(points, distance=cloud.signed(points))
 
 
@@ -391,7 +392,7 @@ def remote_samples(
         empty = replace(empty, distance=torch.from_numpy(signed).to(device))
         return Remote(empty, replace(unseen, distance=unseen.value))
 
-    remote = found(_spread(cloud, count, generator))
+    remote = found(spread_points(cloud, count, generator))
     if len(remote.unseen) < FEWEST:
         return remote
     seeds = remote.unseen.points.cpu()[torch.randint(len(remote.unseen), (count,), generator=generator)]
@@ -399,7 +400,8 @@ def remote_samples(
     return Remote(remote.empty, found(beside.clamp(-DOMAIN, DOMAIN)).unseen)
 
 
-def _spread(cloud: CloudDistance, count: int, generator: torch.Generator) -> Tensor:
+def spread_points(cloud: CloudDistance, count: int, generator: torch.Generator) -> Tensor:
+    """Places ``(count, 3)``, half uniform in the domain, half near the cloud; see `distance_samples`."""
     near_count = count // 2
     uniform = (2 * torch.rand(count - near_count, 3, generator=generator) - 1) * DOMAIN
     anchors = torch.from_numpy(cloud.points)[torch.randint(len(cloud.points), (near_count,), generator=generator)]

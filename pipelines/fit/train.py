@@ -44,12 +44,14 @@ from .plan import Share
 from .review import Review, review_points
 from .samples import Band, Source, band_of, banded_sources, first_sources
 from .timing import Timing
+from .unoriented import Places, Signs, give_signs, signed
 
 __all__ = ["FitConfig", "Review", "Run", "fit", "prepare", "review_points"]
 
 # A level whose error at the points is so many times that of the level before it is worse than none: set to zero, it is
 # that level. Where data contradict themselves, as the sides of a part do that is thinner than their noise, it happens.
 WORSE = 2.0
+GUESSED = ("winding", "propagation")  # what gives estimated normals signs that may be wrong in whole patches
 # Of a sparse cloud, a residual begins so small: at a tenth of the usual its waves tilt the normals of the level before
 # by degrees, on flat places too.
 SMALL_GAIN = 0.01
@@ -149,14 +151,15 @@ def prepare(cloud: PointCloud, config: FitConfig) -> OrientedCloud:
     Raises:
         InputError: see `prepare_cloud`.
     """
+    given = config.normals
     return prepare_cloud(
         cloud,
-        normals=config.normals,
+        normals="estimate" if given == "none" else given,
         sensor_origin=config.sensor_origin,
         isolation=config.isolation,
         drop_outliers=config.drop_outliers,
         turn_normals=config.turn_normals,
-        smooth_noise=config.smooth_noise,
+        smooth_noise=config.smooth_noise and given != "none",  # along which normals, level 0 says first
     )
 
 
@@ -190,6 +193,7 @@ class _Fitting:
         self.points, self.normals = torch.from_numpy(cloud.points), torch.from_numpy(cloud.normals)
         self.index: CloudDistance | None = None  # of the points above
         self.held = torch.zeros(len(self.points), dtype=torch.bool)  # those of them that it leaves out
+        self.signs: Signs | None = None  # that the points without normals were given
         self.spacing = 0.0  # of all of them
         self.frozen: MultiscaleSDF | None = None
         self.errors = torch.empty(0)  # of the last frozen level, at the input points
@@ -200,6 +204,8 @@ class _Fitting:
 
     def run(self, flag: StopFlag) -> Run:
         self.folder.begin(self.record(finished=False))
+        if not self.stages and not self.trainer_state:
+            self.find_signs(flag)
         self.keep_support()
         for level in range(len(self.stages), self.config.num_levels):
             share = self.share(level)
@@ -210,6 +216,33 @@ class _Fitting:
         record = self.record(finished=True)
         self.folder.finish(self.frozen, self.cloud.similarity, record)
         return Run(self.frozen.cpu(), self.cloud.similarity, self.folder.out, record)
+
+    def find_signs(self, flag: StopFlag) -> None:
+        """Let a network say which way normals point whose signs nobody knows for sure."""
+        if self.config.normals != "none" and self.cloud.report.oriented_by not in GUESSED:
+            return
+        places = Places.around(CloudDistance(self.points, self.normals), seed=self.config.seed)
+        if self.config.normals != "none" and not places.contested:
+            return
+        signs = give_signs(
+            self.points,
+            self.normals,
+            self.config,
+            device=self.device,
+            places=places,
+            flag=flag,
+            report=self.timing.schedule,
+        )
+        if signs is None:
+            self.save(self.grown(new_level(self.config, 0, residual=False), None), None)
+            raise Interrupted(self.folder.out)
+        self.take_signs(signs)
+
+    def take_signs(self, signs: Signs) -> None:
+        """Turn normals as was found, and smooth the noise along them, if that was left until now."""
+        self.signs = signs
+        self.cloud = signed(self.cloud, signs, smooth=self.config.normals == "none" and self.config.smooth_noise)
+        self.points, self.normals = torch.from_numpy(self.cloud.points), torch.from_numpy(self.cloud.normals)
 
     def keep_support(self) -> None:
         """Keep the points that are fitted in the run."""
@@ -340,7 +373,7 @@ class _Fitting:
             device=self.device,
             outliers=config.drop_outliers,
             turn=turn,
-            patches=turn and self.cloud.report.oriented_by in ("winding", "propagation"),
+            patches=turn and self.cloud.report.oriented_by in (*GUESSED, "level"),
         )
         if found.dropped.any() or found.turned.any():
             kept, turned = torch.from_numpy(~found.dropped), torch.from_numpy(found.turned)
@@ -370,8 +403,11 @@ class _Fitting:
     def save(self, field: MultiscaleSDF, trainer: Trainer[LevelObjective] | None) -> None:
         """Write a usable field and all that `restore` needs."""
         tensors = checkpoint_of(self.frozen, trainer)
+        if self.signs is not None:
+            tensors["signs.turned"] = torch.from_numpy(self.signs.turned)
         kept = {"samples": self.samples, "notes": self.timing.notes}
-        progress = {"fingerprint": self.fingerprint, "stages": self.stages, **kept}
+        signs = None if self.signs is None else self.signs.record()
+        progress = {"fingerprint": self.fingerprint, "stages": self.stages, "signs": signs, **kept}
         self.folder.save(field, self.cloud.similarity, self.record(finished=False), tensors, progress)
 
     def restore(self) -> None:
@@ -380,6 +416,9 @@ class _Fitting:
         tensors, progress = self.folder.restore(self.fingerprint, mismatch)
         self.stages, self.samples = progress["stages"], progress.get("samples")
         self.timing.notes = progress.get("notes", [])
+        signs = progress.get("signs")
+        if signs is not None:
+            self.take_signs(Signs(tensors["signs.turned"].numpy(), signs["slope"], signs["witness"]))
         levels = [new_level(self.config, level, residual=False) for level in range(len(self.stages))]
         if levels:
             empty = MultiscaleSDF(levels[0], levels[1:], [1.0] * (len(levels) - 1)).to(self.device)
@@ -397,6 +436,7 @@ class _Fitting:
             **named_cloud(self.source, self.folder.path),
             "merging": None if self.merging is None else dataclasses.asdict(self.merging),
             "cleaning": dataclasses.asdict(self.cloud.report),
+            "signs": None if self.signs is None else self.signs.record(),
             "similarity": dataclasses.asdict(self.cloud.similarity),
             "config": dataclasses.asdict(self.config),
             "stages": self.stages,

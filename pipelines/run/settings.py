@@ -56,7 +56,11 @@ class FitConfig(Settings):
         at_most=1,
     )
     samples: int = setting(400_000, "samples made per level and kind, drawn from at every step", above=0)
-    normals: Literal["auto", "file", "estimate"] = setting("auto", "where normals come from: auto, file or estimate")
+    normals: Literal["auto", "file", "estimate", "none"] = setting(
+        "auto",
+        "where normals come from: auto, file, estimate, or none: level 0 learns from points alone, and says which way "
+        "their normals point",
+    )
     sensor_origin: tuple[float, float, float] | None = setting(
         None, "x y z of the sensor, in input units: estimated normals face it"
     )

@@ -1,0 +1,237 @@
+"""Level 0 without orientation: a network that learns a cloud whose normals have no signs, and gives them theirs.
+
+Where signs are not known the usual terms have many minima: |f| = d, |∇f| = 1 and |cos(∇f, N)| = 1 are met by either
+sign at each point, and whatever ripples a network begins with decide. So none of them is used. What is left is
+convex in the values: f = 0 at the points, f = ±d where space is surely out- or inside, with the distance d to the
+nearest point, and |f| ≤ d everywhere else, for no distance is longer than that to a sample of the surface. A smooth
+field that comes down from outside goes on falling through the first wall it meets. So the sides of a thin part, which
+both face the outside, get opposite gradients, and their normals are turned along them.
+
+Two witnesses with different faults say what is outside: `Exterior`, which holes of a scan mislead, and the winding
+numbers of normals that were oriented before, whose usual fault is to fill hollows. Each is believed in turn, and the
+field that has the steeper slope along the normals is kept: where it crosses a wall it has a slope of about 1, and none
+where both sides of the wall got the same sign. Where the slope is faint, signs come from the neighbours.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ...datasets import OrientedCloud
+from ...datasets.clouds.exterior import OUTSIDE, Exterior
+from ...datasets.clouds.noise import noise_deviation
+from ...datasets.clouds.orientation import settle_signs
+from ...datasets.clouds.reestimate import denoise
+from ...neural_fields import Siren
+from ..run.settings import FitConfig
+from ..run.trainer import Group, Objective, Report, StopFlag, Trainer, warm_cosine
+from .cloud import CloudDistance
+from .level import new_level
+from .samples import SURE, spread_points
+
+__all__ = ["STAGE", "Places", "Signs", "give_signs", "signed"]
+
+STEPS, BATCH, SAMPLES, RATE = 300, 4096, 50_000, 2e-3
+POINTS = 2.0  # weight of f = 0 at the points, in units of that of known distances
+SETTLED = 0.25  # of the steps, after which the regions that the outside does not reach get their signs
+CLEAR = 0.1  # mean slope of the field into a region, from which on that has a sign
+FAINT = 0.15  # mean slope at the points, below which it says nothing: that of an open sheet
+CONTRADICTED = 0.01  # share of the places
+STAGE = "level 0: signs"
+
+
+class Signs(NamedTuple):
+    """What `give_signs` finds.
+
+    Attributes:
+        turned: ``(N,)`` the normals whose sign is not the one that they came with.
+        slope: mean of |⟨∇f, N⟩| at the points: about 1 where all is clear, near 0 where nothing is.
+        witness: of what is outside, who was believed: "exterior" or "winding".
+    """
+
+    turned: NDArray[np.bool_]
+    slope: float
+    witness: str
+
+    def record(self) -> dict[str, Any]:
+        """For ``run.json``."""
+        turned = int(self.turned.sum())
+        return {"turned_normals": turned, "slope": self.slope, "clear": self.clear, "witness": self.witness}
+
+    @property
+    def clear(self) -> bool:
+        """Whether there was an in- and an outside; of an open sheet there is none, and signs stay."""
+        return self.slope >= FAINT
+
+
+class Places(NamedTuple):
+    """Places around a cloud, and what its two witnesses say of them.
+
+    Attributes:
+        points: ``(M, 3)``.
+        distance: ``(M,)`` to the nearest point of the cloud.
+        region: ``(M,)`` see `Exterior.regions`.
+        winding: ``(M,)`` 1 where winding numbers say outside for sure, −1 inside, else 0.
+    """
+
+    points: Tensor
+    distance: Tensor
+    region: Tensor
+    winding: Tensor
+
+    @classmethod
+    def around(cls, index: CloudDistance, *, seed: int) -> Places:
+        """Drawn as for level 0's distances."""
+        points = spread_points(index, SAMPLES, torch.Generator().manual_seed(seed))
+        distance = torch.from_numpy(index.nearest(points.numpy())).float().clamp(min=1e-6)
+        region = torch.from_numpy(Exterior(index.points.astype(np.float64)).regions(points.double().numpy()))
+        depth = torch.from_numpy(index.winding_number(points.numpy(), cell=index.cell / 2)).float() - 0.5
+        sure = (depth.abs() > SURE) & (distance > index.cell)
+        return cls(points, distance, region, torch.where(sure, -depth.sign(), 0.0))
+
+    @property
+    def contested(self) -> bool:
+        """Whether the witnesses contradict each other, or there is a hollow or another part whose sign is in doubt."""
+        inside = float(((self.region == OUTSIDE) & (self.winding < 0)).float().mean())
+        enclosed = torch.bincount(self.region)[OUTSIDE + 1 :]
+        return inside > CONTRADICTED or int((enclosed > CONTRADICTED * len(self.region)).sum()) > 1
+
+
+def give_signs(
+    points: Tensor,
+    normals: Tensor,
+    config: FitConfig,
+    *,
+    device: torch.device,
+    places: Places | None = None,
+    flag: StopFlag | None = None,
+    report: Report | None = None,
+) -> Signs | None:
+    """Which normals point inward, by a network that is not told.
+
+    Args:
+        points: ``(N, 3)`` in the unit sphere.
+        normals: ``(N, 3)`` unit normals; their signs are those of one of the witnesses, and of nothing else.
+        config: the network is its level 0, and drawn from its seed.
+        device: that trains.
+        places: see `Places.around`; None to draw them.
+        flag: asks to stop.
+        report: told of the training, as the stage `STAGE`.
+
+    Returns:
+        What was found; None if it was asked to stop.
+    """
+    places = places or Places.around(CloudDistance(points, normals), seed=config.seed)
+    outside = (places.region == OUTSIDE).float()
+    found: list[tuple[Tensor, str]] = []
+    for number, (witness, sign, region) in enumerate(
+        (("winding", places.winding, None), ("exterior", outside, places.region))
+    ):
+        siren = new_level(config, 0, residual=False).to(device)
+        generator = torch.Generator().manual_seed(config.seed)
+        objective = _Unoriented(siren, points, places, sign, region, generator=generator, device=device)
+        trainer = Trainer(objective, stage=f"{STAGE} ({number + 1} of 2)", steps=STEPS)
+        if not trainer.run(flag, report=report):
+            return None
+        with torch.no_grad():
+            gradient = torch.cat([siren.jet(part.to(device)).gradient.cpu() for part in points.split(1 << 16)])
+        found.append(((gradient * normals).sum(dim=1), witness))
+    slope, witness = max(found, key=lambda one: float(one[0].abs().mean()))
+    clear = float(slope.abs().mean())
+    if clear < FAINT:
+        return Signs(np.zeros(len(points), bool), clear, witness)
+    signs = settle_signs(points.double().numpy(), normals.double().numpy(), slope.double().numpy())
+    return Signs(signs < 0, clear, witness)
+
+
+def signed(cloud: OrientedCloud, signs: Signs, *, smooth: bool) -> OrientedCloud:
+    """The cloud with the normals turned that have the wrong sign.
+
+    Args:
+        cloud: as it was prepared.
+        signs: of its normals.
+        smooth: whether noise is smoothed along them now: along wrong ones, it would move the sides of a thin wall
+            onto each other.
+    """
+    points, noise, deviation = cloud.points.astype(np.float64), cloud.noise, 0.0
+    normals = np.where(signs.turned[:, None], -cloud.normals, cloud.normals).astype(np.float64)
+    if smooth:
+        noisy = points
+        points, normals, noise = denoise(noisy, normals)
+        deviation = noise_deviation(noisy, normals) * cloud.similarity.scale if noise else 0.0
+    report = dataclasses.replace(
+        cloud.report,
+        oriented_by="level" if signs.clear else cloud.report.oriented_by,
+        smoothed_noise=noise * cloud.similarity.scale,
+        noise_deviation=deviation if smooth else cloud.report.noise_deviation,
+    )
+    return dataclasses.replace(
+        cloud, points=points.astype(np.float32), normals=normals.astype(np.float32), report=report
+    )
+
+
+class _Unoriented(Objective):
+    """What is said above, for one witness.
+
+    Args:
+        siren: the network.
+        points: ``(N, 3)`` of the cloud.
+        places: around it.
+        sign: ``(M,)`` of the known distances, 0 where it is not known.
+        region: ``(M,)`` of those beyond `OUTSIDE` the signs follow from the field on its way; None: they stay.
+        generator: draws the batches.
+        device: that trains.
+    """
+
+    def __init__(
+        self,
+        siren: Siren,
+        points: Tensor,
+        places: Places,
+        sign: Tensor,
+        region: Tensor | None,
+        *,
+        generator: torch.Generator,
+        device: torch.device,
+    ) -> None:
+        super().__init__(siren, [Group(list(siren.parameters()), warm_cosine(RATE))], generator)
+        self.siren, self.points, self.places = siren, points.to(device), places.points.to(device)
+        self.distance, self.sign = places.distance.to(device), sign.to(device)
+        self.region = None if region is None else region.to(device)
+
+    def losses(self, step: int, done: float) -> tuple[dict[str, Tensor], Tensor]:
+        """See `Objective.losses`."""
+        if self.region is not None and done >= SETTLED:
+            self._settle(self.region)
+            self.region = None
+        at, by = (
+            torch.randint(len(rows), (BATCH // 2,), generator=self.generator) for rows in (self.points, self.places)
+        )
+        at, by = at.to(self.points.device), by.to(self.points.device)
+        value = self.siren.value(torch.cat((self.points[at], self.places[by])))
+        surface, space = value.split(BATCH // 2)
+        distance, sign = self.distance[by], self.sign[by]
+        known = (space - sign * distance).square()
+        terms = {
+            "points": surface.square().mean(),
+            "space": torch.where(sign == 0, (space.abs() - distance).clamp(min=0).square(), known).mean(),
+        }
+        return terms, POINTS * terms["points"] + terms["space"]
+
+    @torch.no_grad()
+    def _settle(self, region: Tensor) -> None:
+        """Give each enclosed region the sign of the mean of f/d in it, where places near the points count most."""
+        value = torch.cat([self.siren.value(part) for part in self.places.split(1 << 16)])
+        weight = self.distance.square().reciprocal() * (region > OUTSIDE)
+        count = int(region.max()) + 1
+        total = torch.zeros(count, device=weight.device).index_add_(0, region, weight)
+        slope = torch.zeros_like(total).index_add_(0, region, weight * value / self.distance)
+        slope /= total.clamp(min=1e-30)
+        signs = torch.where(slope.abs() > CLEAR, slope.sign(), 0.0)
+        self.sign = torch.where(region > OUTSIDE, signs[region], self.sign)

@@ -1,0 +1,28 @@
+"""Signs of normals from evidence at some points and from neighbours at the others."""
+
+import numpy as np
+from mplicits.datasets import sample_sphere
+from mplicits.datasets.clouds.orientation import settle_signs
+
+
+def test_signs_walk_from_where_evidence_is() -> None:
+    cloud = sample_sphere(5000)
+    assert cloud.normals is not None
+    random = np.random.default_rng(0)
+    wrong = random.choice([-1.0, 1.0], len(cloud))
+    evidence = np.where(random.uniform(size=len(cloud)) < 0.6, wrong, 1e-6)
+    normals = cloud.normals.astype(np.float64) * wrong[:, None]
+    assert (settle_signs(cloud.points, normals, evidence) == wrong).mean() > 0.99  # evidence alone: 0.8
+
+
+def test_evidence_outvotes_its_neighbours_where_it_is_strong() -> None:
+    """The two sides of a wall are neighbours, and have opposite normals."""
+    ball = sample_sphere(5000, radius=0.5)
+    assert ball.normals is not None
+    normals = ball.normals.astype(np.float64)
+    evidence = np.ones(len(ball))
+    evidence[:50] = -1.0  # single contradictions among thousands of equal weight
+    signs = settle_signs(ball.points, normals, evidence, weight=0.2)
+    assert (signs == 1).all()
+    followed = settle_signs(ball.points, normals, evidence, weight=100.0)
+    assert (followed == evidence).all()

@@ -1,0 +1,123 @@
+"""Signs from points alone, on shapes whose in- and outside is known."""
+
+import os
+import signal
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from mplicits.datasets import OrientedCloud, PointCloud, sample_sphere, sample_torus
+from mplicits.neural_fields import load_field
+from mplicits.pipelines.fit.cloud import CloudDistance
+from mplicits.pipelines.fit.train import fit, prepare
+from mplicits.pipelines.fit.unoriented import STAGE, Places, give_signs
+from mplicits.pipelines.run.settings import FitConfig
+from mplicits.pipelines.run.trainer import Interrupted, Progress, StopFlag
+from torch import Tensor
+
+SMALL = FitConfig(
+    widths=(32, 48),
+    depths=(2, 2),
+    omegas=(20.0, 20.0),
+    steps=(100, 30),
+    learning_rates=(3e-3, 1e-3),
+    batch=1024,
+    samples=20_000,
+    normals="none",
+)
+CPU = torch.device("cpu")
+# Of a smooth surface no point needs to be wrong; what noise there is in the evidence may spoil one in a hundred.
+FEW = 0.01
+
+
+def ball(count: int, radius: float, *, inward: bool = False) -> tuple[Tensor, Tensor]:
+    cloud = sample_sphere(count, radius=radius)
+    assert cloud.normals is not None
+    normals = torch.from_numpy(cloud.normals)
+    return torch.from_numpy(cloud.points).float(), -normals if inward else normals
+
+
+def joined(*parts: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+    return torch.cat([points for points, _ in parts]), torch.cat([normals for _, normals in parts])
+
+
+def scrambled(normals: Tensor) -> tuple[Tensor, np.ndarray]:
+    """Normals with random signs, and which of them are wrong."""
+    wrong = np.random.default_rng(0).uniform(size=len(normals)) < 0.5
+    return torch.where(torch.from_numpy(wrong)[:, None], -normals, normals), wrong
+
+
+def test_a_ball_gets_its_normals_back() -> None:
+    points, normals = ball(5000, 0.6)
+    given, wrong = scrambled(normals)
+    found = give_signs(points, given, SMALL, device=CPU)
+    assert found is not None
+    assert found.clear
+    assert (found.turned == wrong).all()
+    assert found.record()["turned_normals"] == wrong.sum()
+
+
+def test_the_hollow_of_a_thick_wall_is_outside_though_normals_filled_it() -> None:
+    """The usual fault of winding numbers: the inner wall points outward, so that the hollow is twice inside."""
+    points, normals = joined(ball(5000, 0.8), ball(3000, 0.6, inward=True))
+    given = normals.clone()
+    given[5000:] *= -1
+    found = give_signs(points, given, SMALL, device=CPU)
+    assert found is not None
+    assert found.turned[:5000].mean() < FEW
+    assert found.turned[5000:].mean() > 1 - FEW
+
+
+def test_a_ball_leaves_nothing_in_doubt() -> None:
+    assert not Places.around(CloudDistance(*ball(5000, 0.6)), seed=0).contested
+
+
+def test_of_an_open_sheet_all_stays() -> None:
+    """There is no outside that is not also on its other side."""
+    random = np.random.default_rng(0)
+    points = torch.from_numpy(np.column_stack((random.uniform(-0.7, 0.7, (4000, 2)), np.zeros(4000)))).float()
+    given, _ = scrambled(torch.tensor([0.0, 0.0, 1.0]).expand(4000, 3))
+    found = give_signs(points, given, SMALL, device=CPU)
+    assert found is not None
+    assert not found.clear
+    assert not found.turned.any()
+
+
+def test_stops_when_asked() -> None:
+    points, normals = ball(500, 0.6)
+    flag = StopFlag()
+    flag.requested = True
+    assert give_signs(points, normals, SMALL, device=CPU, flag=flag) is None
+
+
+def spoilt(cloud: PointCloud, config: FitConfig) -> OrientedCloud:
+    """Prepared, with every second normal turned round."""
+    good = prepare(cloud, config)
+    sign = np.where(np.arange(len(good)) % 2, 1, -1).astype(np.float32)
+    return replace(good, normals=good.normals * sign[:, None])
+
+
+def test_a_fit_without_normals(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Nobody knows a sign, and the field is the torus all the same; interrupted anywhere, it comes out the same."""
+    monkeypatch.setattr("mplicits.pipelines.fit.train.prepare", spoilt)
+    cloud = PointCloud(sample_torus(4000, major=0.6, minor=0.25).points)
+    whole = fit(cloud, SMALL)
+    assert whole.record["signs"]["turned_normals"] == pytest.approx(2000, abs=FEW * 4000)
+    assert whole.record["cleaning"]["oriented_by"] == "level"
+    distance = whole.world.distance(np.array([[0.6, 0, 0], [0, 0, 0], [0, -0.6, 0], [1, 1, 1.0]]))
+    assert (np.sign(distance) == [-1, 1, -1, 1]).all()
+
+    for stage in (f"{STAGE} (2 of 2)", "level 1"):
+
+        def interrupt(progress: Progress, stage: str = stage) -> None:
+            if progress.stage == stage and progress.step == 20:
+                os.kill(os.getpid(), signal.SIGINT)
+
+        with pytest.raises(Interrupted, match="checkpoint"):
+            fit(cloud, SMALL, out=tmp_path / stage, progress=interrupt)
+        resumed = fit(cloud, out=tmp_path / stage, resume=True)
+        assert resumed.record["signs"] == whole.record["signs"]
+        kept = load_field(tmp_path / stage / "field.safetensors").field.state_dict()
+        assert all(torch.equal(kept[name], tensor) for name, tensor in whole.field.state_dict().items())
