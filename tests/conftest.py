@@ -1,13 +1,20 @@
-"""Device and dtype fixtures; a missing GPU skips, visibly."""
+"""Device and dtype fixtures. A stand-in takes the place of a GPU, and CUDA comes beside it where there is one."""
 
 import pytest
+import standin
 import torch
 
+ACCELERATORS = [standin.NAME, *(["cuda"] if torch.cuda.is_available() else [])]
 
-@pytest.fixture(params=["cpu", "cuda"])
+
+@pytest.fixture(params=["cpu", *ACCELERATORS])
 def device(request: pytest.FixtureRequest) -> torch.device:
-    if request.param == "cuda" and not torch.cuda.is_available():
-        pytest.skip("no CUDA device on this machine")
+    return torch.device(request.param)
+
+
+@pytest.fixture(params=ACCELERATORS)
+def accelerator(request: pytest.FixtureRequest) -> torch.device:
+    """For tests that compare with the CPU, or count."""
     return torch.device(request.param)
 
 
@@ -19,3 +26,22 @@ def dtype(request: pytest.FixtureRequest) -> torch.dtype:
 @pytest.fixture(autouse=True)
 def _seed() -> None:
     torch.manual_seed(0)
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave out the stand-in in float64: it computes on the CPU, so that only its refusals say something new."""
+    again = [
+        item
+        for item in items
+        if isinstance(item, pytest.Function)
+        and hasattr(item, "callspec")
+        and item.callspec.params.get("device") == standin.NAME
+        and item.callspec.params.get("dtype") == torch.float64
+    ]
+    if again:
+        config.hook.pytest_deselected(items=again)
+        items[:] = [item for item in items if item not in set(again)]
+
+
+def pytest_report_header() -> str:
+    return f"devices: cpu, {', '.join(ACCELERATORS)}" + ("" if "cuda" in ACCELERATORS else " (no CUDA on this machine)")

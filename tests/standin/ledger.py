@@ -1,0 +1,86 @@
+"""What a piece of work asks of the device: kernels that it launches, and moments at which the host waits for them.
+
+A GPU works behind the host's back until somebody wants to know something of it. Then the host stands still until all
+that was asked for before is done. On small batches that is most of the time, and no profile of a CPU shows it.
+"""
+
+import sys
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+
+ROOT = Path(__file__).parents[2]
+OURS = tuple(f"{ROOT / name}/" for name in ("neural_fields", "datasets", "pipelines"))
+# Frames of these say nothing about who asked.
+UNDER = (f"{Path(torch.__file__).parent}/", f"{Path(__file__).parent}/")
+
+
+@dataclass
+class Ledger:
+    """Counts of one piece of work.
+
+    Attributes:
+        waits: how often the host waited, by (why, where): why is ``item`` (a number is read), ``size`` (the shape of a
+            result depends on numbers: `nonzero`, boolean masks, `unique`), ``download`` or ``upload`` (a copy to or
+            from the host that blocks); where is the line of ours, or whoever's it is.
+        launches: kernels by name of the operation, one for each: views and allocations launch none, and those few
+            operations that are several kernels (sort, nonzero) count as one.
+    """
+
+    waits: Counter[tuple[str, str]] = field(default_factory=Counter)
+    launches: Counter[str] = field(default_factory=Counter)
+
+    @property
+    def synchronisations(self) -> int:
+        return self.waits.total()
+
+    @property
+    def kernels(self) -> int:
+        return self.launches.total()
+
+    def report(self, count: int = 20) -> str:
+        """The most frequent waits, a line each."""
+        return "\n".join(f"{times:6d}  {why:8}  {where}" for (why, where), times in self.waits.most_common(count))
+
+
+_open: list[Ledger] = []
+
+
+@contextmanager
+def counted() -> Iterator[Ledger]:
+    """Count what is asked of the device inside the ``with``; ledgers may be open inside each other."""
+    ledger = Ledger()
+    _open.append(ledger)
+    try:
+        yield ledger
+    finally:
+        _open.remove(ledger)
+
+
+def note_launch(name: str) -> None:
+    for ledger in _open:
+        ledger.launches[name] += 1
+
+
+def note_wait(why: str) -> None:
+    if _open:
+        where = _asking_line()
+        for ledger in _open:
+            ledger.waits[why, where] += 1
+
+
+def _asking_line() -> str:
+    """The innermost line of the library, else of whoever is neither torch nor we; autograd's threads have neither."""
+    frame, other = sys._getframe(1), ""
+    while frame is not None:
+        name = frame.f_code.co_filename
+        if name.startswith(OURS):
+            return f"{Path(name).relative_to(ROOT)}:{frame.f_lineno}"
+        if not other and not name.startswith(UNDER) and not name.endswith("contextlib.py"):
+            other = f"{Path(name).name}:{frame.f_lineno}"
+        frame = frame.f_back
+    return other or "autograd"

@@ -1,0 +1,243 @@
+"""The stand-in accelerator: that it refuses, counts exactly, and changes no bit."""
+
+import copy
+import io
+
+import numpy as np
+import pytest
+import standin
+import torch
+from fields import small_multiscale
+from mplicits.neural_fields import Siren, Sphere, sphere_trace
+from torch import Tensor
+
+DEVICE = torch.device(standin.NAME)
+
+
+def on_device(*shape: int) -> Tensor:
+    return torch.rand(*shape).to(DEVICE)
+
+
+def test_numbers_go_there_and_come_back() -> None:
+    x = torch.rand(4, 3)
+    there = x.to(DEVICE)
+    assert isinstance(there, standin.StandInTensor)
+    assert there.device == torch.device(standin.NAME, 0)
+    assert not there.is_cpu
+    assert type(there.cpu()) is Tensor
+    assert there.cpu().equal(x)
+    assert there.tolist() == x.tolist()
+    assert there[1, 2].item() == x[1, 2].item()
+
+
+def test_shells_share_what_their_views_share() -> None:
+    x = torch.arange(6, device=DEVICE)
+    x.view(2, 3)[1] = 7
+    x[:2] += 10
+    assert x.tolist() == [10, 11, 2, 7, 7, 7]
+    x.unsqueeze_(0).squeeze_(0)
+    assert x.shape == (6,)
+    x.data = torch.zeros(6, dtype=torch.int64, device=DEVICE)
+    assert x.tolist() == [0] * 6
+
+
+@pytest.mark.parametrize(
+    "mixed",
+    [
+        lambda x: x + torch.ones(3),
+        lambda x: torch.ones(3) * x,
+        lambda x: torch.cat((x, torch.ones(3))),
+        lambda x: torch.stack((x[0], torch.ones(()))),
+        lambda x: torch.ones(3).add_(x),
+        lambda x: torch.ones(()).add_(x[0]),
+        lambda x: x @ torch.ones(3),
+        lambda x: x.index_copy(0, torch.tensor([1]), x[:1]),
+        lambda x: torch.ones(3)[x.long()],
+        lambda x: torch.where(torch.ones(3, dtype=torch.bool), x, x),
+        lambda x: torch.searchsorted(torch.ones(3), x),
+        lambda x: torch.nn.Linear(3, 1)(x),
+    ],
+)
+def test_operands_on_two_devices_are_refused(mixed: object) -> None:
+    with pytest.raises(RuntimeError, match="same device"):
+        mixed(on_device(3))
+
+
+def test_numbers_of_the_host_are_taken() -> None:
+    """As CUDA does: they travel with the call."""
+    x, two = on_device(3), torch.tensor(2.0)
+    for result in (x * two, two * x, torch.where(x > 2, two, x), torch.maximum(x, two), x.masked_fill(x < 2, two)):
+        assert result.device.type == standin.NAME
+    assert x[torch.tensor([2, 0])].tolist() == [x[2].item(), x[0].item()]
+
+
+def test_numpy_is_refused() -> None:
+    x = on_device(3)
+    for attempt in (x.numpy, lambda: np.asarray(x), lambda: np.add(x, 1)):
+        with pytest.raises(TypeError, match="cpu"):
+            attempt()
+
+
+def test_generators_of_the_host_are_refused() -> None:
+    generator = torch.Generator().manual_seed(0)
+    for draw in (
+        lambda: torch.rand(3, device=DEVICE, generator=generator),
+        lambda: torch.randperm(3, device=DEVICE, generator=generator),
+        lambda: torch.empty(3, device=DEVICE).normal_(generator=generator),
+    ):
+        with pytest.raises(RuntimeError, match="for generator but found 'cpu'"):
+            draw()
+
+
+def test_memory_that_may_not_be_there_yet_is_refused() -> None:
+    x = on_device(3)
+    with pytest.raises(RuntimeError, match="may be read before"):
+        x.to("cpu", non_blocking=True)
+    with pytest.raises(RuntimeError, match="may be read before"):
+        torch.empty(3).copy_(x, non_blocking=True)
+    with pytest.raises((RuntimeError, NotImplementedError)):
+        x.pin_memory()
+
+
+@pytest.mark.parametrize(
+    ("why", "times", "ask"),
+    [
+        ("item", 1, lambda x: x[0].item()),
+        ("item", 1, lambda x: float(x.sum())),
+        ("item", 1, lambda x: bool((x > 0).all())),
+        ("item", 1, lambda x: torch.equal(x, x)),
+        ("item", 3, lambda x: [float(value) for value in x]),
+        ("size", 1, lambda x: x.nonzero()),
+        ("size", 1, lambda x: x[x > 0]),
+        ("size", 1, lambda x: torch.where(x > 0)),
+        ("size", 1, lambda x: x.masked_select(x > 0)),
+        ("size", 1, lambda x: x.unique()),
+        ("size", 1, lambda x: x.repeat_interleave(x.long())),
+        ("size", 1, lambda x: x.clone().__setitem__(x > 0, x)),
+        ("download", 1, lambda x: x.cpu()),
+        ("download", 1, lambda x: x.tolist()),
+        ("download", 1, lambda x: torch.zeros(3).copy_(x)),
+        ("upload", 1, lambda x: torch.tensor([1.0, 2.0], device=x.device)),
+        ("upload", 1, lambda x: torch.ones(3).to(x)),
+        ("upload", 1, lambda x: x[torch.tensor([0, 2])]),
+        ("none", 0, lambda x: torch.where(x > 0, x.sin() + 2.0, 0.0).cumsum(0)[1:].clone()),
+        ("none", 0, lambda x: x.clone().masked_fill_(x > 0, 1.0).sort()),
+        ("none", 0, lambda x: x.clone().__setitem__(x > 0, 1.0)),
+        ("none", 0, lambda x: x.repeat_interleave(2).index_select(0, torch.zeros_like(x).long())),
+        ("none", 0, lambda x: torch.ones(3).to(x, non_blocking=True)),
+        ("none", 0, lambda x: torch.zeros(3, device=x.device, dtype=torch.float64).fill_(2).to(torch.float32)),
+    ],
+)
+def test_waits_are_counted(why: str, times: int, ask: object) -> None:
+    x = torch.ones(3).to(DEVICE)
+    with standin.counted() as book:
+        ask(x)
+    assert {name for name, _ in book.waits} == ({why} if times else set()), book.report()
+    assert book.synchronisations == times
+
+
+def test_launches_are_counted_and_views_are_none() -> None:
+    x = on_device(4, 3)
+    with standin.counted() as book:
+        (x.t()[1:].reshape(2, 4).expand(2, 2, 4)[..., None].detach().sin() + 1).sum()
+        torch.empty(3, device=DEVICE)
+        torch.zeros(3, device=DEVICE).add_(1)
+    assert book.launches == {"sin": 1, "add": 1, "sum": 1, "zero_": 1, "add_": 1}
+    assert book.kernels == 5
+    with standin.counted() as outer:
+        x.sin()
+        with standin.counted() as inner:
+            x.cos()
+    assert (outer.kernels, inner.kernels) == (2, 1)
+
+
+def test_waits_name_the_line_that_asked() -> None:
+    with standin.counted() as book:
+        on_device(3)[0].item()
+    assert [where.split(":")[0] for _, where in book.waits] == ["test_standin.py"] * 2
+    field = small_multiscale().to(DEVICE)
+    x = on_device(50, 3)
+    with standin.counted() as book:
+        field.value(x)
+    # Each residual is evaluated at the rows of its band, whose number the host has to know.
+    assert [(why, where.split(":")[0]) for why, where in book.waits] == [("size", "neural_fields/multiscale.py")]
+    assert book.synchronisations == field.num_levels - 1
+
+
+def test_counts_are_the_same_every_time() -> None:
+    field, x = Siren(8, 2).to(DEVICE), on_device(20, 3)
+    books = []
+    for _ in range(2):
+        with standin.counted() as book:
+            field.zero_grad()
+            field.jet(x).gradient.square().sum().backward()
+        books.append(book)
+    assert books[0].launches == books[1].launches
+    assert books[0].kernels > 0
+    assert books[0].synchronisations == 0
+
+
+def test_modules_and_their_gradients() -> None:
+    here = torch.nn.Sequential(torch.nn.Linear(3, 8), torch.nn.Tanh(), torch.nn.Linear(8, 1))
+    there = copy.deepcopy(here).to(DEVICE)
+    assert all(isinstance(p, torch.nn.Parameter) and p.device.type == standin.NAME for p in there.parameters())
+    x = torch.rand(10, 3)
+    for model, points in ((here, x), (there, x.to(DEVICE))):
+        optimiser = torch.optim.Adam(model.parameters())
+        for _ in range(3):
+            optimiser.zero_grad()
+            model(points).square().mean().backward()
+            optimiser.step()
+    again = copy.deepcopy(there)
+    for a, b, c in zip(here.parameters(), there.parameters(), again.parameters(), strict=True):
+        assert a.equal(b.detach().cpu())
+        assert b.detach().equal(c.detach())
+        assert b.data_ptr() != c.data_ptr()
+    assert {p.dtype for p in there.double().parameters()} == {torch.float64}
+    assert {p.inner.dtype for p in there.parameters()} == {torch.float64}
+
+
+def test_states_are_saved_and_loaded() -> None:
+    there = torch.nn.Linear(3, 2).to(DEVICE)
+    file = io.BytesIO()
+    torch.save(there.state_dict(), file)
+    file.seek(0)
+    back = torch.load(file, weights_only=True, map_location="cpu")
+    other = torch.nn.Linear(3, 2).to(DEVICE)
+    other.load_state_dict(back)
+    assert other.weight.equal(there.weight)
+
+
+@pytest.mark.parametrize("taper", [0.0, 0.5])
+def test_fields_are_the_cpus_to_the_last_bit(taper: float) -> None:
+    field = small_multiscale(taper)
+    twin = copy.deepcopy(field).to(DEVICE)
+    x = 2 * torch.rand(300, 3) - 1
+    y = x.to(DEVICE)
+    assert twin.value(y).cpu().equal(field.value(x))
+    for a, b in zip(twin.second_jet(y), field.second_jet(x), strict=True):
+        assert a.detach().cpu().equal(b.detach())
+    for place, points in ((field, x), (twin, y)):
+        jet = place.jet(points)
+        (jet.value.square().sum() + jet.gradient.square().sum()).backward()
+    for a, b in zip(twin.parameters(), field.parameters(), strict=True):
+        assert a.grad.cpu().equal(b.grad)
+
+
+def test_rays_are_the_cpus_to_the_last_bit() -> None:
+    origins = torch.nn.functional.normalize(torch.randn(200, 3), dim=-1) * 2
+    directions = torch.nn.functional.normalize(0.3 * torch.randn(200, 3) - origins, dim=-1)
+    for field in (Sphere(radius=0.5), small_multiscale()):
+        here = sphere_trace(field, origins, directions)
+        there = sphere_trace(copy.deepcopy(field).to(DEVICE), origins.to(DEVICE), directions.to(DEVICE))
+        for a, b in zip(there, here, strict=True):
+            assert a.cpu().equal(b)
+
+
+def test_a_field_that_forgets_its_device_is_caught() -> None:
+    class Forgetful(Sphere):
+        def value(self, x: Tensor, *, level: int = -1) -> Tensor:
+            return super().value(x + torch.zeros(3), level=level)
+
+    with pytest.raises(RuntimeError, match="same device"):
+        Forgetful().to(DEVICE).value(on_device(5, 3))
