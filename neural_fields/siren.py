@@ -24,6 +24,7 @@ import torch
 from torch import Tensor, nn
 
 from ._checks import at_least, positive
+from ._parallel import Step, one_thread, over_blocks
 from .field import Jet, OneLevelField, SecondJet
 
 __all__ = ["Siren"]
@@ -35,6 +36,8 @@ BLOCK_FLOATS = 1 << 18
 GPU_BLOCK_FLOATS = 1 << 27
 # While a graph is recorded every activation is kept anyway; larger blocks then save more calls than they lose in cache.
 GRAPH_BLOCK_FACTOR = 8
+# Parts that the derivatives of the parameters are summed in: enough for as many cores, few enough to hold them all.
+SHARES = 16
 
 
 class Siren(OneLevelField):
@@ -147,10 +150,12 @@ class Siren(OneLevelField):
         if needs_graph(rows, parameters):
             return forward(rows, parameters)[0][:, :channels]
         output = rows.new_empty(len(rows), channels)
-        block = self.block_rows(rows.device)
-        buffers = [rows.new_empty(min(block, len(rows)), self.width) for _ in range(2)]
-        for start in range(0, len(rows), block):
-            _outputs_into(output[start : start + block], rows[start : start + block], parameters, buffers)
+
+        def prepare(size: int) -> Step:
+            buffers = [rows.new_empty(size, self.width) for _ in range(2)]
+            return lambda part: _outputs_into(output[part], rows[part], parameters, buffers)
+
+        over_blocks(len(rows), self.block_rows(rows.device), prepare, like=rows)
         return output
 
     def jet(self, x: Tensor, *, level: int = -1) -> Jet:
@@ -162,18 +167,19 @@ class Siren(OneLevelField):
         self.resolve_level(level)
         rows = self.check_points(x).reshape(-1, self.in_dim)
         parameters = self.folded()
-        block = self.block_rows(rows.device)
         if needs_graph(rows, parameters):
-            parts = [_SirenJet.apply(part, *parameters) for part in rows.split(GRAPH_BLOCK_FACTOR * block)]
-            output = torch.cat([part[0] for part in parts]) if len(parts) > 1 else parts[0][0]
-            gradient = torch.cat([part[1] for part in parts]) if len(parts) > 1 else parts[0][1]
+            size = GRAPH_BLOCK_FACTOR * self.block_rows(rows.device)
+            parts = [_SirenJet.apply(part, *parameters) for part in rows.split(size)]
+            output, gradient = parts[0] if len(parts) == 1 else map(torch.cat, zip(*parts, strict=True))
         else:
             output = rows.new_empty(len(rows), 1 + self.num_features)
             gradient = torch.empty_like(rows, memory_format=torch.contiguous_format)
-            buffers = [rows.new_empty(min(block, len(rows)), self.width) for _ in range(self.depth + 2)]
-            for start in range(0, len(rows), block):
-                part = slice(start, start + block)
-                _jet_into(output[part], gradient[part], rows[part], parameters, buffers)
+
+            def prepare(size: int) -> Step:
+                buffers = [rows.new_empty(size, self.width) for _ in range(self.depth + 2)]
+                return lambda part: _jet_into(output[part], gradient[part], rows[part], parameters, buffers)
+
+            over_blocks(len(rows), self.block_rows(rows.device), prepare, like=rows)
         shape = x.shape[:-1]
         features = output[:, 1:].reshape(*shape, self.num_features)
         return Jet(output[:, 0].reshape(shape), gradient.reshape(x.shape), features)
@@ -203,8 +209,10 @@ class Siren(OneLevelField):
         """Weights and biases with units and ω₀ folded in: [W_1, b_1, …, W_d, b_d, W_out, b_out]."""
         parameters: list[Tensor] = []
         frequency, out = self.omega * self.units[0], self.units[1]
-        for layer in self._sine_layers():
-            parameters += [layer.weight * frequency, layer.bias * frequency]
+        # On one thread: others that had a share in this little would keep their cores awake, waiting for more of it.
+        with one_thread():
+            for layer in self._sine_layers():
+                parameters += [layer.weight * frequency, layer.bias * frequency]
         # The sweep back ends in a product with three columns; BLAS does it three times faster if they are contiguous.
         parameters[0] = parameters[0].t().contiguous().t()
         last = [self.output.weight, self.output.bias]
@@ -217,7 +225,11 @@ class Siren(OneLevelField):
 
     def block_rows(self, device: torch.device) -> int:
         """How many rows one block holds on ``device``."""
-        return max(256, (BLOCK_FLOATS if device.type == "cpu" else GPU_BLOCK_FLOATS) // self.width)
+        return _block_rows(self.width, device)
+
+
+def _block_rows(width: int, device: torch.device) -> int:
+    return max(256, (BLOCK_FLOATS if device.type == "cpu" else GPU_BLOCK_FLOATS) // width)
 
 
 def needs_graph(x: Tensor, parameters: Sequence[Tensor]) -> bool:
@@ -329,54 +341,104 @@ class _SirenJet(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, *parameters: Tensor) -> tuple[Tensor, Tensor]:
-        output, sines, cosines = forward(x, parameters)
-        cosines = [phase.cos_() for phase in cosines]
-        s_rows, g_rows = [], [parameters[-2][:1].expand(len(x), -1)]
-        for weight, cosine in zip(reversed(parameters[0:-2:2]), reversed(cosines), strict=True):
-            s_rows.append(g_rows[-1] * cosine)
-            g_rows.append(s_rows[-1] @ weight)
-        gradient = g_rows.pop()
-        ctx.depth = len(sines)
-        ctx.save_for_backward(x, *parameters, *sines, *cosines, *reversed(s_rows), *reversed(g_rows))
+        depth, width = len(parameters) // 2 - 1, parameters[-2].shape[1]
+        output = x.new_empty(len(x), len(parameters[-1]))
+        gradient = torch.empty_like(x, memory_format=torch.contiguous_format)
+        # Sines, cosines, s and g of every layer; the last g is the output's weights at every point.
+        kept = [[x.new_empty(len(x), width) for _ in range(depth)] for _ in range(3)]
+        kept.append([x.new_empty(len(x), width) for _ in range(depth - 1)])
+        g_rows = [gradient, *kept[3], parameters[-2][:1].expand(len(x), -1)]
+
+        def step(part: slice) -> None:
+            sines, cosines, s_rows = ([rows[part] for rows in layers] for layers in kept[:3])
+            h = x[part]
+            for index in range(depth):
+                z = torch.addmm(parameters[2 * index + 1], h, parameters[2 * index].t(), out=sines[index])
+                torch.cos(z, out=cosines[index])
+                h = z.sin_()
+            torch.addmm(parameters[-1], h, parameters[-2].t(), out=output[part])
+            for index in range(depth - 1, -1, -1):
+                torch.mul(g_rows[index + 1][part], cosines[index], out=s_rows[index])
+                torch.mm(s_rows[index], parameters[2 * index], out=g_rows[index][part])
+
+        over_blocks(len(x), _block_rows(width, x.device), lambda _: step, like=x)
+        ctx.save_for_backward(x, *parameters, *itertools.chain(*kept))
         return output, gradient
 
     @staticmethod
     def backward(ctx: Any, *cotangents: Tensor | None) -> tuple[Tensor | None, ...]:
-        depth, saved = ctx.depth, ctx.saved_tensors
-        x, parameters = saved[0], saved[1 : 2 * depth + 3]
+        saved = ctx.saved_tensors
+        x, depth = saved[0], len(ctx.needs_input_grad) // 2 - 1
+        parameters = saved[1 : 2 * depth + 3]
         if torch.is_grad_enabled():
             return _differentiable_backward(ctx.needs_input_grad, x, parameters, cotangents)
-        rest = saved[2 * depth + 3 :]
-        sines, cosines, s_rows, g_rows = (rest[i * depth : (i + 1) * depth] for i in range(4))
+        kept = saved[2 * depth + 3 :]
         output_bar, gradient_bar = cotangents
         # Autograd materialises the cotangents nobody asked for.
         assert output_bar is not None
         assert gradient_bar is not None
-        weights = parameters[0:-2:2]
-        bars: list[Tensor] = [torch.empty(0)] * (2 * depth + 2)
+        g_out = parameters[-2][:1].expand(len(x), -1)
+        given = (output_bar, gradient_bar, x, *kept, g_out)
+        x_bar = torch.empty_like(x) if ctx.needs_input_grad[0] else None
+        size = _block_rows(parameters[-2].shape[1], x.device)
+        # The sums over points are made of a fixed number of parts, in their order: the same bits for any threads.
+        share = max(size, -(-len(x) // SHARES))
+        starts = range(0, len(x), share)
+        bars = [torch.zeros(len(starts), *parameter.shape, dtype=x.dtype, device=x.device) for parameter in parameters]
 
-        # Adjoint of the reverse sweep: one tangent forward.
-        u = gradient_bar
-        carried: list[Tensor] = []
-        for index in range(depth):
-            bars[2 * index] = s_rows[index].t() @ u
-            v = u @ weights[index].t()
-            u = v * cosines[index]
-            carried.append(v.mul_(g_rows[index]).mul_(sines[index]))
-        bars[-2] = output_bar.t() @ sines[-1]
-        bars[-2][0] += u.sum(dim=0)
-        bars[-1] = output_bar.sum(dim=0)
+        def prepare(_: int) -> Step:
+            buffers = [x.new_empty(min(size, len(x)), width) for width in [parameters[-2].shape[1]] * (depth + 2)]
 
-        # Adjoint of the value: the usual backward pass.
-        h_bar = output_bar @ parameters[-2]
-        for index in range(depth - 1, -1, -1):
-            z_bar = h_bar.mul_(cosines[index]).sub_(carried[index])
-            below = sines[index - 1] if index else x
-            bars[2 * index].addmm_(z_bar.t(), below)
-            bars[2 * index + 1] = z_bar.sum(dim=0)
-            if index or ctx.needs_input_grad[0]:
-                h_bar = z_bar @ weights[index]
-        return (h_bar if ctx.needs_input_grad[0] else None, *bars)
+            def step(share_of: slice) -> None:
+                for number in range(share_of.start, share_of.stop):
+                    own = [bar[number] for bar in bars]
+                    stop = min(starts[number] + share, len(x))
+                    for start in range(starts[number], stop, size):
+                        part = slice(start, min(start + size, stop))
+                        rows = [tensor[part] for tensor in given]
+                        _add_bars(own, None if x_bar is None else x_bar[part], rows, parameters, buffers)
+
+            return step
+
+        over_blocks(len(starts), 1, prepare, like=x)
+        return (x_bar, *(bar.sum(dim=0) for bar in bars))
+
+
+def _add_bars(
+    bars: Sequence[Tensor],
+    x_bar: Tensor | None,
+    rows: Sequence[Tensor],
+    parameters: Sequence[Tensor],
+    buffers: Sequence[Tensor],
+) -> None:
+    """Add what one block gives to the cotangents of the parameters, and write those of its points."""
+    output_bar, gradient_bar, x = rows[:3]
+    depth = len(parameters) // 2 - 1
+    sines, cosines, s_rows, g_rows = (rows[3 + i * depth : 3 + (i + 1) * depth] for i in range(4))
+    weights = parameters[0:-2:2]
+    carried, (u_row, spare) = [b[: len(x)] for b in buffers[:depth]], [b[: len(x)] for b in buffers[depth:]]
+
+    # Adjoint of the reverse sweep: one tangent forward.
+    u = gradient_bar
+    for index, v in enumerate(carried):
+        torch.addmm(bars[2 * index], s_rows[index].t(), u, out=bars[2 * index])
+        torch.mm(u, weights[index].t(), out=v)
+        u = torch.mul(v, cosines[index], out=u_row)
+        v.mul_(g_rows[index]).mul_(sines[index])
+    torch.addmm(bars[-2], output_bar.t(), sines[-1], out=bars[-2])
+    bars[-2][0] += u.sum(dim=0)
+    bars[-1].add_(output_bar.sum(dim=0))
+
+    # Adjoint of the value: the usual backward pass.
+    h_bar = torch.mm(output_bar, parameters[-2], out=spare)
+    for index in range(depth - 1, -1, -1):
+        z_bar = h_bar.mul_(cosines[index]).sub_(carried[index])
+        torch.addmm(bars[2 * index], z_bar.t(), sines[index - 1] if index else x, out=bars[2 * index])
+        bars[2 * index + 1].add_(z_bar.sum(dim=0))
+        if index:
+            h_bar = torch.mm(z_bar, weights[index], out=u_row if z_bar is spare else spare)
+        elif x_bar is not None:
+            torch.mm(z_bar, weights[0], out=x_bar)
 
 
 def _differentiable_backward(

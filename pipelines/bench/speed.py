@@ -7,11 +7,13 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from multiprocessing import get_context
+from multiprocessing.synchronize import Barrier
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +24,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from ...neural_fields import Field, InputError, Jet, MultiscaleSDF, Siren, levels_of, load_field
+from ...neural_fields._parallel import one_thread, over_blocks, split_operations
 from ...neural_fields.meshing import DEFAULT_BOUNDS, extract_mesh
 from ..run.folder import find_field
 from ..run.machine import best_seconds, peak_memory, sgemm_rate
@@ -48,7 +51,16 @@ SIZES = ((128, 2), (256, 2), (400, 2), (256, 3))
 
 @dataclass(frozen=True)
 class NormalsRow:
-    """Seconds for one network on one set of points; ``gemm`` is the jet's matrix work at the machine's own rate."""
+    """Seconds for one network on one set of points.
+
+    Attributes:
+        gemm: of the jet's matrix work, at the machine's own rate.
+        value_split: of the value with every operation of a block split among all threads.
+        jet_split: the same of the jet.
+        value_one: of the value on one thread.
+        jet_one: of the jet on one thread.
+        threads: that the others used.
+    """
 
     width: int
     depth: int
@@ -60,6 +72,11 @@ class NormalsRow:
     autograd: float
     gemm: float
     largest_difference: float
+    value_split: float
+    jet_split: float
+    value_one: float
+    jet_one: float
+    threads: int
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,8 +91,9 @@ class NormalsBench(Benchmark[NormalsRow]):
     Attributes:
         points: how many.
         sizes: widths and depths of the networks.
-        repeats: the best of so many is what counts.
+        repeats: the best of so many is what counts; beside busy processes the median.
         seed: of points and weights.
+        busy: processes that multiply matrices meanwhile, as others do on a machine that is shared.
     """
 
     name = "normals"
@@ -86,6 +104,7 @@ class NormalsBench(Benchmark[NormalsRow]):
     sizes: tuple[tuple[int, int], ...] = SIZES
     repeats: int = 3
     seed: int = 0
+    busy: int = 0
 
     def cells(self) -> list[Part]:
         """One for each network."""
@@ -93,7 +112,8 @@ class NormalsBench(Benchmark[NormalsRow]):
 
     def measure(self, cell: Part, work: Workplace) -> list[NormalsRow]:
         """See `Benchmark.measure`."""
-        return [self.timed(**cell.parameters)]
+        with _busy(self.busy):
+            return [self.timed(**cell.parameters)]
 
     def timed(self, width: int, depth: int) -> NormalsRow:
         """The row of one network."""
@@ -103,16 +123,37 @@ class NormalsBench(Benchmark[NormalsRow]):
             network = Siren(width, depth).to(self.device).requires_grad_(False)
 
         def seconds(way: Callable[[Tensor], object]) -> float:
-            return best_seconds(lambda: way(x), repeats=self.repeats)
+            return best_seconds(lambda: way(x), repeats=self.repeats, median=self.busy > 0)
 
+        threads = torch.get_num_threads()
         with torch.inference_mode():
             value, jet = seconds(network.value), seconds(network.jet)
+            with split_operations():
+                value_split, jet_split = seconds(network.value), seconds(network.jet)
+            with one_thread():
+                value_one, jet_one = seconds(network.value), seconds(network.jet)
             printed, tangents = (seconds(partial(way, network)) for way in (printed_jet, tangent_jet))
         autograd = seconds(partial(_autograd_jet, network))
         flops = 2 * 2 * self.points * ((depth - 1) * width**2 + 4 * width)
         gemm = flops / sgemm_rate(width, rows=network.block_rows(x.device), device=x.device)
         apart = _largest_difference(network, x[:4096])
-        return NormalsRow(width, depth, self.points, value, jet, printed, tangents, autograd, gemm, apart)
+        return NormalsRow(
+            width,
+            depth,
+            self.points,
+            value=value,
+            jet=jet,
+            printed=printed,
+            tangents=tangents,
+            autograd=autograd,
+            gemm=gemm,
+            largest_difference=apart,
+            value_split=value_split,
+            jet_split=jet_split,
+            value_one=value_one,
+            jet_one=jet_one,
+            threads=threads,
+        )
 
     def tables(self, rows: Sequence[NormalsRow], *, sgemm: float) -> tuple[Table, ...]:
         """See `Benchmark.tables`."""
@@ -137,7 +178,24 @@ class NormalsBench(Benchmark[NormalsRow]):
             f"largest difference between the gradients: {max(r.largest_difference for r in rows):.1e}",
         )
         items = [(f"({r.width},{r.depth})", r) for r in rows]
-        return (tabulated(self.name, "What a gradient costs", "network", figures, items, notes=notes),)
+        cores: list[Figure[NormalsRow]] = [
+            (Column("value, ns", ".0f"), lambda r: 1e9 * r.value / r.points),
+            (Column("split/value", ".2f"), lambda r: r.value_split / r.value),
+            (Column("of 1 thread's", ".0%"), lambda r: r.value_one / (r.threads * r.value)),
+            (Column("jet, ns", ".0f"), lambda r: 1e9 * r.jet / r.points),
+            (Column("split/jet", ".2f"), lambda r: r.jet_split / r.jet),
+            (Column("of 1 thread's", ".0%"), lambda r: r.jet_one / (r.threads * r.jet)),
+        ]
+        beside = f", {self.busy} other process(es) multiplying matrices (medians)" if self.busy else ""
+        about = (
+            f"time of a point on {rows[0].threads} threads{beside}. split: every operation of a block shared by all "
+            "threads, over blocks that belong to one thread each.",
+            "of 1 thread's: work of each thread in a second, of what a single one does.",
+        )
+        return (
+            tabulated(self.name, "What a gradient costs", "network", figures, items, notes=notes),
+            tabulated(f"{self.name}-threads", "What threads do", "network", cores, items, notes=about),
+        )
 
 
 @torch.inference_mode()
@@ -150,12 +208,10 @@ def tangent_jet(network: Siren, x: Tensor) -> tuple[Tensor, Tensor]:
     parameters = network.folded()
     weights, biases = parameters[0:-2:2], parameters[1:-2:2]
     value, gradient = x.new_empty(len(x)), torch.empty_like(x)
-    block = network.block_rows(x.device)
-    buffers = [x.new_empty(block, network.width) for _ in range(6)]
-    for start in range(0, len(x), block):
-        part = x[start : start + block]
-        sine, phase, cosine, *tangents = [buffer[: len(part)] for buffer in buffers]
-        torch.addmm(biases[0], part, weights[0].t(), out=phase)
+
+    def step(buffers: Sequence[Tensor], part: slice) -> None:
+        sine, phase, cosine, *tangents = [buffer[: part.stop - part.start] for buffer in buffers]
+        torch.addmm(biases[0], x[part], weights[0].t(), out=phase)
         torch.cos(phase, out=cosine)
         torch.sin(phase, out=sine)
         for axis, tangent in enumerate(tangents):
@@ -168,9 +224,11 @@ def tangent_jet(network: Siren, x: Tensor) -> tuple[Tensor, Tensor]:
                 # The phase is spent; its buffer takes the product, and the tangent's old buffer the next phase.
                 product = torch.mm(tangent, weight.t(), out=phase).mul_(cosine)
                 phase, tangents[index] = tangent, product
-        torch.addmv(parameters[-1], sine, parameters[-2][0], out=value[start : start + block])
+        torch.addmv(parameters[-1], sine, parameters[-2][0], out=value[part])
         for axis, tangent in enumerate(tangents):
-            gradient[start : start + block, axis] = tangent @ parameters[-2][0]
+            gradient[part, axis] = tangent @ parameters[-2][0]
+
+    _over_blocks(network, x, step, buffers=6)
     return value, gradient
 
 
@@ -180,13 +238,11 @@ def printed_jet(network: Siren, x: Tensor) -> tuple[Tensor, Tensor]:
     parameters = network.folded()
     weights, biases = parameters[0:-2:2], parameters[1:-2:2]
     value, gradient = x.new_empty(len(x)), torch.empty_like(x)
-    block = network.block_rows(x.device)
-    buffers = [x.new_empty(block, network.width) for _ in range(4)]
-    for start in range(0, len(x), block):
-        part = x[start : start + block]
+
+    def step(buffers: Sequence[Tensor], part: slice) -> None:
         for axis in range(3):
-            sine, phase, tangent, cosine = [buffer[: len(part)] for buffer in buffers]
-            torch.addmm(biases[0], part, weights[0].t(), out=phase)
+            sine, phase, tangent, cosine = [buffer[: part.stop - part.start] for buffer in buffers]
+            torch.addmm(biases[0], x[part], weights[0].t(), out=phase)
             torch.mul(torch.cos(phase, out=cosine), weights[0][:, axis], out=tangent)
             torch.sin(phase, out=sine)
             for weight, bias in zip(weights[1:], biases[1:], strict=True):
@@ -194,9 +250,45 @@ def printed_jet(network: Siren, x: Tensor) -> tuple[Tensor, Tensor]:
                 torch.cos(phase, out=cosine)
                 torch.sin(phase, out=sine)
                 tangent, phase = torch.mm(tangent, weight.t(), out=phase).mul_(cosine), tangent
-            gradient[start : start + block, axis] = tangent @ parameters[-2][0]
-            torch.addmv(parameters[-1], sine, parameters[-2][0], out=value[start : start + block])
+            gradient[part, axis] = tangent @ parameters[-2][0]
+            torch.addmv(parameters[-1], sine, parameters[-2][0], out=value[part])
+
+    _over_blocks(network, x, step, buffers=4)
     return value, gradient
+
+
+def _over_blocks(network: Siren, x: Tensor, step: Callable[[Sequence[Tensor], slice], None], *, buffers: int) -> None:
+    """Run a step with buffers of its thread over the blocks that the network's own jet has."""
+
+    def prepare(rows: int) -> Callable[[slice], None]:
+        return partial(step, [x.new_empty(rows, network.width) for _ in range(buffers)])
+
+    over_blocks(len(x), network.block_rows(x.device), prepare, like=x)
+
+
+@contextmanager
+def _busy(count: int) -> Iterator[None]:
+    """Keep ``count`` processes multiplying matrices, each on one thread, until the end of the block."""
+    context = get_context("spawn")
+    begun = context.Barrier(count + 1)
+    processes = [context.Process(target=_multiply, args=(begun,), daemon=True) for _ in range(count)]
+    for process in processes:
+        process.start()
+    begun.wait()
+    try:
+        yield
+    finally:
+        for process in processes:
+            process.terminate()
+            process.join()
+
+
+def _multiply(begun: Barrier) -> None:
+    torch.set_num_threads(1)
+    matrix = torch.eye(512)
+    begun.wait()
+    while True:
+        torch.mm(matrix, matrix)
 
 
 def _autograd_jet(network: Siren, x: Tensor) -> tuple[Tensor, Tensor]:

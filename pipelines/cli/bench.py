@@ -96,7 +96,8 @@ def _measured(parser: argparse.ArgumentParser, resolution: int, samples: int = 5
 
 def _normals_arguments(parser: argparse.ArgumentParser) -> None:
     _number(parser, "--points", whole(1), 262_144, "how many")
-    _number(parser, "--repeats", whole(1), 3, "the best of how many")
+    _number(parser, "--repeats", whole(1), 3, "the best of how many; with --busy the median")
+    _number(parser, "--busy", whole(0, 256), 0, "processes that multiply matrices meanwhile")
     parser.add_argument("--device", default="cpu", help="torch device (cpu)")
     _number(parser, "--seed", whole(0), 0, "of points and weights")
     _folder(parser)
@@ -106,7 +107,7 @@ def _normals_arguments(parser: argparse.ArgumentParser) -> None:
 def _normals(arguments: argparse.Namespace) -> int:
     from ..bench.speed import NormalsBench
 
-    options = {name: getattr(arguments, name) for name in ("points", "repeats", "seed", "device")}
+    options = {name: getattr(arguments, name) for name in ("points", "repeats", "busy", "seed", "device")}
     return _run(arguments, [NormalsBench(**options)], out=arguments.out)
 
 

@@ -123,7 +123,8 @@ def _threads() -> Finding:
     text = f"{threads} of {cores} logical CPUs"
     if threads < cores // 2:
         return Finding("warning", "threads", f"{text}; unset OMP_NUM_THREADS to use more")
-    return Finding("ok", "threads", text)
+    how = "each with blocks of points of its own" if threads > 1 else "blocks of points one after the other"
+    return Finding("ok", "threads", f"{text}; {how}")
 
 
 def _cuda() -> Finding:

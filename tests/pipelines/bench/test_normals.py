@@ -1,5 +1,6 @@
 """The peers of the jet benchmark compute the same thing; the table says what was measured."""
 
+import multiprocessing
 from collections.abc import Callable
 from pathlib import Path
 
@@ -23,12 +24,17 @@ def test_algorithm_1_is_the_jet(depth: int, method: Callable[[Siren, Tensor], tu
 
 
 def test_rows_and_table(tmp_path: Path) -> None:
-    bench = NormalsBench(points=3000, sizes=((16, 2), (24, 3)), repeats=1)
+    bench = NormalsBench(points=3000, sizes=((16, 2), (24, 3)), repeats=1, busy=1)
     rows = bench.rows(tmp_path)
     assert [(row.width, row.depth) for row in rows] == [(16, 2), (24, 3)]
+    assert not multiprocessing.active_children(), "the busy process outlived its rows"
     for row in rows:
         assert min(row.value, row.jet, row.printed, row.tangents, row.autograd, row.gemm) > 0
+        assert min(row.value_split, row.jet_split, row.value_one, row.jet_one) > 0
         assert row.largest_difference < 1e-3
-    table = as_text(*bench.tables(rows, sgemm=1e9))
-    assert "(24,3)" in table
-    assert f"{rows[0].jet / rows[0].value:.2f}" in table
+    costs, threads = map(as_text, bench.tables(rows, sgemm=1e9))
+    assert "(24,3)" in costs
+    assert f"{rows[0].jet / rows[0].value:.2f}" in costs
+    assert "1 other process(es)" in threads
+    assert f"{rows[1].jet_split / rows[1].jet:.2f}" in threads
+    assert f"{rows[1].jet_one / (rows[1].threads * rows[1].jet):.0%}" in threads
