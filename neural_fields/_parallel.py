@@ -61,7 +61,7 @@ def over_blocks(rows: int, size: int, prepare: Callable[[int], Step], *, like: T
     if threads < 2 or count < LEAST_BLOCKS or not _may_share(like):
         step = prepare(min(size, rows))
         for start in range(0, rows, size):
-            step(slice(start, start + size))
+            step(slice(start, min(start + size, rows)))
         return
     blocks, inference = _Blocks(rows, size), torch.is_inference_mode_enabled()
 
