@@ -18,7 +18,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
@@ -26,6 +26,10 @@ from torch import Tensor, nn
 from ._checks import at_least, positive
 from ._parallel import Step, one_thread, over_blocks
 from .field import Jet, OneLevelField, SecondJet
+from .kernels.switch import choose
+
+if TYPE_CHECKING:
+    from .kernels.launch import Network
 
 __all__ = ["Siren"]
 
@@ -146,6 +150,13 @@ class Siren(OneLevelField):
         """The first outputs ``(N, channels)`` at points ``(..., d)``."""
         self.resolve_level(level)
         rows = self.check_points(x).reshape(-1, self.in_dim)
+        parameters = list(self.parameters())
+        if not needs_graph(rows, parameters):
+            fused = choose(rows, width=self.width, depth=self.depth, features=channels - 1)
+            if fused.precision:
+                from .kernels.siren import siren_value
+
+                return siren_value(rows, self.as_network(), fused.precision)[:, None]
         parameters = self.folded()
         if needs_graph(rows, parameters):
             return forward(rows, parameters)[0][:, :channels]
@@ -166,6 +177,14 @@ class Siren(OneLevelField):
         """
         self.resolve_level(level)
         rows = self.check_points(x).reshape(-1, self.in_dim)
+        if not needs_graph(rows, list(self.parameters())):
+            fused = choose(rows, width=self.width, depth=self.depth, features=self.num_features)
+            if fused.precision:
+                from .kernels.siren import siren_jet
+
+                value, gradient = siren_jet(rows, self.as_network(), fused.precision)
+                shape = x.shape[:-1]
+                return Jet(value.reshape(shape), gradient.reshape(x.shape), x.new_empty(*shape, 0))
         parameters = self.folded()
         if needs_graph(rows, parameters):
             size = GRAPH_BLOCK_FACTOR * self.block_rows(rows.device)
@@ -217,6 +236,13 @@ class Siren(OneLevelField):
         parameters[0] = parameters[0].t().contiguous().t()
         last = [self.output.weight, self.output.bias]
         return [*parameters, *(last if out == 1 else [part * out for part in last])]
+
+    def as_network(self) -> Network:
+        """As the fused kernels take it; they are not imported without Triton."""
+        from .kernels.launch import Network
+
+        parameters = [part for layer in (*self._sine_layers(), self.output) for part in (layer.weight, layer.bias)]
+        return Network.of(parameters, self.omega * self.units[0], self.units[1])
 
     def _sine_layers(self) -> Iterator[nn.Linear]:
         for layer in self.layers:

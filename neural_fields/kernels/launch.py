@@ -1,0 +1,99 @@
+"""What every launch needs: how a network is cut into tiles, how many programs there are, and their scratch."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+import triton
+from torch import Tensor
+
+__all__ = ["Network", "Tiling", "on_device", "program_count", "scratch_for", "tiling_of"]
+
+# Programs for each multiprocessor: two fit beside each other by registers and shared memory (docs/accelerators.md).
+PROGRAMS_PER_MULTIPROCESSOR = 2
+# The interpreter runs one after the other; three show what several do.
+INTERPRETED_PROGRAMS = 3
+# Up to this width an accumulator holds all units of a layer.
+WHOLE = 128
+
+
+class Network(NamedTuple):
+    """A SIREN as the kernels take it.
+
+    Attributes:
+        parameters: (W₁, b₁, …, W_d, b_d, W_out, b_out), contiguous, float32; of the output the first row is read.
+        omega: ω₀ times the unit of the sine layers' parameters.
+        gain: the unit of the output's.
+    """
+
+    parameters: tuple[Tensor, ...]
+    omega: float
+    gain: float
+
+    @classmethod
+    def of(cls, parameters: Sequence[Tensor], omega: float, gain: float) -> Network:
+        """With whatever is not contiguous copied."""
+        return cls(tuple(parameter.detach().contiguous() for parameter in parameters), float(omega), float(gain))
+
+    @property
+    def width(self) -> int:
+        """Of the sine layers."""
+        return self.parameters[0].shape[0]
+
+    @property
+    def depth(self) -> int:
+        """How many sine layers there are."""
+        return len(self.parameters) // 2 - 1
+
+
+class Tiling(NamedTuple):
+    """How a kernel cuts its work; the names are those of its arguments.
+
+    Attributes:
+        rows: points of a tile.
+        columns: units of an accumulator, a power of two.
+        piece: inner units of one product, a power of two ≥ 16.
+        warps: of a program.
+    """
+
+    rows: int
+    columns: int
+    piece: int
+    warps: int
+
+    def stride(self, width: int) -> int:
+        """The width rounded up to whole accumulators."""
+        return triton.cdiv(width, self.columns) * self.columns
+
+
+def tiling_of(width: int) -> Tiling:
+    """Tiles for a width: one accumulator up to 128 units; 64 units at a time beyond, of which 400 wastes fewest."""
+    units = max(16, triton.next_power_of_2(width))
+    if units <= WHOLE:
+        return Tiling(64, units, min(32, units), 8 if units == WHOLE else 4)
+    return Tiling(64, 64, 32, 4)
+
+
+def program_count(device: torch.device, tiles: int) -> int:
+    """How many programs share ``tiles``: at least 1, and as many as run at a time."""
+    if device.type != "cuda":
+        return max(1, min(tiles, INTERPRETED_PROGRAMS))
+    return max(1, min(tiles, PROGRAMS_PER_MULTIPROCESSOR * multiprocessors(device)))
+
+
+def multiprocessors(device: torch.device) -> int:
+    """Of a CUDA device."""
+    return torch.cuda.get_device_properties(device).multi_processor_count
+
+
+def scratch_for(x: Tensor, programs: int, floats: int) -> Tensor:
+    """Memory that ``programs`` programs write ``floats`` numbers into each, with nothing in it yet."""
+    return torch.empty(programs * floats, dtype=torch.float32, device=x.device)
+
+
+def on_device(x: Tensor) -> contextlib.AbstractContextManager[object]:
+    """Triton launches on the current device; make it that of ``x``."""
+    return torch.cuda.device(x.device) if x.is_cuda else contextlib.nullcontext()

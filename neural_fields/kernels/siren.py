@@ -1,0 +1,102 @@
+"""Value, or value and gradient, of a SIREN in one launch: the kernel, and what calls it."""
+
+from __future__ import annotations
+
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from .launch import Network, on_device, program_count, scratch_for, tiling_of
+from .tiles import jet_of_tile, planes, points_of, rows_of, value_of_tile
+
+__all__ = ["siren_jet", "siren_value"]
+
+
+@triton.jit(do_not_specialize=["count"])
+def evaluate(
+    x,
+    parameters,
+    value,
+    gradient,
+    scratch,
+    count,
+    omega,
+    gain,
+    JET: tl.constexpr,
+    PLANES: tl.constexpr,
+    ROWS: tl.constexpr,
+    IN: tl.constexpr,
+    WIDTH: tl.constexpr,
+    DEPTH: tl.constexpr,
+    COLUMNS: tl.constexpr,
+    PIECE: tl.constexpr,
+    PRECISION: tl.constexpr,
+):
+    """Every program takes tiles from its own number on, in steps of how many programs there are."""
+    STRIDE: tl.constexpr = (WIDTH + COLUMNS - 1) // COLUMNS * COLUMNS
+    own = scratch + tl.program_id(0).to(tl.int64) * (PLANES * ROWS * STRIDE)
+    for tile in range(tl.program_id(0), tl.cdiv(count, ROWS), tl.num_programs(0)):
+        row = rows_of(tile, ROWS)
+        real = row < count
+        points = points_of(x, row, real, IN)
+        if JET:
+            f, slope = jet_of_tile(
+                points, parameters, own, omega, gain, ROWS, IN, WIDTH, DEPTH, COLUMNS, PIECE, PRECISION
+            )
+            for axis in tl.static_range(IN):
+                tl.store(gradient + row * IN + axis, slope[axis], mask=real)
+        else:
+            f = value_of_tile(
+                points, parameters, own, omega, gain, ROWS, IN, WIDTH, DEPTH, COLUMNS, PIECE, PRECISION
+            )
+        tl.store(value + row, f, mask=real)
+
+
+def siren_value(x: Tensor, network: Network, precision: str) -> Tensor:
+    """f at points ``(N, d)`` → ``(N,)``; N may be 0.
+
+    Args:
+        x: float32, on a CUDA device, or on the CPU under the interpreter.
+        network: on the same.
+        precision: "ieee", "tf32x3" or "tf32".
+    """
+    value = x.new_empty(len(x))
+    _launch(x, network, precision, value, value, jet=False)
+    return value
+
+
+def siren_jet(x: Tensor, network: Network, precision: str) -> tuple[Tensor, Tensor]:
+    """f and its gradient at points ``(N, d)`` → ``(N,)``, ``(N, d)``; for the arguments see `siren_value`."""
+    value, gradient = x.new_empty(len(x)), x.new_empty(x.shape)
+    _launch(x, network, precision, value, gradient, jet=True)
+    return value, gradient
+
+
+def _launch(x: Tensor, network: Network, precision: str, value: Tensor, gradient: Tensor, *, jet: bool) -> None:
+    if not len(x):
+        return
+    tiling = tiling_of(network.width)
+    programs = program_count(x.device, triton.cdiv(len(x), tiling.rows))
+    kept = planes(network.depth, jet=jet)
+    with on_device(x):
+        evaluate[(programs,)](
+            x.contiguous(),
+            network.parameters,
+            value,
+            gradient,
+            scratch_for(x, programs, kept * tiling.rows * tiling.stride(network.width)),
+            len(x),
+            network.omega,
+            network.gain,
+            JET=jet,
+            PLANES=kept,
+            ROWS=tiling.rows,
+            IN=x.shape[1],
+            WIDTH=network.width,
+            DEPTH=network.depth,
+            COLUMNS=tiling.columns,
+            PIECE=tiling.piece,
+            PRECISION=precision,
+            num_warps=tiling.warps,
+            num_stages=2,
+        )

@@ -1,0 +1,101 @@
+"""Whether a network is evaluated by the fused kernels or by PyTorch, and why not by the other.
+
+They are used wherever they can be: float32 on CUDA, with Triton there (``pip install 'mplicits[kernels]'``; PyTorch's
+builds for CUDA bring it). The environment variable ``MPLICITS_KERNELS`` says otherwise:
+
+    auto       the kernels where they can be used, products in IEEE float32 (the default)
+    off        PyTorch everywhere
+    tf32x3     as auto; products on tensor cores, each operand in two parts: near float32's error
+    tf32       as auto; products on tensor cores, with operands of 11 bits: errors of 1e-3 of the terms
+    interpret  the kernels on the CPU too, by Triton's interpreter, which TRITON_INTERPRET=1 has to switch on: for tests
+
+This file does not import Triton.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib.util
+import os
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..errors import InputError
+
+__all__ = ["MAX_DEPTH", "MAX_WIDTH", "MODES", "VARIABLE", "Choice", "choose", "mode", "obstacle"]
+
+VARIABLE = "MPLICITS_KERNELS"
+MODES = ("auto", "off", "tf32x3", "tf32", "interpret")
+# What is tested; wider and deeper ones would run, and keep more in scratch than caches hold.
+MAX_WIDTH, MAX_DEPTH = 512, 8
+# Before it, no tensor cores for float32 of any kind; Triton itself wants 7.0.
+LEAST_CAPABILITY = (8, 0)
+
+
+class Choice(NamedTuple):
+    """How a network will be evaluated.
+
+    Attributes:
+        precision: of the kernels' products, "ieee", "tf32x3" or "tf32"; empty where PyTorch evaluates.
+        reason: why PyTorch does; empty where the kernels do.
+    """
+
+    precision: str
+    reason: str
+
+
+def mode() -> str:
+    """What ``MPLICITS_KERNELS`` says.
+
+    Raises:
+        InputError: it says something else.
+    """
+    said = os.environ.get(VARIABLE, "auto")
+    if said not in MODES:
+        raise InputError(f"{VARIABLE}={said!r} in the environment: expected one of {', '.join(MODES)}")
+    return said
+
+
+def choose(x: Tensor, *, width: int, depth: int, features: int = 0) -> Choice:
+    """How a SIREN is to be evaluated at points ``x`` without a graph.
+
+    Args:
+        x: the points.
+        width: of its sine layers.
+        depth: how many it has.
+        features: how many outputs beside the value are asked for.
+
+    Raises:
+        InputError: see `mode`.
+    """
+    asked = mode()
+    reason = ""
+    if asked == "off":
+        reason = f"{VARIABLE}=off"
+    elif asked != "interpret" and x.device.type != "cuda":
+        reason = f"points on {x.device.type}; the kernels are for CUDA"
+    elif x.dtype != torch.float32:
+        reason = f"{x.dtype}; the kernels compute in float32"
+    elif features:
+        reason = "features are asked for; the kernels have none"
+    elif width > MAX_WIDTH or depth > MAX_DEPTH:
+        reason = f"({width}, {depth}) is more than width {MAX_WIDTH} or depth {MAX_DEPTH}"
+    else:
+        reason = obstacle(x.device, asked)
+    return Choice("", reason) if reason else Choice(asked if asked.startswith("tf32") else "ieee", "")
+
+
+@functools.cache
+def obstacle(device: torch.device, asked: str) -> str:
+    """What the machine lacks for the kernels on ``device``; empty if nothing."""
+    if importlib.util.find_spec("triton") is None:
+        return "Triton is not installed; pip install 'mplicits[kernels]'"
+    if asked == "interpret":
+        return "" if os.environ.get("TRITON_INTERPRET") == "1" else "TRITON_INTERPRET=1 is not set"
+    if os.environ.get("TRITON_INTERPRET") == "1":
+        return "TRITON_INTERPRET=1 is set; only MPLICITS_KERNELS=interpret uses the interpreter"
+    if torch.cuda.get_device_capability(device) < LEAST_CAPABILITY:
+        return f"{torch.cuda.get_device_name(device)} is older than compute capability 8.0"
+    return ""

@@ -1,0 +1,297 @@
+"""What one program does with a tile of points: value, or value and gradient, of a network of any width.
+
+A tile is a matrix of ROWS points; a product is made COLUMNS units at a time, in an accumulator (ROWS, COLUMNS) that stays
+in registers, PIECE inner units after PIECE. Where the accumulator is as wide as the network (up to 128 units):
+
+- the first sine layer is never kept: each piece of it is made from the points when a product wants it, once;
+- the last one goes from its accumulator into the output's sum;
+- the first layer's cosines are made again from the points for the end of the sweep back.
+
+So a value of (128, 2) touches no memory but points, weights and the result, and a jet puts one matrix aside, s₂. What has
+to be put aside, `planes` says how much, lies in a scratch of the program's own, ROWS times its width, small enough for the
+caches: layer i in plane i mod 2 on the way up and on the way back, since that of layer i − 1 is free by then, and the
+cosines of the layers between first and last after them. All products read a plane by pieces, in a loop: a product over
+all inner units at once is unrolled, and spills (`docs/accelerators.md` has the figures).
+
+Units beyond the width have weights and biases of 0: their sines are 0, and 0 is swept back to them.
+"""
+
+from __future__ import annotations
+
+import triton
+import triton.language as tl
+from triton.language.extra import libdevice
+
+__all__ = ["cosine", "first_phase", "jet_of_tile", "planes", "points_of", "product_from", "rows_of", "sine", "value_of_tile"]
+
+# The interpreter runs kernels with numpy and has no libdevice; its sine is numpy's.
+INTERPRETED = tl.constexpr(bool(triton.knobs.runtime.interpret))
+
+
+def planes(depth: int, *, jet: bool) -> int:
+    """How many matrices of ROWS points a program puts aside."""
+    return 2 + max(0, depth - 2) * jet
+
+
+@triton.jit
+def sine(z):
+    """sin z, to two units in the last place whatever z is: phases grow with ω₀, so that a fast sine will not do.
+
+    By CUDA's libdevice (``__nv_sinf``). ``sin.approx``, which options may make of a sine, is 2⁻²¹ off within [−π, π]
+    already, and loses a digit with each digit of its argument.
+    """
+    if INTERPRETED:
+        return tl.sin(z)
+    else:  # noqa: RET505 - only the branch that is chosen is compiled
+        return libdevice.sin(z)
+
+
+@triton.jit
+def cosine(z):
+    """Cos z, as `sine`."""
+    if INTERPRETED:
+        return tl.cos(z)
+    else:  # noqa: RET505
+        return libdevice.cos(z)
+
+
+@triton.jit
+def rows_of(tile, ROWS: tl.constexpr):
+    """The rows of a tile (ROWS,), in 64 bits: offsets of 2³¹ and more are no rarity."""
+    return tl.full((ROWS,), ROWS, tl.int64) * tile + tl.arange(0, ROWS)
+
+
+@triton.jit
+def points_of(x, row, real, IN: tl.constexpr):
+    """The coordinates of the points ``row`` (ROWS,), a tuple of IN columns."""
+    points = ()
+    for axis in tl.static_range(IN):
+        points = points + (tl.load(x + row * IN + axis, mask=real, other=0.0),)  # noqa: RUF005 - Triton's way to append
+    return points
+
+
+@triton.jit
+def first_phase(points, weight, bias, unit, omega, WIDTH: tl.constexpr, IN: tl.constexpr):
+    """ω₀(W₁x + b₁) for some units; so few inner columns are no product for ``tl.dot``, which wants 16."""
+    real = unit < WIDTH
+    z = tl.load(bias + unit, mask=real, other=0.0)[None, :]
+    for axis in tl.static_range(IN):
+        column = tl.load(weight + unit * IN + axis, mask=real, other=0.0)
+        z += points[axis][:, None] * column[None, :]
+    return omega * z
+
+
+@triton.jit
+def product_from(
+    plane,
+    z,
+    weight,
+    unit,
+    WIDTH: tl.constexpr,
+    STRIDE: tl.constexpr,
+    PIECE: tl.constexpr,
+    TRANSPOSED: tl.constexpr,
+    PRECISION: tl.constexpr,
+):
+    """Z + P Wᵀ (``TRANSPOSED``: on the way up) or z + P W (on the way back) for some units, P a plane."""
+    row = tl.arange(0, z.shape[0])
+    for first in range(0, WIDTH, PIECE):
+        inner = first + tl.arange(0, PIECE)
+        kept = tl.load(plane + row[:, None] * STRIDE + inner[None, :])
+        real = (inner < WIDTH)[:, None] & (unit < WIDTH)[None, :]
+        if TRANSPOSED:
+            matrix = tl.load(weight + unit[None, :] * WIDTH + inner[:, None], mask=real, other=0.0)
+        else:
+            matrix = tl.load(weight + inner[:, None] * WIDTH + unit[None, :], mask=real, other=0.0)
+        z = tl.dot(kept, matrix, z, input_precision=PRECISION)
+    return z
+
+
+@triton.jit
+def _second_from_points(
+    points,
+    z,
+    parameters,
+    unit,
+    omega,
+    WIDTH: tl.constexpr,
+    IN: tl.constexpr,
+    PIECE: tl.constexpr,
+    PRECISION: tl.constexpr,
+):
+    """Z + h₁W₂ᵀ for some units, each piece of h₁ made on the way."""
+    for first in range(0, WIDTH, PIECE):
+        inner = first + tl.arange(0, PIECE)
+        h = sine(first_phase(points, parameters[0], parameters[1], inner, omega, WIDTH, IN))
+        real = (inner < WIDTH)[:, None] & (unit < WIDTH)[None, :]
+        matrix = tl.load(parameters[2] + unit[None, :] * WIDTH + inner[:, None], mask=real, other=0.0)
+        z = tl.dot(h, matrix, z, input_precision=PRECISION)
+    return z
+
+
+@triton.jit
+def _phase(
+    points,
+    parameters,
+    scratch,
+    unit,
+    omega,
+    LAYER: tl.constexpr,
+    ROWS: tl.constexpr,
+    IN: tl.constexpr,
+    WIDTH: tl.constexpr,
+    STRIDE: tl.constexpr,
+    COLUMNS: tl.constexpr,
+    PIECE: tl.constexpr,
+    PRECISION: tl.constexpr,
+):
+    """The phases ω₀(W h + b) of some units of a layer, counted from 0, whose layer below is kept or easily made."""
+    if LAYER == 0:
+        return first_phase(points, parameters[0], parameters[1], unit, omega, WIDTH, IN)
+    else:  # noqa: RET505
+        bias = tl.load(parameters[2 * LAYER + 1] + unit, mask=unit < WIDTH, other=0.0)
+        z = tl.zeros((ROWS, COLUMNS), tl.float32) + bias[None, :]
+        if LAYER == 1 and STRIDE == COLUMNS:
+            z = _second_from_points(points, z, parameters, unit, omega, WIDTH, IN, PIECE, PRECISION)
+        else:
+            below = scratch + ((LAYER - 1) % 2) * ROWS * STRIDE
+            z = product_from(below, z, parameters[2 * LAYER], unit, WIDTH, STRIDE, PIECE, True, PRECISION)
+        return omega * z
+
+
+@triton.jit
+def value_of_tile(
+    points,
+    parameters,
+    scratch,
+    omega,
+    gain,
+    ROWS: tl.constexpr,
+    IN: tl.constexpr,
+    WIDTH: tl.constexpr,
+    DEPTH: tl.constexpr,
+    COLUMNS: tl.constexpr,
+    PIECE: tl.constexpr,
+    PRECISION: tl.constexpr,
+):
+    """f of a tile, (ROWS,).
+
+    Args:
+        points: the coordinates, a tuple of IN columns (ROWS,).
+        parameters: pointers (W₁, b₁, …, W_d, b_d, w_out, b_out) to what the module keeps, without ω₀.
+        scratch: pointer to what the program may write, `planes` times ROWS times its padded width.
+        omega: what phases are multiplied by, ω₀ times the unit of the sine layers' parameters.
+        gain: the unit of the output's parameters.
+        ROWS: points of a tile.
+        IN: coordinates of a point.
+        WIDTH: of the sine layers.
+        DEPTH: how many sine layers.
+        COLUMNS: units of an accumulator, a power of two ≥ 16.
+        PIECE: inner units of one ``tl.dot``, a power of two ≥ 16 and at most COLUMNS.
+        PRECISION: of the products, "ieee", "tf32x3" or "tf32".
+    """
+    BLOCKS: tl.constexpr = (WIDTH + COLUMNS - 1) // COLUMNS
+    STRIDE: tl.constexpr = BLOCKS * COLUMNS
+    row = tl.arange(0, ROWS)
+    value = tl.zeros((ROWS,), tl.float32)
+    for layer in tl.static_range(DEPTH):
+        if layer == DEPTH - 1 or layer > 0 or BLOCKS > 1:  # else the next product makes this layer itself
+            for block in range(BLOCKS):
+                unit = block * COLUMNS + tl.arange(0, COLUMNS)
+                h = sine(
+                    _phase(
+                        points, parameters, scratch, unit, omega,
+                        layer, ROWS, IN, WIDTH, STRIDE, COLUMNS, PIECE, PRECISION,
+                    )
+                )  # fmt: skip
+                if layer == DEPTH - 1:
+                    last = tl.load(parameters[2 * DEPTH] + unit, mask=unit < WIDTH, other=0.0)
+                    value += tl.sum(h * last[None, :], axis=1)
+                else:
+                    own = scratch + (layer % 2) * ROWS * STRIDE
+                    tl.store(own + row[:, None] * STRIDE + unit[None, :], h)
+            tl.debug_barrier()  # what one thread put aside, others read
+    return gain * (value + tl.load(parameters[2 * DEPTH + 1]))
+
+
+@triton.jit
+def jet_of_tile(
+    points,
+    parameters,
+    scratch,
+    omega,
+    gain,
+    ROWS: tl.constexpr,
+    IN: tl.constexpr,
+    WIDTH: tl.constexpr,
+    DEPTH: tl.constexpr,
+    COLUMNS: tl.constexpr,
+    PIECE: tl.constexpr,
+    PRECISION: tl.constexpr,
+):
+    """F of a tile (ROWS,), and its gradient, a tuple of IN columns (ROWS,); both sweeps.
+
+    As in `siren.py`, with ω₀ beside the cosines: s_i = g_i ⊙ ω₀ cos ω₀z_i, g_{i−1} = s_i W_i. For the arguments see
+    `value_of_tile`.
+    """
+    BLOCKS: tl.constexpr = (WIDTH + COLUMNS - 1) // COLUMNS
+    STRIDE: tl.constexpr = BLOCKS * COLUMNS
+    PLANE: tl.constexpr = ROWS * STRIDE
+    row = tl.arange(0, ROWS)
+    value = tl.zeros((ROWS,), tl.float32)
+    for layer in tl.static_range(DEPTH - 1):  # up, but for the last
+        if layer > 0 or BLOCKS > 1:
+            for block in range(BLOCKS):
+                unit = block * COLUMNS + tl.arange(0, COLUMNS)
+                cell = row[:, None] * STRIDE + unit[None, :]
+                z = _phase(
+                    points, parameters, scratch, unit, omega,
+                    layer, ROWS, IN, WIDTH, STRIDE, COLUMNS, PIECE, PRECISION,
+                )  # fmt: skip
+                tl.store(scratch + (layer % 2) * PLANE + cell, sine(z))
+                if layer > 0:
+                    tl.store(scratch + (1 + layer) * PLANE + cell, omega * cosine(z))
+            tl.debug_barrier()
+
+    gradient = ()
+    for _ in tl.static_range(IN):
+        gradient = gradient + (tl.zeros((ROWS,), tl.float32),)  # noqa: RUF005
+    for block in range(BLOCKS):  # the last layer, there and back
+        unit = block * COLUMNS + tl.arange(0, COLUMNS)
+        z = _phase(
+            points, parameters, scratch, unit, omega,
+            DEPTH - 1, ROWS, IN, WIDTH, STRIDE, COLUMNS, PIECE, PRECISION,
+        )  # fmt: skip
+        last = gain * tl.load(parameters[2 * DEPTH] + unit, mask=unit < WIDTH, other=0.0)
+        value += tl.sum(sine(z) * last[None, :], axis=1)
+        s = last[None, :] * (omega * cosine(z))
+        if DEPTH == 1:
+            gradient = _add_first(gradient, s, parameters[0], unit, WIDTH, IN)
+        else:
+            tl.store(scratch + ((DEPTH - 1) % 2) * PLANE + row[:, None] * STRIDE + unit[None, :], s)
+    tl.debug_barrier()
+
+    for layer in tl.static_range(DEPTH - 2, -1, -1):  # s of this layer from that of the layer above
+        for block in range(BLOCKS):
+            unit = block * COLUMNS + tl.arange(0, COLUMNS)
+            cell = row[:, None] * STRIDE + unit[None, :]
+            above = scratch + ((layer + 1) % 2) * PLANE
+            g = tl.zeros((ROWS, COLUMNS), tl.float32)
+            g = product_from(above, g, parameters[2 * layer + 2], unit, WIDTH, STRIDE, PIECE, False, PRECISION)
+            if layer == 0:
+                s = g * (omega * cosine(first_phase(points, parameters[0], parameters[1], unit, omega, WIDTH, IN)))
+                gradient = _add_first(gradient, s, parameters[0], unit, WIDTH, IN)
+            else:
+                tl.store(scratch + (layer % 2) * PLANE + cell, g * tl.load(scratch + (1 + layer) * PLANE + cell))
+        tl.debug_barrier()
+    return value + gain * tl.load(parameters[2 * DEPTH + 1]), gradient
+
+
+@triton.jit
+def _add_first(gradient, s, weight, unit, WIDTH: tl.constexpr, IN: tl.constexpr):
+    """The gradient with the share of some units of the first layer, s₁W₁."""
+    added = ()
+    for axis in tl.static_range(IN):
+        column = tl.load(weight + unit * IN + axis, mask=unit < WIDTH, other=0.0)
+        added = added + (gradient[axis] + tl.sum(s * column[None, :], axis=1),)  # noqa: RUF005
+    return added
