@@ -1,8 +1,14 @@
 """Device and dtype fixtures. A stand-in takes the place of a GPU, and CUDA comes beside it where there is one."""
 
+import os
+
 import pytest
 import standin
 import torch
+
+if not torch.cuda.is_available():
+    # Before Triton is imported by anything: its kernels run by its interpreter then, where a test asks for them.
+    os.environ["TRITON_INTERPRET"] = "1"
 
 ACCELERATORS = [standin.NAME, *(["cuda"] if torch.cuda.is_available() else [])]
 

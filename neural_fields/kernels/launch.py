@@ -1,5 +1,8 @@
 """What every launch needs: how a network is cut into tiles, how many programs there are, and their scratch."""
 
+# pyright: reportGeneralTypeIssues=false, reportArgumentType=false, reportCallIssue=false
+# pyright: reportAttributeAccessIssue=false, reportMissingImports=false
+
 from __future__ import annotations
 
 import contextlib
@@ -12,7 +15,8 @@ from torch import Tensor
 
 __all__ = ["Network", "Tiling", "on_device", "program_count", "scratch_for", "tiling_of"]
 
-# Programs for each multiprocessor: two fit beside each other by registers and shared memory (docs/accelerators.md).
+# Programs for each multiprocessor. By their registers two run beside each other, one of the jet of 128 units; the other
+# comes after it.
 PROGRAMS_PER_MULTIPROCESSOR = 2
 # The interpreter runs one after the other; three show what several do.
 INTERPRETED_PROGRAMS = 3

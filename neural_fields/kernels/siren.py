@@ -1,5 +1,8 @@
 """Value, or value and gradient, of a SIREN in one launch: the kernel, and what calls it."""
 
+# pyright: reportGeneralTypeIssues=false, reportArgumentType=false, reportCallIssue=false
+# pyright: reportAttributeAccessIssue=false, reportMissingImports=false
+
 from __future__ import annotations
 
 import triton
@@ -46,14 +49,12 @@ def evaluate(
             for axis in tl.static_range(IN):
                 tl.store(gradient + row * IN + axis, slope[axis], mask=real)
         else:
-            f = value_of_tile(
-                points, parameters, own, omega, gain, ROWS, IN, WIDTH, DEPTH, COLUMNS, PIECE, PRECISION
-            )
+            f = value_of_tile(points, parameters, own, omega, gain, ROWS, IN, WIDTH, DEPTH, COLUMNS, PIECE, PRECISION)
         tl.store(value + row, f, mask=real)
 
 
 def siren_value(x: Tensor, network: Network, precision: str) -> Tensor:
-    """f at points ``(N, d)`` → ``(N,)``; N may be 0.
+    """F at points ``(N, d)`` → ``(N,)``; N may be 0.
 
     Args:
         x: float32, on a CUDA device, or on the CPU under the interpreter.
@@ -66,7 +67,7 @@ def siren_value(x: Tensor, network: Network, precision: str) -> Tensor:
 
 
 def siren_jet(x: Tensor, network: Network, precision: str) -> tuple[Tensor, Tensor]:
-    """f and its gradient at points ``(N, d)`` → ``(N,)``, ``(N, d)``; for the arguments see `siren_value`."""
+    """F and its gradient at points ``(N, d)`` → ``(N,)``, ``(N, d)``; for the arguments see `siren_value`."""
     value, gradient = x.new_empty(len(x)), x.new_empty(x.shape)
     _launch(x, network, precision, value, gradient, jet=True)
     return value, gradient

@@ -1,20 +1,23 @@
 """What one program does with a tile of points: value, or value and gradient, of a network of any width.
 
-A tile is a matrix of ROWS points; a product is made COLUMNS units at a time, in an accumulator (ROWS, COLUMNS) that stays
-in registers, PIECE inner units after PIECE. Where the accumulator is as wide as the network (up to 128 units):
+A tile is a matrix of ROWS points; a product is made COLUMNS units at a time, in an accumulator (ROWS, COLUMNS) that
+stays in registers, PIECE inner units after PIECE. Where it is as wide as the network (up to 128 units):
 
 - the first sine layer is never kept: each piece of it is made from the points when a product wants it, once;
 - the last one goes from its accumulator into the output's sum;
 - the first layer's cosines are made again from the points for the end of the sweep back.
 
-So a value of (128, 2) touches no memory but points, weights and the result, and a jet puts one matrix aside, s₂. What has
-to be put aside, `planes` says how much, lies in a scratch of the program's own, ROWS times its width, small enough for the
-caches: layer i in plane i mod 2 on the way up and on the way back, since that of layer i − 1 is free by then, and the
-cosines of the layers between first and last after them. All products read a plane by pieces, in a loop: a product over
-all inner units at once is unrolled, and spills (`docs/accelerators.md` has the figures).
+So a value of (128, 2) touches no memory but points, weights and the result, and a jet puts one matrix aside, s₂. What
+is put aside lies in a scratch of the program's own, as many `planes` of ROWS times its width, small enough for caches:
+layer i in plane i mod 2, on the way up and on the way back, since that of layer i − 1 is free by then; and after these
+two the cosines of the layers between first and last. Products read a plane piece by piece, in a loop: a product over
+all inner units at once is unrolled, and spills thousands of bytes of registers.
 
 Units beyond the width have weights and biases of 0: their sines are 0, and 0 is swept back to them.
 """
+
+# pyright: reportGeneralTypeIssues=false, reportArgumentType=false, reportCallIssue=false
+# pyright: reportAttributeAccessIssue=false, reportMissingImports=false
 
 from __future__ import annotations
 
@@ -22,7 +25,17 @@ import triton
 import triton.language as tl
 from triton.language.extra import libdevice
 
-__all__ = ["cosine", "first_phase", "jet_of_tile", "planes", "points_of", "product_from", "rows_of", "sine", "value_of_tile"]
+__all__ = [
+    "cosine",
+    "first_phase",
+    "jet_of_tile",
+    "planes",
+    "points_of",
+    "product_from",
+    "rows_of",
+    "sine",
+    "value_of_tile",
+]
 
 # The interpreter runs kernels with numpy and has no libdevice; its sine is numpy's.
 INTERPRETED = tl.constexpr(bool(triton.knobs.runtime.interpret))
@@ -35,14 +48,14 @@ def planes(depth: int, *, jet: bool) -> int:
 
 @triton.jit
 def sine(z):
-    """sin z, to two units in the last place whatever z is: phases grow with ω₀, so that a fast sine will not do.
+    """Sin z, to two units in the last place whatever z is: phases grow with ω₀, so that a fast sine will not do.
 
     By CUDA's libdevice (``__nv_sinf``). ``sin.approx``, which options may make of a sine, is 2⁻²¹ off within [−π, π]
     already, and loses a digit with each digit of its argument.
     """
     if INTERPRETED:
         return tl.sin(z)
-    else:  # noqa: RET505 - only the branch that is chosen is compiled
+    else:
         return libdevice.sin(z)
 
 
@@ -51,7 +64,7 @@ def cosine(z):
     """Cos z, as `sine`."""
     if INTERPRETED:
         return tl.cos(z)
-    else:  # noqa: RET505
+    else:
         return libdevice.cos(z)
 
 
@@ -66,7 +79,7 @@ def points_of(x, row, real, IN: tl.constexpr):
     """The coordinates of the points ``row`` (ROWS,), a tuple of IN columns."""
     points = ()
     for axis in tl.static_range(IN):
-        points = points + (tl.load(x + row * IN + axis, mask=real, other=0.0),)  # noqa: RUF005 - Triton's way to append
+        points = points + (tl.load(x + row * IN + axis, mask=real, other=0.0),)
     return points
 
 
@@ -148,7 +161,7 @@ def _phase(
     """The phases ω₀(W h + b) of some units of a layer, counted from 0, whose layer below is kept or easily made."""
     if LAYER == 0:
         return first_phase(points, parameters[0], parameters[1], unit, omega, WIDTH, IN)
-    else:  # noqa: RET505
+    else:
         bias = tl.load(parameters[2 * LAYER + 1] + unit, mask=unit < WIDTH, other=0.0)
         z = tl.zeros((ROWS, COLUMNS), tl.float32) + bias[None, :]
         if LAYER == 1 and STRIDE == COLUMNS:
@@ -174,7 +187,7 @@ def value_of_tile(
     PIECE: tl.constexpr,
     PRECISION: tl.constexpr,
 ):
-    """f of a tile, (ROWS,).
+    """F of a tile, (ROWS,).
 
     Args:
         points: the coordinates, a tuple of IN columns (ROWS,).
@@ -255,7 +268,7 @@ def jet_of_tile(
 
     gradient = ()
     for _ in tl.static_range(IN):
-        gradient = gradient + (tl.zeros((ROWS,), tl.float32),)  # noqa: RUF005
+        gradient = gradient + (tl.zeros((ROWS,), tl.float32),)
     for block in range(BLOCKS):  # the last layer, there and back
         unit = block * COLUMNS + tl.arange(0, COLUMNS)
         z = _phase(
@@ -293,5 +306,5 @@ def _add_first(gradient, s, weight, unit, WIDTH: tl.constexpr, IN: tl.constexpr)
     added = ()
     for axis in tl.static_range(IN):
         column = tl.load(weight + unit * IN + axis, mask=unit < WIDTH, other=0.0)
-        added = added + (gradient[axis] + tl.sum(s * column[None, :], axis=1),)  # noqa: RUF005
+        added = added + (gradient[axis] + tl.sum(s * column[None, :], axis=1),)
     return added

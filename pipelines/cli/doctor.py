@@ -13,6 +13,8 @@ from typing import Literal
 
 import torch
 
+from ...neural_fields import InputError
+from ...neural_fields.kernels.switch import choose
 from ..run.machine import sgemm_rate
 
 __all__ = ["Finding", "examine", "format_findings"]
@@ -51,6 +53,7 @@ def examine(folder: Path | None = None) -> list[Finding]:
         _cv2(),
         _threads(),
         _cuda(),
+        _kernels(),
         _speed(),
         _disk(folder or Path()),
     ]
@@ -136,6 +139,19 @@ def _cuda() -> Finding:
         return Finding("warning", "CUDA", f"present but unusable ({str(error).splitlines()[0]}); use --device cpu")
     memory = torch.cuda.get_device_properties(0).total_memory / 2**30
     return Finding("ok", "CUDA", f"{torch.cuda.get_device_name(0)}, {memory:.0f} GiB")
+
+
+def _kernels() -> Finding:
+    """Who evaluates networks, and why not by fused kernels; asked as a field asks."""
+    x = torch.empty(0, 3, device="cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        choice = choose(x, width=128, depth=2)
+    except InputError as error:
+        return Finding("warning", "kernels", str(error))
+    if choice.reason:
+        return Finding("note", "kernels", f"PyTorch evaluates all networks ({choice.reason})")
+    rest = "PyTorch evaluates training, features and float64"
+    return Finding("ok", "kernels", f"fused, with products in {choice.precision}, for values and jets; {rest}")
 
 
 def _speed() -> Finding:

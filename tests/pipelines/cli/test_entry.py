@@ -433,6 +433,16 @@ def test_doctor_finds_nothing_wrong_here(capsys):
     assert "error" not in text.replace("errors", "")
 
 
+def test_doctor_says_who_evaluates(monkeypatch, tmp_path):
+    monkeypatch.setenv("MPLICITS_KERNELS", "off")
+    (kernels,) = [finding for finding in doctor.examine(tmp_path) if finding.topic == "kernels"]
+    assert (kernels.level, kernels.text) == ("note", "PyTorch evaluates all networks (MPLICITS_KERNELS=off)")
+    monkeypatch.setenv("MPLICITS_KERNELS", "on")
+    (kernels,) = [finding for finding in doctor.examine(tmp_path) if finding.topic == "kernels"]
+    assert kernels.level == "warning"
+    assert "expected one of auto, off" in kernels.text
+
+
 def test_doctor_knows_all_extras(monkeypatch, tmp_path):
     """As installers write them into the metadata, from pyproject.toml."""
     project = tomllib.loads((Path(__file__).parents[3] / "pyproject.toml").read_text())["project"]
