@@ -24,7 +24,7 @@ import torch
 from torch import Tensor, nn
 
 from ._checks import at_least, positive
-from ._parallel import Step, one_thread, over_blocks
+from ._parallel import Step, over_blocks
 from .field import Jet, OneLevelField, SecondJet
 from .kernels.switch import choose
 
@@ -177,14 +177,11 @@ class Siren(OneLevelField):
         """
         self.resolve_level(level)
         rows = self.check_points(x).reshape(-1, self.in_dim)
-        if not needs_graph(rows, list(self.parameters())):
-            fused = choose(rows, width=self.width, depth=self.depth, features=self.num_features)
-            if fused.precision:
-                from .kernels.siren import siren_jet
-
-                value, gradient = siren_jet(rows, self.as_network(), fused.precision)
-                shape = x.shape[:-1]
-                return Jet(value.reshape(shape), gradient.reshape(x.shape), x.new_empty(*shape, 0))
+        fused = choose(rows, width=self.width, depth=self.depth, features=self.num_features)
+        if fused.precision:
+            value, gradient = self._fused_jet(rows, fused.precision)
+            shape = x.shape[:-1]
+            return Jet(value.reshape(shape), gradient.reshape(x.shape), x.new_empty(*shape, 0))
         parameters = self.folded()
         if needs_graph(rows, parameters):
             size = GRAPH_BLOCK_FACTOR * self.block_rows(rows.device)
@@ -202,6 +199,15 @@ class Siren(OneLevelField):
         shape = x.shape[:-1]
         features = output[:, 1:].reshape(*shape, self.num_features)
         return Jet(output[:, 0].reshape(shape), gradient.reshape(x.shape), features)
+
+    def _fused_jet(self, rows: Tensor, precision: str) -> tuple[Tensor, Tensor]:
+        """Value and gradient by the fused kernels, on the graph if one is recorded."""
+        from .kernels.siren import siren_jet
+
+        network, parameters = self.as_network(), self._raw()
+        if needs_graph(rows, parameters):
+            return _FusedJet.apply(rows, network.omega, network.gain, precision, *parameters)
+        return siren_jet(rows, network, precision)
 
     def second_jet(self, x: Tensor, *, level: int = -1, dims: int | None = None) -> SecondJet:
         """See `Field.second_jet`; one tangent forward for each of the ``dims`` coordinates, without autograd.
@@ -226,23 +232,17 @@ class Siren(OneLevelField):
 
     def folded(self) -> list[Tensor]:
         """Weights and biases with units and ω₀ folded in: [W_1, b_1, …, W_d, b_d, W_out, b_out]."""
-        parameters: list[Tensor] = []
-        frequency, out = self.omega * self.units[0], self.units[1]
-        # On one thread: others that had a share in this little would keep their cores awake, waiting for more of it.
-        with one_thread():
-            for layer in self._sine_layers():
-                parameters += [layer.weight * frequency, layer.bias * frequency]
-        # The sweep back ends in a product with three columns; BLAS does it three times faster if they are contiguous.
-        parameters[0] = parameters[0].t().contiguous().t()
-        last = [self.output.weight, self.output.bias]
-        return [*parameters, *(last if out == 1 else [part * out for part in last])]
+        return fold(self._raw(), self.omega * self.units[0], self.units[1])
 
     def as_network(self) -> Network:
         """As the fused kernels take it; they are not imported without Triton."""
         from .kernels.launch import Network
 
-        parameters = [part for layer in (*self._sine_layers(), self.output) for part in (layer.weight, layer.bias)]
-        return Network.of(parameters, self.omega * self.units[0], self.units[1])
+        return Network.of(self._raw(), self.omega * self.units[0], self.units[1])
+
+    def _raw(self) -> list[Tensor]:
+        """Weights and biases as they are kept: [W_1, b_1, …, W_out, b_out]."""
+        return [part for layer in (*self._sine_layers(), self.output) for part in (layer.weight, layer.bias)]
 
     def _sine_layers(self) -> Iterator[nn.Linear]:
         for layer in self.layers:
@@ -256,6 +256,15 @@ class Siren(OneLevelField):
 
 def _block_rows(width: int, device: torch.device) -> int:
     return max(256, (BLOCK_FLOATS if device.type == "cpu" else GPU_BLOCK_FLOATS) // width)
+
+
+def fold(parameters: Sequence[Tensor], frequency: float, out: float) -> list[Tensor]:
+    """The sine layers' weights and biases times ``frequency``, the output's times ``out``."""
+    folded = [parameter * frequency for parameter in parameters[:-2]]
+    # The sweep back ends in a product with three columns; BLAS does it three times faster if they are contiguous.
+    folded[0] = folded[0].t().contiguous().t()
+    last = parameters[-2:]
+    return [*folded, *(last if out == 1 else [part * out for part in last])]
 
 
 def needs_graph(x: Tensor, parameters: Sequence[Tensor]) -> bool:
@@ -465,6 +474,45 @@ def _add_bars(
             h_bar = torch.mm(z_bar, weights[index], out=u_row if z_bar is spare else spare)
         elif x_bar is not None:
             torch.mm(z_bar, weights[0], out=x_bar)
+
+
+class _FusedJet(torch.autograd.Function):
+    """Value and gradient of a SIREN of one output by the fused kernels, and the way back by another.
+
+    Parameters are those that the module keeps; ω₀ is multiplied in the kernels.
+    """
+
+    @staticmethod
+    def forward(
+        ctx: Any, x: Tensor, omega: float, gain: float, precision: str, *parameters: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        from .kernels.launch import Network
+        from .kernels.siren import siren_jet
+
+        ctx.numbers = omega, gain, precision
+        ctx.save_for_backward(x, *parameters)
+        return siren_jet(x, Network.of(parameters, omega, gain), precision)
+
+    @staticmethod
+    def backward(ctx: Any, *cotangents: Tensor | None) -> tuple[Tensor | None, ...]:
+        from .kernels.launch import Network
+        from .kernels.training import jet_backward
+
+        (omega, gain, precision), (x, *parameters) = ctx.numbers, ctx.saved_tensors
+        value_bar, gradient_bar = cotangents
+        assert value_bar is not None
+        assert gradient_bar is not None
+        if torch.is_grad_enabled():
+            # Who differentiates once more gets plain operations.
+            needed = [ctx.needs_input_grad[0], *ctx.needs_input_grad[4:]]
+            wanted = [tensor for tensor, need in zip((x, *parameters), needed, strict=True) if need]
+            output, jacobian = plain_jet(x, fold(parameters, omega, gain), 1)
+            outputs, bars = (output[:, 0], jacobian[:, 0]), (value_bar, gradient_bar)
+            found = iter(torch.autograd.grad(outputs, wanted, bars, create_graph=True, materialize_grads=True))
+            x_bar, *own = (next(found) if need else None for need in needed)
+        else:
+            x_bar, own = jet_backward(x, Network.of(parameters, omega, gain), value_bar, gradient_bar, precision)
+        return x_bar, None, None, None, *own
 
 
 def _differentiable_backward(

@@ -279,7 +279,7 @@ def jet_of_tile(
         value += tl.sum(sine(z) * last[None, :], axis=1)
         s = last[None, :] * (omega * cosine(z))
         if DEPTH == 1:
-            gradient = _add_first(gradient, s, parameters[0], unit, WIDTH, IN)
+            gradient = add_first(gradient, s, parameters[0], unit, WIDTH, IN)
         else:
             tl.store(scratch + ((DEPTH - 1) % 2) * PLANE + row[:, None] * STRIDE + unit[None, :], s)
     tl.debug_barrier()
@@ -293,7 +293,7 @@ def jet_of_tile(
             g = product_from(above, g, parameters[2 * layer + 2], unit, WIDTH, STRIDE, PIECE, False, PRECISION)
             if layer == 0:
                 s = g * (omega * cosine(first_phase(points, parameters[0], parameters[1], unit, omega, WIDTH, IN)))
-                gradient = _add_first(gradient, s, parameters[0], unit, WIDTH, IN)
+                gradient = add_first(gradient, s, parameters[0], unit, WIDTH, IN)
             else:
                 tl.store(scratch + (layer % 2) * PLANE + cell, g * tl.load(scratch + (1 + layer) * PLANE + cell))
         tl.debug_barrier()
@@ -301,8 +301,8 @@ def jet_of_tile(
 
 
 @triton.jit
-def _add_first(gradient, s, weight, unit, WIDTH: tl.constexpr, IN: tl.constexpr):
-    """The gradient with the share of some units of the first layer, s₁W₁."""
+def add_first(gradient, s, weight, unit, WIDTH: tl.constexpr, IN: tl.constexpr):
+    """A gradient, IN columns, with the share of some units of the first layer, s₁W₁."""
     added = ()
     for axis in tl.static_range(IN):
         column = tl.load(weight + unit * IN + axis, mask=unit < WIDTH, other=0.0)

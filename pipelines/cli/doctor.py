@@ -150,8 +150,8 @@ def _kernels() -> Finding:
         return Finding("warning", "kernels", str(error))
     if choice.reason:
         return Finding("note", "kernels", f"PyTorch evaluates all networks ({choice.reason})")
-    rest = "PyTorch evaluates training, features and float64"
-    return Finding("ok", "kernels", f"fused, with products in {choice.precision}, for values and jets; {rest}")
+    how = f"fused, with products in {choice.precision}, for values, jets and their way back"
+    return Finding("ok", "kernels", f"{how}; PyTorch for features, float64 and second derivatives")
 
 
 def _speed() -> Finding:
