@@ -17,7 +17,7 @@ made by each program for itself, tile after tile, and added up at the end, in th
 """
 
 # pyright: reportGeneralTypeIssues=false, reportArgumentType=false, reportCallIssue=false
-# pyright: reportAttributeAccessIssue=false, reportMissingImports=false
+# pyright: reportAttributeAccessIssue=false, reportMissingImports=false, reportAssignmentType=false
 
 from __future__ import annotations
 
