@@ -132,6 +132,12 @@ class OrientedCloud:
         """Standard deviation, in the unit sphere, of the noise that was smoothed off the points; 0 for none."""
         return self.report.smoothed_noise / self.similarity.scale
 
+    @property
+    def guessed(self) -> bool:
+        """Whether the normals were estimated from noisy points."""
+        estimated = self.report.normals_source == "estimated" or self.report.reestimated_normals > 0
+        return estimated and self.report.smoothed_noise > 0
+
 
 def prepare_cloud(
     cloud: PointCloud,

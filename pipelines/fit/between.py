@@ -71,7 +71,14 @@ class Densified(NamedTuple):
 
 
 def dense_distance(
-    points: Tensor, normals: Tensor, *, omega: float, count: int, noise: float = 0.0, seed: int = 0
+    points: Tensor,
+    normals: Tensor,
+    *,
+    omega: float,
+    count: int,
+    noise: float = 0.0,
+    guessed: bool = False,
+    seed: int = 0,
 ) -> CloudDistance:
     """Distances to a cloud, and where it is sparse for a network of frequency ``omega``, to what fills it in.
 
@@ -81,16 +88,18 @@ def dense_distance(
         omega: the highest frequency that will be fitted to it.
         count: points of the cloud and places tried between them, all together.
         noise: see `CloudDistance`.
+        guessed: see `CloudDistance`.
         seed: of the places.
     """
-    index = CloudDistance(points, normals, noise=noise)
+    about = {"noise": noise, "guessed": guessed}
+    index = CloudDistance(points, normals, **about)
     if index.spacing * omega <= TURN or count <= len(points):
         return index
     found = densified(index.points, index.normals, count - len(points), seed=seed)
     new_points, new_normals = (torch.from_numpy(a.astype(np.float32)) for a in (found.points, found.new_normals))
     own_normals = torch.from_numpy(found.normals.astype(np.float32))
     dense = torch.cat((points.cpu(), new_points)), torch.cat((own_normals, new_normals))
-    return CloudDistance(*dense, noise=noise, given=len(points), gap=index.spacing, repaired=found.repaired)
+    return CloudDistance(*dense, **about, given=len(points), gap=index.spacing, repaired=found.repaired)
 
 
 def densified(points: NDArray[np.floating], normals: NDArray[np.floating], count: int, *, seed: int = 0) -> Densified:

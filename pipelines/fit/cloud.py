@@ -128,6 +128,7 @@ class CloudDistance:
         cell: edge of the cells in which points are merged into dipoles for the winding number; dipoles
             are used only further than ``2 · cell`` from the surface, where their error is below 0.05.
         noise: standard deviation of the noise that was smoothed off the points.
+        guessed: whether the normals were estimated from those noisy points.
         given: how many of the points are the cloud's own, the first ones; None for all. The others fill it in.
         gap: the spacing of those; None for that of all.
         repaired: how many normals of points on edges were replaced by one side's.
@@ -144,6 +145,7 @@ class CloudDistance:
         neighbors: int = 6,
         cell: float = 0.05,
         noise: float = 0.0,
+        guessed: bool = False,
         given: int | None = None,
         gap: float | None = None,
         repaired: int = 0,
@@ -152,7 +154,7 @@ class CloudDistance:
         self.points: Float32 = points.cpu().numpy()
         self.normals: Float32 = normals.cpu().numpy()
         self.tree = KDTree(self.points, compact_nodes=False, balanced_tree=False)
-        self.noise = noise
+        self.noise, self.guessed = noise, guessed
         self.neighbors, self.cell = min(neighbors, len(points)), cell
         count = min(8, len(points) - 1)
         reach = np.asarray(self.tree.query(self.points, k=count + 1, workers=-1)[0])[:, -1]

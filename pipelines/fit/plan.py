@@ -8,9 +8,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from ..run.costs import Net, Speed, densifying, jets, preparation, queries, training, windings
+from ..run.costs import Net, Speed, densifying, jets, preparation, queries, training, values, windings
 from ..run.schedule import Stage
 from ..run.settings import FitConfig
+from .unoriented import BATCH, SAMPLES, STAGES, STEPS
 
 __all__ = ["FEWEST_SAMPLES", "FEWEST_STEPS", "FitPlan", "Share"]
 
@@ -56,6 +57,16 @@ class FitPlan:
     def preparing(self) -> Stage:
         """Cleaning the cloud."""
         return Stage("preparing the cloud", "preparation", self.speed.points(preparation(self.points)))
+
+    def signs(self) -> list[Stage]:
+        """Signs of normals, where level 0 gives them: one stage for each witness, the first with places to ask."""
+        backward = 2  # times the work of a value
+        points = (1 + backward) * values(STEPS * BATCH, self.nets[:1])
+        seconds = self.speed.networks(points, steps=STEPS)
+        # Of cells half as wide there are four times as many on a surface.
+        places = self.speed.points(queries(SAMPLES, self.points) + windings(SAMPLES, 4 * DIPOLES))
+        first, second = STAGES
+        return [Stage(first, "steps", places + seconds), Stage(second, "steps", seconds)]
 
     def levels(self, first: int = 0, last: int | None = None) -> list[Stage]:
         """Samples and training of the levels from ``first`` on, up to but without ``last``."""

@@ -38,6 +38,7 @@ __all__ = [
     "distance_samples",
     "first_sources",
     "free_lengths",
+    "near_samples",
     "offset_samples",
     "remote_samples",
     "spread_points",
@@ -55,6 +56,9 @@ STRAY = 4.0
 TAIL = 20.0
 # How far a winding number must be from one half to say in or out: it is off by less than 0.05 where it is asked.
 SURE = 0.4
+# Normals estimated from noisy points are wrong by tens of degrees where parts are as thin as the noise, and there no
+# field of slope 1 is near the points either. Weights of both terms, in units of those of the settings.
+GUESSED_NORMAL, GUESSED_SLOPE = 0.1, 0.2
 # So few places that the level before gets wrong far from the cloud are not worth a share of the batch.
 FEWEST = 32
 
@@ -154,11 +158,12 @@ class Weights:
     normal: float | None = None
     eikonal: float | None = None
 
-    def resolved(self, config: FitConfig, errors: Tensor, noise: float) -> tuple[float, float, float]:
+    def resolved(self, config: FitConfig, errors: Tensor, cloud: CloudDistance) -> tuple[float, float, float]:
         """Data, normal and eikonal weight, where the levels before miss the surface samples by ``errors`` ``(n,)``."""
-        data = config.data_weight_after(float(errors.square().mean()), noise)
+        data = config.data_weight_after(float(errors.square().mean()), cloud.noise)
         given = (self.data, self.normal, self.eikonal)
-        usual = (data, config.normal_weight, config.eikonal_weight)
+        normal, slope = (GUESSED_NORMAL, GUESSED_SLOPE) if cloud.guessed else (1.0, 1.0)
+        usual = (data, normal * config.normal_weight, slope * config.eikonal_weight)
         return tuple(u if g is None else g for g, u in zip(given, usual, strict=True))  # pyright: ignore[reportReturnType]
 
 
@@ -188,6 +193,8 @@ def banded_sources(
 ) -> list[Source]:
     """A residual level's: the cloud, its offsets and dithered points, inside the band (Sec. 3.2); and remote places.
 
+    Where normals are guesses, `near_samples` take the place of offsets, which believe the sign of each normal.
+
     Args:
         index: the cloud.
         previous: the frozen levels.
@@ -202,11 +209,14 @@ def banded_sources(
         InputError: one kind of samples is empty.
     """
     device = previous.like.device
-    offset = offset_samples(index, delta, config.samples, generator=generator)
+    if index.guessed:
+        beside = "near", near_samples(index, delta, config.samples // 4, generator=generator)
+    else:
+        beside = "offset", offset_samples(index, delta, config.samples, generator=generator)
     band = band_samples(index, delta, config.samples, generator=generator)
     kept = {
         kind: with_previous(samples, previous, delta, device=device, watch=watch)
-        for kind, samples in (("surface", surface_samples(index)), ("offset", offset), ("band", band))
+        for kind, samples in (("surface", surface_samples(index)), beside, ("band", band))
     }
     for kind, samples in kept.items():
         if not len(samples):
@@ -216,7 +226,7 @@ def banded_sources(
             )
     surface = kept["surface"]
     assert surface.value is not None
-    terms = (weights or Weights()).resolved(config, surface.value, index.noise)
+    terms = (weights or Weights()).resolved(config, surface.value, index)
     third = config.batch // 3
     usual = usual_errors(surface, kept["band"]) if config.robust_normals and index.filled else SQUARES
     if previous.num_levels == 1:  # corners and thin parts that a coarse level has missed are far: squares reach them
@@ -453,6 +463,15 @@ def offset_samples(cloud: CloudDistance, delta: float, count: int, *, generator:
     t = lengths[which] * torch.rand(count, generator=generator) * (1 - 2.0 * side)
     normal = torch.from_numpy(cloud.normals)[index]
     return Samples(torch.from_numpy(cloud.points)[index] + t[:, None] * normal, distance=t, normal=normal)
+
+
+def near_samples(cloud: CloudDistance, delta: float, count: int, *, generator: torch.Generator) -> Samples:
+    """Cloud points with every coordinate moved by U(−δ, δ), and their signed distances.
+
+    Their signs are those of winding numbers, which weigh all normals against each other; nothing is known of gradients.
+    """
+    points = band_samples(cloud, delta / 2, count, generator=generator).points
+    return Samples(points, distance=cloud.signed(points))
 
 
 def band_samples(cloud: CloudDistance, delta: float, count: int, *, generator: torch.Generator) -> Samples:

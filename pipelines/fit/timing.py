@@ -61,19 +61,25 @@ class Timing:
     def begin(self, cloud: PointCloud | str | Path) -> None:
         """Say what is to come, and that the cloud is read now."""
         reading = Stage("reading the cloud", "reading", reading_seconds(_size(cloud)))
-        self._tell([reading, self.plan.preparing(), *self.plan.levels()], self.config.time_budget)
+        self._tell([reading, self.plan.preparing(), *self._signs(), *self.plan.levels()], self.config.time_budget)
         self._at("reading the cloud", 0.0)
 
     def has_read(self, points: int) -> None:
         """The cloud has so many points, and is prepared now."""
         self._at("reading the cloud", 1.0)
         self.plan = FitPlan(self.config, points, self.plan.speed)
-        self._tell([self.plan.preparing(), *self.plan.levels()], self._left())
+        self._tell([self.plan.preparing(), *self._signs(), *self.plan.levels()], self._left())
         self._at("preparing the cloud", 0.0)
 
     def has_prepared(self) -> None:
         """The cloud is prepared."""
         self._at("preparing the cloud", 1.0)
+
+    def finds_signs(self) -> None:
+        """Level 0 is asked for the signs of normals now, whether that was known before or the cloud has shown it."""
+        stages = self.plan.signs()
+        self._tell([*stages, *self.plan.levels()], self._left())
+        self._at(stages[0].name, 0.0)
 
     def first_samples(self) -> int:
         """How many samples a level may have, before anything is measured; without a budget all."""
@@ -135,6 +141,10 @@ class Timing:
         self.left_out = list(range(first, self.config.num_levels))
         names = f"level {first} is" if len(self.left_out) == 1 else f"levels {first} to {self.left_out[-1]} are"
         self.notes.append(f"{names} left out: too little time for samples and {FEWEST_STEPS} steps")
+
+    def _signs(self) -> list[Stage]:
+        """The stages of signs, where it is known that there will be some."""
+        return self.plan.signs() if self.config.normals == "none" else []
 
     def _left(self) -> float | None:
         """Seconds left of the budget."""

@@ -221,9 +221,14 @@ class _Fitting:
         """Let a network say which way normals point whose signs nobody knows for sure."""
         if self.config.normals != "none" and self.cloud.report.oriented_by not in GUESSED:
             return
+        asked = self.config.normals == "none"
+        if asked:
+            self.timing.finds_signs()
         places = Places.around(CloudDistance(self.points, self.normals), seed=self.config.seed)
-        if self.config.normals != "none" and not places.contested:
-            return
+        if not asked:
+            if not places.contested:
+                return
+            self.timing.finds_signs()
         signs = give_signs(
             self.points,
             self.normals,
@@ -336,15 +341,17 @@ class _Fitting:
 
     def distances(self) -> CloudDistance:
         """The points that are trained on, and where they are sparse, what they say of the places between them."""
-        config, noise, all_points = self.config, self.cloud.noise, self.points.numpy()
+        config, all_points = self.config, self.points.numpy()
+        noise, guessed = self.cloud.noise, self.cloud.guessed
         self.spacing = spacing_of(all_points.astype(np.float64))
         self.held = torch.from_numpy(held_out(all_points, self.spacing, config.hold_out, seed=config.seed))
         points, normals = self.points[~self.held], self.normals[~self.held]
         if not config.between:
-            return CloudDistance(points, normals, noise=noise)
+            return CloudDistance(points, normals, noise=noise, guessed=guessed)
         omega = max(config.omegas[: config.num_levels])
         count = self.timing.first_samples()
-        return dense_distance(points, normals, omega=omega, count=count, noise=noise, seed=config.seed)
+        about = {"noise": noise, "guessed": guessed, "seed": config.seed}
+        return dense_distance(points, normals, omega=omega, count=count, **about)
 
     def next_band(self) -> Band:
         """The band around the last frozen level (Eq. 5), inside the one before: under noise it could be wider."""

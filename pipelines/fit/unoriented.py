@@ -35,7 +35,7 @@ from .cloud import CloudDistance
 from .level import new_level
 from .samples import SURE, spread_points
 
-__all__ = ["STAGE", "Places", "Signs", "give_signs", "signed"]
+__all__ = ["BATCH", "SAMPLES", "STAGE", "STAGES", "STEPS", "Places", "Signs", "give_signs", "signed"]
 
 STEPS, BATCH, SAMPLES, RATE = 300, 4096, 50_000, 2e-3
 POINTS = 2.0  # weight of f = 0 at the points, in units of that of known distances
@@ -44,6 +44,7 @@ CLEAR = 0.1  # mean slope of the field into a region, from which on that has a s
 FAINT = 0.15  # mean slope at the points, below which it says nothing: that of an open sheet
 CONTRADICTED = 0.01  # share of the places
 STAGE = "level 0: signs"
+STAGES = tuple(f"{STAGE} ({number} of 2)" for number in (1, 2))  # one for each witness
 
 
 class Signs(NamedTuple):
@@ -122,7 +123,7 @@ def give_signs(
         device: that trains.
         places: see `Places.around`; None to draw them.
         flag: asks to stop.
-        report: told of the training, as the stage `STAGE`.
+        report: told of the training, as the stages `STAGES`.
 
     Returns:
         What was found; None if it was asked to stop.
@@ -130,13 +131,12 @@ def give_signs(
     places = places or Places.around(CloudDistance(points, normals), seed=config.seed)
     outside = (places.region == OUTSIDE).float()
     found: list[tuple[Tensor, str]] = []
-    for number, (witness, sign, region) in enumerate(
-        (("winding", places.winding, None), ("exterior", outside, places.region))
-    ):
+    witnesses = (("winding", places.winding, None), ("exterior", outside, places.region))
+    for stage, (witness, sign, region) in zip(STAGES, witnesses, strict=True):
         siren = new_level(config, 0, residual=False).to(device)
         generator = torch.Generator().manual_seed(config.seed)
         objective = _Unoriented(siren, points, places, sign, region, generator=generator, device=device)
-        trainer = Trainer(objective, stage=f"{STAGE} ({number + 1} of 2)", steps=STEPS)
+        trainer = Trainer(objective, stage=stage, steps=STEPS)
         if not trainer.run(flag, report=report):
             return None
         with torch.no_grad():

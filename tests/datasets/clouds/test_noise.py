@@ -88,6 +88,20 @@ def along_rays(points: np.ndarray, normals: np.ndarray, sigma: float) -> np.ndar
     return RNG.normal(0, sigma, (len(points), 1)) / np.abs(normals @ ray)[:, None] * ray
 
 
+@pytest.mark.parametrize("sigma", [0.004, 0.007])
+def test_noise_narrower_than_the_spacing_is_told_from_a_shape(sigma):
+    """Neighbours in waves 2 σ high, 2π spacings long, are as high as in noise; only there are further ones higher."""
+    count = 8000
+    spacing = 1.4 / np.sqrt(count)
+    points = np.column_stack((RNG.uniform(-0.7, 0.7, (count, 2)), np.zeros(count)))
+    normals = np.tile([0.0, 0.0, 1.0], (count, 1))
+    assert sigma < spacing / 2
+    noisy = points + RNG.normal(0, sigma, (count, 1)) * normals
+    assert 0.65 * sigma < noise_level(noisy, normals) <= sigma  # up to a third less, as on any plane
+    waves = points + 2 * sigma * np.sin(points[:, :1] / spacing) * normals
+    assert noise_level(waves, normals) == 0
+
+
 @pytest.mark.parametrize("noise", [along_normals, in_all_directions, along_rays])
 @pytest.mark.parametrize(("count", "sigma"), [(8000, 0.0115), (60000, 0.03)])
 def test_the_deviation_is_that_along_the_normals_whatever_the_direction(noise, count, sigma):

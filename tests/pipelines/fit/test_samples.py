@@ -9,12 +9,14 @@ from mplicits.pipelines.fit.samples import (
     LEAST,
     SQUARES,
     Samples,
+    Weights,
     band_of,
     band_samples,
     banded_sources,
     delta_of,
     distance_samples,
     free_lengths,
+    near_samples,
     offset_samples,
     remote_samples,
     usual_errors,
@@ -274,6 +276,32 @@ def test_the_next_level_takes_an_invented_surface_away(cloud: CloudDistance) -> 
     assert previous.value(outside).abs().max() < 1e-5
     assert field.value(outside).min() > 0.02
     assert field.value(torch.from_numpy(cloud.points)).square().mean().sqrt() < 0.01
+
+
+def test_near_a_cloud_of_guessed_normals_all_of_them_together_say_the_side() -> None:
+    """One in eight points inward: the winding number is 3/4 inside, and offsets along those would be on the wrong side."""
+    points, normals = sphere_points(20_000)
+    normals = torch.where((torch.arange(20_000) % 8 == 0)[:, None], -normals, normals)
+    cloud, delta = CloudDistance(points, normals, noise=0.01, guessed=True), 0.05
+    samples = near_samples(cloud, delta, 2000, generator=generator())
+    assert samples.normal is None
+    assert samples.distance is not None
+    exact = samples.points.norm(dim=1) - RADIUS
+    assert exact.abs().max() <= 3**0.5 * delta * (1 + 1e-6)  # of a cube of half-edge δ around a point
+    clear = exact.abs() > cloud.noise
+    assert clear.float().mean() > 0.5
+    assert (samples.distance.sign() == exact.sign())[clear].all()
+    assert (samples.distance.abs() - exact.abs()).abs().max() < cloud.spacing
+
+    config = FitConfig(samples=8000)
+    sources = banded_sources(cloud, Sphere(radius=RADIUS - 0.01), delta, config, generator=generator())
+    assert [source.name for source in sources] == ["surface", "near", "band"]
+    assert {(source.normal, source.eikonal) for source in sources} == {
+        (0.1 * config.normal_weight, 0.2 * config.eikonal_weight)
+    }
+    fixed = Weights(normal=1.0, eikonal=2.0)
+    sources = banded_sources(cloud, Sphere(radius=RADIUS - 0.01), delta, config, generator=generator(), weights=fixed)
+    assert {(source.normal, source.eikonal) for source in sources} == {(1.0, 2.0)}
 
 
 def test_usual_errors_are_those_of_the_smooth_places() -> None:
