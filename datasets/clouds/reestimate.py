@@ -61,34 +61,40 @@ def denoise(points: Float64, normals: Float64, *, rounds: int = ROUNDS) -> tuple
         normals = refit_normals(smooth_along_normals(points, normals, level), normals, reach)
         level = noise_level(points, normals) or level
     moved = smooth_along_normals(points, normals, level)
-    fitted = refit_normals(moved, normals, reach)
-    if not has_edges(moved, fitted):
+    tree = KDTree(moved)
+    fitted = refit_normals(moved, normals, reach, tree=tree)
+    if not has_edges(moved, fitted, tree=tree):
         return moved, fitted, level
     for _ in range(rounds):
-        normals = filter_normals(moved, fitted)
+        normals = filter_normals(moved, fitted, tree=tree)
         level = noise_level(points, normals) or level
         moved = smooth_along_normals(points, normals, level, alike=ALIKE_AT_EDGES)
-        fitted = refit_normals(moved, normals, reach)
-    return moved, filter_normals(moved, fitted), level
+        tree = KDTree(moved)
+        fitted = refit_normals(moved, normals, reach, tree=tree)
+    return moved, filter_normals(moved, fitted, tree=tree), level
 
 
-def has_edges(points: Float64, normals: Float64, *, seed: int = 0) -> bool:
+def has_edges(points: Float64, normals: Float64, *, seed: int = 0, tree: KDTree | None = None) -> bool:
     """Whether normals turn at few places by much, as at the edges between faces, and not everywhere by some.
 
     Args:
         points: ``(N, 3)``, around the origin.
         normals: ``(N, 3)`` unit normals.
         seed: of the points that are asked.
+        tree: of the points; None to build it.
     """
     asked = np.random.default_rng(seed).permutation(len(points))[:ASKED]
-    near = np.asarray(KDTree(points).query(points[asked], k=min(9, len(points)), workers=-1)[1])[:, 1:]
+    tree = tree or KDTree(points)
+    near = np.asarray(tree.query(points[asked], k=min(9, len(points)), workers=-1)[1])[:, 1:]
     cosine = np.einsum("md,mkd->mk", normals[asked], normals[near])
     angle = np.arccos(cosine.clip(-1, 1)).mean(axis=1)
     usual, large = np.quantile(angle, (0.5, 0.9))
     return bool(large > EDGED * usual)
 
 
-def filter_normals(points: Float64, normals: Float64, *, turn: float = TURN, passes: int = PASSES) -> Float64:
+def filter_normals(
+    points: Float64, normals: Float64, *, turn: float = TURN, passes: int = PASSES, tree: KDTree | None = None
+) -> Float64:
     """Unit means of normals over neighbours, those counting most that are near and nearly the same.
 
     Weights are ``(1 − d²/r²)² exp(−(1 − c)/turn²)``, d being the distance, r that of the last of `FILTERED` nearest
@@ -99,11 +105,12 @@ def filter_normals(points: Float64, normals: Float64, *, turn: float = TURN, pas
         normals: ``(N, 3)`` unit normals.
         turn: in radians.
         passes: how often.
+        tree: of the points; None to build it.
 
     Returns:
         ``(N, 3)``.
     """
-    found = KDTree(points).query(points, k=min(FILTERED, len(points)), workers=-1)
+    found = (tree or KDTree(points)).query(points, k=min(FILTERED, len(points)), workers=-1)
     distance, near = np.asarray(found[0]), np.asarray(found[1])
     beside = (1 - (distance / (distance[:, -1:] * 1.001)) ** 2) ** 2
     for _ in range(passes):
@@ -124,6 +131,7 @@ def refit_normals(
     neighbors: int = NEIGHBORS,
     rows: Rows | None = None,
     among: Rows | None = None,
+    tree: KDTree | None = None,
 ) -> Float64:
     """Normals of planes through neighbours with like normals.
 
@@ -138,6 +146,7 @@ def refit_normals(
         neighbors: nearest points that are asked.
         rows: ``(m,)`` points whose normals are wanted; None for all.
         among: ``(n,)`` points that planes are fitted to; None for all. A point without a like one keeps its normal.
+        tree: of the points that planes are fitted to; None to build it.
 
     Returns:
         ``(m, 3)`` unit normals.
@@ -145,7 +154,7 @@ def refit_normals(
     asked = np.arange(len(points)) if rows is None else rows
     others = np.arange(len(points)) if among is None else among
     count = min(neighbors, len(others))
-    tree, fitted = KDTree(points[others]), np.empty((len(asked), 3))
+    tree, fitted = tree or KDTree(points[others]), np.empty((len(asked), 3))
     for part in np.array_split(np.arange(len(asked)), -(-len(asked) // BLOCK)):
         here = asked[part]
         found = tree.query(points[here], k=count, workers=-1)

@@ -7,9 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from mplicits.datasets import PointCloud
 from mplicits.pipelines.fit.plan import FEWEST_SAMPLES, FEWEST_STEPS, SAMPLING_SHARE, FitPlan
+from mplicits.pipelines.fit.timing import USUAL_POINTS, Timing
 from mplicits.pipelines.fit.train import fit
+from mplicits.pipelines.fit.unoriented import BATCH, STEPS
 from mplicits.pipelines.run.costs import Net, Speed
 from mplicits.pipelines.run.folder import read_record
 from mplicits.pipelines.run.settings import FitConfig
@@ -53,6 +56,25 @@ def test_levels_go_one_by_one_the_finest_first() -> None:
     assert set(counts) == {1, 2, 3}
     assert PLAN.shares(1, 0.0) == []  # what is begun is enough
     assert len(PLAN.shares(0, 0.0)) == 1  # without level 0 there is nothing
+
+
+def test_signs_without_orientation_are_foreseen(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The second witness trains as long as the first, whose places are drawn before; steps are of values, not jets."""
+    first, second = PLAN.signs()
+    assert first.seconds > second.seconds > 0
+    assert second.seconds / STEPS < PLAN.step_seconds(0) * BATCH / CONFIG.batch
+
+    monkeypatch.setattr("mplicits.pipelines.fit.timing.speed", lambda _: PLAN.speed)
+
+    def left(config: FitConfig) -> float:
+        told: list[Progress] = []
+        Timing(config, told.append, torch.device("cpu")).begin(sphere_cloud())
+        assert told[-1].left is not None
+        return told[-1].left
+
+    usual = FitPlan(CONFIG, USUAL_POINTS, PLAN.speed)  # the cloud is not read yet
+    asked = sum(stage.seconds for stage in usual.signs())
+    assert left(replace(CONFIG, normals="none")) - left(CONFIG) == pytest.approx(asked, abs=0.1)  # of a clock that runs
 
 
 def test_a_slow_machine_is_a_smaller_budget() -> None:

@@ -279,7 +279,7 @@ def test_the_next_level_takes_an_invented_surface_away(cloud: CloudDistance) -> 
 
 
 def test_near_a_cloud_of_guessed_normals_all_of_them_together_say_the_side() -> None:
-    """One in eight points inward: the winding number is 3/4 inside, and offsets along those would be on the wrong side."""
+    """One in eight points inward, and its offsets would be on the wrong side; inside the winding number is 3/4."""
     points, normals = sphere_points(20_000)
     normals = torch.where((torch.arange(20_000) % 8 == 0)[:, None], -normals, normals)
     cloud, delta = CloudDistance(points, normals, noise=0.01, guessed=True), 0.05
@@ -290,7 +290,8 @@ def test_near_a_cloud_of_guessed_normals_all_of_them_together_say_the_side() -> 
     assert exact.abs().max() <= 3**0.5 * delta * (1 + 1e-6)  # of a cube of half-edge δ around a point
     clear = exact.abs() > cloud.noise
     assert clear.float().mean() > 0.5
-    assert (samples.distance.sign() == exact.sign())[clear].all()
+    # Close to such a point it may be more than 1/4 off.
+    assert (samples.distance.sign() != exact.sign())[clear].float().mean() < 0.1 / 8
     assert (samples.distance.abs() - exact.abs()).abs().max() < cloud.spacing
 
     config = FitConfig(samples=8000)
