@@ -62,7 +62,7 @@ class Base:
     def index(self) -> CloudDistance:
         """Distances to the cloud."""
         points, normals = torch.from_numpy(self.cloud.points), torch.from_numpy(self.cloud.normals)
-        return CloudDistance(points, normals, noise=self.cloud.noise)
+        return CloudDistance(points, normals, noise=self.cloud.noise, guessed=self.cloud.guessed)
 
 
 def base_cell(cell: PaperCell, overrides: tuple[tuple[str, Any], ...] = ()) -> PaperCell:
@@ -129,7 +129,7 @@ def domain_sources(
     spread = distance_samples(index, config.samples, generator=generator)
     surface, domain = (with_previous(s, everywhere, math.inf, device=device) for s in (surface_samples(index), spread))
     assert surface.value is not None
-    data, normal, eikonal = Weights().resolved(config, surface.value, index.noise)
+    data, normal, eikonal = Weights().resolved(config, surface.value, index)
     half = config.batch // 2
     return [
         Source("surface", surface, half, data, normal, eikonal),
