@@ -47,7 +47,7 @@ def layer_level(points: Float64, normals: Float64) -> float:
     level = noise_level(points, normals)
     if not level:
         return 0.0
-    return min(level, noise_level(points, refit_normals(points, normals, 0.0, neighbors=FITTED)))
+    return min(level, noise_level(points, refit_normals(points, normals, 0.0, neighbors=FITTED), fitted=True))
 
 
 def neighborly(points: Float64, normals: Float64) -> Float64:

@@ -58,7 +58,7 @@ class _Neighbors(NamedTuple):
     height: Float64
 
 
-def noise_level(points: Float64, normals: Float64, *, seed: int = 0) -> float:
+def noise_level(points: Float64, normals: Float64, *, seed: int = 0, fitted: bool = False) -> float:
     """How thick the layer of points is along the normals, or 0 where the spacing is wider than that.
 
     It is what smoothing measures in, and less than the noise's standard deviation, the more so the wider its
@@ -68,8 +68,10 @@ def noise_level(points: Float64, normals: Float64, *, seed: int = 0) -> float:
         points: ``(N, 3)``, around the origin.
         normals: ``(N, 3)`` unit normals.
         seed: of the points that are asked.
+        fitted: whether the normals were fitted to a few of these very neighbours. Those are nearer to their plane than
+            the next ones in any case, and what grows with the distance is not taken for shape.
     """
-    return _measured(points, normals, seed)[0]
+    return _measured(points, normals, seed, fitted=fitted)[0]
 
 
 def noise_deviation(points: Float64, normals: Float64, *, seed: int = 0) -> float:
@@ -93,14 +95,17 @@ def noise_deviation(points: Float64, normals: Float64, *, seed: int = 0) -> floa
     return _deviation(near) if level and near is not None else 0.0
 
 
-def _measured(points: Float64, normals: Float64, seed: int, *, thin: float = THIN) -> tuple[float, _Neighbors | None]:
+def _measured(
+    points: Float64, normals: Float64, seed: int, *, thin: float = THIN, fitted: bool = False
+) -> tuple[float, _Neighbors | None]:
     """The layer's thickness, in neighbourhoods ``1/thin`` times as wide, and those; 0 and None if it is no layer."""
     order = np.random.default_rng(seed).permutation(len(points))
     layer = _Layer(points, normals, order)
     ratio = _thickness(layer.around(order[:ASKED], 8))[0]
     if not ratio > THICK:
         return 0.0, None
-    if ratio < THICKEST and _growth(layer.around(order[:ASKED], 16)) > GROWN * np.interp(ratio, RATIOS, GROWTHS):
+    grown = GROWN * np.interp(ratio, RATIOS, GROWTHS)
+    if ratio < THICKEST and not fitted and _growth(layer.around(order[:ASKED], 16)) > grown:
         return 0.0, None
     level, near = 0.0, None
     while len(order) > 32:  # fewer and fewer points show wider and wider neighbourhoods, at the same cost

@@ -42,6 +42,7 @@ __all__ = [
     "FitRow",
     "ScaleBench",
     "ScaleRow",
+    "clouds_of",
     "fit_home",
     "has_poisson",
     "kept_fit",
@@ -164,9 +165,8 @@ class FitBench(Benchmark[FitRow]):
         """See `Benchmark.measure`."""
         (path,), seed = cell.files, self.config.seed
         reference = read_reference(path)
-        cloud = read_cloud(path) if self.points is None else _drawn(path, reference, self.points, seed)
-        if self.noise:
-            cloud = (add_isotropic_noise if self.isotropic else add_noise)(cloud, self.noise, seed=seed)
+        about = {"points": self.points, "noise": self.noise, "isotropic": self.isotropic, "seed": seed}
+        _, cloud = clouds_of(path, **about)
         rows: list[FitRow] = []
         drawn: list[tuple[str, Surface]] = [("input", from_cloud(cloud))]
         drawing: dict[str, Any] = {} if self.points is None else {"points": self.points}
@@ -264,10 +264,30 @@ def _faceted(surface: Surface) -> Surface:
     return Surface(surface.vertices[corners], np.arange(len(corners)).reshape(-1, 3), normals, colors)
 
 
-def _drawn(path: Path, reference: Surface, count: int, seed: int) -> PointCloud:
-    points, normals = sample_points(reference, count, np.random.default_rng(seed))
-    assert normals is not None
-    return PointCloud(points, normals.astype(np.float32), None, str(path))
+def clouds_of(
+    path: Path, *, points: int | None, noise: float, isotropic: bool, seed: int
+) -> tuple[PointCloud, PointCloud]:
+    """The vertices of a mesh, or points drawn on it, with exact normals; and the same with noise.
+
+    Args:
+        path: the mesh.
+        points: see `FitBench`.
+        noise: see `FitRow`.
+        isotropic: see `FitRow`.
+        seed: of what is drawn, and of the noise.
+
+    Raises:
+        InputError: the file cannot be read.
+    """
+    if points is None:
+        cloud = read_cloud(path)
+    else:
+        drawn, normals = sample_points(read_reference(path), points, np.random.default_rng(seed))
+        assert normals is not None
+        cloud = PointCloud(drawn, normals.astype(np.float32), None, str(path))
+    if not noise:
+        return cloud, cloud
+    return cloud, (add_isotropic_noise if isotropic else add_noise)(cloud, noise, seed=seed)
 
 
 def timed_mesh(run: Run, resolution: int, level: int = -1) -> tuple[Mesh | None, float]:

@@ -132,12 +132,28 @@ def _mesh(arguments: argparse.Namespace) -> int:
     return _run(arguments, [bench], out=arguments.out)
 
 
-def _fit_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("shapes", nargs="+", metavar="SHAPE", help="mesh files")
+def _noisy(parser: argparse.ArgumentParser) -> None:
+    """Flags for the clouds of meshes."""
     _number(parser, "--noise", positive, None, "move points by up to X bounding-box diagonals")
     what = "noise in all directions (Gaussian), as strong along the normals; --normals estimate leaves those out"
     parser.add_argument("--isotropic", action="store_true", help=what)
     _number(parser, "--points", whole(100), None, "draw so many points with exact normals, and leave the vertices")
+
+
+def _noise(arguments: argparse.Namespace) -> float:
+    """How much of it, of what `_noisy` has declared.
+
+    Raises:
+        InputError: it has a kind and no amount.
+    """
+    if arguments.isotropic and not arguments.noise:
+        raise input_error("--isotropic: how much noise? add --noise, 0.01 for one per cent of the diagonal")
+    return arguments.noise or 0.0
+
+
+def _fit_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("shapes", nargs="+", metavar="SHAPE", help="mesh files")
+    _noisy(parser)
     _measured(parser, 512)
     _number(parser, "--poisson-depth", whole(4, 14), 10, "octree depth")
     parser.add_argument("--pictures", type=Path, metavar="DIR", help="write two pictures of all methods per shape")
@@ -147,15 +163,13 @@ def _fit_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _fit(arguments: argparse.Namespace) -> int:
-    config = read_settings(arguments, FitConfig)
-    if arguments.isotropic and not arguments.noise:
-        raise input_error("--isotropic: how much noise? add --noise, 0.01 for one per cent of the diagonal")
+    config, noise = read_settings(arguments, FitConfig), _noise(arguments)
     from ..bench.fits import FitBench
 
     bench = FitBench(
         shapes=arguments.shapes,
         config=config,
-        noise=arguments.noise or 0.0,
+        noise=noise,
         isotropic=arguments.isotropic,
         points=arguments.points,
         resolution=arguments.resolution,
@@ -164,6 +178,22 @@ def _fit(arguments: argparse.Namespace) -> int:
         pictures=arguments.pictures,
     )
     return _run(arguments, [bench], out=arguments.out)
+
+
+def _signs_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("shapes", nargs="+", metavar="SHAPE", help="mesh files")
+    _noisy(parser)
+    _folder(parser)
+    add_flags(parser, "--json")
+    add_settings(parser, FitConfig)
+
+
+def _signs(arguments: argparse.Namespace) -> int:
+    config, noise = read_settings(arguments, FitConfig), _noise(arguments)
+    from ..bench.signs import SignsBench
+
+    options = {"noise": noise, "isotropic": arguments.isotropic, "points": arguments.points, "device": config.device}
+    return _run(arguments, [SignsBench(shapes=arguments.shapes, config=config, **options)], out=arguments.out)
 
 
 def _render_arguments(parser: argparse.ArgumentParser) -> None:
@@ -442,6 +472,15 @@ BENCH_COMMANDS: Mapping[str, Command] = MappingProxyType(
             _fit_arguments,
             _fit,
             "Fit the vertices of each mesh and measure the result against the mesh; Poisson needs mplicits[poisson].",
+        ),
+        "bench signs": Command(
+            "how many estimated normals point the wrong way",
+            """  mplicits bench signs armadillo.ply
+  mplicits bench signs armadillo.ply eiffel.ply --noise 0.005 --isotropic --json signs.json""",
+            _signs_arguments,
+            _signs,
+            "Estimate the normals of the vertices of each mesh as a fit does, then by a network that is not told of "
+            "signs (fit --normals none), and compare both with the exact ones.",
         ),
         "bench render": Command(
             "what a picture costs: the rows of the paper's Tab. 4",
