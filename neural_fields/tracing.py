@@ -18,9 +18,24 @@ import torch
 from torch import Tensor
 
 from ._checks import positive
-from ._march import Expected, Found, Near, Rays, Rule, march, march_budget
+from ._march import (
+    BOLDNESS,
+    FLOOR,
+    PATIENCE,
+    STEEPEST_RISE,
+    Expected,
+    Found,
+    Near,
+    Rays,
+    Rule,
+    march,
+    march_budget,
+)
 from .field import Field
 from .function import FieldLike, as_field
+from .kernels.switch import choose
+from .multiscale import levels_of
+from .siren import Siren
 from .volume import ball_chord
 
 __all__ = [
@@ -38,6 +53,8 @@ __all__ = [
 
 # Fields live in the unit sphere; their surfaces may pass it by a little.
 BOUNDING_RADIUS = 1.05
+# Networks of more units are not marched through in one launch: their activations do not stay in registers.
+WIDEST_FUSED = 128
 
 
 class Hits(NamedTuple):
@@ -243,10 +260,46 @@ def trace_expected(
         depth, slope, value = (part.to(directions).broadcast_to(shape) for part in expected)
         flat = Expected((depth * length).reshape(-1), slope.reshape(-1), value.reshape(-1))
         rays = rays.expecting(flat, rule)
-    march(field, level, rays, found, rule, max_steps, reach)
+    fused = None if expected is not None or reach is not None else _fused(field, level, rays)
+    if fused is None:
+        march(field, level, rays, found, rule, max_steps, reach)
+    else:
+        _march_fused(*fused, rays, found, rule, max_steps)
     clear, value, leave = (column.reshape(shape) for column in found.near)
     near_surface = Near(clear / length, value, leave / length)
     return _hits(found, origins, directions, length), found.slope.reshape(shape), near_surface
+
+
+def _fused(field: Field, level: int, rays: Rays) -> tuple[Siren, str] | None:
+    """The network whose surface is looked for, and the precision of its products, if one launch marches all rays."""
+    network = levels_of(field)[0]
+    if level > 0 or not isinstance(network, Siren) or network.width > WIDEST_FUSED:
+        return None
+    precision = choose(rays.origin, width=network.width, depth=network.depth).precision
+    return (network, precision) if precision else None
+
+
+def _march_fused(network: Siren, precision: str, rays: Rays, found: Found, rule: Rule, max_steps: int) -> None:
+    """What `march` does, by the fused kernels; what they find has the same bounds, and not the same last bits."""
+    from .kernels.tracing import march_rays
+
+    marched = march_rays(
+        network.as_network(),
+        (rays.origin, rays.direction, rays.depth, rays.entry, rays.far),
+        tolerance=rule.tolerance,
+        resolution=rule.resolution,
+        lipschitz=rule.lipschitz,
+        max_steps=max_steps,
+        constants={
+            "PATIENCE": PATIENCE,
+            "BOLDNESS": BOLDNESS,
+            "STEEPEST_RISE": STEEPEST_RISE,
+            "FLOOR": FLOOR * torch.finfo(rays.depth.dtype).eps,
+        },
+        precision=precision,
+    )
+    found.record(rays.ray, mask=marched.mask, depth=marched.depth, level=0, steps=marched.steps)
+    found.record_slope(rays.ray, marched.slope)
 
 
 def _begin(
