@@ -169,7 +169,7 @@ def from_figures(kind: Any, figures: Any) -> Any:
     if dataclasses.is_dataclass(kind):
         hints = get_type_hints(kind)
         names = [field.name for field in dataclasses.fields(kind)]
-        return kind(**{name: from_figures(hints[name], figures[name]) for name in names})  # type: ignore[operator]
+        return kind(**{name: from_figures(hints[name], figures[name]) for name in names if name in figures})  # type: ignore[operator]
     return tuple(figures) if get_origin(kind) is tuple else figures
 
 

@@ -196,6 +196,10 @@ def _signs(arguments: argparse.Namespace) -> int:
     return _run(arguments, [SignsBench(shapes=arguments.shapes, config=config, **options)], out=arguments.out)
 
 
+# The names of `bench.model.DEVICES`, which help must not load torch for.
+MODELLED = ("h100", "a100", "4090", "m2")
+
+
 def _render_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("shapes", nargs="+", metavar="SHAPE", help="meshes or clouds")
     _folder(parser, required=True)
@@ -203,6 +207,14 @@ def _render_arguments(parser: argparse.ArgumentParser) -> None:
     _number(parser, "--views", whole(1), 3, "cameras around the shape")
     _number(parser, "--repeats", whole(1), 2, "the best of how many")
     parser.add_argument("--no-naive", action="store_true", help="leave out the naive tracer, which takes minutes")
+    parser.add_argument(
+        "--model",
+        nargs="+",
+        choices=MODELLED,
+        default=(),
+        metavar="GPU",
+        help=f"times on GPUs by a model of counts and published rates: {', '.join(MODELLED)}",
+    )
     add_flags(parser, "--json")
     add_settings(parser, FitConfig)
 
@@ -214,7 +226,8 @@ def _render(arguments: argparse.Namespace) -> int:
 
     options = {name: getattr(arguments, name) for name in ("shapes", "size", "views", "repeats")}
     naive, device = not arguments.no_naive, str(choose_device(config.device))
-    return _run(arguments, [RenderBench(config=config, naive=naive, device=device, **options)], out=arguments.out)
+    bench = RenderBench(config=config, naive=naive, device=device, devices=tuple(arguments.model), **options)
+    return _run(arguments, [bench], out=arguments.out)
 
 
 # The paper's (64,1), with a frequency and a schedule at which it is a closed surface that looks like the shape.
@@ -485,7 +498,8 @@ BENCH_COMMANDS: Mapping[str, Command] = MappingProxyType(
         "bench render": Command(
             "what a picture costs: the rows of the paper's Tab. 4",
             """  mplicits bench render armadillo.ply -o bench_render
-  mplicits bench render armadillo.ply eiffel.ply -o bench_render --views 1 --no-naive --json render.json""",
+  mplicits bench render armadillo.ply eiffel.ply -o bench_render --views 1 --no-naive --json render.json
+  mplicits bench render armadillo.ply -o bench_render --model h100 4090""",
             _render_arguments,
             _render,
             "Fit the networks of the paper's Tab. 4 to each shape, trace pictures of them in several ways, and judge "
