@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import os
 import sys
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
@@ -109,6 +110,28 @@ def _normals(arguments: argparse.Namespace) -> int:
 
     options = {name: getattr(arguments, name) for name in ("points", "repeats", "busy", "seed", "device")}
     return _run(arguments, [NormalsBench(**options)], out=arguments.out)
+
+
+def _kernels_arguments(parser: argparse.ArgumentParser) -> None:
+    _number(parser, "--widths", whole(1, 512), (16, 64, 128, 256, 400), "of the networks", nargs="+")
+    _number(parser, "--depths", whole(1, 8), (1, 2, 3), "of the networks", nargs="+")
+    _number(parser, "--points", whole(1), 65, "at which they are compared")
+    _number(parser, "--seed", whole(0), 0, "of points and weights")
+    _folder(parser)
+    add_flags(parser, "--json")
+
+
+def _kernels(arguments: argparse.Namespace) -> int:
+    from ..run.machine import choose_device
+
+    device = str(choose_device("auto"))
+    if device == "cpu":  # before anything imports Triton
+        os.environ["TRITON_INTERPRET"], os.environ["MPLICITS_KERNELS"] = "1", "interpret"
+    from ..bench.kernels import KernelsBench
+
+    sizes = tuple((width, depth) for width in arguments.widths for depth in arguments.depths)
+    bench = KernelsBench(sizes=sizes, points=arguments.points, seed=arguments.seed, device=device)
+    return _run(arguments, [bench], out=arguments.out)
 
 
 def _mesh_arguments(parser: argparse.ArgumentParser) -> None:
@@ -471,6 +494,14 @@ BENCH_COMMANDS: Mapping[str, Command] = MappingProxyType(
             _eta,
             "Do a fit, a reconstruction and a morph, and compare the time that they take with what was said after five "
             "seconds, a quarter and half of it.",
+        ),
+        "bench kernels": Command(
+            "how exact the fused kernels are, and what they move",
+            "  mplicits bench kernels\n  mplicits bench kernels --widths 128 --depths 2 --json kernels.json",
+            _kernels_arguments,
+            _kernels,
+            "Compare jets by the fused kernels (pip install 'mplicits[kernels]') with the same networks in float64, "
+            "and count what they read and write. Without CUDA, Triton's interpreter runs them, slowly.",
         ),
         "bench mesh": Command(
             "what extraction costs: adaptive, the paper's, dense",

@@ -6,7 +6,7 @@ from typing import Any
 import mplicits.neural_fields.kernels.siren as fused
 import pytest
 import torch
-from bounds import assert_within
+from bounds import assert_within, rounding
 from mplicits.neural_fields import Siren
 from mplicits.neural_fields.kernels.rounding import rounding_bound
 from mplicits.neural_fields.kernels.tiles import planes
@@ -33,6 +33,11 @@ def assert_exact(network: Siren, x: torch.Tensor) -> None:
     expected = exact.requires_grad_(False).jet(x.double().cpu())
     own = network.as_network()
     bounds = [bound.cpu() for bound in rounding_bound(x, own.parameters, own.omega, own.gain)]
+    # That holds for any network, and grows with each layer's weights beyond what is of use; this is what happens to
+    # this one when weights and points are changed by rounding.
+    if len(x):
+        likely = rounding(exact, x.cpu(), lambda field, p: (field.jet(p).value, field.jet(p).gradient))
+        bounds = [torch.minimum(*pair) for pair in zip(bounds, likely, strict=True)]
     assert_within(value.cpu(), expected.value, bounds[0])
     assert_within(jet.value.cpu(), expected.value, bounds[0])
     assert_within(jet.gradient.cpu(), expected.gradient, bounds[1])

@@ -1,0 +1,62 @@
+"""The bench of the fused kernels: errors within their bounds, and bytes that are counted by hand."""
+
+import json
+import os
+from pathlib import Path
+
+import pytest
+import torch
+from mplicits.pipelines.bench.kernels import KernelsBench
+from mplicits.pipelines.bench.report import as_text
+from mplicits.pipelines.cli.entry import main
+
+pytest.importorskip("triton", reason="Triton is not installed: pip install 'mplicits[kernels]' on Linux")
+
+
+def test_a_network_is_as_exact_as_it_has_to_be(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    if not torch.cuda.is_available():
+        monkeypatch.setenv("MPLICITS_KERNELS", "interpret")
+    bench = KernelsBench(sizes=((16, 2), (16, 1)), points=20, device="cuda" if torch.cuda.is_available() else "cpu")
+    rows = bench.rows(tmp_path / "out")
+    for row in rows:
+        assert 0 < row.value_error < row.value_bound
+        assert 0 < row.gradient_error < row.gradient_bound
+        assert row.share < 1
+        assert row.pytorch_value_error < row.value_bound
+        assert row.fused_bytes == 28  # a point, a value and a gradient of four bytes a number
+    assert rows[0].staged_bytes == 4 * 2 * 16  # one matrix, written and read
+    assert rows[1].staged_bytes == 0
+    (table,) = bench.tables(rows, sgemm=1.0)
+    assert "(16,2)" in as_text(table)
+
+
+def test_bytes_of_the_papers_coarse_network() -> None:
+    """At least eight times fewer than PyTorch's operations, s₂ counted as if no cache held it."""
+    from mplicits.neural_fields import Siren
+    from mplicits.pipelines.bench.kernels import staged_bytes
+    from mplicits.pipelines.bench.model import count_frame
+
+    x = torch.rand(4096, 3)
+    counts = count_frame(Siren(128, 2).requires_grad_(False), lambda field: field.jet(x), 1)  # type: ignore[attr-defined]
+    unfused = (counts.product_bytes + counts.other_bytes) / len(x)
+    assert staged_bytes(128, 2) == 1024
+    assert unfused >= 8 * (28 + staged_bytes(128, 2))
+    # 400 units are made 64 at a time, in seven blocks, and each of them reads the whole layer below, 416 with its rest.
+    assert staged_bytes(400, 2) == 4 * (448 + 7 * 416 + 448 + 7 * 416)
+
+
+def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MPLICITS_KERNELS", "auto")  # put back afterwards
+    monkeypatch.setenv("TRITON_INTERPRET", os.environ.get("TRITON_INTERPRET", "0"))
+    words = ["bench", "kernels", "--widths", "16", "--depths", "1", "--points", "5"]
+    assert main([*words, "--json", str(tmp_path / "kernels.json")]) == 0
+    assert "of bound" in (tmp_path / "kernels.json").read_text()
+    assert json.loads((tmp_path / "kernels.json").read_text())
+
+
+def test_where_the_kernels_cannot_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from mplicits.neural_fields import InputError
+
+    monkeypatch.setenv("MPLICITS_KERNELS", "off")
+    with pytest.raises(InputError, match="cannot run here: MPLICITS_KERNELS=off"):
+        KernelsBench(sizes=((16, 1),)).rows(tmp_path / "out")
