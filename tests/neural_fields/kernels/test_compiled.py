@@ -20,20 +20,25 @@ from triton.compiler import ASTSource
 from mplicits.neural_fields.kernels.launch import tiling_of
 from mplicits.neural_fields.kernels.siren import evaluate
 from mplicits.neural_fields.kernels.tiles import planes
+from mplicits.neural_fields.kernels.tracing import march
+from mplicits.neural_fields.kernels.training import sweep
 
-width, depth, jet, precision, capability = json.loads(sys.argv[1])
-tiling = tiling_of(width)
+kind, width, depth, precision, capability = json.loads(sys.argv[1])
+kernel = {"back": sweep, "march": march}.get(kind, evaluate)
+tiling, jet = tiling_of(width), kind == "jet"
 constants = {
     "JET": jet, "PLANES": planes(depth, jet=jet), "ROWS": tiling.rows, "IN": 3, "WIDTH": width, "DEPTH": depth,
     "COLUMNS": tiling.columns, "PIECE": tiling.piece, "PRECISION": precision,
+    "PATIENCE": 32, "BOLDNESS": 0.9, "STEEPEST_RISE": 0.6, "FLOOR": 1e-6,
 }
-types = {name: "*fp32" for name in ("x", "value", "gradient", "scratch")}
-types |= {"parameters": ("*fp32",) * (2 * depth + 2), "count": "i64", "omega": "fp32", "gain": "fp32"}
-names = evaluate.arg_names
+numbers = ("omega", "gain", "tolerance", "resolution", "lipschitz")
+types = {"parameters": ("*fp32",) * (2 * depth + 2), "count": "i64", "share": "i64", "max_steps": "i32"}
+types |= {"found_mask": "*i8", "found_steps": "*i32", **dict.fromkeys(numbers, "fp32")}
+names = kernel.arg_names
 source = ASTSource(
-    evaluate,
-    {name: "constexpr" if name in constants else types[name] for name in names},
-    {(names.index(name),): constant for name, constant in constants.items()},
+    kernel,
+    {name: "constexpr" if name in constants else types.get(name, "*fp32") for name in names},
+    {(names.index(name),): constant for name, constant in constants.items() if name in names},
 )
 options = {"num_warps": tiling.warps, "num_stages": 2}
 compiled = triton.compile(source, target=GPUTarget("cuda", capability, 32), options=options)
@@ -43,28 +48,30 @@ print(json.dumps({"shared": compiled.metadata.shared, "fast": len(re.findall(r"(
 """
 
 
-def compiled(width: int, depth: int, *, jet: bool, precision: str, capability: int) -> dict[str, int]:
+def compiled(kind: str, width: int, depth: int, *, precision: str, capability: int) -> dict[str, int]:
     """What became of a kernel: bytes of shared memory, how many fast sines, how many products on tensor cores."""
     environment = {name: value for name, value in os.environ.items() if name != "TRITON_INTERPRET"}
     environment["TRITON_DEFAULT_FP_FUSION"] = "1"
-    words = [sys.executable, "-c", CODE, json.dumps([width, depth, jet, precision, capability])]
+    words = [sys.executable, "-c", CODE, json.dumps([kind, width, depth, precision, capability])]
     done = subprocess.run(words, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-2000:]
     return json.loads(done.stdout)
 
 
 def test_a_jet_compiles_for_a_hopper() -> None:
-    found = compiled(16, 2, jet=True, precision="ieee", capability=90)
+    found = compiled("jet", 16, 2, precision="ieee", capability=90)
     assert found["shared"] <= SHARED[90]
     assert (found["fast"], found["tensor"]) == (0, 0)  # sines of libdevice, products of float32 units
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("capability", SHARED)
-@pytest.mark.parametrize("precision", ["ieee", "tf32x3", "tf32"])
-@pytest.mark.parametrize(("width", "depth", "jet"), [(128, 2, False), (128, 2, True), (128, 3, True), (400, 2, True)])
-def test_kernels_compile(width: int, depth: int, jet: bool, precision: str, capability: int) -> None:
-    found = compiled(width, depth, jet=jet, precision=precision, capability=capability)
+@pytest.mark.parametrize(("precision", "capability"), [("ieee", 80), ("ieee", 90), ("tf32", 89), ("tf32x3", 90)])
+@pytest.mark.parametrize(
+    ("kind", "width", "depth"),
+    [("value", 128, 2), ("jet", 128, 2), ("jet", 128, 3), ("jet", 400, 2), ("back", 128, 2), ("march", 128, 2)],
+)
+def test_kernels_compile(kind: str, width: int, depth: int, precision: str, capability: int) -> None:
+    found = compiled(kind, width, depth, precision=precision, capability=capability)
     assert found["shared"] <= SHARED[capability]
     assert found["fast"] == 0
     assert (found["tensor"] > 0) == (precision != "ieee")
