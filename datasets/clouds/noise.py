@@ -24,9 +24,9 @@ BLOCK = 1 << 13  # points moved at once, to bound memory
 VOTERS = 256  # neighbours that are asked, at most
 ALIKE = 0.7  # smallest cosine between normals of one surface
 # Heights of the eight nearest over their distance: 1/√5 = 0.45 where noise is far wider than the spacing. Below the
-# first it is narrower than a fifth of that, and levels average over it themselves; above the second there is no shape
+# first it is narrower than a fourth of that, and levels average over it themselves; above the second there is no shape
 # left that it could be. Between them may be edges, the other side of a blade, or normals estimated there.
-THICK, THICKEST = 0.15, 0.35
+THICK, THICKEST = 0.2, 0.35
 # Those are the higher the further away, while noise is as high nearby: heights of the last four of sixteen neighbours
 # over those of the first four, medians, on a plane with noise of any direction, by that ratio. Six shapes with noise of
 # 0.1 to 1 % and estimated normals have 0.9 to 1.14 times as much; the same without noise 1.35 times and more.

@@ -88,7 +88,7 @@ def along_rays(points: np.ndarray, normals: np.ndarray, sigma: float) -> np.ndar
     return RNG.normal(0, sigma, (len(points), 1)) / np.abs(normals @ ray)[:, None] * ray
 
 
-@pytest.mark.parametrize("sigma", [0.004, 0.007])
+@pytest.mark.parametrize("sigma", [0.006, 0.0075])
 def test_noise_narrower_than_the_spacing_is_told_from_a_shape(sigma):
     """Neighbours in waves 2 σ high, 2π spacings long, are as high as in noise; only there are further ones higher."""
     count = 8000
