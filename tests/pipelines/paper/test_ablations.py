@@ -245,10 +245,11 @@ def test_residual_levels_see_the_cloud_that_level_0_has_judged(base: Base) -> No
 
 
 def test_weights_stand_where_they_are_given(base: Base) -> None:
-    errors = torch.full((4,), 0.01)
-    usual = Weights().resolved(base.config, errors, 0.0)
+    errors, cloud = torch.full((4,), 0.01), base.index()
+    assert cloud.noise == 0
+    usual = Weights().resolved(base.config, errors, cloud)
     assert usual == pytest.approx((1e4, base.config.normal_weight, base.config.eikonal_weight))
-    assert Weights(data=0.0, eikonal=7.0).resolved(base.config, errors, 0.0) == (0.0, base.config.normal_weight, 7.0)
+    assert Weights(data=0.0, eikonal=7.0).resolved(base.config, errors, cloud) == (0.0, base.config.normal_weight, 7.0)
 
 
 def test_sources_of_the_variants(base: Base) -> None:
