@@ -34,6 +34,7 @@ ROOMS = (
     "pipelines/mesh",
     "pipelines/render",
     "pipelines/viewer",
+    "pipelines/web",
     "pipelines/evolve",
     "pipelines/reconstruct",
     "pipelines/bench",

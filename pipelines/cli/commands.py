@@ -22,6 +22,7 @@ from .mesh import EVALUATE, MESH
 from .solids import BOOLEAN, OFFSET
 from .train import EVOLVE, RECONSTRUCT, TEXTURE
 from .views import CHECK_CAMERAS, SCENE
+from .web import WEB
 
 __all__ = ["COMMANDS"]
 
@@ -149,6 +150,7 @@ COMMANDS: Mapping[str, Command] = MappingProxyType(
         "render": RENDER,
         "slice": SLICE,
         "view": VIEW,
+        "web": WEB,
         "check-cameras": CHECK_CAMERAS,
         "evaluate": EVALUATE,
         "info": Command(

@@ -1,0 +1,211 @@
+"""From a run to the page: what is shown of it, rounded and packed, inside the files of the folder ``page``."""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import hashlib
+import json
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...datasets.cameras import turntable
+from ...neural_fields import Field, InputError, MultiscaleSDF, Similarity, extract_mesh
+from ...neural_fields.files import write_whole
+from ...neural_fields.meshing import NoSurfaceError
+from ...neural_fields.spacetime import SpaceTimeSDF
+from ...neural_fields.tracing import BOUNDING_RADIUS
+from ..render.subject import FRAME_RESOLUTION, traced_part
+from ..run.folder import chosen_level, find_field, load_still
+from .networks import Rounding, network_layers, rounding_error, shader_levels, taper_of
+from .payload import Payload
+from .shell import shell_mesh
+
+__all__ = ["BITS", "WebOptions", "WebPage", "web_run"]
+
+BITS = 16
+VERSION = 1
+SCRIPTS = ("decode.js", "network.js", "tracer.js", "camera.js", "page.js")
+ERROR_POINTS = 4000  # at which rounding is measured
+# The whole page: nothing is fetched, nothing is sent, and only the scripts and styles with these digests run.
+POLICY = (
+    "default-src 'none'; script-src 'sha256-{script}'; style-src 'sha256-{style}'; img-src blob: data:; "
+    "base-uri 'none'; form-action 'none'"
+)
+
+
+@dataclass(frozen=True)
+class WebOptions:
+    """What a page shows.
+
+    Attributes:
+        levels: how many levels, from the coarsest on; None is all.
+        time: the moment, of a run that moves.
+        float32: whether the weights are kept as they are; else they are rounded to `BITS` bits.
+        up: the axis that points up, "y" or "z".
+        title: of the page; None is the name of the run.
+    """
+
+    levels: int | None = None
+    time: float | None = None
+    float32: bool = False
+    up: str = "y"
+    title: str | None = None
+
+
+@dataclass(frozen=True)
+class WebPage:
+    """A page that was written.
+
+    Attributes:
+        size: of the file, in bytes.
+        levels: that it shows.
+        triangles: of the mesh between which rays are sought.
+        rounding: what rounding the weights has changed, for each level; empty if they are exact.
+    """
+
+    size: int
+    levels: int
+    triangles: int
+    rounding: tuple[Rounding, ...]
+
+
+def web_run(
+    run: str | Path,
+    out: str | Path,
+    options: WebOptions | None = None,
+    *,
+    say: Callable[[str], None] | None = None,
+) -> WebPage:
+    """Write a page that shows a run, and needs nothing but itself.
+
+    Args:
+        run: run directory or .safetensors file.
+        out: the .html file.
+        options: what to show.
+        say: called with a line about what rounding has cost.
+
+    Raises:
+        InputError: there is no such run, it has no surface or is of a kind that no shader knows, or the file cannot be
+            written.
+    """
+    options = options or WebOptions()
+    file = find_field(run)
+    shown, similarity = _still(file, options.time)
+    if options.levels is not None:
+        chosen_level(shown, file, options.levels - 1, flag="--levels")
+        shown = _coarse(shown, options.levels)
+    name = options.title or _name_of(file)
+    header, data, page = _content(shown, similarity, name, file, options)
+    write_whole(out, fill_page(header, data))
+    done = dataclasses.replace(page, size=Path(out).stat().st_size)
+    if say is not None and done.rounding:
+        worst = [max(getattr(part, key) for part in done.rounding) for key in ("value", "angle")]
+        length = worst[0] * similarity.scale
+        say(f"weights of {BITS} bits: distances change by at most {length:.2g} input units, normals by {worst[1]:.2g}°")
+    return done
+
+
+def _still(file: Path, time: float | None) -> tuple[Field, Similarity]:
+    """A field that stands still, frozen at its time if it moves."""
+    saved = load_still(file, time)
+    inner = getattr(saved.field, "field", None)
+    if time is not None and isinstance(inner, SpaceTimeSDF):
+        return inner.at(time), saved.similarity
+    return saved.field, saved.similarity
+
+
+def _coarse(shown: Field, levels: int) -> Field:
+    """The first levels of a field."""
+    if not isinstance(shown, MultiscaleSDF) or levels == shown.num_levels:
+        return shown
+    residuals = list(shown.levels[1:levels])
+    return MultiscaleSDF(shown.base, residuals, shown.deltas[: levels - 1], taper=shown.taper)
+
+
+def _name_of(file: Path) -> str:
+    return file.resolve().parent.name if file.name == "field.safetensors" else file.stem
+
+
+def _content(
+    shown: Field, similarity: Similarity, name: str, file: Path, options: WebOptions
+) -> tuple[dict[str, Any], bytes, WebPage]:
+    """Header and bytes of the page, and what is told of it."""
+    networks = shader_levels(shown, file)
+    try:
+        outline = traced_part(extract_mesh(shown, resolution=FRAME_RESOLUTION, normals=False).vertices)
+        shell = shell_mesh(shown)
+    except NoSurfaceError as error:
+        raise InputError(f"{file}: no surface to show ({error})") from error
+    bits = None if options.float32 else BITS
+    every = max(1, len(outline) // ERROR_POINTS)
+    rounding = [] if bits is None else rounding_error(shown, bits, outline[::every])
+    payload = Payload()
+    levels = [payload.add_network(f"level{index}", network_layers(part, bits)) for index, part in enumerate(networks)]
+    low, high = shell.vertices.min(axis=0), shell.vertices.max(axis=0)
+    payload.add("shell.vertices", np.rint((shell.vertices - low) / (high - low) * 65535), "u2")
+    payload.add("shell.faces", shell.faces, "u2" if len(shell.vertices) <= 65536 else "u4")
+    data, described = payload.content()
+    header = {
+        "format": "mplicits-web",
+        "version": VERSION,
+        "title": name,
+        "levels": levels,
+        "deltas": [float(delta) for delta in shown.deltas],
+        "taper": taper_of(shown),
+        "radius": BOUNDING_RADIUS,
+        "shell": {"low": low.tolist(), "high": high.tolist(), "triangles": len(shell.faces)},
+        "view": _view(outline, options.up),
+        "unit": similarity.scale,
+        "center": list(similarity.center),
+        "bits": bits,
+        "rounding": [dataclasses.asdict(part) for part in rounding],
+        **described,
+    }
+    return header, data, WebPage(0, len(levels), len(shell.faces), tuple(rounding))
+
+
+def _view(outline: NDArray[np.floating], up: str) -> dict[str, Any]:
+    """Where the camera stands first: where ``mplicits render`` would put it for a picture as wide as high."""
+    camera = turntable(outline, 1, up=up)[0]
+    middle = (outline.min(axis=0) + outline.max(axis=0)) / 2
+    distance = float(np.linalg.norm(camera.eye.numpy() - middle))
+    return {"middle": middle.tolist(), "distance": distance, "azimuth": 30.0, "elevation": 15.0, "up": up, "fov": 25.0}
+
+
+def fill_page(header: Mapping[str, Any], data: bytes) -> str:
+    """The page with a header and its bytes in it, and a policy that lets its own script and styles run, and no others.
+
+    What comes from the run stands in blocks of data, which browsers do not run, and in which no "<" is left.
+    """
+    folder = files("mplicits.pipelines.web") / "page"
+    texts = {name: (folder / name).read_text(encoding="utf-8") for name in ("index.html", "style.css", "shaders.glsl")}
+    script = "\n" + "\n".join(_bare((folder / name).read_text(encoding="utf-8")) for name in SCRIPTS)
+    style = "\n" + texts["style.css"]
+    policy = POLICY.format(script=_digest(script), style=_digest(style))
+    parts = {
+        "POLICY": policy,
+        "STYLE": style,
+        "SHADERS": _bare(texts["shaders.glsl"]),
+        "SCRIPT": script,
+        "HEADER": json.dumps(header, ensure_ascii=True, separators=(",", ":")).replace("<", "\\u003c"),
+        "DATA": base64.b64encode(data).decode(),
+    }
+    return re.sub("@([A-Z]+)@", lambda found: parts[found[1]], texts["index.html"])
+
+
+def _bare(text: str) -> str:
+    """A source without its indentation and the lines that are comments: the page has to be small."""
+    lines = (line.strip() for line in text.splitlines())
+    return "\n".join(line for line in lines if line and not line.startswith("//"))
+
+
+def _digest(text: str) -> str:
+    return base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()

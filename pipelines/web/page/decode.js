@@ -1,0 +1,86 @@
+"use strict";
+// What the page carries: a header in JSON, and bytes that it describes. All errors are sentences for people.
+
+class PageError extends Error {}
+
+function bytesOf(text) {
+  let binary;
+  try {
+    binary = atob(text.trim());
+  } catch {
+    throw new PageError('The field in this page is damaged. Write the page again with `mplicits web`.');
+  }
+  const bytes = new Uint8Array(binary.length);
+  for (let i = 0; i < bytes.length; i++) bytes[i] = binary.charCodeAt(i);
+  return bytes;
+}
+
+// CRC-32 as in zip files; crypto.subtle is not there for pages from a disk in every browser.
+function checksum(bytes) {
+  const table = new Uint32Array(256);
+  for (let n = 0; n < 256; n++) {
+    let c = n;
+    for (let k = 0; k < 8; k++) c = c & 1 ? 0xedb88320 ^ (c >>> 1) : c >>> 1;
+    table[n] = c;
+  }
+  let crc = 0xffffffff;
+  for (const byte of bytes) crc = table[(crc ^ byte) & 255] ^ (crc >>> 8);
+  return (crc ^ 0xffffffff) >>> 0;
+}
+
+// The header and the arrays of a page; what is cut off, changed or of another kind is refused.
+function decodeField(headerText, dataText) {
+  let header;
+  try {
+    header = JSON.parse(headerText);
+  } catch {
+    throw new PageError('This page is not complete. Copy it again, or write it again with `mplicits web`.');
+  }
+  if (header?.format !== 'mplicits-web') throw new PageError('The data in this page is no field of mplicits.');
+  if (header.version !== 1) throw new PageError(`The field in this page is of version ${header.version}; this page reads 1.`);
+  const bytes = bytesOf(dataText);
+  if (bytes.length !== header.bytes || checksum(bytes) !== header.crc32) {
+    throw new PageError('The field in this page is damaged or cut off. Copy the page again, or write it again with `mplicits web`.');
+  }
+  const arrays = new Map();
+  for (const [name, [kind, count, start]] of Object.entries(header.blocks)) {
+    arrays.set(name, numbersOf(bytes, kind, count, start));
+  }
+  return { header, arrays };
+}
+
+function numbersOf(bytes, kind, count, start) {
+  if (kind === 'f4') return new Float32Array(bytes.buffer, start, count);
+  if (kind === 'u2') return new Uint16Array(bytes.buffer, start, count);
+  if (kind === 'u4') return new Uint32Array(bytes.buffer, start, count);
+  const bits = Number(kind.slice(1));
+  const numbers = new Int32Array(count);
+  let held = 0, pool = 0, at = start;
+  for (let i = 0; i < count; i++) {
+    while (held < bits) {
+      pool += bytes[at++] * 2 ** held;
+      held += 8;
+    }
+    const code = pool % 2 ** bits;
+    numbers[i] = code >= 2 ** (bits - 1) ? code - 2 ** bits : code;
+    pool = Math.floor(pool / 2 ** bits);
+    held -= bits;
+  }
+  return numbers;
+}
+
+// The layers of a network: weights row by row, out x in.
+function layersOf(arrays, { name, depth }) {
+  const layers = [];
+  for (let index = 0; index <= depth; index++) {
+    const key = `${name}.${index}`;
+    const bias = arrays.get(`${key}.bias`), scale = arrays.get(`${key}.scale`), codes = arrays.get(`${key}.weight`);
+    let weight = codes;
+    if (scale) {
+      const columns = codes.length / bias.length;
+      weight = Float32Array.from(codes, (code, i) => code * scale[Math.floor(i / columns)]);
+    }
+    layers.push({ weight, bias });
+  }
+  return layers;
+}

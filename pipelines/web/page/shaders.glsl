@@ -1,0 +1,239 @@
+#part sine
+// The sine of angles in turns. Whole turns are taken off here, not left to the GPU, whose own sine may be good near 0
+// alone; the rest is folded onto a quarter turn, where an odd polynomial is within 2e-7 of the sine.
+vec4 sine(vec4 s) {
+  s -= round(s);
+  vec4 t = min(abs(s), 0.5 - abs(s));
+  vec4 q = t * t;
+  vec4 p = 41.99998856 - 14.33702469 * q;
+  p = -76.70366669 + p * q;
+  p = 81.60520935 + p * q;
+  p = -41.34170151 + p * q;
+  p = 6.283185482 + p * q;
+  return sign(s) * t * p;
+}
+vec4 cosine(vec4 s) {
+  return sine(s - round(s) + 0.25);
+}
+
+#part plane
+// One triangle that covers the target.
+void main() {
+  vec2 corner = vec2(gl_VertexID == 1 ? 3.0 : -1.0, gl_VertexID == 2 ? 3.0 : -1.0);
+  gl_Position = vec4(corner, 0.0, 1.0);
+}
+
+#part layer
+// A product of matrices: 4 points (one in each target) x 4 neurons for each fragment. Activations are an array of four
+// textures: layer = point mod 4, x = point div 4, y = neuron div 4.
+uniform highp sampler2D weights;
+uniform highp sampler2D bias;
+uniform int quads;
+#ifdef FIRST
+uniform highp sampler2D points;
+uniform int base;
+#else
+uniform highp sampler2DArray source;
+#endif
+#ifdef BACK
+uniform highp sampler2DArray phases;
+#endif
+layout(location = 0) out vec4 out0;
+layout(location = 1) out vec4 out1;
+layout(location = 2) out vec4 out2;
+layout(location = 3) out vec4 out3;
+#ifdef FIRST
+vec4 product(ivec2 at, int point, mat3x4 w, vec4 b) {
+  int i = base + 4 * at.x + point;
+  return w * texelFetch(points, ivec2(i & 2047, i >> 11), 0).xyz + b;
+}
+#endif
+vec4 finish(vec4 z, ivec2 at, int point) {
+#if defined(BACK)
+  return 6.283185307 * z * cosine(texelFetch(phases, ivec3(at, point), 0));
+#elif defined(PHASE)
+  return z;
+#else
+  return sine(z);
+#endif
+}
+void main() {
+  ivec2 at = ivec2(gl_FragCoord.xy);
+#ifdef BACK
+  vec4 b = vec4(0.0);
+#else
+  vec4 b = texelFetch(bias, ivec2(at.y, 0), 0);
+#endif
+#ifdef FIRST
+  mat3x4 w = mat3x4(
+    texelFetch(weights, ivec2(0, at.y), 0),
+    texelFetch(weights, ivec2(1, at.y), 0),
+    texelFetch(weights, ivec2(2, at.y), 0));
+  vec4 z0 = product(at, 0, w, b), z1 = product(at, 1, w, b), z2 = product(at, 2, w, b), z3 = product(at, 3, w, b);
+#else
+  vec4 z0 = b, z1 = b, z2 = b, z3 = b;
+  for (int k = 0; k < quads; k++) {
+    mat4 w = mat4(
+      texelFetch(weights, ivec2(4 * k, at.y), 0),
+      texelFetch(weights, ivec2(4 * k + 1, at.y), 0),
+      texelFetch(weights, ivec2(4 * k + 2, at.y), 0),
+      texelFetch(weights, ivec2(4 * k + 3, at.y), 0));
+    z0 += w * texelFetch(source, ivec3(at.x, k, 0), 0);
+    z1 += w * texelFetch(source, ivec3(at.x, k, 1), 0);
+    z2 += w * texelFetch(source, ivec3(at.x, k, 2), 0);
+    z3 += w * texelFetch(source, ivec3(at.x, k, 3), 0);
+  }
+#endif
+  out0 = finish(z0, at, 0);
+  out1 = finish(z1, at, 1);
+  out2 = finish(z2, at, 2);
+  out3 = finish(z3, at, 3);
+}
+
+#part bend
+// Sines of phases; or, with SEED, where the sweep back begins: the output's weights times their cosines.
+uniform highp sampler2DArray phases;
+#ifdef SEED
+uniform highp sampler2D weights;
+#endif
+layout(location = 0) out vec4 out0;
+layout(location = 1) out vec4 out1;
+layout(location = 2) out vec4 out2;
+layout(location = 3) out vec4 out3;
+vec4 bent(ivec2 at, int point) {
+  vec4 phase = texelFetch(phases, ivec3(at, point), 0);
+#ifdef SEED
+  return 6.283185307 * texelFetch(weights, ivec2(at.y, 0), 0) * cosine(phase);
+#else
+  return sine(phase);
+#endif
+}
+void main() {
+  ivec2 at = ivec2(gl_FragCoord.xy);
+  out0 = bent(at, 0);
+  out1 = bent(at, 1);
+  out2 = bent(at, 2);
+  out3 = bent(at, 3);
+}
+
+#part value
+// The first output, of four points for each fragment.
+uniform highp sampler2DArray source;
+uniform highp sampler2D weights;
+uniform float bias;
+uniform int quads;
+out vec4 result;
+void main() {
+  int x = int(gl_FragCoord.x);
+  vec4 sum = vec4(bias);
+  for (int k = 0; k < quads; k++) {
+    vec4 w = texelFetch(weights, ivec2(k, 0), 0);
+    sum += vec4(
+      dot(w, texelFetch(source, ivec3(x, k, 0), 0)),
+      dot(w, texelFetch(source, ivec3(x, k, 1), 0)),
+      dot(w, texelFetch(source, ivec3(x, k, 2), 0)),
+      dot(w, texelFetch(source, ivec3(x, k, 3), 0)));
+  }
+  result = sum;
+}
+
+#part triple
+// Three numbers for each point: three rows of weights times what is there, the end of the sweep back.
+uniform highp sampler2DArray source;
+uniform highp sampler2D weights;
+uniform vec3 bias;
+uniform int quads;
+uniform int first;
+out vec4 result;
+void main() {
+  ivec2 at = ivec2(gl_FragCoord.xy);
+  int i = (at.y - first) * 2048 + at.x;
+  vec3 sum = bias;
+  for (int k = 0; k < quads; k++) {
+    vec4 g = texelFetch(source, ivec3(i >> 2, k, i & 3), 0);
+    sum += vec3(
+      dot(g, texelFetch(weights, ivec2(k, 0), 0)),
+      dot(g, texelFetch(weights, ivec2(k, 1), 0)),
+      dot(g, texelFetch(weights, ivec2(k, 2), 0)));
+  }
+  result = vec4(sum, 1.0);
+}
+
+#part hull
+// The mesh around the band, as the camera sees it: row 0 of the target is the upper row of the picture.
+uniform vec3 eye;
+uniform mat3 axes;
+uniform vec4 lens;
+uniform vec4 frame;
+in vec3 position;
+out vec3 way;
+void main() {
+  way = position - eye;
+  vec3 seen = way * axes;
+  vec2 pixel = lens.xy * seen.xy + lens.zw * seen.z;
+  vec2 place = 2.0 * (pixel + 0.5 * seen.z) / frame.xy - seen.z;
+  float z = ((frame.w + frame.z) * seen.z - 2.0 * frame.w * frame.z) / (frame.w - frame.z);
+  gl_Position = vec4(place, z, seen.z);
+}
+
+#part depth
+in vec3 way;
+out vec4 result;
+void main() {
+  result = vec4(length(way));
+}
+
+#part shade
+// Colours of what was traced: xyz is the normal, w the depth, 0 where nothing is. Rows from `ready` on are still those of
+// the coarser picture; with more than one ray per pixel the colours are averaged, in light and not as stored.
+uniform highp sampler2D fine;
+uniform highp sampler2D coarse;
+uniform int ready;
+uniform vec2 size;
+uniform int shading;
+uniform mat3 axes;
+uniform vec4 lens;
+uniform vec3 paper;
+uniform vec3 clay;
+out vec4 result;
+vec3 light(vec3 display) { return pow(display, vec3(2.2)); }
+vec3 matcap(vec3 n) {
+  vec3 lamp = normalize(vec3(-0.5, 0.7, 0.6));
+  float d = max(dot(n, lamp), 0.0);
+  float rim = pow(1.0 - max(n.z, 0.0), 3.0);
+  float shine = pow(max(dot(reflect(vec3(0.0, 0.0, -1.0), n), lamp), 0.0), 24.0);
+  vec3 warm = vec3(0.62, 0.27, 0.16), cool = vec3(0.12, 0.14, 0.22);
+  return mix(cool, warm, 0.25 + 0.75 * d) * (0.55 + 0.75 * d) + 0.22 * shine + 0.12 * rim * vec3(0.7, 0.8, 1.0);
+}
+vec3 shaded(vec4 seen, vec2 pixel) {
+  if (seen.w <= 0.0) return light(paper);
+  vec3 ray = normalize(axes * vec3((pixel - lens.zw) / lens.xy, 1.0));
+  vec3 n = seen.xyz;
+  if (shading == 1) return light(0.5 + 0.5 * n);
+  if (dot(n, ray) > 0.2) n = -n;
+  else if (dot(n, ray) > 0.0) n -= 2.0 * dot(n, ray) * ray;
+  vec3 v = vec3(1.0, -1.0, -1.0) * (n * axes);
+  if (shading == 0) return matcap(v);
+  float key = max(dot(v, normalize(vec3(-0.55, 0.70, 0.60))), 0.0);
+  float fill = max(dot(v, normalize(vec3(0.75, 0.05, 0.65))), 0.0);
+  vec3 ambient = mix(vec3(0.15, 0.14, 0.13), vec3(0.34, 0.36, 0.39), 0.5 + 0.5 * v.y);
+  return light(clay) * (key * vec3(0.96, 0.93, 0.88) + fill * vec3(0.17, 0.18, 0.20) + ambient);
+}
+void main() {
+  vec2 at = vec2(gl_FragCoord.x, size.y - gl_FragCoord.y);
+  ivec2 grid = textureSize(fine, 0), rough = textureSize(coarse, 0);
+  ivec2 many = max(ivec2(1), ivec2(round(vec2(grid) / size)));
+  ivec2 first = ivec2(floor((at - 0.5) * vec2(grid) / size + (many == ivec2(1) ? 0.5 * vec2(grid) / size : vec2(0.0))));
+  vec3 sum = vec3(0.0);
+  for (int j = 0; j < many.y; j++) {
+    for (int i = 0; i < many.x; i++) {
+      ivec2 place = min(first + ivec2(i, j), grid - 1);
+      vec2 middle = (vec2(place) + 0.5) / vec2(grid);
+      vec4 seen = place.y < ready
+        ? texelFetch(fine, place, 0)
+        : texelFetch(coarse, min(ivec2(middle * vec2(rough)), rough - 1), 0);
+      sum += shaded(seen, middle * size - 0.5);
+    }
+  }
+  result = vec4(pow(clamp(sum / float(many.x * many.y), 0.0, 1.0), vec3(1.0 / 2.2)), 1.0);
+}

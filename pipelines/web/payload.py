@@ -1,0 +1,71 @@
+"""What the page carries of a run: one block of bytes and a description of what is where in it."""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .networks import Layer
+
+__all__ = ["Payload", "pack_codes"]
+
+
+@dataclass
+class Payload:
+    """Named arrays one behind the other, each beginning at a multiple of four bytes, little-endian.
+
+    Attributes:
+        blocks: name → kind ("f4", "u2", "u4" or "i" and a number of bits), count of its numbers and first byte.
+        parts: the bytes.
+    """
+
+    blocks: dict[str, list[Any]] = field(default_factory=dict)
+    parts: list[bytes] = field(default_factory=list)
+    size: int = 0
+
+    def add(self, name: str, numbers: NDArray[Any], kind: str) -> None:
+        """Append an array; its shape is not kept.
+
+        Args:
+            name: of the block.
+            numbers: any shape.
+            kind: "f4", "u2", "u4", or e.g. "i13": signed codes of 13 bits, see `pack_codes`.
+        """
+        flat = np.ascontiguousarray(numbers).reshape(-1)
+        data = pack_codes(flat, int(kind[1:])) if kind[0] == "i" else flat.astype(f"<{kind}").tobytes()
+        data += b"\0" * (-len(data) % 4)
+        self.blocks[name] = [kind, len(flat), self.size]
+        self.parts.append(data)
+        self.size += len(data)
+
+    def add_network(self, name: str, layers: list[Layer]) -> dict[str, Any]:
+        """Append the layers of a network.
+
+        Returns:
+            What the page has to know of it: its name, width and depth.
+        """
+        for index, layer in enumerate(layers):
+            key = f"{name}.{index}"
+            self.add(f"{key}.bias", layer.bias, "f4")
+            if layer.codes is None or layer.scale is None:
+                self.add(f"{key}.weight", layer.weight, "f4")
+            else:
+                bits = max(2, int(np.abs(layer.codes).max()).bit_length() + 1)
+                self.add(f"{key}.scale", layer.scale, "f4")
+                self.add(f"{key}.weight", layer.codes, f"i{bits}")
+        return {"name": name, "width": layers[0].weight.shape[0], "depth": len(layers) - 1}
+
+    def content(self) -> tuple[bytes, dict[str, Any]]:
+        """All bytes, and for the header: the blocks, the number of bytes and their CRC-32."""
+        data = b"".join(self.parts)
+        return data, {"blocks": self.blocks, "bytes": len(data), "crc32": zlib.crc32(data)}
+
+
+def pack_codes(codes: NDArray[np.integer], bits: int) -> bytes:
+    """Signed numbers ``(N,)`` in two's complement of ``bits`` bits, lowest bit first, without gaps."""
+    places = (codes.astype(np.int64)[:, None] >> np.arange(bits)) & 1
+    return np.packbits(places.astype(np.uint8).reshape(-1), bitorder="little").tobytes()

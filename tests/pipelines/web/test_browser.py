@@ -1,0 +1,233 @@
+"""The page in a real browser, from a file, with WebGL in software; skipped where there is no Chromium.
+
+What it traces is compared with the tracer of this package, both to the same precision, from the same cameras.
+"""
+
+import base64
+import time
+
+import numpy as np
+import pytest
+import torch
+from browser import CHROMEDRIVER, CHROMIUM, FLAGS
+from mplicits.datasets.cameras import look_at, turntable
+from mplicits.neural_fields import (
+    MultiscaleSDF,
+    Similarity,
+    Siren,
+    extract_mesh,
+    save_field,
+    solve_sphere,
+    sphere_trace,
+)
+from mplicits.pipelines.cli import main
+from mplicits.pipelines.web.networks import rounded_field
+
+pytest.importorskip("selenium")
+
+from selenium import webdriver
+from selenium.webdriver.common.by import By
+from selenium.webdriver.common.keys import Keys
+
+WINDOW = ("--window-size=320,320",)
+PATIENCE = 60.0
+SIZE = (96, 72)
+# Depths of both tracers are known to this, in units of the field.
+PRECISION = 1e-4
+RENDER = """
+const made = window.mplicits.render(arguments[0]);
+const bytes = new Uint8Array(made.seen.buffer);
+let text = '';
+for (let i = 0; i < bytes.length; i += 4096) text += String.fromCharCode(...bytes.subarray(i, i + 4096));
+return {seen: btoa(text), counts: made.counts};
+"""
+TITLE = "<img src=x onerror=alert(1)> & ball"
+
+
+def bumpy():
+    """A sphere of level 0 and bumps of two levels in its bands: no bump is larger than its band."""
+    torch.manual_seed(3)
+    base = Siren(32, 2, omega=6.0)
+    solve_sphere(base, 0.6)
+    residuals = [Siren(18, 2, omega=8.0, output_gain=0.5), Siren(16, 3, omega=16.0, output_gain=0.1)]
+    return MultiscaleSDF(base, residuals, [0.12, 0.05], taper=0.3).requires_grad_(False)
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("page")
+    save_field(folder / "ball.safetensors", bumpy(), similarity=Similarity((5.0, 6.0, 7.0), 100.0))
+    out = folder / "ball.html"
+    assert main(["web", str(folder / "ball.safetensors"), "-o", str(out), "--title", TITLE]) == 0
+    return out
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    if CHROMIUM is None or CHROMEDRIVER is None:
+        pytest.skip("no chromium and chromedriver on this machine")
+    options = webdriver.ChromeOptions()
+    options.binary_location = CHROMIUM
+    for flag in (*FLAGS, *WINDOW, f"--user-data-dir={tmp_path_factory.mktemp('chromium')}"):
+        options.add_argument(flag)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    driver = webdriver.Chrome(options=options, service=webdriver.ChromeService(CHROMEDRIVER))
+    yield driver
+    driver.quit()
+
+
+@pytest.fixture
+def opened(browser, page):
+    """The page, with rays of 16 pixels at rest: software is slow."""
+    address = f"{page.as_uri()}?pixel=16"
+    if browser.current_url != address:
+        browser.get(address)
+        until(lambda: browser.execute_script("return !!window.mplicits"))
+    return browser
+
+
+def until(condition):
+    deadline = time.monotonic() + PATIENCE
+    while not (found := condition()):
+        assert time.monotonic() < deadline, "waited in vain"
+        time.sleep(0.05)
+    return found
+
+
+def complaints(browser):
+    return [entry["message"] for entry in browser.get_log("browser") if entry["level"] == "SEVERE"]
+
+
+def message(browser):
+    """What the page says instead of a picture, or nothing."""
+    return browser.find_element(By.ID, "reason").text if browser.find_element(By.ID, "message").is_displayed() else ""
+
+
+def pictures(browser):
+    """How many the page has drawn."""
+    return int(browser.execute_script("return document.documentElement.dataset.drawn"))
+
+
+def rendered(browser, camera, **wanted):
+    """Normals and depths ``(H, W, 4)`` that the page traces, and what they have cost."""
+    fx, fy, cx, cy = camera.fx_fy_cx_cy
+    view = {name: getattr(camera, name).tolist() for name in ("eye", "right", "down", "forward")}
+    view |= {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "width": camera.width, "height": camera.height}
+    made = browser.execute_script(RENDER, {"camera": view, "precision": PRECISION, **wanted})
+    seen = np.frombuffer(base64.b64decode(made["seen"]), np.float32)
+    return seen.reshape(camera.height, camera.width, 4), made["counts"]
+
+
+def cameras():
+    width, height = SIZE
+    outline = extract_mesh(bumpy(), resolution=48, normals=False).vertices
+    around = turntable(outline, 1, azimuth=-60.0, elevation=35.0, width=width, height=height)[0]
+    # Within the mesh around the band, with the surface on all sides of the picture.
+    near = look_at((0.0, 0.2, 0.9), (0.1, 0.0, 0.0), fov=60.0, width=width, height=height)
+    return {"around": (around, 2), "coarse": (around, 0), "near": (near, 1)}
+
+
+@pytest.mark.parametrize("name", ["around", "coarse", "near"])
+def test_the_page_traces_what_this_package_traces(opened, name):
+    camera, level = cameras()[name]
+    field = rounded_field(bumpy(), 16)
+    found, counts = rendered(opened, camera, level=level)
+    eye, directions = camera.rays()
+    hits = sphere_trace(field, eye, directions, level=level, tolerance=PRECISION, resolution=PRECISION)
+    mask = hits.mask.numpy()
+    assert 500 < mask.sum() <= mask.size
+    assert ((found[..., 3] > 0) != mask).mean() <= 5e-4
+    both = (found[..., 3] > 0) & mask
+    assert (np.abs(found[..., 3] - hits.depth.numpy())[both] <= 1e-3).mean() >= 0.999
+    gradient = torch.nn.functional.normalize(field.jet(hits.position[mask], level=level).gradient, dim=-1)
+    normals = np.zeros((*mask.shape, 3), np.float32)
+    normals[mask] = gradient.numpy()
+    chord = np.linalg.norm(normals - found[..., :3], axis=-1)[both]
+    assert (np.degrees(2 * np.arcsin(chord.clip(0, 2) / 2)) <= 2).mean() >= 0.99
+    # A finer level is asked in the band of the one before it alone, and no level that is not wanted.
+    assert all(fine <= before for before, fine in zip(counts["values"], counts["values"][1:], strict=False))
+    assert counts["values"][level + 1 :] == [0] * (2 - level)
+    assert counts["jets"][0] == (found[..., 3] > 0).sum()
+    assert not complaints(opened)
+
+
+def test_normals_of_the_finest_level_on_the_coarsest(opened):
+    camera, _ = cameras()["around"]
+    coarse, _ = rendered(opened, camera, level=0)
+    mapped, counts = rendered(opened, camera, level=0, normalLevel=2)
+    assert ((coarse[..., 3] > 0) == (mapped[..., 3] > 0)).all()
+    assert counts["values"][1:] == [0, 0]
+    assert counts["jets"][2] > 0
+    seen = coarse[..., 3] > 0
+    assert np.abs(coarse - mapped)[seen][:, :3].max() > 0.05
+
+
+def test_what_a_person_sees_and_does(opened):
+    assert message(opened) == ""
+    assert opened.title == TITLE
+    assert opened.find_element(By.ID, "title").text == TITLE
+    assert not opened.find_elements(By.TAG_NAME, "img")
+    facts = opened.find_element(By.ID, "facts").text
+    assert "SIRENs 32 × 2, 18 × 2, 16 × 3" in facts
+    assert "δ = 12, 5 input units" in facts
+    assert "weights of 16 bits: off by ≤ " in facts
+    canvas = opened.find_element(By.ID, "picture")
+    level = opened.find_element(By.ID, "level")
+    assert level.get_attribute("value") == "2"
+    canvas.send_keys("0")
+    assert level.get_attribute("value") == "0"
+    drawn = pictures(opened)
+    before = opened.get_screenshot_as_png()
+    canvas.send_keys(Keys.ARROW_LEFT, "+")
+    until(lambda: pictures(opened) > drawn)
+    assert opened.get_screenshot_as_png() != before
+    drawn = pictures(opened)
+    opened.find_element(By.ID, "theme").click()
+    until(lambda: pictures(opened) > drawn)
+    assert not complaints(opened)
+
+
+def test_at_rest_the_picture_is_refined(browser, page):
+    """Strip by strip, to rays of the size that was asked for, and then to nothing finer."""
+    browser.get(f"{page.as_uri()}?pixel=4&camera=10,80")
+    until(lambda: browser.execute_script("return document.documentElement.dataset.finished"))
+    width, height = browser.execute_script("return [innerWidth, innerHeight]")
+    assert browser.find_element(By.ID, "state").text == f"{round(width / 4)} × {round(height / 4)} rays"
+
+
+def test_a_lost_context_is_told_and_comes_back(opened):
+    script = "const gl = document.getElementById('picture').getContext('webgl2'); "
+    opened.execute_script(f"{script} window.loss = gl.getExtension('WEBGL_lose_context'); window.loss.loseContext();")
+    assert "taken away" in until(lambda: message(opened))
+    opened.execute_script("window.loss.restoreContext();")
+    until(lambda: message(opened) == "")
+    camera, level = cameras()["around"]
+    found, _ = rendered(opened, camera, level=level)
+    assert (found[..., 3] > 0).sum() > 500
+
+
+DAMAGES = {
+    "cut": (lambda text: text[: text.index('id="data">') + 4000], "damaged or cut off"),
+    "header": (lambda text: text[: text.index('"deltas"')], "not complete"),
+    "flipped": (lambda text: text.replace('id="data">', 'id="data">AAAA'), "damaged or cut off"),
+    "foreign": (lambda text: text.replace('"mplicits-web"', '"something"'), "no field of mplicits"),
+    "newer": (lambda text: text.replace('"version":1', '"version":7'), "version 7"),
+    "no base64": (lambda text: text.replace('id="data">', 'id="data">!'), "damaged"),
+}
+
+
+@pytest.mark.parametrize("name", DAMAGES)
+def test_damage_is_told(browser, page, tmp_path, name):
+    damage, expected = DAMAGES[name]
+    broken = tmp_path / "broken.html"
+    broken.write_text(damage(page.read_text(encoding="utf-8")), encoding="utf-8")
+    browser.get(broken.as_uri())
+    assert expected in until(lambda: message(browser) if "has not run" not in message(browser) else "")
+
+
+def test_a_browser_without_webgl_is_told(browser, page):
+    spoil = "HTMLCanvasElement.prototype.getContext = () => null"
+    number = browser.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": spoil})
+    browser.get(page.as_uri())
+    assert "no WebGL 2" in until(lambda: message(browser))
+    browser.execute_cdp_cmd("Page.removeScriptToEvaluateOnNewDocument", number)

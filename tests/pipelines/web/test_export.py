@@ -1,0 +1,117 @@
+"""The page as a file: its policy, what of the run is in it, and one line for each mistake."""
+
+import base64
+import hashlib
+import json
+import re
+import zlib
+
+import pytest
+import torch
+from mplicits.neural_fields import MultiscaleSDF, Similarity, Siren, Sphere, save_field, solve_sphere
+from mplicits.neural_fields.spacetime import SpaceTimeSDF
+from mplicits.pipelines.cli import main
+
+NASTY = '</script><img src=x onerror="document.title=1">@DATA@'
+
+
+def ball(levels=2):
+    torch.manual_seed(0)
+    base = Siren(32, 2, omega=6.0)
+    solve_sphere(base, 0.6)
+    residuals = [Siren(16, 2, omega=8.0, output_gain=0.1) for _ in range(levels - 1)]
+    return MultiscaleSDF(base, residuals, [0.1] * (levels - 1), taper=0.2)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    file = tmp_path_factory.mktemp("run") / "ball.safetensors"
+    save_field(file, ball(), similarity=Similarity((1e6, 2.0, 3.0), 40.0), metadata={"secret": "a name of the user"})
+    return file
+
+
+def web(*words):
+    return main(["web", *(str(word) for word in words)])
+
+
+def parts(page):
+    """Header, bytes, scripts and styles of a page, as a browser would find them."""
+    text = page.read_text(encoding="utf-8")
+    header = json.loads(re.search(r'id="header">(.*?)</script>', text)[1])
+    data = base64.b64decode(re.search(r'id="data">(.*?)</script>', text)[1])
+    return text, header, data
+
+
+def test_a_page_is_whole_and_lets_nothing_else_in(run, tmp_path, capsys):
+    out = tmp_path / "page.html"
+    assert web(run, "-o", out) == 0
+    said = capsys.readouterr().out
+    assert "weights of 16 bits: distances change by at most" in said
+    assert "2 levels" in said
+    text, header, data = parts(out)
+    assert header["bytes"] == len(data)
+    assert header["crc32"] == zlib.crc32(data)
+    assert [part["width"] for part in header["levels"]] == [32, 16]
+    assert header["title"] == "ball"
+    policy = re.search(r'Content-Security-Policy" content="([^"]*)"', text)[1]
+    assert policy.startswith("default-src 'none'; ")
+    for kind, found in (("script", r"<script>(.*?)</script>"), ("style", r"<style>(.*?)</style>")):
+        digest = base64.b64encode(hashlib.sha256(re.search(found, text, re.DOTALL)[1].encode()).digest()).decode()
+        assert f"{kind}-src 'sha256-{digest}'" in policy
+    assert "unsafe" not in policy
+    assert "innerHTML" not in text
+    assert not re.search(r"https?://", text)  # not even the name of a namespace
+    assert "a name of the user" not in text
+
+
+def test_the_title_is_text_whatever_it_is(run, tmp_path):
+    out = tmp_path / "page.html"
+    assert web(run, "-o", out, "--title", NASTY) == 0
+    text, header, _ = parts(out)
+    assert header["title"] == NASTY
+    assert "<img" not in text
+
+
+def test_exact_weights_and_fewer_levels(run, tmp_path, capsys):
+    sizes = {}
+    for name, flags in {"all": [], "one": ["--levels", "1"], "exact": ["--float32"]}.items():
+        out = tmp_path / f"{name}.html"
+        assert web(run, "-o", out, *flags) == 0
+        sizes[name], header = out.stat().st_size, parts(out)[1]
+        assert len(header["levels"]) == (1 if name == "one" else 2)
+        assert header["bits"] == (None if name == "exact" else 16)
+    assert sizes["one"] < sizes["all"] < sizes["exact"]
+    assert "weights of" not in capsys.readouterr().out.splitlines()[-1]
+
+
+def test_a_moment_of_a_field_that_moves(tmp_path):
+    moving = SpaceTimeSDF.from_static(ball())
+    file = tmp_path / "moving.safetensors"
+    save_field(file, moving)
+    assert web(file, "-o", tmp_path / "page.html", "--time", 0.5) == 0
+    assert [part["width"] for part in parts(tmp_path / "page.html")[1]["levels"]] == [32, 16]
+
+
+def test_mistakes_are_one_line(run, tmp_path, capsys):
+    foreign = tmp_path / "letter.html"
+    foreign.write_text("<p>mine")
+    sphere = tmp_path / "sphere.safetensors"
+    save_field(sphere, Sphere(radius=0.5))
+    out = tmp_path / "page.html"
+    mistakes = {
+        (run, "-o", tmp_path / "page.png"): "unknown extension",
+        (run, "-o", foreign): "no page of this command",
+        (tmp_path / "none", "-o", out): "no such run",
+        (sphere, "-o", out): "not a Sphere",
+        (run, "-o", out, "--levels", 3): "has levels 0 to 1",
+        (run, "-o", out, "--time", 0.5): "does not move",
+    }
+    for words, expected in mistakes.items():
+        assert web(*words) == 2
+        said = capsys.readouterr().err.strip()
+        assert expected in said
+        assert "\n" not in said
+    assert not out.exists()
+    assert foreign.read_text() == "<p>mine"
+    assert web(run, "-o", foreign, "--force") == 0
+    assert web(run, "-o", foreign) == 0  # a page of this command may be written again

@@ -1,0 +1,90 @@
+"""Numbers for the shaders: turns, rounding and packing, against exact arithmetic."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from fields import small_multiscale
+from mplicits.neural_fields import InputError, MultiscaleSDF, Siren, Sphere
+from mplicits.pipelines.web.networks import network_layers, rounded_field, rounding_error, shader_levels
+from mplicits.pipelines.web.payload import Payload, pack_codes
+
+
+def evaluate(layers, points):
+    """The network in float64, from what the page is given."""
+    h = points
+    for layer in layers[:-1]:
+        turns = h @ layer.weight.astype(np.float64).T + layer.bias
+        h = np.sin(2 * math.pi * (turns - np.rint(turns)))
+    return h @ layers[-1].weight.astype(np.float64).T + layers[-1].bias
+
+
+def test_layers_in_turns_are_the_network():
+    torch.manual_seed(0)
+    network = Siren(24, 3, omega=20.0, num_features=2).double()
+    points = np.random.default_rng(0).uniform(-1, 1, (50, 3))
+    expected, features = network.value_features(torch.from_numpy(points))
+    found = evaluate(network_layers(network, None, channels=3), points)
+    # Weights are rounded to float32: each of 24 terms of a phase by 2⁻²⁴ of some 20, through three layers.
+    bound = 24 * 20 * 2**-24 * 3
+    np.testing.assert_allclose(found[:, 0], expected.detach().numpy(), atol=bound)
+    np.testing.assert_allclose(found[:, 1:], features.detach().numpy(), atol=bound)
+
+
+def test_rounded_weights_are_within_half_a_step_of_their_row():
+    torch.manual_seed(1)
+    network = Siren(16, 2, omega=30.0)
+    exact, rounded = network_layers(network, None), network_layers(network, 16)
+    assert rounded[0].codes is None
+    assert rounded[2].codes is None
+    codes, scale = rounded[1].codes, rounded[1].scale
+    assert np.abs(codes).max() == 2**15 - 1
+    step = np.abs(exact[1].weight).max(axis=1) / (2**15 - 1)
+    np.testing.assert_allclose(scale, step, rtol=1e-6)
+    # Half a step, and the rounding of the product to float32.
+    assert (np.abs(rounded[1].weight - exact[1].weight) <= step[:, None] * 0.5 * (1 + 1e-3) + 2e-7).all()
+
+
+def test_the_error_that_is_stated_is_that_of_the_rounded_field():
+    torch.manual_seed(2)
+    field = small_multiscale(0.4).requires_grad_(False)
+    points = np.random.default_rng(0).uniform(-0.6, 0.6, (200, 3)).astype(np.float32)
+    x = torch.from_numpy(points)
+    rough = rounding_error(field, 6, points)
+    for level, part in enumerate(rough):
+        change = (rounded_field(field, 6).value(x, level=level) - field.value(x, level=level)).abs().max()
+        assert part.value == pytest.approx(float(change), rel=1e-4)
+        assert part.value > 0
+        assert part.angle > 0
+    assert all(
+        after.value < before.value for before, after in zip(rough, rounding_error(field, 12, points), strict=True)
+    )
+
+
+def test_a_field_that_no_shader_knows_is_refused_in_one_line():
+    with pytest.raises(InputError, match=r"ball: a page traces SIRENs and their levels, not a Sphere") as caught:
+        shader_levels(MultiscaleSDF(Sphere(radius=0.5), [Siren(8, 1)], [0.1]), "ball")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("bits", [2, 5, 8, 13, 16, 24])
+def test_packed_codes_come_back(bits):
+    most = 2 ** (bits - 1) - 1
+    codes = np.random.default_rng(0).integers(-most, most + 1, 101)
+    codes[:2] = -most, most
+    data = pack_codes(codes, bits)
+    assert len(data) == math.ceil(101 * bits / 8)
+    number = int.from_bytes(data, "little")
+    found = [(number >> (bits * i)) & (2**bits - 1) for i in range(101)]
+    assert [code - 2**bits if code >> (bits - 1) else code for code in found] == codes.tolist()
+
+
+def test_blocks_begin_at_multiples_of_four():
+    payload = Payload()
+    payload.add("a", np.arange(3), "u2")
+    payload.add("b", np.array([1.5]), "f4")
+    data, described = payload.content()
+    assert described["blocks"] == {"a": ["u2", 3, 0], "b": ["f4", 1, 8]}
+    assert described["bytes"] == len(data) == 12
+    assert np.frombuffer(data, "<f4", 1, 8)[0] == 1.5
