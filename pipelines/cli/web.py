@@ -20,6 +20,7 @@ def _web_arguments(parser: argparse.ArgumentParser) -> None:
     add_flags(parser, "run", "--time")
     add_flags(parser, "--out", help=", ".join(PAGES))
     add("--levels", type=whole(1), metavar="N", help="only the N coarsest levels (default: all)")
+    add("--no-colors", dest="colors", action="store_false", help="leave out the colours of the run's texture")
     add("--float32", action="store_true", help="keep the weights as they are (default: 16 bits each)")
     add_flags(parser, "--up")
     add("--title", metavar="TEXT", help="of the page (default: the name of the run)")
@@ -36,6 +37,7 @@ def _web(arguments: argparse.Namespace) -> int:
     started = time.monotonic()
     done = web_run(arguments.run, out, WebOptions(**given_flags(arguments, WebOptions)), say=print)
     levels = f"{done.levels} level{'s' if done.levels > 1 else ''}"
+    levels += " with colours" if done.colored else ""
     seconds = time.monotonic() - started
     print(f"{out}: {done.size / 1024:,.0f} KiB, {levels}, {done.triangles:,} triangles around them, in {seconds:.1f} s")
     return 0

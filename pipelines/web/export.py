@@ -17,13 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...datasets.cameras import turntable
-from ...neural_fields import Field, InputError, MultiscaleSDF, Similarity, extract_mesh
+from ...neural_fields import Field, InputError, MultiscaleSDF, Similarity, TextureField, extract_mesh
 from ...neural_fields.files import write_whole
 from ...neural_fields.meshing import NoSurfaceError
 from ...neural_fields.spacetime import SpaceTimeSDF
 from ...neural_fields.tracing import BOUNDING_RADIUS
 from ..render.subject import FRAME_RESOLUTION, traced_part
 from ..run.folder import chosen_level, find_field, load_still
+from ..texture.train import texture_of
 from .networks import Rounding, network_layers, rounding_error, shader_levels, taper_of
 from .payload import Payload
 from .shell import shell_mesh
@@ -33,6 +34,7 @@ __all__ = ["BITS", "WebOptions", "WebPage", "web_run"]
 BITS = 16
 VERSION = 1
 SCRIPTS = ("decode.js", "network.js", "tracer.js", "camera.js", "page.js")
+CHANNELS = 3
 ERROR_POINTS = 4000  # at which rounding is measured
 # The whole page: nothing is fetched, nothing is sent, and only the scripts and styles with these digests run.
 POLICY = (
@@ -48,6 +50,7 @@ class WebOptions:
     Attributes:
         levels: how many levels, from the coarsest on; None is all.
         time: the moment, of a run that moves.
+        colors: whether the colours of the run's texture are in it, if it has one and does not move.
         float32: whether the weights are kept as they are; else they are rounded to `BITS` bits.
         up: the axis that points up, "y" or "z".
         title: of the page; None is the name of the run.
@@ -55,6 +58,7 @@ class WebOptions:
 
     levels: int | None = None
     time: float | None = None
+    colors: bool = True
     float32: bool = False
     up: str = "y"
     title: str | None = None
@@ -67,12 +71,14 @@ class WebPage:
     Attributes:
         size: of the file, in bytes.
         levels: that it shows.
+        colored: whether it has colours.
         triangles: of the mesh between which rays are sought.
         rounding: what rounding the weights has changed, for each level; empty if they are exact.
     """
 
     size: int
     levels: int
+    colored: bool
     triangles: int
     rounding: tuple[Rounding, ...]
 
@@ -99,11 +105,12 @@ def web_run(
     options = options or WebOptions()
     file = find_field(run)
     shown, similarity = _still(file, options.time)
+    texture = texture_of(file, shown) if options.colors and options.time is None else None
     if options.levels is not None:
         chosen_level(shown, file, options.levels - 1, flag="--levels")
         shown = _coarse(shown, options.levels)
     name = options.title or _name_of(file)
-    header, data, page = _content(shown, similarity, name, file, options)
+    header, data, page = _content(shown, texture, similarity, name, file, options)
     write_whole(out, fill_page(header, data))
     done = dataclasses.replace(page, size=Path(out).stat().st_size)
     if say is not None and done.rounding:
@@ -135,7 +142,7 @@ def _name_of(file: Path) -> str:
 
 
 def _content(
-    shown: Field, similarity: Similarity, name: str, file: Path, options: WebOptions
+    shown: Field, texture: TextureField | None, similarity: Similarity, name: str, file: Path, options: WebOptions
 ) -> tuple[dict[str, Any], bytes, WebPage]:
     """Header and bytes of the page, and what is told of it."""
     networks = shader_levels(shown, file)
@@ -149,6 +156,12 @@ def _content(
     rounding = [] if bits is None else rounding_error(shown, bits, outline[::every])
     payload = Payload()
     levels = [payload.add_network(f"level{index}", network_layers(part, bits)) for index, part in enumerate(networks)]
+    colors = None
+    if texture is not None:
+        colors = payload.add_network("colors", network_layers(texture.network.siren, bits, channels=CHANNELS))
+        # Of a page with fewer levels, the finest that it has stands for the one that was coloured.
+        colors["level"] = min(texture.geometry_level, shown.num_levels - 1)
+        colors |= {"delta": float(texture.delta), "outside": texture.outside.tolist()}
     low, high = shell.vertices.min(axis=0), shell.vertices.max(axis=0)
     payload.add("shell.vertices", np.rint((shell.vertices - low) / (high - low) * 65535), "u2")
     payload.add("shell.faces", shell.faces, "u2" if len(shell.vertices) <= 65536 else "u4")
@@ -158,6 +171,7 @@ def _content(
         "version": VERSION,
         "title": name,
         "levels": levels,
+        "colors": colors,
         "deltas": [float(delta) for delta in shown.deltas],
         "taper": taper_of(shown),
         "radius": BOUNDING_RADIUS,
@@ -169,7 +183,7 @@ def _content(
         "rounding": [dataclasses.asdict(part) for part in rounding],
         **described,
     }
-    return header, data, WebPage(0, len(levels), len(shell.faces), tuple(rounding))
+    return header, data, WebPage(0, len(levels), colors is not None, len(shell.faces), tuple(rounding))
 
 
 def _view(outline: NDArray[np.floating], up: str) -> dict[str, Any]:

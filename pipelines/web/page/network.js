@@ -254,6 +254,16 @@ class Networks {
     return this.read(this.values, count, 1);
   }
 
+  // Three outputs of a network, as r, g, b and 1.
+  color(index, points, count) {
+    if (!count) return new Float32Array(0);
+    const net = this.nets[index];
+    this.load(points, count);
+    this.each(count, (base, here, wide) => this.addTriples(net, this.sweep(net, base, wide, false), net.output, net.outputBias, base, here));
+    this.counts.values[index] += count;
+    return this.read(this.triples, count, 4);
+  }
+
   // Values, and gradients by the sweep back: s_i = g_i cos z_i, g_(i-1) = s_i W_i.
   jet(index, points, count) {
     if (!count) return { value: new Float32Array(0), gradient: new Float32Array(0) };

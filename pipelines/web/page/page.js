@@ -24,7 +24,7 @@ class Page {
     this.canvas = byId('picture');
     this.orbit = new Orbit(saved.header.view);
     this.level = this.normals = saved.header.levels.length - 1;
-    this.shading = 2;
+    this.shading = saved.header.colors ? 3 : 2; // 3 is colours in light, 4 bare colours; they want the network of colours
     this.factor = COARSEST; // canvas pixels per ray while it moves; less as soon as the adapter shows how fast it is
     this.speed = 200;     // pixels per millisecond
     const pixel = Number(new URLSearchParams(location.search).get('pixel')); // coarser at rest, for slow adapters
@@ -69,6 +69,8 @@ class Page {
     if (wanted.has('camera') && given.length === 2 && given.every(Number.isFinite)) {
       [this.orbit.azimuth, this.orbit.elevation] = [given[0], Math.min(90, Math.max(-90, given[1]))];
     }
+    if (header.colors) byId('shading').prepend(new Option('colours', 3), new Option('bare colours', 4));
+    byId('shading').value = this.shading;
     this.setTheme(matchMedia('(prefers-color-scheme: light)').matches ? 'light' : 'dark');
     byId('message').hidden = true;
     byId('panel').hidden = false;
@@ -126,7 +128,11 @@ class Page {
     });
     byId('level').addEventListener('change', ({ target }) => this.choose(Number(target.value), Number(target.value)));
     byId('normals').addEventListener('change', ({ target }) => this.choose(this.level, Number(target.value)));
-    byId('shading').addEventListener('change', ({ target }) => { this.shading = Number(target.value); this.present(); });
+    byId('shading').addEventListener('change', ({ target }) => {
+      this.shading = Number(target.value);
+      if (this.shading > 2) this.changed();
+      else this.present();
+    });
     byId('reset').addEventListener('click', () => { orbit.reset(); this.changed(); });
     byId('theme').addEventListener('click', () => { this.setTheme(this.theme === 'dark' ? 'light' : 'dark'); this.present(); });
     byId('panel').addEventListener('submit', (event) => event.preventDefault());
@@ -187,11 +193,11 @@ class Page {
   whole(factor) {
     const grid = this.grid(factor);
     const started = performance.now();
-    const seen = this.tracer.trace(grid, { level: this.level, normalLevel: this.normals });
+    const seen = this.tracer.trace(grid, { level: this.level, normalLevel: this.normals, colored: this.shading > 2 });
     this.speed = (grid.width * grid.height) / Math.max(1, performance.now() - started);
     this.keep('coarse', grid, seen, 0, grid.height);
     this.ready = 0;
-    this.fine = this.fine ?? { ...this.coarse, own: false };
+    this.fine = this.fine ?? { ...this.coarse, borrowed: true };
     this.present();
     this.report(grid, false);
   }
@@ -206,7 +212,7 @@ class Page {
         if (this.version !== version || this.lost || document.hidden) return;
         const rows = Math.min(grid.height - first, Math.max(1, Math.floor((STRIP * this.speed) / grid.width)));
         const started = performance.now();
-        const seen = this.tracer.trace(grid, { level: this.level, normalLevel: this.normals, first, rows });
+        const seen = this.tracer.trace(grid, { level: this.level, normalLevel: this.normals, first, rows, colored: this.shading > 2 });
         // Empty strips are quick; the next may not be.
         this.speed = Math.min(1.5 * this.speed, (grid.width * rows) / Math.max(1, performance.now() - started));
         this.keep('fine', grid, seen, first, rows);
@@ -221,17 +227,24 @@ class Page {
     document.documentElement.dataset.finished = this.drawn;
   }
 
-  // Rows of a picture into its texture.
-  keep(name, grid, seen, first, rows) {
+  // Rows of a picture into its textures: what is seen, and its colours, of which a picture without them has one texel.
+  keep(name, grid, made, first, rows) {
     const { gl } = this;
+    const colored = this.shading > 2;
     const held = this[name];
-    if (!held || held.own === false || held.width !== grid.width || held.height !== grid.height) {
-      if (held && held.own !== false) gl.deleteTexture(held.texture);
-      this[name] = { texture: texture2d(gl, grid.width, grid.height), width: grid.width, height: grid.height };
-      if (name === 'coarse' && this.fine?.own === false) this.fine = null;
+    if (!held || held.borrowed || held.width !== grid.width || held.height !== grid.height || held.colored !== colored) {
+      if (held && !held.borrowed) for (const texture of [held.texture, held.color]) gl.deleteTexture(texture);
+      const { width, height } = grid;
+      this[name] = { width, height, colored, texture: texture2d(gl, width, height), color: texture2d(gl, colored ? width : 1, colored ? height : 1) };
+      if (this.fine?.borrowed) this.fine = null;
     }
-    gl.bindTexture(gl.TEXTURE_2D, this[name].texture);
-    if (seen) gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, first, grid.width, rows, gl.RGBA, gl.FLOAT, seen);
+    if (!made) return;
+    gl.activeTexture(gl.TEXTURE0);
+    for (const [texture, numbers] of [[this[name].texture, made.seen], [this[name].color, made.color]]) {
+      if (!numbers.length) continue;
+      gl.bindTexture(gl.TEXTURE_2D, texture);
+      gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, first, grid.width, rows, gl.RGBA, gl.FLOAT, numbers);
+    }
   }
 
   present() {
@@ -242,7 +255,8 @@ class Page {
     gl.useProgram(shade.program);
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     gl.viewport(0, 0, camera.width, camera.height);
-    [['fine', this.fine], ['coarse', this.coarse]].forEach(([name, { texture }], unit) => {
+    const planes = { fine: this.fine.texture, coarse: this.coarse.texture, fineColor: this.fine.color, coarseColor: this.coarse.color };
+    Object.entries(planes).forEach(([name, texture], unit) => {
       gl.activeTexture(gl.TEXTURE0 + unit);
       gl.bindTexture(gl.TEXTURE_2D, texture);
       gl.uniform1i(shade.at(name), unit);
@@ -262,13 +276,41 @@ class Page {
   }
 
   // One picture of any camera, for tests and for other scripts: arrays of its pixels, and what they have cost.
-  render({ camera, level = this.level, normalLevel = level, precision = null }) {
+  render({ camera, level = this.level, normalLevel = level, precision = null, colored = false }) {
+    if (colored && !this.tracer.colors) throw new PageError('This page has no colours.');
     const { counts } = this.tracer.networks;
     for (const kind of ['values', 'jets']) counts[kind].fill(0);
     Object.assign(counts, { passes: 0, read: 0 });
     const started = performance.now();
-    const seen = this.tracer.trace(camera, { level, normalLevel, precision });
-    return { width: camera.width, height: camera.height, seen, milliseconds: performance.now() - started, counts: structuredClone(counts) };
+    const made = this.tracer.trace(camera, { level, normalLevel, precision, colored });
+    return { width: camera.width, height: camera.height, ...made, milliseconds: performance.now() - started, counts: structuredClone(counts) };
+  }
+
+  // Pictures of a camera that goes around, one in each frame: how many in a second, and what one costs.
+  async bench({ size = 512, frames = 12, level = this.level } = {}) {
+    const orbit = new Orbit(this.saved.header.view);
+    let milliseconds = 0, operations = 0, passes = 0, read = 0;
+    const evaluations = this.tracer.networks.nets.map(() => 0);
+    for (let frame = 0; frame < frames; frame++) {
+      await new Promise((resolve) => { setTimeout(resolve, 0); });
+      orbit.azimuth = (360 * frame) / frames;
+      const { counts, milliseconds: took } = this.render({ camera: orbit.camera(size, size), level });
+      milliseconds += took / frames;
+      passes += counts.passes / frames;
+      read += counts.read / frames;
+      this.tracer.networks.nets.forEach(({ width, depth }, index) => {
+        // A product of a weight and a sum are two operations; a jet goes through the matrices twice.
+        const once = 2 * width * (3 + (depth - 1) * width + 1), jets = counts.jets[index];
+        operations += (once * (counts.values[index] + 2 * jets)) / frames;
+        evaluations[index] += (counts.values[index] + jets) / frames / size ** 2;
+      });
+    }
+    return { size, level, frames, fps: 1000 / milliseconds, milliseconds, evaluations, passes, read, operations };
+  }
+
+  describeBench({ size, level, fps, evaluations, passes, read, operations }) {
+    const each = evaluations.map(digits).join(' + ');
+    byId('facts').textContent = `level ${level} at ${size} × ${size}: ${digits(fps)} pictures a second; ${each} evaluations per pixel, ${digits(operations / 1e9)} GFLOP, ${digits(passes)} passes, ${digits(read / 2 ** 20)} MiB read back, each picture`;
   }
 }
 
@@ -289,5 +331,10 @@ addEventListener('DOMContentLoaded', () => guarded(() => {
     return [part.slice(0, end), part.slice(end)];
   }));
   const page = new Page(decodeField(text('header'), text('data')), parts);
-  window.mplicits = { render: (wanted) => page.render(wanted), header: page.saved.header };
+  window.mplicits = { render: (wanted) => page.render(wanted), bench: (wanted) => page.bench(wanted), header: page.saved.header };
+  const wanted = new URLSearchParams(location.search);
+  if (wanted.has('bench')) {
+    const size = Math.min(1024, Math.max(16, Number(wanted.get('bench')) || 512));
+    page.bench({ size }).then((found) => page.describeBench(found)).catch(failed);
+  }
 }));

@@ -188,6 +188,8 @@ void main() {
 // the coarser picture; with more than one ray per pixel the colours are averaged, in light and not as stored.
 uniform highp sampler2D fine;
 uniform highp sampler2D coarse;
+uniform highp sampler2D fineColor;
+uniform highp sampler2D coarseColor;
 uniform int ready;
 uniform vec2 size;
 uniform int shading;
@@ -205,10 +207,11 @@ vec3 matcap(vec3 n) {
   vec3 warm = vec3(0.62, 0.27, 0.16), cool = vec3(0.12, 0.14, 0.22);
   return mix(cool, warm, 0.25 + 0.75 * d) * (0.55 + 0.75 * d) + 0.22 * shine + 0.12 * rim * vec3(0.7, 0.8, 1.0);
 }
-vec3 shaded(vec4 seen, vec2 pixel) {
+vec3 shaded(vec4 seen, vec3 own, vec2 pixel) {
   if (seen.w <= 0.0) return light(paper);
   vec3 ray = normalize(axes * vec3((pixel - lens.zw) / lens.xy, 1.0));
   vec3 n = seen.xyz;
+  if (shading == 4) return light(own);
   if (shading == 1) return light(0.5 + 0.5 * n);
   if (dot(n, ray) > 0.2) n = -n;
   else if (dot(n, ray) > 0.0) n -= 2.0 * dot(n, ray) * ray;
@@ -217,7 +220,7 @@ vec3 shaded(vec4 seen, vec2 pixel) {
   float key = max(dot(v, normalize(vec3(-0.55, 0.70, 0.60))), 0.0);
   float fill = max(dot(v, normalize(vec3(0.75, 0.05, 0.65))), 0.0);
   vec3 ambient = mix(vec3(0.15, 0.14, 0.13), vec3(0.34, 0.36, 0.39), 0.5 + 0.5 * v.y);
-  return light(clay) * (key * vec3(0.96, 0.93, 0.88) + fill * vec3(0.17, 0.18, 0.20) + ambient);
+  return light(shading == 3 ? own : clay) * (key * vec3(0.96, 0.93, 0.88) + fill * vec3(0.17, 0.18, 0.20) + ambient);
 }
 void main() {
   vec2 at = vec2(gl_FragCoord.x, size.y - gl_FragCoord.y);
@@ -229,10 +232,12 @@ void main() {
     for (int i = 0; i < many.x; i++) {
       ivec2 place = min(first + ivec2(i, j), grid - 1);
       vec2 middle = (vec2(place) + 0.5) / vec2(grid);
-      vec4 seen = place.y < ready
-        ? texelFetch(fine, place, 0)
-        : texelFetch(coarse, min(ivec2(middle * vec2(rough)), rough - 1), 0);
-      sum += shaded(seen, middle * size - 0.5);
+      ivec2 before = min(ivec2(middle * vec2(rough)), rough - 1);
+      bool isReady = place.y < ready;
+      vec4 seen = isReady ? texelFetch(fine, place, 0) : texelFetch(coarse, before, 0);
+      vec3 own = clay;
+      if (shading > 2) own = isReady ? texelFetch(fineColor, place, 0).rgb : texelFetch(coarseColor, before, 0).rgb;
+      sum += shaded(seen, own, middle * size - 0.5);
     }
   }
   result = vec4(pow(clamp(sum / float(many.x * many.y), 0.0, 1.0), vec3(1.0 / 2.2)), 1.0);

@@ -5,6 +5,7 @@
 const PATIENCE = 32, BAND_ENTRY = 0.5, BOLDNESS = 0.9, STEEPEST_RISE = 0.6, MOST_STEPS = 512;
 const FLOOR = 8 * 2 ** -23;
 const TOLERANCE = 0.1, RESOLUTION = 0.75, NEWTON_REACH = 0.2, SHALLOW = 0.05, NEAREST = 0.05;
+const MOST_MOVES = 10, ARRIVED = 1e-5, LEAST_SLOPE = 0.5;
 const SLACK = 1e-4; // rounding of the depths of the mesh
 
 const dot3 = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
@@ -66,6 +67,40 @@ class Field {
       });
     }
     return { value: f, gradient: g };
+  }
+}
+
+// Display colours around a surface: those of a network at points in the band of a level, the others first moved onto the
+// surface by x - f g / |g|^2; what does not arrive there has the colour of what lies outside.
+class Colors {
+  constructor(field, index, { level, delta, outside }) {
+    Object.assign(this, { field, index, level, delta, outside });
+  }
+
+  at(points, count) {
+    const { field, delta } = this;
+    const moved = points.slice(0, 3 * count);
+    const reached = field.value(moved, count, this.level).map((f) => Number(Math.abs(f) < delta));
+    let away = Array.from(reached.keys()).filter((i) => !reached[i]);
+    for (let step = 0; step <= MOST_MOVES && away.length; step++) {
+      const places = Float32Array.from(away.flatMap((i) => [...moved.subarray(3 * i, 3 * i + 3)]));
+      const { value, gradient } = field.jet(places, away.length, this.level);
+      away = away.filter((i, k) => {
+        if (Math.abs(value[k]) < ARRIVED) {
+          reached[i] = 1;
+          return false;
+        }
+        const slope = Math.hypot(...gradient.subarray(3 * k, 3 * k + 3)) || 1;
+        for (let c = 0; c < 3; c++) moved[3 * i + c] -= (value[k] * gradient[3 * k + c]) / slope / Math.max(slope, LEAST_SLOPE);
+        return true;
+      });
+    }
+    const found = field.networks.color(this.index, moved, count);
+    const colors = new Float32Array(3 * count);
+    for (let i = 0; i < count; i++) {
+      for (let c = 0; c < 3; c++) colors[3 * i + c] = reached[i] ? Math.min(1, Math.max(0, found[4 * i + c])) : this.outside[c];
+    }
+    return colors;
   }
 }
 
@@ -139,8 +174,10 @@ class Hull {
 class Tracer {
   constructor(gl, parts, { header, arrays }) {
     this.header = header;
-    this.networks = new Networks(gl, parts, header.levels.map((level) => layersOf(arrays, level)));
+    const saved = header.colors ? [...header.levels, header.colors] : header.levels;
+    this.networks = new Networks(gl, parts, saved.map((network) => layersOf(arrays, network)));
     this.field = new Field(this.networks, header);
+    this.colors = header.colors && new Colors(this.field, header.levels.length, header.colors);
     this.hull = new Hull(gl, parts, arrays, header);
   }
 
@@ -150,9 +187,10 @@ class Tracer {
     return 0;
   }
 
-  // What rows [first, first + rows) of a camera's picture see: normal and depth of each pixel, depth 0 for nothing.
+  // What rows [first, first + rows) of a camera's picture see: normal and depth of each pixel, depth 0 for nothing; and
+  // where it is `colored`, the surface's own colours.
   // Depths are known to a tenth of a pixel, or to `precision` in units of the field.
-  trace(camera, { level, normalLevel = level, first = 0, rows = camera.height, precision = null }) {
+  trace(camera, { level, normalLevel = level, first = 0, rows = camera.height, precision = null, colored = false }) {
     const size = Math.max(Math.hypot(...camera.eye) - this.header.radius, NEAREST) / Math.max(camera.fx, camera.fy);
     const seen = new Float32Array(4 * camera.width * rows);
     const rays = this.begin(camera, first, rows);
@@ -160,6 +198,7 @@ class Tracer {
     const points = this.points(camera, rays.direction, rays.depth, hits);
     const { value, gradient } = this.field.jet(points, hits.length, normalLevel);
     const reach = precision ?? NEWTON_REACH * size;
+    const color = new Float32Array(colored ? seen.length : 0);
     hits.forEach((ray, i) => {
       const normal = [gradient[3 * i], gradient[3 * i + 1], gradient[3 * i + 2]];
       const length = Math.hypot(...normal) || 1;
@@ -171,8 +210,13 @@ class Tracer {
       const at = 4 * rays.pixel[ray];
       for (let c = 0; c < 3; c++) seen[at + c] = normal[c] / length;
       seen[at + 3] = depth;
+      for (let c = 0; c < 3; c++) points[3 * i + c] = camera.eye[c] + depth * rays.direction[3 * ray + c];
     });
-    return seen;
+    if (colored) {
+      const colors = this.colors.at(points, hits.length);
+      hits.forEach((ray, i) => color.set(colors.subarray(3 * i, 3 * i + 3), 4 * rays.pixel[ray]));
+    }
+    return { seen, color };
   }
 
   // The rays that enter the mesh around the band, from where they do to where they leave it for good.

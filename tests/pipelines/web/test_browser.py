@@ -12,11 +12,15 @@ import torch
 from browser import CHROMEDRIVER, CHROMIUM, FLAGS
 from mplicits.datasets.cameras import look_at, turntable
 from mplicits.neural_fields import (
+    ColorSiren,
     MultiscaleSDF,
     Similarity,
     Siren,
+    TextureField,
     extract_mesh,
+    map_colors,
     save_field,
+    save_texture,
     solve_sphere,
     sphere_trace,
 )
@@ -39,7 +43,7 @@ const made = window.mplicits.render(arguments[0]);
 const bytes = new Uint8Array(made.seen.buffer);
 let text = '';
 for (let i = 0; i < bytes.length; i += 4096) text += String.fromCharCode(...bytes.subarray(i, i + 4096));
-return {seen: btoa(text), counts: made.counts};
+return {seen: btoa(text), color: Array.from(made.color), counts: made.counts};
 """
 TITLE = "<img src=x onerror=alert(1)> & ball"
 
@@ -53,10 +57,19 @@ def bumpy():
     return MultiscaleSDF(base, residuals, [0.12, 0.05], taper=0.3).requires_grad_(False)
 
 
+def painted():
+    """Colours in a band that holds most of the coarsest level's surface, but not all."""
+    torch.manual_seed(4)
+    return TextureField(bumpy(), ColorSiren(16, 2, omega=8.0), delta=0.02, outside=(1.0, 0.0, 0.0)).requires_grad_(
+        False
+    )
+
+
 @pytest.fixture(scope="module")
 def page(tmp_path_factory):
     folder = tmp_path_factory.mktemp("page")
     save_field(folder / "ball.safetensors", bumpy(), similarity=Similarity((5.0, 6.0, 7.0), 100.0))
+    save_texture(folder / "texture.safetensors", painted())
     out = folder / "ball.html"
     assert main(["web", str(folder / "ball.safetensors"), "-o", str(out), "--title", TITLE]) == 0
     return out
@@ -109,13 +122,14 @@ def pictures(browser):
 
 
 def rendered(browser, camera, **wanted):
-    """Normals and depths ``(H, W, 4)`` that the page traces, and what they have cost."""
+    """Normals and depths ``(H, W, 4)`` that the page traces, what they have cost, and among that the colours."""
     fx, fy, cx, cy = camera.fx_fy_cx_cy
     view = {name: getattr(camera, name).tolist() for name in ("eye", "right", "down", "forward")}
     view |= {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "width": camera.width, "height": camera.height}
     made = browser.execute_script(RENDER, {"camera": view, "precision": PRECISION, **wanted})
     seen = np.frombuffer(base64.b64decode(made["seen"]), np.float32)
-    return seen.reshape(camera.height, camera.width, 4), made["counts"]
+    counts = made["counts"] | {"color": np.array(made["color"], np.float32).reshape(-1, 4)}
+    return seen.reshape(camera.height, camera.width, 4), counts
 
 
 def cameras():
@@ -146,7 +160,7 @@ def test_the_page_traces_what_this_package_traces(opened, name):
     assert (np.degrees(2 * np.arcsin(chord.clip(0, 2) / 2)) <= 2).mean() >= 0.99
     # A finer level is asked in the band of the one before it alone, and no level that is not wanted.
     assert all(fine <= before for before, fine in zip(counts["values"], counts["values"][1:], strict=False))
-    assert counts["values"][level + 1 :] == [0] * (2 - level)
+    assert counts["values"][level + 1 :] == [0] * (3 - level)  # the last are the colours
     assert counts["jets"][0] == (found[..., 3] > 0).sum()
     assert not complaints(opened)
 
@@ -156,10 +170,41 @@ def test_normals_of_the_finest_level_on_the_coarsest(opened):
     coarse, _ = rendered(opened, camera, level=0)
     mapped, counts = rendered(opened, camera, level=0, normalLevel=2)
     assert ((coarse[..., 3] > 0) == (mapped[..., 3] > 0)).all()
-    assert counts["values"][1:] == [0, 0]
+    assert counts["values"][1:] == [0, 0, 0]
     assert counts["jets"][2] > 0
     seen = coarse[..., 3] > 0
     assert np.abs(coarse - mapped)[seen][:, :3].max() > 0.05
+
+
+def test_colours_are_those_of_the_texture(opened):
+    """In its band, and on a coarse surface outside of it, from where points are moved to the one that was coloured."""
+    camera, _ = cameras()["around"]
+    found, counts = rendered(opened, camera, level=0, colored=True)
+    seen = found[..., 3] > 0
+    eye, directions = camera.rays()
+    points = eye + torch.from_numpy(np.array(found[..., 3:])) * directions
+    away = bumpy().value(points[seen]).abs() > 0.02
+    assert 0 < int(away.sum()) < len(away)
+    expected = map_colors(painted(), points[seen]).values.numpy()
+    # 16-bit weights, and depths in float32, change smooth colours by far less than a step of a display.
+    close = np.abs(counts["color"].reshape(*seen.shape, 4)[seen][:, :3] - expected).max(axis=1) < 1 / 255
+    assert close.mean() > 0.99
+    assert np.ptp(expected, axis=0).max() > 0.1
+    assert len(rendered(opened, camera, level=0)[1]["color"]) == 0
+
+
+def test_the_bench_counts_what_networks_are_asked(opened):
+    found = opened.execute_async_script(
+        "const done = arguments[0]; window.mplicits.bench({size: 24, frames: 2, level: 1}).then(done);"
+    )
+    base, fine, none, colors = found["evaluations"]
+    assert base > fine > 0
+    assert none == colors == 0
+    # Each evaluation of (32, 2) is 32·3 + 32·32 + 32 products; a jet is two.
+    once = 2 * (base * (32 * 3 + 32 * 32 + 32) + fine * (18 * 3 + 18 * 18 + 18)) * 24**2
+    assert once < found["operations"] < 2 * once
+    assert found["fps"] > 0
+    assert found["read"] > 0
 
 
 def test_what_a_person_sees_and_does(opened):
@@ -174,6 +219,7 @@ def test_what_a_person_sees_and_does(opened):
     canvas = opened.find_element(By.ID, "picture")
     level = opened.find_element(By.ID, "level")
     assert level.get_attribute("value") == "2"
+    assert opened.find_element(By.ID, "shading").get_attribute("value") == "3"  # colours, as there are some
     canvas.send_keys("0")
     assert level.get_attribute("value") == "0"
     drawn = pictures(opened)
