@@ -182,7 +182,9 @@ class Page {
     const ratio = Math.min(2, devicePixelRatio || 1);
     const width = Math.max(1, Math.round(this.canvas.clientWidth * ratio)), height = Math.max(1, Math.round(this.canvas.clientHeight * ratio));
     if (this.canvas.width !== width || this.canvas.height !== height) Object.assign(this.canvas, { width, height });
-    this.camera = this.orbit.camera(width, height);
+    // The shape stands in the middle of what the panel leaves free.
+    const free = height - ratio * (byId('panel').offsetHeight + 24);
+    this.camera = { ...this.orbit.camera(width, Math.max(height / 2, free)), height };
   }
 
   grid(factor) {
