@@ -177,7 +177,7 @@ def _reading(
         name = "texture.safetensors" if form == TEXTURE_FORMAT else "field.safetensors"
         raise InputError(f"{path}: no such file; expected {thing} written by `{command}` ({name})")
     try:
-        with safe_open(path, framework="pt", device=str(device)) as file:
+        with safe_open(path, framework="pt") as file:  # it knows few devices by name; torch moves to any
             header_text = (file.metadata() or {}).get(form)
             if header_text is None:
                 raise InputError(f"{path}: a safetensors file, but not {thing}; expected one written by `{command}`")
@@ -187,7 +187,7 @@ def _reading(
                     f"{path}: {thing.split()[-1]} format version {header['version']}; this mplicits reads version "
                     f"{VERSION}, so write it again with `{command}` or install the version that wrote it"
                 )
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            tensors = {name: file.get_tensor(name).to(device) for name in file.keys()}  # noqa: SIM118
         yield header, tensors
     except InputError:
         raise

@@ -71,7 +71,7 @@ class NeuSHost:
         inverse = (10 * self.inverse_deviation).exp()
         ahead, behind = (torch.sigmoid((sdf + sign * slope * 0.05) * inverse) for sign in (-1, 1))
         alpha = ((ahead - behind + 1e-5) / (ahead + 1e-5)).reshape(rays, samples).clip(0, 1)
-        passed = torch.cumprod(torch.cat((torch.ones(rays, 1), 1 - alpha + 1e-7), -1), -1)[:, :-1]
+        passed = torch.cumprod(torch.cat((depths.new_ones(rays, 1), 1 - alpha + 1e-7), -1), -1)[:, :-1]
         rendered = (color * (alpha * passed)[..., None]).sum(dim=1)
         eikonal = ((gradients.reshape(rays, samples, 3).norm(dim=-1) - 1) ** 2).mean()
         return (rendered - wanted).abs().mean() + 0.1 * eikonal

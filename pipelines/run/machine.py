@@ -46,9 +46,9 @@ def best_seconds(work: Callable[[], object], *, repeats: int = 5, median: bool =
 @torch.inference_mode()
 def sgemm_rate(width: int = 512, *, rows: int = 2048, device: torch.device | str = "cpu", repeats: int = 20) -> float:
     """Measured float32 matrix-product rate ``(rows, width) @ (width, width)``, in FLOP/s: the limit of any SIREN."""
-    random = torch.Generator(device).manual_seed(0)  # of its own: who measures in between draws the same afterwards
-    a = torch.randn(rows, width, device=device, generator=random)
-    b = torch.randn(width, width, device=device, generator=random)
+    random = torch.Generator().manual_seed(0)  # of its own: who measures in between draws the same afterwards
+    a = torch.randn(rows, width, generator=random).to(device)
+    b = torch.randn(width, width, generator=random).to(device)
     out = torch.empty(rows, width, device=device)
     return 2 * rows * width * width / best_seconds(lambda: torch.mm(a, b, out=out), repeats=repeats)
 

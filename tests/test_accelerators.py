@@ -1,0 +1,300 @@
+"""Everything that evaluates or trains, on an accelerator: the same calls on the CPU and there.
+
+Random numbers come from generators of the host, whatever the device, and the stand-in computes with the CPU's kernels:
+there results are equal to the last bit. On CUDA itself, which rounds otherwise, this asks for finite results of the
+same shape; how good they are is asked elsewhere.
+"""
+
+import copy
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import standin
+import torch
+from evolutions import few_points
+from fields import small_multiscale, small_spacetime, two_levels
+from hosts import Heads, NeuSHost, ray_samples
+from mplicits.datasets import PointCloud, sample_torus, write_cloud_ply
+from mplicits.datasets.cameras import look_at
+from mplicits.datasets.clouds.prepare import prepare_cloud
+from mplicits.datasets.synthetic.scenes import SCENES, render_scene
+from mplicits.datasets.views.writing import write_neus
+from mplicits.neural_fields import (
+    InstantNSRGeometry,
+    NerfstudioField,
+    NeuSGeometry,
+    Similarity,
+    Siren,
+    Sphere,
+    Torus,
+    WorldField,
+    extract_mesh,
+    load_field,
+    render_volume,
+    sphere_trace,
+)
+from mplicits.neural_fields.cones import cone_ends, cone_starts
+from mplicits.neural_fields.dynamic_tracing import DynamicTracer
+from mplicits.neural_fields.radiance import ViewColor
+from mplicits.neural_fields.sphere_start import fit_sphere, solve_sphere
+from mplicits.neural_fields.volume_renderer import Sampling
+from mplicits.pipelines.cli.entry import main
+from mplicits.pipelines.fit.unoriented import give_signs
+from mplicits.pipelines.mesh.files import write_mesh
+from mplicits.pipelines.paper.grids import NGP_PRESETS, BanfRecipe, InstantNgpRecipe
+from mplicits.pipelines.paper.networks import BaconRecipe, IdfRecipe, SirenRecipe
+from mplicits.pipelines.run.config import load_config
+from mplicits.pipelines.run.settings import FitConfig
+from mplicits.pipelines.viewer.frames import Look
+from mplicits.pipelines.viewer.paint import Painter
+from test_commands import EVOLVE, FIT, RECONSTRUCT, TEXTURE
+from torch import Tensor, nn
+
+Result = Sequence[Tensor | np.ndarray]
+CAMERA = look_at((0.4, 0.5, 2.6), (0.0, 0.0, 0.0), fov=42.0, width=12, height=12)
+
+
+def same(work: Callable[[torch.device], Result], accelerator: torch.device) -> None:
+    """``work`` gives on the accelerator what it gives on the CPU, from the same seed."""
+    results = []
+    for device in (torch.device("cpu"), accelerator):
+        torch.manual_seed(0)
+        results.append(work(device))
+    here, there = results
+    assert len(here) == len(there) > 0
+    for a, b in zip(here, there, strict=True):
+        a, b = torch.as_tensor(a).detach(), torch.as_tensor(b).detach().cpu()
+        assert a.shape == b.shape
+        if accelerator.type == standin.NAME:
+            assert torch.equal(a.nan_to_num(nan=-9.0), b.nan_to_num(nan=-9.0))
+        elif a.is_floating_point():
+            assert torch.equal(a.isfinite(), b.isfinite())
+
+
+def rays(device: torch.device) -> tuple[Tensor, Tensor]:
+    origin, directions = CAMERA.rays()
+    return origin.to(device), directions.to(device)
+
+
+def tensors(module: nn.Module) -> list[Tensor]:
+    return [*module.state_dict().values()]
+
+
+# --- consumers of a field -----------------------------------------------------------------------------
+
+
+def traced(device: torch.device) -> Result:
+    field, (origin, directions) = small_multiscale(0.3).to(device), rays(device)
+    near = cone_starts(field, origin, directions, tiles=(8, 4))
+    far = cone_ends(field, origin, directions, near.isfinite(), tiles=(8, 4))
+    hits = sphere_trace(field, origin, directions, near=near, far=far, max_steps=64)
+    fixed = sphere_trace(field, origin, directions, budget=(20, 5, 5))
+    graph = sphere_trace(field, origin, directions, max_steps=64, differentiable=True)
+    graph.depth[graph.mask].sum().backward()
+    return near, far, *hits, *fixed, *(parameter.grad for parameter in field.base.parameters())
+
+
+def traced_in_time(device: torch.device) -> Result:
+    origin, directions = rays(device)
+    tracer = DynamicTracer(small_spacetime().to(device), origin, directions)
+    return [part for time in (0.2, 0.21) for part in tracer.trace(time)]
+
+
+def meshed(device: torch.device) -> Result:
+    mesh = extract_mesh(Sphere(radius=0.6).to(device), resolution=24)
+    fine = extract_mesh(two_levels().to(device), resolution=24)
+    return mesh.vertices, mesh.faces, mesh.normals, fine.vertices, fine.normals
+
+
+def volume_rendered(device: torch.device) -> Result:
+    field = small_multiscale(0.3)
+    color = ViewColor(field.base.num_features, width=16, depth=1)
+    with torch.no_grad():
+        field.deltas.mul_(0.1)
+    field, color = field.to(device), color.to(device)
+    origin, directions = rays(device)
+    directions = directions.reshape(-1, 3)
+    found = []
+    for generator in (None, torch.Generator().manual_seed(0)):
+        seen = render_volume(
+            field,
+            color,
+            origin.expand_as(directions),
+            directions,
+            inv_std=20.0,
+            sampling=Sampling(uniform=8, importance=8),
+            background=torch.ones(3, device=device),
+            generator=generator,
+        )
+        found += [seen.color, seen.opacity, seen.depth, seen.normal]
+    (found[4].square().mean() + seen.jet.gradient.norm(dim=-1).mean()).backward()
+    return *found, *(parameter.grad for parameter in field.parameters())
+
+
+def in_neus(device: torch.device) -> Result:
+    host = NeuSHost(NeuSGeometry(small_multiscale(0.5)), 2)
+    host.geometry.to(device)
+    host.color.to(device)
+    host.inverse_deviation = nn.Parameter(host.inverse_deviation.detach().to(device))
+    optimiser = torch.optim.Adam(host.parameters(), lr=1e-3)
+    origin, directions = rays(device)
+    directions = directions.reshape(-1, 3)[::16]
+    origins = origin.expand_as(directions)
+    depths = torch.linspace(1.8, 3.2, 8, device=device).expand(len(directions), 8)
+    for _ in range(2):
+        finer = host.finer_depths(origins, directions, depths)
+        optimiser.zero_grad()
+        host.loss(origins, directions, finer, torch.zeros_like(directions)).backward()
+        optimiser.step()
+    return *tensors(host.geometry), *tensors(host.color)
+
+
+def in_instant_nsr(device: torch.device) -> Result:
+    geometry = InstantNSRGeometry(small_multiscale(0.5), radius=1.5).to(device)
+    x = (torch.rand(20, 3) - 0.5).to(device)
+    found = geometry(x, with_grad=True, with_feature=True)
+    sum(part.square().mean() for part in found).backward()
+    return *found, *(parameter.grad for parameter in geometry.parameters())
+
+
+def in_nerfstudio(device: torch.device) -> Result:
+    host = NerfstudioField(small_multiscale(0.5), ViewColor(2, width=16, depth=1), heads=Heads).to(device)
+    samples = ray_samples(torch.linspace(0.2, 1.8, 8).expand(6, 8))
+    for name in ("origins", "directions", "starts"):
+        setattr(samples.frustums, name, getattr(samples.frustums, name).to(device))
+    samples.deltas, samples.camera_indices = samples.deltas.to(device), samples.camera_indices.to(device)
+    outputs = host(samples, return_alphas=True)
+    outputs[Heads.ALPHA].mean().backward()
+    return [outputs[head] for head in (Heads.SDF, Heads.NORMALS, Heads.ALPHA)]
+
+
+def in_input_units(device: torch.device) -> Result:
+    """Arrays in, arrays out, wherever the field is."""
+    world = WorldField(small_multiscale(0.3).to(device), Similarity((5.0, 0.0, -1.0), 20.0))
+    points = np.random.default_rng(0).uniform(-20, 20, (40, 3))
+    hits = world.trace(points, -points)
+    closest = world.closest(points)
+    return world.distance(points), world.normals(points), *hits, *closest, world.mesh(resolution=16).vertices
+
+
+def painted(device: torch.device) -> Result:
+    found = []
+    for field, shading in ((small_multiscale(0.3), "lambert"), (Sphere(radius=0.5), "curvature")):
+        field = copy.deepcopy(field).to(device)
+        painter = Painter(field, reference=lambda: np.zeros((1, 3), np.float32))
+        level = field.num_levels - 1
+        look = Look(level=level, normal_level=level, shading=shading, shadows=True, occlusion=True)
+        found += painter(CAMERA, look, lambda: None)
+        found.append(painter.picture(CAMERA, look, lambda: None, transparent=True))
+    return found
+
+
+def begun_as_spheres(device: torch.device) -> Result:
+    solved, trained = Siren(32, 2, omega=10.0).to(device), Siren(32, 2, omega=10.0).to(device)
+    solve_sphere(solved)
+    fit_sphere(trained, steps=3, batch=64)
+    return *tensors(solved), *tensors(trained)
+
+
+CONSUMERS = (
+    traced,
+    traced_in_time,
+    meshed,
+    volume_rendered,
+    in_neus,
+    in_instant_nsr,
+    in_nerfstudio,
+    in_input_units,
+    painted,
+    begun_as_spheres,
+)
+
+
+@pytest.mark.parametrize("work", CONSUMERS, ids=lambda work: work.__name__)
+def test_what_uses_a_field(work: Callable[[torch.device], Result], accelerator: torch.device) -> None:
+    same(work, accelerator)
+
+
+# --- trainings ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("recipe", [SirenRecipe(), BaconRecipe(), IdfRecipe(), InstantNgpRecipe("fine"), BanfRecipe()])
+def test_methods_of_the_peers(recipe: object, accelerator: torch.device) -> None:
+    cloud = prepare_cloud(sample_torus(300))
+    presets = NGP_PRESETS if isinstance(recipe, InstantNgpRecipe) else recipe.presets
+    settings = presets["fine", "smoke"] if isinstance(recipe, InstantNgpRecipe) else presets["smoke"]
+    steps = (4,) * len(settings.steps) if isinstance(settings.steps, tuple) else 4
+    settings = replace(settings, steps=steps)
+
+    def work(device: torch.device) -> Result:
+        outputs, _ = recipe.learn(cloud, settings, seed=0, device=str(device), progress=None)
+        return [tensor for output in outputs for tensor in tensors(output.field)]
+
+    same(work, accelerator)
+
+
+def test_signs_of_normals(accelerator: torch.device, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mplicits.pipelines.fit.unoriented.STEPS", 3)
+    monkeypatch.setattr("mplicits.pipelines.fit.unoriented.SAMPLES", 500)
+    config = replace(load_config(FitConfig, "fast"), batch=64, widths=(16,) * 3, depths=(1,) * 3)
+    cloud = prepare_cloud(sample_torus(300))
+    points, normals = torch.from_numpy(cloud.points), torch.from_numpy(cloud.normals)
+
+    def work(device: torch.device) -> Result:
+        signs = give_signs(points, normals, config, device=device)
+        assert signs is not None
+        return signs.turned, np.array(signs.slope)
+
+    same(work, accelerator)
+
+
+# --- commands -----------------------------------------------------------------------------------------
+
+SMALL = "--size 12 --samples 1"
+COMMANDS = (
+    f"fit scan.ply -o run {FIT} --quiet",
+    f"texture run coloured.ply {TEXTURE} --quiet",
+    f"render run -o lambert.png {SMALL}",
+    f"render run -o color.png {SMALL} --shading color",
+    f"render run -o error.png {SMALL} --shading error",
+    f"reconstruct photos -o photographed {RECONSTRUCT} --quiet",
+    f"evolve sphere:0.4 torus:0.4,0.15 -o moving {EVOLVE} --quiet",
+    "animate moving -o moving.png --frames 2 --size 16 --samples 1",
+    "bench normal-map run mesh.ply -o compared --size 16 --views 1 --repeats 1 --resolution 16",
+)
+FIELDS = ("run", "photographed", "moving")
+PICTURES = ("lambert.png", "color.png", "error.png", "photographed/held_out.png", "moving.png", "compared/images.png")
+
+
+def test_commands(accelerator: torch.device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    few_points(monkeypatch)
+    monkeypatch.setattr("mplicits.pipelines.reconstruct.train.TEXTURE_SAMPLES", 500)
+    monkeypatch.setattr("mplicits.pipelines.reconstruct.train.TEXTURE_RESOLUTION", 32)
+    cloud = sample_torus(400)
+    scene = render_scene(SCENES["painted-sphere"](), views=6, size=12, samples=2)
+
+    def work(device: torch.device) -> Result:
+        folder = tmp_path / device.type
+        folder.mkdir()
+        monkeypatch.chdir(folder)
+        write_cloud_ply(Path("scan.ply"), cloud)
+        write_cloud_ply(
+            Path("coloured.ply"), PointCloud(cloud.points, cloud.normals, np.abs(cloud.points).astype(np.float32))
+        )
+        write_mesh(Path("mesh.ply"), extract_mesh(Torus(major=0.5, minor=0.2), resolution=16), Similarity.identity())
+        write_neus(Path("photos"), scene)
+        for command in COMMANDS:
+            assert main([*command.split(), "--device", str(device)]) == 0, command
+        found = [tensor for name in FIELDS for tensor in tensors(load_field(f"{name}/field.safetensors").field)]
+        return [*found, *(cv2.imread(name, cv2.IMREAD_UNCHANGED) for name in PICTURES)]
+
+    same(work, accelerator)
+
+
+def test_a_device_that_is_not_there_is_refused_before_any_work(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["bench", "eta", "--device", "warp"]) == 2
+    assert "--device warp: not usable here" in capsys.readouterr().err
