@@ -1,5 +1,6 @@
 """Neural signed distance fields, and the mathematics that evaluates them."""
 
+from ._fixed import FixedShapes, fixed_shapes
 from .adapters import Deviation, InstantNSRGeometry, NerfstudioField, NeuSGeometry
 from .algebra import Bounded, Difference, Intersection, Offset, Placed, Shell, Union
 from .analytic import Box, Capsule, Plane, Sphere, Torus
@@ -37,6 +38,7 @@ __all__ = [
     "Difference",
     "Field",
     "FieldLike",
+    "FixedShapes",
     "FunctionField",
     "Hits",
     "InputError",
@@ -86,6 +88,7 @@ __all__ = [
     "curvature",
     "extract_mesh",
     "fit_sphere",
+    "fixed_shapes",
     "flow",
     "in_one_frame",
     "key_loss",

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from .field import Field
 
-__all__ = ["Expected", "Found", "Near", "Rays", "Rule", "march", "march_budget"]
+__all__ = ["PATIENCE", "Expected", "Found", "Near", "Rays", "Rule", "Stand", "look", "march", "march_budget"]
 
 # Steps at a gap of one `resolution`, before it doubles: few rays need as many, and none may need thousands.
 PATIENCE = 32
@@ -82,14 +82,21 @@ class Found:
         """How fast the field fell along the rays at their last step."""
         self.slope[index] = slope
 
-    def record_near(self, rays: Rays, close: Tensor) -> None:
-        """Note where rays come near the surface and leave it again, before they take in what they see."""
+    def record_near(self, rays: Rays, close: Tensor, there: Tensor | None = None) -> None:
+        """Note where rays come near the surface and leave it again, before they take in what they see.
+
+        Of those that are not ``there``, ``(K,)`` bool, nothing is noted.
+        """
         clear, value, leave = (column[rays.ray] for column in self.near)
         first = close & clear.isinf()
-        self.near.clear[rays.ray] = torch.where(first, rays.low, clear)
-        self.near.value[rays.ray] = torch.where(first, rays.low_value, value)
         left = torch.where(clear.isfinite(), torch.minimum(leave, rays.depth), torch.inf)
-        self.near.leave[rays.ray] = torch.where(close, torch.inf, left)
+        noted = (
+            torch.where(first, rays.low, clear),
+            torch.where(first, rays.low_value, value),
+            torch.where(close, torch.inf, left),
+        )
+        for column, new, old in zip(self.near, noted, (clear, value, leave), strict=True):
+            column[rays.ray] = new if there is None else torch.where(there, new, old)
 
 
 class Rays(NamedTuple):
@@ -181,6 +188,17 @@ class Rays(NamedTuple):
         """Which rays are at their start, where nothing is known yet."""
         return self.low_value.isinf() & (self.depth == self.low)
 
+    def looked_too_far(self, value: Tensor, rule: Rule) -> Tensor:
+        """Which rays looked ahead, and are behind the surface there, at their first ``value``."""
+        # Where the hit itself was looked at, half of all that found it are behind it by less than the tolerance.
+        found = (value >= -rule.tolerance * self.fall) & (self.expected - self.depth <= rule.resolution)
+        # A ray that knows the value at its start has the surface between the two.
+        return (self.depth > self.low) & (value < 0) & ~found & self.low_value.isinf()
+
+    def began_behind(self, value: Tensor) -> Tensor:
+        """Which rays are at their start, behind the surface, and may begin earlier."""
+        return (value < 0) & (self.depth > self.entry) & self.is_fresh()
+
     def only(self, rows: Tensor) -> Rays:
         return Rays(*(column[rows] for column in self))
 
@@ -223,7 +241,7 @@ def march(
         if reach is not None:
             found.record_near(rays, (value * rays.sign < reach) | (rays.sign < 0))
         gap = rule.resolution * 2.0 ** ((count - 1) // PATIENCE)
-        rays, stand = _look(rays, value * rays.sign, rule, gap)
+        rays, stand = look(rays, value * rays.sign, rule, gap)
         ended = stand.hit | stand.passed if count < max_steps else torch.ones_like(stand.hit)
         rows = ended.nonzero()[:, 0]
         found.record(
@@ -235,10 +253,7 @@ def march(
 
 def _from_the_start(field: Field, level: int, rays: Rays, value: Tensor, rule: Rule) -> tuple[Rays, Tensor]:
     """Send rays that looked ahead, and are behind the surface there, back to their start; with the values there."""
-    # Where the hit itself was looked at, half of all that found it are behind it by less than the tolerance.
-    found = (value >= -rule.tolerance * rays.fall) & (rays.expected - rays.depth <= rule.resolution)
-    # A ray that knows the value at its start has the surface between the two.
-    behind = ((rays.depth > rays.low) & (value < 0) & ~found & rays.low_value.isinf()).nonzero()[:, 0]
+    behind = rays.looked_too_far(value, rule).nonzero()[:, 0]
     if not len(behind):
         return rays, value
     rays = rays._replace(depth=rays.depth.index_copy(0, behind, rays.low[behind]))
@@ -247,7 +262,7 @@ def _from_the_start(field: Field, level: int, rays: Rays, value: Tensor, rule: R
 
 def _from_the_front(field: Field, level: int, rays: Rays, value: Tensor) -> tuple[Rays, Tensor]:
     """Send rays whose start is behind the surface back to where they may begin; with the values there."""
-    behind = ((value < 0) & (rays.depth > rays.entry) & rays.is_fresh()).nonzero()[:, 0]
+    behind = rays.began_behind(value).nonzero()[:, 0]
     if not len(behind):
         return rays, value
     depth = rays.depth.index_copy(0, behind, rays.entry[behind])
@@ -265,7 +280,7 @@ class Stand(NamedTuple):
     slope: Tensor
 
 
-def _look(rays: Rays, value: Tensor, rule: Rule, resolution: float) -> tuple[Rays, Stand]:
+def look(rays: Rays, value: Tensor, rule: Rule, resolution: Tensor | float) -> tuple[Rays, Stand]:
     """Take in the ``value`` at ``rays.depth``, and say where to look next."""
     level, delta = rule.band(value.abs())
     free = ((value.abs() - delta) / rule.lipschitz).clamp(min=0)
@@ -281,7 +296,7 @@ def _look(rays: Rays, value: Tensor, rule: Rule, resolution: float) -> tuple[Ray
     low_value, high_value = torch.where(before, value, rays.low_value), torch.where(behind, value, rays.high_value)
 
     # Before a change of sign: as far as two tangent balls on a plane reach, or over a gap that may be left.
-    gap = torch.maximum(BAND_ENTRY * delta, torch.full_like(delta, resolution))
+    gap = torch.maximum(BAND_ENTRY * delta, torch.as_tensor(resolution, dtype=delta.dtype))
     s = slope.clamp(-1, STEEPEST_RISE)
     widest = rays.boldness * free * (1 + s) / (1 - s)
     zero = torch.where(s < 0, value / -s, torch.inf)

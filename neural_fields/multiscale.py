@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 import torch
 from torch import Tensor, nn
 
+from ._fixed import FixedShapes, current_shapes
 from .field import Field, Jet, SecondJet
 from .function import FieldLike, as_field
 from .siren import Siren
@@ -25,7 +26,8 @@ Parts = tuple[Tensor, ...]
 class MultiscaleSDF(Field):
     """Nested residual levels around the surface of a base field.
 
-    Rows outside a band are gathered away before the residual sees them, so they cost nothing. The gate is
+    Rows outside a band are gathered away before the residual sees them, so they cost nothing (see `fixed_shapes` for
+    GPUs, which wait for such a gathering). The gate is
     the paper's hard one for ``taper=0``; otherwise it falls from 1 at ``(1 − taper) δ`` to 0 at δ as the
     cubic 1 − u²(3 − 2u), which makes value and gradient continuous for renderers that differentiate them.
 
@@ -220,6 +222,10 @@ def walk_levels(
     points = x.reshape(-1, x.shape[-1])
     parts = evaluate(levels[0], points)
     yield shaped(parts)
+    shapes = current_shapes()
+    if shapes is not None:
+        yield from map(shaped, _walk_on(levels[1:], deltas, points, parts, evaluate, join, shapes))
+        return
     rows = torch.arange(len(points), device=points.device)
     for level, delta in zip(levels[1:], deltas, strict=False):
         kept = (parts[0][rows].abs() < delta).nonzero()[:, 0]
@@ -227,6 +233,37 @@ def walk_levels(
         joined = join(tuple(part[rows] for part in parts), evaluate(level, points), delta)
         parts = tuple(part.index_copy(0, rows, new) for part, new in zip(parts, joined, strict=True))
         yield shaped(parts)
+
+
+def _walk_on(
+    residuals: Sequence[Field],
+    deltas: Tensor,
+    points: Tensor,
+    parts: Parts,
+    evaluate: Callable[[Field, Tensor], Parts],
+    join: Callable[[Parts, Parts, Tensor], Parts],
+    shapes: FixedShapes,
+) -> Iterator[Parts]:
+    """The walk from the base on where shapes are fixed."""
+    shapes.begin()
+    count = len(points)
+    inside = torch.ones_like(parts[0], dtype=torch.bool) if shapes.wanted is None else shapes.wanted
+    for index, (level, delta) in enumerate(zip(residuals, deltas, strict=False)):
+        inside, rows = shapes.admit(index, inside & (parts[0].abs() < delta))
+        if rows is None:
+            joined = join(parts, evaluate(level, points), delta)
+            parts = tuple(
+                torch.where(inside.reshape(-1, *[1] * (new.ndim - 1)), new, part)
+                for part, new in zip(parts, joined, strict=True)
+            )
+        else:
+            taken = rows.clamp(max=count - 1)  # places that are left over get the last point, and
+            joined = join(tuple(part[taken] for part in parts), evaluate(level, points[taken]), delta)
+            parts = tuple(
+                torch.cat((part, part[:1])).index_copy(0, rows, new)[:count]  # what they find goes behind it
+                for part, new in zip(parts, joined, strict=True)
+            )
+        yield parts
 
 
 def _value(level: Field, points: Tensor) -> Parts:

@@ -17,6 +17,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from ._ahead import march_ahead
 from ._checks import positive
 from ._march import (
     BOLDNESS,
@@ -31,6 +32,7 @@ from ._march import (
     march,
     march_budget,
 )
+from .devices import makes_wait
 from .field import Field
 from .function import FieldLike, as_field
 from .kernels.switch import choose
@@ -262,7 +264,8 @@ def trace_expected(
         rays = rays.expecting(flat, rule)
     fused = None if expected is not None or reach is not None else _fused(field, level, rays)
     if fused is None:
-        march(field, level, rays, found, rule, max_steps, reach)
+        go = march_ahead if makes_wait(directions.device) else march
+        go(field, level, rays, found, rule, max_steps, reach)
     else:
         _march_fused(*fused, rays, found, rule, max_steps)
     clear, value, leave = (column.reshape(shape) for column in found.near)
@@ -316,15 +319,18 @@ def _begin(
     """
     origins, directions = torch.broadcast_tensors(origins, directions)
     shape = directions.shape[:-1]
-    starts, ends = (
-        (torch.as_tensor(depth).to(directions).broadcast_to(shape) * length).reshape(-1) for depth in (near, far)
-    )
+    starts, ends = ((_like(depth, directions).broadcast_to(shape) * length).reshape(-1) for depth in (near, far))
     origins, directions = origins.reshape(-1, 3), directions.reshape(-1, 3)
     entries = torch.zeros_like(starts)
     if radius is not None:
         entry, leave = ball_crossing(origins, directions, radius)
         entries, ends = entry.clamp(min=0), torch.minimum(ends, leave)
     return Rays.begin(origins, directions, entries, torch.maximum(starts, entries), ends), Found(starts)
+
+
+def _like(number: Tensor | float, other: Tensor) -> Tensor:
+    """A number where ``other`` is, and as precise; one of the host's is filled in there, which nobody waits for."""
+    return number.to(other) if isinstance(number, Tensor) else other.new_full((), number)
 
 
 def _hits(found: Found, origins: Tensor, directions: Tensor, length: Tensor) -> Hits:

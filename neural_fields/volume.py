@@ -17,6 +17,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import softplus
 
+from .devices import upload
+
 __all__ = [
     "ball_chord",
     "composite",
@@ -148,11 +150,11 @@ def stratified_depths(near: Tensor, far: Tensor, count: int, *, generator: torch
     """
     shift = torch.rand(len(near), 1, generator=generator) if generator else torch.full((1, 1), 0.5)
     strata = (torch.arange(count) + shift) / count
-    return near[:, None] + (far - near)[:, None] * strata.to(near)
+    return near[:, None] + (far - near)[:, None] * upload(strata, near.device).to(near.dtype)
 
 
 def importance_depths(
-    depths: Tensor, values: Tensor, count: int, inv_std: float, *, generator: torch.Generator | None = None
+    depths: Tensor, values: Tensor, count: int, inv_std: Tensor | float, *, generator: torch.Generator | None = None
 ) -> Tensor:
     """``count`` more depths on each ray, where the field's weights say that its surface is → ``(R, count)``, sorted.
 
@@ -179,7 +181,8 @@ def importance_depths(
     cumulative = cumulative / cumulative[:, -1:]
     quantiles = stratified_depths(torch.zeros_like(depths[:, 0]), torch.ones_like(depths[:, 0]), count)
     if generator:
-        quantiles = quantiles + (torch.rand(quantiles.shape, generator=generator).to(quantiles) - 0.5) / count
+        shifts = upload(torch.rand(quantiles.shape, generator=generator), quantiles.device).to(quantiles.dtype)
+        quantiles = quantiles + (shifts - 0.5) / count
     right = torch.searchsorted(cumulative, quantiles.contiguous()).clamp(1, depths.shape[1] - 1)
     low, high = cumulative.gather(1, right - 1), cumulative.gather(1, right)
     share = ((quantiles - low) / (high - low).clamp(min=1e-12)).clamp(0, 1)

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from ._checks import at_least, positive
+from .devices import precise
 from .field import Field, Jet
 from .function import FieldLike, as_field
 from .volume import (
@@ -190,13 +191,14 @@ def sample_depths(
     samples reach into the band in which the finer surface may lie.
     """
     depths = stratified_depths(near, far, sampling.uniform, generator=generator)
-    sharpest = BAND_SHARPNESS / float(field.deltas[0]) if field.resolve_level(level) else float("inf")
+    sharpest = BAND_SHARPNESS / field.deltas[0].to(precise(near.device)) if field.resolve_level(level) else None
     if sampling.importance:
         values = field.value(ray_points(origins, directions, depths), level=0)
         share, extra = divmod(sampling.importance, sampling.rounds)
         for index in range(sampling.rounds):
             count = share + (index < extra)
-            sharpness = min(sampling.sharpness * 2**index, sharpest)
+            sharpness = sampling.sharpness * 2**index
+            sharpness = sharpness if sharpest is None else sharpest.clamp(max=sharpness)
             more = importance_depths(depths, values, count, sharpness, generator=generator)
             depths, order = torch.cat((depths, more), dim=1).sort(dim=1)
             if index + 1 < sampling.rounds:

@@ -75,6 +75,12 @@ def same(work: Callable[[torch.device], Result], accelerator: torch.device) -> N
             assert torch.equal(a.isfinite(), b.isfinite())
 
 
+@pytest.fixture(autouse=True)
+def _one_march(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rays march on the CPU too as they do on accelerators; test_ahead.py compares the two marches."""
+    monkeypatch.setattr("mplicits.neural_fields.tracing.makes_wait", lambda _: True)
+
+
 def rays(device: torch.device) -> tuple[Tensor, Tensor]:
     origin, directions = CAMERA.rays()
     return origin.to(device), directions.to(device)

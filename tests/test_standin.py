@@ -8,8 +8,9 @@ import pytest
 import standin
 import torch
 from fields import small_multiscale
-from mplicits.neural_fields import Siren, Sphere, sphere_trace
+from mplicits.neural_fields import Siren, Sphere, Torus, sphere_trace
 from torch import Tensor
+from waits import some_rays
 
 DEVICE = torch.device(standin.NAME)
 
@@ -95,7 +96,7 @@ def test_memory_that_may_not_be_there_yet_is_refused() -> None:
         x.to("cpu", non_blocking=True)
     with pytest.raises(RuntimeError, match="may be read before"):
         torch.empty(3).copy_(x, non_blocking=True)
-    with pytest.raises((RuntimeError, NotImplementedError)):
+    with pytest.raises(RuntimeError, match="only dense CPU tensors can be pinned"):
         x.pin_memory()
 
 
@@ -124,7 +125,9 @@ def test_memory_that_may_not_be_there_yet_is_refused() -> None:
         ("none", 0, lambda x: x.clone().masked_fill_(x > 0, 1.0).sort()),
         ("none", 0, lambda x: x.clone().__setitem__(x > 0, 1.0)),
         ("none", 0, lambda x: x.repeat_interleave(2).index_select(0, torch.zeros_like(x).long())),
-        ("none", 0, lambda x: torch.ones(3).to(x, non_blocking=True)),
+        ("upload", 1, lambda x: torch.ones(3).to(x, non_blocking=True)),
+        ("upload", 1, lambda x: torch.ones(3).pin_memory().to(x)),
+        ("none", 0, lambda x: torch.ones(3).pin_memory().to(x, non_blocking=True)),
         ("none", 0, lambda x: torch.zeros(3, device=x.device, dtype=torch.float64).fill_(2).to(torch.float32)),
     ],
 )
@@ -225,9 +228,8 @@ def test_fields_are_the_cpus_to_the_last_bit(taper: float) -> None:
 
 
 def test_rays_are_the_cpus_to_the_last_bit() -> None:
-    origins = torch.nn.functional.normalize(torch.randn(200, 3), dim=-1) * 2
-    directions = torch.nn.functional.normalize(0.3 * torch.randn(200, 3) - origins, dim=-1)
-    for field in (Sphere(radius=0.5), small_multiscale()):
+    origins, directions = some_rays(200)
+    for field in (Sphere(radius=0.5), Torus(major=0.5, minor=0.2)):
         here = sphere_trace(field, origins, directions)
         there = sphere_trace(copy.deepcopy(field).to(DEVICE), origins.to(DEVICE), directions.to(DEVICE))
         for a, b in zip(there, here, strict=True):

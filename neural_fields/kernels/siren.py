@@ -80,7 +80,7 @@ def _launch(x: Tensor, network: Network, precision: str, value: Tensor, gradient
     programs = program_count(x.device, triton.cdiv(len(x), tiling.rows))
     kept = planes(network.depth, jet=jet)
     with on_device(x):
-        evaluate[(programs,)](
+        evaluate[(programs,)](  # pyright: ignore[reportIndexIssue]
             x.contiguous(),
             network.parameters,
             value,

@@ -251,7 +251,7 @@ def jet_backward(
     sums = x.new_zeros(programs, sum(sizes))
     if tiles:
         with on_device(x):
-            sweep[(programs,)](
+            sweep[(programs,)](  # pyright: ignore[reportIndexIssue]
                 x.contiguous(),
                 network.parameters,
                 value_bar.contiguous(),

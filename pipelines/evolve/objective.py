@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from ...neural_fields import Jet, Siren, SpaceTimeSDF, key_loss, law_loss, spacetime_jet
+from ...neural_fields.devices import upload
 from ...neural_fields.losses import eikonal_loss
 from ..run.settings import EvolveConfig
 from ..run.trainer import Group, Objective, Report, Trainer, seeded, warm_cosine
@@ -100,7 +101,7 @@ class EvolveObjective(Objective):
         device = self.kept["pool"].device
         if not size:
             return torch.empty(0, dtype=torch.long, device=device)
-        return torch.randint(size, (count,), generator=self.generator).to(device)
+        return upload(torch.randint(size, (count,), generator=self.generator), device)
 
 
 class _StillObjective(Objective):

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from ...neural_fields import Siren
+from ...neural_fields.devices import upload
 from ...neural_fields.losses import data_loss, eikonal_loss, normal_loss, pseudo_huber
 from ..run.settings import EvolveConfig, FitConfig
 from ..run.team import my_share, whole_batch
@@ -121,4 +122,4 @@ class LevelObjective(Objective):
 
     def _draw(self, source: Source) -> Tensor:
         index = torch.randint(len(source.samples), (whole_batch(source.batch),), generator=self.generator)
-        return my_share(index).to(source.samples.points.device)
+        return upload(my_share(index), source.samples.points.device)

@@ -29,6 +29,7 @@ from ...datasets.clouds.noise import noise_deviation
 from ...datasets.clouds.orientation import settle_signs
 from ...datasets.clouds.reestimate import denoise
 from ...neural_fields import Siren
+from ...neural_fields.devices import upload
 from ..run.settings import FitConfig
 from ..run.trainer import Group, Objective, Report, StopFlag, Trainer, warm_cosine
 from .cloud import CloudDistance
@@ -213,7 +214,7 @@ class _Unoriented(Objective):
         at, by = (
             torch.randint(len(rows), (BATCH // 2,), generator=self.generator) for rows in (self.points, self.places)
         )
-        at, by = at.to(self.points.device), by.to(self.points.device)
+        at, by = upload(at, self.points.device), upload(by, self.points.device)
         value = self.siren.value(torch.cat((self.points[at], self.places[by])))
         surface, space = value.split(BATCH // 2)
         distance, sign = self.distance[by], self.sign[by]

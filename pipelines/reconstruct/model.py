@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from ...datasets.views.images import PosedImage
 from ...neural_fields import Field, InputError, Jet, MultiscaleSDF, Similarity, Siren
 from ...neural_fields.baselines import NeusSDF
+from ...neural_fields.devices import precise, upload
 from ...neural_fields.radiance import Outside, ViewColor
 from ...neural_fields.sphere_start import fit_sphere
 from ...neural_fields.volume import sphere_span
@@ -51,7 +52,9 @@ class SceneModel(nn.Module):
     def widen(self, band: float, least: float) -> None:
         """Make all bands ``band`` / s wide, but at least ``least``: as wide as the surface is unsure."""
         if len(self.geometry.deltas):
-            self.geometry.deltas.fill_(max(band / float(self.inv_std.detach()), least))
+            inv_std = self.inv_std.detach()
+            width = (band / inv_std.to(precise(inv_std.device))).clamp(min=least)
+            self.geometry.deltas.copy_(width.expand_as(self.geometry.deltas))
 
     def render(
         self,
@@ -183,7 +186,8 @@ class RayPool:
 
     def draw(self, count: int, generator: torch.Generator) -> Rays:
         """``count`` rays at random, with replacement."""
-        rows = torch.randint(len(self), (count,), generator=generator).to(self.device)
+        rows = torch.randint(len(self), (count,), generator=generator)
+        rows = upload(rows, self.device)
         view, pixel = self.owners[rows].long(), self.pixels[rows].long()
         fx, fy, cx, cy = self.lens[view].unbind(dim=1)
         x, y = pixel % self.widths[view], pixel // self.widths[view]

@@ -16,6 +16,7 @@ from typing import Any, Generic, NamedTuple, TypeVar
 import torch
 from torch import Tensor, nn
 
+from ...neural_fields.devices import precise
 from .schedule import Progress, Report
 from .team import agreed, average_gradients, is_alone
 
@@ -252,7 +253,8 @@ class Trainer(Generic[O]):
             stop, self.elapsed = agreed(flag.requested, time.monotonic() - start, device)
             late = time.monotonic() - told > report_seconds
             if self.step % report_every == 0 or self.fraction >= 1 or late:
-                self.losses = {name: float(term) for name, term in terms.items()}
+                read = torch.stack([term.to(precise(device)) for term in terms.values()]).tolist()  # one wait for all
+                self.losses = dict(zip(terms, read, strict=True))
                 report(self.progress)
                 told = time.monotonic()
             if time.monotonic() - saved > save_every:

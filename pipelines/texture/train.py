@@ -26,6 +26,7 @@ from ...neural_fields import (
     load_texture,
     save_texture,
 )
+from ...neural_fields.devices import upload
 from ...neural_fields.dynamic_tracing import moment
 from ...neural_fields.losses import color_loss, tangential_loss
 from ..run.config import load_config
@@ -362,7 +363,7 @@ class TextureObjective(Objective):
         return {"color": color, "tangential": tangential}, color + self.config.tangential_weight * tangential
 
     def _draw(self, pool: Tensor, count: int) -> Tensor:
-        return torch.randint(len(pool), (count,), generator=self.generator).to(pool.device)
+        return upload(torch.randint(len(pool), (count,), generator=self.generator), pool.device)
 
 
 @torch.no_grad()

@@ -68,6 +68,9 @@ class StandInTensor(Tensor):
     def tolist(self) -> Any:
         return self.detach().cpu().tolist()
 
+    def __format__(self, spec: str) -> str:
+        return format(self.item(), spec) if self.ndim == 0 else str(self)
+
     def data_ptr(self) -> int:
         return self.inner.data_ptr()
 
@@ -133,6 +136,8 @@ class _Operation(NamedTuple):
 def _run(func: Any, *args: Any, **kwargs: Any) -> Any:
     """Do what a device would do, which is: refuse, note down, or run on the shells' inner tensors."""
     operation = _Operation.of(func)
+    if operation.name == "_pin_memory":
+        raise RuntimeError(f"cannot pin '{NAME}', only dense CPU tensors can be pinned")
     hosts: list[Tensor] = []
     opened = [_opened(value, hosts) for value in args]
     named = {name: _opened(value, hosts) for name, value in kwargs.items()}
@@ -177,19 +182,22 @@ def _check_hosts(operation: _Operation, args: Any, kwargs: Any, hosts: Sequence[
 
 
 def _note_copy(name: str, args: Any, kwargs: Any) -> None:
-    """Copies inside the device launch a kernel; those that leave it or come into it block, unless asked not to."""
+    """Copies inside the device launch a kernel; those that leave it or come into it block.
+
+    Unless they come from pinned memory and are asked not to: other memory is copied there first, when it is its turn.
+    """
     if name == "copy_":
         target, source = args[:2]
-        waits = not (args[2] if len(args) > 2 else kwargs.get("non_blocking", False))
+        asked = args[2] if len(args) > 2 else kwargs.get("non_blocking", False)
         down, up = not isinstance(target, StandInTensor), not isinstance(source, StandInTensor)
     else:
-        device = kwargs.get("device")
-        waits = not kwargs.get("non_blocking", False)
+        device, source = kwargs.get("device"), args[0]
+        asked = kwargs.get("non_blocking", False)
         down = device is not None and torch.device(device).type != NAME
-        up = not isinstance(args[0], StandInTensor)
-    if down and not waits:
+        up = not isinstance(source, StandInTensor)
+    if down and asked:
         raise RuntimeError("non_blocking copy to the host: it may be read before it is there")
-    if down or (up and waits):
+    if down or (up and not (asked and _is_pinned(source))):
         note_wait("download" if down else "upload")
     elif not up:
         note_launch(name)
@@ -247,6 +255,17 @@ def _shelled(result: Any) -> Any:
     return type(result)(map(_shelled, result)) if isinstance(result, list | tuple) else result
 
 
+def _pin(tensor: Tensor, device: torch.device | None = None) -> Tensor:
+    """Memory of the host that the device can read by itself: here a copy that says so."""
+    pinned = tensor.clone()
+    pinned.__dict__["pinned"] = True
+    return pinned
+
+
+def _is_pinned(tensor: Tensor, device: torch.device | None = None) -> bool:
+    return "pinned" in tensor.__dict__
+
+
 class _Module(_DummyBackendModule):
     """What ``torch.standin`` is."""
 
@@ -263,6 +282,9 @@ def _register() -> tuple[torch.library.Library, ...]:
         packet, _, overload = name.partition(".")
         func: Callable[..., Any] = getattr(getattr(torch.ops.aten, packet), overload or "default")
         some.impl(name, functools.partial(_run, func), "PrivateUse1")
+    if not torch.cuda.is_available():  # which pins memory itself
+        some.impl("_pin_memory", _pin, "CPU")
+        some.impl("is_pinned", _is_pinned, "CPU")
     return everything, some
 
 

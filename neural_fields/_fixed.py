@@ -1,0 +1,110 @@
+"""Evaluations whose shapes follow from those of the points alone, so that the host never waits for the device.
+
+How many rows lie in a band is a number that only the device knows. A CPU looks, and gathers exactly these rows; a GPU
+would have to finish all its work first, and then wait for the host. Inside `fixed_shapes` a band has room for
+a given number of rows instead. The first so many of those that lie in it are found by prefix sums and take their
+places; places that are left over are computed and thrown away.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+
+import torch
+from torch import Tensor
+
+__all__ = ["FixedShapes", "current_shapes", "first_rows", "fixed_shapes"]
+
+
+class FixedShapes:
+    """How much room bands have, and who found none.
+
+    Attributes:
+        capacity: rows for each residual level, coarse to fine; None, and levels beyond the last, have room for all.
+        wanted: ``(N,)`` bool, the points whose values anybody will read; None for all. Others get a coarse value.
+        demand: for each residual level that was evaluated, the most points that were in its band, 0-dimensional int64.
+        lost: ``(N,)`` bool of the last evaluation, the points that found no room in a band: they have the value of a
+            coarser level. None where there was room for all.
+    """
+
+    def __init__(self, capacity: Sequence[int] | None = None, wanted: Tensor | None = None) -> None:
+        self.capacity, self.wanted = capacity, wanted
+        self.demand: list[Tensor] = []
+        self.lost: Tensor | None = None
+
+    def begin(self) -> None:
+        """Forget who was lost: a new evaluation begins."""
+        self.lost = None
+
+    def admit(self, index: int, inside: Tensor) -> tuple[Tensor, Tensor | None]:
+        """Let points into the band of a residual level.
+
+        Args:
+            index: of the residual, from 0.
+            inside: ``(N,)`` bool, who lies in the band.
+
+        Returns:
+            ``(N,)`` bool, who found room; and their rows ``(C,)``, those left over being N; None if there is room for
+            all, so that every point may be evaluated where it is.
+        """
+        count = inside.sum()
+        if index < len(self.demand):
+            self.demand[index] = torch.maximum(self.demand[index], count)
+        else:
+            self.demand.append(count)
+        room = len(inside) if self.capacity is None or index >= len(self.capacity) else self.capacity[index]
+        if room >= len(inside):
+            return inside, None
+        admitted = inside & (inside.cumsum(0) <= room)
+        turned_away = inside & ~admitted
+        self.lost = turned_away if self.lost is None else self.lost | turned_away
+        return admitted, first_rows(admitted, room)
+
+
+_shapes: ContextVar[FixedShapes | None] = ContextVar("shapes", default=None)
+
+
+@contextmanager
+def fixed_shapes(capacity: Sequence[int] | None = None) -> Iterator[FixedShapes]:
+    """Inside this, a `MultiscaleSDF` never makes the host wait, and launches the same kernels for any points.
+
+    Without a ``capacity`` every level is evaluated at every point, and used where it lies in the band: as many more
+    operations as bands are thin. Results are those of the usual way but for rounding: a matrix product may add up in
+    another order when it has other rows beside it. With capacities, look at ``lost``.
+
+    Args:
+        capacity: see `FixedShapes`.
+
+    Example:
+        >>> import torch
+        >>> from mplicits.neural_fields import MultiscaleSDF, fixed_shapes
+        >>> sdf = MultiscaleSDF.from_widths([(16, 1), (16, 1)], omegas=[5, 10])
+        >>> x = torch.zeros(4, 3)
+        >>> with fixed_shapes():
+        ...     value = sdf.value(x)
+        >>> bool((value - sdf.value(x)).abs().max() < 1e-6)
+        True
+    """
+    shapes = FixedShapes(capacity)
+    token = _shapes.set(shapes)
+    try:
+        yield shapes
+    finally:
+        _shapes.reset(token)
+
+
+def current_shapes() -> FixedShapes | None:
+    """Those of the innermost `fixed_shapes`; None outside of any."""
+    return _shapes.get()
+
+
+def first_rows(mask: Tensor, count: int) -> Tensor:
+    """The first ``count`` rows of ``mask`` ``(N,)`` that are True, in order; N where there are fewer → ``(count,)``.
+
+    What `nonzero` gives, in a shape that is known before: each row goes to where the sum of those before it says.
+    """
+    place = torch.where(mask, mask.cumsum(0) - 1, count).clamp(max=count)
+    rows = torch.full((count + 1,), len(mask), dtype=torch.int64, device=mask.device)
+    return rows.scatter_(0, place, torch.arange(len(mask), device=mask.device))[:count]

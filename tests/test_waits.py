@@ -1,0 +1,36 @@
+"""What keeps the host waiting, held to what was reached; `waits.py` counts, and prints the table of the docs."""
+
+from pathlib import Path
+
+import pytest
+import waits
+from waits import Row
+
+
+def per_unit(row: Row) -> float:
+    return row.ledger.synchronisations / row.count
+
+
+def test_the_tracer_is_looked_at_once_in_eight_passes() -> None:
+    row = waits.tracing(300)
+    assert row.count > 16
+    assert per_unit(row) <= 1 / 8, row.ledger.report()
+
+
+@pytest.mark.parametrize("name", ["value", "jet"])
+def test_fixed_shapes_need_no_wait(name: str) -> None:
+    ask = getattr(waits.MultiscaleSDF, name)
+    assert waits.evaluating(name, waits.in_fixed_shapes(ask)).ledger.synchronisations == 0
+    usual = waits.evaluating(name, ask).ledger
+    assert usual.synchronisations == 2  # a look for each residual
+
+
+def test_training_steps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    limits = {"`fit`": 0, "`reconstruct`, reconstruct": 3, "`reconstruct`, texture": 0}
+    seen = set()
+    for row in waits.trainings():
+        (limit,) = [limit for name, limit in limits.items() if row.name.startswith(name)]
+        assert per_unit(row) <= limit, f"{row}\n{row.ledger.report()}"
+        seen.add(row.name)
+    assert len(seen) == 5
