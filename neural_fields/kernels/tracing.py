@@ -210,7 +210,7 @@ def march_rays(
         programs = program_count(origins.device, triton.cdiv(count, tiling.rows))
         kept = planes(network.depth, jet=False)
         with on_device(origins):
-            march[(programs,)](
+            march[(programs,)](  # pyright: ignore[reportIndexIssue]
                 origins, directions, starts, entries, ends, network.parameters, mask, depth, steps, slope,
                 scratch_for(origins, programs, kept * tiling.rows * tiling.stride(network.width)),
                 count, triton.cdiv(count, programs), max_steps,
