@@ -4,10 +4,11 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 CLOUD ?=
 OUT ?= demo
+MINUTES ?= 30
 # Errors only; and Python compiles what is imported when it is, which is a tenth of what pip would compile for a minute.
 PIP := $(BIN)/python -m pip install --quiet --quiet --no-compile --disable-pip-version-check -c constraints.txt
 
-.PHONY: demo test test-all lint docs clean
+.PHONY: demo test test-all fuzz lint docs clean
 
 # What using it needs; the stamps below add what developing it and its site need.
 $(VENV)/.installed: pyproject.toml constraints.txt
@@ -28,6 +29,9 @@ test: lint
 
 test-all: lint
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 -m ''
+
+fuzz: $(VENV)/.dev
+	$(BIN)/python tests/fuzz/hunt.py --minutes $(MINUTES)
 
 lint: $(VENV)/.dev
 	$(BIN)/ruff check .

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import math
+import os
+import threading
 import zipfile
 import zlib
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from ..neural_fields import InputError
+from ..neural_fields.files import damage
 
 __all__ = [
     "DAMAGED_ARRAYS",
@@ -27,9 +31,17 @@ __all__ = [
     "read_json",
     "read_rgb",
     "readable",
+    "reader",
     "rgb_and_alpha",
     "unit_range",
 ]
+
+P = TypeVar("P", bound="str | Path")
+A = ParamSpec("A")
+R = TypeVar("R")
+
+# An archive may hold this many times its own bytes and more than MODEST, and no more: points do not shrink so much.
+MOST_UNPACKED, MODEST = 200, 256 << 20
 
 DAMAGED_ARRAYS = (ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error)
 """What NumPy's loaders raise on files that are not whole, or not theirs."""
@@ -37,21 +49,67 @@ DAMAGED_ARRAYS = (ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error
 
 @contextmanager
 def readable(path: Path, *, missing: str = "check the path") -> Iterator[None]:
-    """A block that reads ``path``: what the disc refuses becomes one line.
+    """A block that reads ``path``: what the disc refuses, or the reader trips over, becomes one line.
+
+    Nothing is said but that: no warnings, and nothing that a library prints.
 
     Args:
         path: the file, which the message names.
         missing: what to do if there is no such file.
 
     Raises:
-        InputError: the block raised an OSError.
+        InputError: the block raised anything that is no `InputError`.
     """
-    try:
-        yield
-    except FileNotFoundError as error:
-        raise InputError(f"{error.filename or path}: no such file; {missing}") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error}); check its permissions") from error
+    with damage(path, "export it again"), _silence:
+        try:
+            yield
+        except FileNotFoundError as error:
+            raise InputError(f"{error.filename or path}: no such file; {missing}") from None
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read ({error.strerror or error}); check its permissions") from error
+
+
+class _Silence:
+    """A block in which what libraries print to stderr is lost: OpenCV and libpng do on damaged images.
+
+    They write to the file descriptor, so that of the process is turned away; by the first thread that comes in, until
+    the last one leaves.
+    """
+
+    def __init__(self) -> None:
+        self._lock, self._inside, self._kept = threading.Lock(), 0, -1
+
+    def __enter__(self) -> None:
+        with self._lock:
+            self._inside += 1
+            if self._inside == 1:
+                with suppress(OSError):  # there is none
+                    self._kept = os.dup(2)
+                    sink = os.open(os.devnull, os.O_WRONLY)
+                    os.dup2(sink, 2)
+                    os.close(sink)
+
+    def __exit__(self, *_: object) -> None:
+        with self._lock:
+            self._inside -= 1
+            if not self._inside and self._kept >= 0:
+                os.dup2(self._kept, 2)
+                os.close(self._kept)
+                self._kept = -1
+
+
+_silence = _Silence()
+
+
+def reader(read: Callable[Concatenate[P, A], R]) -> Callable[Concatenate[P, A], R]:
+    """Make a function that reads the file of its first argument refuse it in one line; see `readable`."""
+
+    @functools.wraps(read)
+    def reading(path: P, *args: A.args, **kwargs: A.kwargs) -> R:
+        with readable(Path(path)):
+            return read(path, *args, **kwargs)
+
+    return reading
 
 
 def read_json(path: Path, *, missing: str = "check the path") -> Any:
@@ -100,21 +158,43 @@ def read_arrays(
         InputError: the file cannot be read, is damaged, or holds Python objects.
     """
     named = f"{path}"
-    try:
-        with readable(path), path.open("rb") as file:  # by itself np.load leaves damaged files open
+    with readable(path), path.open("rb") as file:  # by itself np.load leaves damaged files open
+        try:
+            if file.read(6) == b"\x93NUMPY":
+                # Mapped first: that fails where the file is shorter than its head says, before anything is allocated.
+                return np.array(np.lib.format.open_memmap(path, mode="r"))
+            file.seek(0)
             loaded = np.load(file, allow_pickle=False)
             if isinstance(loaded, np.ndarray):
                 return loaded
             arrays = {}
             for name in choose(loaded.files):
                 named = f"{path}: {name}"
+                _check_member(loaded.zip, name, path)
                 arrays[name] = loaded[name]
             return arrays
-    except InputError:
-        raise
-    except DAMAGED_ARRAYS as error:
-        reason = "holds Python objects" if "Object arrays" in str(error) else "damaged or not a NumPy file"
-        raise InputError(f"{named}: {reason}; export it again as plain numbers") from error
+        except InputError:
+            raise
+        except DAMAGED_ARRAYS as error:
+            objects = "ython objects" in str(error) or "Object arrays" in str(error)
+            reason = "holds Python objects" if objects else "damaged or not a NumPy file"
+            raise InputError(f"{named}: {reason}; export it again as plain numbers") from error
+
+
+def _check_member(archive: zipfile.ZipFile | None, name: str, path: Path) -> None:
+    """Refuse an array that says it is larger than what is packed, or what can be believed of so small a file."""
+    assert archive is not None, "an archive that is open"
+    packed = archive.getinfo(name if name in archive.namelist() else f"{name}.npy")
+    if packed.file_size > max(MODEST, MOST_UNPACKED * path.stat().st_size):
+        raise InputError(f"{path}: {name}: claims {packed.file_size / 1e9:.3g} GB; export it again, uncompressed")
+    with archive.open(packed) as file:
+        version = np.lib.format.read_magic(file)
+        if version[0] > 2:
+            return  # names of columns that are not ASCII: no array of ours, and `numeric` will say so
+        head = np.lib.format.read_array_header_1_0 if version[0] == 1 else np.lib.format.read_array_header_2_0
+        shape, _, kind = head(file)
+        if not kind.hasobject and math.prod(shape) * kind.itemsize > packed.file_size:
+            raise InputError(f"{path}: {name}: shape {shape} is more than the archive holds; export it again")
 
 
 def numeric(array: NDArray[Any], named: str) -> NDArray[Any]:

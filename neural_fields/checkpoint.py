@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import math
 import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -12,7 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from safetensors import SafetensorError, safe_open
+from safetensors import safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
@@ -92,10 +93,11 @@ def load_field(path: str | os.PathLike[str], *, device: torch.device | str = "cp
     """
     path = Path(path)
     with _reading(path, FORMAT, "a field", "mplicits fit", device) as (header, tensors):
-        field = _build(header["field"])
+        field = _build(header["field"], tensors)
         _restore(path, field, tensors, "fit the field again")
-        center, scale = header["similarity"]["center"], header["similarity"]["scale"]
-        similarity = Similarity((float(center[0]), float(center[1]), float(center[2])), float(scale))
+        similarity = _similarity(header["similarity"])
+        if not isinstance(header["metadata"], dict):
+            raise TypeError(f"metadata is a {type(header['metadata']).__name__}")
         return SavedField(field.to(device).requires_grad_(False), similarity, header["metadata"])
 
 
@@ -137,6 +139,7 @@ def load_texture(path: str | os.PathLike[str], geometry: Field) -> TextureField:
         if header["geometry"]["digest"] != _digest(geometry):
             raise InputError(f"{path}: the texture of another field than this one; run `mplicits texture` again")
         sizes = dict(header["network"])
+        _check_size(sizes, tensors)
         network = ColorSiren(sizes.pop("width"), sizes.pop("depth"), **sizes)
         prefix = "network."
         own = {name.removeprefix(prefix): tensor for name, tensor in tensors.items() if name.startswith(prefix)}
@@ -191,7 +194,7 @@ def _reading(
         yield header, tensors
     except InputError:
         raise
-    except (SafetensorError, KeyError, IndexError, TypeError, ValueError, RuntimeError) as error:
+    except Exception as error:  # whatever a head that somebody else wrote can make of our constructors
         reason = " ".join(str(error).split())[:160]
         raise InputError(f"{path}: damaged, or not {thing} written by `{command}` ({reason})") from error
 
@@ -245,18 +248,41 @@ def _describe(field: Field) -> dict[str, Any]:
     )
 
 
-def _build(description: Mapping[str, Any]) -> Field:
+def _similarity(described: Mapping[str, Any]) -> Similarity:
+    x, y, z = (float(number) for number in described["center"])
+    scale = float(described["scale"])
+    if not (all(map(math.isfinite, (x, y, z))) and 0 < scale < math.inf):
+        raise ValueError(f"similarity: center {x:g} {y:g} {z:g}, scale {scale:g}")
+    return Similarity((x, y, z), scale)
+
+
+def _check_size(arguments: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> None:
+    """Refuse a network that cannot have come from these tensors, before one is made.
+
+    Raises:
+        ValueError: a whole number of its description is larger than all that the file holds.
+    """
+    held = sum(tensor.numel() for tensor in tensors.values())
+    for name, number in arguments.items():
+        most = len(tensors) if name == "depth" else held
+        if isinstance(number, int) and number > most:
+            raise ValueError(f"{name} {number:.6g} in a file of {held:,} numbers")
+
+
+def _build(description: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> Field:
     arguments = {key: value for key, value in description.items() if key != "type"}
+    if description["type"] in ("Siren", "NeusSDF"):
+        _check_size(arguments, tensors)
     if description["type"] == "Siren":
         return Siren(arguments.pop("width"), arguments.pop("depth"), **arguments)
     if description["type"] == "NeusSDF":
         return NeusSDF(**arguments)
     if description["type"] == "MultiscaleSDF":
-        levels = [_build(level) for level in description["levels"]]
+        levels = [_build(level, tensors) for level in description["levels"]]
         # The band widths are among the tensors; the constructor only needs as many of them.
         return MultiscaleSDF(levels[0], levels[1:], [1.0] * (len(levels) - 1), taper=description["taper"])
     if description["type"] == "SpaceTimeSDF":
-        sdf = _build(description["sdf"])
+        sdf = _build(description["sdf"], tensors)
         if not isinstance(sdf, MultiscaleSDF):
             raise ValueError(f"a SpaceTimeSDF of a {type(sdf).__name__}")
         return SpaceTimeSDF(sdf)
@@ -266,8 +292,7 @@ def _build(description: Mapping[str, Any]) -> Field:
         )
     if description["type"] in COMBINED:
         if "similarity" in arguments:
-            center, scale = arguments["similarity"]["center"], arguments["similarity"]["scale"]
-            arguments["similarity"] = Similarity((float(center[0]), float(center[1]), float(center[2])), float(scale))
-        parts = [_build(part) for part in arguments.pop("parts")]
+            arguments["similarity"] = _similarity(arguments["similarity"])
+        parts = [_build(part, tensors) for part in arguments.pop("parts")]
         return COMBINED[description["type"]](*parts, **arguments)
     raise ValueError(f"unknown field type {description['type']!r}")

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import json
 import os
+import re
+import warnings
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from .errors import InputError
 
-__all__ = ["check_place", "files_in", "whole_file", "write_json", "write_whole"]
+__all__ = ["check_place", "damage", "files_in", "whole_file", "write_json", "write_whole"]
 
 
 def check_place(path: str | Path) -> None:
@@ -29,6 +33,41 @@ def check_place(path: str | Path) -> None:
         raise InputError(f"{path}: {above} is no folder; choose another place")
     if not os.access(above, os.W_OK | os.X_OK):
         raise InputError(f"{path}: the folder {above} may not be written; choose another place")
+
+
+_LONG_WORD = re.compile(r"\S{200,}")  # of a file, quoted: what it says is clear from its beginning
+
+
+@contextmanager
+def damage(path: str | Path, remedy: str) -> Iterator[None]:
+    """A block that reads a file which others made: whatever it trips over becomes one line, and nothing else is said.
+
+    Numbers that overflow are those of the file; whoever reads it says of results what must be said. The
+    exception itself is kept as the cause.
+
+    Args:
+        path: the file, which the message names.
+        remedy: what to do about it.
+
+    Raises:
+        InputError: the block raised anything that is no `InputError`.
+    """
+    try:
+        with warnings.catch_warnings(), np.errstate(all="ignore"):
+            warnings.simplefilter("ignore")
+            yield
+    except InputError as error:
+        line = _LONG_WORD.sub(lambda word: word[0] if word[0] in str(path) else f"{word[0][:40]}…", str(error))
+        if line == str(error):
+            raise
+        raise InputError(line) from error
+    except MemoryError as error:
+        raise InputError(f"{path}: claims more than fits into the memory; {remedy}") from error
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error}); check its permissions") from error
+    except Exception as error:
+        reason = " ".join(str(error).split())[:160]
+        raise InputError(f"{path}: damaged ({type(error).__name__}: {reason}); {remedy}") from error
 
 
 @contextmanager

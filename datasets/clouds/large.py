@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from .point_cloud import PointCloud, begins, colors_from, normals_from, unit_rows
+from .point_cloud import PointCloud, begins, colors_from, normals_from, unit_rows, usable_rows
 from .stream import CloudStream
 
 __all__ = ["Merging", "merge_cloud"]
@@ -157,7 +157,7 @@ def _survey(stream: CloudStream) -> _Survey:
     samples: list[Float64] = []
     for piece in stream.pieces(ROWS):
         points = piece.points.astype(np.float64)
-        points = points[np.isfinite(points).all(axis=1)]
+        points = points[usable_rows(points)]
         if len(points):
             low, high = np.minimum(low, points.min(axis=0)), np.maximum(high, points.max(axis=0))
         finite, normals = finite + len(points), piece.normals is not None
@@ -200,7 +200,7 @@ def _pieces(stream: CloudStream, frame: _Survey) -> Iterator[tuple[Float64, Floa
     """Offsets, unit normals (zero where unusable) and colours (of no columns without any) of the finite points."""
     for piece in stream.pieces(ROWS):
         points = piece.points.astype(np.float64)
-        finite = np.isfinite(points).all(axis=1)
+        finite = usable_rows(points)
         count = int(finite.sum())
         normals = np.zeros((count, 3)) if piece.normals is None else unit_rows(normals_from(piece.normals[finite]))
         if piece.colors is None or frame.brightest is None:

@@ -6,6 +6,7 @@ without faces.
 
 from __future__ import annotations
 
+import logging
 import re
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,9 @@ from .point_cloud import PointCloud, colors_from, unit_rows
 from .tables import numbers
 
 __all__ = ["ObjText", "read_obj", "read_off", "read_stl", "spread_on_faces", "triangulate", "vertex_normals", "weld"]
+
+# Its parsers print the traceback of every damaged file, where nobody handles what they log.
+logging.getLogger("trimesh").addHandler(logging.NullHandler())
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]

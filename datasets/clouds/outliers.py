@@ -20,6 +20,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from .orientation import fit_planes
+from .point_cloud import centred
 
 __all__ = ["Verdict", "agreement", "inspect_points"]
 
@@ -128,7 +129,7 @@ class _Cloud:
     """
 
     def __init__(self, points: Float64, normals: Float64 | None, rows: Rows | None = None) -> None:
-        self.points = points - points.mean(axis=0)
+        self.points = centred(points)
         self.signed = normals is not None
         self.normals = np.zeros_like(points) if normals is None else normals
         self.flat = np.ones(len(points), bool)

@@ -205,7 +205,7 @@ def _parse_header(data: bytes, path: Path) -> tuple[str, list[_Element], int]:
                     raise ValueError(line)
         except (ValueError, KeyError, IndexError) as error:
             raise InputError(
-                f"{path}: header line {number}: {line.strip()!r} is not valid PLY; export it again"
+                f"{path}: header line {number}: {line.strip()[:80]!r} is not valid PLY; export it again"
             ) from error
     if not encoding:
         raise InputError(f"{path}: format: missing from the header; expected one of {', '.join(_ORDERS)}")
@@ -252,14 +252,35 @@ def _decode(data: bytes, start: int, element: _Element, order: str, path: Path) 
     """Read all rows of ``element`` from ``data[start:]`` → columns by name, and where the rows end."""
     if element.count == 0 or not element.properties:
         return {p.name: np.empty(0, p.kind) for p in element.properties}, start
+    # Before anything is made of it: each row takes its numbers, and a list its length, at the least.
+    least = sum(np.dtype(p.length_kind or p.kind).itemsize for p in element.properties)
+    if element.count > (len(data) - start) // least:
+        raise _cut_off(path, element)
     try:
         uniform = _decode_uniform(data, start, element, order)
         return uniform if uniform is not None else _decode_ragged(data, start, element, order)
     except (ValueError, IndexError) as error:
-        raise InputError(
-            f"{path}: {element.name}: the file ends before its {element.count} rows do (truncated?); "
-            "copy or export it again"
-        ) from error
+        raise _cut_off(path, element) from error
+
+
+def _cut_off(path: Path, element: _Element) -> InputError:
+    return InputError(
+        f"{path}: {element.name}: the file ends before its {element.count:.6g} rows do (truncated?); "
+        "copy or export it again"
+    )
+
+
+def _list_length(data: bytes, at: int, kind: str, item: str) -> int:
+    """The length of the list that begins at ``at``.
+
+    Raises:
+        ValueError: it is none, or longer than what is left of the file.
+    """
+    length = float(np.frombuffer(data, kind, 1, at)[0])
+    left = len(data) - at - np.dtype(kind).itemsize
+    if not (length.is_integer() and 0 <= length <= left // np.dtype(item).itemsize):
+        raise ValueError(f"a list of {length:g} items")
+    return int(length)
 
 
 def _decode_uniform(data: bytes, start: int, element: _Element, order: str) -> tuple[_Columns, int] | None:
@@ -271,7 +292,7 @@ def _decode_uniform(data: bytes, start: int, element: _Element, order: str) -> t
             fields.append((f"{number}", order + p.kind))
             at += np.dtype(p.kind).itemsize
             continue
-        length = int(np.frombuffer(data, order + p.length_kind, 1, at)[0])
+        length = _list_length(data, at, order + p.length_kind, p.kind)
         fields += [(f"{number}#", order + p.length_kind), (f"{number}", order + p.kind, (length,))]
         at += np.dtype(p.length_kind).itemsize + length * np.dtype(p.kind).itemsize
     row = np.dtype(fields)
@@ -300,7 +321,7 @@ def _decode_ragged(data: bytes, start: int, element: _Element, order: str) -> tu
         for column, p in zip(values, element.properties, strict=True):
             length = 1
             if p.length_kind is not None:
-                length = int(np.frombuffer(data, order + p.length_kind, 1, at)[0])
+                length = _list_length(data, at, order + p.length_kind, p.kind)
                 at += np.dtype(p.length_kind).itemsize
             column.append(np.frombuffer(data, order + p.kind, length, at) if length else np.empty(0, p.kind))
             at += length * np.dtype(p.kind).itemsize

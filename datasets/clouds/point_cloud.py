@@ -13,18 +13,23 @@ from scipy.spatial import KDTree
 __all__ = [
     "PointCloud",
     "begins",
+    "centred",
     "colors_from",
     "columns_of",
+    "middle_of",
     "normals_from",
     "select",
     "spacing_of",
     "spread",
     "thin",
     "unit_rows",
+    "usable_rows",
     "voxel_representatives",
 ]
 
 Float64 = NDArray[np.float64]
+
+FARTHEST = 1e150  # a coordinate whose square is still a number
 
 NAMES = {  # of columns, as files have them; what comes first counts
     "points": (("x", "y", "z"), ("px", "py", "pz")),
@@ -173,6 +178,26 @@ def voxel_representatives(points: Float64, size: float) -> NDArray[np.int64]:
     return np.sort(nearest[np.flatnonzero(firsts)])
 
 
+def usable_rows(points: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Which points ``(N, 3)`` are usable ``(N,)``: finite, and near enough for the squares of their distances to be."""
+    with np.errstate(invalid="ignore"):
+        return np.asarray((np.abs(points) < FARTHEST).all(axis=1))
+
+
+def centred(points: Float64) -> Float64:
+    """Points ``(N, 3)`` around the origin, as trees want them: over map coordinates they would lose digits.
+
+    The origin is the median by each coordinate of at most 10,000 of them; a mean would go away with one point that is
+    very far off, and take the digits of all others along.
+    """
+    return points - middle_of(points)
+
+
+def middle_of(points: Float64) -> Float64:
+    """Where `centred` puts the origin ``(3,)``."""
+    return np.median(points[:: 1 + len(points) // 10_000], axis=0)
+
+
 def spacing_of(points: Float64, *, share: float = 0.95, sample: int = 20_000) -> float:
     """Distance to the nearest neighbour that ``share`` of the points ``(N, 3)`` stay below; 0 for a lone point.
 
@@ -180,7 +205,7 @@ def spacing_of(points: Float64, *, share: float = 0.95, sample: int = 20_000) ->
     """
     if len(points) < 2:
         return 0.0
-    shifted = points - points.mean(axis=0)  # a tree over map coordinates would lose digits
+    shifted = centred(points)
     asked = shifted[:: 1 + len(points) // sample]
     return float(np.quantile(KDTree(shifted).query(asked, k=2)[0][:, 1], share))
 

@@ -15,7 +15,7 @@ from .meshes import weld
 from .noise import noise_deviation, noise_level, smooth_along_normals
 from .orientation import estimate_normals, nearest, openness, orient_normals, outwardness
 from .outliers import inspect_points
-from .point_cloud import PointCloud, unit_rows
+from .point_cloud import PointCloud, centred, middle_of, unit_rows, usable_rows
 from .reading import MIN_POINTS
 from .reestimate import denoise, refit_normals
 from .winding import orient_by_winding
@@ -186,7 +186,7 @@ def prepare_cloud(
     if sensor_origin is not None and not np.isfinite(np.asarray(sensor_origin, np.float64)).all():
         raise InputError(f"sensor_origin={sensor_origin}: expected three finite numbers")
 
-    finite = np.flatnonzero(np.isfinite(cloud.points).all(axis=1))
+    finite = np.flatnonzero(usable_rows(cloud.points))
     distinct = finite[np.sort(weld(cloud.points[finite])[0])]
     _check_enough(len(distinct), cloud, "are left after dropping NaN and duplicates")
 
@@ -270,15 +270,15 @@ def _agreeing(points: Float64, normals: Float64) -> tuple[Float64, int]:
     Where the points are noisy as well, planes are fitted in turns with smoothing, as for normals that are estimated,
     and replace all.
     """
-    centred = points - points.mean(axis=0)
-    level = layer_level(centred, normals)
-    worse = worse_normals(centred, normals, level)
+    around = centred(points)
+    level = layer_level(around, normals)
+    worse = worse_normals(around, normals, level)
     if not worse.any():
         return normals, 0
-    guides = neighborly(centred, normals)
+    guides = neighborly(around, normals)
     if level:
-        return denoise(centred, guides)[1], len(normals)
-    fitted = refit_normals(centred, guides, 0.0, neighbors=16)
+        return denoise(around, guides)[1], len(normals)
+    fitted = refit_normals(around, guides, 0.0, neighbors=16)
     return np.where(worse[:, None], fitted, normals), int(worse.sum())
 
 
@@ -288,7 +288,7 @@ def _smoothed(points: Float64, normals: Float64, *, flips: bool = False) -> tupl
     Where ``flips`` may be among the normals of a thin part, one side passes for noise about the other: what is no noise
     once they are turned round is none.
     """
-    middle = points.mean(axis=0)
+    middle = middle_of(points)
     level, sound = noise_level(points - middle, normals), normals
     if level and flips:
         flipped = inspect_points(points, normals, outliers=False).flipped
@@ -313,7 +313,7 @@ def _repair(
     missing = np.flatnonzero(~usable)
     if len(missing) == 0:
         return normals, usable
-    shifted = points - points.mean(axis=0)  # a tree over map coordinates would lose digits
+    shifted = centred(points)
     near = KDTree(shifted[usable]).query(shifted[missing], k=min(neighbors, int(usable.sum())), workers=-1)[1]
     mean = normals[usable][near.reshape(len(missing), -1)].mean(axis=1)
     length = np.linalg.norm(mean, axis=1)

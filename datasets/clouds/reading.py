@@ -14,7 +14,7 @@ from ..files import readable
 from .las import LasStream, read_las
 from .meshes import read_obj, read_off, read_stl
 from .ply import ply_stream, read_ply
-from .point_cloud import PointCloud
+from .point_cloud import PointCloud, usable_rows
 from .stream import CloudStream
 from .tables import npy_stream, read_npy, read_npz, read_text
 
@@ -22,6 +22,9 @@ __all__ = ["MIN_POINTS", "READERS", "check_cloud", "check_cloud_path", "open_str
 
 MIN_POINTS = 10
 """Fewer points than this are no surface."""
+
+SMALLEST = 1e-100
+"""Clouds of a smaller extent cannot be computed with: squares of distances within them vanish."""
 
 READERS: Mapping[str, Callable[[Path], PointCloud]] = MappingProxyType(
     {
@@ -108,11 +111,13 @@ def check_cloud(cloud: PointCloud) -> None:
     Raises:
         InputError: too few finite points, or all at one place.
     """
-    finite = cloud.points[np.isfinite(cloud.points).all(axis=1)]
+    finite = cloud.points[usable_rows(cloud.points)]
     if len(finite) == 0:
         raise InputError(f"{cloud.source}: points: none with finite coordinates among {len(cloud)}; export it again")
     if bool((finite == finite[0]).all()) and len(finite) > 1:
         raise InputError(f"{cloud.source}: points: all {len(finite)} coincide; export it with more digits")
+    if len(finite) > 1 and (extent := float(np.ptp(finite, axis=0).max())) < SMALLEST:
+        raise InputError(f"{cloud.source}: points: {extent:.3g} across; export it in a smaller unit")
     if len(finite) < MIN_POINTS:
         raise InputError(
             f"{cloud.source}: points: {len(finite)} with finite coordinates; at least {MIN_POINTS} are needed"

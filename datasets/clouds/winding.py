@@ -21,7 +21,7 @@ from scipy.spatial import KDTree
 from .dipoles import DipoleSums
 from .noise import noise_level
 from .orientation import fit_planes, openness
-from .point_cloud import spread
+from .point_cloud import centred, spread
 
 __all__ = ["WindingNormals", "disc_areas", "layer_thickness", "misfit", "orient_by_winding", "winding_normals"]
 
@@ -64,7 +64,7 @@ def orient_by_winding(points: Float64, normals: Float64, *, limit: int = 16_000)
     """
     some = spread(points, limit)
     # Noise hides single wrong signs from the misfit, and propagation from one noisy normal to the next has many.
-    noise = noise_level(points - points.mean(axis=0), normals)
+    noise = noise_level(centred(points), normals)
     before = misfit(points[some], normals[some], softening=2 * noise)
     if before < FITS and not noise:
         return None

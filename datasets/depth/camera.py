@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ...neural_fields import InputError
 from ..cameras import COEFFICIENTS, Camera, intrinsics, pinhole_intrinsics
-from ..files import finite_number, read_json
+from ..files import finite_number, read_json, reader
 
 __all__ = ["DepthCamera", "read_intrinsics"]
 
@@ -117,6 +117,7 @@ class DepthCamera:
         return pixels, inside
 
 
+@reader
 def read_intrinsics(path: str | Path) -> DepthCamera:
     """Read the intrinsics of a depth camera from JSON.
 
@@ -133,7 +134,7 @@ def read_intrinsics(path: str | Path) -> DepthCamera:
         raise InputError(f"{path}: expected an object with width, height, fx, fy, cx and cy")
     if "intrinsic_matrix" in content:
         content = {**content, **_open3d(content["intrinsic_matrix"], path)}
-    missing = [name for name in ("width", "height", "fx", "fy", "cx", "cy") if name not in content]
+    missing = [name for name in ("width", "height", "fx", "fy", "cx", "cy") if content.get(name) is None]
     if missing:
         raise InputError(f"{path}: {', '.join(missing)}: missing; add {'it' if len(missing) == 1 else 'them'}")
     numbers = {

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ...neural_fields import InputError
 from ..cameras import Camera
-from ..files import readable
+from ..files import readable, reader
 from ..views.reading import read_cameras
 from .camera import DepthCamera
 from .images import fit_color, read_color, read_depth
@@ -123,6 +123,7 @@ def read_poses(path: str | Path) -> list[PosedFrame]:
     return [(None, pose, None) for pose in read_trajectory(path)]
 
 
+@reader
 def read_trajectory(path: str | Path) -> Float64:
     """Read an Open3D trajectory: per frame a line of three whole numbers, and four of a 4 × 4 matrix.
 
@@ -150,7 +151,7 @@ def read_trajectory(path: str | Path) -> Float64:
         rows = [words for index, words in enumerate(lines) if index % 5]
         poses = np.array(rows, np.float64).reshape(-1, 4, 4)
     except ValueError as error:
-        raise InputError(f"{path}: {error}; expected five lines per frame, as Open3D writes them") from error
+        raise InputError(f"{path}: {str(error)[:80]}; expected five lines per frame, as Open3D writes them") from error
     return np.stack([_rigid(pose, f"{path}: frame {index}") for index, pose in enumerate(poses)])
 
 

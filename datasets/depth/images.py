@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ...neural_fields import InputError
 from ..color_space import linear_to_srgb, srgb_to_linear
-from ..files import DAMAGED_ARRAYS, numeric, read_arrays, read_image, read_rgb
+from ..files import DAMAGED_ARRAYS, numeric, read_arrays, read_image, read_rgb, readable, reader
 
 __all__ = ["DEPTH_SCALE", "DEPTH_SUFFIXES", "fit_color", "is_depth_file", "read_color", "read_depth"]
 
@@ -72,6 +72,11 @@ def read_depth(
         raise InputError(
             f"{path}: unknown extension {path.suffix!r}; depth maps are read from {', '.join(DEPTH_SUFFIXES)}"
         )
+    with readable(path):
+        return _depth(path, scale, integer_scale, inverse=inverse)
+
+
+def _depth(path: Path, scale: float | None, integer_scale: float | None, *, inverse: bool) -> Float64:
     numbers = _read_array(path) if path.suffix.lower() in (".npy", ".npz") else read_image(path)
     if numbers.ndim == 3 and 1 in (numbers.shape[0], numbers.shape[2]):
         numbers = numbers[0] if numbers.shape[0] == 1 else numbers[..., 0]
@@ -90,6 +95,7 @@ def read_depth(
     return values / (scale or (1.0 if numbers.dtype.kind == "f" else integer_scale or DEPTH_SCALE))
 
 
+@reader
 def read_color(path: str | Path) -> Bytes:
     """Read a colour picture → ``(H, W, 3)`` display RGB; grey becomes RGB, and transparency is left out.
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ...neural_fields import InputError, Similarity
 from ..cameras import Camera
+from ..files import readable
 from .colmap import read_colmap_points
 from .neus import read_neus_sphere
 from .pictures import read_mask, read_picture, resample, shrink, undistort, undistorted_camera
@@ -90,6 +91,11 @@ def read_posed_images(path: str | Path, *, width: int | None = None, region: Sim
     if width is not None and width < 1:
         raise ValueError(f"width={width}: expected at least one pixel")
     source = find_source(path)
+    with readable(source):
+        return _posed(source, width, region)
+
+
+def _posed(source: Path, width: int | None, region: Similarity | None) -> PosedImages:
     shots = read_shots(source)
     neus = source.suffix.lower() == ".npz"
     sphere = read_neus_sphere(source) if neus else None

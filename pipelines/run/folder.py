@@ -13,13 +13,13 @@ from typing import Any, TypeVar
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from safetensors import SafetensorError, safe_open
+from safetensors import safe_open
 from safetensors.torch import save
 from torch import Tensor
 
 from ...neural_fields import Field, InputError, SavedField, Similarity, load_field, save_field
 from ...neural_fields.dynamic_tracing import moment
-from ...neural_fields.files import check_place, write_json, write_whole
+from ...neural_fields.files import check_place, damage, write_json, write_whole
 from .config import load_config
 from .lock import check_unlocked, lock_file, locked
 from .team import is_leader
@@ -332,14 +332,13 @@ def read_record(directory: Path) -> dict[str, Any]:
         InputError: there is none, or it is damaged.
     """
     path = directory / RECORD_FILE
-    try:
-        record = json.loads(path.read_text(encoding="utf-8"))
+    with damage(path, "fit again into a new directory"):
+        try:
+            record = json.loads(path.read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            raise InputError(f"{path}: no such file; expected a run of mplicits fit, evolve or reconstruct") from None
         if not isinstance(record["config"], dict):
             raise TypeError("config is not a mapping")
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; expected a run of mplicits fit, evolve or reconstruct") from None
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{path}: damaged ({error}); fit again into a new directory") from error
     return record
 
 
@@ -360,9 +359,6 @@ def load_state(directory: Path, *, name: str = STATE_FILE) -> tuple[dict[str, Te
     path = directory / name
     if not path.is_file():
         raise InputError(f"{path}: no such file, so there is nothing to resume; leave out --resume and choose a new -o")
-    try:
-        with safe_open(path, framework="pt") as file:
-            progress = json.loads(file.metadata()["progress"])
-            return {name: file.get_tensor(name) for name in file.keys()}, progress  # noqa: SIM118
-    except (SafetensorError, KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{path}: damaged ({error}); begin again without --resume") from error
+    with damage(path, "begin again without --resume"), safe_open(path, framework="pt") as file:
+        progress = json.loads(file.metadata()["progress"])
+        return {name: file.get_tensor(name) for name in file.keys()}, progress  # noqa: SIM118

@@ -1,0 +1,252 @@
+"""Small whole files of every kind that the package reads, and what reads each."""
+
+from __future__ import annotations
+
+import io
+import json
+import random
+import struct
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import torch
+from mplicits.datasets import (
+    SCENES,
+    PointCloud,
+    prepare_cloud,
+    read_cameras,
+    read_cloud,
+    read_depth,
+    read_intrinsics,
+    read_posed_images,
+    read_poses,
+    read_textured,
+    render_scene,
+    write_cloud_ply,
+    write_colmap,
+    write_neus,
+    write_transforms,
+)
+from mplicits.neural_fields import MultiscaleSDF, Siren, load_field, save_field
+from mplicits.neural_fields.glb import write_glb
+from mplicits.pipelines.run.config import load_config
+from mplicits.pipelines.run.folder import load_state, read_record, save_state, write_record
+from mplicits.pipelines.run.settings import FitConfig
+from mutate import damaged, damaged_json
+
+__all__ = ["Specimen", "specimens"]
+
+Damage = Callable[[bytes, random.Random], bytes]
+
+# And two points more, for there must be ten at least to be a cloud.
+CUBE = np.array(
+    [[x, y, z] for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (0.0, 1.0)] + [[0.5, 0.5, 2], [0.5, 2, 0.5]]
+)
+QUADS = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
+FACES = np.concatenate((QUADS[:, :3], QUADS[:, [0, 2, 3]], [[0, 8, 9], [7, 9, 8]]))
+
+
+@dataclass(frozen=True)
+class Specimen:
+    """A whole file, and how it is read.
+
+    Attributes:
+        name: of the file, from the folder that it lies in; the part before a ``/`` tells specimens apart.
+        data: its bytes.
+        read: what is asked to read it, given its path.
+        beside: other files of the same folder, by name.
+        damage: how it is damaged.
+    """
+
+    name: str
+    data: bytes
+    read: Callable[[Path], object]
+    beside: dict[str, bytes] = field(default_factory=dict)
+    damage: Damage = damaged
+
+
+def specimens() -> list[Specimen]:
+    """All of them; the same bytes whenever they are made."""
+    with TemporaryDirectory() as folder:
+        return [*_clouds(Path(folder)), *_meshes(Path(folder)), *_views(Path(folder)), *_runs(Path(folder))]
+
+
+def _clouds(folder: Path) -> Iterator[Specimen]:
+    random_ = np.random.default_rng(0)
+    points = random_.normal(size=(40, 3)).round(4)
+    normals = (points / np.linalg.norm(points, axis=1, keepdims=True)).astype(np.float32)
+    colors = random_.uniform(size=(40, 3)).astype(np.float32)
+    cloud = PointCloud(points, normals, colors, "cloud")
+    write_cloud_ply(folder / "cloud.ply", cloud)
+    yield Specimen("cloud.ply", (folder / "cloud.ply").read_bytes(), read_cloud)
+    rows = "\n".join(" ".join(f"{value:g}" for value in row) for row in np.hstack((points, normals)))
+    yield Specimen("cloud.xyz", rows.encode(), read_cloud)
+    yield Specimen("prepared.xyz", rows.encode(), lambda path: prepare_cloud(read_cloud(path)))
+    yield Specimen("cloud.csv", ("x,y,z,nx,ny,nz\n" + rows.replace(" ", ",")).encode(), read_cloud)
+    for order, name in (("<", "little"), (">", "big"), ("", "ascii")):
+        for polygons, label in ((FACES, "even"), (list(QUADS[:3]) + list(FACES[6:]), "uneven")):
+            yield Specimen(f"{label}_{name}.ply", _mesh_ply(order, polygons), read_cloud)
+    for save, suffix, arrays in (
+        (np.save, "npy", (np.hstack((points, normals)),)),
+        (np.savez_compressed, "npz", None),
+    ):
+        memory = io.BytesIO()
+        if arrays is None:
+            save(memory, points=points, normals=normals, colors=colors)  # pyright: ignore[reportCallIssue]
+        else:
+            save(memory, *arrays)
+        yield Specimen(f"cloud.{suffix}", memory.getvalue(), read_cloud)
+    import laspy
+
+    las = laspy.create(point_format=3, file_version="1.2")
+    las.x, las.y, las.z = points.T
+    las.red, las.green, las.blue = (colors.T * 65535).astype(np.uint16)
+    las.write(folder / "cloud.las")
+    yield Specimen("cloud.las", (folder / "cloud.las").read_bytes(), read_cloud)
+
+
+def _mesh_ply(order: str, polygons: Any) -> bytes:
+    """A cube with colours and faces; ASCII where there is no byte ``order``."""
+    form = {"<": "binary_little_endian", ">": "binary_big_endian", "": "ascii"}[order]
+    head = ["ply", f"format {form} 1.0", "comment a cube", f"element vertex {len(CUBE)}"]
+    head += [f"property float {axis}" for axis in "xyz"] + [f"property uchar {c}" for c in ("red", "green", "blue")]
+    head += [f"element face {len(polygons)}", "property list int int vertex_indices", "end_header\n"]
+    vertices = [(*vertex, 10, 20, 30) for vertex in CUBE]
+    if not order:
+        lines = [" ".join(f"{value:g}" for value in row) for row in vertices]
+        lines += [" ".join(map(str, (len(polygon), *polygon))) for polygon in polygons]
+        return ("\n".join(head) + "\n".join(lines) + "\n").encode()
+    body = b"".join(struct.pack(f"{order}3f3B", *row) for row in vertices)
+    body += b"".join(struct.pack(f"{order}{1 + len(polygon)}i", len(polygon), *polygon) for polygon in polygons)
+    return "\n".join(head).encode() + body
+
+
+def _meshes(folder: Path) -> Iterator[Specimen]:
+    obj = "\n".join(
+        [
+            "mtllib cube.mtl",
+            *("v {:g} {:g} {:g}".format(*vertex) for vertex in CUBE),
+            "vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\nusemtl red",
+            *("f " + " ".join(f"{corner + 1}/{1 + i}" for i, corner in enumerate(quad)) for quad in QUADS),
+        ]
+    ).encode()
+    material = b"newmtl red\nKd 1 0.2 0.1\nmap_Kd cube.png\n"
+    picture = _png(np.arange(48, dtype=np.uint8).reshape(4, 4, 3))
+    yield Specimen("cube.obj", obj, read_textured, {"cube.mtl": material, "cube.png": picture})
+    yield Specimen("points.obj", obj, read_cloud, {"cube.mtl": material, "cube.png": picture})
+    yield Specimen("cube.mtl", material, _beside(read_textured, "cube.obj"), {"cube.obj": obj, "cube.png": picture})
+    yield Specimen("cube.png", picture, _beside(read_textured, "cube.obj"), {"cube.obj": obj, "cube.mtl": material})
+    yield Specimen("cube.ply", _mesh_ply("<", FACES), read_textured)
+    corners = CUBE[FACES].astype("<f4")
+    yield Specimen(
+        "cube.off",
+        (f"OFF\n{len(CUBE)} {len(FACES)} 0\n" + "\n".join("{:g} {:g} {:g}".format(*v) for v in CUBE) + "\n").encode()
+        + "\n".join("3 {} {} {}".format(*face) for face in FACES).encode(),
+        read_cloud,
+    )
+    facets = b"".join(struct.pack("<12fH", 0, 0, 1, *triangle.reshape(-1), 0) for triangle in corners)
+    yield Specimen("cube.stl", b"\0" * 80 + struct.pack("<I", len(corners)) + facets, read_cloud)
+    lines = "".join(
+        "facet normal 0 0 1\nouter loop\n"
+        + "".join("vertex {:g} {:g} {:g}\n".format(*corner) for corner in triangle)
+        + "endloop\nendfacet\n"
+        for triangle in corners
+    )
+    yield Specimen("words.stl", f"solid cube\n{lines}endsolid cube\n".encode(), read_cloud)
+    color = np.full((len(CUBE), 3), 0.5, np.float32)
+    glb = folder / "cube.glb"
+    write_glb(glb, FACES, {"POSITION": CUBE.astype(np.float32), "COLOR_0": color})
+    yield Specimen("cube.glb", glb.read_bytes(), read_textured)
+    yield Specimen("described.glb", glb.read_bytes(), read_textured, damage=_within_glb)
+
+
+def _views(folder: Path) -> Iterator[Specimen]:
+    images = render_scene(SCENES["painted-sphere"](), 2, 12, samples=1)
+    for name, write, chosen in (
+        ("neus", write_neus, ("cameras_sphere.npz",)),
+        ("transforms", write_transforms, ("transforms.json",)),
+        ("binary", write_colmap, ("cameras.bin", "images.bin", "points3D.bin")),
+        ("text", lambda f, i: write_colmap(f, i, form="text"), ("cameras.txt", "images.txt", "points3D.txt")),
+    ):
+        write(folder / name, images)
+        files = {p.relative_to(folder / name).as_posix(): p.read_bytes() for p in (folder / name).rglob("*.*")}
+        for file, data in files.items():
+            if Path(file).name in chosen:
+                beside = {other: content for other, content in files.items() if other != file}
+                yield Specimen(file, data, _above(read_posed_images, file), beside)
+                if file.endswith(".json"):
+                    yield Specimen(file, data, read_cameras, beside, _as_json)
+    depth = np.full((6, 8), 1000, np.uint16)
+    yield Specimen("depth.png", _png(depth), lambda path: read_depth(path, scale=1000.0))
+    lens = {"width": 8, "height": 6, "fx": 8.0, "fy": 8.0, "cx": 3.5, "cy": 2.5}
+    yield Specimen("lens.json", json.dumps(lens).encode(), read_intrinsics)
+    yield Specimen("lens.json", json.dumps(lens).encode(), read_intrinsics, damage=_as_json)
+    log = "".join(f"{i} {i} 0\n" + "\n".join(" ".join(map(str, row)) for row in np.eye(4)) + "\n" for i in range(3))
+    yield Specimen("poses.log", log.encode(), read_poses)
+
+
+def _runs(folder: Path) -> Iterator[Specimen]:
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        sdf = MultiscaleSDF(Siren(8, 1), [Siren(8, 2)], deltas=[0.1])
+    save_field(folder / "field.safetensors", sdf, metadata={"run": {"cloud": "cloud.ply", "finished": True}})
+    data = (folder / "field.safetensors").read_bytes()
+    yield Specimen("field.safetensors", data, load_field)
+    yield Specimen("described.safetensors", data, load_field, damage=_within_safetensors)
+    save_state(folder, {"a": torch.arange(5.0)}, {"fingerprint": "x", "step": 3})
+    state = (folder / "resume.safetensors").read_bytes()
+    yield Specimen("resume.safetensors", state, _above(load_state, "resume.safetensors"))
+    record = {"config": {"seed": 0}, "cloud": "cloud.ply", "finished": True, "levels": [{"loss": 0.1}], "time": 1.5}
+    write_record(folder, record)
+    written = (folder / "run.json").read_bytes()
+    yield Specimen("run.json", written, _above(read_record, "run.json"))
+    yield Specimen("run.json", written, _above(read_record, "run.json"), damage=_as_json)
+    settings = b"seed: 1\nbatch: 500\nsteps: [100, 200, 300]\nlevels: 2\n"
+    yield Specimen("fit.yaml", settings, partial(load_config, FitConfig))
+
+
+def _png(pixels: np.ndarray) -> bytes:
+    import cv2
+
+    return cv2.imencode(".png", pixels)[1].tobytes()
+
+
+def _beside(read: Callable[[Path], object], name: str) -> Callable[[Path], object]:
+    """Read another file of the same folder."""
+    return lambda path: read(path.parent / name)
+
+
+def _above(read: Callable[[Path], object], file: str) -> Callable[[Path], object]:
+    """Read the folder that ``file`` lies in, at whatever depth."""
+    return lambda path: read(path.parents[len(Path(file).parts) - 1])
+
+
+def _as_json(data: bytes, chance: random.Random) -> bytes:
+    return json.dumps(damaged_json(json.loads(data), chance)).encode()
+
+
+def _within_glb(data: bytes, chance: random.Random) -> bytes:
+    """Damage to the description alone, in a file whose lengths fit."""
+    (length,) = struct.unpack_from("<I", data, 12)
+    text = _as_json(data[20 : 20 + length].rstrip(b" \0"), chance)
+    text += b" " * (-len(text) % 4)
+    rest = data[20 + length :]
+    head = struct.pack("<4sII", b"glTF", 2, 20 + len(text) + len(rest))
+    return head + struct.pack("<I4s", len(text), b"JSON") + text + rest
+
+
+def _within_safetensors(data: bytes, chance: random.Random) -> bytes:
+    """Damage to our own description within the head, in a file whose lengths fit."""
+    (length,) = struct.unpack_from("<Q", data)
+    head = json.loads(data[8 : 8 + length])
+    (form,) = head["__metadata__"]
+    described = damaged_json(json.loads(head["__metadata__"][form]), chance)
+    head["__metadata__"][form] = json.dumps(described)
+    text = json.dumps(head).encode()
+    text += b" " * (-len(text) % 8)
+    return struct.pack("<Q", len(text)) + text + data[8 + length :]
