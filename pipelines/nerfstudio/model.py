@@ -20,7 +20,7 @@ from nerfstudio.models.neus import NeuSModel, NeuSModelConfig  # pyright: ignore
 from nerfstudio.models.neus_facto import NeuSFactoModel, NeuSFactoModelConfig  # pyright: ignore[reportMissingImports]
 from torch import Tensor, nn
 
-from ...neural_fields import MultiscaleSDF, NerfstudioField, Siren, ViewColor, solve_sphere
+from ...neural_fields import MultiscaleSDF, NerfstudioField, Siren, ViewColor, fit_sphere
 from ...neural_fields.rates import HOST_RATE
 
 __all__ = [
@@ -99,7 +99,8 @@ def build_field(config: MultiscaleFieldConfig, *, aabb: Tensor, **_: object) -> 
         learning_rate=config.learning_rate,
     )
     assert isinstance(sdf.base, Siren)
-    solve_sphere(sdf.base, config.radius * float((aabb[1] - aabb[0]).min()) / 2 * shell.scale)
+    with torch.enable_grad():
+        fit_sphere(sdf.base, config.radius * float((aabb[1] - aabb[0]).min()) / 2 * shell.scale)
     return shell
 
 

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from mplicits.neural_fields import Siren
+from mplicits.neural_fields import NeuSGeometry, Siren
 from mplicits.neural_fields.sphere_start import RIDGE, SLOPE_WEIGHT, fit_sphere, solve_sphere
 
 
@@ -123,3 +123,38 @@ def test_a_solved_start_draws_nothing_and_leaves_features_and_units() -> None:
         torch.testing.assert_close(tensor, first[name], rtol=1e-4, atol=1e-4)
     with pytest.raises(ValueError, match="radius=0"):
         solve_sphere(network, 0)
+
+
+def first_step(network: Siren, radius: float) -> float:
+    """How far a sphere moves, in radii, if Adam's first step at NeuS's full rate takes all weights to the same side."""
+    geometry = NeuSGeometry(network, learning_rate=5e-4)
+    x = torch.nn.functional.normalize(torch.randn(1000, 3), dim=1) * radius
+    adam = torch.optim.Adam(geometry.parameters(), lr=5e-4)
+    before = geometry.sdf(x).mean()
+    before.backward()
+    adam.step()
+    with torch.no_grad():
+        return float(before - geometry.sdf(x).mean()) / radius
+
+
+def test_a_trained_start_outlasts_a_first_step_without_warm_up() -> None:
+    """A surface that moves by its radius is gone: instant-nsr-pl has no warm-up, and NeuS's may be cut short."""
+    torch.manual_seed(0)
+    trained, linear = (Siren(128, 4, omega=10.0) for _ in range(2))
+    fit_sphere(trained, 0.35)
+    solve_sphere(linear, 0.35)
+    assert first_step(trained, 0.35) < 1
+    assert first_step(linear, 0.35) > 1  # what the description of `solve_sphere` warns of
+
+
+def test_a_trained_start_does_not_depend_on_units() -> None:
+    """Powers of two round nothing, so that the same numbers come to the bit."""
+    found = []
+    for units in ((1.0, 1.0), (0.5, 0.25)):
+        torch.manual_seed(4)
+        network = Siren(16, 2, omega=10.0)
+        network.set_units(*units)
+        fit_sphere(network, steps=5, batch=64)
+        assert network.units == units
+        found.append(network.state_dict())
+    assert all(torch.equal(found[0][name], found[1][name]) for name in found[0])

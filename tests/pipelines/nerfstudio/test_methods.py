@@ -66,7 +66,7 @@ def test_the_start_is_a_sphere_in_the_scene_box(plugin: Any) -> None:
     x = torch.nn.functional.normalize(torch.randn(500, 3), dim=1)
     with torch.no_grad():
         off = field.field.base.value(1.2 * x * field.scale) / field.scale
-    # `solve_sphere` is off by 0.01 of the field's unit, which is 2 √3 here; the largest of many is a few times that.
+    # `fit_sphere` comes nearer than 0.01 of the field's unit, which is 2 √3 here.
     assert float(off.square().mean().sqrt()) < 2 * 0.01 / field.scale
 
 
