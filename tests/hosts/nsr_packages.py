@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator, Mapping
 from itertools import product
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -169,6 +170,12 @@ def accumulate_along_rays(weights: Tensor, ray_indices: Tensor, values: Tensor |
     return terms.new_zeros(n_rays, terms.shape[-1]).index_add(0, ray_indices, terms)
 
 
+def to_tensor(image: Any) -> Tensor:
+    """torchvision's: a picture of bytes ``(H, W)`` or ``(H, W, C)`` → ``(C, H, W)`` from 0 to 1."""
+    values = torch.from_numpy(np.array(image)).float() / 255
+    return values[None] if values.ndim == 2 else values.permute(2, 0, 1)
+
+
 class LightningModule(nn.Module):
     """Lightning's, as far as one hand-written loop needs it."""
 
@@ -196,6 +203,9 @@ def install() -> None:
         },
         "nerfacc.intersection": {"ray_aabb_intersect": ray_aabb_intersect},
         "torch_efficient_distloss": {"flatten_eff_distloss": refuse},
+        "torchvision": {},
+        "torchvision.transforms": {},
+        "torchvision.transforms.functional": {"to_tensor": to_tensor},
         "pytorch_lightning": {"LightningModule": LightningModule, "LightningDataModule": object},
         "pytorch_lightning.utilities": {},
         "pytorch_lightning.utilities.rank_zero": {
