@@ -10,12 +10,18 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from ...neural_fields import InputError, Mesh, NerfstudioField, NoSurfaceError
+from ...neural_fields import InputError, Mesh, NerfstudioField, NoSurfaceError, Similarity
 from ...neural_fields.mesh_files import check_mesh_path
+from ..mesh.bake import check_texture_size, textured_mesh
+from ..mesh.extract import normals_near
+from ..mesh.files import check_textured_path
 
 __all__ = ["colored_mesh", "export_mesh", "in_data_coordinates", "main"]
+
+Float64 = NDArray[np.float64]
+Move = tuple[Float64, float]  # (3, 4) and a scale: see `in_data_coordinates`
 
 BATCH = 1 << 14
 
@@ -26,10 +32,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--load-config", type=Path, required=True, help="config.yml of the training")
     parser.add_argument("--output-path", type=Path, required=True, help="PLY, OBJ, STL or GLB")
     parser.add_argument("--resolution", type=int, default=512, help="cells along the longest side of the scene box")
+    parser.add_argument("--texture", type=int, metavar="N", help="colours and normals as images of N × N (GLB, OBJ)")
+    parser.add_argument("--texture-faces", type=int, default=50_000, help="triangles below the texture")
     parser.add_argument("--level", type=int, default=-1, help="of detail, 0 the coarsest, -1 the finest")
     options = parser.parse_args(arguments)
     try:
-        mesh = export_mesh(options.load_config, options.output_path, options.resolution, level=options.level)
+        mesh = export_mesh(
+            *(options.load_config, options.output_path, options.resolution),
+            level=options.level,
+            texture=options.texture,
+            faces=options.texture_faces,
+        )
     except (InputError, NoSurfaceError, ValueError) as error:
         print(f"ns-mplicits-export: error: {error}", file=sys.stderr)
         return 2
@@ -37,14 +50,28 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def export_mesh(config: Path, path: Path, resolution: int = 512, *, level: int = -1) -> Mesh:
+def export_mesh(
+    config: Path,
+    path: Path,
+    resolution: int = 512,
+    *,
+    level: int = -1,
+    texture: int | None = None,
+    faces: int = 50_000,
+) -> Mesh:
     """Mesh the last checkpoint of a training, colour it and write it, in the coordinates of the data set.
+
+    Returns:
+        The mesh as written: with vertex colours, or with ``texture`` the decimated one below its images.
 
     Args:
         config: ``config.yml`` of the training.
         path: the file; its extension chooses the format.
         resolution: cells along the longest side of the scene box.
         level: of detail.
+        texture: texels along each side of two images, colours and normals, that take the place of vertex colours; for
+            GLB and OBJ, with ``mplicits[texture]``.
+        faces: triangles to keep below the texture.
 
     Raises:
         InputError: there is no such training, it is not one of ours, or the file cannot be written, which is found
@@ -54,7 +81,11 @@ def export_mesh(config: Path, path: Path, resolution: int = 512, *, level: int =
     """
     if not config.is_file():
         raise InputError(f"{config}: no such file; expected the config.yml that ns-train wrote")
-    check_mesh_path(path)
+    if texture is None:
+        check_mesh_path(path)
+    else:
+        check_textured_path(path)
+        check_texture_size(texture)
     from nerfstudio.utils.eval_utils import eval_setup  # pyright: ignore[reportMissingImports]
 
     _, pipeline, _, _ = eval_setup(config, test_mode="inference")
@@ -62,10 +93,30 @@ def export_mesh(config: Path, path: Path, resolution: int = 512, *, level: int =
     if not isinstance(field, NerfstudioField):
         raise InputError(f"{config}: trained by another method; expected mplicits or mplicits-facto")
     outputs = pipeline.datamanager.train_dataparser_outputs
-    mesh = colored_mesh(field, resolution, level=level)
-    mesh = in_data_coordinates(mesh, outputs.dataparser_transform, outputs.dataparser_scale)
+    move = np.asarray(outputs.dataparser_transform, np.float64), float(outputs.dataparser_scale)
+    if texture is not None:
+        mesh = in_data_coordinates(field.mesh(resolution, level=level, normals=False), *move)
+        return _textured(path, mesh, field.cpu(), move, texture, faces, level % field.field.num_levels)
+    mesh = in_data_coordinates(colored_mesh(field, resolution, level=level), *move)
     mesh.export(path)
     return mesh
+
+
+def _textured(path: Path, mesh: Mesh, field: NerfstudioField, move: Move, size: int, faces: int, level: int) -> Mesh:
+    """Write a mesh in the data's coordinates with images of the field's colours and normals."""
+    rotation = move[0][:, :3]
+
+    def colors_at(points: Float64) -> NDArray[np.float32]:
+        x = torch.from_numpy(_moved(points, *move)).to(field.field.like)
+        with torch.no_grad():
+            return torch.cat([field.frontal_colors(part) for part in x.split(BATCH)]).float().numpy()
+
+    def normals_at(points: Float64) -> NDArray[np.float64]:
+        return normals_near(field.field, _moved(points, *move) * field.scale, level=level) @ rotation
+
+    identity = Similarity((0.0, 0.0, 0.0), 1.0)
+    written = textured_mesh(path, mesh, identity, colors_at, normals_at, size=size, faces=faces)
+    return Mesh(written.vertices, written.faces.astype(np.int32), written.normals.astype(np.float32))
 
 
 @torch.no_grad()
@@ -96,6 +147,11 @@ def in_data_coordinates(mesh: Mesh, transform: ArrayLike, scale: float) -> Mesh:
     vertices = (mesh.vertices / float(scale) - shift) @ rotation
     normals = None if mesh.normals is None else (mesh.normals @ rotation).astype(np.float32)
     return dataclasses.replace(mesh, vertices=vertices, normals=normals)
+
+
+def _moved(points: Float64, transform: Float64, scale: float) -> Float64:
+    """Nerfstudio's scale · (R x + t)."""
+    return scale * (points @ transform[:, :3].T + transform[:, 3])
 
 
 if __name__ == "__main__":

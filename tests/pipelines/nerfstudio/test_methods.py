@@ -7,6 +7,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -134,6 +135,25 @@ def test_the_mesh_is_where_the_data_are(monkeypatch: pytest.MonkeyPatch, tmp_pat
     assert mesh.colors is not None
     assert (mesh.colors == [1, 0, 0]).all()
     assert (tmp_path / "ball.ply").stat().st_size > 0
+
+
+def test_a_texture_has_the_colours_and_normals_of_the_field(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """A sphere's normals are those of its mesh: the normal map is upright all over, to what a facet turns."""
+    pytest.importorskip("xatlas", reason="the extra mplicits[texture] is not installed")
+    pytest.importorskip("fast_simplification", reason="the extra mplicits[texture] is not installed")
+    field = NerfstudioField(Sphere(radius=0.25), Red(), heads=Heads, scale=0.5)
+    config, middle = exported(monkeypatch, tmp_path, field)
+    mesh = export_mesh(config, tmp_path / "ball.obj", 32, texture=64, faces=1000)
+    assert len(mesh.faces) <= 1000
+    assert abs(np.linalg.norm(mesh.vertices - middle, axis=1) - 1).max() < 0.02
+    color, normal = (cv2.imread(str(tmp_path / f"ball_{name}.png"))[..., ::-1] for name in ("color", "normal"))
+    assert (color == [255, 0, 0]).all()
+    upright = normal / 127.5 - 1
+    assert np.median(upright[..., 2]) > 0.99
+    with pytest.raises(InputError, match=r"textures are written as .glb or .obj"):
+        export_mesh(config, tmp_path / "ball.ply", 32, texture=64)
+    with pytest.raises(InputError, match="--texture 4: expected 16 to"):
+        export_mesh(config, tmp_path / "ball.glb", 32, texture=4)
 
 
 def test_undoing_the_move_of_the_data_is_exact() -> None:
