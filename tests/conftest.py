@@ -1,6 +1,7 @@
 """Device and dtype fixtures. A stand-in takes the place of a GPU, and CUDA comes beside it where there is one."""
 
 import os
+from importlib.util import find_spec
 
 import pytest
 import standin
@@ -49,5 +50,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         items[:] = [item for item in items if item not in set(again)]
 
 
-def pytest_report_header() -> str:
-    return f"devices: cpu, {', '.join(ACCELERATORS)}" + ("" if "cuda" in ACCELERATORS else " (no CUDA on this machine)")
+def pytest_report_header() -> list[str]:
+    devices = f"devices: cpu, {', '.join(ACCELERATORS)}"
+    missing = "" if find_spec("triton") else "kernels: Triton is not installed, so that their tests are left out"
+    return [devices + ("" if "cuda" in ACCELERATORS else " (no CUDA on this machine)"), *([missing] if missing else [])]

@@ -1,9 +1,14 @@
 """The kernels by Triton's interpreter where there is no CUDA, which `tests/conftest.py` has switched on."""
 
+from importlib.util import find_spec
+
 import pytest
 import torch
 
-pytest.importorskip("triton", reason="Triton is not installed: pip install 'mplicits[kernels]' on Linux")
+# Not pytest.importorskip: a folder's conftest that skips ends the run where the folder is named on the command line.
+# `tests/conftest.py` says at the top of the run what is left out.
+if find_spec("triton") is None:
+    collect_ignore_glob = ["test_*.py"]
 
 
 @pytest.fixture
