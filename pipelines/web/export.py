@@ -33,7 +33,7 @@ __all__ = ["BITS", "WebOptions", "WebPage", "web_run"]
 
 BITS = 16
 VERSION = 1
-SCRIPTS = ("decode.js", "network.js", "tracer.js", "camera.js", "page.js")
+SCRIPTS = ("decode.js", "network.js", "tracer.js", "renderer.js", "camera.js", "page.js")
 CHANNELS = 3
 ERROR_POINTS = 4000  # at which rounding is measured
 # The whole page: nothing is fetched, nothing is sent, and only the scripts and styles with these digests run.

@@ -45,7 +45,7 @@ class Page {
       throw new PageError('This graphics adapter cannot draw into float textures (EXT_color_buffer_float), in which the page computes. Another device can.');
     }
     this.gl = gl;
-    this.tracer = new Tracer(gl, this.parts, this.saved);
+    this.renderer = openRenderer(gl, this.parts, this.saved);
     this.shade = compile(gl, this.parts, 'plane', 'shade');
     this.coarse = this.fine = null;
   }
@@ -165,17 +165,24 @@ class Page {
     this.version++;
     if (this.waiting) return;
     this.waiting = true;
-    requestAnimationFrame(() => guarded(() => {
-      this.waiting = false;
+    requestAnimationFrame(() => this.next().catch(failed));
+  }
+
+  async next() {
+    const { version } = this;
+    try {
       if (this.lost) return;
       this.fit();
       const started = performance.now();
-      this.whole(this.factor);
+      await this.whole(this.factor);
       const took = performance.now() - started;
       this.factor = Math.min(COARSEST, Math.max(1, this.factor * Math.sqrt(took / FRAME) * 0.5 + this.factor * 0.5));
-      clearTimeout(this.timer);
-      this.timer = setTimeout(() => this.refine(this.version).catch(failed), REST);
-    }));
+    } finally {
+      this.waiting = false;
+    }
+    clearTimeout(this.timer);
+    if (this.version !== version) this.changed();
+    else this.timer = setTimeout(() => this.refine(version).catch(failed), REST);
   }
 
   fit() {
@@ -191,11 +198,15 @@ class Page {
     return resized(this.camera, Math.max(1, Math.round(this.camera.width / factor)), Math.max(1, Math.round(this.camera.height / factor)));
   }
 
+  wanted() {
+    return { level: this.level, normalLevel: this.normals, colored: this.shading > 2 };
+  }
+
   // The whole picture at once, in rays of `factor` pixels.
-  whole(factor) {
+  async whole(factor) {
     const grid = this.grid(factor);
     const started = performance.now();
-    const seen = this.tracer.trace(grid, { level: this.level, normalLevel: this.normals, colored: this.shading > 2 });
+    const seen = await this.renderer.frame(grid, this.wanted());
     this.speed = (grid.width * grid.height) / Math.max(1, performance.now() - started);
     this.keep('coarse', grid, seen, 0, grid.height);
     this.ready = 0;
@@ -214,7 +225,8 @@ class Page {
         if (this.version !== version || this.lost || document.hidden) return;
         const rows = Math.min(grid.height - first, Math.max(1, Math.floor((STRIP * this.speed) / grid.width)));
         const started = performance.now();
-        const seen = this.tracer.trace(grid, { level: this.level, normalLevel: this.normals, first, rows, colored: this.shading > 2 });
+        const seen = await this.renderer.frame(grid, { ...this.wanted(), first, rows });
+        if (this.version !== version || this.lost) return;
         // Empty strips are quick; the next may not be.
         this.speed = Math.min(1.5 * this.speed, (grid.width * rows) / Math.max(1, performance.now() - started));
         this.keep('fine', grid, seen, first, rows);
@@ -278,34 +290,27 @@ class Page {
   }
 
   // One picture of any camera, for tests and for other scripts: arrays of its pixels, and what they have cost.
-  render({ camera, level = this.level, normalLevel = level, precision = null, colored = false }) {
-    if (colored && !this.tracer.colors) throw new PageError('This page has no colours.');
-    const { counts } = this.tracer.networks;
-    for (const kind of ['values', 'jets']) counts[kind].fill(0);
-    Object.assign(counts, { passes: 0, read: 0 });
+  async render({ camera, level = this.level, normalLevel = level, precision = null, colored = false }) {
+    this.renderer.clear();
     const started = performance.now();
-    const made = this.tracer.trace(camera, { level, normalLevel, precision, colored });
-    return { width: camera.width, height: camera.height, ...made, milliseconds: performance.now() - started, counts: structuredClone(counts) };
+    const made = await this.renderer.frame(camera, { level, normalLevel, precision, colored });
+    return { ...made, milliseconds: performance.now() - started, counts: this.renderer.counts() };
   }
 
   // Pictures of a camera that goes around, one in each frame: how many in a second, and what one costs.
   async bench({ size = 512, frames = 12, level = this.level } = {}) {
     const orbit = new Orbit(this.saved.header.view);
     let milliseconds = 0, operations = 0, passes = 0, read = 0;
-    const evaluations = this.tracer.networks.nets.map(() => 0);
+    const evaluations = this.renderer.counts().values.map(() => 0);
     for (let frame = 0; frame < frames; frame++) {
       await new Promise((resolve) => { setTimeout(resolve, 0); });
       orbit.azimuth = (360 * frame) / frames;
-      const { counts, milliseconds: took } = this.render({ camera: orbit.camera(size, size), level });
+      const { counts, milliseconds: took } = await this.render({ camera: orbit.camera(size, size), level });
       milliseconds += took / frames;
       passes += counts.passes / frames;
       read += counts.read / frames;
-      this.tracer.networks.nets.forEach(({ width, depth }, index) => {
-        // A product of a weight and a sum are two operations; a jet goes through the matrices twice.
-        const once = 2 * width * (3 + (depth - 1) * width + 1), jets = counts.jets[index];
-        operations += (once * (counts.values[index] + 2 * jets)) / frames;
-        evaluations[index] += (counts.values[index] + jets) / frames / size ** 2;
-      });
+      operations += this.renderer.operations(counts) / frames;
+      evaluations.forEach((_, index) => { evaluations[index] += (counts.values[index] + counts.jets[index]) / frames / size ** 2; });
     }
     return { size, level, frames, fps: 1000 / milliseconds, milliseconds, evaluations, passes, read, operations };
   }
@@ -333,7 +338,7 @@ addEventListener('DOMContentLoaded', () => guarded(() => {
     return [part.slice(0, end), part.slice(end)];
   }));
   const page = new Page(decodeField(text('header'), text('data')), parts);
-  window.mplicits = { render: (wanted) => page.render(wanted), bench: (wanted) => page.bench(wanted), header: page.saved.header };
+  window.mplicits = { render: (wanted) => page.render(wanted), bench: (wanted) => page.bench(wanted), get renderer() { return page.renderer; }, header: page.saved.header };
   const wanted = new URLSearchParams(location.search);
   if (wanted.has('bench')) {
     const size = Math.min(1024, Math.max(16, Number(wanted.get('bench')) || 512));

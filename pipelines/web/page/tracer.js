@@ -181,6 +181,18 @@ class Tracer {
     this.hull = new Hull(gl, parts, arrays, header);
   }
 
+  get kind() {
+    return 'WebGL 2';
+  }
+
+  get counts() {
+    return this.networks.counts;
+  }
+
+  values(points, count, level) {
+    return this.field.value(points, count, level);
+  }
+
   // How many bands |f| = size is inside of, as the δ of the first that it is not; 0 after the last.
   band(size, level) {
     for (let j = 0; j < level; j++) if (size >= this.field.deltas[j]) return this.field.deltas[j];

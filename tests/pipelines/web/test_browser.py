@@ -39,11 +39,12 @@ SIZE = (96, 72)
 # Depths of both tracers are known to this, in units of the field.
 PRECISION = 1e-4
 RENDER = """
-const made = window.mplicits.render(arguments[0]);
+return window.mplicits.render(arguments[0]).then((made) => {
 const bytes = new Uint8Array(made.seen.buffer);
 let text = '';
 for (let i = 0; i < bytes.length; i += 4096) text += String.fromCharCode(...bytes.subarray(i, i + 4096));
 return {seen: btoa(text), color: Array.from(made.color), counts: made.counts};
+});
 """
 TITLE = "<img src=x onerror=alert(1)> & ball"
 
@@ -191,6 +192,20 @@ def test_colours_are_those_of_the_texture(opened):
     assert close.mean() > 0.99
     assert np.ptp(expected, axis=0).max() > 0.1
     assert len(rendered(opened, camera, level=0)[1]["color"]) == 0
+
+
+def test_a_single_ray_finds_what_the_picture_shows(opened):
+    camera, level = cameras()["around"]
+    found, _ = rendered(opened, camera, level=level)
+    row, column = np.argwhere(found[..., 3] > 0)[len(found) // 2]
+    x, y = int(column), int(row)
+    pick = "return window.mplicits.renderer.pick(arguments[0], arguments[1])"
+    picked = opened.execute_script(pick, x, y)
+    assert np.allclose([*picked["normal"], picked["depth"]], found[row, column], atol=1e-4)
+    script = "return window.mplicits.renderer.values(Float32Array.from(arguments[0]), 2).then((f) => Array.from(f))"
+    (value,) = opened.execute_script(script, picked["position"])
+    assert abs(value) <= 2 * PRECISION
+    assert opened.execute_script(pick, -50, -50) is None
 
 
 def test_the_bench_counts_what_networks_are_asked(opened):

@@ -1,0 +1,83 @@
+// What the page asks of whatever traces: pictures, single points, values, and what they have cost. Each call is answered
+// by a promise, one after the other, so that none meets the buffers of another half used.
+
+class Renderer {
+  constructor(tracer, { header }) {
+    this.tracer = tracer;
+    this.header = header;
+    this.camera = this.options = null;
+    this.last = Promise.resolve();
+    this.clear();
+  }
+
+  get kind() {
+    return this.tracer.kind;
+  }
+
+  get colored() {
+    return Boolean(this.header.colors);
+  }
+
+  queue(work) {
+    const answer = this.last.then(work);
+    this.last = answer.catch(() => {});
+    return answer;
+  }
+
+  // What rows [first, first + rows) of a camera's picture see: `seen` has for each pixel, row by row from the upper left,
+  // the normal and the depth along the ray, 0 where nothing is; `color` its own colours where they were asked for.
+  //
+  // Options: level, normalLevel (whose normals), first, rows, colored, and precision: of depths, in units of the field;
+  // null is a tenth of a pixel.
+  frame(camera, options) {
+    if (options.colored && !this.colored) throw new PageError('This page has no colours.');
+    return this.queue(async () => {
+      [this.camera, this.options] = [camera, options];
+      return { width: camera.width, height: camera.height, ...await this.tracer.trace(camera, options) };
+    });
+  }
+
+  // What stands at a place of the last frame, in its pixels from the middle of the upper left one: position, normal and
+  // depth in the field's units, by a ray of its own; null where nothing is.
+  async pick(x, y) {
+    const { camera, options } = this;
+    if (!camera) return null;
+    const one = { ...camera, cx: camera.cx - x, cy: camera.cy - y, width: 1, height: 1 };
+    const { seen } = await this.queue(() => this.tracer.trace(one, { ...options, first: 0, rows: 1, colored: false }));
+    const [nx, ny, nz, depth] = seen;
+    if (!depth) return null;
+    const across = -one.cx / one.fx, down = -one.cy / one.fy, length = Math.hypot(across, down, 1);
+    const position = one.eye.map((part, c) => part + (depth * (one.right[c] * across + one.down[c] * down + one.forward[c])) / length);
+    return { position, normal: [nx, ny, nz], depth };
+  }
+
+  // The values of a level at points x, y, z, x, y, …, in the field's units.
+  values(points, level) {
+    return this.queue(() => this.tracer.values(points, points.length / 3, level));
+  }
+
+  // Since `clear`: of each network (the colours' last) the values and the jets that were asked for; passes of the
+  // adapter, and bytes read back.
+  counts() {
+    return structuredClone(this.tracer.counts);
+  }
+
+  clear() {
+    const { counts } = this.tracer;
+    for (const kind of ['values', 'jets']) counts[kind].fill(0);
+    Object.assign(counts, { passes: 0, read: 0 });
+  }
+
+  // Operations of those counts: a product of a weight and a sum are two, and a jet goes through the matrices twice.
+  operations({ values, jets }) {
+    const { levels, colors } = this.header;
+    return [...levels, ...(colors ? [colors] : [])].reduce((sum, { width, depth }, index) => {
+      const once = 2 * width * (3 + (depth - 1) * width + 1);
+      return sum + once * (values[index] + 2 * jets[index]);
+    }, 0);
+  }
+}
+
+function openRenderer(gl, parts, saved) {
+  return new Renderer(new Tracer(gl, parts, saved), saved);
+}
