@@ -33,7 +33,17 @@ __all__ = ["BITS", "WebOptions", "WebPage", "web_run"]
 
 BITS = 16
 VERSION = 1
-SCRIPTS = ("decode.js", "network.js", "tracer.js", "renderer.js", "camera.js", "page.js")
+SCRIPTS = (
+    "decode.js",
+    "network.js",
+    "tracer.js",
+    "renderer.js",
+    "camera.js",
+    "interface.js",
+    "controls.js",
+    "page.js",
+    "main.js",
+)
 CHANNELS = 3
 ERROR_POINTS = 4000  # at which rounding is measured
 # The whole page: nothing is fetched, nothing is sent, and only the scripts and styles with these digests run.

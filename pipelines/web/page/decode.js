@@ -29,7 +29,7 @@ function checksum(bytes) {
 }
 
 // The header and the arrays of a page; what is cut off, changed or of another kind is refused.
-function decodeField(headerText, dataText) {
+function decodeField(headerText, bytes) {
   let header;
   try {
     header = JSON.parse(headerText);
@@ -38,7 +38,6 @@ function decodeField(headerText, dataText) {
   }
   if (header?.format !== 'mplicits-web') throw new PageError('The data in this page is no field of mplicits.');
   if (header.version !== 1) throw new PageError(`The field in this page is of version ${header.version}; this page reads 1.`);
-  const bytes = bytesOf(dataText);
   if (bytes.length !== header.bytes || checksum(bytes) !== header.crc32) {
     throw new PageError('The field in this page is damaged or cut off. Copy the page again, or write it again with `mplicits web`.');
   }

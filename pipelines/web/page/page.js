@@ -1,7 +1,5 @@
-// The page: what is on it, what moves the camera, and when pictures are traced. Whatever comes from the run is put in as
-// text, never as HTML.
+// The page: its pictures, when they are traced, and how fine. Whatever comes from the run is put in as text, never as HTML.
 
-const byId = (id) => document.getElementById(id);
 const COARSEST = 16, FINEST = 0.5; // canvas pixels per ray
 const FRAME = 40, STRIP = 60, REST = 180; // milliseconds: of a picture while it moves, of a strip, before it is refined
 const THEMES = {
@@ -9,31 +7,30 @@ const THEMES = {
   light: { paper: [0.957, 0.949, 0.933], clay: [0.77, 0.72, 0.66] },
 };
 
-function tell(reason) {
-  byId('reason').textContent = reason;
-  byId('message').hidden = false;
-  byId('panel').hidden = true;
-}
-
 const digits = (number) => Number(number.toPrecision(3)).toLocaleString('en', { maximumSignificantDigits: 3 });
 
 class Page {
-  constructor(saved, parts) {
+  // A field, its shaders, where it is shown; and what is wished: {camera: [azimuth, elevation], pixel}.
+  constructor(saved, parts, ui, { camera = null, pixel = 0 } = {}) {
     this.saved = saved;
     this.parts = parts;
-    this.canvas = byId('picture');
+    this.ui = ui;
+    this.ended = new AbortController();
+    this.canvas = ui.picture;
     this.orbit = new Orbit(saved.header.view);
+    if (camera) Object.assign(this.orbit, { azimuth: camera[0], elevation: Math.min(90, Math.max(-90, camera[1])) });
     this.level = this.normals = saved.header.levels.length - 1;
     this.shading = saved.header.colors ? 3 : 2; // 3 is colours in light, 4 bare colours; they want the network of colours
     this.factor = COARSEST; // canvas pixels per ray while it moves; less as soon as the adapter shows how fast it is
     this.speed = 200;     // pixels per millisecond
-    const pixel = Number(new URLSearchParams(location.search).get('pixel')); // coarser at rest, for slow adapters
-    this.finest = pixel > 0 ? Math.min(COARSEST, Math.max(FINEST, pixel)) : FINEST;
+    this.finest = pixel > 0 ? Math.min(COARSEST, Math.max(FINEST, pixel)) : FINEST; // coarser at rest, for slow adapters
     this.drawn = 0;       // pictures so far
     this.version = 0;     // of what is to be seen; a refinement of an older one ends
     this.open();
     this.describe();
-    this.listen();
+    this.controls = new Controls(this);
+    this.watch();
+    ui.carryOn();
     this.changed();
   }
 
@@ -52,112 +49,42 @@ class Page {
 
   describe() {
     const { header } = this.saved;
-    document.title = header.title;
-    byId('title').textContent = header.title;
+    this.ui.title.textContent = header.title;
     const sizes = header.levels.map(({ width, depth }) => `${width} × ${depth}`).join(', ');
     const bands = header.deltas.length ? ` · bands δ = ${header.deltas.map((delta) => digits(delta * header.unit)).join(', ')} input units` : '';
     const exact = header.bits === null
       ? 'weights in float32'
       : `weights of ${header.bits} bits: off by ≤ ${digits(Math.max(...header.rounding.map((part) => part.value)) * header.unit)} units, ${digits(Math.max(...header.rounding.map((part) => part.angle)))}°`;
-    byId('facts').textContent = `SIRENs ${sizes}${bands} · ${exact}`;
-    for (const id of ['level', 'normals']) {
-      header.levels.forEach((_, index) => byId(id).append(new Option(index === header.levels.length - 1 && index ? `${index} (finest)` : `${index}`, index)));
-      byId(id).value = this.level;
-    }
-    const wanted = new URLSearchParams(location.search);
-    const given = (wanted.get('camera') ?? '').split(',').map(Number);
-    if (wanted.has('camera') && given.length === 2 && given.every(Number.isFinite)) {
-      [this.orbit.azimuth, this.orbit.elevation] = [given[0], Math.min(90, Math.max(-90, given[1]))];
-    }
-    if (header.colors) byId('shading').prepend(new Option('colours', 3), new Option('bare colours', 4));
-    byId('shading').value = this.shading;
-    this.setTheme(matchMedia('(prefers-color-scheme: light)').matches ? 'light' : 'dark');
-    byId('message').hidden = true;
-    byId('panel').hidden = false;
+    this.ui.facts.textContent = `SIRENs ${sizes}${bands} · ${exact}`;
   }
 
-  setTheme(name) {
-    this.theme = name;
-    document.documentElement.dataset.theme = name;
-  }
-
-  listen() {
-    const { canvas, orbit } = this;
-    const held = new Map();
-    const share = () => Math.min(canvas.clientWidth, canvas.clientHeight);
-    canvas.addEventListener('pointerdown', (event) => {
-      canvas.setPointerCapture(event.pointerId);
-      held.set(event.pointerId, [event.clientX, event.clientY]);
-    });
-    canvas.addEventListener('pointermove', (event) => {
-      if (!held.has(event.pointerId)) return;
-      const before = [...held.values()], [x, y] = held.get(event.pointerId);
-      held.set(event.pointerId, [event.clientX, event.clientY]);
-      const dx = (event.clientX - x) / share(), dy = (event.clientY - y) / share();
-      if (before.length === 1) {
-        if (event.buttons & 2 || event.buttons & 4 || event.shiftKey) orbit.pan(dx, dy);
-        else orbit.turn(180 * dx, 180 * dy);
-      } else if (before.length === 2) { // each finger moves the middle of the two by half
-        const spread = ([[ax, ay], [bx, by]]) => Math.hypot(ax - bx, ay - by);
-        orbit.pan(dx / 2, dy / 2);
-        orbit.zoom(spread([...held.values()]) / Math.max(1, spread(before)));
-      }
-      this.changed();
-    });
-    for (const end of ['pointerup', 'pointercancel', 'lostpointercapture']) canvas.addEventListener(end, (event) => held.delete(event.pointerId));
-    canvas.addEventListener('contextmenu', (event) => event.preventDefault());
-    canvas.addEventListener('wheel', (event) => {
-      event.preventDefault();
-      const lines = event.deltaMode === WheelEvent.DOM_DELTA_PIXEL ? event.deltaY / 30 : event.deltaY;
-      orbit.zoom(1.08 ** -Math.max(-8, Math.min(8, lines)));
-      this.changed();
-    }, { passive: false });
-    canvas.addEventListener('keydown', (event) => {
-      if (event.ctrlKey || event.metaKey || event.altKey) return;
-      const move = (x, y) => (event.shiftKey ? orbit.pan(x / 20, y / 20) : orbit.turn(6 * x, 6 * y));
-      const keys = {
-        ArrowLeft: () => move(-1, 0), ArrowRight: () => move(1, 0), ArrowUp: () => move(0, -1), ArrowDown: () => move(0, 1),
-        '+': () => orbit.zoom(1.15), '=': () => orbit.zoom(1.15), '-': () => orbit.zoom(1 / 1.15), Home: () => orbit.reset(),
-      };
-      const level = Number(event.key);
-      if (keys[event.key]) keys[event.key]();
-      else if (event.key.trim() && level < this.saved.header.levels.length) this.choose(level, level);
-      else return;
-      event.preventDefault();
-      this.changed();
-    });
-    byId('level').addEventListener('change', ({ target }) => this.choose(Number(target.value), Number(target.value)));
-    byId('normals').addEventListener('change', ({ target }) => this.choose(this.level, Number(target.value)));
-    byId('shading').addEventListener('change', ({ target }) => {
-      this.shading = Number(target.value);
-      if (this.shading > 2) this.changed();
-      else this.present();
-    });
-    byId('reset').addEventListener('click', () => { orbit.reset(); this.changed(); });
-    byId('theme').addEventListener('click', () => { this.setTheme(this.theme === 'dark' ? 'light' : 'dark'); this.present(); });
-    byId('panel').addEventListener('submit', (event) => event.preventDefault());
-    addEventListener('resize', () => this.changed());
-    document.addEventListener('visibilitychange', () => { if (!document.hidden) this.changed(); });
+  // The size of the canvas, and the adapter, may change under us.
+  watch() {
+    const { canvas, ui } = this;
+    const seen = new ResizeObserver(() => this.changed());
+    seen.observe(canvas);
+    this.ended.signal.addEventListener('abort', () => seen.disconnect());
     canvas.addEventListener('webglcontextlost', (event) => {
       event.preventDefault(); // or it would never come back
       this.version++;
       this.lost = true;
-      tell('The graphics adapter was taken away from this page. It goes on as soon as it is back; if nothing happens, reload the page.');
+      ui.tell('The graphics adapter was taken away from this page. It goes on as soon as it is back; if nothing happens, reload the page.');
     });
-    canvas.addEventListener('webglcontextrestored', () => guarded(() => {
+    canvas.addEventListener('webglcontextrestored', () => ui.guarded(() => {
       this.lost = false;
       this.open();
-      byId('message').hidden = true;
-      byId('panel').hidden = false;
+      ui.carryOn();
       this.changed();
     }));
   }
 
-  choose(level, normals) {
-    [this.level, this.normals] = [level, normals];
-    byId('level').value = level;
-    byId('normals').value = normals;
-    this.changed();
+  // For good: the adapter's memory is given back.
+  close() {
+    this.ended.abort();
+    this.version++;
+    this.lost = true;
+    clearTimeout(this.timer);
+    this.gl.getExtension('WEBGL_lose_context')?.loseContext();
   }
 
   // Something else is to be seen: a coarse picture in the next frame, and finer ones when it rests.
@@ -165,7 +92,7 @@ class Page {
     this.version++;
     if (this.waiting) return;
     this.waiting = true;
-    requestAnimationFrame(() => this.next().catch(failed));
+    requestAnimationFrame(() => this.next().catch((error) => this.ui.failed(error)));
   }
 
   async next() {
@@ -182,7 +109,7 @@ class Page {
     }
     clearTimeout(this.timer);
     if (this.version !== version) this.changed();
-    else this.timer = setTimeout(() => this.refine(version).catch(failed), REST);
+    else this.timer = setTimeout(() => this.refine(version).catch((error) => this.ui.failed(error)), REST);
   }
 
   fit() {
@@ -190,7 +117,7 @@ class Page {
     const width = Math.max(1, Math.round(this.canvas.clientWidth * ratio)), height = Math.max(1, Math.round(this.canvas.clientHeight * ratio));
     if (this.canvas.width !== width || this.canvas.height !== height) Object.assign(this.canvas, { width, height });
     // The shape stands in the middle of what the panel leaves free.
-    const free = height - ratio * (byId('panel').offsetHeight + 24);
+    const free = height - ratio * (this.ui.panel.offsetHeight + 24);
     this.camera = { ...this.orbit.camera(width, Math.max(height / 2, free)), height };
   }
 
@@ -238,7 +165,7 @@ class Page {
       [this.coarse, this.fine] = [this.fine, this.coarse];
       this.ready = 0;
     }
-    document.documentElement.dataset.finished = this.drawn;
+    this.ui.told.finished = this.drawn;
   }
 
   // Rows of a picture into its textures: what is seen, and its colours, of which a picture without them has one texel.
@@ -264,7 +191,7 @@ class Page {
   present() {
     const { gl, shade, camera } = this;
     if (this.lost || !this.coarse) return;
-    document.documentElement.dataset.drawn = ++this.drawn;
+    this.ui.told.drawn = ++this.drawn;
     const { paper, clay } = THEMES[this.theme];
     gl.useProgram(shade.program);
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
@@ -286,7 +213,7 @@ class Page {
   }
 
   report(grid, more) {
-    byId('state').textContent = `${grid.width} × ${grid.height} rays${more ? ' …' : ''}`;
+    this.ui.state.textContent = `${grid.width} × ${grid.height} rays${more ? ' …' : ''}`;
   }
 
   // One picture of any camera, for tests and for other scripts: arrays of its pixels, and what they have cost.
@@ -317,31 +244,6 @@ class Page {
 
   describeBench({ size, level, fps, evaluations, passes, read, operations }) {
     const each = evaluations.map(digits).join(' + ');
-    byId('facts').textContent = `level ${level} at ${size} × ${size}: ${digits(fps)} pictures a second; ${each} evaluations per pixel, ${digits(operations / 1e9)} GFLOP, ${digits(passes)} passes, ${digits(read / 2 ** 20)} MiB read back, each picture`;
+    this.ui.facts.textContent = `level ${level} at ${size} × ${size}: ${digits(fps)} pictures a second; ${each} evaluations per pixel, ${digits(operations / 1e9)} GFLOP, ${digits(passes)} passes, ${digits(read / 2 ** 20)} MiB read back, each picture`;
   }
 }
-
-const failed = (error) => tell(error instanceof PageError ? error.message : `Something went wrong in this page: ${error.message}`);
-
-function guarded(work) {
-  try {
-    work();
-  } catch (error) {
-    failed(error);
-  }
-}
-
-addEventListener('DOMContentLoaded', () => guarded(() => {
-  const text = (id) => byId(id)?.textContent ?? '';
-  const parts = new Map(text('shaders').split('#part ').slice(1).map((part) => {
-    const end = part.indexOf('\n');
-    return [part.slice(0, end), part.slice(end)];
-  }));
-  const page = new Page(decodeField(text('header'), text('data')), parts);
-  window.mplicits = { render: (wanted) => page.render(wanted), bench: (wanted) => page.bench(wanted), get renderer() { return page.renderer; }, header: page.saved.header };
-  const wanted = new URLSearchParams(location.search);
-  if (wanted.has('bench')) {
-    const size = Math.min(1024, Math.max(16, Number(wanted.get('bench')) || 512));
-    page.bench({ size }).then((found) => page.describeBench(found)).catch(failed);
-  }
-}));

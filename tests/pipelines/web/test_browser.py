@@ -243,6 +243,7 @@ def test_what_a_person_sees_and_does(opened):
     until(lambda: pictures(opened) > drawn)
     assert opened.get_screenshot_as_png() != before
     drawn = pictures(opened)
+    opened.find_element(By.TAG_NAME, "summary").click()
     opened.find_element(By.ID, "theme").click()
     until(lambda: pictures(opened) > drawn)
     assert not complaints(opened)

@@ -1,0 +1,120 @@
+// What moves the camera and changes what is seen: pointers, fingers, keys, and the controls of the panel.
+
+class Controls {
+  constructor(page) {
+    this.page = page;
+    this.ui = page.ui;
+    this.held = new Map();
+    this.fill();
+    this.panel();
+    this.pointers();
+    this.keys();
+  }
+
+  fill() {
+    const { ui, page } = this;
+    const { levels, colors } = page.saved.header;
+    const last = levels.length - 1;
+    ui.level.max = last;
+    ui.levels.hidden = !last;
+    ui.normals.replaceChildren(...levels.map((_, index) => new Option(index === last ? `${index} (finest)` : index, index)));
+    ui.normals.parentNode.hidden = !last;
+    if (colors) ui.shading.prepend(new Option('colours', 3), new Option('bare colours', 4));
+    const bright = matchMedia('(prefers-color-scheme: light)');
+    this.setTheme(bright.matches ? 'light' : 'dark');
+    bright.addEventListener('change', () => {
+      this.setTheme(bright.matches ? 'light' : 'dark');
+      page.present();
+    }, this.heard);
+    this.show();
+  }
+
+  // Listeners on what outlives the page end with it.
+  get heard() {
+    return { signal: this.page.ended.signal };
+  }
+
+  // The controls as the page is.
+  show() {
+    const { ui, page } = this;
+    ui.level.value = page.level;
+    ui.levelName.textContent = page.level;
+    ui.normals.value = page.normals;
+    ui.shading.value = page.shading;
+  }
+
+  setTheme(name) {
+    this.page.theme = this.ui.stage.dataset.theme = name;
+  }
+
+  choose(level, normals) {
+    Object.assign(this.page, { level, normals });
+    this.show();
+    this.page.changed();
+  }
+
+  panel() {
+    const { ui, page } = this;
+    ui.level.addEventListener('input', () => this.choose(Number(ui.level.value), Number(ui.level.value)));
+    ui.normals.addEventListener('change', () => this.choose(page.level, Number(ui.normals.value)));
+    ui.shading.addEventListener('change', () => {
+      page.shading = Number(ui.shading.value);
+      if (page.shading > 2) page.changed();
+      else page.present();
+    });
+    ui.reset.addEventListener('click', () => { page.orbit.reset(); page.changed(); });
+    ui.theme.addEventListener('click', () => { this.setTheme(page.theme === 'dark' ? 'light' : 'dark'); page.present(); });
+    ui.panel.addEventListener('submit', (event) => event.preventDefault());
+    document.addEventListener('visibilitychange', () => { if (!document.hidden) page.changed(); }, this.heard);
+  }
+
+  pointers() {
+    const { page, held } = this, { canvas, orbit } = page;
+    const share = () => Math.min(canvas.clientWidth, canvas.clientHeight);
+    canvas.addEventListener('pointerdown', (event) => {
+      canvas.setPointerCapture(event.pointerId);
+      held.set(event.pointerId, [event.clientX, event.clientY]);
+    });
+    canvas.addEventListener('pointermove', (event) => {
+      if (!held.has(event.pointerId)) return;
+      const before = [...held.values()], [x, y] = held.get(event.pointerId);
+      held.set(event.pointerId, [event.clientX, event.clientY]);
+      const dx = (event.clientX - x) / share(), dy = (event.clientY - y) / share();
+      if (before.length === 1) {
+        if (event.buttons & 2 || event.buttons & 4 || event.shiftKey) orbit.pan(dx, dy);
+        else orbit.turn(180 * dx, 180 * dy);
+      } else if (before.length === 2) { // each finger moves the middle of the two by half
+        const spread = ([[ax, ay], [bx, by]]) => Math.hypot(ax - bx, ay - by);
+        orbit.pan(dx / 2, dy / 2);
+        orbit.zoom(spread([...held.values()]) / Math.max(1, spread(before)));
+      }
+      page.changed();
+    });
+    for (const end of ['pointerup', 'pointercancel', 'lostpointercapture']) canvas.addEventListener(end, (event) => held.delete(event.pointerId));
+    canvas.addEventListener('contextmenu', (event) => event.preventDefault());
+    canvas.addEventListener('wheel', (event) => {
+      event.preventDefault();
+      const lines = event.deltaMode === WheelEvent.DOM_DELTA_PIXEL ? event.deltaY / 30 : event.deltaY;
+      orbit.zoom(1.08 ** -Math.max(-8, Math.min(8, lines)));
+      page.changed();
+    }, { passive: false });
+  }
+
+  keys() {
+    const { page } = this, { orbit } = page;
+    page.canvas.addEventListener('keydown', (event) => {
+      if (event.ctrlKey || event.metaKey || event.altKey) return;
+      const move = (x, y) => (event.shiftKey ? orbit.pan(x / 20, y / 20) : orbit.turn(6 * x, 6 * y));
+      const keys = {
+        ArrowLeft: () => move(-1, 0), ArrowRight: () => move(1, 0), ArrowUp: () => move(0, -1), ArrowDown: () => move(0, 1),
+        '+': () => orbit.zoom(1.15), '=': () => orbit.zoom(1.15), '-': () => orbit.zoom(1 / 1.15), Home: () => orbit.reset(),
+      };
+      const level = Number(event.key);
+      if (keys[event.key]) keys[event.key]();
+      else if (event.key.trim() && level < page.saved.header.levels.length) this.choose(level, level);
+      else return;
+      event.preventDefault();
+      page.changed();
+    });
+  }
+}
