@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
@@ -15,9 +16,13 @@ from torch import Tensor, nn
 from ._fixed import FixedShapes, current_shapes
 from .field import Field, Jet, SecondJet
 from .function import FieldLike, as_field
-from .siren import Siren
+from .kernels.switch import Choice, choose
+from .siren import Siren, needs_graph
 
-__all__ = ["MultiscaleSDF", "Parts", "levels_of", "walk_levels"]
+if TYPE_CHECKING:
+    from .kernels.levels import Levels
+
+__all__ = ["MultiscaleSDF", "Parts", "choose_levels", "levels_of", "walk_levels"]
 
 # The tensors of a jet of any order, the value first; ``(N,)``, alone or with features, is a jet of order 0.
 Parts = tuple[Tensor, ...]
@@ -126,6 +131,12 @@ class MultiscaleSDF(Field):
 
     def value(self, x: Tensor, *, level: int = -1) -> Tensor:
         """See `Field.value`; outside the band of level j − 1, level j is level j − 1."""
+        fused = self._fused(x, level, jet=False)
+        if fused.precision:
+            from .kernels.levels import levels_value
+
+            rows = self.check_points(x).reshape(-1, self.in_dim)
+            return levels_value(rows, self.as_levels(level), fused.precision, _wanted()).reshape(x.shape[:-1])
         (f,) = deque(self._walk(x, level, _value), maxlen=1).pop()
         return f
 
@@ -141,6 +152,13 @@ class MultiscaleSDF(Field):
 
     def jet(self, x: Tensor, *, level: int = -1) -> Jet:
         """See `Field.jet`; inside a tapered band ∇(γr) = γ∇r + r γ′ ∇f."""
+        fused = self._fused(x, level, jet=True)
+        if fused.precision:
+            from .kernels.levels import levels_jet
+
+            rows, shape = self.check_points(x).reshape(-1, self.in_dim), x.shape[:-1]
+            value, gradient = levels_jet(rows, self.as_levels(level), fused.precision, _wanted())
+            return Jet(value.reshape(shape), gradient.reshape(x.shape), x.new_empty(*shape, 0))
         return Jet(*deque(self._walk(x, level, lambda part, points: part.jet(points)), maxlen=1).pop())
 
     def second_jet(self, x: Tensor, *, level: int = -1, dims: int | None = None) -> SecondJet:
@@ -148,6 +166,25 @@ class MultiscaleSDF(Field):
         dims = self.resolve_dims(dims)
         walk = self._walk(x, level, lambda part, points: part.second_jet(points, dims=dims))
         return SecondJet(*deque(walk, maxlen=1).pop())
+
+    def as_levels(self, level: int = -1) -> Levels:
+        """As the fused kernels take it, if all levels up to ``level`` are networks (`choose_levels`)."""
+        from .kernels.levels import Levels
+
+        networks = [
+            part.as_network() for part in self.levels[: self.resolve_level(level) + 1] if isinstance(part, Siren)
+        ]
+        return Levels.of(networks, self.deltas, self.taper)
+
+    def _fused(self, x: Tensor, level: int, *, jet: bool) -> Choice:
+        """Whether one launch evaluates all levels up to ``level`` at ``x``."""
+        levels = self.levels[: self.resolve_level(level) + 1]
+        if len(levels) == 1:
+            return Choice("", "one level is evaluated by itself")
+        choice = choose_levels(levels, x, jet=jet)
+        if choice.precision and needs_graph(x, [weight for part in levels for weight in part.parameters()]):
+            return Choice("", "a graph is recorded; levels are evaluated one by one")
+        return choice
 
     def _walk(self, x: Tensor, level: int, evaluate: Callable[[Field, Tensor], Parts]) -> Iterator[Parts]:
         """The jets of the levels up to ``level``."""
@@ -194,6 +231,26 @@ class MultiscaleSDF(Field):
 def levels_of(field: Field) -> tuple[Field, ...]:
     """The levels of a `MultiscaleSDF`, coarse to fine; any other field is of one piece."""
     return field.levels if isinstance(field, MultiscaleSDF) else (field,)
+
+
+def choose_levels(levels: Sequence[Field], x: Tensor, *, jet: bool) -> Choice:
+    """How levels are to be evaluated together at points ``x``, without a graph: see `kernels.switch`.
+
+    Args:
+        levels: coarse to fine.
+        x: the points.
+        jet: gradients and features are asked for beside the values.
+    """
+    networks = [level for level in levels if isinstance(level, Siren)]
+    if len(networks) < len(levels):
+        return Choice("", "a level is no SIREN")
+    return choose(
+        x,
+        width=max(network.width for network in networks),
+        depth=max(network.depth for network in networks),
+        features=networks[0].num_features if jet else 0,
+        levels=len(networks),
+    )
 
 
 def walk_levels(
@@ -264,6 +321,15 @@ def _walk_on(
                 for part, new in zip(parts, joined, strict=True)
             )
         yield parts
+
+
+def _wanted() -> Tensor | None:
+    """The points that are let into bands where shapes are fixed; one launch has room for all of them."""
+    shapes = current_shapes()
+    if shapes is None:
+        return None
+    shapes.begin()
+    return shapes.wanted
 
 
 def _value(level: Field, points: Tensor) -> Parts:

@@ -18,9 +18,11 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-__all__ = ["rounding_bound"]
+__all__ = ["gated_bound", "rounding_bound"]
 
 SINE_ERROR = 4.0  # in u
+# Roundings of a gate, and of the sum behind it.
+GATE, SUM = 8, 4
 # Beside the terms of a product: the bias, ω₀ or a unit, a rounding of the weight that was multiplied by it, the store.
 FURTHER = 4
 
@@ -59,6 +61,57 @@ def rounding_bound(
         error = error + (s.abs() + error) * u
         g, error = s @ weight, error @ weight.abs() + _gamma(len(weight), u) * ((s.abs() + error) @ weight.abs())
     return value, error
+
+
+def gated_bound(
+    jets: Sequence[tuple[Tensor, Tensor]],
+    bounds: Sequence[tuple[Tensor, Tensor]],
+    deltas: Tensor,
+    taper: float,
+    dtype: torch.dtype = torch.float32,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Bounds for levels that are added up behind their gates, and where they hold.
+
+    The gate γ of `mplicits.neural_fields.multiscale` has a slope of at most 3/2 by u, and γ′ one of at most 6/(δτ),
+    while u is off by what f is off by over δτ, and by some roundings over τ; the rest is the product rule. Where |f| is
+    nearer to δ than f is off by, rounding decides whether the next level is added at all.
+
+    Args:
+        jets: exact values ``(N,)`` and gradients ``(N, d)`` of each level by itself, at all points, in float64.
+        bounds: on each, see `rounding_bound`.
+        deltas: half-widths of the bands.
+        taper: see `MultiscaleSDF`.
+        dtype: the precision whose errors are meant.
+
+    Returns:
+        ``(N,)`` bool, where no decision is rounding's; bounds on the value ``(N,)`` and the gradient ``(N, d)``.
+    """
+    rounding = torch.finfo(dtype).eps / 2
+    (f, g), (f_off, g_off) = jets[0], bounds[0]
+    inside = torch.ones_like(f, dtype=torch.bool)
+    sure = inside
+    for (r, slope), (r_off, slope_off), delta in zip(jets[1:], bounds[1:], deltas.double(), strict=True):
+        sure = sure & (~inside | ((f.abs() - delta).abs() > f_off))
+        inside = inside & (f.abs() < delta)
+        gate, fall = torch.ones_like(f), torch.zeros_like(f)
+        gate_off, fall_off = fall, fall
+        if taper:
+            u = ((f.abs() / delta - (1 - taper)) / taper).clamp(0, 1)
+            gate, fall = 1 - u * u * (3 - 2 * u), -6 * u * (1 - u) * f.sign() / (delta * taper)
+            u_off = f_off / (delta * taper) + GATE * rounding / taper
+            gate_off = 1.5 * u_off + GATE * rounding
+            fall_off = 6 * (u_off + GATE * rounding) / (delta * taper)
+        steeper = 1 + fall * r
+        steeper_off = r.abs() * fall_off + (fall.abs() + fall_off) * r_off + SUM * rounding * (1 + (fall * r).abs())
+        joined_off = f_off + (r.abs() + r_off) * gate_off + gate * r_off + SUM * rounding * (f.abs() + r.abs())
+        columns = (gate[:, None], gate_off[:, None], steeper.abs()[:, None], steeper_off[:, None])
+        joined_g_off = columns[2] * g_off + columns[3] * (g.abs() + g_off) + columns[0] * slope_off
+        joined_g_off = joined_g_off + columns[1] * (slope.abs() + slope_off)
+        joined_g_off = joined_g_off + SUM * rounding * (columns[2] * g.abs() + slope.abs())
+        f_off, g_off = torch.where(inside, joined_off, f_off), torch.where(inside[:, None], joined_g_off, g_off)
+        g = torch.where(inside[:, None], steeper[:, None] * g + gate[:, None] * slope, g)
+        f = torch.where(inside, f + gate * r, f)
+    return sure, f_off, g_off
 
 
 def _gamma(terms: int, u: float) -> float:

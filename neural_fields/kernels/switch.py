@@ -24,12 +24,14 @@ from torch import Tensor
 
 from ..errors import InputError
 
-__all__ = ["MAX_DEPTH", "MAX_WIDTH", "MODES", "VARIABLE", "Choice", "choose", "mode", "obstacle"]
+__all__ = ["MAX_DEPTH", "MAX_LEVELS", "MAX_WIDTH", "MODES", "VARIABLE", "Choice", "choose", "mode", "obstacle"]
 
 VARIABLE = "MPLICITS_KERNELS"
 MODES = ("auto", "off", "tf32x3", "tf32", "interpret")
 # What is tested; wider and deeper ones would run, and keep more in scratch than caches hold.
 MAX_WIDTH, MAX_DEPTH = 512, 8
+# A kernel over levels has the code of each; compiling takes some seconds for one of them.
+MAX_LEVELS = 4
 # Before it, no tensor cores for float32 of any kind; Triton itself wants 7.0.
 LEAST_CAPABILITY = (8, 0)
 
@@ -58,14 +60,15 @@ def mode() -> str:
     return said
 
 
-def choose(x: Tensor, *, width: int, depth: int, features: int = 0) -> Choice:
-    """How a SIREN is to be evaluated at points ``x`` without a graph.
+def choose(x: Tensor, *, width: int, depth: int, features: int = 0, levels: int = 1) -> Choice:
+    """How a SIREN, or several of them in one launch, is to be evaluated at points ``x`` without a graph.
 
     Args:
         x: the points.
-        width: of its sine layers.
-        depth: how many it has.
+        width: of its sine layers; of several, the largest.
+        depth: how many it has; likewise.
         features: how many outputs beside the value are asked for.
+        levels: how many SIRENs; only level by level where they are more than `MAX_LEVELS`.
 
     Raises:
         InputError: see `mode`.
@@ -82,6 +85,8 @@ def choose(x: Tensor, *, width: int, depth: int, features: int = 0) -> Choice:
         reason = "features are asked for; the kernels have none"
     elif width > MAX_WIDTH or depth > MAX_DEPTH:
         reason = f"({width}, {depth}) is more than width {MAX_WIDTH} or depth {MAX_DEPTH}"
+    elif levels > MAX_LEVELS:
+        reason = f"{levels} levels are more than {MAX_LEVELS}; they are evaluated one by one"
     else:
         reason = obstacle(x.device, asked)
     return Choice("", reason) if reason else Choice(asked if asked.startswith("tf32") else "ieee", "")

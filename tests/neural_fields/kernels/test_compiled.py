@@ -14,25 +14,36 @@ import pytest
 SHARED = {80: 163 << 10, 89: 99 << 10, 90: 227 << 10}
 CODE = """
 import json, re, sys
-import triton
+import torch, triton
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
-from mplicits.neural_fields.kernels.launch import tiling_of
+from mplicits.neural_fields.kernels.launch import Network, tiling_of
+from mplicits.neural_fields.kernels.levels import Levels, walk
 from mplicits.neural_fields.kernels.siren import evaluate
 from mplicits.neural_fields.kernels.tiles import planes
 from mplicits.neural_fields.kernels.tracing import march
 from mplicits.neural_fields.kernels.training import sweep
 
-kind, width, depth, precision, capability = json.loads(sys.argv[1])
-kernel = {"back": sweep, "march": march}.get(kind, evaluate)
-tiling, jet = tiling_of(width), kind == "jet"
+kind, sizes, precision, capability = json.loads(sys.argv[1])
+kernel = {"back": sweep, "march": march, "levels": walk, "levels jet": walk}.get(kind, evaluate)
+jet, ((width, depth), *_) = kind.endswith("jet"), sizes
+tiling, warps = tiling_of(width), tiling_of(width).warps
 constants = {
     "JET": jet, "PLANES": planes(depth, jet=jet), "ROWS": tiling.rows, "IN": 3, "WIDTH": width, "DEPTH": depth,
-    "COLUMNS": tiling.columns, "PIECE": tiling.piece, "PRECISION": precision,
+    "COLUMNS": tiling.columns, "PIECE": tiling.piece, "PRECISION": precision, "WANTED": True, "TAPERED": True,
     "PATIENCE": 32, "BOLDNESS": 0.9, "STEEPEST_RISE": 0.6, "FLOOR": 1e-6,
 }
-numbers = ("omega", "gain", "tolerance", "resolution", "lipschitz")
-types = {"parameters": ("*fp32",) * (2 * depth + 2), "count": "i64", "share": "i64", "max_steps": "i32"}
+numbers = ("omega", "gain", "tolerance", "resolution", "lipschitz", "taper")
+parameters = ("*fp32",) * (2 * depth + 2)
+types = {"parameters": parameters, "count": "i64", "share": "i64", "room": "i32", "max_steps": "i32"}
+types |= {"lists": "*i64", "wanted": "*i8"}
+if len(sizes) > 1:  # all that matters of a network is its shape
+    networks = [Network((torch.empty(w, 3),) * (2 * d + 2), 1.0, 1.0) for w, d in sizes]
+    shape = Levels.of(networks, torch.ones(len(sizes) - 1), 0.5).shape(jet=jet)
+    constants |= {"SIZES": shape.sizes, "FLOATS": shape.floats}
+    types |= {"parameters": tuple(("*fp32",) * len(one.parameters) for one in networks)}
+    types |= dict.fromkeys(("omegas", "gains"), ("fp32",) * len(sizes))
+    warps = shape.warps
 types |= {"found_mask": "*i8", "found_steps": "*i32", **dict.fromkeys(numbers, "fp32")}
 names = kernel.arg_names
 source = ASTSource(
@@ -40,7 +51,7 @@ source = ASTSource(
     {name: "constexpr" if name in constants else types.get(name, "*fp32") for name in names},
     {(names.index(name),): constant for name, constant in constants.items() if name in names},
 )
-options = {"num_warps": tiling.warps, "num_stages": 2}
+options = {"num_warps": warps, "num_stages": 2}
 compiled = triton.compile(source, target=GPUTarget("cuda", capability, 32), options=options)
 ptx = compiled.asm["ptx"]
 print(json.dumps({"shared": compiled.metadata.shared, "fast": len(re.findall(r"(sin|cos)[.]approx", ptx)),
@@ -48,18 +59,18 @@ print(json.dumps({"shared": compiled.metadata.shared, "fast": len(re.findall(r"(
 """
 
 
-def compiled(kind: str, width: int, depth: int, *, precision: str, capability: int) -> dict[str, int]:
+def compiled(kind: str, sizes: list[tuple[int, int]], *, precision: str, capability: int) -> dict[str, int]:
     """What became of a kernel: bytes of shared memory, how many fast sines, how many products on tensor cores."""
     environment = {name: value for name, value in os.environ.items() if name != "TRITON_INTERPRET"}
     environment["TRITON_DEFAULT_FP_FUSION"] = "1"
-    words = [sys.executable, "-c", CODE, json.dumps([kind, width, depth, precision, capability])]
+    words = [sys.executable, "-c", CODE, json.dumps([kind, sizes, precision, capability])]
     done = subprocess.run(words, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-2000:]
     return json.loads(done.stdout)
 
 
 def test_a_jet_compiles_for_a_hopper() -> None:
-    found = compiled("jet", 16, 2, precision="ieee", capability=90)
+    found = compiled("jet", [(16, 2)], precision="ieee", capability=90)
     assert found["shared"] <= SHARED[90]
     assert (found["fast"], found["tensor"]) == (0, 0)  # sines of libdevice, products of float32 units
 
@@ -67,11 +78,16 @@ def test_a_jet_compiles_for_a_hopper() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(("precision", "capability"), [("ieee", 80), ("ieee", 90), ("tf32", 89), ("tf32x3", 90)])
 @pytest.mark.parametrize(
-    ("kind", "width", "depth"),
-    [("value", 128, 2), ("jet", 128, 2), ("jet", 128, 3), ("jet", 400, 2), ("back", 128, 2), ("march", 128, 2)],
+    ("kind", "sizes"),
+    [
+        *((kind, [(128, 2)]) for kind in ("value", "jet", "back", "march")),
+        ("jet", [(128, 3)]),
+        ("jet", [(400, 2)]),
+        *((kind, [(128, 2), (256, 2), (400, 2)]) for kind in ("levels", "levels jet")),
+    ],
 )
-def test_kernels_compile(kind: str, width: int, depth: int, precision: str, capability: int) -> None:
-    found = compiled(kind, width, depth, precision=precision, capability=capability)
+def test_kernels_compile(kind: str, sizes: list[tuple[int, int]], precision: str, capability: int) -> None:
+    found = compiled(kind, sizes, precision=precision, capability=capability)
     assert found["shared"] <= SHARED[capability]
     assert found["fast"] == 0
     assert (found["tensor"] > 0) == (precision != "ieee")
