@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,7 +15,7 @@ from numpy.typing import NDArray
 from ...neural_fields import Field, InputError, Similarity
 from ..run.settings import SHADINGS
 from .camera import describe_reading, image_size, probe, viser_camera
-from .controls import Controls
+from .controls import LARGEST_PICTURE_SIDE, Controls
 from .frames import Frame, FrameScheduler, Superseded, View
 from .paint import Painter
 from .scene import SceneNodes, Shapes
@@ -24,6 +26,56 @@ SCREENSHOT_SECONDS = 20.0
 JPEG_QUALITY = 92
 # Pixels of an image that is quickly sent as PNG; the blocks of JPEG show when it is enlarged.
 SMALL_IMAGE = 1 << 15
+
+
+# Pictures that are drawn at a time, of all browsers: each may be 200 MB large.
+_PICTURES = threading.Semaphore(2)
+
+
+class OneAtATime:
+    """Work that is asked for more often than it can be done: once now, and once more if it was asked for meanwhile."""
+
+    def __init__(self) -> None:
+        self._lock, self._asked, self._runs = threading.Lock(), False, False
+
+    def run(self, work: Callable[[], None]) -> None:
+        """Do the work, or let the thread that does it already do it once more."""
+        with self._lock:
+            self._asked = True
+            if self._runs:
+                return
+            self._runs = True
+        try:
+            while self._wanted():
+                work()
+        except BaseException:
+            with self._lock:
+                self._runs = False
+            raise
+
+    def _wanted(self) -> bool:
+        with self._lock:
+            self._runs, self._asked = self._asked, False
+            return self._runs
+
+
+@contextmanager
+def _one_picture(mine: threading.Lock, controls: Controls) -> Iterator[bool]:
+    """Whether a browser may have a picture made: one at a time for each, and few for all together."""
+    if not mine.acquire(blocking=False):
+        yield False
+        return
+    try:
+        if not _PICTURES.acquire(blocking=False):
+            controls.say("Others are having pictures drawn; try again.")
+            yield False
+            return
+        try:
+            yield True
+        finally:
+            _PICTURES.release()
+    finally:
+        mine.release()
 
 
 @dataclass(frozen=True)
@@ -60,10 +112,13 @@ class Client:
         handle: viser's handle of it.
         shown: what it is shown.
         scheduler: who draws the images.
+        connection: the guarded connection that it came by.
     """
 
-    def __init__(self, handle: Any, shown: Shown, scheduler: FrameScheduler) -> None:
+    def __init__(self, handle: Any, shown: Shown, scheduler: FrameScheduler, connection: Any = None) -> None:
         self._handle, self._shown, self._scheduler = handle, shown, scheduler
+        self.connection = connection
+        self._arranging, self._picturing = OneAtATime(), threading.Lock()
         self._gone = threading.Event()
         self._last: Frame | None = None
         self._pictures = 0
@@ -91,7 +146,7 @@ class Client:
     def leave(self) -> None:
         """Stop all work for this browser."""
         self._gone.set()
-        self._scheduler.forget(self._handle.client_id)
+        self._scheduler.leave(self._handle.client_id)
 
     def show(self, frame: Frame) -> None:
         """Show an image; called by the scheduler."""
@@ -140,6 +195,9 @@ class Client:
 
     def _rearrange(self) -> None:
         """What stands beside the traced image has changed."""
+        self._arranging.run(self._arrange)
+
+    def _arrange(self) -> None:
         had_depth = self._scene.is_filled
         try:
             self._scene.arrange(busy=lambda: self._controls.say("Extracting a mesh …"))
@@ -174,8 +232,14 @@ class Client:
         self._update_depth(had_depth)
 
     def _save_picture(self) -> None:
+        with _one_picture(self._picturing, self._controls) as free:
+            if free:
+                self._draw_picture()
+
+    def _draw_picture(self) -> None:
         width, transparent = self._controls.picture
-        height = max(1, round(width / self._handle.camera.aspect))
+        canvas = (self._handle.camera.image_width, self._handle.camera.image_height)
+        height = min(max(1, round(width * canvas[1] / max(canvas[0], 1))), LARGEST_PICTURE_SIDE)
         view = self._view((width, height))
         self._controls.say(f"Drawing {width} × {height} …")
         try:
@@ -186,11 +250,19 @@ class Client:
         self._controls.say(f"Saved {width} × {height}.")
 
     def _save_screenshot(self) -> None:
-        camera = self._handle.camera
+        with _one_picture(self._picturing, self._controls) as free:
+            if free:
+                self._take_screenshot()
+
+    def _take_screenshot(self) -> None:
+        camera, larger = self._handle.camera, nullcontext()
+        if self.connection is not None:
+            larger = self.connection.awaiting_picture()
         try:
-            image = self._handle.get_render(
-                camera.image_height, camera.image_width, transport_format="png", timeout=SCREENSHOT_SECONDS
-            )
+            with larger:
+                image = self._handle.get_render(
+                    camera.image_height, camera.image_width, transport_format="png", timeout=SCREENSHOT_SECONDS
+                )
         except (RuntimeError, TimeoutError) as error:
             self._controls.say(f"**The browser sent no picture:** {error}")
             return

@@ -10,7 +10,7 @@ from ...neural_fields import Similarity
 from ..render.slice import round_step
 from .frames import Look
 
-__all__ = ["SURFACES", "Controls", "slice_range"]
+__all__ = ["LARGEST_PICTURE_SIDE", "SURFACES", "Controls", "slice_range"]
 
 TRACED, MESH, BOTH, NOTHING = SURFACES = ("traced", "mesh", "traced and wires", "hidden")
 NO_BAND = "none"
@@ -20,6 +20,7 @@ AXES = ("x", "y", "z")
 TIME_STEP = 1 / 48
 # Of the slider that moves the slice plane, about, from one side of the unit sphere to the other.
 SLICE_STEPS = 200
+LARGEST_PICTURE_SIDE = 8192  # pixels
 NOTHING_READ = "Click on the surface, or on the slice plane."
 
 
@@ -39,8 +40,15 @@ def slice_range(similarity: Similarity, axis: int) -> tuple[float, float, float]
     return round(low * step, digits), round(high * step, digits), step
 
 
+def _one_of(allowed: Sequence[str], value: Any) -> str:
+    """The value, or the first that is allowed if it is none of them."""
+    return value if value in allowed else allowed[0]
+
+
 class Controls:
     """The controls of one browser; every property says what its control shows now.
+
+    What a browser says of a control may be anything. Properties are within its bounds all the same.
 
     Args:
         gui: viser's interface to the panel of that browser.
@@ -63,8 +71,9 @@ class Controls:
         similarity: Similarity | None = None,
         deltas: Sequence[float] = (),
     ) -> None:
-        self._levels, self._similarity = levels, similarity or Similarity.identity()
-        names = [str(level) for level in range(levels)]
+        self._similarity = similarity or Similarity.identity()
+        self._names = names = [str(level) for level in range(levels)]
+        self._shadings = tuple(shadings)
         self._moves = moves
         with gui.add_folder("Time", visible=moves):
             self._time = gui.add_slider("Time", min=0.0, max=1.0, step=0.001, initial_value=0.0)
@@ -100,7 +109,7 @@ class Controls:
             self._reading = gui.add_markdown(NOTHING_READ)
         with gui.add_folder("Picture"):
             self._width = gui.add_number(
-                "Width", 1600, min=16, max=8192, step=1, hint="pixels; the view's shape is kept"
+                "Width", 1600, min=16, max=LARGEST_PICTURE_SIDE, step=1, hint="pixels; the view's shape is kept"
             )
             self._transparent = gui.add_checkbox("Transparent", False)
             self._save = gui.add_button("Save picture", hint="the traced surface as a PNG, at this width")
@@ -121,7 +130,7 @@ class Controls:
 
     def _turn_slice(self) -> None:
         """Another axis is chosen: the slider counts along that one, and the plane stands in the middle of it."""
-        axis = AXES.index(self._axis.value)
+        axis = self._across
         self._position.min, self._position.max, _ = slice_range(self._similarity, axis)
         self._position.value = self._beside(axis, 0.0)
 
@@ -143,13 +152,15 @@ class Controls:
     @property
     def look(self) -> Look:
         """How the field is drawn; normals come from no coarser level than the surface."""
-        normals = self.level if self._normals.value == SAME else max(self.level, int(self._normals.value))
-        return Look(self.level, normals, self._shading.value, self._shadows.value, self._occlusion.value, self.time)
+        finer = str(self._normals.value)
+        normals = max(self.level, int(finer)) if finer in self._names else self.level
+        shading = _one_of(self._shadings, self._shading.value)
+        return Look(self.level, normals, shading, bool(self._shadows.value), bool(self._occlusion.value), self.time)
 
     @property
     def time(self) -> float:
         """When; 0 for a field that does not move."""
-        return float(self._time.value)
+        return min(max(0.0, float(self._time.value)), 1.0)
 
     def play_on(self) -> None:
         """An image is shown: on to the next time if the motion is played, and from the end to the start."""
@@ -160,7 +171,7 @@ class Controls:
     @property
     def level(self) -> int:
         """The level shown."""
-        return int(self._level.value)
+        return int(_one_of(self._names[::-1], self._level.value))
 
     @property
     def is_traced(self) -> bool:
@@ -180,20 +191,25 @@ class Controls:
     @property
     def band(self) -> int | None:
         """The level whose band is shown, if one is."""
-        return None if self._band.value == NO_BAND else int(self._band.value)
+        return int(self._band.value) if self._band.value in self._names[:-1] else None
 
     @property
     def slice(self) -> tuple[int, float] | None:
         """Axis (0, 1, 2) and position of the slice plane in the unit sphere, if it is shown."""
         if not self._slice.value:
             return None
-        axis = AXES.index(self._axis.value)
-        return axis, self._in_sphere(axis, float(self._position.value))
+        return self._across, self._in_sphere(self._across, float(self._position.value))
+
+    @property
+    def _across(self) -> int:
+        """The axis that the slice plane stands across: 0, 1 or 2."""
+        return AXES.index(_one_of(AXES, self._axis.value))
 
     @property
     def picture(self) -> tuple[int, bool]:
         """Width of the picture to be saved, and whether without a background."""
-        return int(self._width.value), bool(self._transparent.value)
+        width = min(max(16, int(self._width.value)), LARGEST_PICTURE_SIDE)
+        return width, bool(self._transparent.value)
 
     def read(self, text: str) -> None:
         """Show what is under the pointer, in Markdown."""

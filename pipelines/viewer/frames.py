@@ -21,6 +21,9 @@ FIRST_IMAGE = 0.2
 # The coarsest image has 1/8 of the width; the first one ever, when nothing has been measured yet, 1/4.
 MOST_HALVINGS = 3
 UNKNOWN_HALVINGS = 2
+# Seconds of drawing that a client may have had more than another that waits, before it comes after it.
+AHEAD = 1.0
+MOST_MEASURED = 256  # looks and sizes of which times are kept
 
 
 class Superseded(Exception):  # noqa: N818  not an error
@@ -129,7 +132,9 @@ class FrameScheduler:
 
     The first image of a view is drawn to its end even when the camera has moved on, since otherwise nothing would be
     shown while it moves; it is chosen small enough to be quick. Finer images are given up as soon as their client
-    asks for another view, leaves, or another client waits for its first image.
+    asks for another view, leaves, or another client waits for its first image. But whoever has had `AHEAD` seconds
+    more than the one that waits and has had least comes after all others, and nothing is given up for it: a client that
+    never stops asking gets its share, and no more.
 
     Args:
         draw: makes an image.
@@ -146,6 +151,8 @@ class FrameScheduler:
         self._draw, self._deliver, self._failed = draw, deliver, failed
         self._jobs: dict[int, _Job] = {}
         self._measured: dict[tuple[Look, int, int], dict[int, float]] = {}
+        self._had: dict[int, float] = {}  # seconds of drawing, by client
+        self._least = 0.0  # of those that wait; it only grows
         self._order = 0
         self._closed = False
         self._changed = threading.Condition()
@@ -158,6 +165,8 @@ class FrameScheduler:
             self._order += 1
             job = _Job(view, 0, self._order)
             job.halvings = halvings_in_time(self._measured.get(job.key, {}))
+            if client not in self._jobs:  # who has not waited has no claim to time that went by
+                self._had[client] = max(self._had.get(client, 0.0), self._least)
             self._jobs[client] = job
             self._changed.notify()
 
@@ -165,6 +174,12 @@ class FrameScheduler:
         """Draw nothing more for the client."""
         with self._changed:
             self._jobs.pop(client, None)
+
+    def leave(self, client: int) -> None:
+        """Draw nothing more for the client, which will not come back."""
+        with self._changed:
+            self._jobs.pop(client, None)
+            self._had.pop(client, None)
 
     def close(self, timeout: float = 5.0) -> None:
         """Stop drawing, and wait until the thread has ended."""
@@ -180,7 +195,12 @@ class FrameScheduler:
             self._changed.wait_for(lambda: self._jobs or self._closed)
             if self._closed:
                 return None
-            return min(self._jobs.items(), key=lambda item: item[1].urgency)
+            self._least = max(self._least, min(self._had[client] for client in self._jobs))
+            return min(self._jobs.items(), key=lambda item: (self._is_ahead(item[0]), *item[1].urgency))
+
+    def _is_ahead(self, client: int) -> bool:
+        """Whether a client has had much more than another that waits."""
+        return self._had[client] > min(self._had[other] for other in self._jobs) + AHEAD
 
     def _is_wanted(self, client: int, job: _Job) -> bool:
         if self._closed or client not in self._jobs:
@@ -188,7 +208,8 @@ class FrameScheduler:
         if job.first:
             return True
         with self._changed:
-            return self._jobs.get(client) is job and not any(other.first for other in self._jobs.values())
+            waiting = (name for name, other in self._jobs.items() if other.first)
+            return self._jobs.get(client) is job and all(map(self._is_ahead, waiting))
 
     def _work(self) -> None:
         while (chosen := self._next()) is not None:
@@ -206,6 +227,8 @@ class FrameScheduler:
                 continue
             with self._changed:
                 self._measured.setdefault(job.key, {})[job.halvings] = frame.seconds
+                while len(self._measured) > MOST_MEASURED:
+                    del self._measured[next(iter(self._measured))]  # the oldest
                 if frame.final and self._jobs.get(client) is job:
                     del self._jobs[client]
                 self._order += 1
@@ -222,8 +245,14 @@ class FrameScheduler:
             factor = 2**job.halvings
             camera = full.resized(max(1, full.width // factor), max(1, full.height // factor))
         started = time.perf_counter()
-        rgb, z = self._draw(camera, job.view.look, check)
-        return Frame(camera, rgb, z, time.perf_counter() - started, job.halvings == 0)
+        try:
+            rgb, z = self._draw(camera, job.view.look, check)
+        finally:
+            seconds = time.perf_counter() - started
+            with self._changed:
+                if client in self._had:
+                    self._had[client] += seconds
+        return Frame(camera, rgb, z, seconds, job.halvings == 0)
 
     def _drop(self, client: int, job: _Job) -> None:
         with self._changed:

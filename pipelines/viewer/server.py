@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import errno
 import io
@@ -22,6 +23,8 @@ from ..texture.riding import start_texture
 from .camera import first_eye
 from .client import Client, Shown
 from .frames import Frame, FrameScheduler
+from .gate import Gate
+from .guard import connection_of_this_task, guarded
 from .paint import Painter
 from .scene import Shapes
 
@@ -34,6 +37,9 @@ FOV = math.radians(30)
 
 class Viewer:
     """A running viewer; `close` it, or use it as a context manager.
+
+    Only who knows the token in its `url` is let in, and no other page than its own (`Gate`); what browsers send is
+    bounded in size, rate and values (`guarded`).
 
     Args:
         shown: what to show.
@@ -53,7 +59,8 @@ class Viewer:
         self._lock = threading.Lock()
         self._shown = shown
         self._scheduler = FrameScheduler(shown.painter, self._deliver, self._fail)
-        with _silent():
+        gate = Gate(host, port)
+        with _silent(), guarded(gate):
             self._server: Any = viser.ViserServer(host=host, port=port, label=shown.name, verbose=False)
         self._server.gui.configure_theme(show_logo=False, show_share_button=False)
         self._server.gui.main_panel.dock_right()  # beside the image, not on it
@@ -61,14 +68,14 @@ class Viewer:
         camera = self._server.initial_camera
         camera.position, camera.look_at, camera.fov = first_eye(up, FOV), (0.0, 0.0, 0.0), FOV
         camera.up = UP_AXES[up]
-        self.url = f"http://{_in_url(host)}:{self._server.get_port()}"
+        if self._server.get_port() != port:  # somebody else took it just now; viser then takes another
+            self._server.stop()
+            raise InputError(f"--port {port}: is in use; leave out --port to take a free one")
+        self.url = gate.url
 
         @self._server.on_client_connect
-        def _(handle: Any) -> None:
-            with self._lock:
-                self._clients[handle.client_id] = Client(handle, self._shown, self._scheduler)
-            if handle.client_id not in self._server.get_clients():
-                self._leave(handle.client_id)  # gone before it was here
+        async def _(handle: Any) -> None:  # in the task of its connection
+            await asyncio.to_thread(self._join, handle, connection_of_this_task())
 
         @self._server.on_client_disconnect
         def _(handle: Any) -> None:
@@ -91,7 +98,7 @@ class Viewer:
                 if name in clients:
                     clients[name].gui.reset()
                     clients[name].scene.reset()
-                    self._clients[name] = Client(clients[name], shown, scheduler)
+                    self._clients[name] = Client(clients[name], shown, scheduler, client.connection)
         before[0].shapes.close()
         before[1].close()
 
@@ -109,6 +116,12 @@ class Viewer:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+    def _join(self, handle: Any, connection: Any) -> None:
+        with self._lock:
+            self._clients[handle.client_id] = Client(handle, self._shown, self._scheduler, connection)
+        if handle.client_id not in self._server.get_clients():
+            self._leave(handle.client_id)  # gone before it was here
 
     def _leave(self, name: int) -> None:
         with self._lock:
@@ -212,13 +225,6 @@ def free_port(host: str, port: int | None) -> int:
             ) from error
         return candidate
     raise InputError(f"no port from {FIRST_PORT} to {FIRST_PORT + PORTS - 1} is free; name one with --port")
-
-
-def _in_url(host: str) -> str:
-    """An address that a browser on this machine can open."""
-    if host in ("0.0.0.0", "::", ""):
-        return "127.0.0.1"
-    return f"[{host}]" if ":" in host else host
 
 
 @contextlib.contextmanager

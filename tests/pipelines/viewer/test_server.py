@@ -29,6 +29,7 @@ from mplicits.neural_fields import (
 from mplicits.neural_fields.analytic import Plane
 from mplicits.pipelines.render.trace import trace_view
 from mplicits.pipelines.run.folder import named_cloud
+from mplicits.pipelines.viewer import frames
 from mplicits.pipelines.viewer.camera import (
     describe_reading,
     first_eye,
@@ -215,6 +216,29 @@ def test_a_first_image_is_finished_though_the_camera_moves_on(studio):
     studio.go.set()
     studio.wait(lambda: (1, 2, 64) in studio.shown)
     assert studio.shown[:2] == [(1, 1, 16), (1, 2, 16)]
+
+
+def test_a_client_that_never_stops_asking_does_not_keep_others_from_fine_images(studio, monkeypatch):
+    monkeypatch.setattr(frames, "AHEAD", 0.01)
+    deliver, draw = studio.scheduler._deliver, studio.scheduler._draw
+
+    def slow(*arguments):
+        time.sleep(0.002)
+        return draw(*arguments)
+
+    def again(client, frame):  # there is a first image to be drawn for it at any time
+        deliver(client, frame)
+        if client == 1:
+            studio.request(1, len(studio.shown))
+
+    studio.scheduler._draw, studio.scheduler._deliver = slow, again
+    studio.request(1, 0)
+    studio.wait(lambda: len(studio.shown) > 5)
+    studio.request(2, 10**6)
+    studio.wait(lambda: any(client == 2 and width == 64 for client, _, width in studio.shown))
+    before = len(studio.shown)
+    studio.wait(lambda: len(studio.shown) > before + 5)  # nor is it forgotten itself
+    studio.scheduler.leave(1)
 
 
 def test_first_images_of_others_come_before_fine_ones(studio):

@@ -1,0 +1,134 @@
+"""Who may talk to a server of ours: who knows the token of its address, from its own page, by a name of this machine.
+
+A server on 127.0.0.1 is open to every user of the machine, and by way of their browsers to every page that they
+visit: such a page may open a WebSocket to any address (it is not held back by the same-origin policy), and with a name
+of its own that it lets point to 127.0.0.1 it may read what is served there. Hence three checks of every request. They
+know nothing of any server: headers in, an answer out.
+"""
+
+from __future__ import annotations
+
+import hmac
+import ipaddress
+import secrets
+from collections.abc import Mapping
+from http import HTTPStatus
+from http.cookies import CookieError, SimpleCookie
+from typing import NamedTuple
+from urllib.parse import parse_qs, urlsplit
+
+__all__ = ["Gate", "Verdict"]
+
+# What a page of ours may do at most with what it came by: nobody frames it, nobody learns its address.
+HEADERS: Mapping[str, str] = {
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "SAMEORIGIN",
+    "Cache-Control": "no-store",
+}
+ASKING = """<!doctype html><meta charset="utf-8"><title>mplicits</title>
+<body style="font: 16px sans-serif; margin: 20vh auto; max-width: 30em">
+<p>Open the address that the command has printed, or give its token:</p>
+<form><input name="token" size="24" autofocus autocomplete="off"> <button>Open</button></form>
+"""
+
+
+class Verdict(NamedTuple):
+    """What becomes of a request.
+
+    Attributes:
+        status: 200 to let it in; any other is the answer to it.
+        body: what to answer; empty where it is let in.
+        headers: to be sent along, whatever the status.
+    """
+
+    status: HTTPStatus
+    body: str
+    headers: Mapping[str, str]
+
+    @property
+    def admitted(self) -> bool:
+        """Whether it is let in."""
+        return self.status == HTTPStatus.OK
+
+
+class Gate:
+    """The checks of one server.
+
+    Args:
+        host: the address that it listens on.
+        port: its port.
+        token: what its address ends with; drawn at random if it is None.
+
+    Example:
+        >>> gate = Gate("127.0.0.1", 8080, token="secret")
+        >>> gate.url
+        'http://127.0.0.1:8080/?token=secret'
+        >>> gate.admit("/", {"Host": "127.0.0.1:8080"}).status.value
+        403
+        >>> gate.admit("/?token=secret", {"Host": "127.0.0.1:8080"}).headers["Set-Cookie"]
+        'mplicits-8080=secret; Path=/; HttpOnly; SameSite=Strict'
+    """
+
+    def __init__(self, host: str, port: int, token: str | None = None) -> None:
+        self.host, self.port, self.token = host, port, token or secrets.token_urlsafe(18)
+        self._name = f"mplicits-{port}"  # browsers keep cookies by host, whatever the port
+
+    @property
+    def url(self) -> str:
+        """What a browser on this machine opens."""
+        local = "127.0.0.1" if self.host in ("0.0.0.0", "::", "") else self.host
+        return f"http://{f'[{local}]' if ':' in local else local}:{self.port}/?token={self.token}"
+
+    def admit(self, path: str, headers: Mapping[str, str]) -> Verdict:
+        """Whether a request may come in; a page as well as the handshake of a WebSocket.
+
+        Whoever comes with the token in the address gets it as a cookie, by which the page's own requests are known.
+
+        Args:
+            path: with what follows the question mark.
+            headers: of the request, looked up by their usual names.
+        """
+        host, origin = headers.get("Host", ""), headers.get("Origin")
+        if _is_loopback(self.host) and not _is_loopback(_name_of(host)):
+            return _refused(HTTPStatus.MISDIRECTED_REQUEST, "This server answers to names of its own machine only.\n")
+        if origin is not None and origin not in (f"http://{host}", f"https://{host}"):
+            return _refused(HTTPStatus.FORBIDDEN, "This server answers to its own page only.\n")
+        if self._is_token(parse_qs(urlsplit(path).query).get("token", [""])[0]):
+            cookie = f"{self._name}={self.token}; Path=/; HttpOnly; SameSite=Strict"
+            return Verdict(HTTPStatus.OK, "", {**HEADERS, "Set-Cookie": cookie})
+        if self._is_token(self._kept(headers.get("Cookie", ""))):
+            return Verdict(HTTPStatus.OK, "", HEADERS)
+        return _refused(HTTPStatus.FORBIDDEN, ASKING)
+
+    def _is_token(self, text: str) -> bool:
+        return hmac.compare_digest(text.encode("utf-8", "replace"), self.token.encode())  # in the same time for all
+
+    def _kept(self, cookies: str) -> str:
+        try:
+            kept = SimpleCookie(cookies).get(self._name)
+        except CookieError:
+            return ""
+        return "" if kept is None else kept.value
+
+
+def _refused(status: HTTPStatus, body: str) -> Verdict:
+    kind = "text/html; charset=utf-8" if body.startswith("<") else "text/plain; charset=utf-8"
+    return Verdict(status, body, {**HEADERS, "Content-Type": kind})
+
+
+def _name_of(host: str) -> str:
+    """The name in a Host header, without port and brackets; tunnels change the port."""
+    try:
+        return urlsplit(f"//{host}").hostname or ""
+    except ValueError:
+        return ""
+
+
+def _is_loopback(host: str) -> bool:
+    if host.rstrip(".").lower() == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
