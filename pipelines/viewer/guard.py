@@ -203,12 +203,13 @@ def _guarded_connection() -> Any:
         @contextmanager
         def awaiting_picture(self) -> Iterator[None]:
             """A block that waits for a picture, which may be larger than other messages."""
-            before = self.protocol.max_message_size
-            self.protocol.max_message_size = LARGEST_PICTURE
+            name = "max_message_size" if hasattr(self.protocol, "max_message_size") else "max_size"  # before 16
+            before = getattr(self.protocol, name)
+            setattr(self.protocol, name, LARGEST_PICTURE)
             try:
                 yield
             finally:
-                self.protocol.max_message_size = before
+                setattr(self.protocol, name, before)
 
         async def recv(self, decode: bool | None = None) -> Any:
             while True:
