@@ -12,7 +12,7 @@ and the field itself sees to it that a residual is evaluated only inside its ban
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -20,6 +20,7 @@ from torch import Tensor
 from ._ahead import march_ahead
 from ._checks import positive
 from ._march import (
+    BAND_ENTRY,
     BOLDNESS,
     FLOOR,
     PATIENCE,
@@ -35,8 +36,7 @@ from ._march import (
 from .devices import makes_wait
 from .field import Field
 from .function import FieldLike, as_field
-from .kernels.switch import choose
-from .multiscale import levels_of
+from .multiscale import MultiscaleSDF, choose_levels, levels_of
 from .siren import Siren
 from .volume import ball_chord
 
@@ -55,8 +55,8 @@ __all__ = [
 
 # Fields live in the unit sphere; their surfaces may pass it by a little.
 BOUNDING_RADIUS = 1.05
-# Networks of more units are not marched through in one launch: their activations do not stay in registers.
-WIDEST_FUSED = 128
+# One network of so many units leaves registers enough to keep the rays there too, while one launch marches them.
+IN_REGISTERS = 128
 
 
 class Hits(NamedTuple):
@@ -262,46 +262,52 @@ def trace_expected(
         depth, slope, value = (part.to(directions).broadcast_to(shape) for part in expected)
         flat = Expected((depth * length).reshape(-1), slope.reshape(-1), value.reshape(-1))
         rays = rays.expecting(flat, rule)
-    fused = None if expected is not None or reach is not None else _fused(field, level, rays)
-    if fused is None:
+    precision = "" if expected is not None or reach is not None else _fused(field, level, rays)
+    if precision:
+        _march_fused(field, level, precision, rays, found, rule, max_steps)
+    else:
         go = march_ahead if makes_wait(directions.device) else march
         go(field, level, rays, found, rule, max_steps, reach)
-    else:
-        _march_fused(*fused, rays, found, rule, max_steps)
     clear, value, leave = (column.reshape(shape) for column in found.near)
     near_surface = Near(clear / length, value, leave / length)
     return _hits(found, origins, directions, length), found.slope.reshape(shape), near_surface
 
 
-def _fused(field: Field, level: int, rays: Rays) -> tuple[Siren, str] | None:
-    """The network whose surface is looked for, and the precision of its products, if one launch marches all rays."""
-    network = levels_of(field)[0]
-    if level > 0 or not isinstance(network, Siren) or network.width > WIDEST_FUSED:
-        return None
-    precision = choose(rays.origin, width=network.width, depth=network.depth).precision
-    return (network, precision) if precision else None
+def _fused(field: Field, level: int, rays: Rays) -> str:
+    """The precision of the networks' products if one launch marches all rays; empty if PyTorch does."""
+    return choose_levels(levels_of(field)[: level + 1], rays.origin, jet=False).precision
 
 
-def _march_fused(network: Siren, precision: str, rays: Rays, found: Found, rule: Rule, max_steps: int) -> None:
+def _march_fused(
+    field: Field, level: int, precision: str, rays: Rays, found: Found, rule: Rule, max_steps: int
+) -> None:
     """What `march` does, by the fused kernels; what they find has the same bounds, and not the same last bits."""
+    from .kernels.levels import Levels
+    from .kernels.paths import march_levels
     from .kernels.tracing import march_rays
 
-    marched = march_rays(
-        network.as_network(),
-        (rays.origin, rays.direction, rays.depth, rays.entry, rays.far),
-        tolerance=rule.tolerance,
-        resolution=rule.resolution,
-        lipschitz=rule.lipschitz,
-        max_steps=max_steps,
-        constants={
+    networks = [part.as_network() for part in levels_of(field)[: level + 1] if isinstance(part, Siren)]
+    options: dict[str, Any] = {
+        "tolerance": rule.tolerance,
+        "resolution": rule.resolution,
+        "lipschitz": rule.lipschitz,
+        "max_steps": max_steps,
+        "constants": {
             "PATIENCE": PATIENCE,
             "BOLDNESS": BOLDNESS,
             "STEEPEST_RISE": STEEPEST_RISE,
+            "BAND_ENTRY": BAND_ENTRY,
             "FLOOR": FLOOR * torch.finfo(rays.depth.dtype).eps,
         },
-        precision=precision,
-    )
-    found.record(rays.ray, mask=marched.mask, depth=marched.depth, level=0, steps=marched.steps)
+        "precision": precision,
+    }
+    columns = (rays.origin, rays.direction, rays.depth, rays.entry, rays.far)
+    if len(networks) == 1 and networks[0].width <= IN_REGISTERS:
+        marched = march_rays(networks[0], columns, **options)
+    else:
+        taper = field.taper if isinstance(field, MultiscaleSDF) else 0.0
+        marched = march_levels(Levels.of(networks, rule.deltas, taper), columns, **options)
+    found.record(rays.ray, mask=marched.mask, depth=marched.depth, level=marched.level, steps=marched.steps)
     found.record_slope(rays.ray, marched.slope)
 
 

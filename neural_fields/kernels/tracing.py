@@ -2,8 +2,8 @@
 
 `mplicits.neural_fields._march` asks the field once a pass for all rays that are left, and between passes has some
 seventy small operations for what a value allows; on a GPU each is a launch. Here a program marches ROWS rays at a time:
-a value of its tile, then the same rules (`_look`) in registers. A ray that ends writes what it found, and its place is
-taken by the next ray of the program's own, so that tiles stay full though rays are of different lengths.
+a value of its tile, then the same rules (`rules.py`) in registers. A ray that ends writes what it found, and its place
+is taken by the next ray of the program's own, so that tiles stay full though rays are of different lengths.
 
 The rules are those of `sphere_trace` for a field without bands and without expectations: steps as wide as two tangent
 balls on a plane allow, taken back where a gap opens, then the secant and bisection in turn. What they decide is the
@@ -23,6 +23,7 @@ import triton.language as tl
 from torch import Tensor
 
 from .launch import Network, on_device, program_count, scratch_for, tiling_of
+from .rules import look_at, turned_back
 from .tiles import planes, value_of_tile
 
 __all__ = ["Marched", "march_rays"]
@@ -36,12 +37,24 @@ class Marched(NamedTuple):
         depth: where, or where its search ended.
         steps: how often the network was evaluated on it.
         slope: how fast the field fell along the ray at its last step.
+        level: how many bands its last value lay in.
     """
 
     mask: Tensor
     depth: Tensor
     steps: Tensor
     slope: Tensor
+    level: Tensor
+
+    @classmethod
+    def nothing(cls, starts: Tensor) -> Marched:
+        """Room for what kernels find, in the types that they write."""
+        small, number = (torch.zeros_like(starts, dtype=dtype) for dtype in (torch.int8, torch.int32))
+        return cls(small, starts.clone(), number, torch.ones_like(starts), torch.zeros_like(number))
+
+    def in_own_types(self) -> Marched:
+        """In those of `mplicits.neural_fields.Hits`."""
+        return self._replace(mask=self.mask.bool(), steps=self.steps.long(), level=self.level.long())
 
 
 @triton.jit(do_not_specialize=["count", "share", "max_steps"])
@@ -68,6 +81,7 @@ def march(
     PATIENCE: tl.constexpr,
     BOLDNESS: tl.constexpr,
     STEEPEST_RISE: tl.constexpr,
+    BAND_ENTRY: tl.constexpr,
     FLOOR: tl.constexpr,
     PLANES: tl.constexpr,
     ROWS: tl.constexpr,
@@ -118,60 +132,24 @@ def march(
         points = (ox + depth * dx, oy + depth * dy, oz + depth * dz)
         raw = value_of_tile(points, parameters, own, omega, gain, ROWS, 3, WIDTH, DEPTH, COLUMNS, PIECE, PRECISION)
 
-        # A start behind the surface: look again where the ray may begin, and if that is inside, look for the way out.
-        fresh = (low_value == infinite) & (depth == low)
-        sent_back = fresh & (raw < 0) & (depth > entry)
-        sign = tl.where(fresh & (raw < 0), -1.0, sign)
-        sign = tl.where(sent_back, 1.0, sign)
+        sent_back, sign = turned_back(raw, depth, entry, low, low_value, sign)
         looks = under_way & (sent_back == 0)
-        value = raw * sign
         steps = tl.where(looks, steps + 1, steps)
-
-        wide = resolution * tl.exp2(((steps - 1) // PATIENCE).to(tl.float32))
-        new_free = tl.abs(value) / lipschitz
-        known = low_value < infinite
-        slope = tl.where(known, (value - low_value) / tl.where(known & (depth != low), depth - low, 1.0), -1.0)
-        enclosed = high < infinite
-        sound = enclosed | (depth - low - free - new_free <= gap)
-        before, behind = sound & (value > 0), sound & (value <= 0)
-        new_low, new_high = tl.where(before, depth, low), tl.where(behind, depth, high)
-        new_low_value, new_high_value = tl.where(before, value, low_value), tl.where(behind, value, high_value)
-
-        s = tl.minimum(tl.maximum(slope, -1.0), STEEPEST_RISE)
-        widest = boldness * new_free * (1 + s) / (1 - s)
-        zero_at = tl.where(s < 0, value / tl.where(s < 0, -s, 1.0), infinite)
-        ahead = depth + new_free + tl.maximum(widest, tl.minimum(wide, zero_at - new_free))
-        ahead = tl.where(before, ahead, low + free)
-        closed = new_high < infinite
-        width = tl.where(closed, new_high - new_low, 0.0)
-        span = tl.where(closed & (new_low_value < infinite), new_low_value - new_high_value, 1.0)
-        span = tl.where(span == 0, 1.0, span)  # of rays that have ended, on places that nobody takes
-        share_of = tl.where(new_low_value < infinite, new_low_value / span, 1.0)
-        chord = new_low + width * share_of
-        halved = (enclosed == 0) | (2 * width <= high - low)
-        closing = tl.where(halved, chord, new_low + width / 2)
-
-        steep = tl.minimum(tl.abs(slope), 1.0)
-        near = sound & (tl.abs(value) <= tl.maximum(tolerance * steep, FLOOR))
-        pinned = closed & (width <= tolerance)
-        passed = before & (closed == 0) & (depth + new_free + wide >= far) & (near == 0)
-        step = value / tl.maximum(steep, 1e-30)  # nothing steeper matters: it is cut off at the tolerance
-        landing = depth + tl.minimum(tl.maximum(step, -tolerance), tolerance)
-        hit = near | pinned
+        ahead, new_low, new_low_value, new_free, wide, new_high, new_high_value, bold, hit, passed, end, fall = look_at(
+            raw * sign, 0.0, depth, far, low, low_value, free, gap, high, high_value, boldness, steps,
+            tolerance, resolution, lipschitz, PATIENCE, BOLDNESS, STEEPEST_RISE, BAND_ENTRY, FLOOR,
+        )  # fmt: skip
         ended = looks & (hit | passed | (steps >= max_steps))
         tl.store(found_mask + ray, hit.to(tl.int8), mask=ended)
-        tl.store(found_depth + ray, tl.where(near, landing, tl.where(pinned, chord, depth)), mask=ended)
+        tl.store(found_depth + ray, end, mask=ended)
         tl.store(found_steps + ray, steps, mask=ended)
-        tl.store(found_slope + ray, steep, mask=ended)
+        tl.store(found_slope + ray, fall, mask=ended)
 
-        bold = tl.where(sound | (known == 0), boldness, boldness / 2)
-        next_depth = tl.minimum(tl.where(closed, closing, ahead), far)
-        boldness, gap = tl.where(looks, bold, boldness), tl.where(looks, wide, gap)
-        free = tl.where(looks & before, new_free, free)
+        depth = tl.where(looks, ahead, tl.where(sent_back, entry, depth))
         low = tl.where(looks, new_low, tl.where(sent_back, entry, low))
+        low_value, free = tl.where(looks, new_low_value, low_value), tl.where(looks, new_free, free)
         high, high_value = tl.where(looks, new_high, high), tl.where(looks, new_high_value, high_value)
-        low_value = tl.where(looks, new_low_value, low_value)
-        depth = tl.where(looks, next_depth, tl.where(sent_back, entry, depth))
+        boldness, gap = tl.where(looks, bold, boldness), tl.where(looks, wide, gap)
         free_place = tl.where(ended, 1, free_place)
         running = (taken < last) | (tl.sum(free_place, axis=0) < ROWS)
 
@@ -197,21 +175,20 @@ def march_rays(
         resolution: see there.
         lipschitz: see there.
         max_steps: see there.
-        constants: PATIENCE, BOLDNESS and STEEPEST_RISE of `_march`, and FLOOR, the size below which a value is zero.
+        constants: PATIENCE, BOLDNESS, STEEPEST_RISE and BAND_ENTRY of `_march`, and FLOOR, the size below which a value
+            is zero.
         precision: see `mplicits.neural_fields.kernels.siren.siren_value`.
     """
     origins, directions, starts, entries, ends = (part.contiguous() for part in rays)
     count = len(origins)
-    mask = torch.zeros(count, dtype=torch.int8, device=origins.device)
-    depth, slope = starts.clone(), torch.ones_like(starts)
-    steps = torch.zeros(count, dtype=torch.int32, device=origins.device)
+    found = Marched.nothing(starts)
     if count:
         tiling = tiling_of(network.width)
         programs = program_count(origins.device, triton.cdiv(count, tiling.rows))
         kept = planes(network.depth, jet=False)
         with on_device(origins):
             march[(programs,)](  # pyright: ignore[reportIndexIssue]
-                origins, directions, starts, entries, ends, network.parameters, mask, depth, steps, slope,
+                origins, directions, starts, entries, ends, network.parameters, *found[:4],
                 scratch_for(origins, programs, kept * tiling.rows * tiling.stride(network.width)),
                 count, triton.cdiv(count, programs), max_steps,
                 float(tolerance), float(resolution), float(lipschitz), network.omega, network.gain,
@@ -219,4 +196,4 @@ def march_rays(
                 PLANES=kept, ROWS=tiling.rows, WIDTH=network.width, DEPTH=network.depth, COLUMNS=tiling.columns,
                 PIECE=tiling.piece, PRECISION=precision, num_warps=tiling.warps, num_stages=2,
             )  # fmt: skip
-    return Marched(mask.bool(), depth, steps.long(), slope)
+    return found.in_own_types()

@@ -150,7 +150,7 @@ def _kernels() -> Finding:
         return Finding("warning", "kernels", str(error))
     if choice.reason:
         return Finding("note", "kernels", f"PyTorch evaluates all networks ({choice.reason})")
-    how = f"fused, with products in {choice.precision}, for values, jets, their way back, and all levels at once"
+    how = f"fused, with products in {choice.precision}, for values and jets of all levels, the jets' way back, and rays"
     return Finding("ok", "kernels", f"{how}; PyTorch for features, float64 and second derivatives")
 
 

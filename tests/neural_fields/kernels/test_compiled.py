@@ -19,24 +19,27 @@ from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 from mplicits.neural_fields.kernels.launch import Network, tiling_of
 from mplicits.neural_fields.kernels.levels import Levels, walk
+from mplicits.neural_fields.kernels.paths import COLUMNS, march_bands
 from mplicits.neural_fields.kernels.siren import evaluate
 from mplicits.neural_fields.kernels.tiles import planes
 from mplicits.neural_fields.kernels.tracing import march
 from mplicits.neural_fields.kernels.training import sweep
 
 kind, sizes, precision, capability = json.loads(sys.argv[1])
-kernel = {"back": sweep, "march": march, "levels": walk, "levels jet": walk}.get(kind, evaluate)
+named = {"back": sweep, "march": march, "levels": walk, "levels jet": walk, "bands": march_bands}
+kernel = named.get(kind, evaluate)
 jet, ((width, depth), *_) = kind.endswith("jet"), sizes
 tiling, warps = tiling_of(width), tiling_of(width).warps
 constants = {
     "JET": jet, "PLANES": planes(depth, jet=jet), "ROWS": tiling.rows, "IN": 3, "WIDTH": width, "DEPTH": depth,
     "COLUMNS": tiling.columns, "PIECE": tiling.piece, "PRECISION": precision, "WANTED": True, "TAPERED": True,
     "PATIENCE": 32, "BOLDNESS": 0.9, "STEEPEST_RISE": 0.6, "FLOOR": 1e-6,
+    "BAND_ENTRY": 0.5, "NUMBERS": COLUMNS,
 }
 numbers = ("omega", "gain", "tolerance", "resolution", "lipschitz", "taper")
 parameters = ("*fp32",) * (2 * depth + 2)
 types = {"parameters": parameters, "count": "i64", "share": "i64", "room": "i32", "max_steps": "i32"}
-types |= {"lists": "*i64", "wanted": "*i8"}
+types |= {"lists": "*i64", "wanted": "*i8", "counts": "*i32", "found_level": "*i32"}
 if len(sizes) > 1:  # all that matters of a network is its shape
     networks = [Network((torch.empty(w, 3),) * (2 * d + 2), 1.0, 1.0) for w, d in sizes]
     shape = Levels.of(networks, torch.ones(len(sizes) - 1), 0.5).shape(jet=jet)
@@ -83,7 +86,7 @@ def test_a_jet_compiles_for_a_hopper() -> None:
         *((kind, [(128, 2)]) for kind in ("value", "jet", "back", "march")),
         ("jet", [(128, 3)]),
         ("jet", [(400, 2)]),
-        *((kind, [(128, 2), (256, 2), (400, 2)]) for kind in ("levels", "levels jet")),
+        *((kind, [(128, 2), (256, 2), (400, 2)]) for kind in ("levels", "levels jet", "bands")),
     ],
 )
 def test_kernels_compile(kind: str, sizes: list[tuple[int, int]], precision: str, capability: int) -> None:
