@@ -18,6 +18,7 @@ __all__ = [
     "estimate_normals",
     "fibonacci_directions",
     "fit_planes",
+    "mean_agreement",
     "nearest",
     "openness",
     "orient_normals",
@@ -165,6 +166,22 @@ def fibonacci_directions(count: int) -> Float64:
     angle = np.pi * (1 + np.sqrt(5)) * np.arange(count)
     ring = np.sqrt(1 - z**2)
     return np.stack((ring * np.cos(angle), ring * np.sin(angle), z), axis=1)
+
+
+def mean_agreement(points: Float64, normals: Float64, *, neighbors: int = 8) -> float:
+    """How well the signs of normals go from point to point: 1 if all neighbours agree, −1 if none do.
+
+    The mean over neighbours i and j of what `orient_normals` passes signs on by, ⟨n_i, n_j⟩ − 2⟨e, n_i⟩⟨e, n_j⟩/|e|²
+    along the edge e between them.
+
+    Args:
+        points: ``(N, 3)``, finite.
+        normals: ``(N, 3)`` unit normals.
+        neighbors: of each point.
+    """
+    near = nearest(points, min(neighbors + 1, len(points)))
+    rows, columns = np.repeat(np.arange(len(points)), near.shape[1] - 1), near[:, 1:].ravel()
+    return float(_agreement(points, normals, np.zeros(len(points)), rows, columns).mean())
 
 
 def _agreement(points: Float64, normals: Float64, spread: Float64, i: Index, j: Index) -> Float64:

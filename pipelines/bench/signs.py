@@ -17,7 +17,7 @@ from ...datasets import OrientedCloud, PointCloud
 from ...neural_fields import InputError
 from ..fit.cloud import CloudDistance
 from ..fit.train import prepare
-from ..fit.unoriented import Places, give_signs
+from ..fit.unoriented import Places, fits_better, give_signs
 from ..run.settings import FitConfig
 from ..surface.surface import read_reference
 from .benchmark import Benchmark, Part
@@ -41,6 +41,7 @@ class SignsRow:
         before: share of the normals that point inward, as the cloud was prepared.
         after: the same once a network that was not told of signs has given them.
         asked: whether a fit would have asked for that by itself.
+        fits: whether it would then have taken them: neighbours or winding numbers fit better with them.
         seconds: of the preparation.
         more_seconds: of the network.
     """
@@ -53,6 +54,7 @@ class SignsRow:
     before: float
     after: float
     asked: bool
+    fits: bool
     seconds: float
     more_seconds: float
 
@@ -117,6 +119,7 @@ class SignsBench(Benchmark[SignsRow]):
                 before=float(against.mean()),
                 after=float((against != signs.turned).mean()),
                 asked=places.contested,
+                fits=fits_better(cloud, signs),
                 seconds=seconds,
                 more_seconds=time.perf_counter() - started,
             )
@@ -130,6 +133,7 @@ class SignsBench(Benchmark[SignsRow]):
             (Column("wrong, %", ".2f"), lambda row: 100 * row.before),
             (Column("after the network, %", ".2f"), lambda row: 100 * row.after),
             (Column("asked by itself", "s"), lambda row: "yes" if row.asked else "no"),
+            (Column("fits better", "s"), lambda row: "yes" if row.fits else "no"),
             (Column("preparation, s", ".1f"), lambda row: row.seconds),
             (Column("network, s", ".1f"), lambda row: row.more_seconds),
         ]

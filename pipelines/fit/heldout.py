@@ -5,6 +5,10 @@ they judge it by its own loss there, Eq. 4 without the eikonal term: where a lev
 it sees, its loss falls at those and rises here. In the end it must have made distances or the angles of normals surely
 less, and neither surely more. A loss of squares would not do for that: it is mostly that of the few points on sharp
 edges, and a level that mends a little there pays for the roughness of all faces with it.
+
+Of thin parts and corners, which a few hundred points hardly know of, they are often not sure of anything. There the
+points that the level has learnt from are asked as well: what it has gained at those by far, and the others see too,
+if less surely, is no overfitting.
 """
 
 from __future__ import annotations
@@ -21,10 +25,12 @@ from ...neural_fields import Field, Siren
 from ...neural_fields.losses import data_loss, normal_loss, pseudo_huber
 from .samples import SQUARES, Samples, Usual, with_previous
 
-__all__ = ["FEWEST", "LOOKS", "Error", "Fall", "Judge", "Verdict", "held_out", "standard_errors", "voxels_of"]
+__all__ = ["FEWEST", "LEARNT", "LOOKS", "Error", "Fall", "Judge", "Verdict", "held_out", "standard_errors", "voxels_of"]
 
 FEWEST = 200  # whose mean square is known to a tenth
+WANTED, SPARED = 600, 0.05  # so many, of clouds that need not spare more than this part for them
 MOST = 0.1  # of the points; a cloud that would have to spare more spares none
+LEARNT = 0.8  # root mean square at the points that a level has learnt from, over that without it: a gain by far
 VOXEL = 2.0  # edge of a voxel in spacings: about four points, whose neighbours can still fill the gap
 SURELY = 2.0  # standard errors
 LOOKS = 8  # how often a level is judged while it trains
@@ -42,7 +48,7 @@ def held_out(points: NDArray[np.float32], spacing: float, share: float, *, seed:
     Returns:
         ``(N,)``; of a cloud that is too small to spare any, none.
     """
-    count = max(FEWEST, math.ceil(share * len(points)))
+    count = max(FEWEST, math.ceil(share * len(points)), min(WANTED, math.floor(SPARED * len(points))))
     if not share or count > MOST * len(points) or not spacing > 0:
         return np.zeros(len(points), bool)
     owner = voxels_of(points, spacing)
@@ -118,6 +124,7 @@ class Verdict(NamedTuple):
         after: the error with it.
         at: fraction of its schedule after which its weights were kept.
         fall: how sure the difference is.
+        learnt: root mean square of |f| at the points that it has learnt from, over that without it.
     """
 
     points: int
@@ -125,11 +132,22 @@ class Verdict(NamedTuple):
     after: Error
     at: float
     fall: Fall
+    learnt: float = 1.0
 
     @property
     def better(self) -> bool:
-        """Whether the level is worth having: one error is surely less, and the other not surely more."""
-        return max(self.fall) > SURELY and min(self.fall) > -SURELY
+        """Whether the level is worth having.
+
+        Either one error is surely less, and the other not surely more. Or both are less, surely or not, and it has
+        gained by far at the points that it has learnt from.
+        """
+        sure = max(self.fall) > SURELY and min(self.fall) > -SURELY
+        return sure or self.learns
+
+    @property
+    def learns(self) -> bool:
+        """Whether both errors are less, and those at the points that it has learnt from are by far."""
+        return min(self.fall) > 0 and self.learnt < LEARNT
 
     def words(self, level: int, *, scale: float = 1.0) -> str:
         """One line for people, of the ``level`` with this number; ``scale`` takes distances to input units."""
@@ -143,6 +161,8 @@ class Verdict(NamedTuple):
         pairs = zip(before, after, self.fall, (scale, 1.0), strict=True)
         distance, angle = (f"{b * unit:.3g} → {a * unit:.3g}{{}} ({_sure(fall)})" for b, a, fall, unit in pairs)
         errors = f"mean distance {distance.format('')}, mean angle of the normals {angle.format('°')}"
+        if self.learns and max(self.fall) <= SURELY:
+            errors += f"; at those that it has learnt from the root mean square is {self.learnt:.2f} of what it was"
         return f"level {level} {judged}: without it → with it, at {self.points:,} points that it has not seen: {errors}"
 
     def record(self, level: int, *, scale: float = 1.0) -> dict[str, Any]:
@@ -155,6 +175,7 @@ class Verdict(NamedTuple):
             "distance": [error.distance * scale for error in (self.before, self.after)],
             "angle": [error.angle for error in (self.before, self.after)],
             "fall_in_standard_errors": self.fall._asdict(),
+            "learnt": self.learnt,
             "verdict": self.words(level, scale=scale),
         }
 

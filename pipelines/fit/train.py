@@ -44,7 +44,7 @@ from .plan import Share
 from .review import Review, review_points
 from .samples import Band, Source, band_of, banded_sources, first_sources
 from .timing import Timing
-from .unoriented import Places, Signs, give_signs, signed
+from .unoriented import Places, Signs, fits_better, give_signs, signed
 
 __all__ = ["FitConfig", "Review", "Run", "fit", "prepare", "review_points"]
 
@@ -241,7 +241,8 @@ class _Fitting:
         if signs is None:
             self.save(self.grown(new_level(self.config, 0, residual=False), None), None)
             raise Interrupted(self.folder.out)
-        self.take_signs(signs)
+        if asked or fits_better(self.cloud, signs):
+            self.take_signs(signs)
 
     def take_signs(self, signs: Signs) -> None:
         """Turn normals as was found, and smooth the noise along them, if that was left until now."""
@@ -310,7 +311,10 @@ class _Fitting:
         review = self.review() if level == 0 else None
         before, self.errors = self.errors, self.values_at_cloud()
         silenced = level > 0 and _rms(self.errors) > WORSE * _rms(before)
-        silenced |= verdict is not None and not verdict.better
+        if verdict is not None:
+            seen = ~self.held
+            verdict = verdict._replace(learnt=_rms(self.errors[seen]) / max(_rms(before[seen]), 1e-30))
+            silenced |= not verdict.better
         if silenced:
             nn.init.zeros_(siren.output.weight)
             nn.init.zeros_(siren.output.bias)

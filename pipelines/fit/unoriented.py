@@ -11,6 +11,10 @@ Two witnesses with different faults say what is outside: `Exterior`, which holes
 numbers of normals that were oriented before, whose usual fault is to fill hollows. Each is believed in turn, and the
 field that has the steeper slope along the normals is kept: where it crosses a wall it has a slope of about 1, and none
 where both sides of the wall got the same sign. Where the slope is faint, signs come from the neighbours.
+
+Of bars that are thin for the network the field is faint all over, and its signs are worse than what came before: they
+change from point to point, and winding numbers fit them less. Neither need be so of good ones alone. A filled hollow
+has as few contradictions as an empty one, and winding numbers see no walls of two spacings.
 """
 
 from __future__ import annotations
@@ -26,8 +30,10 @@ from torch import Tensor
 from ...datasets import OrientedCloud
 from ...datasets.clouds.exterior import OUTSIDE, Exterior
 from ...datasets.clouds.noise import noise_deviation
-from ...datasets.clouds.orientation import settle_signs
+from ...datasets.clouds.orientation import mean_agreement, settle_signs
+from ...datasets.clouds.point_cloud import spread
 from ...datasets.clouds.reestimate import denoise
+from ...datasets.clouds.winding import misfit
 from ...neural_fields import Siren
 from ...neural_fields.devices import upload
 from ..run.settings import FitConfig
@@ -36,7 +42,7 @@ from .cloud import CloudDistance
 from .level import new_level
 from .samples import SURE, spread_points
 
-__all__ = ["BATCH", "SAMPLES", "STAGE", "STAGES", "STEPS", "Places", "Signs", "give_signs", "signed"]
+__all__ = ["BATCH", "SAMPLES", "STAGE", "STAGES", "STEPS", "Places", "Signs", "fits_better", "give_signs", "signed"]
 
 STEPS, BATCH, SAMPLES, RATE = 300, 4096, 50_000, 2e-3
 POINTS = 2.0  # weight of f = 0 at the points, in units of that of known distances
@@ -44,6 +50,7 @@ SETTLED = 0.25  # of the steps, after which the regions that the outside does no
 CLEAR = 0.1  # mean slope of the field into a region, from which on that has a sign
 FAINT = 0.15  # mean slope at the points, below which it says nothing: that of an open sheet
 CONTRADICTED = 0.01  # share of the places
+ASKED = 16_000  # points at which winding numbers are looked at
 STAGE = "level 0: signs"
 STAGES = tuple(f"{STAGE} ({number} of 2)" for number in (1, 2))  # one for each witness
 
@@ -149,6 +156,23 @@ def give_signs(
         return Signs(np.zeros(len(points), bool), clear, witness)
     signs = settle_signs(points.double().numpy(), normals.double().numpy(), slope.double().numpy())
     return Signs(signs < 0, clear, witness)
+
+
+def fits_better(cloud: OrientedCloud, signs: Signs) -> bool:
+    """Whether these signs fit the cloud better than those that it has, by neighbours or by winding numbers.
+
+    See `mean_agreement` and `misfit`. Where both are worse, signs have been spoilt.
+
+    Args:
+        cloud: as it was prepared.
+        signs: of its normals.
+    """
+    points, before = cloud.points.astype(np.float64), cloud.normals.astype(np.float64)
+    after = np.where(signs.turned[:, None], -before, before)
+    if mean_agreement(points, after) > mean_agreement(points, before):
+        return True
+    some, soft = spread(points, ASKED), 2 * cloud.noise
+    return misfit(points[some], after[some], softening=soft) < misfit(points[some], before[some], softening=soft)
 
 
 def signed(cloud: OrientedCloud, signs: Signs, *, smooth: bool) -> OrientedCloud:

@@ -12,6 +12,7 @@ from mplicits.neural_fields import Siren, Sphere
 from mplicits.pipelines.cli.info import describe
 from mplicits.pipelines.fit.heldout import (
     FEWEST,
+    LEARNT,
     VOXEL,
     Each,
     Error,
@@ -57,6 +58,8 @@ def test_whole_voxels_are_held_out() -> None:
     held = held_out(x, spacing, 0.03)
     size = np.bincount(np.unique(np.floor(x / (VOXEL * spacing)), axis=0, return_inverse=True)[1].reshape(-1))
     assert 600 <= held.sum() <= 600 + size.max()
+    assert 600 <= held_out(x, spacing, 0.01).sum() <= 600 + size.max()  # a share would be two hundred
+    assert 400 <= held_out(x[:8000], spacing, 0.01).sum() <= 400 + size.max()  # and six hundred too many
     cells = np.floor(x.astype(np.float64) / (VOXEL * spacing)).astype(np.int64)
     inside, outside = ({tuple(cell) for cell in cells[rows].tolist()} for rows in (held, ~held))
     assert not inside & outside
@@ -210,6 +213,17 @@ def test_a_level_is_kept_if_it_is_surely_better() -> None:
     assert verdict_of(math.inf, 0.0).better
 
 
+def test_where_held_out_points_are_not_sure_those_learnt_from_are_asked() -> None:
+    assert verdict_of(1.5, 1.5)._replace(learnt=0.79).better
+    assert not verdict_of(1.5, 1.5)._replace(learnt=0.81).better  # hardly more than what any level overfits
+    assert not verdict_of(1.5, -0.1)._replace(learnt=0.1).better  # nothing of that holds beside them
+    assert not verdict_of(-0.1, 1.5)._replace(learnt=0.1).better
+    words = verdict_of(1.5, 1.5)._replace(learnt=0.7).words(1)
+    assert words.startswith("level 1 kept: ")
+    assert words.endswith("; at those that it has learnt from the root mean square is 0.70 of what it was")
+    assert "learnt" not in verdict_of(3.0, 3.0)._replace(learnt=0.7).words(1)
+
+
 def test_roughness_of_faces_is_not_paid_for_at_edges() -> None:
     # A tenth of the points, at edges, is off by 20°, which becomes 19°; the others by 1°, which becomes 2°.
     x = points(1000)
@@ -241,6 +255,7 @@ def test_a_verdict_in_words() -> None:
         "distance": [0.1, 0.02],
         "angle": [3.0, 1.5],
         "fall_in_standard_errors": {"distance": 3.0, "angle": -3.0},
+        "learnt": 1.0,
         "verdict": worse.words(1, scale=10.0),
     }
 
@@ -277,7 +292,8 @@ def test_no_level_of_a_fit_is_worse_at_held_out_points_than_the_one_before(noise
     assert judged["points"] >= FEWEST / 2
     assert math.isfinite(judged["before"])
     falls = judged["fall_in_standard_errors"].values()
-    assert stage["silenced"] == (max(falls) <= 2 or min(falls) < -2)
+    learns = min(falls) > 0 and judged["learnt"] < LEARNT
+    assert stage["silenced"] == ((max(falls) <= 2 or min(falls) < -2) and not learns)
     assert judged["verdict"].startswith(f"level 1 {'set to zero' if stage['silenced'] else 'kept'}")
     assert judged["verdict"] in describe(tmp_path / "run")
     if noise:  # a sphere and noise: there is nothing that waves of this frequency could add to it

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from mplicits.datasets import OrientedCloud, PointCloud, sample_sphere, sample_torus
+from mplicits.datasets import OrientedCloud, PointCloud, prepare_cloud, sample_sphere, sample_torus
 from mplicits.neural_fields import load_field
 from mplicits.pipelines.fit.cloud import CloudDistance
 from mplicits.pipelines.fit.train import fit, prepare
-from mplicits.pipelines.fit.unoriented import STAGES, Places, give_signs
+from mplicits.pipelines.fit.unoriented import STAGES, Places, Signs, fits_better, give_signs
 from mplicits.pipelines.run.settings import FitConfig
 from mplicits.pipelines.run.trainer import Interrupted, Progress, StopFlag
 from torch import Tensor
@@ -75,6 +75,20 @@ def test_the_hollow_of_a_thick_wall_is_outside_though_normals_filled_it() -> Non
     assert found is not None
     assert found.turned[:5000].mean() < FEW
     assert found.turned[5000:].mean() > 1 - FEW
+
+
+def test_signs_are_taken_where_neighbours_or_winding_numbers_fit_better_with_them() -> None:
+    points, normals = joined(ball(2500, 0.8), ball(1500, 0.6, inward=True))
+    cloud = prepare_cloud(PointCloud(points.double().numpy(), normals.numpy(), None, "shell"), normals="file")
+    inner = np.arange(len(cloud)) >= 2500
+    filled = replace(cloud, normals=np.where(inner[:, None], -cloud.normals, cloud.normals))
+    assert fits_better(filled, Signs(inner, 1.0, "exterior"))
+    assert not fits_better(cloud, Signs(inner, 1.0, "exterior"))
+    some = np.random.default_rng(0).uniform(size=len(cloud)) < 0.07
+    assert not fits_better(cloud, Signs(some, 1.0, "winding"))
+    spotted = replace(cloud, normals=np.where(some[:, None], -cloud.normals, cloud.normals))
+    assert fits_better(spotted, Signs(some, 1.0, "winding"))
+    assert fits_better(spotted, Signs(some != inner, 1.0, "winding"))  # neighbours cannot tell which side is out
 
 
 def test_a_ball_leaves_nothing_in_doubt() -> None:
