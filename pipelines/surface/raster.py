@@ -96,37 +96,72 @@ def cover(xy: Float64, faces: Int64, shape: tuple[int, int], *, chunk: int = CHU
         xy: ``(V, 2)`` vertices, in units of the grid.
         faces: ``(F, 3)`` vertex indices.
         shape: columns along x and y.
-        chunk: how many candidate pairs to hold at a time.
+        chunk: how many pairs to test at a time, of a triangle and a column between its edges.
     """
     corners = xy[faces]  # (F, 3, 2)
     top = np.asarray(shape) - 1
     low = np.clip(np.ceil(corners.min(axis=1)), 0, top + 1).astype(np.int64)  # (F, 2)
     high = np.clip(np.floor(corners.max(axis=1)), -1, top).astype(np.int64)
-    size = np.maximum(high - low + 1, 0)
-    count = size[:, 0] * size[:, 1]
-    used = np.flatnonzero(count)
-    ends = np.cumsum(count[used])
+    lines = np.where((high >= low).all(axis=1), high[:, 0] - low[:, 0] + 1, 0)
+    used = np.flatnonzero(lines)
+    for start, stop in _groups(lines[used], chunk):
+        some = used[start:stop]
+        row = np.repeat(np.arange(len(some)), lines[some])
+        i = low[some, 0][row] + _within(lines[some])
+        first, count = _between(corners[some], row, i, low[some, 1], high[some, 1])
+        for begin, end in _groups(count, chunk):
+            times = count[begin:end]
+            j = np.repeat(first[begin:end], times) + _within(times)
+            yield _inside(
+                xy, faces[some], some, np.repeat(row[begin:end], times), np.repeat(i[begin:end], times), j, shape[1]
+            )
+
+
+def _groups(count: Int64, chunk: int) -> Iterator[tuple[int, int]]:
+    """Consecutive ranges of ``count`` whose sums are at most ``chunk``, or that have one member."""
+    ends = np.cumsum(count)
     start = 0
-    while start < len(used):
+    while start < len(count):
         base = ends[start - 1] if start else 0
         stop = max(int(np.searchsorted(ends, base + chunk, side="right")), start + 1)
-        some = used[start:stop]
-        yield _cover_candidates(xy, faces, some, low[some], size[some], shape[1])
+        yield start, stop
         start = stop
 
 
-def _cover_candidates(xy: Float64, faces: Int64, some: Int64, low: Int64, size: Int64, ny: int) -> Coverage:
-    """Test every column in the bounding boxes of the triangles ``some``."""
-    count = size[:, 0] * size[:, 1]
-    row = np.repeat(np.arange(len(some)), count)
-    within = np.arange(len(row)) - np.repeat(np.cumsum(count) - count, count)
-    i = low[row, 0] + within // size[row, 1]
-    j = low[row, 1] + within % size[row, 1]
-    face = some[row]
+def _within(count: Int64) -> Int64:
+    """0 … count[0] − 1, 0 … count[1] − 1, and so on: ``(Σ count,)``."""
+    return np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+
+
+def _between(corners: Float64, row: Int64, i: Int64, low: Int64, high: Int64) -> tuple[Int64, Int64]:
+    """Where the line x = ``i`` runs through the triangle ``corners[row]``: the first column to be tested, and how many.
+
+    The two edges that the line crosses bound it. The interval is widened by what the test of a column can be wrong by:
+    on an edge from (x₀, y₀) by (Δx, Δy) its error is a few roundings of |Δx||j − y₀| + |Δy||i − x₀|, and
+    |i − x₀| ≤ |Δx| there, so that in y it is a few roundings of the triangle's height.
+    """
+    lowest, highest = np.full(len(row), np.inf), np.full(len(row), -np.inf)
+    for k in range(3):
+        start, end = corners[:, k], corners[:, (k + 1) % 3]
+        left, right = np.minimum(start[:, 0], end[:, 0])[row], np.maximum(start[:, 0], end[:, 0])[row]
+        (x, y), (dx, dy) = start[row].T, (end - start)[row].T
+        crossed = (left <= i) & (i <= right) & (dx != 0)
+        y = y + dy * np.divide(i - x, dx, out=np.zeros_like(x), where=crossed)
+        np.minimum(lowest, y, out=lowest, where=crossed)
+        np.maximum(highest, y, out=highest, where=crossed)
+    low, high = low[row], high[row]
+    wider = 64 * np.finfo(np.float64).eps * (np.abs(corners[..., 1]).max(axis=1)[row] + 1)
+    first = np.ceil(np.clip(lowest - wider, low, high + 1)).astype(np.int64)
+    last = np.floor(np.clip(highest + wider, low - 1, high)).astype(np.int64)
+    return first, np.maximum(last - first + 1, 0)
+
+
+def _inside(xy: Float64, faces: Int64, some: Int64, row: Int64, i: Int64, j: Int64, ny: int) -> Coverage:
+    """Those of the columns (``i``, ``j``) that are in the triangle ``faces[row]``, number ``some[row]`` of all."""
     sides = np.empty((len(row), 3))  # twice the signed area of the point with each edge
     left = np.empty((len(row), 3), dtype=bool)
     for k in range(3):  # the edge opposite vertex k
-        a, b = faces[some, (k + 1) % 3], faces[some, (k + 2) % 3]
+        a, b = faces[:, (k + 1) % 3], faces[:, (k + 2) % 3]
         forward = a < b
         first, second = xy[np.where(forward, a, b)], xy[np.where(forward, b, a)]
         along = (second - first)[row]
@@ -140,4 +175,5 @@ def _cover_candidates(xy: Float64, faces: Int64, some: Int64, low: Int64, size: 
     sides = np.abs(sides[hit])
     area = sides.sum(axis=1, keepdims=True)
     weights = np.divide(sides, area, out=np.full_like(sides, 1 / 3), where=area > 0)
-    return Coverage(face[hit], (i * ny + j)[hit], weights, np.where(total[hit] == 3, 1, -1).astype(np.int8))
+    sign = np.where(total[hit] == 3, 1, -1).astype(np.int8)
+    return Coverage(some[row[hit]], (i * ny + j)[hit], weights, sign)

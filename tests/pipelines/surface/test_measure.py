@@ -172,6 +172,36 @@ def test_columns_of_a_triangle_are_those_inside_it():
     np.testing.assert_array_equal(np.sort(turned.column), np.sort(found.column))
 
 
+@pytest.mark.parametrize("places", ["anywhere", "columns", "far", "in line"])
+def test_columns_are_those_that_a_test_of_all_finds(places):
+    """Between the two edges that a line crosses lies every column that the test of all three sides would take."""
+    rng = np.random.default_rng(5)
+    xy = rng.uniform(-5, 40, (60, 2))
+    if places == "columns":
+        xy = np.round(2 * xy) / 2
+    elif places == "far":
+        xy *= rng.choice([1, 1e5, 1e9], (60, 1))
+    elif places == "in line":
+        xy[:, 1] = 3 * xy[:, 0] + rng.uniform(-1e-14, 1e-14, 60)
+    faces = np.stack([rng.permutation(60)[:3] for _ in range(80)])
+    parts = list(cover(xy, faces, (32, 40)))
+    found = {(f, c, s) for part in parts for f, c, s in zip(part.face, part.column, part.sign, strict=True)}
+
+    i, j = np.meshgrid(np.arange(32), np.arange(40), indexing="ij")
+    expected = set()
+    for number, face in enumerate(faces):
+        left = []
+        for a, b in zip(face, np.roll(face, -1), strict=True):
+            first, along = xy[min(a, b)], xy[max(a, b)] - xy[min(a, b)]
+            left.append((along[0] * (j - first[1]) - along[1] * (i - first[0]) > 0) == (a < b))
+        low, high = xy[face].min(axis=0), xy[face].max(axis=0)
+        box = (low[0] <= i) & (i <= high[0]) & (low[1] <= j) & (j <= high[1])
+        for sign, hit in ((1, np.all(left, axis=0)), (-1, ~np.any(left, axis=0))):
+            expected |= {(number, c, sign) for c in np.flatnonzero(hit & box)}
+    assert found == expected
+    assert len(expected) > 20 or places == "in line"
+
+
 def test_small_chunks_cover_the_same_columns():
     rng = np.random.default_rng(3)
     xy, faces = rng.uniform(-5, 40, (60, 2)), rng.integers(0, 60, (50, 3))
