@@ -29,7 +29,16 @@ from .similarity import Similarity
 from .siren import Siren
 from .spacetime import SpaceTimeSDF
 
-__all__ = ["SavedField", "load_field", "load_texture", "save_field", "save_texture"]
+__all__ = [
+    "SavedField",
+    "checksum_of",
+    "field_bytes",
+    "load_field",
+    "load_texture",
+    "save_field",
+    "save_texture",
+    "texture_bytes",
+]
 
 # Closed forms are made again of their definition; what is put together of fields, of that and of its parts.
 CLOSED: Mapping[str, Callable[..., Field]] = {cls.__name__: cls for cls in (Box, Capsule, Plane, Sphere, Torus)}
@@ -39,6 +48,7 @@ COMBINED: Mapping[str, Callable[..., Field]] = {
 FORMAT = "mplicits-field"
 TEXTURE_FORMAT = "mplicits-texture"
 VERSION = 1
+_AGAIN = {FORMAT: "take it from a backup, or fit again", TEXTURE_FORMAT: "run `mplicits texture` again"}
 
 
 class SavedField(NamedTuple):
@@ -66,6 +76,22 @@ def save_field(
 
     Args:
         path: where to write.
+        field: see `field_bytes`.
+        similarity: see `field_bytes`.
+        metadata: see `field_bytes`.
+
+    Raises:
+        TypeError: a field of this type has no description on disk.
+    """
+    write_whole(Path(path), field_bytes(field, similarity=similarity, metadata=metadata))
+
+
+def field_bytes(
+    field: Field, *, similarity: Similarity | None = None, metadata: Mapping[str, Any] | None = None
+) -> bytes:
+    """What a file of a field holds.
+
+    Args:
         field: a `Siren`, a `MultiscaleSDF` of them, a `SpaceTimeSDF` of that, a closed form such as `Sphere`, or what
             `Union`, `Difference`, `Offset` and the like make of all these.
         similarity: the map from input to unit-sphere coordinates; the identity if there is none.
@@ -82,7 +108,7 @@ def save_field(
         "similarity": {"center": list(similarity.center), "scale": similarity.scale},
         "metadata": dict(metadata or {}),
     }
-    _write(Path(path), dict(field.state_dict()), FORMAT, header)
+    return _packed(dict(field.state_dict()), FORMAT, header)
 
 
 def load_field(path: str | os.PathLike[str], *, device: torch.device | str = "cpu") -> SavedField:
@@ -104,10 +130,14 @@ def load_field(path: str | os.PathLike[str], *, device: torch.device | str = "cp
 def save_texture(
     path: str | os.PathLike[str], texture: TextureField, *, metadata: Mapping[str, Any] | None = None
 ) -> None:
-    """Write a texture, without its geometry, to a safetensors file, whole or not at all.
+    """Write a texture, without its geometry, to a safetensors file, whole or not at all; see `texture_bytes`."""
+    write_whole(Path(path), texture_bytes(texture, metadata=metadata))
+
+
+def texture_bytes(texture: TextureField, *, metadata: Mapping[str, Any] | None = None) -> bytes:
+    """What a file of a texture holds.
 
     Args:
-        path: where to write.
         texture: its geometry is not stored; a digest of it is, so that no other geometry gets these colours.
         metadata: JSON values to keep with it.
     """
@@ -120,7 +150,7 @@ def save_texture(
         "metadata": dict(metadata or {}),
     }
     tensors = {name: tensor for name, tensor in texture.state_dict().items() if not name.startswith("geometry.")}
-    _write(Path(path), tensors, TEXTURE_FORMAT, header)
+    return _packed(tensors, TEXTURE_FORMAT, header)
 
 
 def load_texture(path: str | os.PathLike[str], geometry: Field) -> TextureField:
@@ -164,11 +194,20 @@ def _digest(field: Field) -> str:
     return digest.hexdigest()
 
 
-def _write(path: Path, state: Mapping[str, Tensor], form: str, header: Mapping[str, Any]) -> None:
+def checksum_of(tensors: Mapping[str, Tensor]) -> str:
+    """SHA-256 of tensors on the CPU, with their names, types and shapes."""
+    digest = hashlib.sha256()
+    for name, tensor in sorted(tensors.items()):
+        digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}\n".encode())
+        digest.update(tensor.contiguous().reshape(-1).view(torch.uint8).numpy().data)
+    return digest.hexdigest()
+
+
+def _packed(state: Mapping[str, Tensor], form: str, header: Mapping[str, Any]) -> bytes:
     # Cloned: a field that is part of a combination twice has its tensors twice, which safetensors refuses.
     tensors = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in state.items()}
     # Bytes, not save_file: that makes files nobody else may read, whatever the umask.
-    write_whole(path, save(tensors, metadata={form: json.dumps(header)}))
+    return save(tensors, metadata={form: json.dumps({**header, "checksum": checksum_of(tensors)})})
 
 
 @contextmanager
@@ -190,7 +229,10 @@ def _reading(
                     f"{path}: {thing.split()[-1]} format version {header['version']}; this mplicits reads version "
                     f"{VERSION}, so write it again with `{command}` or install the version that wrote it"
                 )
-            tensors = {name: file.get_tensor(name).to(device) for name in file.keys()}  # noqa: SIM118
+            held = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            if header.get("checksum") not in (None, checksum_of(held)):  # older files have none
+                raise InputError(f"{path}: damaged (its numbers are not those that were written); {_AGAIN[form]}")
+            tensors = {name: tensor.to(device) for name, tensor in held.items()}
         yield header, tensors
     except InputError:
         raise

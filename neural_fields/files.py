@@ -13,9 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from . import disk
 from .errors import InputError
 
-__all__ = ["check_place", "damage", "files_in", "whole_file", "write_json", "write_whole"]
+__all__ = ["check_place", "damage", "files_in", "json_bytes", "partial_of", "whole_file", "write_json", "write_whole"]
 
 
 def check_place(path: str | Path) -> None:
@@ -70,6 +71,11 @@ def damage(path: str | Path, remedy: str) -> Iterator[None]:
         raise InputError(f"{path}: damaged ({type(error).__name__}: {reason}); {remedy}") from error
 
 
+def partial_of(path: Path) -> Path:
+    """What ``path`` is called while it is written: hidden, with the number of the process and the same extension."""
+    return path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
+
+
 @contextmanager
 def whole_file(path: str | Path) -> Iterator[Path]:
     """A temporary file beside ``path``, for the block to write, that takes its name when the block ends.
@@ -85,14 +91,14 @@ def whole_file(path: str | Path) -> Iterator[Path]:
         ...     write_slowly(partial)  # doctest: +SKIP
     """
     path = Path(path)
-    partial = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
+    partial = partial_of(path)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        disk.make_folder(path.parent)
         try:
             yield partial
-            partial.replace(path)
+            disk.rename(partial, path)
         finally:
-            partial.unlink(missing_ok=True)
+            disk.remove(partial)
     except OSError as error:
         reason = error.strerror or error
         raise InputError(f"{path}: cannot be written ({reason}); choose another place") from error
@@ -105,16 +111,21 @@ def write_whole(path: str | Path, content: str | bytes) -> None:
         InputError: see `whole_file`.
     """
     with whole_file(path) as partial:
-        partial.write_bytes(content.encode() if isinstance(content, str) else content)
+        disk.write(partial, content.encode() if isinstance(content, str) else content)
+
+
+def json_bytes(data: Any) -> bytes:
+    """Data as JSON, indented by two."""
+    return (json.dumps(data, indent=2) + "\n").encode()
 
 
 def write_json(path: str | Path, data: Any) -> None:
-    """Write data as JSON, indented by two, through `whole_file`.
+    """Write data as `json_bytes` through `whole_file`.
 
     Raises:
         InputError: see `whole_file`.
     """
-    write_whole(path, json.dumps(data, indent=2) + "\n")
+    write_whole(path, json_bytes(data))
 
 
 def files_in(folder: Path, suffixes: Collection[str]) -> list[Path]:

@@ -30,7 +30,7 @@ from ...neural_fields import (
 from ..evolve.checks import slope_figures
 from ..evolve.shapes import Placed, Placement
 from ..evolve.train import evolve
-from ..run.folder import FIELD_FILE
+from ..run.folder import find_field
 from ..run.settings import EvolveConfig, FitConfig
 from ..surface.measure import evaluate_surfaces
 from ..surface.surface import components, from_mesh, read_reference
@@ -315,7 +315,7 @@ class MorphBench(Benchmark[MorphRow]):
         run = evolve(own, out=work.run(), progress=work.stage("morph"))
         fits, ends, floors = [], [], []
         for time, (path, directory) in enumerate(zip(cell.files, runs, strict=True)):
-            fitted, similarity, _ = load_field(directory / FIELD_FILE)
+            fitted, similarity, _ = load_field(find_field(directory))
             moved = read_reference(path).moved(similarity)
             back = Placement.from_dict(run.record["placements"][time]).inverse()
             for found, into in ((fitted, fits), (Placed(run.field.at(float(time)), back), ends)):

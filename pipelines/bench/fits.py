@@ -27,7 +27,7 @@ from ..fit.cloud import load_cloud
 from ..fit.train import Run, fit, prepare
 from ..render.picture import contact_sheet, write_picture
 from ..render.rasterise import picture_of
-from ..run.folder import FIELD_FILE, RECORD_FILE, STATE_FILE, is_fitted, read_record
+from ..run.folder import STATE_FILE, find_field, is_fitted, read_record
 from ..run.machine import peak_memory
 from ..run.settings import FitConfig
 from ..run.trainer import Report
@@ -87,10 +87,10 @@ def kept_fit(directory: Path, cloud: PointCloud | Path, config: FitConfig, *, pr
         InputError: the cloud cannot be used.
         Interrupted: the fit was asked to stop; the next call goes on with it.
     """
-    if not (directory / RECORD_FILE).is_file() or not is_fitted(directory):
+    if not is_fitted(directory):
         directory.parent.mkdir(parents=True, exist_ok=True)
         return fit(cloud, config, out=directory, resume=(directory / STATE_FILE).is_file(), progress=progress)
-    field, similarity, _ = load_field(directory / FIELD_FILE)
+    field, similarity, _ = load_field(find_field(directory))
     assert isinstance(field, MultiscaleSDF)
     return Run(field, similarity, directory, read_record(directory))
 

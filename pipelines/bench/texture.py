@@ -19,7 +19,7 @@ from ..render.compare import Drawing, ImageError, draw, image_error, psnr
 from ..render.picture import Image, as_bytes, contact_sheet, write_picture
 from ..render.rasterise import mesh_view
 from ..render.trace import trace_view
-from ..run.folder import FIELD_FILE, TEXTURE_FILE, digest_of, read_record
+from ..run.folder import TEXTURE_FILE, digest_of, find_field, read_record
 from ..run.machine import choose_device
 from ..run.settings import FitConfig, TextureConfig
 from ..surface.surface import Surface, from_mesh
@@ -175,7 +175,7 @@ class TextureBench(Benchmark[TextureRow]):
         trained = (run / TEXTURE_FILE).is_file() and read_record(run).get("texture", {}).get("finished", False)
         if not trained and not texture_run(run, path, self.texture, progress=progress).record["finished"]:
             raise KeyboardInterrupt
-        field, similarity, _ = load_field(run / FIELD_FILE, device=choose_device(self.texture.device))
+        field, similarity, _ = load_field(find_field(run), device=choose_device(self.texture.device))
         return Fitted(field, similarity, load_texture(run / TEXTURE_FILE, field), read_record(run))
 
     def drawn(

@@ -36,6 +36,7 @@ def _run(arguments: argparse.Namespace, benches: Sequence[Benchmark[Any]], *, ou
     from ..bench.cells import Catalogue, make_folder
     from ..bench.report import as_text
     from ..bench.run import run_cells
+    from ..run.lock import locked
     from ..run.progress import progress_bars
     from ..run.trainer import Interrupted
 
@@ -45,6 +46,7 @@ def _run(arguments: argparse.Namespace, benches: Sequence[Benchmark[Any]], *, ou
     with ExitStack() as stack:
         folder = out or Path(stack.enter_context(tempfile.TemporaryDirectory()))
         make_folder(folder)
+        stack.enter_context(locked(folder))
         try:
             with progress_bars(whole=False) as bars:
                 ran = run_cells(

@@ -52,6 +52,7 @@ def _paper(arguments: argparse.Namespace) -> int:
     from ..bench.cells import make_folder
     from ..bench.report import as_text, section_as_dict
     from ..paper.bench import PAGE, Bench, bench_paper, find_shapes
+    from ..run.lock import locked
     from ..run.trainer import Interrupted
 
     make_folder(arguments.out)
@@ -67,7 +68,8 @@ def _paper(arguments: argparse.Namespace) -> int:
         page=arguments.page,
     )
     try:
-        sections, failures = bench_paper(bench, arguments.out, say=lambda text: print(text, file=sys.stderr))
+        with locked(arguments.out):
+            sections, failures = bench_paper(bench, arguments.out, say=lambda text: print(text, file=sys.stderr))
     except (Interrupted, KeyboardInterrupt):
         print("interrupted; the same command goes on after the last finished cell", file=sys.stderr)
         return 130

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ...neural_fields import Siren, levels_of, load_field
-from ..run.folder import RECORD_FILE, find_field, is_field
+from ..run.folder import RECORD_FILE, find_field, is_field, read_record, resumes_with
 from ..run.trainer import parameter_count
 from ..surface.surface import Surface, components, is_closed, read_surface
 
@@ -34,7 +33,7 @@ def _describe_field(path: Path) -> Rows:
     field, similarity, metadata = load_field(file)
     record = metadata.get("run", {})
     if path.is_dir() and (path / RECORD_FILE).is_file():
-        record = json.loads((path / RECORD_FILE).read_text(encoding="utf-8"))
+        record = read_record(path)
     rows: Rows = [
         (
             "kind",
@@ -56,7 +55,7 @@ def _describe_field(path: Path) -> Rows:
             rows.append((f"  band {index}", f"δ = {delta:.5g} ({delta * similarity.scale:.5g} input units)"))
     center = ", ".join(f"{number:.9g}" for number in similarity.center)
     rows.append(("input frame", f"center ({center}), 1 unit = {similarity.scale:.9g} input units"))
-    return rows + _describe_record(record)
+    return rows + _describe_record(record, path)
 
 
 def _describe_level(level: Any, stage: dict[str, Any]) -> str:
@@ -74,7 +73,7 @@ def _describe_level(level: Any, stage: dict[str, Any]) -> str:
     return text
 
 
-def _describe_record(record: dict[str, Any]) -> Rows:
+def _describe_record(record: dict[str, Any], path: Path) -> Rows:
     if not record:
         return []
     rows: Rows = [("fitted to", str(record.get("cloud", "?")))]
@@ -88,7 +87,10 @@ def _describe_record(record: dict[str, Any]) -> Rows:
     signs = record.get("signs")
     if signs:
         rows.append(("signs", _describe_signs(signs, cleaning.get("kept", 0))))
-    rows.append(("state", "finished" if record.get("finished") else "unfinished: --resume continues it"))
+    rows.append(("state", _describe_state(record, path)))
+    texture = record.get("texture")
+    if texture and not texture.get("finished", True):
+        rows.append(("texture", f"unfinished: mplicits texture {path} {texture['source']} --resume"))
     if "training_seconds" in record:
         rows.append(("time", f"{record['training_seconds']:.1f} s"))
     if environment:
@@ -98,6 +100,16 @@ def _describe_record(record: dict[str, Any]) -> Rows:
     if "seed" in record.get("config", {}):
         rows.append(("seed", str(record["config"]["seed"])))
     return rows
+
+
+def _describe_state(record: dict[str, Any], path: Path) -> str:
+    """Whether the training is finished, and what to type if not."""
+    if record.get("finished"):
+        return "finished"
+    if not path.is_dir():
+        return "unfinished"
+    again = resumes_with(path, record)
+    return f"unfinished: {again}" if again else "unfinished, with nothing to resume from: begin again with --force"
 
 
 def _describe_signs(signs: dict[str, Any], count: int) -> str:

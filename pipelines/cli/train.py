@@ -121,9 +121,6 @@ TEXTURE = Command(
 )
 
 
-MESH_FILE = "mesh.ply"
-
-
 def _reconstruct_arguments(parser: argparse.ArgumentParser) -> None:
     what = (
         "directory of NeuS/DTU (cameras_sphere.npz), nerfstudio or Blender (transforms.json), or COLMAP; or that file"
@@ -140,7 +137,7 @@ def _reconstruct(arguments: argparse.Namespace) -> int:
     config = None if arguments.resume else read_settings(arguments, ReconstructConfig)
     from ..mesh.extract import mesh_run
     from ..mesh.plan import mesh_stage, meshing
-    from ..reconstruct.train import HELD_OUT_FILE, reconstruct
+    from ..reconstruct.train import HELD_OUT_FILE, MESH_FILE, reconstruct
     from ..run.costs import Net
     from ..run.folder import check_new_run, read_record
     from ..run.machine import choose_device, speed

@@ -154,7 +154,6 @@ class _Evolving:
         self.trainer_state: dict[str, Tensor] = {}
 
     def run(self, flag: StopFlag) -> Evolution:
-        self.folder.begin(self.record(finished=False))
         for level in range(len(self.stages), self.config.num_levels):
             self.schedule.plan(self.plan.stages(level, begun=bool(self.trainer_state)), budget=self.left())
             if not self.trainer_state and not self.is_worth(level):
@@ -173,7 +172,7 @@ class _Evolving:
         record["checks"] = check_evolution(
             field, self.problem.ends, frames=self.config.frames, resolution=self.config.resolution, count=count
         )
-        self.folder.finish(field, self.problem.similarity, record)
+        record = self.folder.finish(field, self.problem.similarity, record)
         return Evolution(field, self.problem.similarity, self.folder.out, record)
 
     def train_level(self, level: int, flag: StopFlag) -> None:

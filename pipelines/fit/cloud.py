@@ -30,12 +30,12 @@ from ...datasets.clouds.reading import check_cloud, open_stream
 from ...datasets.clouds.stream import MemoryStream
 from ...neural_fields.files import whole_file
 from ..run.costs import queries, windings
+from ..run.folder import MERGED_FILE
 
-__all__ = ["MERGED_FILE", "CloudDistance", "load_cloud"]
+__all__ = ["CloudDistance", "load_cloud"]
 
 Float32 = NDArray[np.float32]
 
-MERGED_FILE = "merged_cloud.npz"
 # What merging does may change; what an older version left behind is then made again.
 VERSION = 1
 # Area of a point's disc over the median one: scans are this much sparser where they graze the surface, hardly more.

@@ -29,11 +29,11 @@ from ...datasets import (
 from ...datasets.depth.frame import PosedFrame
 from ...datasets.depth.images import COLOR_SUFFIXES, DEPTH_SUFFIXES
 from ...neural_fields import InputError
-from ...neural_fields.files import files_in
+from ...neural_fields.files import files_in, partial_of
 from ..run.folder import CLOUD_FILE, kept_cloud, read_record
 from ..run.machine import choose_device
 from ..run.trainer import Report
-from .train import FitConfig, Run, fit
+from .train import FitConfig, Run, fit, fit_moved
 
 __all__ = ["DepthInput", "depth_cloud", "fit_depth", "trim_suggestion"]
 
@@ -148,10 +148,12 @@ def fit_depth(
         say(facts.summary())
     if config.normals == "auto":
         config = dataclasses.replace(config, normals="file")
-    out.mkdir(parents=True, exist_ok=True)
-    kept = out / CLOUD_FILE
-    write_cloud_ply(kept, cloud)
-    return fit(kept, config, out=out, progress=progress)
+    made = partial_of(out / CLOUD_FILE)  # until the first checkpoint, when what was there makes way
+    try:
+        write_cloud_ply(made, cloud)
+        return fit_moved(made, config, out=out, name=CLOUD_FILE, progress=progress)
+    finally:
+        made.unlink(missing_ok=True)
 
 
 def trim_suggestion(run: Path) -> float:

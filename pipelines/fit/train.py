@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from ...datasets import OrientedCloud, PointCloud, prepare_cloud, spacing_of
 from ...datasets.clouds.large import Merging
 from ...neural_fields import InputError, MultiscaleSDF, Similarity, Siren, WorldField, save_field
-from ..run.folder import RunFolder, digest_of, named_cloud
+from ..run.folder import SUPPORT_FILE, RunFolder, digest_of, named_cloud
 from ..run.machine import choose_device, environment, peak_memory
 from ..run.settings import FitConfig
 from ..run.trainer import (
@@ -35,7 +35,7 @@ from ..run.trainer import (
     stop_on_signals,
     without_prefix,
 )
-from ..surface.trim import write_support
+from ..surface.trim import thinned
 from .between import dense_distance
 from .cloud import CloudDistance, load_cloud
 from .heldout import FEWEST, Judge, held_out
@@ -46,7 +46,7 @@ from .samples import Band, Source, band_of, banded_sources, first_sources
 from .timing import Timing
 from .unoriented import Places, Signs, fits_better, give_signs, signed
 
-__all__ = ["FitConfig", "Review", "Run", "fit", "prepare", "review_points"]
+__all__ = ["FitConfig", "Review", "Run", "fit", "fit_moved", "prepare", "review_points"]
 
 # A level whose error at the points is so many times that of the level before it is worse than none: set to zero, it is
 # that level. Where data contradict themselves, as the sides of a part do that is thinner than their noise, it happens.
@@ -127,7 +127,37 @@ def fit(
         >>> run = fit("scan.ply")  # doctest: +SKIP
         >>> run.world.distance(points)  # of the scan, in its coordinates and units  # doctest: +SKIP
     """
-    folder = RunFolder(out, resume=resume)
+    return _fit(RunFolder(out, resume=resume), cloud, config, progress=progress, level_done=level_done)
+
+
+def fit_moved(file: Path, config: FitConfig, *, out: Path, name: str, progress: Report | None = None) -> Run:
+    """`fit` a cloud that was made for the run, and lies in its directory.
+
+    Args:
+        file: the cloud.
+        config: settings.
+        out: run directory.
+        name: what the file is called there from the first checkpoint on; until then that may be another run's.
+        progress: see `fit`.
+
+    Raises:
+        InputError: see `fit`.
+        Interrupted: see `fit`.
+    """
+    folder = RunFolder(out)
+    folder.keep(name, file)
+    return _fit(folder, file, config, source=str(out / name), progress=progress)
+
+
+def _fit(
+    folder: RunFolder,
+    cloud: Cloud,
+    config: FitConfig | None,
+    *,
+    source: str | None = None,
+    progress: Report | None = None,
+    level_done: LevelDone | None = None,
+) -> Run:
     config = folder.config(FitConfig, config)
     device = choose_device(config.device)
     timing, points = Timing(config, progress, device), _as_cloud(cloud)
@@ -137,10 +167,10 @@ def fit(
     prepared = prepare(raw, config)
     timing.has_prepared()
     load_compiler()
-    fitting = _Fitting(prepared, raw.source, config, device, folder, timing, merging)
+    fitting = _Fitting(prepared, source or raw.source, config, device, folder, timing, merging)
     fitting.level_done = level_done
     with folder.writing(), stop_on_signals() as flag:
-        if resume:
+        if folder.resume:
             fitting.restore()
         return fitting.run(flag)
 
@@ -203,7 +233,6 @@ class _Fitting:
         self.samples: int | None = None  # of the level under way, where a time budget leaves it fewer
 
     def run(self, flag: StopFlag) -> Run:
-        self.folder.begin(self.record(finished=False))
         if not self.stages and not self.trainer_state:
             self.find_signs(flag)
         self.keep_support()
@@ -213,8 +242,7 @@ class _Fitting:
                 break
             self.train_level(level, share, flag)
         assert self.frozen is not None
-        record = self.record(finished=True)
-        self.folder.finish(self.frozen, self.cloud.similarity, record)
+        record = self.folder.finish(self.frozen, self.cloud.similarity, self.record(finished=True))
         return Run(self.frozen.cpu(), self.cloud.similarity, self.folder.out, record)
 
     def find_signs(self, flag: StopFlag) -> None:
@@ -253,7 +281,7 @@ class _Fitting:
     def keep_support(self) -> None:
         """Keep the points that are fitted in the run."""
         if self.folder.out is not None:
-            write_support(self.folder.out, self.points.numpy())
+            self.folder.keep_tensors(SUPPORT_FILE, thinned(self.points.numpy()))
 
     def share(self, level: int) -> Share | None:
         """Samples of a level, and seconds for it all in the time budget; None if none are left that are worth it."""

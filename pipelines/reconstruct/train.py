@@ -18,8 +18,9 @@ from torch import Tensor
 
 from ...datasets import PointCloud
 from ...datasets.views.images import PosedImage, PosedImages, read_posed_images
-from ...neural_fields import InputError, Jet, NoSurfaceError, TextureField, extract_mesh, save_texture
-from ..render.picture import write_picture
+from ...neural_fields import InputError, Jet, NoSurfaceError, TextureField, extract_mesh
+from ...neural_fields.checkpoint import texture_bytes
+from ..render.picture import Image, picture_bytes, write_picture
 from ..run.costs import Speed
 from ..run.folder import TEXTURE_FILE, RunFolder, digest_of
 from ..run.machine import choose_device, environment, speed
@@ -34,10 +35,19 @@ from .objective import scene_trainer
 from .plan import SPHERE, ReconstructPlan, level_stage
 from .views import ViewImage, comparison_sheet, held_out, measure, render_image
 
-__all__ = ["HELD_OUT_FILE", "PREVIEW_FILE", "Reconstruction", "reconstruct", "scene_texture", "surface_colors"]
+__all__ = [
+    "HELD_OUT_FILE",
+    "MESH_FILE",
+    "PREVIEW_FILE",
+    "Reconstruction",
+    "reconstruct",
+    "scene_texture",
+    "surface_colors",
+]
 
 HELD_OUT_FILE = "held_out.png"
 PREVIEW_FILE = "preview.png"
+MESH_FILE = "mesh.ply"  # that the command makes of a finished run
 PREVIEWS = 5  # pictures of the first view on the way
 SHEET_VIEWS = 4  # rows of the sheet of held-out views
 TEXTURE_RESOLUTION = 128  # of the mesh whose points are coloured: finer than the texture's band is wide
@@ -104,7 +114,7 @@ def reconstruct(
     schedule(Progress(reading.name, 0, 0, 1.0, {}))
     load_compiler()
     training = _Reconstruction(images, config, device, folder, schedule, machine=machine, started=started)
-    with folder.writing(HELD_OUT_FILE):
+    with folder.writing(HELD_OUT_FILE, PREVIEW_FILE, MESH_FILE):
         if resume:
             training.restore()
         return training.run()
@@ -161,7 +171,6 @@ class _Reconstruction:
 
     def run(self) -> Reconstruction:
         """Train to the end, measure, colour, write."""
-        self.folder.begin(self._record(finished=False))
         with stop_on_signals() as flag:
             if not self.trainer.run(flag, report=self._report, save=self._save):
                 raise Interrupted(self.folder.out)
@@ -173,13 +182,11 @@ class _Reconstruction:
         self.model.cpu()
         texture, record["texture"] = self._texture()
         out = self.folder.out
-        if out is not None:
-            if texture is not None:
-                save_texture(out / TEXTURE_FILE, texture, metadata={"texture": record["texture"]})
-            if pairs:
-                self._write_sheet(out / HELD_OUT_FILE, pairs[:SHEET_VIEWS])
-            self.folder.finish(self.model.geometry, self.images.similarity, record)
-            (out / PREVIEW_FILE).unlink(missing_ok=True)
+        if texture is not None:
+            self.folder.keep(TEXTURE_FILE, texture_bytes(texture, metadata={"texture": record["texture"]}))
+        if pairs:
+            self.folder.keep(HELD_OUT_FILE, picture_bytes(self._sheet(pairs[:SHEET_VIEWS])))
+        record = self.folder.finish(self.model.geometry, self.images.similarity, record, gone=(PREVIEW_FILE,))
         return Reconstruction(self.model, texture, self.images, out, record)
 
     def _report(self, progress: Progress) -> None:
@@ -190,10 +197,12 @@ class _Reconstruction:
         if self.folder.out is not None and done * (PREVIEWS + 1) >= self.shown + 1 and done < 1:
             self.shown = int(done * (PREVIEWS + 1))
             view = (self.test_views or self.train_views)[0]
-            self._write_sheet(self.folder.out / PREVIEW_FILE, [(view, self._image(view))])
+            if not self.folder.has_checkpoint:  # or the picture would lie beside the run that was there
+                self._save()
+            write_picture(self.folder.out / PREVIEW_FILE, self._sheet([(view, self._image(view))]))
 
-    def _write_sheet(self, file: Path, pairs: Sequence[tuple[PosedImage, ViewImage]]) -> None:
-        write_picture(file, comparison_sheet(pairs, self.model.background))
+    def _sheet(self, pairs: Sequence[tuple[PosedImage, ViewImage]]) -> Image:
+        return comparison_sheet(pairs, self.model.background)
 
     def _image(self, view: PosedImage) -> ViewImage:
         return render_image(self.model, view, self.images.similarity, self.trainer.objective.sampling, level=self.level)

@@ -16,7 +16,16 @@ from numpy.typing import NDArray
 from ...neural_fields import InputError
 from ...neural_fields.files import check_place, write_whole
 
-__all__ = ["Image", "as_bytes", "check_picture_path", "contact_sheet", "in_rows", "stacked", "write_picture"]
+__all__ = [
+    "Image",
+    "as_bytes",
+    "check_picture_path",
+    "contact_sheet",
+    "in_rows",
+    "picture_bytes",
+    "stacked",
+    "write_picture",
+]
 
 Image = NDArray[np.uint8]
 Titled = tuple[str, Image]
@@ -90,6 +99,11 @@ def check_picture_path(path: str | Path, *, transparent: bool = False) -> None:
     check_place(path)
 
 
+def picture_bytes(image: Image, suffix: str = ".png") -> bytes:
+    """What a file of a picture holds; see `write_picture`."""
+    return iio.imwrite("<bytes>", image, extension=suffix)
+
+
 def write_picture(path: str | Path, image: Image) -> None:
     """Write a PNG ``(H, W, 3 | 4)`` or a JPEG ``(H, W, 3)``, whole or not at all.
 
@@ -98,4 +112,4 @@ def write_picture(path: str | Path, image: Image) -> None:
     """
     path = Path(path)
     check_picture_path(path, transparent=image.shape[2] == 4)
-    write_whole(path, iio.imwrite("<bytes>", image, extension=path.suffix.lower()))
+    write_whole(path, picture_bytes(image, path.suffix.lower()))

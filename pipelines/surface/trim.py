@@ -14,16 +14,16 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
+from torch import Tensor
 
 from ...datasets import spacing_of
 from ...datasets.clouds.point_cloud import voxel_representatives
 from ...neural_fields import InputError
 from ...neural_fields.meshing import Mesh
-from ..run.folder import FIELD_FILE, load_state, save_state
+from ..run.folder import FIELD_FILE, SUPPORT_FILE, load_state
 from .surface import component_of_faces, face_normals
 
 __all__ = [
-    "SUPPORT_FILE",
     "Support",
     "Supported",
     "drop_unsupported",
@@ -32,12 +32,11 @@ __all__ = [
     "keep_largest",
     "read_support",
     "support_radius",
+    "thinned",
     "trim_distance",
     "without_voids",
-    "write_support",
 ]
 
-SUPPORT_FILE = "support.safetensors"
 # Voxels of this size, in the unit sphere, keep one point each: some 60,000 of a surface of area 4, in half precision
 # (off by 0.0003 at most) 400 KB.
 VOXEL = 1 / 128
@@ -192,10 +191,10 @@ class Support(NamedTuple):
     radius: float
 
 
-def write_support(directory: Path, points: NDArray[np.floating]) -> None:
-    """Keep the points ``(N, 3)`` of a fit, one per voxel, beside its field; whole or not at all."""
-    thinned = points[voxel_representatives(np.asarray(points, np.float64), VOXEL)]
-    save_state(directory, {"points": torch.from_numpy(thinned).half()}, {}, name=SUPPORT_FILE)
+def thinned(points: NDArray[np.floating]) -> dict[str, Tensor]:
+    """What is kept of the points ``(N, 3)`` of a fit in `SUPPORT_FILE`: one per voxel."""
+    kept = points[voxel_representatives(np.asarray(points, np.float64), VOXEL)]
+    return {"points": torch.from_numpy(kept).half()}
 
 
 def read_support(field: Path, record: dict[str, Any], level: int) -> Support | None:
@@ -207,13 +206,15 @@ def read_support(field: Path, record: dict[str, Any], level: int) -> Support | N
         level: counted from 0.
 
     Raises:
-        InputError: the points are damaged.
+        InputError: the points are damaged, or of another run.
     """
     path = field.with_name(SUPPORT_FILE)
     stages = record.get("stages", [])
     if field.name != FIELD_FILE or not path.is_file() or level >= len(stages):
         return None
-    tensors, _ = load_state(field.parent, name=SUPPORT_FILE)
+    tensors, about = load_state(field.parent, name=SUPPORT_FILE)
+    if about.get("generation") != record.get("generation"):
+        raise InputError(f"{path}: is not of the run of {field}; bring back both, or fit again")
     if "points" not in tensors or tensors["points"].ndim != 2 or tensors["points"].shape[1] != 3:
         raise InputError(f"{path}: damaged (no points); remove it, or fit again")
     points = tensors["points"].double().numpy()

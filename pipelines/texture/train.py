@@ -24,29 +24,29 @@ from ...neural_fields import (
     levels_of,
     load_field,
     load_texture,
-    save_texture,
 )
+from ...neural_fields.checkpoint import texture_bytes
 from ...neural_fields.devices import upload
 from ...neural_fields.dynamic_tracing import moment
+from ...neural_fields.files import write_whole
 from ...neural_fields.losses import color_loss, tangential_loss
 from ..run.config import load_config
 from ..run.costs import Net, Speed, jets, training
 from ..run.folder import (
-    RECORD_FILE,
     TEXTURE_FILE,
     chosen_level,
     digest_of,
     find_field,
     load_state,
-    read_record,
     save_state,
     texture_state_file,
-    write_record,
+    write_texture,
 )
 from ..run.lock import locked
 from ..run.machine import choose_device, environment, speed
 from ..run.schedule import Progress, Report, Schedule, Stage
 from ..run.settings import TextureConfig
+from ..run.swap import sweep
 from ..run.trainer import (
     Group,
     Objective,
@@ -237,6 +237,8 @@ def texture_run(
     beside = target == file.with_name(TEXTURE_FILE)
     state_file = texture_state_file(target)
     with locked(file.parent if beside else target):
+        if beside:
+            sweep(file.parent)
         before = _interrupted(state_file) if resume else None
         if before is not None:
             config, level = before.config, before.level
@@ -252,8 +254,6 @@ def texture_run(
                 f"{source}: not the colours, or {file} not the field, that the interrupted training began with; "
                 "resume with those, or leave out --resume"
             )
-        if before is None:
-            state_file.unlink(missing_ok=True)  # of another training; this one shall not be resumed from it
         about = {"config": dataclasses.asdict(config), "level": level, "fingerprint": fingerprint}
         fitted = fit_texture(
             geometry,
@@ -266,11 +266,14 @@ def texture_run(
             state=None if before is None else before.tensors,
             started=started,
         )
-        save_texture(target, fitted.texture, metadata={"texture": fitted.record})
-        if beside and file.with_name(RECORD_FILE).is_file():
-            write_record(file.parent, read_record(file.parent) | {"texture": fitted.record})
-        if fitted.record["finished"]:
-            state_file.unlink(missing_ok=True)
+        content = texture_bytes(fitted.texture, metadata={"texture": fitted.record})
+        finished = bool(fitted.record["finished"])
+        if beside:
+            write_texture(file.parent, content, fitted.record, finished=finished)
+        else:
+            write_whole(target, content)
+            if finished:
+                state_file.unlink(missing_ok=True)
         return fitted
 
 

@@ -33,9 +33,10 @@ from mplicits.datasets import (
     write_transforms,
 )
 from mplicits.neural_fields import MultiscaleSDF, Siren, load_field, save_field
+from mplicits.neural_fields.files import write_json
 from mplicits.neural_fields.glb import write_glb
 from mplicits.pipelines.run.config import load_config
-from mplicits.pipelines.run.folder import load_state, read_record, save_state, write_record
+from mplicits.pipelines.run.folder import RECORD_FILE, load_state, read_record, save_state
 from mplicits.pipelines.run.settings import FitConfig
 from mutate import damaged, damaged_json
 
@@ -202,7 +203,7 @@ def _runs(folder: Path) -> Iterator[Specimen]:
     state = (folder / "resume.safetensors").read_bytes()
     yield Specimen("resume.safetensors", state, _above(load_state, "resume.safetensors"))
     record = {"config": {"seed": 0}, "cloud": "cloud.ply", "finished": True, "levels": [{"loss": 0.1}], "time": 1.5}
-    write_record(folder, record)
+    write_json(folder / RECORD_FILE, record)
     written = (folder / "run.json").read_bytes()
     yield Specimen("run.json", written, _above(read_record, "run.json"))
     yield Specimen("run.json", written, _above(read_record, "run.json"), damage=_as_json)

@@ -10,7 +10,8 @@ from mplicits.datasets.clouds.large import Merging, merge_cloud
 from mplicits.datasets.clouds.reading import open_stream
 from mplicits.datasets.clouds.stream import MemoryStream
 from mplicits.neural_fields import InputError
-from mplicits.pipelines.fit.cloud import MERGED_FILE, load_cloud
+from mplicits.pipelines.fit.cloud import load_cloud
+from mplicits.pipelines.run.folder import MERGED_FILE
 
 
 def merged(cloud: PointCloud, limit: int = 100_000, **settings: float | None) -> tuple[PointCloud, Merging]:

@@ -9,11 +9,11 @@ import torch
 import trimesh
 from evolutions import QUICK, ball, fails, few_points
 from mplicits.neural_fields import Field, Jet
+from mplicits.neural_fields.files import write_json
 from mplicits.pipelines.bench import evolve as bench_evolve
 from mplicits.pipelines.bench.evolve import CASES, ExactBench, MorphBench, measure_exact
 from mplicits.pipelines.bench.fits import fit_home
 from mplicits.pipelines.bench.report import as_text
-from mplicits.pipelines.run.folder import write_record
 from mplicits.pipelines.run.settings import FitConfig
 from torch import Tensor
 
@@ -84,7 +84,7 @@ def test_a_morph_is_measured_against_meshes(tmp_path: Path) -> None:
         home = fit_home(tmp_path / "out", meshes[-1], FitConfig())  # where its fit is kept
         home.mkdir(parents=True)
         ball(home / "field.safetensors", radius, levels=True)
-        write_record(home, {"config": {}, "finished": True})
+        write_json(home / "run.json", {"config": {}, "finished": True})
     config = replace(QUICK, align="none", steps=(150,), samples=4000)
     first, second = meshes
     bench = MorphBench(meshes=(first, second), config=config, resolution=32, samples=5000)

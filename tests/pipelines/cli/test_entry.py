@@ -203,7 +203,7 @@ def test_ctrl_c_leaves_a_run_that_resume_finishes(cloud, tmp_path):
     arguments = [sys.executable, "-c", program, "fit", str(cloud), "-o", str(out)]
     process = subprocess.Popen([*arguments, *slow], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     deadline = time.monotonic() + 60
-    while not (out / "run.json").is_file() and time.monotonic() < deadline:
+    while not (out / "run.lock").is_file() and time.monotonic() < deadline:
         time.sleep(0.05)
     time.sleep(0.5)
     process.send_signal(signal.SIGINT)

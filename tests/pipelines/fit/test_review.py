@@ -13,8 +13,9 @@ from mplicits.neural_fields.meshing import Mesh, extract_mesh
 from mplicits.pipelines.fit.review import review_points
 from mplicits.pipelines.fit.train import fit, prepare
 from mplicits.pipelines.mesh.extract import MeshOptions, mesh_run
+from mplicits.pipelines.run.folder import SUPPORT_FILE
 from mplicits.pipelines.run.settings import FitConfig
-from mplicits.pipelines.surface.trim import SUPPORT_FILE, read_support
+from mplicits.pipelines.surface.trim import read_support
 
 SMALL = FitConfig(
     widths=(32, 48),
