@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from ._ahead import FIRST_PASSES, PASSES
+from ._fixed import first_rows
+from .devices import makes_wait
 from .field import Field
 from .function import FieldLike, as_field
+from .multiscale import choose_levels, levels_of
+from .siren import Siren
 from .tracing import BOUNDING_RADIUS, ball_crossing, check_rays, unit_directions
 
 __all__ = ["CONE_LIPSCHITZ", "cone_ends", "cone_starts"]
 
 # Networks are a little steeper than a distance here and there, and a cone that goes too far loses thin parts.
 CONE_LIPSCHITZ = 1.15
+
+Columns = tuple[Tensor, ...]
 
 
 @torch.no_grad()
@@ -110,23 +117,23 @@ def cone_ends(
     directions, length = unit_directions(directions)
     reach = origin.norm() + radius
     depth = torch.full_like(length, torch.inf)
-    delta = clearance + (float(field.deltas[0]) if level else 0.0)
+    delta = _margin(field, level, directions, clearance)
+
+    def advance(fixed: Columns, moving: Columns, on: Tensor) -> tuple[Columns, Tensor]:
+        (axis, sigma, entry), (end,) = fixed, moving
+        t = torch.where(on, end, 0)  # those that are left out may be infinite
+        value = field.value(origin + t[:, None] * axis, level=0)
+        closer = (t - ((value.abs() - delta) / lipschitz).clamp(min=0)) / (1 - sigma)
+        return (torch.minimum(t, closer),), (t - closer > t * sigma) & (closer > entry)
+
     for tile in tiles:
         cones = _Cones.of(directions, tile)
-        count = len(cones.axis)
-        asked = wanted.new_zeros(count, dtype=torch.uint8)
+        asked = wanted.new_zeros(len(cones.axis), dtype=torch.uint8)
         asked = asked.scatter_reduce(0, cones.of_pixel.flatten(), wanted.flatten().to(torch.uint8), "amax").bool()
         entry, leave = ball_crossing(origin.expand_as(cones.axis), cones.axis, radius + cones.spread * reach)
         ends = torch.minimum(depth[::tile, ::tile].reshape(-1), leave / (1 - cones.spread))
-        active = (asked & (ends > entry)).nonzero()[:, 0]
-        for _ in range(max_steps):
-            if not len(active):
-                break
-            t, sigma = ends[active], cones.spread[active]
-            value = field.value(origin + t[:, None] * cones.axis[active], level=0)
-            closer = (t - ((value.abs() - delta) / lipschitz).clamp(min=0)) / (1 - sigma)
-            ends[active] = torch.minimum(t, closer)
-            active = active[(t - closer > t * sigma) & (closer > entry[active])]
+        fixed = (cones.axis, cones.spread, entry)
+        (ends,) = _until_all_stop(fixed, (ends,), asked & (ends > entry), advance, max_steps)
         depth = torch.where(asked, ends, torch.inf)[cones.of_pixel]
     return depth / length
 
@@ -144,28 +151,77 @@ def _march_cones(
 ) -> Tensor:
     """How far each cone is empty; infinite where it leaves the ball of ``radius`` untouched."""
     axis, spread = cones.axis, cones.spread
-    delta = clearance + (field.deltas[0].to(axis) if level else axis.new_zeros(()))
+    delta = _margin(field, level, axis, clearance)
     # A ray of the cone may be in the ball where its axis is not; spread · reach is the most that they are apart.
     reach = origin.norm() + radius
     entry, leave = ball_crossing(origin.expand_as(axis), axis, radius + spread * reach)
     depth = torch.maximum(starts, entry).clamp(min=0)
-    depth[depth >= leave] = torch.inf
-    active = depth.isfinite().nonzero()[:, 0]
-    before, value_before = depth.clone(), torch.full_like(depth, torch.nan)
-    for _ in range(max_steps):
-        if not len(active):
-            break
-        t, sigma, old = depth[active], spread[active], before[active]
-        value = field.value(origin + t[:, None] * axis[active], level=0)
+    depth = torch.where(depth >= leave, torch.inf, depth)
+    network = levels_of(field)[0]
+    precision = choose_levels((network,), axis, jet=False).precision
+    if precision and isinstance(network, Siren):
+        from .kernels.cones import march_cones
+
+        return march_cones(
+            network.as_network(), (origin, axis, spread, leave, depth), delta, lipschitz, max_steps, precision
+        )
+
+    def advance(fixed: Columns, moving: Columns, on: Tensor) -> tuple[Columns, Tensor]:
+        (axis, sigma, leave), (depth, before, value_before) = fixed, moving
+        t = torch.where(on, depth, 0)  # those that have left are at infinity
+        value = field.value(origin + t[:, None] * axis, level=0)
         # Behind the surface? Then the field is steeper than it was said to be: back, and leave it to the rays.
-        passed = value * value_before[active] < 0
+        passed = value * value_before < 0
         step = ((value.abs() - delta) / lipschitz - t * sigma) / (1 + sigma)
-        ahead = torch.where(passed, old, t + step.clamp(min=0))
-        before[active], value_before[active] = t, value
-        depth[active] = torch.where(ahead >= leave[active], torch.inf, ahead)
+        ahead = torch.where(passed, before, t + step.clamp(min=0))
         # Once a step is shorter than the cone is wide, smaller cones get on better.
-        active = active[(step > t * sigma) & (ahead < leave[active]) & ~passed]
-    return depth
+        goes_on = (step > t * sigma) & (ahead < leave) & ~passed
+        return (torch.where(ahead >= leave, torch.inf, ahead), t, value), goes_on
+
+    moving = (depth, depth, torch.full_like(depth, torch.nan))
+    return _until_all_stop((axis, spread, leave), moving, depth.isfinite(), advance, max_steps)[0]
+
+
+def _margin(field: Field, level: int, like: Tensor, clearance: float) -> Tensor:
+    """How far cones keep from the surface of level 0, a number on the device of ``like``."""
+    return clearance + (field.deltas[0].to(like) if level else like.new_zeros(()))
+
+
+def _until_all_stop(
+    fixed: Columns,
+    moving: Columns,
+    going: Tensor,
+    advance: Callable[[Columns, Columns, Tensor], tuple[Columns, Tensor]],
+    max_steps: int,
+) -> Columns:
+    """Advance the rows that are ``going`` until none is, or so often.
+
+    A CPU looks after each step, and leaves out who has stopped; what works behind the host's back is looked at as in
+    `_ahead`.
+
+    Args:
+        fixed: what is known of each row, ``(K, …)`` each.
+        moving: what changes.
+        going: ``(K,)`` bool.
+        advance: from fixed, moving and going to the next moving, and to who goes on, of those that were going.
+        max_steps: of each row.
+    """
+    looked, steps = not makes_wait(going.device), 0
+    chunk, left = (1, int(going.sum())) if looked else (FIRST_PASSES, len(going))
+    while left and steps < max_steps:
+        rows = going.nonzero()[:, 0] if looked else first_rows(going, left)
+        if left == len(going):
+            rows = torch.arange(left, device=going.device)
+        here, part, on = tuple(column[rows] for column in fixed), tuple(column[rows] for column in moving), going[rows]
+        for _ in range(min(chunk, max_steps - steps)):
+            moved, goes_on = advance(here, part, on)
+            part = tuple(torch.where(on, new, old) for new, old in zip(moved, part, strict=True))
+            on = on & goes_on
+        moving = tuple(column.index_copy(0, rows, new) for column, new in zip(moving, part, strict=True))
+        going = going.index_copy(0, rows, on)
+        steps, left = steps + chunk, int(on.sum())
+        chunk = 1 if looked else PASSES
+    return moving
 
 
 class _Cones(NamedTuple):

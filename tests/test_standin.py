@@ -131,10 +131,13 @@ def test_memory_that_may_not_be_there_yet_is_refused() -> None:
         ("none", 0, lambda x: torch.zeros(3, device=x.device, dtype=torch.float64).fill_(2).to(torch.float32)),
     ],
 )
-def test_waits_are_counted(why: str, times: int, ask: object) -> None:
-    x = torch.ones(3).to(DEVICE)
-    with standin.counted() as book:
-        ask(x)
+@pytest.mark.parametrize("inference", [False, True])
+def test_waits_are_counted(why: str, times: int, ask: object, inference: bool) -> None:
+    """In inference mode as well, where operations come to a device before they are taken apart."""
+    with torch.inference_mode(inference):
+        x = torch.ones(3).to(DEVICE)
+        with standin.counted() as book:
+            ask(x)
     assert {name for name, _ in book.waits} == ({why} if times else set()), book.report()
     assert book.synchronisations == times
 

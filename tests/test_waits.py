@@ -3,7 +3,10 @@
 from pathlib import Path
 
 import pytest
+import standin
+import torch
 import waits
+from mplicits.neural_fields import Sphere, cone_starts
 from waits import Row
 
 
@@ -15,6 +18,22 @@ def test_the_tracer_is_looked_at_once_in_eight_passes() -> None:
     row = waits.tracing(300)
     assert row.count > 16
     assert per_unit(row) <= 1 / 8, row.ledger.report()
+
+
+def test_cones_are_looked_at_once_for_each_size_of_tiles() -> None:
+    """Where eight steps are enough for all of a size."""
+    across = torch.linspace(-0.4, 0.4, 24)
+    rows, columns = torch.meshgrid(across, across, indexing="ij")
+    directions = torch.stack((columns, rows, torch.ones_like(rows)), dim=-1)
+    origin = torch.tensor([0.0, 0.0, -2.2])
+    near = cone_starts(Sphere(radius=0.5), origin, directions, tiles=(8, 4))
+    with standin.counted() as ledger:
+        ahead = cone_starts(
+            Sphere(radius=0.5).to(waits.DEVICE), origin.to(waits.DEVICE), directions.to(waits.DEVICE), tiles=(8, 4)
+        )
+    assert torch.equal(ahead.cpu(), near)
+    looks = sum(times for (_, where), times in ledger.waits.items() if where.startswith("neural_fields/cones.py"))
+    assert looks == 2, ledger.report()
 
 
 @pytest.mark.parametrize("name", ["value", "jet"])

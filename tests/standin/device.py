@@ -104,12 +104,14 @@ class _Operation(NamedTuple):
         launches: whether it runs anything on the device.
         numbers: whether it takes 0-dimensional tensors of the host for numbers.
         written: places and names of the arguments that it writes into and returns.
+        composite: whether it is made of others.
     """
 
     name: str
     launches: bool
     numbers: bool
     written: tuple[tuple[int, str], ...]
+    composite: bool
 
     @classmethod
     @functools.cache
@@ -130,12 +132,15 @@ class _Operation(NamedTuple):
             launches=not func.is_view and name not in STILL,
             numbers=torch.Tag.pointwise in func.tags or name in TAKE_NUMBERS,
             written=returned,
+            composite=torch._C._dispatch_has_kernel_for_dispatch_key(func.name(), "CompositeImplicitAutograd"),
         )
 
 
 def _run(func: Any, *args: Any, **kwargs: Any) -> Any:
     """Do what a device would do, which is: refuse, note down, or run on the shells' inner tensors."""
     operation = _Operation.of(func)
+    if operation.composite and torch.is_inference_mode_enabled():
+        return func.decompose(*args, **kwargs)  # elsewhere PyTorch has done so before it comes here
     if operation.name == "_pin_memory":
         raise RuntimeError(f"cannot pin '{NAME}', only dense CPU tensors can be pinned")
     hosts: list[Tensor] = []
