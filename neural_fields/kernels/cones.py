@@ -2,6 +2,7 @@
 
 # pyright: reportGeneralTypeIssues=false, reportArgumentType=false, reportCallIssue=false
 # pyright: reportAttributeAccessIssue=false, reportMissingImports=false, reportAssignmentType=false
+# pyright: reportOperatorIssue=false
 
 from __future__ import annotations
 

@@ -1,19 +1,24 @@
 """How long a picture would take on a GPU that is not here: a model of it, from counts and published rates.
 
 Counted, while a picture is traced on the CPU: FLOPs of matrix products, sines, bytes that operations read and write,
-operations (each one a launch) and places where the host has to wait for a result; for networks and for all else, the
-march, apart. Published: what the device multiplies and moves in a second. With these
+operations (each one a launch) and places where the host has to wait for a result; apart for networks, for what marches
+and levels do around them, and for the rest of a picture. Published: what the device multiplies and moves in a second.
+With these
 
     T = max(device, host) + waits · `WAIT`,      host = launches · `LAUNCH`
-    device = max(products / rate, their bytes / memory) + max(sines · `SINE` / float32, other bytes / memory) + march
+    device = max(products / rate, their bytes / memory) + max(sines · `SINE` / float32, other bytes / memory) + around
 
-for PyTorch, where each operation is a kernel, with the march's bytes / memory. Fused, a level evaluated is one launch,
-which reads points and writes results:
+for PyTorch, where each operation is a kernel, with the bytes around the networks / memory. Fused, a march is one
+launch, and so is a `MultiscaleSDF` evaluated at points; what was around the networks happens inside, and only the rest
+is launched and waits:
 
-    device = max(products / rate + sines · `SINE` / float32, bytes / memory) + march.
+    device = max(products / rate + sines · `SINE` / float32, bytes / memory, chain) + rest / memory.
 
-No kernel reaches the published rates, so device times are bounds from below; `LAUNCH` and `WAIT` are assumptions. A
-model, to be confirmed or refuted by the first measurement.
+No kernel reaches the published rates, so these are bounds from below. The chain is what cannot be shared out: a ray
+takes one step after the other, each a tile's evaluation on one multiprocessor, which has its share of the rates. It
+is counted as if one ray were behind every pass of the march in which a level was evaluated at all, which is no less
+than the longest ray needs. `LAUNCH` and `WAIT` are assumptions. A model, to be confirmed or refuted by the first
+measurement.
 """
 
 from __future__ import annotations
@@ -29,7 +34,7 @@ import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from ...neural_fields import Field, Jet, MultiscaleSDF, levels_of, siren
+from ...neural_fields import Field, Jet, MultiscaleSDF, cones, levels_of, siren, tracing
 from .tables import Column, Figure, Table, tabulated
 
 __all__ = ["DEVICES", "Device", "FrameCounts", "Prediction", "count_frame", "model_table", "predict"]
@@ -39,6 +44,11 @@ WAIT = 15e-6  # seconds from the end of a kernel until the host has the result a
 SINE = 40  # float32 operations of one sine of libdevice, as Triton's compiler writes it
 SPLIT = 3  # products on tensor cores that make one with split operands (tf32x3)
 POINT, VALUE, JET = 12, 4, 16  # bytes of a point, of a value, of a value and its gradient
+# Bytes of a ray at a pass of `kernels/paths.py`, all from and into caches: where it stands, there and back, its origin
+# and direction, its place on a ring; and where it is only handed on from a level to the next.
+STANDS, HANDED_ON = 132, 44
+LISTED = 16  # of a row on the list of a band in `kernels/levels.py`, there and back
+TILE = 64  # rows
 
 _aten = torch.ops.aten
 _PRODUCTS = (_aten.mm, _aten.addmm, _aten.addmm_, _aten.addmv, _aten.addmv_, _aten.mv)
@@ -56,6 +66,7 @@ class Device:
         float32: FLOP/s outside tensor cores.
         tensor: FLOP/s of tensor cores in TF32, dense; 0 without.
         memory: bytes a second.
+        processors: multiprocessors, which share the rates.
         fused: whether the fused kernels run on it.
         source: of the figures.
     """
@@ -64,16 +75,19 @@ class Device:
     float32: float
     tensor: float
     memory: float
+    processors: int
     fused: bool
     source: str
 
 
 DEVICES: Mapping[str, Device] = MappingProxyType(
     {
-        "h100": Device("H100 SXM5", 66.9e12, 494.7e12, 3.35e12, True, "NVIDIA, H100 architecture whitepaper, 2022"),
-        "a100": Device("A100 SXM 80 GB", 19.5e12, 156e12, 2.039e12, True, "NVIDIA, A100 datasheet, 2021"),
-        "4090": Device("RTX 4090", 82.6e12, 82.6e12, 1.008e12, True, "NVIDIA, Ada architecture whitepaper, 2022"),
-        "m2": Device("Apple M2, 10 GPU cores", 3.6e12, 0.0, 0.1e12, False, "Apple, M2 announcement, 2022"),
+        "h100": Device(
+            "H100 SXM5", 66.9e12, 494.7e12, 3.35e12, 132, True, "NVIDIA, H100 architecture whitepaper, 2022"
+        ),
+        "a100": Device("A100 SXM 80 GB", 19.5e12, 156e12, 2.039e12, 108, True, "NVIDIA, A100 datasheet, 2021"),
+        "4090": Device("RTX 4090", 82.6e12, 82.6e12, 1.008e12, 128, True, "NVIDIA, Ada architecture whitepaper, 2022"),
+        "m2": Device("Apple M2, 10 GPU cores", 3.6e12, 0.0, 0.1e12, 10, False, "Apple, M2 announcement, 2022"),
     }
 )
 
@@ -89,11 +103,16 @@ class FrameCounts:
         sines: and cosines.
         other_bytes: of the networks' operations beside products.
         launches: operations of the networks.
-        calls: how often a level was evaluated, a launch each where that is fused.
-        fused_bytes: that those launches read and write.
-        march_bytes: of all that is not a network.
-        march_launches: its operations.
-        waits: how often the host waits for the device.
+        around_bytes: that marches, and gathers between levels, read and write.
+        around_launches: their operations.
+        around_waits: how often the host waits for them.
+        rest_bytes: of all else.
+        rest_launches: its operations.
+        rest_waits: how often the host waits for it.
+        calls: how many launches fused kernels make: one for each march, and for each field evaluated outside of any.
+        fused_bytes: that those read and write.
+        chain: FLOPs of products in tiles one after the other.
+        chain_sines: sines of them.
     """
 
     pixels: int
@@ -102,20 +121,33 @@ class FrameCounts:
     sines: float
     other_bytes: float
     launches: int
+    around_bytes: float
+    around_launches: int
+    around_waits: int
+    rest_bytes: float
+    rest_launches: int
+    rest_waits: int
     calls: int
     fused_bytes: float
-    march_bytes: float
-    march_launches: int
-    waits: int
+    chain: float
+    chain_sines: float
 
 
 @dataclass(frozen=True)
 class Prediction:
-    """Seconds of a picture, and of what: the device's work, the host's launches (beside it), the waits (after it)."""
+    """Seconds of a picture, and of what.
+
+    Attributes:
+        device: its work, or the longest ray.
+        host: its launches, beside that.
+        waits: after it.
+        chained: whether the longest ray takes longer than the work.
+    """
 
     device: float
     host: float
     waits: float
+    chained: bool = False
 
     @property
     def seconds(self) -> float:
@@ -125,7 +157,7 @@ class Prediction:
     @property
     def limit(self) -> str:
         """What takes longest."""
-        parts = {"work": self.device, "launches": self.host, "waits": self.waits}
+        parts = {"longest ray" if self.chained else "work": self.device, "launches": self.host, "waits": self.waits}
         return max(parts, key=lambda name: parts[name])
 
 
@@ -143,15 +175,21 @@ def predict(counts: FrameCounts, device: Device, *, fused: bool, split: bool = F
     """
     if (fused and not device.fused) or (split and not device.tensor):
         raise ValueError(f"{device.words}: no {'tensor cores' if split and not device.tensor else 'fused kernels'}")
-    products = counts.products / (device.tensor / SPLIT if split else device.float32)
-    sines = counts.sines * SINE / device.float32
+    rate = device.tensor / SPLIT if split else device.float32
+    rest, chained = counts.rest_bytes / device.memory, False
     if fused:
-        networks = max(products + sines, counts.fused_bytes / device.memory)
+        work = counts.products / rate + counts.sines * SINE / device.float32
+        chain = device.processors * (counts.chain / rate + counts.chain_sines * SINE / device.float32)
+        networks = max(work, counts.fused_bytes / device.memory)
+        chained, networks = chain > networks, max(chain, networks)
+        launches, waits = counts.rest_launches + counts.calls, counts.rest_waits
     else:
-        networks = max(products, counts.product_bytes / device.memory)
-        networks += max(sines, counts.other_bytes / device.memory)
-    launches = counts.march_launches + (counts.calls if fused else counts.launches)
-    return Prediction(networks + counts.march_bytes / device.memory, launches * LAUNCH, counts.waits * WAIT)
+        networks = max(counts.products / rate, counts.product_bytes / device.memory)
+        networks += max(counts.sines * SINE / device.float32, counts.other_bytes / device.memory)
+        networks += counts.around_bytes / device.memory
+        launches = counts.launches + counts.around_launches + counts.rest_launches
+        waits = counts.around_waits + counts.rest_waits
+    return Prediction(networks + rest, launches * LAUNCH, waits * WAIT, chained)
 
 
 def count_frame(field: Field, draw: Callable[[Field], object], pixels: int) -> FrameCounts:
@@ -163,13 +201,13 @@ def count_frame(field: Field, draw: Callable[[Field], object], pixels: int) -> F
         pixels: of the picture.
     """
     watch = _Watch()
-    levels = [_Level(level, watch) for level in levels_of(field)]
+    levels = [_Level(level, watch, first=not index) for index, level in enumerate(levels_of(field))]
     same: Field = levels[0]
     if isinstance(field, MultiscaleSDF):
         same = MultiscaleSDF(levels[0], levels[1:], field.deltas, taper=field.taper)
-    with _blocks_of_a_gpu(), watch:
+    with _blocks_of_a_gpu(), _regions(watch), watch:
         draw(same)
-    network, march = watch.of_networks, watch.of_march
+    network, around, rest = watch.of_networks, watch.around, watch.rest
     return FrameCounts(
         pixels=pixels,
         products=network.products,
@@ -177,11 +215,16 @@ def count_frame(field: Field, draw: Callable[[Field], object], pixels: int) -> F
         sines=network.sines,
         other_bytes=network.other_bytes,
         launches=network.launches,
-        calls=sum(level.calls for level in levels),
-        fused_bytes=sum(level.bytes for level in levels),
-        march_bytes=march.product_bytes + march.other_bytes,
-        march_launches=march.launches,
-        waits=network.waits + march.waits,
+        around_bytes=around.product_bytes + around.other_bytes,
+        around_launches=around.launches,
+        around_waits=network.waits + around.waits,
+        rest_bytes=rest.product_bytes + rest.other_bytes,
+        rest_launches=rest.launches,
+        rest_waits=rest.waits,
+        calls=watch.calls,
+        fused_bytes=watch.fused_bytes,
+        chain=watch.chain,
+        chain_sines=watch.chain_sines,
     )
 
 
@@ -198,19 +241,41 @@ class _Tally:
 
 
 class _Watch(TorchDispatchMode):
-    """Counts operations, those of networks apart."""
+    """Counts operations, by where they come from.
+
+    Attributes:
+        of_networks: what networks do.
+        around: what marches and fields of levels do around them.
+        rest: all else.
+        network: whether a network is at work.
+        march: whether a march is.
+        depth: of how many marches and fields of levels inside each other this is.
+    """
 
     def __init__(self) -> None:
         super().__init__()
-        self.of_networks, self.of_march = _Tally(), _Tally()
-        self.inside = False
+        self.of_networks, self.around, self.rest = _Tally(), _Tally(), _Tally()
+        self.network = self.march = False
+        self.depth = self.calls = 0
+        self.fused_bytes = self.chain = self.chain_sines = 0.0
+
+    @contextmanager
+    def region(self, *, march: bool) -> Iterator[None]:
+        """What would be one launch: a march, or a field evaluated, unless it is inside of another."""
+        self.calls += self.depth == 0
+        self.depth += 1
+        before, self.march = self.march, self.march or march
+        try:
+            yield
+        finally:
+            self.depth, self.march = self.depth - 1, before
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         result = func(*args, **(kwargs or {}))
         packet = func.overloadpacket
         if func.is_view or packet in _FREE:
             return result
-        tally = self.of_networks if self.inside else self.of_march
+        tally = self.of_networks if self.network else self.around if self.depth else self.rest
         tally.launches += 1
         # A mask as an index is turned into numbers of rows first, and how many there are the host has to know.
         masked = packet in (_aten.index, _aten.index_put, _aten.index_put_) and any(
@@ -230,12 +295,16 @@ class _Watch(TorchDispatchMode):
 
 
 class _Level(Field):
-    """A level that says when it is evaluated, and counts how often and what a fused kernel would move."""
+    """A level that says when it is evaluated, and counts what a fused kernel would move."""
 
-    def __init__(self, inner: Field, watch: _Watch) -> None:
+    def __init__(self, inner: Field, watch: _Watch, *, first: bool) -> None:
         super().__init__()
-        self.inner, self.in_dim, self.watch = inner, inner.in_dim, watch
-        self.calls = self.bytes = 0
+        self.inner, self.in_dim, self.watch, self.first = inner, inner.in_dim, watch, first
+        self.num_features = getattr(inner, "num_features", 0)
+        weights = [parameter for parameter in inner.parameters() if parameter.ndim == 2]
+        # Of one point: products of the sine layers and the output's first row, and the sines.
+        self.flops = 2 * (sum(weight.numel() for weight in weights[:-1]) + weights[-1].shape[1])
+        self.sines = sum(weight.shape[0] for weight in weights[:-1])
 
     def value(self, x: Tensor, *, level: int = -1) -> Tensor:
         """See `Field.value`."""
@@ -249,13 +318,47 @@ class _Level(Field):
 
     @contextmanager
     def _inside(self, x: Tensor, result: int) -> Iterator[None]:
-        self.calls += 1
-        self.bytes += (POINT + result) * x.shape[:-1].numel()
-        self.watch.inside = True
+        watch, rows, first = self.watch, x.shape[:-1].numel(), self.first
+        if watch.march:
+            watch.fused_bytes += (STANDS if first else HANDED_ON) * rows
+            if rows:
+                watch.chain += TILE * self.flops
+                watch.chain_sines += TILE * self.sines
+        else:
+            watch.fused_bytes += (POINT + result + (0 if first else LISTED + result)) * rows
+        watch.network = True
         try:
-            yield
+            with watch.region(march=False):
+                yield
         finally:
-            self.watch.inside = False
+            watch.network = False
+
+
+@contextmanager
+def _regions(watch: _Watch) -> Iterator[None]:
+    """Tell the watch when a march, cones or a field of levels begin and end."""
+
+    def inside(function: Callable[..., Any], *, march: bool) -> Callable[..., Any]:
+        def call(*arguments: Any, **options: Any) -> Any:
+            with watch.region(march=march):
+                return function(*arguments, **options)
+
+        return call
+
+    places = [
+        (tracing, "march", True),
+        (cones, "_until_all_stop", True),
+        (MultiscaleSDF, "value", False),
+        (MultiscaleSDF, "jet", False),
+    ]
+    before = [getattr(owner, name) for owner, name, _ in places]
+    for (owner, name, march), function in zip(places, before, strict=True):
+        setattr(owner, name, inside(function, march=march))
+    try:
+        yield
+    finally:
+        for (owner, name, _), function in zip(places, before, strict=True):
+            setattr(owner, name, function)
 
 
 def _tensors(values: Any) -> Iterator[Tensor]:
@@ -278,6 +381,11 @@ def _blocks_of_a_gpu() -> Iterator[None]:
         yield
     finally:
         siren.BLOCK_FLOATS = before
+
+
+def _launches(counts: FrameCounts) -> int:
+    """By PyTorch."""
+    return counts.launches + counts.around_launches + counts.rest_launches
 
 
 def model_table(items: Sequence[tuple[str, float, FrameCounts]], names: Sequence[str]) -> Table:
@@ -307,10 +415,12 @@ def model_table(items: Sequence[tuple[str, float, FrameCounts]], names: Sequence
         (Column("TFLOP", ".3f"), lambda item: item[1].products / 1e12),
         (Column("GB, PyTorch", ".2f"), lambda item: (item[1].product_bytes + item[1].other_bytes) / 1e9),
         (Column("GB, fused", ".3f"), lambda item: item[1].fused_bytes / 1e9),
-        (Column("GB, march", ".2f"), lambda item: item[1].march_bytes / 1e9),
-        (Column("launches", "d"), lambda item: item[1].launches + item[1].march_launches),
-        (Column("fused", "d"), lambda item: item[1].calls + item[1].march_launches),
-        (Column("waits", "d"), lambda item: item[1].waits),
+        (Column("GB, around", ".2f"), lambda item: item[1].around_bytes / 1e9),
+        (Column("GB, rest", ".2f"), lambda item: item[1].rest_bytes / 1e9),
+        (Column("launches", "d"), lambda item: _launches(item[1])),
+        (Column("fused", "d"), lambda item: item[1].calls + item[1].rest_launches),
+        (Column("waits", "d"), lambda item: item[1].around_waits + item[1].rest_waits),
+        (Column("fused", "d"), lambda item: item[1].rest_waits),
     ]
     for name in names:
         figures += [

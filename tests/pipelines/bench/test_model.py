@@ -4,11 +4,13 @@ import dataclasses
 
 import pytest
 import torch
-from mplicits.neural_fields import MultiscaleSDF, Siren
+from mplicits.neural_fields import MultiscaleSDF, Siren, sphere_trace
 from mplicits.pipelines.bench.model import (
     DEVICES,
     LAUNCH,
     SINE,
+    STANDS,
+    TILE,
     WAIT,
     Device,
     FrameCounts,
@@ -19,7 +21,7 @@ from mplicits.pipelines.bench.model import (
 from mplicits.pipelines.cli.bench import MODELLED
 
 N, W = 100, 32
-ROUND = Device("round numbers", 1e12, 6e12, 1e9, True, "made up")
+ROUND = Device("round numbers", 1e12, 6e12, 1e9, 10, True, "made up")
 COUNTS = FrameCounts(
     pixels=16,
     products=2e12,
@@ -27,11 +29,16 @@ COUNTS = FrameCounts(
     sines=1e10,
     other_bytes=3e9,
     launches=1000,
+    around_bytes=3e8,
+    around_launches=500,
+    around_waits=15,
+    rest_bytes=1e8,
+    rest_launches=50,
+    rest_waits=5,
     calls=10,
     fused_bytes=5e7,
-    march_bytes=1e8,
-    march_launches=500,
-    waits=20,
+    chain=1e10,
+    chain_sines=1e8,
 )
 
 
@@ -50,7 +57,8 @@ def test_counts_of_a_value_and_a_jet() -> None:
     assert counts.sines == 2 * N * W + 4 * N * W
     assert counts.calls == 2
     assert counts.fused_bytes == N * (16 + 28)
-    assert (counts.march_launches, counts.march_bytes, counts.waits) == (0, 0, 0)
+    assert (counts.rest_launches, counts.rest_bytes, counts.rest_waits) == (0, 0, 0)
+    assert (counts.around_launches, counts.around_waits, counts.chain) == (0, 0, 0)
     # The least that a jet reads and writes: activations of two layers, and their cosines, once each way.
     assert counts.product_bytes + counts.other_bytes > 8 * 4 * N * W
 
@@ -63,28 +71,56 @@ def test_blocks_are_those_of_a_gpu() -> None:
     assert many.launches == few.launches
 
 
-def test_gathers_are_of_the_march_and_wait() -> None:
+def test_gathers_are_around_the_networks_and_wait() -> None:
     field = MultiscaleSDF.from_widths([(16, 1), (16, 1)], omegas=[5, 5], deltas=[0.5]).requires_grad_(False)
     x = torch.rand(N, 3)
+    inside = int((field.value(x, level=0).abs() < 0.5).sum())
     counts = count_frame(field, lambda same: same.value(x), 1)
-    assert counts.calls == 2
-    assert counts.waits == 1  # which rows are in the band
-    assert counts.march_launches > 0
+    assert counts.calls == 1  # one launch has both levels
+    assert (counts.around_waits, counts.rest_waits) == (1, 0)  # which rows are in the band
+    assert counts.around_launches > 0
+    assert counts.fused_bytes == N * 16 + inside * (16 + 16 + 4)
+
+
+def test_a_march_is_one_launch_and_its_longest_ray_a_chain() -> None:
+    """A network whose rays all take the same four steps: as many tiles, one after the other."""
+    network = Siren(16, 1).requires_grad_(False)
+    origins = torch.tensor([0.0, 0.0, -2.0]).expand(N, 3)
+
+    def draw(field: torch.nn.Module) -> None:
+        hits = sphere_trace(field, origins, -origins / 2, max_steps=4, radius=None)  # type: ignore[arg-type]
+        steps.append(int(hits.steps.max()))
+
+    steps: list[int] = []
+    counts = count_frame(network, draw, 1)
+    assert 0 < steps[0] <= 4
+    assert counts.calls == 1
+    assert counts.chain == steps[0] * TILE * 2 * (3 * 16 + 16)
+    assert counts.chain_sines == steps[0] * TILE * 16
+    assert counts.fused_bytes == steps[0] * STANDS * N
+    assert 0 < counts.rest_launches < 150
 
 
 def test_the_arithmetic() -> None:
     plain = predict(COUNTS, ROUND, fused=False)
-    assert plain.device == pytest.approx(2 + 3 + 0.1)  # products, the bytes of sines, the march
-    assert plain.host == pytest.approx(1500 * LAUNCH)
+    assert plain.device == pytest.approx(2 + 3 + 0.3 + 0.1)  # products, the bytes of sines, around them, the rest
+    assert plain.host == pytest.approx(1550 * LAUNCH)
     assert plain.seconds == pytest.approx(plain.device + 20 * WAIT)
     fused = predict(COUNTS, ROUND, fused=True)
     assert fused.device == pytest.approx(2 + SINE / 100 + 0.1)
-    assert fused.host == pytest.approx(510 * LAUNCH)
+    assert fused.host == pytest.approx(60 * LAUNCH)
     assert predict(COUNTS, ROUND, fused=True, split=True).device == pytest.approx(1 + SINE / 100 + 0.1)
     assert fused.limit == "work"
-    idle = dataclasses.replace(COUNTS, products=0.0, sines=0.0, fused_bytes=0.0, march_bytes=0.0)
+    assert fused.waits == pytest.approx(5 * WAIT)
+    # One multiprocessor has a tenth of the rates.
+    chained = predict(dataclasses.replace(COUNTS, chain=1e12), ROUND, fused=True)
+    assert chained.device == pytest.approx(10 * (1 + SINE / 1e4) + 0.1)
+    assert chained.limit == "longest ray"
+    idle = dataclasses.replace(
+        COUNTS, products=0.0, sines=0.0, fused_bytes=0.0, rest_bytes=0.0, chain=0.0, chain_sines=0.0
+    )
     assert predict(idle, ROUND, fused=True).limit == "launches"
-    assert predict(dataclasses.replace(idle, waits=1000), ROUND, fused=True).limit == "waits"
+    assert predict(dataclasses.replace(idle, rest_waits=1000), ROUND, fused=True).limit == "waits"
 
 
 def test_what_a_device_cannot_do() -> None:
