@@ -23,6 +23,9 @@ if TYPE_CHECKING:
 
 __all__ = ["BENCH_COMMANDS"]
 
+# The names of `bench.model.DEVICES`, which help must not load torch for.
+MODELLED = ("h100", "a100", "4090", "m2")
+
 
 def _run(arguments: argparse.Namespace, benches: Sequence[Benchmark[Any]], *, out: Path | None) -> int:
     """Do what is not done yet, print the tables, and write them.
@@ -136,6 +139,40 @@ def _kernels(arguments: argparse.Namespace) -> int:
     return _run(arguments, [bench], out=arguments.out)
 
 
+def _size(text: str) -> tuple[int, int]:
+    """Width and height of a picture."""
+    width, _, height = text.partition("x")
+    if not (width.isdecimal() and height.isdecimal() and 4 <= min(int(width), int(height)) <= 8192):
+        raise argparse.ArgumentTypeError(f"{text!r}: expected WIDTHxHEIGHT, of 4 to 8192 pixels each")
+    return int(width), int(height)
+
+
+def _gpu_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("run", metavar="RUN", help="run directory or .safetensors file")
+    sizes = ((512, 512), (1920, 1080))
+    shown = " ".join(f"{width}x{height}" for width, height in sizes)
+    parser.add_argument(
+        "--sizes", type=_size, nargs="+", default=sizes, metavar="WxH", help=f"of the pictures ({shown})"
+    )
+    _modelled(parser, ("h100", "4090"))
+    _folder(parser)
+    add_flags(parser, "--json")
+
+
+def _modelled(parser: argparse.ArgumentParser, default: tuple[str, ...]) -> None:
+    about = f"times on GPUs by a model of counts and published rates: {', '.join(MODELLED)}"
+    if default:
+        about += f" ({' '.join(default)})"
+    parser.add_argument("--model", nargs="+", choices=MODELLED, default=default, metavar="GPU", help=about)
+
+
+def _gpu(arguments: argparse.Namespace) -> int:
+    from ..bench.gpu import GpuBench
+
+    bench = GpuBench(run_file=arguments.run, sizes=tuple(arguments.sizes), devices=tuple(arguments.model))
+    return _run(arguments, [bench], out=arguments.out)
+
+
 def _mesh_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("run", metavar="RUN", help="run directory or .safetensors file")
     _number(parser, "--resolutions", whole(8, 2048), (256, 512, 1024), "where ours is timed", nargs="+")
@@ -221,10 +258,6 @@ def _signs(arguments: argparse.Namespace) -> int:
     return _run(arguments, [SignsBench(shapes=arguments.shapes, config=config, **options)], out=arguments.out)
 
 
-# The names of `bench.model.DEVICES`, which help must not load torch for.
-MODELLED = ("h100", "a100", "4090", "m2")
-
-
 def _render_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("shapes", nargs="+", metavar="SHAPE", help="meshes or clouds")
     _folder(parser, required=True)
@@ -232,14 +265,7 @@ def _render_arguments(parser: argparse.ArgumentParser) -> None:
     _number(parser, "--views", whole(1), 3, "cameras around the shape")
     _number(parser, "--repeats", whole(1), 2, "the best of how many")
     parser.add_argument("--no-naive", action="store_true", help="leave out the naive tracer, which takes minutes")
-    parser.add_argument(
-        "--model",
-        nargs="+",
-        choices=MODELLED,
-        default=(),
-        metavar="GPU",
-        help=f"times on GPUs by a model of counts and published rates: {', '.join(MODELLED)}",
-    )
+    _modelled(parser, ())
     add_flags(parser, "--json")
     add_settings(parser, FitConfig)
 
@@ -504,6 +530,14 @@ BENCH_COMMANDS: Mapping[str, Command] = MappingProxyType(
             _kernels,
             "Compare jets by the fused kernels (pip install 'mplicits[kernels]') with the same networks in float64, "
             "and count what they read and write. Without CUDA, Triton's interpreter runs them, slowly.",
+        ),
+        "bench gpu": Command(
+            "what pictures of a run would cost on GPUs: a model",
+            "  mplicits bench gpu runs/scan\n  mplicits bench gpu runs/scan --sizes 512x512 --model h100 m2",
+            _gpu_arguments,
+            _gpu,
+            "Count, on the CPU, what pictures of the coarsest and the finest level ask of a device, and tell by "
+            "published rates how long they would take on GPUs that are not here.",
         ),
         "bench mesh": Command(
             "what extraction costs: adaptive, the paper's, dense",
