@@ -53,9 +53,10 @@ def over_blocks(rows: int, size: int, prepare: Callable[[int], Step], *, like: T
     Raises:
         BaseException: what a step raised first; no further block is begun then.
     """
-    shorter = min(size, max(LEAST_ROWS, -(-rows // WANTED)))
-    if -(-rows // shorter) >= LEAST_BLOCKS:
-        size = shorter
+    if like.device.type == "cpu":  # elsewhere more blocks are more launches
+        shorter = min(size, max(LEAST_ROWS, -(-rows // WANTED)))
+        if -(-rows // shorter) >= LEAST_BLOCKS:
+            size = shorter
     count = -(-rows // size)
     threads = min(torch.get_num_threads(), count)
     if threads < 2 or count < LEAST_BLOCKS or not _may_share(like):

@@ -34,7 +34,7 @@ import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from ...neural_fields import Field, Jet, MultiscaleSDF, cones, levels_of, siren, tracing
+from ...neural_fields import Field, Jet, MultiscaleSDF, _parallel, cones, levels_of, siren, tracing
 from .tables import Column, Figure, Table, tabulated
 
 __all__ = ["DEVICES", "Device", "FrameCounts", "Prediction", "count_frame", "model_table", "predict"]
@@ -375,12 +375,12 @@ def _tensors(values: Any) -> Iterator[Tensor]:
 @contextmanager
 def _blocks_of_a_gpu() -> Iterator[None]:
     """Blocks as large as on a GPU: those of a CPU would be launches that it does not make."""
-    before = siren.BLOCK_FLOATS
-    siren.BLOCK_FLOATS = siren.GPU_BLOCK_FLOATS
+    before = siren.BLOCK_FLOATS, _parallel.WANTED
+    siren.BLOCK_FLOATS, _parallel.WANTED = siren.GPU_BLOCK_FLOATS, 1
     try:
         yield
     finally:
-        siren.BLOCK_FLOATS = before
+        siren.BLOCK_FLOATS, _parallel.WANTED = before
 
 
 def _launches(counts: FrameCounts) -> int:

@@ -121,6 +121,7 @@ def _kernels_arguments(parser: argparse.ArgumentParser) -> None:
     _number(parser, "--widths", whole(1, 512), (16, 64, 128, 256, 400), "of the networks", nargs="+")
     _number(parser, "--depths", whole(1, 8), (1, 2, 3), "of the networks", nargs="+")
     _number(parser, "--points", whole(1), 65, "at which they are compared")
+    parser.add_argument("--levels", action="store_true", help="fields of two and three levels as well")
     _number(parser, "--seed", whole(0), 0, "of points and weights")
     _folder(parser)
     add_flags(parser, "--json")
@@ -132,11 +133,13 @@ def _kernels(arguments: argparse.Namespace) -> int:
     device = str(choose_device("auto"))
     if device == "cpu":  # before anything imports Triton
         os.environ["TRITON_INTERPRET"], os.environ["MPLICITS_KERNELS"] = "1", "interpret"
+    from ..bench.kernel_levels import LevelsBench
     from ..bench.kernels import KernelsBench
 
     sizes = tuple((width, depth) for width in arguments.widths for depth in arguments.depths)
     bench = KernelsBench(sizes=sizes, points=arguments.points, seed=arguments.seed, device=device)
-    return _run(arguments, [bench], out=arguments.out)
+    levels = [LevelsBench(points=arguments.points, seed=arguments.seed, device=device)] if arguments.levels else []
+    return _run(arguments, [bench, *levels], out=arguments.out)
 
 
 def _size(text: str) -> tuple[int, int]:
@@ -525,7 +528,7 @@ BENCH_COMMANDS: Mapping[str, Command] = MappingProxyType(
         ),
         "bench kernels": Command(
             "how exact the fused kernels are, and what they move",
-            "  mplicits bench kernels\n  mplicits bench kernels --widths 128 --depths 2 --json kernels.json",
+            "  mplicits bench kernels\n  mplicits bench kernels --widths 128 --depths 2 --levels",
             _kernels_arguments,
             _kernels,
             "Compare jets by the fused kernels (pip install 'mplicits[kernels]') with the same networks in float64, "

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
+import standin
 import torch
 from mplicits.neural_fields import Siren
 from mplicits.neural_fields._parallel import LEAST_BLOCKS, LEAST_ROWS, Step, one_thread, over_blocks, split_operations
@@ -46,6 +47,13 @@ def test_every_row_is_in_one_block(rows: int, size: int, threads: int) -> None:
     assert [row for part in blocks for row in range(rows)[part]] == list(range(rows))
     assert all(part.stop - part.start <= size for part in blocks)
     assert len(names) <= max(1, threads)
+
+
+def test_an_accelerator_is_given_as_much_as_it_may_have_at_once() -> None:
+    """A CPU gets a block for each of its cores; elsewhere each block would be launches of its own."""
+    rows = 20 * LEAST_ROWS
+    assert len(recorded(rows, rows, torch.empty(0))[0]) > 1
+    assert recorded(rows, rows, torch.empty(0, device=standin.NAME))[0] == [slice(0, rows)]
 
 
 def step_of(network: Siren, x: Tensor) -> list[Tensor]:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from mplicits.pipelines.bench.kernel_levels import LevelsBench
 from mplicits.pipelines.bench.kernels import KernelsBench
 from mplicits.pipelines.bench.report import as_text
 from mplicits.pipelines.cli.entry import main
@@ -28,6 +29,26 @@ def test_a_network_is_as_exact_as_it_has_to_be(tmp_path: Path, monkeypatch: pyte
     assert rows[1].staged_bytes == 0
     (table,) = bench.tables(rows, sgemm=1.0)
     assert "(16,2)" in as_text(table)
+
+
+def test_levels_are_as_exact_as_they_have_to_be(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    if not torch.cuda.is_available():
+        monkeypatch.setenv("MPLICITS_KERNELS", "interpret")
+    sizes = ((8, 1), (16, 1))
+    bench = LevelsBench(fields=(sizes,), points=40, device="cuda" if torch.cuda.is_available() else "cpu")
+    rows = bench.rows(tmp_path / "out")
+    assert [row.taper for row in rows] == [0.0, 0.5]
+    for row in rows:
+        assert row.inside == (0.5,)
+        assert 0 < row.value_error < 1e-5
+        assert row.share < 1
+        # A point and a jet for all; for half of them a place on the list, the point again, and the jet there and back.
+        assert row.fused_bytes == 28 + (16 + 28 + 16) / 2
+        assert row.staged_bytes == 0  # one layer is never put aside
+        assert row.unfused_launches > 20
+        assert row.unfused_waits == 1
+    (table,) = bench.tables(rows, sgemm=1.0)
+    assert "(8,1)▷(16,1), taper 0.5" in as_text(table)
 
 
 def test_bytes_of_the_papers_coarse_network() -> None:
