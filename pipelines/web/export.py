@@ -39,11 +39,16 @@ SCRIPTS = (
     "tracer.js",
     "renderer.js",
     "camera.js",
+    "paint.js",
+    "section.js",
+    "tools.js",
+    "save.js",
     "interface.js",
     "controls.js",
     "page.js",
     "main.js",
 )
+SHADERS = ("shaders.glsl", "shade.glsl")
 CHANNELS = 3
 ERROR_POINTS = 4000  # at which rounding is measured
 # The whole page: nothing is fetched, nothing is sent, and only the scripts and styles with these digests run.
@@ -210,14 +215,14 @@ def fill_page(header: Mapping[str, Any], data: bytes) -> str:
     What comes from the run stands in blocks of data, which browsers do not run, and in which no "<" is left.
     """
     folder = files("mplicits.pipelines.web") / "page"
-    texts = {name: (folder / name).read_text(encoding="utf-8") for name in ("index.html", "style.css", "shaders.glsl")}
+    texts = {name: (folder / name).read_text(encoding="utf-8") for name in ("index.html", "style.css")}
     script = "\n" + "\n".join(_bare((folder / name).read_text(encoding="utf-8")) for name in SCRIPTS)
     style = "\n" + texts["style.css"]
     policy = POLICY.format(script=_digest(script), style=_digest(style))
     parts = {
         "POLICY": policy,
         "STYLE": style,
-        "SHADERS": _bare(texts["shaders.glsl"]),
+        "SHADERS": "\n".join(_bare((folder / name).read_text(encoding="utf-8")) for name in SHADERS),
         "SCRIPT": script,
         "HEADER": json.dumps(header, ensure_ascii=True, separators=(",", ":")).replace("<", "\\u003c"),
         "DATA": base64.b64encode(data).decode(),

@@ -1,9 +1,12 @@
 // What moves the camera and changes what is seen: pointers, fingers, keys, and the controls of the panel.
 
+const TAP = 5; // pixels that a pointer may move between down and up, and still mean a place
+
 class Controls {
   constructor(page) {
     this.page = page;
     this.ui = page.ui;
+    this.tools = page.tools;
     this.held = new Map();
     this.fill();
     this.panel();
@@ -41,6 +44,35 @@ class Controls {
     ui.levelName.textContent = page.level;
     ui.normals.value = page.normals;
     ui.shading.value = page.shading;
+    ui.occlusion.checked = page.occlusion;
+    ui.axis.value = page.section.axis ?? -1;
+    ui.place.hidden = ui.placeName.hidden = page.section.axis === null;
+    if (page.section.axis === null) return;
+    const { unit, center } = page.saved.header, { axis, at } = page.section;
+    ui.placeName.textContent = digits(at * unit + center[axis]);
+  }
+
+  // The slice: its axis and place, as the controls have them.
+  slice() {
+    const { ui, page } = this, axis = Number(ui.axis.value);
+    page.section.choose(axis < 0 ? null : axis, Number(ui.place.value));
+    this.show();
+    page.changed();
+  }
+
+  // Something that takes a while; one at a time.
+  async save(button, work) {
+    const { ui } = this;
+    if (this.saving) return;
+    this.saving = true;
+    button.disabled = true;
+    try {
+      await work();
+    } catch (error) {
+      ui.state.textContent = error instanceof PageError ? error.message : `Not saved: ${error.message}`;
+    } finally {
+      this.saving = button.disabled = false;
+    }
   }
 
   setTheme(name) {
@@ -62,6 +94,20 @@ class Controls {
       if (page.shading > 2) page.changed();
       else page.present();
     });
+    ui.occlusion.addEventListener('change', () => { page.occlusion = ui.occlusion.checked; page.present(); });
+    ui.place.value = 0.5;
+    ui.axis.addEventListener('change', () => this.slice());
+    ui.place.addEventListener('input', () => this.slice());
+    ui.ruler.addEventListener('click', () => this.tools.toggleRuler());
+    const { title } = page.saved.header;
+    ui.savePicture.addEventListener('click', () => this.save(ui.savePicture, async () => {
+      await page.rested();
+      download(await savedPicture(page), fileName(title, 'png'));
+    }));
+    ui.saveFilm.addEventListener('click', () => this.save(ui.saveFilm, async () => {
+      const { blob, ending } = await turntable(page);
+      download(blob, fileName(title, ending));
+    }));
     ui.reset.addEventListener('click', () => { page.orbit.reset(); page.changed(); });
     ui.theme.addEventListener('click', () => { this.setTheme(page.theme === 'dark' ? 'light' : 'dark'); page.present(); });
     ui.panel.addEventListener('submit', (event) => event.preventDefault());
@@ -73,10 +119,17 @@ class Controls {
     const share = () => Math.min(canvas.clientWidth, canvas.clientHeight);
     canvas.addEventListener('pointerdown', (event) => {
       canvas.setPointerCapture(event.pointerId);
+      this.down = held.size ? null : [event.offsetX, event.offsetY]; // two fingers mean no place
+      this.tools.leave();
       held.set(event.pointerId, [event.clientX, event.clientY]);
     });
     canvas.addEventListener('pointermove', (event) => {
-      if (!held.has(event.pointerId)) return;
+      if (!held.has(event.pointerId)) {
+        this.tools.hover(event.offsetX, event.offsetY);
+        return;
+      }
+      if (this.down && Math.hypot(event.offsetX - this.down[0], event.offsetY - this.down[1]) <= TAP) return;
+      this.down = null;
       const before = [...held.values()], [x, y] = held.get(event.pointerId);
       held.set(event.pointerId, [event.clientX, event.clientY]);
       const dx = (event.clientX - x) / share(), dy = (event.clientY - y) / share();
@@ -90,6 +143,11 @@ class Controls {
       }
       page.changed();
     });
+    canvas.addEventListener('pointerup', () => {
+      if (this.down) this.tools.tap(...this.down).catch((error) => this.ui.failed(error));
+      this.down = null;
+    });
+    canvas.addEventListener('pointerleave', () => this.tools.leave());
     for (const end of ['pointerup', 'pointercancel', 'lostpointercapture']) canvas.addEventListener(end, (event) => held.delete(event.pointerId));
     canvas.addEventListener('contextmenu', (event) => event.preventDefault());
     canvas.addEventListener('wheel', (event) => {
@@ -108,6 +166,8 @@ class Controls {
       const keys = {
         ArrowLeft: () => move(-1, 0), ArrowRight: () => move(1, 0), ArrowUp: () => move(0, -1), ArrowDown: () => move(0, 1),
         '+': () => orbit.zoom(1.15), '=': () => orbit.zoom(1.15), '-': () => orbit.zoom(1 / 1.15), Home: () => orbit.reset(),
+        r: () => this.tools.toggleRuler(), Escape: () => this.tools.toggleRuler(false),
+        Enter: () => this.tools.tap(page.canvas.clientWidth / 2, page.canvas.clientHeight / 2).catch((error) => this.ui.failed(error)),
       };
       const level = Number(event.key);
       if (keys[event.key]) keys[event.key]();

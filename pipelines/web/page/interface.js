@@ -16,13 +16,22 @@ class Interface {
     const button = (id, text) => make('button', { id, type: 'button' }, text);
     const range = (id, max, step, name) => make('input', { id, type: 'range', min: 0, max, step, value: 0, 'aria-label': name });
     const tools = make('details', { id: 'tools' }, make('summary', {}, 'Tools'), make('div', {},
-      label('Normals', make('select', { id: 'normals' })),
+      label('Normals of level', make('select', { id: 'normals' })),
+      make('label', {}, make('input', { id: 'occlusion', type: 'checkbox' }), ' Occlusion'),
+      make('span', { class: 'row' },
+        label('Slice', make('select', { id: 'axis' }, ...['none', 'x', 'y', 'z'].map((name, index) => new Option(name, index - 1)))),
+        range('place', 1, 'any', 'Place of the slice'), make('output', { id: 'placeName' })),
+      make('button', { id: 'ruler', type: 'button', 'aria-pressed': false }, 'Ruler'),
+      button('savePicture', 'Save picture'),
+      button('saveFilm', 'Save turntable'),
       button('reset', 'Reset view'),
       button('theme', 'Light or dark'),
     ));
     stage.replaceChildren(
       make('canvas', { id: 'picture', tabindex: 0, 'aria-label': HELP }),
-      make('header', {}, make('h1', { id: 'title' }), make('p', { id: 'facts' })),
+      make('canvas', { id: 'marks', 'aria-hidden': true }),
+      make('header', {}, make('h1', { id: 'title' }), make('p', { id: 'facts' }),
+        make('output', { id: 'length', hidden: '' }), make('output', { id: 'reading', hidden: '' })),
       make('form', { id: 'panel', hidden: '' },
         make('label', { id: 'levels' }, 'Level ', range('level', 0, 1, 'Level of detail'), make('output', { id: 'levelName' })),
         label('Shading', make('select', { id: 'shading' },

@@ -20,7 +20,7 @@ addEventListener('DOMContentLoaded', () => {
     const saved = decodeField(text('header'), bytesOf(text('data')));
     document.title = saved.header.title;
     const page = new Page(saved, shaderParts(text('shaders')), ui, wishes(search));
-    window.mplicits = { render: (wanted) => page.render(wanted), bench: (wanted) => page.bench(wanted), get renderer() { return page.renderer; }, header: saved.header };
+    window.mplicits = { render: (wanted) => page.render(wanted), bench: (wanted) => page.bench(wanted), turntable: (wanted) => turntable(page, wanted), get renderer() { return page.renderer; }, header: saved.header };
     if (search.has('bench')) {
       const size = Math.min(1024, Math.max(16, Number(search.get('bench')) || 512));
       page.bench({ size }).then((found) => page.describeBench(found)).catch((error) => ui.failed(error));

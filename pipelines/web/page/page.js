@@ -2,10 +2,6 @@
 
 const COARSEST = 16, FINEST = 0.5; // canvas pixels per ray
 const FRAME = 40, STRIP = 60, REST = 180; // milliseconds: of a picture while it moves, of a strip, before it is refined
-const THEMES = {
-  dark: { paper: [0.086, 0.094, 0.114], clay: [0.77, 0.72, 0.66] },
-  light: { paper: [0.957, 0.949, 0.933], clay: [0.77, 0.72, 0.66] },
-};
 
 const digits = (number) => Number(number.toPrecision(3)).toLocaleString('en', { maximumSignificantDigits: 3 });
 
@@ -20,6 +16,9 @@ class Page {
     this.orbit = new Orbit(saved.header.view);
     if (camera) Object.assign(this.orbit, { azimuth: camera[0], elevation: Math.min(90, Math.max(-90, camera[1])) });
     this.level = this.normals = saved.header.levels.length - 1;
+    this.waiters = [];      // for the finest picture
+    this.occlusion = true;
+    this.section = new Section(saved.header);
     this.shading = saved.header.colors ? 3 : 2; // 3 is colours in light, 4 bare colours; they want the network of colours
     this.factor = COARSEST; // canvas pixels per ray while it moves; less as soon as the adapter shows how fast it is
     this.speed = 200;     // pixels per millisecond
@@ -28,6 +27,7 @@ class Page {
     this.version = 0;     // of what is to be seen; a refinement of an older one ends
     this.open();
     this.describe();
+    this.tools = new Tools(this);
     this.controls = new Controls(this);
     this.watch();
     ui.carryOn();
@@ -43,8 +43,8 @@ class Page {
     }
     this.gl = gl;
     this.renderer = openRenderer(gl, this.parts, this.saved);
-    this.shade = compile(gl, this.parts, 'plane', 'shade');
-    this.coarse = this.fine = null;
+    this.section.forget();
+    this.paint = new Paint(gl, this.parts);
   }
 
   describe() {
@@ -100,6 +100,7 @@ class Page {
     try {
       if (this.lost) return;
       this.fit();
+      await this.section.refresh(this.gl, this.renderer, this.level);
       const started = performance.now();
       await this.whole(this.factor);
       const took = performance.now() - started;
@@ -126,7 +127,7 @@ class Page {
   }
 
   wanted() {
-    return { level: this.level, normalLevel: this.normals, colored: this.shading > 2 };
+    return { level: this.level, normalLevel: this.normals, colored: this.shading > 2, clip: this.section.clip };
   }
 
   // The whole picture at once, in rays of `factor` pixels.
@@ -135,18 +136,17 @@ class Page {
     const started = performance.now();
     const seen = await this.renderer.frame(grid, this.wanted());
     this.speed = (grid.width * grid.height) / Math.max(1, performance.now() - started);
-    this.keep('coarse', grid, seen, 0, grid.height);
-    this.ready = 0;
-    this.fine = this.fine ?? { ...this.coarse, borrowed: true };
+    this.paint.whole(grid, seen);
     this.present();
     this.report(grid, false);
   }
 
   // Finer and finer, strip by strip, until something else is to be seen.
   async refine(version) {
+    if (await this.section.refresh(this.gl, this.renderer, this.level, true)) this.present();
     for (let factor = 2 ** Math.floor(Math.log2(this.factor) - 1e-9); factor >= this.finest; factor /= 2) {
       const grid = this.grid(factor);
-      this.keep('fine', grid, null, 0, 0);
+      this.paint.begin(grid, this.shading > 2);
       for (let first = 0; first < grid.height;) {
         await new Promise((resolve) => { setTimeout(resolve, 0); });
         if (this.version !== version || this.lost || document.hidden) return;
@@ -156,60 +156,53 @@ class Page {
         if (this.version !== version || this.lost) return;
         // Empty strips are quick; the next may not be.
         this.speed = Math.min(1.5 * this.speed, (grid.width * rows) / Math.max(1, performance.now() - started));
-        this.keep('fine', grid, seen, first, rows);
+        this.paint.add(grid, seen, first, rows);
         first += rows;
-        this.ready = first;
         this.present();
         this.report(grid, first < grid.height);
       }
-      [this.coarse, this.fine] = [this.fine, this.coarse];
-      this.ready = 0;
+      this.paint.complete();
     }
     this.ui.told.finished = this.drawn;
+    this.waiters.splice(0).forEach((resolve) => resolve());
   }
 
-  // Rows of a picture into its textures: what is seen, and its colours, of which a picture without them has one texel.
-  keep(name, grid, made, first, rows) {
-    const { gl } = this;
-    const colored = this.shading > 2;
-    const held = this[name];
-    if (!held || held.borrowed || held.width !== grid.width || held.height !== grid.height || held.colored !== colored) {
-      if (held && !held.borrowed) for (const texture of [held.texture, held.color]) gl.deleteTexture(texture);
-      const { width, height } = grid;
-      this[name] = { width, height, colored, texture: texture2d(gl, width, height), color: texture2d(gl, colored ? width : 1, colored ? height : 1) };
-      if (this.fine?.borrowed) this.fine = null;
+  // When the picture is as fine as it gets.
+  rested() {
+    if (Number(this.ui.told.finished) === this.drawn) return Promise.resolve();
+    return new Promise((resolve) => { this.waiters.push(resolve); });
+  }
+
+  // A whole picture of that many pixels on the canvas, one ray each; false if something else came in between.
+  async still(width, height) {
+    const version = ++this.version;
+    clearTimeout(this.timer);
+    Object.assign(this.canvas, { width, height });
+    const camera = this.orbit.camera(width, height);
+    const { colored } = this.wanted(), size = 4 * width * height;
+    const made = { seen: new Float32Array(size), color: new Float32Array(colored ? size : 0) };
+    for (let first = 0; first < height;) {
+      await new Promise((resolve) => { setTimeout(resolve, 0); });
+      const rows = Math.min(height - first, Math.max(1, Math.floor((STRIP * this.speed) / width)));
+      const started = performance.now();
+      const { seen, color } = await this.renderer.frame(camera, { ...this.wanted(), first, rows });
+      if (this.version !== version || this.lost) return false;
+      this.speed = Math.min(1.5 * this.speed, (width * rows) / Math.max(1, performance.now() - started));
+      made.seen.set(seen, 4 * width * first);
+      made.color.set(color, 4 * width * first);
+      first += rows;
     }
-    if (!made) return;
-    gl.activeTexture(gl.TEXTURE0);
-    for (const [texture, numbers] of [[this[name].texture, made.seen], [this[name].color, made.color]]) {
-      if (!numbers.length) continue;
-      gl.bindTexture(gl.TEXTURE_2D, texture);
-      gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, first, grid.width, rows, gl.RGBA, gl.FLOAT, numbers);
-    }
+    this.camera = camera;
+    this.paint.whole(camera, made);
+    this.present();
+    return true;
   }
 
   present() {
-    const { gl, shade, camera } = this;
-    if (this.lost || !this.coarse) return;
+    if (this.lost || !this.paint.coarse) return;
     this.ui.told.drawn = ++this.drawn;
-    const { paper, clay } = THEMES[this.theme];
-    gl.useProgram(shade.program);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
-    gl.viewport(0, 0, camera.width, camera.height);
-    const planes = { fine: this.fine.texture, coarse: this.coarse.texture, fineColor: this.fine.color, coarseColor: this.coarse.color };
-    Object.entries(planes).forEach(([name, texture], unit) => {
-      gl.activeTexture(gl.TEXTURE0 + unit);
-      gl.bindTexture(gl.TEXTURE_2D, texture);
-      gl.uniform1i(shade.at(name), unit);
-    });
-    gl.uniform1i(shade.at('ready'), this.ready);
-    gl.uniform1i(shade.at('shading'), this.shading);
-    gl.uniform2f(shade.at('size'), camera.width, camera.height);
-    gl.uniformMatrix3fv(shade.at('axes'), false, [...camera.right, ...camera.down, ...camera.forward]);
-    gl.uniform4f(shade.at('lens'), camera.fx, camera.fy, camera.cx, camera.cy);
-    gl.uniform3f(shade.at('paper'), ...paper);
-    gl.uniform3f(shade.at('clay'), ...clay);
-    gl.drawArrays(gl.TRIANGLES, 0, 3);
+    this.paint.present(this.camera, this);
+    this.tools.draw();
   }
 
   report(grid, more) {

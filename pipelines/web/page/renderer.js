@@ -28,7 +28,7 @@ class Renderer {
   // the normal and the depth along the ray, 0 where nothing is; `color` its own colours where they were asked for.
   //
   // Options: level, normalLevel (whose normals), first, rows, colored, and precision: of depths, in units of the field;
-  // null is a tenth of a pixel.
+  // null is a tenth of a pixel; clip: {axis, at}, a plane before which nothing is seen.
   frame(camera, options) {
     if (options.colored && !this.colored) throw new PageError('This page has no colours.');
     return this.queue(async () => {

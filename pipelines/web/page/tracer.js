@@ -202,10 +202,10 @@ class Tracer {
   // What rows [first, first + rows) of a camera's picture see: normal and depth of each pixel, depth 0 for nothing; and
   // where it is `colored`, the surface's own colours.
   // Depths are known to a tenth of a pixel, or to `precision` in units of the field.
-  trace(camera, { level, normalLevel = level, first = 0, rows = camera.height, precision = null, colored = false }) {
+  trace(camera, { level, normalLevel = level, first = 0, rows = camera.height, precision = null, colored = false, clip = null }) {
     const size = Math.max(Math.hypot(...camera.eye) - this.header.radius, NEAREST) / Math.max(camera.fx, camera.fy);
     const seen = new Float32Array(4 * camera.width * rows);
-    const rays = this.begin(camera, first, rows);
+    const rays = this.begin(camera, first, rows, clip);
     const hits = this.march(camera, rays, level, precision ?? TOLERANCE * size, precision ?? RESOLUTION * size);
     const points = this.points(camera, rays.direction, rays.depth, hits);
     const { value, gradient } = this.field.jet(points, hits.length, normalLevel);
@@ -232,7 +232,7 @@ class Tracer {
   }
 
   // The rays that enter the mesh around the band, from where they do to where they leave it for good.
-  begin(camera, first, rows) {
+  begin(camera, first, rows, clip) {
     const { eye, right, down, forward, fx, fy, cx, cy, width } = camera;
     const { radius } = this.header;
     const crossings = this.hull.crossings(camera, first, rows);
@@ -252,7 +252,13 @@ class Tracer {
       }
       const half = Math.sqrt(Math.max(0, b * b - distance2 + radius * radius));
       // A camera within the mesh sees its far side first: its rays begin at the eye.
-      const start = Math.max(0, -b - half, within ? 0 : front - SLACK), end = Math.min(-b + half, back + SLACK);
+      let start = Math.max(0, -b - half, within ? 0 : front - SLACK);
+      const end = Math.min(-b + half, back + SLACK);
+      if (clip) { // what stands before a plane across an axis is cut away: rays begin on the plane
+        const met = (clip.at - eye[clip.axis]) / rays.direction[3 * i + clip.axis];
+        if (!(met > 0)) continue;
+        start = Math.max(start, met);
+      }
       if (!half || start >= end) continue;
       rays.pixel[i] = pixel;
       rays.depth[i] = start;

@@ -4,37 +4,20 @@ What it traces is compared with the tracer of this package, both to the same pre
 """
 
 import base64
-import time
 
 import numpy as np
 import pytest
 import torch
-from browser import CHROMEDRIVER, CHROMIUM, FLAGS
 from mplicits.datasets.cameras import look_at, turntable
-from mplicits.neural_fields import (
-    ColorSiren,
-    MultiscaleSDF,
-    Similarity,
-    Siren,
-    TextureField,
-    extract_mesh,
-    map_colors,
-    save_field,
-    save_texture,
-    solve_sphere,
-    sphere_trace,
-)
-from mplicits.pipelines.cli import main
+from mplicits.neural_fields import extract_mesh, map_colors, sphere_trace
 from mplicits.pipelines.web.networks import rounded_field
+from pages import TITLE, bumpy, painted, until
 
 pytest.importorskip("selenium")
 
-from selenium import webdriver
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
 
-WINDOW = ("--window-size=320,320",)
-PATIENCE = 60.0
 SIZE = (96, 72)
 # Depths of both tracers are known to this, in units of the field.
 PRECISION = 1e-4
@@ -46,66 +29,6 @@ for (let i = 0; i < bytes.length; i += 4096) text += String.fromCharCode(...byte
 return {seen: btoa(text), color: Array.from(made.color), counts: made.counts};
 });
 """
-TITLE = "<img src=x onerror=alert(1)> & ball"
-
-
-def bumpy():
-    """A sphere of level 0 and bumps of two levels in its bands: no bump is larger than its band."""
-    torch.manual_seed(3)
-    base = Siren(32, 2, omega=6.0)
-    solve_sphere(base, 0.6)
-    residuals = [Siren(18, 2, omega=8.0, output_gain=0.5), Siren(16, 3, omega=16.0, output_gain=0.1)]
-    return MultiscaleSDF(base, residuals, [0.12, 0.05], taper=0.3).requires_grad_(False)
-
-
-def painted():
-    """Colours in a band that holds most of the coarsest level's surface, but not all."""
-    torch.manual_seed(4)
-    return TextureField(bumpy(), ColorSiren(16, 2, omega=8.0), delta=0.02, outside=(1.0, 0.0, 0.0)).requires_grad_(
-        False
-    )
-
-
-@pytest.fixture(scope="module")
-def page(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("page")
-    save_field(folder / "ball.safetensors", bumpy(), similarity=Similarity((5.0, 6.0, 7.0), 100.0))
-    save_texture(folder / "texture.safetensors", painted())
-    out = folder / "ball.html"
-    assert main(["web", str(folder / "ball.safetensors"), "-o", str(out), "--title", TITLE]) == 0
-    return out
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory):
-    if CHROMIUM is None or CHROMEDRIVER is None:
-        pytest.skip("no chromium and chromedriver on this machine")
-    options = webdriver.ChromeOptions()
-    options.binary_location = CHROMIUM
-    for flag in (*FLAGS, *WINDOW, f"--user-data-dir={tmp_path_factory.mktemp('chromium')}"):
-        options.add_argument(flag)
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-    driver = webdriver.Chrome(options=options, service=webdriver.ChromeService(CHROMEDRIVER))
-    yield driver
-    driver.quit()
-
-
-@pytest.fixture
-def opened(browser, page):
-    """The page, with rays of 16 pixels at rest: software is slow."""
-    address = f"{page.as_uri()}?pixel=16"
-    if browser.current_url != address:
-        browser.get(address)
-        until(lambda: browser.execute_script("return !!window.mplicits"))
-    return browser
-
-
-def until(condition):
-    deadline = time.monotonic() + PATIENCE
-    while not (found := condition()):
-        assert time.monotonic() < deadline, "waited in vain"
-        time.sleep(0.05)
-    return found
 
 
 def complaints(browser):

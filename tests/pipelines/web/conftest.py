@@ -1,0 +1,44 @@
+"""One browser, and one page of a field with colours, for all tests of pages; skipped where there is no Chromium."""
+
+import pytest
+from browser import CHROMEDRIVER, CHROMIUM, FLAGS
+from mplicits.neural_fields import Similarity, save_field, save_texture
+from mplicits.pipelines.cli import main
+from pages import TITLE, bumpy, painted, until
+
+WINDOW = ("--window-size=320,320",)
+
+
+@pytest.fixture(scope="session")
+def page(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("page")
+    save_field(folder / "ball.safetensors", bumpy(), similarity=Similarity((5.0, 6.0, 7.0), 100.0))
+    save_texture(folder / "texture.safetensors", painted())
+    out = folder / "ball.html"
+    assert main(["web", str(folder / "ball.safetensors"), "-o", str(out), "--title", TITLE]) == 0
+    return out
+
+
+@pytest.fixture(scope="session")
+def browser(tmp_path_factory):
+    if CHROMIUM is None or CHROMEDRIVER is None:
+        pytest.skip("no chromium and chromedriver on this machine")
+    webdriver = pytest.importorskip("selenium.webdriver")
+    options = webdriver.ChromeOptions()
+    options.binary_location = CHROMIUM
+    for flag in (*FLAGS, *WINDOW, f"--user-data-dir={tmp_path_factory.mktemp('chromium')}"):
+        options.add_argument(flag)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    driver = webdriver.Chrome(options=options, service=webdriver.ChromeService(CHROMEDRIVER))
+    yield driver
+    driver.quit()
+
+
+@pytest.fixture
+def opened(browser, page):
+    """The page, with rays of 16 pixels at rest: software is slow."""
+    address = f"{page.as_uri()}?pixel=16"
+    if browser.current_url != address:
+        browser.get(address)
+        until(lambda: browser.execute_script("return !!window.mplicits"))
+    return browser
