@@ -4,7 +4,7 @@ import shutil
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 CHROMEDRIVER = shutil.which("chromedriver")
-# WebGL in software, and nothing of the browser's own that would want the network.
+# WebGL and WebGPU in software, and nothing of the browser's own that would want the network.
 FLAGS = (
     "--headless=new",
     "--no-sandbox",
@@ -12,6 +12,8 @@ FLAGS = (
     "--use-gl=angle",
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
+    "--enable-unsafe-webgpu",
+    "--use-webgpu-adapter=swiftshader",
     "--disable-quic",
     "--no-first-run",
     "--disable-background-networking",

@@ -27,7 +27,7 @@ from ..run.folder import chosen_level, find_field, load_still
 from ..texture.train import texture_of
 from .networks import Rounding, network_layers, rounding_error, shader_levels, taper_of
 from .payload import Payload
-from .shell import shell_mesh
+from .shell import shell_mesh, surface_reach
 
 __all__ = ["BITS", "WebOptions", "WebPage", "web_run"]
 
@@ -37,8 +37,10 @@ SCRIPTS = (
     "decode.js",
     "network.js",
     "tracer.js",
-    "renderer.js",
     "camera.js",
+    "kernels.js",
+    "webgpu.js",
+    "renderer.js",
     "paint.js",
     "section.js",
     "tools.js",
@@ -48,7 +50,7 @@ SCRIPTS = (
     "page.js",
     "main.js",
 )
-SHADERS = ("shaders.glsl", "shade.glsl")
+SHADERS = ("shaders.glsl", "shade.glsl", "march.wgsl")
 CHANNELS = 3
 ERROR_POINTS = 4000  # at which rounding is measured
 # The whole page: nothing is fetched, nothing is sent, and only the scripts and styles with these digests run.
@@ -189,6 +191,7 @@ def _content(
         "colors": colors,
         "deltas": [float(delta) for delta in shown.deltas],
         "taper": taper_of(shown),
+        "reach": surface_reach(shown),
         "radius": BOUNDING_RADIUS,
         "shell": {"low": low.tolist(), "high": high.tolist(), "triangles": len(shell.faces)},
         "view": _view(outline, options.up),

@@ -16,8 +16,11 @@ from ...neural_fields import Field, extract_mesh
 from ...neural_fields.mesh import Mesh
 from ...neural_fields.tracing import BOUNDING_RADIUS
 
-__all__ = ["CELLS", "shell_mesh"]
+__all__ = ["CELLS", "shell_mesh", "surface_reach"]
 
+RESOLUTION = 96  # of the meshes on which values of coarser levels are looked at
+# Between the corners of those meshes a coarser level may be this much further from zero.
+MARGIN = 1.25
 CELLS = 36  # along the box: a few thousand triangles
 # Distance of the mesh from the band, in cells. No point of a cell is further than √3/2 of a cell from a corner, so
 # that a part of the band within a cell shows at its corners, and chords of the mesh do not cut into the band.
@@ -49,3 +52,28 @@ def shell_mesh(field: Field, *, cells: int = CELLS) -> Mesh:
     corner = (half, half, half)
     mesh = extract_mesh(outside, resolution=cells, bounds=((-half, -half, -half), corner), normals=False)
     return Mesh(np.asarray(mesh.vertices), mesh.faces)
+
+
+@torch.no_grad()
+def surface_reach(field: Field) -> list[list[float]]:
+    """How far from zero a coarser level is on the surface of a finer one; rays look there alone for finer levels.
+
+    A band is as wide as training wanted it; the surface lies in its inner part,
+
+        reach[l][j] = min(δ_j, `MARGIN` · max |f_j(x)| over the corners x of the meshes of levels j < k ≤ l).
+
+    Returns:
+        For each level l the reaches of levels 0 … l − 1.
+
+    Raises:
+        NoSurfaceError: a level has no surface.
+    """
+    found: list[list[float]] = [[]]
+    for level in range(1, field.num_levels):
+        mesh = extract_mesh(field, resolution=RESOLUTION, level=level, normals=False)
+        corners = torch.from_numpy(np.asarray(mesh.vertices)).to(field.like)
+        before = [*found[-1], 0.0]
+        reaches = [MARGIN * float(field.value(corners, level=j).abs().max()) for j in range(level)]
+        deltas = [float(delta) for delta in field.deltas[:level]]
+        found.append([min(delta, max(pair)) for delta, *pair in zip(deltas, before, reaches, strict=True)])
+    return found

@@ -210,11 +210,8 @@ class Page {
   }
 
   // One picture of any camera, for tests and for other scripts: arrays of its pixels, and what they have cost.
-  async render({ camera, level = this.level, normalLevel = level, precision = null, colored = false }) {
-    this.renderer.clear();
-    const started = performance.now();
-    const made = await this.renderer.frame(camera, { level, normalLevel, precision, colored });
-    return { ...made, milliseconds: performance.now() - started, counts: this.renderer.counts() };
+  render({ camera, level = this.level, normalLevel = level, precision = null, colored = false }) {
+    return this.renderer.frame(camera, { level, normalLevel, precision, colored });
   }
 
   // Pictures of a camera that goes around, one in each frame: how many in a second, and what one costs.

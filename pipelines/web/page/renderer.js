@@ -2,16 +2,42 @@
 // by a promise, one after the other, so that none meets the buffers of another half used.
 
 class Renderer {
-  constructor(tracer, { header }) {
-    this.tracer = tracer;
-    this.header = header;
-    this.camera = this.options = null;
+  // `gl` is there for adapters that know no WebGPU.
+  constructor(gl, parts, saved) {
+    Object.assign(this, { gl, parts, saved, header: saved.header, tracer: null, camera: null, options: null });
+    const networks = [...this.header.levels, ...(this.header.colors ? [this.header.colors] : [])];
+    this.tally = { values: networks.map(() => 0), jets: networks.map(() => 0), passes: 0, read: 0 };
     this.last = Promise.resolve();
-    this.clear();
   }
 
+  // WebGPU where there is an adapter that takes this field, else WebGL 2; `?webgl` in the address asks for that.
+  async open() {
+    const forced = new URLSearchParams(location.search).has('webgl');
+    const tracer = (!forced && await GpuTracer.open(this.parts, this.saved)) || new Tracer(this.gl, this.parts, this.saved);
+    tracer.counts = this.tally;
+    this.tracer = tracer;
+  }
+
+  // What traces, or null before the first picture.
   get kind() {
-    return this.tracer.kind;
+    return this.tracer?.kind ?? null;
+  }
+
+  // Ends what is under way on the adapter; no other call may follow.
+  close() {
+    this.queue(() => this.tracer?.close());
+  }
+
+  // Work with the tracer; where its device was lost meanwhile, it is done again with another.
+  async traced(work) {
+    if (!this.tracer) await this.open();
+    try {
+      return await work(this.tracer);
+    } catch (error) {
+      if (!await this.tracer.isLost()) throw error;
+      await this.open();
+      return work(this.tracer);
+    }
   }
 
   get colored() {
@@ -25,7 +51,8 @@ class Renderer {
   }
 
   // What rows [first, first + rows) of a camera's picture see: `seen` has for each pixel, row by row from the upper left,
-  // the normal and the depth along the ray, 0 where nothing is; `color` its own colours where they were asked for.
+  // the normal and the depth along the ray, 0 where nothing is; `color` its own colours where they were asked for; and
+  // what it has cost, see `counts`.
   //
   // Options: level, normalLevel (whose normals), first, rows, colored, and precision: of depths, in units of the field;
   // null is a tenth of a pixel; clip: {axis, at}, a plane before which nothing is seen.
@@ -33,7 +60,11 @@ class Renderer {
     if (options.colored && !this.colored) throw new PageError('This page has no colours.');
     return this.queue(async () => {
       [this.camera, this.options] = [camera, options];
-      return { width: camera.width, height: camera.height, ...await this.tracer.trace(camera, options) };
+      this.clear();
+      const started = performance.now();
+      const made = await this.traced((tracer) => tracer.trace(camera, options));
+      const milliseconds = performance.now() - started;
+      return { width: camera.width, height: camera.height, ...made, milliseconds, counts: structuredClone(this.tally) };
     });
   }
 
@@ -43,7 +74,7 @@ class Renderer {
     const { camera, options } = this;
     if (!camera) return null;
     const one = { ...camera, cx: camera.cx - x, cy: camera.cy - y, width: 1, height: 1 };
-    const { seen } = await this.queue(() => this.tracer.trace(one, { ...options, first: 0, rows: 1, colored: false }));
+    const { seen } = await this.queue(() => this.traced((tracer) => tracer.trace(one, { ...options, first: 0, rows: 1, colored: false })));
     const [nx, ny, nz, depth] = seen;
     if (!depth) return null;
     const across = -one.cx / one.fx, down = -one.cy / one.fy, length = Math.hypot(across, down, 1);
@@ -53,19 +84,18 @@ class Renderer {
 
   // The values of a level at points x, y, z, x, y, …, in the field's units.
   values(points, level) {
-    return this.queue(() => this.tracer.values(points, points.length / 3, level));
+    return this.queue(() => this.traced((tracer) => tracer.value(points, points.length / 3, level)));
   }
 
-  // Since `clear`: of each network (the colours' last) the values and the jets that were asked for; passes of the
-  // adapter, and bytes read back.
+  // Since the last picture began: of each network (the colours' last) the values and the jets that were asked for; passes
+  // of the adapter, and bytes read back.
   counts() {
-    return structuredClone(this.tracer.counts);
+    return structuredClone(this.tally);
   }
 
   clear() {
-    const { counts } = this.tracer;
-    for (const kind of ['values', 'jets']) counts[kind].fill(0);
-    Object.assign(counts, { passes: 0, read: 0 });
+    for (const kind of ['values', 'jets']) this.tally[kind].fill(0);
+    Object.assign(this.tally, { passes: 0, read: 0 });
   }
 
   // Operations of those counts: a product of a weight and a sum are two, and a jet goes through the matrices twice.
@@ -78,6 +108,4 @@ class Renderer {
   }
 }
 
-function openRenderer(gl, parts, saved) {
-  return new Renderer(new Tracer(gl, parts, saved), saved);
-}
+const openRenderer = (gl, parts, saved) => new Renderer(gl, parts, saved);

@@ -7,6 +7,37 @@ const FLOOR = 8 * 2 ** -23;
 const TOLERANCE = 0.1, RESOLUTION = 0.75, NEWTON_REACH = 0.2, SHALLOW = 0.05, NEAREST = 0.05;
 const MOST_MOVES = 10, ARRIVED = 1e-5, LEAST_SLOPE = 0.5;
 const SLACK = 1e-4; // rounding of the depths of the mesh
+const MOST_TOLERANCE = 2.5e-4;
+const DEEP = 0.35; // share of level 0's band behind which a ray looks at its root before it asks finer levels
+
+// How exactly depths are to be known, in units of the field: to `precision`, or to a tenth of a pixel; and the pixel.
+function ruleOf(camera, radius, precision) {
+  const size = Math.max(Math.hypot(...camera.eye) - radius, NEAREST) / Math.max(camera.fx, camera.fy);
+  return {
+    size, tolerance: precision ?? Math.min(TOLERANCE * size, MOST_TOLERANCE), resolution: precision ?? RESOLUTION * size,
+    accept: precision ?? Math.min(ACCEPT * size, MOST_ACCEPT),
+  };
+}
+
+// Which pixels of a picture's rows from `first` on show something, and the points that they show.
+function hitsOf({ eye, right, down, forward, fx, fy, cx, cy, width }, seen, first) {
+  const pixels = [], points = [];
+  for (let pixel = 0; 4 * pixel < seen.length; pixel++) {
+    const depth = seen[4 * pixel + 3];
+    if (!depth) continue;
+    const x = ((pixel % width) - cx) / fx, y = (first + Math.floor(pixel / width) - cy) / fy, length = Math.hypot(x, y, 1);
+    pixels.push(pixel);
+    for (let c = 0; c < 3; c++) points.push(eye[c] + (depth * (right[c] * x + down[c] * y + forward[c])) / length);
+  }
+  return { pixels, points: Float32Array.from(points) };
+}
+
+// Corners and faces of the mesh around the band.
+function shellArrays({ shell }, arrays) {
+  const codes = arrays.get('shell.vertices');
+  const places = Float32Array.from(codes, (code, i) => shell.low[i % 3] + (code / 65535) * (shell.high[i % 3] - shell.low[i % 3]));
+  return { places, faces: arrays.get('shell.faces') };
+}
 
 const dot3 = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 
@@ -38,12 +69,13 @@ class Field {
     return [kept.subarray(0, count), chosen];
   }
 
-  value(points, count, level) {
+  // Finer levels are asked up to the values `ends` of those before: their bands, or as far as is of interest.
+  value(points, count, level, ends = this.deltas) {
     const f = this.networks.value(0, points, count).slice(0, count);
     let rows = null;
     for (let j = 1; j <= level; j++) {
       let chosen;
-      [rows, chosen] = this.inside(f, rows, points, this.deltas[j - 1]);
+      [rows, chosen] = this.inside(f, rows, points, ends[j - 1]);
       const own = this.networks.value(j, chosen, rows.length);
       rows.forEach((row, i) => { f[row] += this.gate(f[row], this.deltas[j - 1])[0] * own[i]; });
     }
@@ -73,18 +105,19 @@ class Field {
 // Display colours around a surface: those of a network at points in the band of a level, the others first moved onto the
 // surface by x - f g / |g|^2; what does not arrive there has the colour of what lies outside.
 class Colors {
-  constructor(field, index, { level, delta, outside }) {
-    Object.assign(this, { field, index, level, delta, outside });
+  // `source` answers value(points, count, level), jet(…) and color(points, count), or promises to.
+  constructor(source, { level, delta, outside }) {
+    Object.assign(this, { source, level, delta, outside });
   }
 
-  at(points, count) {
-    const { field, delta } = this;
+  async at(points, count) {
+    const { source, delta } = this;
     const moved = points.slice(0, 3 * count);
-    const reached = field.value(moved, count, this.level).map((f) => Number(Math.abs(f) < delta));
+    const reached = (await source.value(moved, count, this.level)).map((f) => Number(Math.abs(f) < delta));
     let away = Array.from(reached.keys()).filter((i) => !reached[i]);
     for (let step = 0; step <= MOST_MOVES && away.length; step++) {
       const places = Float32Array.from(away.flatMap((i) => [...moved.subarray(3 * i, 3 * i + 3)]));
-      const { value, gradient } = field.jet(places, away.length, this.level);
+      const { value, gradient } = await source.jet(places, away.length, this.level);
       away = away.filter((i, k) => {
         if (Math.abs(value[k]) < ARRIVED) {
           reached[i] = 1;
@@ -95,7 +128,7 @@ class Colors {
         return true;
       });
     }
-    const found = field.networks.color(this.index, moved, count);
+    const found = await source.color(moved, count);
     const colors = new Float32Array(3 * count);
     for (let i = 0; i < count; i++) {
       for (let c = 0; c < 3; c++) colors[3 * i + c] = reached[i] ? Math.min(1, Math.max(0, found[4 * i + c])) : this.outside[c];
@@ -106,11 +139,10 @@ class Colors {
 
 // The mesh around the band, rasterised: where the ray of each pixel enters it first and leaves it last.
 class Hull {
-  constructor(gl, parts, arrays, { shell }) {
+  constructor(gl, parts, arrays, header) {
     this.gl = gl;
     this.program = compile(gl, parts, 'hull', 'depth');
-    const codes = arrays.get('shell.vertices'), faces = arrays.get('shell.faces');
-    const places = Float32Array.from(codes, (code, i) => shell.low[i % 3] + (code / 65535) * (shell.high[i % 3] - shell.low[i % 3]));
+    const { places, faces } = shellArrays(header, arrays);
     this.places = gl.createVertexArray();
     gl.bindVertexArray(this.places);
     gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
@@ -177,7 +209,11 @@ class Tracer {
     const saved = header.colors ? [...header.levels, header.colors] : header.levels;
     this.networks = new Networks(gl, parts, saved.map((network) => layersOf(arrays, network)));
     this.field = new Field(this.networks, header);
-    this.colors = header.colors && new Colors(this.field, header.levels.length, header.colors);
+    this.colors = header.colors && new Colors({
+      value: (...asked) => this.field.value(...asked),
+      jet: (...asked) => this.field.jet(...asked),
+      color: (points, count) => this.networks.color(header.levels.length, points, count),
+    }, header.colors);
     this.hull = new Hull(gl, parts, arrays, header);
   }
 
@@ -185,28 +221,34 @@ class Tracer {
     return 'WebGL 2';
   }
 
-  get counts() {
-    return this.networks.counts;
+  set counts(counts) {
+    this.networks.counts = counts;
   }
 
-  values(points, count, level) {
+  // The page hears of a lost context itself, and begins anew.
+  isLost() {
+    return false;
+  }
+
+  close() {}
+
+  value(points, count, level) {
     return this.field.value(points, count, level);
   }
 
-  // How many bands |f| = size is inside of, as the δ of the first that it is not; 0 after the last.
+  // The first level's reach that |f| = size is beyond: there the surface cannot be; 0 if there is none.
   band(size, level) {
-    for (let j = 0; j < level; j++) if (size >= this.field.deltas[j]) return this.field.deltas[j];
-    return 0;
+    return this.header.reach[level].find((reach) => size >= reach) ?? 0;
   }
 
   // What rows [first, first + rows) of a camera's picture see: normal and depth of each pixel, depth 0 for nothing; and
   // where it is `colored`, the surface's own colours.
   // Depths are known to a tenth of a pixel, or to `precision` in units of the field.
-  trace(camera, { level, normalLevel = level, first = 0, rows = camera.height, precision = null, colored = false, clip = null }) {
-    const size = Math.max(Math.hypot(...camera.eye) - this.header.radius, NEAREST) / Math.max(camera.fx, camera.fy);
+  async trace(camera, { level, normalLevel = level, first = 0, rows = camera.height, precision = null, colored = false, clip = null }) {
+    const { size, tolerance, resolution } = ruleOf(camera, this.header.radius, precision);
     const seen = new Float32Array(4 * camera.width * rows);
     const rays = this.begin(camera, first, rows, clip);
-    const hits = this.march(camera, rays, level, precision ?? TOLERANCE * size, precision ?? RESOLUTION * size);
+    const hits = this.march(camera, rays, level, tolerance, resolution);
     const points = this.points(camera, rays.direction, rays.depth, hits);
     const { value, gradient } = this.field.jet(points, hits.length, normalLevel);
     const reach = precision ?? NEWTON_REACH * size;
@@ -225,7 +267,7 @@ class Tracer {
       for (let c = 0; c < 3; c++) points[3 * i + c] = camera.eye[c] + depth * rays.direction[3 * ray + c];
     });
     if (colored) {
-      const colors = this.colors.at(points, hits.length);
+      const colors = await this.colors.at(points, hits.length);
       hits.forEach((ray, i) => color.set(colors.subarray(3 * i, 3 * i + 3), 4 * rays.pixel[ray]));
     }
     return { seen, color };
@@ -286,7 +328,7 @@ class Tracer {
     const hits = [];
     let under = Int32Array.from({ length: count }, (_, i) => i);
     for (let step = 1; step <= MOST_STEPS && under.length; step++) {
-      const values = this.field.value(this.points(camera, direction, depth, under), under.length, level);
+      const values = this.field.value(this.points(camera, direction, depth, under), under.length, level, this.header.reach[level]);
       const least = resolution * 2 ** Math.floor((step - 1) / PATIENCE);
       let left = 0;
       for (let k = 0; k < under.length; k++) {

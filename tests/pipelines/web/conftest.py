@@ -37,8 +37,24 @@ def browser(tmp_path_factory):
 @pytest.fixture
 def opened(browser, page):
     """The page, with rays of 16 pixels at rest: software is slow."""
-    address = f"{page.as_uri()}?pixel=16"
+    address = f"{page.as_uri()}?pixel=16&webgl"
     if browser.current_url != address:
         browser.get(address)
         until(lambda: browser.execute_script("return !!window.mplicits"))
+    return browser
+
+
+@pytest.fixture(scope="module")
+def kind(request):
+    return request.param
+
+
+@pytest.fixture
+def drawn(browser, page, kind):
+    """The page, with either of the two that trace: "WebGL 2" or "WebGPU"."""
+    address = f"{page.as_uri()}?pixel=16{'&webgl' if kind == 'WebGL 2' else ''}"
+    if browser.current_url != address:
+        browser.get(address)
+        until(lambda: browser.execute_script("return window.mplicits?.renderer?.kind"))
+    assert browser.execute_script("return window.mplicits.renderer.kind") == kind
     return browser

@@ -6,7 +6,7 @@ import torch
 import trimesh
 from mplicits.neural_fields import MultiscaleSDF, Siren, Sphere, Torus, Union
 from mplicits.neural_fields.tracing import BOUNDING_RADIUS
-from mplicits.pipelines.web.shell import shell_mesh
+from mplicits.pipelines.web.shell import MARGIN, shell_mesh, surface_reach
 
 SHAPES = {
     "torus": Torus(major=0.6, minor=0.15),
@@ -35,3 +35,19 @@ def test_both_parts_have_a_shell():
     mesh = shell_mesh(MultiscaleSDF(SHAPES["needle"], [Siren(4, 1)], [0.03]))
     assert (np.linalg.norm(mesh.vertices, axis=1) < 0.15).any()
     assert (mesh.vertices[:, 0] > 0.5).any()
+
+
+def test_reach_is_what_the_levels_differ_by():
+    """Level 1 is level 0 and a constant, so on its surface level 0 is minus that, and within the band."""
+    step = Siren(4, 1)
+    with torch.no_grad():
+        for part in step.parameters():
+            part.zero_()
+        list(step.parameters())[-1].fill_(0.02)
+    gain = float(step.value(torch.zeros(1, 3)).detach())
+    assert 0 < gain < 0.05
+    none, (reach,) = surface_reach(MultiscaleSDF(Sphere(radius=0.6), [step], [0.1]))
+    assert none == []
+    # The corners of the mesh lie on the surface but for linear interpolation in a cell of 1/48, within h²/8R = 1e-4.
+    assert abs(reach / MARGIN - gain) < 2e-4
+    assert surface_reach(MultiscaleSDF(Sphere(radius=0.6), [step], [gain]))[1] == [pytest.approx(gain)]

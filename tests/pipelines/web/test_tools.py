@@ -25,7 +25,7 @@ def resting(browser, page):
     """A page of its own, seen along −x, at rest; higher than others, so that the panel leaves room for the shape."""
     before = browser.get_window_size()
     browser.set_window_size(500, 500)
-    browser.get(f"{page.as_uri()}?pixel=16&camera=90,0")
+    browser.get(f"{page.as_uri()}?pixel=16&camera=90,0&webgl")
     rest(browser)
     yield browser
     browser.set_window_size(before["width"], before["height"])
@@ -170,7 +170,7 @@ def test_pictures_and_films_are_saved(resting, tmp_path):
 def test_paper_is_as_bright_as_the_system_and_can_be_changed(browser, page):
     wish = {"features": [{"name": "prefers-color-scheme", "value": "light"}]}
     browser.execute_cdp_cmd("Emulation.setEmulatedMedia", wish)
-    browser.get(f"{page.as_uri()}?pixel=16")
+    browser.get(f"{page.as_uri()}?pixel=16&webgl")
     until(lambda: browser.execute_script("return !!window.mplicits"))
     stage = browser.find_element(By.ID, "stage")
     assert stage.get_attribute("data-theme") == "light"
