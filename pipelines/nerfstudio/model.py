@@ -40,7 +40,7 @@ class MultiscaleFieldConfig(InstantiateConfig):
     _target: Type = field(default_factory=lambda: cast(Any, build_field))  # noqa: UP006
     widths: Tuple[int, ...] = (128, 256)  # noqa: UP006
     """Neurons per layer of each level, coarse to fine."""
-    depths: Tuple[int, ...] = (4, 5)  # noqa: UP006
+    depths: Tuple[int, ...] = (2, 3)  # noqa: UP006
     """Sine layers of each level."""
     omegas: Tuple[float, ...] = (10.0, 30.0)  # noqa: UP006
     """SIREN frequency of each level."""

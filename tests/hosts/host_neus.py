@@ -13,6 +13,8 @@ import torch
 import trimesh
 from host_common import EVERY, LOOKS, MORE_STEPS, RAYS, RESOLUTION, applied, changes, in_ball, now, surface
 
+DEEPER = "[(128, 2), (256, 3)]", "[(128, 4), (256, 5)]"  # what `ours, deeper` changes: the paper's networks for images
+
 
 def set_up(args: argparse.Namespace, clone: Path, scene: Path, row: str, folder: Path) -> None:
     """A copy of the host in ``folder``, changed for one row, with the schedule squeezed into so many steps."""
@@ -22,11 +24,12 @@ def set_up(args: argparse.Namespace, clone: Path, scene: Path, row: str, folder:
         if row == "host" and "weights_only" not in diff:
             continue
         path = conf if file.endswith(".conf") else folder / file
-        if path == conf and row == "ours, 256 features":
+        if path == conf and row != "ours":
             continue
         path.write_text(applied(path.read_text(), diff))
-    if row == "ours, 256 features":
-        runner.write_text(runner.read_text().replace("num_features=32", "num_features=256"))
+    if row.startswith("ours, "):
+        text = runner.read_text().replace("num_features=32", "num_features=256")
+        runner.write_text(text.replace(*DEEPER) if row == "ours, deeper" else text)
     if not torch.cuda.is_available():
         for path in folder.rglob("*.py"):
             path.write_text(path.read_text().replace("device('cuda')", "device('cpu')").replace(".cuda()", ".cpu()"))
@@ -67,6 +70,11 @@ def colors(runner: Any, views: list[int]) -> float:
     return float(np.mean(errors))
 
 
+def eikonal(slopes: torch.Tensor) -> float:
+    """Mean (|∇f| − 1)² of gradients ``(N, 3)``."""
+    return ((slopes.norm(dim=1) - 1) ** 2).mean().item()
+
+
 def work(scene: Path, seed: int) -> dict[str, Any]:
     """One training in a copy of the host, as its ``__main__`` would do it, and what came of it."""
     sys.path.insert(0, str(Path.cwd()))
@@ -98,15 +106,18 @@ def work(scene: Path, seed: int) -> dict[str, Any]:
     seconds, course.look = now() - start - spent, None
 
     x = in_ball()
-    slopes = torch.cat([runner.sdf_network.gradient(part)[:, 0].detach() for part in x.split(2000)])
+    network = runner.sdf_network
+    slopes = torch.cat([network.gradient(part)[:, 0].detach() for part in x.split(2000)])
     box = (torch.tensor(bound, dtype=torch.float32) for bound in ([-1.01] * 3, [1.01] * 3))
     mesh = trimesh.Trimesh(*runner.renderer.extract_geometry(*box, resolution=RESOLUTION))
-    parameters = [parameter.numel() for parameter in runner.sdf_network.parameters()]
+    parameters = [parameter.numel() for parameter in network.parameters()]
+    ours = hasattr(network, "field")
     result = {
         "parameters": sum(parameters),
         "s/step": seconds / runner.end_iter,
         "colour": colors(runner, held_out),
-        "eikonal": ((slopes.norm(dim=1) - 1) ** 2).mean().item(),
+        "eikonal": eikonal(slopes),
+        **({"of level 0": eikonal(network.field.jet(network.scale * x, level=0).gradient.detach())} if ours else {}),
         **surface(mesh, scene / "surface.ply"),
         "1/s": float(1 / runner.deviation_network(torch.zeros([1, 3]))[0, 0]),
     }

@@ -3,9 +3,10 @@
     python tests/hosts/run.py --neus path/to/NeuS --data path/to/dtu_scan24 --steps 240 --rays 64 --seeds 0 1 2
 
 The clone and the data stay as they are: what is run is a copy in a temporary folder, in which the document's lines are
-changed (``ours``), its other colour network is not (``ours, 256 features``), or nothing is (``host``), and ``cuda`` is
-``cpu`` where there is no GPU. The host's own packages have to be there: ``pip install pyhocon icecream tqdm PyMCubes``
-for NeuS, ``pip install omegaconf matplotlib PyMCubes`` for instant-nsr-pl (``--nsr``), whose others have stand-ins.
+changed (``ours``), its other colour network is not (``ours, 256 features``; ``ours, deeper`` with the paper's deeper
+levels), or nothing is (``host``), and ``cuda`` is ``cpu`` where there is no GPU. The host's own packages have to be
+there: ``pip install pyhocon icecream tqdm PyMCubes`` for NeuS, ``pip install omegaconf matplotlib PyMCubes`` for
+instant-nsr-pl (``--nsr``), whose others have stand-ins.
 
 Every eighth view is kept from the training, and colours are measured there, on the same rays for all. Where the data
 has a ``surface.ply`` (``mplicits scene``), the mesh is measured against it. With ``--keep FILE`` rows are written to a
@@ -25,7 +26,7 @@ import host_neus
 import host_nsr
 
 HOSTS = {"neus": host_neus, "nsr": host_nsr}
-ROWS = {"neus": ("host", "ours", "ours, 256 features"), "nsr": ("host", "ours")}
+ROWS = {"neus": ("host", "ours", "ours, 256 features", "ours, deeper"), "nsr": ("host", "ours")}
 
 
 def run(args: argparse.Namespace, host: str, scene: Path, row: str, seed: int) -> dict[str, Any]:
