@@ -16,8 +16,12 @@ from torch import Tensor
 
 from ._fixed import first_rows, fixed_shapes
 from ._march import PATIENCE, Found, Rays, Rule, Stand, look
+from .algebra import Combined
+from .analytic import ClosedForm
 from .field import Field
 from .multiscale import MultiscaleSDF
+from .siren import Siren
+from .spacetime import SpaceTimeSDF, TimeSlice
 
 __all__ = ["march_ahead"]
 
@@ -48,6 +52,15 @@ def march_ahead(
         passes = PASSES
 
 
+def _asks_at_all_points(field: Field) -> bool:
+    """Whether every `MultiscaleSDF` inside is asked at the very points that ``field`` is asked at, in their order."""
+    if isinstance(field, Combined):
+        return all(map(_asks_at_all_points, field.fields))
+    if isinstance(field, TimeSlice):
+        return _asks_at_all_points(field.field)
+    return isinstance(field, MultiscaleSDF | SpaceTimeSDF | Siren | ClosedForm)
+
+
 class _Chunk:
     """Some passes of rays, none of which leaves.
 
@@ -67,7 +80,7 @@ class _Chunk:
     def run(self, passes: int, found: Found, reach: float | None, capacity: Sequence[int]) -> list[Tensor]:
         """So many passes; then what the rays that ended have found is noted → how much room bands were asked for."""
         demand: list[Tensor] = []
-        if isinstance(self.field, MultiscaleSDF):
+        if _asks_at_all_points(self.field):
             with fixed_shapes(capacity) as shapes:
                 for _ in range(passes):
                     shapes.wanted = ~self.ended
@@ -76,7 +89,7 @@ class _Chunk:
                         value, shapes.wanted if shapes.lost is None else shapes.wanted & ~shapes.lost, found, reach
                     )
             demand = shapes.demand
-        else:  # a field that builds on another may ask it for fewer points, and could not say who found no room
+        else:  # who asks another field at fewer points could not say who found no room
             for _ in range(passes):
                 self._pass(self._values(), ~self.ended, found, reach)
         ray, stand = self.rays.ray, self.stand

@@ -9,13 +9,13 @@ places; places that are left over are computed and thrown away.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from contextvars import ContextVar
 
 import torch
 from torch import Tensor
 
-__all__ = ["FixedShapes", "current_shapes", "first_rows", "fixed_shapes"]
+__all__ = ["FixedShapes", "current_shapes", "first_rows", "fixed_shapes", "one_evaluation"]
 
 
 class FixedShapes:
@@ -26,17 +26,29 @@ class FixedShapes:
         wanted: ``(N,)`` bool, the points whose values anybody will read; None for all. Others get a coarse value.
         demand: for each residual level that was evaluated, the most points that were in its band, 0-dimensional int64.
         lost: ``(N,)`` bool of the last evaluation, the points that found no room in a band: they have the value of a
-            coarser level. None where there was room for all.
+            coarser level. None where there was room for all. Of a field of fields (`Union`, …), in a band of any part.
     """
 
     def __init__(self, capacity: Sequence[int] | None = None, wanted: Tensor | None = None) -> None:
         self.capacity, self.wanted = capacity, wanted
         self.demand: list[Tensor] = []
         self.lost: Tensor | None = None
+        self._under_way = False
 
     def begin(self) -> None:
-        """Forget who was lost: a new evaluation begins."""
-        self.lost = None
+        """Forget who was lost: a new evaluation begins, unless it is part of another."""
+        if not self._under_way:
+            self.lost = None
+
+    @contextmanager
+    def whole(self) -> Iterator[None]:
+        """What is evaluated inside this is one evaluation."""
+        self.begin()
+        before, self._under_way = self._under_way, True
+        try:
+            yield
+        finally:
+            self._under_way = before
 
     def admit(self, index: int, inside: Tensor) -> tuple[Tensor, Tensor | None]:
         """Let points into the band of a residual level.
@@ -98,6 +110,12 @@ def fixed_shapes(capacity: Sequence[int] | None = None) -> Iterator[FixedShapes]
 def current_shapes() -> FixedShapes | None:
     """Those of the innermost `fixed_shapes`; None outside of any."""
     return _shapes.get()
+
+
+def one_evaluation() -> AbstractContextManager[None]:
+    """Inside this, fields that are asked one after the other, at the same points, count as one."""
+    shapes = current_shapes()
+    return nullcontext() if shapes is None else shapes.whole()
 
 
 def first_rows(mask: Tensor, count: int) -> Tensor:

@@ -23,6 +23,8 @@ import torch
 from torch import Tensor
 
 from ._checks import at_least, positive
+from ._fixed import current_shapes, one_evaluation
+from .devices import few_numbers
 from .field import Field, Jet
 from .function import FieldLike, as_field
 from .similarity import Similarity
@@ -67,6 +69,8 @@ class Combined(Field):
         level = self.resolve_level(level)
         if level == 0 or not self.check_points(x).numel():
             return self._jet(self.check_points(x), level)
+        if current_shapes() is not None:
+            return self._jet_of_all(x, level)
         with torch.no_grad():
             reached = self._walk(x, level)[1].reshape(-1)
         rows = [(reached == each).nonzero()[:, 0] for each in range(level + 1)]
@@ -79,10 +83,28 @@ class Combined(Field):
         joined = (torch.cat(pieces)[order] for pieces in zip(*jets, strict=True))
         return Jet(*(part.reshape(*x.shape[:-1], *part.shape[1:]) for part in joined))
 
+    def _jet_of_all(self, x: Tensor, level: int) -> Jet:
+        """The same where shapes are fixed: the jets of all levels at every point, and from each its own."""
+        with one_evaluation():
+            with torch.no_grad():
+                reached = self._walk(x, level)[1]
+            jet = self._jet(x, 0)
+            for each in range(1, level + 1):
+                there = reached >= each
+                pairs = zip(self._jet(x, each), jet, strict=True)
+                jet = Jet(
+                    *(
+                        torch.where(there.reshape(*there.shape, *[1] * (new.ndim - there.ndim)), new, old)
+                        for new, old in pairs
+                    )
+                )
+        return jet
+
     def _walk(self, x: Tensor, level: int) -> tuple[list[Tensor], Tensor]:
         """The values of all levels up to ``level``, and which of them each point has come to, int64 ``(...,)``."""
         home = self._home(self.check_points(x))
-        columns = [field.level_values(home, level=min(level, field.num_levels - 1)) for field in self.fields]
+        with one_evaluation():
+            columns = [field.level_values(home, level=min(level, field.num_levels - 1)) for field in self.fields]
         found = [self._join(x, [column[0] for column in columns])]
         inside = torch.ones_like(found[0], dtype=torch.bool)
         reached = torch.zeros_like(inside, dtype=torch.int64)
@@ -340,7 +362,7 @@ class Placed(Combined):
         self.similarity = similarity
 
     def _home(self, x: Tensor) -> Tensor:
-        return (x - x.new_tensor(self.similarity.center)) / self.similarity.scale
+        return (x - few_numbers(self.similarity.center, x)) / self.similarity.scale
 
     def _band(self, delta: Tensor) -> Tensor:
         return delta * self.similarity.scale

@@ -8,12 +8,13 @@ import torch
 from torch import Tensor
 
 from ._checks import positive
+from .devices import few_numbers
 from .field import Jet, OneLevelField
 
 __all__ = ["Box", "Capsule", "Plane", "Sphere", "Torus"]
 
 
-class _Exact(OneLevelField):
+class ClosedForm(OneLevelField):
     """A closed-form field; a subclass gives value and gradient at points."""
 
     @abstractmethod
@@ -29,10 +30,6 @@ class _Exact(OneLevelField):
         return Jet(value, gradient, x.new_empty((*x.shape[:-1], 0)))
 
 
-def _vector(values: tuple[float, ...], like: Tensor) -> Tensor:
-    return torch.tensor(values, dtype=like.dtype, device=like.device)
-
-
 def _norm_and_direction(v: Tensor) -> tuple[Tensor, Tensor]:
     """Length of ``v`` and ``v`` over it; zero vectors get direction zero instead of NaN."""
     length = v.norm(dim=-1)
@@ -40,7 +37,7 @@ def _norm_and_direction(v: Tensor) -> tuple[Tensor, Tensor]:
     return length, v / safe[..., None]
 
 
-class Sphere(_Exact):
+class Sphere(ClosedForm):
     """``f(x) = |x − center| − radius``.
 
     Example:
@@ -57,11 +54,11 @@ class Sphere(_Exact):
         self.radius, self.center = radius, center
 
     def _evaluate(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        length, direction = _norm_and_direction(x - _vector(self.center, x))
+        length, direction = _norm_and_direction(x - few_numbers(self.center, x))
         return length - self.radius, direction
 
 
-class Plane(_Exact):
+class Plane(ClosedForm):
     """``f(x) = ⟨normal, x⟩ − offset`` with a unit normal; negative on the side the normal leaves."""
 
     defined_by = ("normal", "offset")
@@ -74,11 +71,11 @@ class Plane(_Exact):
         self.normal, self.offset = tuple(c / length for c in normal), offset
 
     def _evaluate(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        normal = _vector(self.normal, x)
+        normal = few_numbers(self.normal, x)
         return x @ normal - self.offset, normal.expand(x.shape)
 
 
-class Torus(_Exact):
+class Torus(ClosedForm):
     """``f(x) = √((√(x² + y²) − major)² + z²) − minor``, around the z axis."""
 
     defined_by = ("major", "minor")
@@ -95,7 +92,7 @@ class Torus(_Exact):
         return length - self.minor, torch.cat((q[..., :1] * radial, q[..., 1:]), -1)
 
 
-class Box(_Exact):
+class Box(ClosedForm):
     """Axis-aligned box with half-sizes ``half_size`` around ``center``.
 
     Outside, the distance to the nearest point of the box; inside, minus the distance to the nearest face.
@@ -115,9 +112,9 @@ class Box(_Exact):
         self.half_size, self.center = half_size, center
 
     def _evaluate(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        p = x - _vector(self.center, x)
+        p = x - few_numbers(self.center, x)
         sign = torch.where(p < 0, -1.0, 1.0).to(x.dtype)
-        q = p.abs() - _vector(self.half_size, x)
+        q = p.abs() - few_numbers(self.half_size, x)
         outside, direction = _norm_and_direction(q.clamp(min=0))
         inside, axis = q.max(dim=-1)
         facing = torch.nn.functional.one_hot(axis, 3).to(x.dtype)
@@ -125,7 +122,7 @@ class Box(_Exact):
         return outside + inside.clamp(max=0), gradient
 
 
-class Capsule(_Exact):
+class Capsule(ClosedForm):
     """All points within ``radius`` of the segment from ``start`` to ``end``."""
 
     defined_by = ("start", "end", "radius")
@@ -143,8 +140,8 @@ class Capsule(_Exact):
         self.start, self.end, self.radius = start, end, radius
 
     def _evaluate(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        start = _vector(self.start, x)
-        axis = _vector(self.end, x) - start
+        start = few_numbers(self.start, x)
+        axis = few_numbers(self.end, x) - start
         along = (((x - start) @ axis) / (axis @ axis)).clamp(0, 1)
         length, direction = _norm_and_direction(x - start - along[..., None] * axis)
         return length - self.radius, direction

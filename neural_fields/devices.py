@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
-__all__ = ["makes_wait", "precise", "upload"]
+__all__ = ["few_numbers", "makes_wait", "precise", "upload"]
 
 
 def makes_wait(device: torch.device) -> bool:
@@ -22,6 +24,11 @@ def upload(tensor: Tensor, device: torch.device | str) -> Tensor:
     if device.type in ("cpu", "mps"):  # these share the host's memory
         return tensor.to(device)
     return tensor.pin_memory().to(device, non_blocking=True)
+
+
+def few_numbers(numbers: Sequence[float], like: Tensor) -> Tensor:
+    """A vector of some numbers of the host, where and as ``like`` is: filled in there, which nobody waits for."""
+    return torch.stack([like.new_full((), number) for number in numbers])
 
 
 def precise(device: torch.device) -> torch.dtype:

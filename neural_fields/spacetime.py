@@ -69,7 +69,7 @@ def spacetime_jet(field: Field, x: Tensor, *, level: int = -1, order: int = 1) -
 
 def at_time(x: Tensor, t: Tensor | float) -> Tensor:
     """Points ``(..., 3)`` at a time, or each at its own ``(...,)``, as points ``(..., 4)`` of space-time."""
-    time = torch.as_tensor(t, dtype=x.dtype, device=x.device).expand(x.shape[:-1])
+    time = (t.to(x) if isinstance(t, Tensor) else x.new_full((), t)).expand(x.shape[:-1])
     return torch.cat((x, time[..., None]), dim=-1)
 
 

@@ -94,8 +94,11 @@ def test_levels_agree_within_the_tolerance(few: int, both, monkeypatch: pytest.M
         assert torch.equal(first.level[first.mask], second.level[second.mask])
 
 
+@pytest.mark.parametrize("few", [_ahead.FEW, 5], ids=["room", "little-room"])
 @pytest.mark.parametrize("name", ["union", "placed", "difference-of-multiscale", "slice"])
-def test_fields_of_fields(name: str, both) -> None:
+def test_fields_of_fields(name: str, few: int, both, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_ahead, "FEW", few)
+    monkeypatch.setattr(_ahead, "LEAST_ROOM", few)
     field: Field = FIELDS[name]().double()
     origins, directions = rays(torch.float64, 60)
     first, second = both(sphere_trace, field, origins, directions, max_steps=64)

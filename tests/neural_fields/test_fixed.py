@@ -6,8 +6,18 @@ import pytest
 import standin
 import torch
 from bounds import assert_within, rounding
-from fields import small_multiscale
-from mplicits.neural_fields import FixedShapes, MultiscaleSDF, fixed_shapes
+from fields import small_multiscale, small_spacetime
+from mplicits.neural_fields import (
+    Field,
+    FixedShapes,
+    MultiscaleSDF,
+    Placed,
+    Similarity,
+    Sphere,
+    TimeSlice,
+    Union,
+    fixed_shapes,
+)
 from mplicits.neural_fields._fixed import first_rows
 from torch import Tensor
 
@@ -114,3 +124,30 @@ def test_nobody_waits_and_the_kernels_are_the_same_for_any_points(capacity: list
         assert book.synchronisations == 0, book.report()
         launched.append(book.launches)
     assert launched[0] == launched[1]
+
+
+def composed(name: str) -> Field:
+    """Fields of fields of levels, whose bands are those of their parts."""
+    if name == "slice":
+        return TimeSlice(small_spacetime(0.4), 0.3).double().requires_grad_(False)
+    other = Placed(small_multiscale(0.3), Similarity((0.3, 0.0, 0.1), 1.1))
+    return Union(sdf(), other, Sphere(radius=0.3)).double().requires_grad_(False)
+
+
+@pytest.mark.parametrize("capacity", [None, [60, 20]])
+@pytest.mark.parametrize("name", ["union", "slice"])
+def test_fields_of_fields_need_no_wait_either(name: str, capacity: list[int] | None) -> None:
+    field, x = composed(name), points()
+    usual = field.jet(x)
+    with fixed_shapes(capacity) as shapes:
+        found = field.jet(x)
+    there = torch.ones(len(x), dtype=torch.bool) if shapes.lost is None else ~shapes.lost
+    assert (int(there.sum()) < len(x)) == (capacity is not None)
+    for a, b in zip(found, usual, strict=True):
+        # The same products with other rows beside them, of 16 terms in float64.
+        assert_within(a[there], b[there], 1e-11)
+    on_device, there = copy.deepcopy(field).to(standin.NAME), x.to(standin.NAME)
+    with standin.counted() as book, fixed_shapes(capacity):
+        on_device.value(there)
+        on_device.jet(there)
+    assert book.synchronisations == 0, book.report()
