@@ -1,9 +1,10 @@
-"""``mplicits web``: a run as one HTML file."""
+"""``mplicits web``: a run as one HTML file, or as a folder with an element for other pages."""
 
 from __future__ import annotations
 
 import argparse
 import time
+from pathlib import Path
 
 from ..run.config import given_flags, input_error
 from .common import Command, add_flags, check_output, whole
@@ -18,20 +19,37 @@ MARK = 'id="header">{"format":"mplicits-web"'
 def _web_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add_flags(parser, "run", "--time")
-    add_flags(parser, "--out", help=", ".join(PAGES))
+    add_flags(parser, "--out", help=f"{', '.join(PAGES)}, or a folder: field, module and page")
     add("--levels", type=whole(1), metavar="N", help="only the N coarsest levels (default: all)")
     add("--no-colors", dest="colors", action="store_false", help="leave out the colours of the run's texture")
     add("--float32", action="store_true", help="keep the weights as they are (default: 16 bits each)")
     add_flags(parser, "--up")
     add("--title", metavar="TEXT", help="of the page (default: the name of the run)")
-    add("--force", action="store_true", help="overwrite a file that is no page of this command")
+    add("--force", action="store_true", help="overwrite what was not written by this command")
+
+
+def _check_folder(out: Path) -> None:
+    """Refuse a folder in which something else is than what this command writes."""
+    if out.exists() and not out.is_dir():
+        raise input_error(f"{out}: is a file; name a folder, or a file that ends with {' or '.join(PAGES)}")
+    from ...neural_fields.files import check_place
+
+    check_place(out / "index.html")
+    field = out / "field.bin"
+    ours = field.is_file() and field.read_bytes().startswith(b"mplicits-field\n")
+    if out.is_dir() and any(out.iterdir()) and not ours:
+        raise input_error(f"{out}: is not empty, and was not written by this command; name another folder")
 
 
 def _web(arguments: argparse.Namespace) -> int:
     out = arguments.out
-    check_output(out, PAGES)
-    if out.exists() and not arguments.force and MARK not in out.read_text(encoding="utf-8", errors="replace"):
-        raise input_error(f"{out}: is there, and no page of this command; name another file, or say --force")
+    if out.suffix:
+        check_output(out, PAGES)
+    else:
+        _check_folder(out)
+    page = out if out.suffix else out / "index.html"
+    if page.exists() and not arguments.force and MARK not in page.read_text(encoding="utf-8", errors="replace"):
+        raise input_error(f"{page}: is there, and no page of this command; name another file, or say --force")
     from ..web.export import WebOptions, web_run
 
     started = time.monotonic()
@@ -47,9 +65,10 @@ WEB = Command(
     "write a fit as one HTML file, traced in the browser of who opens it",
     """  mplicits web runs/scan -o scan.html
   mplicits web runs/scan -o small.html --levels 1
-  mplicits web runs/scan -o exact.html --float32 --up z""",
+  mplicits web runs/scan -o exact.html --float32 --up z
+  mplicits web runs/scan -o site/scan        # a folder: <mplicits-field> for other pages""",
     _web_arguments,
     _web,
     "Write a fit as one HTML file that needs no network, no server and no Python: the networks themselves, traced by "
-    "the GPU of whoever opens it (WebGL 2).",
+    "the GPU of whoever opens it (WebGL 2). With a folder's name it writes an element for other pages.",
 )

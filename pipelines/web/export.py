@@ -1,15 +1,10 @@
-"""From a run to the page: what is shown of it, rounded and packed, inside the files of the folder ``page``."""
+"""From a run to the page: what is shown of it, rounded and packed."""
 
 from __future__ import annotations
 
-import base64
 import dataclasses
-import hashlib
-import json
-import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -25,39 +20,18 @@ from ...neural_fields.tracing import BOUNDING_RADIUS
 from ..render.subject import FRAME_RESOLUTION, traced_part
 from ..run.folder import chosen_level, find_field, load_still
 from ..texture.train import texture_of
+from .assembly import fill_page, write_folder
 from .networks import Rounding, network_layers, rounding_error, shader_levels, taper_of
 from .payload import Payload
 from .shell import shell_mesh, surface_reach
 
-__all__ = ["BITS", "WebOptions", "WebPage", "web_run"]
+__all__ = ["BITS", "PAGES", "WebOptions", "WebPage", "web_run"]
 
+PAGES = (".html", ".htm")
 BITS = 16
 VERSION = 1
-SCRIPTS = (
-    "decode.js",
-    "network.js",
-    "tracer.js",
-    "camera.js",
-    "kernels.js",
-    "webgpu.js",
-    "renderer.js",
-    "paint.js",
-    "section.js",
-    "tools.js",
-    "save.js",
-    "interface.js",
-    "controls.js",
-    "page.js",
-    "main.js",
-)
-SHADERS = ("shaders.glsl", "shade.glsl", "march.wgsl")
 CHANNELS = 3
 ERROR_POINTS = 4000  # at which rounding is measured
-# The whole page: nothing is fetched, nothing is sent, and only the scripts and styles with these digests run.
-POLICY = (
-    "default-src 'none'; script-src 'sha256-{script}'; style-src 'sha256-{style}'; img-src blob: data:; "
-    "base-uri 'none'; form-action 'none'"
-)
 
 
 @dataclass(frozen=True)
@@ -86,7 +60,7 @@ class WebPage:
     """A page that was written.
 
     Attributes:
-        size: of the file, in bytes.
+        size: of the file, or of what the element fetches: ``field.bin`` and its module; in bytes.
         levels: that it shows.
         colored: whether it has colours.
         triangles: of the mesh between which rays are sought.
@@ -107,11 +81,11 @@ def web_run(
     *,
     say: Callable[[str], None] | None = None,
 ) -> WebPage:
-    """Write a page that shows a run, and needs nothing but itself.
+    """Write a page that shows a run, and needs nothing but itself; or a folder, to show it in another page.
 
     Args:
         run: run directory or .safetensors file.
-        out: the .html file.
+        out: a file of `PAGES`; any other name is a folder's, see `write_folder`.
         options: what to show.
         say: called with a line about what rounding has cost.
 
@@ -128,13 +102,22 @@ def web_run(
         shown = _coarse(shown, options.levels)
     name = options.title or _name_of(file)
     header, data, page = _content(shown, texture, similarity, name, file, options)
-    write_whole(out, fill_page(header, data))
-    done = dataclasses.replace(page, size=Path(out).stat().st_size)
+    out = Path(out)
+    if out.suffix.lower() in PAGES:
+        write_whole(out, fill_page(header, data))
+    else:
+        write_folder(out, header, data)
+    done = dataclasses.replace(page, size=sum(part.stat().st_size for part in _fetched(out)))
     if say is not None and done.rounding:
         worst = [max(getattr(part, key) for part in done.rounding) for key in ("value", "angle")]
         length = worst[0] * similarity.scale
         say(f"weights of {BITS} bits: distances change by at most {length:.2g} input units, normals by {worst[1]:.2g}°")
     return done
+
+
+def _fetched(out: Path) -> list[Path]:
+    """What a browser fetches: the page, or of a folder the field and the module."""
+    return [out] if out.suffix.lower() in PAGES else [out / "field.bin", out / "mplicits-field.js"]
 
 
 def _still(file: Path, time: float | None) -> tuple[Field, Similarity]:
@@ -210,34 +193,3 @@ def _view(outline: NDArray[np.floating], up: str) -> dict[str, Any]:
     middle = (outline.min(axis=0) + outline.max(axis=0)) / 2
     distance = float(np.linalg.norm(camera.eye.numpy() - middle))
     return {"middle": middle.tolist(), "distance": distance, "azimuth": 30.0, "elevation": 15.0, "up": up, "fov": 25.0}
-
-
-def fill_page(header: Mapping[str, Any], data: bytes) -> str:
-    """The page with a header and its bytes in it, and a policy that lets its own script and styles run, and no others.
-
-    What comes from the run stands in blocks of data, which browsers do not run, and in which no "<" is left.
-    """
-    folder = files("mplicits.pipelines.web") / "page"
-    texts = {name: (folder / name).read_text(encoding="utf-8") for name in ("index.html", "style.css")}
-    script = "\n" + "\n".join(_bare((folder / name).read_text(encoding="utf-8")) for name in SCRIPTS)
-    style = "\n" + texts["style.css"]
-    policy = POLICY.format(script=_digest(script), style=_digest(style))
-    parts = {
-        "POLICY": policy,
-        "STYLE": style,
-        "SHADERS": "\n".join(_bare((folder / name).read_text(encoding="utf-8")) for name in SHADERS),
-        "SCRIPT": script,
-        "HEADER": json.dumps(header, ensure_ascii=True, separators=(",", ":")).replace("<", "\\u003c"),
-        "DATA": base64.b64encode(data).decode(),
-    }
-    return re.sub("@([A-Z]+)@", lambda found: parts[found[1]], texts["index.html"])
-
-
-def _bare(text: str) -> str:
-    """A source without its indentation and the lines that are comments: the page has to be small."""
-    lines = (line.strip() for line in text.splitlines())
-    return "\n".join(line for line in lines if line and not line.startswith("//"))
-
-
-def _digest(text: str) -> str:
-    return base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()

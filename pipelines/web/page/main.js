@@ -1,17 +1,5 @@
 // A page of its own: the field lies in it.
 
-const shaderParts = (text) => new Map(text.split('#part ').slice(1).map((part) => {
-  const end = part.indexOf('\n');
-  return [part.slice(0, end), part.slice(end)];
-}));
-
-// What the address wishes: ?camera=AZIMUTH,ELEVATION&pixel=N
-function wishes(search) {
-  const given = (search.get('camera') ?? '').split(',').map(Number);
-  const camera = search.has('camera') && given.length === 2 && given.every(Number.isFinite) ? given : null;
-  return { camera, pixel: Number(search.get('pixel')) };
-}
-
 addEventListener('DOMContentLoaded', () => {
   const text = (id) => document.getElementById(id)?.textContent ?? '';
   const ui = new Interface(document.getElementById('stage'));

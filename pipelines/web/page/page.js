@@ -5,6 +5,19 @@ const FRAME = 40, STRIP = 60, REST = 180; // milliseconds: of a picture while it
 
 const digits = (number) => Number(number.toPrecision(3)).toLocaleString('en', { maximumSignificantDigits: 3 });
 
+// The parts of the shaders, by their names.
+const shaderParts = (text) => new Map(text.split('#part ').slice(1).map((part) => {
+  const end = part.indexOf('\n');
+  return [part.slice(0, end), part.slice(end)];
+}));
+
+// What an address wishes, or an element: camera=AZIMUTH,ELEVATION and pixel=N.
+function wishes(search) {
+  const given = (search.get('camera') ?? '').split(',').map(Number);
+  const camera = search.has('camera') && given.length === 2 && given.every(Number.isFinite) ? given : null;
+  return { camera, pixel: Number(search.get('pixel')) };
+}
+
 class Page {
   // A field, its shaders, where it is shown; and what is wished: {camera: [azimuth, elevation], pixel}.
   constructor(saved, parts, ui, { camera = null, pixel = 0 } = {}) {

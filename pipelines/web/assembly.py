@@ -1,0 +1,114 @@
+"""From the sources in the folder ``page`` to what is written: a page with its field, or a module that fetches it."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import re
+import struct
+from collections.abc import Mapping
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from ...neural_fields.files import write_whole
+
+__all__ = ["fill_page", "write_folder"]
+
+SCRIPTS = (
+    "decode.js",
+    "network.js",
+    "tracer.js",
+    "camera.js",
+    "kernels.js",
+    "webgpu.js",
+    "renderer.js",
+    "paint.js",
+    "section.js",
+    "tools.js",
+    "save.js",
+    "interface.js",
+    "controls.js",
+    "page.js",
+)
+SHADERS = ("shaders.glsl", "shade.glsl", "march.wgsl")
+MAGIC = b"mplicits-field\n"
+MARK = "// mplicits-field: written by `mplicits web`"
+# The whole page: nothing is fetched, nothing is sent, and only the scripts and styles with these digests run.
+POLICY = (
+    "default-src 'none'; script-src 'sha256-{script}'; style-src 'sha256-{style}'; img-src blob: data:; "
+    "base-uri 'none'; form-action 'none'"
+)
+
+
+def fill_page(header: Mapping[str, Any], data: bytes) -> str:
+    """The page with a header and its bytes in it, and a policy that lets its own script and styles run, and no others.
+
+    What comes from the run stands in blocks of data, which browsers do not run, and in which no "<" is left.
+    """
+    script = "\n" + "\n".join(_bare(_source(name)) for name in (*SCRIPTS, "main.js"))
+    style = "\n" + _source("style.css")
+    policy = POLICY.format(script=_digest(script), style=_digest(style))
+    parts = {
+        "POLICY": policy,
+        "STYLE": style,
+        "SHADERS": _shaders(),
+        "SCRIPT": script,
+        "HEADER": _header(header).replace("<", "\\u003c"),
+        "DATA": base64.b64encode(data).decode(),
+    }
+    return re.sub("@([A-Z]+)@", lambda found: parts[found[1]], _source("index.html"))
+
+
+def write_folder(out: Path, header: Mapping[str, Any], data: bytes) -> None:
+    """Write what another page needs to show a field, and the page of its own beside it.
+
+    ``field.bin`` is `MAGIC`, the length of the header as an unsigned number of four bytes, little-endian, the header in
+    JSON, and the bytes; ``mplicits-field.js`` an ES module that defines the element ``<mplicits-field>``; its types,
+    and a README that says how to use it, come with it.
+
+    Args:
+        out: the folder, which is made if it is not there.
+        header: of the page.
+        data: its bytes.
+
+    Raises:
+        InputError: a file cannot be written.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    text = _header(header).encode()
+    title = " ".join(str(header["title"]).split())
+    write_whole(out / "field.bin", MAGIC + struct.pack("<I", len(text)) + text + data)
+    write_whole(out / "mplicits-field.js", _module())
+    write_whole(out / "mplicits-field.d.ts", _source("mplicits-field.d.ts"))
+    write_whole(out / "README.md", _source("embed.md").replace("@TITLE@", title))
+    write_whole(out / "index.html", fill_page(header, data))
+
+
+def _module() -> str:
+    texts = {"STYLE": _source("style.css"), "SHADERS": _shaders()}
+    known = "\n".join(f"const {name} = {json.dumps(text)};" for name, text in texts.items())
+    return "\n".join((MARK, known, *(_bare(_source(name)) for name in (*SCRIPTS, "element.js")))) + "\n"
+
+
+def _header(header: Mapping[str, Any]) -> str:
+    return json.dumps(header, ensure_ascii=True, separators=(",", ":"))
+
+
+def _shaders() -> str:
+    return "\n".join(_bare(_source(name)) for name in SHADERS)
+
+
+def _source(name: str) -> str:
+    return (files("mplicits.pipelines.web") / "page" / name).read_text(encoding="utf-8")
+
+
+def _bare(text: str) -> str:
+    """A source without its indentation and the lines that are comments: the page has to be small."""
+    lines = (line.strip() for line in text.splitlines())
+    return "\n".join(line for line in lines if line and not line.startswith("//"))
+
+
+def _digest(text: str) -> str:
+    return base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
