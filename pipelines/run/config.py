@@ -236,6 +236,9 @@ def _read_preset(preset: str | Path | None, thing: str) -> tuple[str, Pairs]:
         place = f", line {mark.line + 1}, column {mark.column + 1}" if mark else ""
         problem = getattr(error, "problem", None) or "unreadable"
         raise input_error(f"{source}{place}: not YAML ({problem})") from error
+    except (RecursionError, ValueError) as error:  # a year of 400 digits, a date of the 45th of May
+        reason = "nested too deeply" if isinstance(error, RecursionError) else " ".join(str(error).split())[:160]
+        raise input_error(f"{source}: not settings ({reason}); expected lines of 'key: value'") from error
     if pairs is None:
         return source, {}
     if not isinstance(pairs, dict):

@@ -128,8 +128,12 @@ def _plan(file: Path) -> list[str]:
     """The names that shall be gone; of this folder only, whoever wrote the file."""
     if not file.is_file():
         return []
-    names = json.loads(file.read_text(encoding="utf-8"))
-    return [name for name in names if isinstance(name, str) and Path(name).name == name]
+    try:
+        names = json.loads(file.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError):
+        return []
+    names = names if isinstance(names, list) else []
+    return [name for name in names if isinstance(name, str) and name and Path(name).name == name]
 
 
 def _left_over(folder: Path) -> Iterator[Path]:

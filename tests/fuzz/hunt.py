@@ -33,6 +33,7 @@ from mplicits.neural_fields import InputError
 __all__ = ["BAD", "Outcome", "case", "hunt"]
 
 SECONDS = 20
+IDLE = 10  # times as long where nothing is done
 SPARE = 256 << 20  # bytes that reading may take, beside three times the file
 LONGEST_LINE = 700
 BAD = ("traceback", "hang", "memory", "vague", "noise", "died")
@@ -94,13 +95,17 @@ def _limits(size: int) -> Iterator[None]:
     before = resource.getrlimit(resource.RLIMIT_AS)
     now = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (now + SPARE + 3 * size, before[1]))
-    handler = signal.signal(signal.SIGALRM, stop)
-    signal.alarm(SECONDS)
+    # Of work; and somewhat more by the clock, which goes on while the machine does other things.
+    handlers = [(number, signal.signal(number, stop)) for number in (signal.SIGPROF, signal.SIGALRM)]
+    signal.setitimer(signal.ITIMER_PROF, SECONDS)
+    signal.setitimer(signal.ITIMER_REAL, IDLE * SECONDS)
     try:
         yield
     finally:
-        signal.alarm(0)
-        signal.signal(signal.SIGALRM, handler)
+        for timer in (signal.ITIMER_PROF, signal.ITIMER_REAL):
+            signal.setitimer(timer, 0)
+        for number, handler in handlers:
+            signal.signal(number, handler)
         resource.setrlimit(resource.RLIMIT_AS, before)
 
 
@@ -147,7 +152,7 @@ def hunt(seed: int, numbers: range) -> Iterator[Outcome]:
         at: int | None = None
         while True:
             try:
-                if not ours.poll(120 if at is None else 3 * SECONDS):
+                if not ours.poll(600 if at is None else 2 * IDLE * SECONDS):
                     process.kill()
                     raise EOFError
                 told = ours.recv()

@@ -1,11 +1,11 @@
 """Damaged files are read or refused in one line, whatever the damage; those that once were not stay so."""
 
+import functools
 import io
 import json
 import os
 import random
 import struct
-import time
 import zipfile
 from collections import Counter
 from collections.abc import Callable
@@ -22,29 +22,48 @@ pytest.importorskip("resource", reason="limits of memory are those of POSIX")
 import hunt as hunting
 from hunt import BAD, case, hunt, outcome_of
 
-SEED, CASES = 2026, 504  # twelve of each file
+SEED, ROUNDS = 2026, 30
+# Of these folders' files, which take a tenth of a second each, every seventh round.
+SLOW, EVERY = ("sparse/", "transforms.json"), 7
 FOUND = sorted((Path(__file__).parent / "found").glob("*.json"))
 
 
+@functools.cache
+def known() -> list[Specimen]:
+    """All whole files, made once."""
+    return specimens()
+
+
 def test_whole_files_are_read(tmp_path: Path) -> None:
-    for number, specimen in enumerate(specimens()):
+    for number, specimen in enumerate(known()):
         (tmp_path / f"{number}").mkdir()
         outcome = outcome_of(number, specimen, specimen.data, tmp_path / f"{number}")
         assert outcome.kind == "read", outcome
 
 
-def test_damaged_files_are_read_or_refused_in_one_line() -> None:
+def test_damaged_files_are_read_or_refused_in_one_line(tmp_path: Path) -> None:
     counts: Counter[str] = Counter()
-    for outcome in hunt(SEED, range(CASES)):
+    found = known()
+    for number in range(ROUNDS * len(found)):
+        specimen, data = case(found, SEED, number)
+        if specimen.name.startswith(SLOW) and number // len(found) % EVERY:
+            continue
+        (tmp_path / f"{number}").mkdir()
+        outcome = outcome_of(number, specimen, data, tmp_path / f"{number}")
         assert outcome.kind not in BAD, f"case {SEED}-{outcome.number}, {outcome.specimen}: {outcome.said[-600:]}"
         counts[outcome.kind] += 1
-    assert sum(counts.values()) == CASES
-    assert counts["refused"] > CASES / 2, "the damage is too light to mean anything"
+    assert sum(counts.values()) >= 1000
+    assert counts["refused"] > sum(counts.values()) / 2, "the damage is too light to mean anything"
+
+
+@pytest.mark.slow
+def test_the_hunt_goes_on_in_a_process_of_its_own() -> None:
+    assert [outcome.number for outcome in hunt(SEED, range(60))] == list(range(60))
 
 
 @pytest.mark.parametrize("file", FOUND, ids=lambda file: file.stem)
 def test_what_was_found_stays_mended(file: Path, tmp_path: Path) -> None:
-    by_name = {specimen.name: specimen for specimen in specimens()}
+    by_name = {specimen.name: specimen for specimen in known()}
     specimen = by_name[json.loads(file.read_text())["name"]]
     outcome = outcome_of(0, specimen, file.with_suffix(".bin").read_bytes(), tmp_path)
     assert outcome.kind not in BAD, outcome.said[-600:]
@@ -82,7 +101,8 @@ def test_the_hunt_sees_what_it_looks_for(kind: str, tmp_path: Path, monkeypatch:
             case "noise":
                 os.write(2, b"libfoo: warning")
             case "hang":
-                time.sleep(30)
+                while True:
+                    pass
             case _:
                 np.ones(2 << 30, np.uint8)
 
@@ -117,7 +137,7 @@ def _bomb() -> bytes:
 
 
 def _las() -> bytes:
-    whole = next(specimen for specimen in specimens() if specimen.name == "cloud.las").data
+    whole = next(specimen for specimen in known() if specimen.name == "cloud.las").data
     return whole[:107] + struct.pack("<I", 2**27) + whole[111:]  # where version 1.2 has the number of points
 
 
@@ -155,7 +175,7 @@ def test_claims_are_checked_before_they_are_believed(
     [("depth", 10**6), ("depth", 10**12), ("width", 10**9), ("omega", 0), ("type", "Vase"), ("in_dim", 10**30)],
 )
 def test_a_network_is_not_made_of_what_a_head_claims(name: str, value: object, tmp_path: Path) -> None:
-    specimen = next(one for one in specimens() if one.name == "described.safetensors")
+    specimen = next(one for one in known() if one.name == "described.safetensors")
     (length,) = struct.unpack_from("<Q", specimen.data)
     head = json.loads(specimen.data[8 : 8 + length])
     described = json.loads(head["__metadata__"]["mplicits-field"])

@@ -1,0 +1,87 @@
+"""A disk that fails, or a process that is killed, at a chosen one of the operations that change a disk for good.
+
+Every such operation of the package goes through `mplicits.neural_fields.disk`. `Faults` counts them, and at one of them
+
+- "killed": nothing of it happens, nor of any that would follow: no clean-up, as after SIGKILL or a power cut;
+- "torn": half of it happens, if it is a write, and nothing after it;
+- "full": it raises that the disk is full, once; what follows works.
+"""
+
+from __future__ import annotations
+
+import errno
+import functools
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from mplicits.neural_fields import disk
+
+__all__ = ["KINDS", "Faults", "Killed", "dead_holder"]
+
+KINDS = ("killed", "torn", "full")
+OPERATIONS = ("write", "sync", "rename", "remove", "make_folder", "remove_tree")
+
+
+class Killed(BaseException):
+    """The process is no more; only a test sees this."""
+
+
+class Faults:
+    """Operations of a block, counted, one of which goes wrong.
+
+    Args:
+        at: the number of that one, from 0; None for none.
+        kind: one of `KINDS`.
+
+    Attributes:
+        count: how many there have been.
+    """
+
+    def __init__(self, at: int | None = None, kind: str = "killed") -> None:
+        self.at, self.kind, self.count, self.dead = at, kind, 0, False
+
+    @contextmanager
+    def injected(self) -> Iterator[Faults]:
+        """A block in which they count and fail."""
+        with pytest.MonkeyPatch.context() as patch:
+            for name in OPERATIONS:
+                patch.setattr(disk, name, self._instead(name, getattr(disk, name)))
+            yield self
+
+    def _instead(self, name: str, operation: Callable[..., None]) -> Callable[..., None]:
+        def run(path: Path, *more: Any) -> None:
+            if self.dead:
+                raise Killed
+            now, self.count = self.count, self.count + 1
+            if now != self.at:
+                operation(path, *more)
+            elif self.kind == "full":
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            else:
+                self.dead = True
+                if self.kind == "torn" and name == "write":
+                    operation(path, more[0][: len(more[0]) // 2])
+                raise Killed
+
+        return run
+
+
+@functools.cache
+def _ended() -> int:
+    """The number of a process that is no more."""
+    with subprocess.Popen([sys.executable, "-S", "-c", ""]) as process:
+        pass
+    return process.pid
+
+
+def dead_holder(run: Path) -> None:
+    """Leave a lock in a directory as a process that was killed leaves it."""
+    holder = {"pid": _ended(), "host": os.uname().nodename, "since": "noon", "started": 1}
+    (run / "run.lock").write_text(json.dumps(holder))
