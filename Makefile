@@ -5,10 +5,11 @@ BIN := $(VENV)/bin
 CLOUD ?=
 OUT ?= demo
 MINUTES ?= 30
+N ?= 200
 # Errors only; and Python compiles what is imported when it is, which is a tenth of what pip would compile for a minute.
 PIP := $(BIN)/python -m pip install --quiet --quiet --no-compile --disable-pip-version-check -c constraints.txt
 
-.PHONY: demo test test-all fuzz lint docs clean
+.PHONY: demo test test-all fuzz kills clients lint docs clean
 
 # What using it needs; the stamps below add what developing it and its site need.
 $(VENV)/.installed: pyproject.toml constraints.txt
@@ -32,6 +33,12 @@ test-all: lint
 
 fuzz: $(VENV)/.dev
 	$(BIN)/python tests/fuzz/hunt.py --minutes $(MINUTES)
+
+kills: $(VENV)/.dev
+	OMP_NUM_THREADS=1 $(BIN)/python tests/kills.py --number $(N)
+
+clients: $(VENV)/.dev
+	$(BIN)/python tests/clients.py --minutes $(MINUTES)
 
 lint: $(VENV)/.dev
 	$(BIN)/ruff check .

@@ -100,6 +100,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         # Whoever read our output has left, `head` say. Python would complain again when it flushes at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
+    except OSError as error:
+        if error.filename is None:
+            raise
+        reason = error.strerror or type(error).__name__
+        return _fail(f"{os.fsdecode(error.filename)}: {reason}; check the path and its permissions")
     except ValueError as error:
         from ...neural_fields import InputError
 

@@ -486,8 +486,8 @@ def read_record(directory: Path) -> dict[str, Any]:
 def state_bytes(tensors: Mapping[str, Tensor], progress: Mapping[str, Any]) -> bytes:
     """What `load_state` reads: tensors, and JSON."""
     plain = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in tensors.items()}
-    text = json.dumps(dict(progress))
-    return save(plain, metadata={"progress": text, "checksum": _checksum(plain, text)})
+    about = {**progress, "checksum": _checksum(plain, progress)}
+    return save(plain, metadata={"progress": json.dumps(about)})
 
 
 def save_state(
@@ -514,15 +514,15 @@ def load_state(
     if not path.is_file():
         raise InputError(f"{path}: no such file, so there is nothing to resume; leave out --resume and choose a new -o")
     with damage(path, "begin again without --resume"), safe_open(path, framework="pt") as file:
-        about = file.metadata()
-        progress = json.loads(about["progress"])
+        progress = json.loads(file.metadata()["progress"])
+        checksum = progress.pop("checksum", None)  # older ones have none
         held = {name: file.get_tensor(name) for name in file.keys()} if tensors else {}  # noqa: SIM118
-        if tensors and about.get("checksum") not in (None, _checksum(held, about["progress"])):  # older ones have none
+        if tensors and checksum not in (None, _checksum(held, progress)):
             raise InputError(
                 f"{path}: damaged (its numbers are not those that were written); begin again without --resume"
             )
         return held, progress
 
 
-def _checksum(tensors: Mapping[str, Tensor], text: str) -> str:
-    return hashlib.sha256((checksum_of(tensors) + text).encode()).hexdigest()
+def _checksum(tensors: Mapping[str, Tensor], progress: Mapping[str, Any]) -> str:
+    return hashlib.sha256((checksum_of(tensors) + json.dumps(dict(progress))).encode()).hexdigest()

@@ -95,7 +95,8 @@ def _limits(size: int) -> Iterator[None]:
     before = resource.getrlimit(resource.RLIMIT_AS)
     now = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (now + SPARE + 3 * size, before[1]))
-    # Of work; and somewhat more by the clock, which goes on while the machine does other things.
+    # Of work; and more by the clock, which goes on while the machine does other things, and begins anew after a pause.
+    signal.signal(signal.SIGCONT, lambda *_: signal.setitimer(signal.ITIMER_REAL, IDLE * SECONDS))
     handlers = [(number, signal.signal(number, stop)) for number in (signal.SIGPROF, signal.SIGALRM)]
     signal.setitimer(signal.ITIMER_PROF, SECONDS)
     signal.setitimer(signal.ITIMER_REAL, IDLE * SECONDS)
@@ -104,7 +105,7 @@ def _limits(size: int) -> Iterator[None]:
     finally:
         for timer in (signal.ITIMER_PROF, signal.ITIMER_REAL):
             signal.setitimer(timer, 0)
-        for number, handler in handlers:
+        for number, handler in [*handlers, (signal.SIGCONT, signal.SIG_DFL)]:
             signal.signal(number, handler)
         resource.setrlimit(resource.RLIMIT_AS, before)
 
