@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from numbers import Real
@@ -195,7 +196,13 @@ class Field(nn.Module, ABC):
 
         Raises:
             ValueError: there is no such level.
+            TypeError: it is no whole number.
         """
+        if not isinstance(level, int):
+            try:
+                level = operator.index(level)
+            except TypeError:
+                raise TypeError(f"level={level!r}: expected a whole number") from None
         if not -self.num_levels <= level < self.num_levels:
             raise ValueError(f"level={level}: this field has levels 0 to {self.num_levels - 1} (or -1 for the finest)")
         return level % self.num_levels
@@ -215,7 +222,10 @@ class Field(nn.Module, ABC):
 
         Raises:
             ValueError: it is not.
+            TypeError: it is no tensor.
         """
+        if not isinstance(x, Tensor):
+            raise TypeError(f"x is a {type(x).__name__}; expected a tensor (..., {self.in_dim}): torch.as_tensor(x)")
         if x.ndim == 0 or x.shape[-1] != self.in_dim:
             raise ValueError(f"x has shape {tuple(x.shape)}; expected (..., {self.in_dim})")
         return x

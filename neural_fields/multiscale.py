@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from ._fixed import FixedShapes, current_shapes
+from ._transforms import under_vmap
 from .field import Field, Jet, SecondJet
 from .function import FieldLike, as_field
 from .kernels.switch import Choice, choose
@@ -131,6 +132,7 @@ class MultiscaleSDF(Field):
 
     def value(self, x: Tensor, *, level: int = -1) -> Tensor:
         """See `Field.value`; outside the band of level j − 1, level j is level j − 1."""
+        self.check_points(x)
         fused = self._fused(x, level, jet=False)
         if fused.precision:
             from .kernels.levels import levels_value
@@ -152,6 +154,7 @@ class MultiscaleSDF(Field):
 
     def jet(self, x: Tensor, *, level: int = -1) -> Jet:
         """See `Field.jet`; inside a tapered band ∇(γr) = γ∇r + r γ′ ∇f."""
+        self.check_points(x)
         fused = self._fused(x, level, jet=True)
         if fused.precision:
             from .kernels.levels import levels_jet
@@ -179,7 +182,7 @@ class MultiscaleSDF(Field):
     def _fused(self, x: Tensor, level: int, *, jet: bool) -> Choice:
         """Whether one launch evaluates all levels up to ``level`` at ``x``."""
         levels = self.levels[: self.resolve_level(level) + 1]
-        if len(levels) == 1:
+        if len(levels) == 1 or under_vmap():
             return Choice("", "one level is evaluated by itself")
         choice = choose_levels(levels, x, jet=jet)
         if choice.precision and needs_graph(x, [weight for part in levels for weight in part.parameters()]):
@@ -282,6 +285,17 @@ def walk_levels(
     shapes = current_shapes()
     if shapes is not None:
         yield from map(shaped, _walk_on(levels[1:], deltas, points, parts, evaluate, join, shapes))
+        return
+    if under_vmap():  # every level everywhere: which rows are in a band differs from call to call
+        inside = torch.ones_like(parts[0], dtype=torch.bool)
+        for level, delta in zip(levels[1:], deltas, strict=False):
+            inside = inside & (parts[0].abs() < delta)
+            joined = join(parts, evaluate(level, points), delta)
+            parts = tuple(
+                torch.where(inside.reshape(-1, *[1] * (new.ndim - 1)), new, part)
+                for part, new in zip(parts, joined, strict=True)
+            )
+            yield shaped(parts)
         return
     rows = torch.arange(len(points), device=points.device)
     for level, delta in zip(levels[1:], deltas, strict=False):

@@ -25,6 +25,7 @@ from torch import Tensor, nn
 
 from ._checks import at_least, positive
 from ._parallel import Step, over_blocks
+from ._transforms import under_vmap
 from .field import Jet, OneLevelField, SecondJet
 from .kernels.switch import choose
 
@@ -150,6 +151,8 @@ class Siren(OneLevelField):
         """The first outputs ``(N, channels)`` at points ``(..., d)``."""
         self.resolve_level(level)
         rows = self.check_points(x).reshape(-1, self.in_dim)
+        if under_vmap():
+            return forward(rows, self.folded())[0][:, :channels]
         parameters = list(self.parameters())
         if not needs_graph(rows, parameters):
             fused = choose(rows, width=self.width, depth=self.depth, features=channels - 1)
@@ -177,6 +180,11 @@ class Siren(OneLevelField):
         """
         self.resolve_level(level)
         rows = self.check_points(x).reshape(-1, self.in_dim)
+        if under_vmap():
+            output, gradients = plain_jet(rows, self.folded(), 1)
+            shape = x.shape[:-1]
+            features = output[:, 1:].reshape(*shape, self.num_features)
+            return Jet(output[:, 0].reshape(shape), gradients[:, 0].reshape(x.shape), features)
         fused = choose(rows, width=self.width, depth=self.depth, features=self.num_features)
         if fused.precision:
             value, gradient = self._fused_jet(rows, fused.precision)
@@ -229,6 +237,21 @@ class Siren(OneLevelField):
             output[:, 1:].reshape(*shape, self.num_features),
             hessian.reshape(*shape, dims, dims),
         )
+
+    def check_points(self, x: Tensor) -> Tensor:
+        """See `Field.check_points`.
+
+        Raises:
+            ValueError: the shape or the device is another than this network's.
+            TypeError: it is no tensor, or of another precision.
+        """
+        super().check_points(x)
+        like = self.output.weight
+        if x.device != like.device:
+            raise ValueError(f"x is on {x.device}, the network on {like.device}; bring them together: x.to(field.like)")
+        if x.dtype != like.dtype and not torch.is_autocast_enabled(x.device.type):
+            raise TypeError(f"x is {x.dtype}, the network {like.dtype}; bring them together: x.to(field.like)")
+        return x
 
     def folded(self) -> list[Tensor]:
         """Weights and biases with units and ω₀ folded in: [W_1, b_1, …, W_d, b_d, W_out, b_out]."""

@@ -1,0 +1,18 @@
+"""Whether `torch.func.vmap` looks on, which takes neither results of unknown size nor writing into buffers."""
+
+from __future__ import annotations
+
+import torch
+
+__all__ = ["under_vmap"]
+
+
+def under_vmap() -> bool:
+    """Whether this call is mapped over a batch, at any depth of `torch.func`'s transforms."""
+    if torch.compiler.is_compiling():
+        return False
+    functorch = torch._C._functorch  # pyright: ignore[reportAttributeAccessIssue]
+    if functorch.maybe_current_level() is None:
+        return False
+    vmap = functorch.TransformType.Vmap
+    return any(each.key() == vmap for each in functorch.get_interpreter_stack() or ())
