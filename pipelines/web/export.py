@@ -6,21 +6,32 @@ import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...datasets.cameras import turntable
-from ...neural_fields import Field, InputError, MultiscaleSDF, Similarity, TextureField, extract_mesh
+from ...neural_fields import (
+    Field,
+    InputError,
+    MultiscaleSDF,
+    Similarity,
+    Siren,
+    TextureField,
+    extract_mesh,
+    load_field,
+)
 from ...neural_fields.files import write_whole
 from ...neural_fields.meshing import NoSurfaceError
+from ...neural_fields.multiscale import levels_of
 from ...neural_fields.spacetime import SpaceTimeSDF
 from ...neural_fields.tracing import BOUNDING_RADIUS
 from ..render.subject import FRAME_RESOLUTION, traced_part
 from ..run.folder import chosen_level, find_field, load_still
 from ..texture.train import texture_of
 from .assembly import fill_page, write_folder
+from .film import MOMENTS, band_reach, swept_shell
 from .networks import Rounding, network_layers, rounding_error, shader_levels, taper_of
 from .payload import Payload
 from .shell import shell_mesh, surface_reach
@@ -40,7 +51,7 @@ class WebOptions:
 
     Attributes:
         levels: how many levels, from the coarsest on; None is all.
-        time: the moment, of a run that moves.
+        time: the moment, of a run that moves; None shows all of its moments.
         colors: whether the colours of the run's texture are in it, if it has one and does not move.
         float32: whether the weights are kept as they are; else they are rounded to `BITS` bits.
         up: the axis that points up, "y" or "z".
@@ -95,8 +106,9 @@ def web_run(
     """
     options = options or WebOptions()
     file = find_field(run)
-    shown, similarity = _still(file, options.time)
-    texture = texture_of(file, shown) if options.colors and options.time is None else None
+    shown, similarity = _shown(file, options.time)
+    still = shown.in_dim == 3 and options.time is None
+    texture = texture_of(file, shown) if options.colors and still else None
     if options.levels is not None:
         chosen_level(shown, file, options.levels - 1, flag="--levels")
         shown = _coarse(shown, options.levels)
@@ -108,6 +120,8 @@ def web_run(
     else:
         write_folder(out, header, data)
     done = dataclasses.replace(page, size=sum(part.stat().st_size for part in _fetched(out)))
+    if say is not None and shown.in_dim == 4:
+        say("it moves: all of its moments are on the page; --time T shows one")
     if say is not None and done.rounding:
         worst = [max(getattr(part, key) for part in done.rounding) for key in ("value", "angle")]
         length = worst[0] * similarity.scale
@@ -120,17 +134,23 @@ def _fetched(out: Path) -> list[Path]:
     return [out] if out.suffix.lower() in PAGES else [out / "field.bin", out / "mplicits-field.js"]
 
 
-def _still(file: Path, time: float | None) -> tuple[Field, Similarity]:
-    """A field that stands still, frozen at its time if it moves."""
+def _shown(file: Path, time: float | None) -> tuple[Field, Similarity]:
+    """A field that stands still, frozen at its time if it moves and there is one; else a `SpaceTimeSDF`."""
+    saved = load_field(file)
+    if time is None and isinstance(saved.field, SpaceTimeSDF):
+        return saved.field, saved.similarity
     saved = load_still(file, time)
-    inner = getattr(saved.field, "field", None)
-    if time is not None and isinstance(inner, SpaceTimeSDF):
-        return inner.at(time), saved.similarity
     return saved.field, saved.similarity
 
 
+@overload
+def _coarse(shown: MultiscaleSDF, levels: int) -> MultiscaleSDF: ...
+@overload
+def _coarse(shown: Field, levels: int) -> Field: ...
 def _coarse(shown: Field, levels: int) -> Field:
     """The first levels of a field."""
+    if isinstance(shown, SpaceTimeSDF):
+        return SpaceTimeSDF(_coarse(shown.sdf, levels))
     if not isinstance(shown, MultiscaleSDF) or levels == shown.num_levels:
         return shown
     residuals = list(shown.levels[1:levels])
@@ -145,15 +165,18 @@ def _content(
     shown: Field, texture: TextureField | None, similarity: Similarity, name: str, file: Path, options: WebOptions
 ) -> tuple[dict[str, Any], bytes, WebPage]:
     """Header and bytes of the page, and what is told of it."""
-    networks = shader_levels(shown, file)
+    moving = shown if isinstance(shown, SpaceTimeSDF) else None
+    stills: list[Field] = [shown] if moving is None else [moving.at(float(t)) for t in MOMENTS]
+    shader_levels(stills[0], file)
+    networks = [part for part in levels_of(shown if moving is None else moving.sdf) if isinstance(part, Siren)]
     try:
-        outline = traced_part(extract_mesh(shown, resolution=FRAME_RESOLUTION, normals=False).vertices)
-        shell = shell_mesh(shown)
+        outlines = _outlines(stills)
+        shell = shell_mesh(shown) if moving is None else swept_shell(moving)
     except NoSurfaceError as error:
         raise InputError(f"{file}: no surface to show ({error})") from error
+    outline = np.concatenate([points for _, points in outlines])
     bits = None if options.float32 else BITS
-    every = max(1, len(outline) // ERROR_POINTS)
-    rounding = [] if bits is None else rounding_error(shown, bits, outline[::every])
+    rounding = [] if bits is None else _rounding(outlines, bits)
     payload = Payload()
     levels = [payload.add_network(f"level{index}", network_layers(part, bits)) for index, part in enumerate(networks)]
     colors = None
@@ -170,11 +193,13 @@ def _content(
         "format": "mplicits-web",
         "version": VERSION,
         "title": name,
+        "moves": moving is not None,
         "levels": levels,
         "colors": colors,
         "deltas": [float(delta) for delta in shown.deltas],
-        "taper": taper_of(shown),
-        "reach": surface_reach(shown),
+        "taper": taper_of(stills[0]),
+        # What a film's levels reach at every moment is not known; their bands are.
+        "reach": surface_reach(shown) if moving is None else band_reach(shown),
         "radius": BOUNDING_RADIUS,
         "shell": {"low": low.tolist(), "high": high.tolist(), "triangles": len(shell.faces)},
         "view": _view(outline, options.up),
@@ -185,6 +210,34 @@ def _content(
         **described,
     }
     return header, data, WebPage(0, len(levels), colors is not None, len(shell.faces), tuple(rounding))
+
+
+def _outlines(stills: list[Field]) -> list[tuple[Field, NDArray[np.floating]]]:
+    """The moments that have a surface, and points of it.
+
+    Raises:
+        NoSurfaceError: none has one.
+    """
+    found: list[tuple[Field, NDArray[np.floating]]] = []
+    missing: NoSurfaceError | None = None
+    for still in stills:
+        try:
+            found.append((still, traced_part(extract_mesh(still, resolution=FRAME_RESOLUTION, normals=False).vertices)))
+        except NoSurfaceError as error:
+            missing = error
+    if not found and missing is not None:
+        raise missing
+    return found
+
+
+def _rounding(outlines: list[tuple[Field, NDArray[np.floating]]], bits: int) -> list[Rounding]:
+    """What rounding changes, for each level: the most of all moments."""
+    every = max(1, sum(len(points) for _, points in outlines) // ERROR_POINTS)
+    found = [rounding_error(still, bits, points[::every]) for still, points in outlines]
+    return [
+        Rounding(max(part.value for part in parts), max(part.angle for part in parts))
+        for parts in zip(*found, strict=True)
+    ]
 
 
 def _view(outline: NDArray[np.floating], up: str) -> dict[str, Any]:

@@ -7,6 +7,7 @@ change nothing, are taken off before any sine. So it does not matter how good a 
 from __future__ import annotations
 
 import copy
+import dataclasses
 import math
 from dataclasses import dataclass
 
@@ -31,12 +32,14 @@ class Layer:
         bias: ``(out,)`` float32, likewise.
         codes: ``(out, in)`` int32 in [−2^(bits−1) + 1, 2^(bits−1) − 1] if the weights are rounded, else None.
         scale: ``(out,)`` float32; a rounded weight is its code times the scale of its row.
+        rate: ``(out,)`` float32, of the first layer of a network that moves: how fast its bias grows with time.
     """
 
     weight: NDArray[np.float32]
     bias: NDArray[np.float32]
     codes: NDArray[np.int32] | None = None
     scale: NDArray[np.float32] | None = None
+    rate: NDArray[np.float32] | None = None
 
 
 @dataclass(frozen=True)
@@ -80,7 +83,7 @@ def network_layers(network: Siren, bits: int | None, *, channels: int = 1) -> li
     First layer, output and biases stay as they are.
 
     Args:
-        network: which.
+        network: which; of one in space and time, the first layer's weights of time become its `Layer.rate`.
         bits: of a rounded weight; None rounds none.
         channels: outputs that the page asks for.
     """
@@ -89,7 +92,11 @@ def network_layers(network: Siren, bits: int | None, *, channels: int = 1) -> li
     layers: list[Layer] = []
     for index, (weight, bias) in enumerate(pairs[:-1]):
         turns = weight / TURN
-        layers.append(_layer(turns, bias / TURN, bits if index else None))
+        if not index and network.in_dim == 4:
+            first = _layer(turns[:, :3], bias / TURN, None)
+            layers.append(dataclasses.replace(first, rate=turns[:, 3].astype(np.float32)))
+        else:
+            layers.append(_layer(turns, bias / TURN, bits if index else None))
     weight, bias = pairs[-1]
     return [*layers, _layer(weight[:channels], bias[:channels], None)]
 

@@ -51,6 +51,8 @@ class Payload:
         for index, layer in enumerate(layers):
             key = f"{name}.{index}"
             self.add(f"{key}.bias", layer.bias, "f4")
+            if layer.rate is not None:
+                self.add(f"{key}.rate", layer.rate, "f4")
             if layer.codes is None or layer.scale is None:
                 self.add(f"{key}.weight", layer.weight, "f4")
             else:

@@ -1,6 +1,7 @@
 // What moves the camera and changes what is seen: pointers, fingers, keys, and the controls of the panel.
 
 const TAP = 5; // pixels that a pointer may move between down and up, and still mean a place
+const PASSAGE = 4; // seconds from the first moment to the last
 
 class Controls {
   constructor(page) {
@@ -16,7 +17,7 @@ class Controls {
 
   fill() {
     const { ui, page } = this;
-    const { levels, colors } = page.saved.header;
+    const { levels, colors, moves } = page.saved.header;
     const last = levels.length - 1;
     ui.level.max = last;
     ui.levels.hidden = !last;
@@ -29,6 +30,8 @@ class Controls {
       this.setTheme(bright.matches ? 'light' : 'dark');
       page.present();
     }, this.heard);
+    ui.times.hidden = !moves;
+    if (moves) ui.saveFilm.textContent = 'Save film';
     this.show();
   }
 
@@ -45,6 +48,8 @@ class Controls {
     ui.normals.value = page.normals;
     ui.shading.value = page.shading;
     ui.occlusion.checked = page.occlusion;
+    ui.time.value = page.time;
+    ui.timeName.textContent = page.time.toFixed(2);
     ui.axis.value = page.section.axis ?? -1;
     ui.place.hidden = ui.placeName.hidden = page.section.axis === null;
     if (page.section.axis === null) return;
@@ -75,6 +80,27 @@ class Controls {
     }
   }
 
+  // Forth and back through time, as long as nobody stops it.
+  play(on = !this.playing) {
+    const { page, ui } = this;
+    this.playing = on && page.saved.header.moves;
+    ui.play.textContent = this.playing ? 'Pause' : 'Play';
+    let before = null, share = this.back ? 2 - page.time : page.time;
+    const step = (now) => {
+      if (!this.playing || page.ended.signal.aborted) return;
+      if (before !== null) {
+        // A tab in the background stands still; nothing is skipped when it comes back.
+        share = (share + Math.min(200, now - before) / 1000 / PASSAGE) % 2;
+        this.back = share > 1;
+        page.setTime(this.back ? 2 - share : share);
+        this.show();
+      }
+      before = now;
+      requestAnimationFrame(step);
+    };
+    requestAnimationFrame(step);
+  }
+
   setTheme(name) {
     this.page.theme = this.ui.stage.dataset.theme = name;
   }
@@ -98,6 +124,12 @@ class Controls {
     ui.place.value = 0.5;
     ui.axis.addEventListener('change', () => this.slice());
     ui.place.addEventListener('input', () => this.slice());
+    ui.play.addEventListener('click', () => this.play());
+    ui.time.addEventListener('input', () => {
+      this.play(false);
+      page.setTime(Number(ui.time.value));
+      this.show();
+    });
     ui.ruler.addEventListener('click', () => this.tools.toggleRuler());
     const { title } = page.saved.header;
     ui.savePicture.addEventListener('click', () => this.save(ui.savePicture, async () => {
@@ -166,6 +198,7 @@ class Controls {
       const keys = {
         ArrowLeft: () => move(-1, 0), ArrowRight: () => move(1, 0), ArrowUp: () => move(0, -1), ArrowDown: () => move(0, 1),
         '+': () => orbit.zoom(1.15), '=': () => orbit.zoom(1.15), '-': () => orbit.zoom(1 / 1.15), Home: () => orbit.reset(),
+        ' ': () => this.play(),
         r: () => this.tools.toggleRuler(), Escape: () => this.tools.toggleRuler(false),
         Enter: () => this.tools.tap(page.canvas.clientWidth / 2, page.canvas.clientHeight / 2).catch((error) => this.ui.failed(error)),
       };

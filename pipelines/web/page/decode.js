@@ -79,7 +79,7 @@ function layersOf(arrays, { name, depth }) {
       const columns = codes.length / bias.length;
       weight = Float32Array.from(codes, (code, i) => code * scale[Math.floor(i / columns)]);
     }
-    layers.push({ weight, bias });
+    layers.push({ weight, bias, rate: arrays.get(`${key}.rate`) });
   }
   return layers;
 }

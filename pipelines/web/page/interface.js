@@ -34,6 +34,7 @@ class Interface {
         make('output', { id: 'length', hidden: '' }), make('output', { id: 'reading', hidden: '' })),
       make('form', { id: 'panel', hidden: '' },
         make('label', { id: 'levels' }, 'Level ', range('level', 0, 1, 'Level of detail'), make('output', { id: 'levelName' })),
+        make('span', { id: 'times', class: 'row', hidden: '' }, button('play', 'Play'), range('time', 1, 'any', 'Time'), make('output', { id: 'timeName' })),
         label('Shading', make('select', { id: 'shading' },
           new Option('light', 2), new Option('matcap', 0), new Option('normals', 1))),
         tools,

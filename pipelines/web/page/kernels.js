@@ -36,7 +36,7 @@ function packNetwork(layers) {
   starts.output = add(layers[depth].bias.length, (row, n) => layers[depth].weight[row * width + n]);
   const all = new Float32Array(4 * size);
   parts.reduce((at, part) => { all.set(part, at); return at + part.length; }, 0);
-  return { numbers: all, starts, width, depth, outputs: Array.from(layers[depth].bias) };
+  return { numbers: all, starts, width, depth, outputs: Array.from(layers[depth].bias), bias: layers[0].bias, rate: layers[0].rate };
 }
 
 // The kernel of a packed network: kind 'value', 'jet', or 'color' (three outputs instead of one).

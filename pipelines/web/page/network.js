@@ -125,9 +125,24 @@ class Networks {
         bias: rowsTexture(gl, 1, width, (_, column) => bias[column]),
       });
     });
+    net.bias = layers[0].bias;
+    net.rate = layers[0].rate; // of a field that moves: what its first biases gain with time
     net.output = rowsTexture(gl, lastBias.length, width, (row, column) => last[row * width + column]);
     net.outputBias = lastBias;
     return net;
+  }
+
+  // The moment, of a field that moves: b + t w, the weights of time folded into the first biases.
+  at(time) {
+    const { gl } = this;
+    for (const { bias, rate, width, quads, sines } of this.nets) {
+      if (!rate) continue;
+      const numbers = new Float32Array(4 * quads);
+      for (let i = 0; i < width; i++) numbers[i] = bias[i] + time * rate[i];
+      gl.activeTexture(gl.TEXTURE0);
+      gl.bindTexture(gl.TEXTURE_2D, sines[0].bias);
+      gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, quads, 1, gl.RGBA, gl.FLOAT, numbers);
+    }
   }
 
   // Room for points, values and gradients of `rows` rows of points.

@@ -29,6 +29,7 @@ class Page {
     this.orbit = new Orbit(saved.header.view);
     if (camera) Object.assign(this.orbit, { azimuth: camera[0], elevation: Math.min(90, Math.max(-90, camera[1])) });
     this.level = this.normals = saved.header.levels.length - 1;
+    this.time = 0;          // of a field that moves, from 0 to 1
     this.waiters = [];      // for the finest picture
     this.occlusion = true;
     this.section = new Section(saved.header);
@@ -113,6 +114,7 @@ class Page {
     try {
       if (this.lost) return;
       this.fit();
+      await this.renderer.at(this.time);
       await this.section.refresh(this.gl, this.renderer, this.level);
       const started = performance.now();
       await this.whole(this.factor);
@@ -124,6 +126,12 @@ class Page {
     clearTimeout(this.timer);
     if (this.version !== version) this.changed();
     else this.timer = setTimeout(() => this.refine(version).catch((error) => this.ui.failed(error)), REST);
+  }
+
+  setTime(time) {
+    this.time = time;
+    this.section.version++; // its values are of another moment
+    this.changed();
   }
 
   fit() {
@@ -140,7 +148,7 @@ class Page {
   }
 
   wanted() {
-    return { level: this.level, normalLevel: this.normals, colored: this.shading > 2, clip: this.section.clip };
+    return { level: this.level, normalLevel: this.normals, colored: this.shading > 2, clip: this.section.clip, time: this.time };
   }
 
   // The whole picture at once, in rays of `factor` pixels.
@@ -192,6 +200,8 @@ class Page {
     clearTimeout(this.timer);
     Object.assign(this.canvas, { width, height });
     const camera = this.orbit.camera(width, height);
+    await this.renderer.at(this.time);
+    await this.section.refresh(this.gl, this.renderer, this.level);
     const { colored } = this.wanted(), size = 4 * width * height;
     const made = { seen: new Float32Array(size), color: new Float32Array(colored ? size : 0) };
     for (let first = 0; first < height;) {
@@ -223,8 +233,8 @@ class Page {
   }
 
   // One picture of any camera, for tests and for other scripts: arrays of its pixels, and what they have cost.
-  render({ camera, level = this.level, normalLevel = level, precision = null, colored = false }) {
-    return this.renderer.frame(camera, { level, normalLevel, precision, colored });
+  render({ camera, level = this.level, normalLevel = level, precision = null, colored = false, time = this.time }) {
+    return this.renderer.frame(camera, { level, normalLevel, precision, colored, time });
   }
 
   // Pictures of a camera that goes around, one in each frame: how many in a second, and what one costs.

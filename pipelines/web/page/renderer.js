@@ -7,6 +7,7 @@ class Renderer {
     Object.assign(this, { gl, parts, saved, header: saved.header, tracer: null, camera: null, options: null });
     const networks = [...this.header.levels, ...(this.header.colors ? [this.header.colors] : [])];
     this.tally = { values: networks.map(() => 0), jets: networks.map(() => 0), passes: 0, read: 0 };
+    this.time = 0;
     this.last = Promise.resolve();
   }
 
@@ -15,6 +16,7 @@ class Renderer {
     const forced = new URLSearchParams(location.search).has('webgl');
     const tracer = (!forced && await GpuTracer.open(this.parts, this.saved)) || new Tracer(this.gl, this.parts, this.saved);
     tracer.counts = this.tally;
+    if (this.header.moves) tracer.at(this.time);
     this.tracer = tracer;
   }
 
@@ -55,17 +57,30 @@ class Renderer {
   // what it has cost, see `counts`.
   //
   // Options: level, normalLevel (whose normals), first, rows, colored, and precision: of depths, in units of the field;
-  // null is a tenth of a pixel; clip: {axis, at}, a plane before which nothing is seen.
+  // null is a tenth of a pixel; clip: {axis, at}, a plane before which nothing is seen;
+  // time: of a field that moves, which single rays and values then stay at.
   frame(camera, options) {
     if (options.colored && !this.colored) throw new PageError('This page has no colours.');
     return this.queue(async () => {
       [this.camera, this.options] = [camera, options];
       this.clear();
+      this.turn(options.time ?? this.time);
       const started = performance.now();
       const made = await this.traced((tracer) => tracer.trace(camera, options));
       const milliseconds = performance.now() - started;
       return { width: camera.width, height: camera.height, ...made, milliseconds, counts: structuredClone(this.tally) };
     });
+  }
+
+  // The moment of a field that moves, from now on.
+  at(time) {
+    return this.queue(() => this.turn(time));
+  }
+
+  turn(time) {
+    if (!this.header.moves || time === this.time) return;
+    this.time = time;
+    this.tracer?.at(time);
   }
 
   // What stands at a place of the last frame, in its pixels from the middle of the upper left one: position, normal and

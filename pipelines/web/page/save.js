@@ -50,16 +50,21 @@ async function recorded(pictures, rate) {
   return { blob: new Blob(parts, { type }), ending };
 }
 
-// Pictures of the shape as it stands, once around; then where it stood. What moves the camera meanwhile ends it.
+// Pictures of the shape as it stands, once around; of one that moves, from its first moment to the last. Then all is where
+// it was. What moves the camera meanwhile ends it.
 async function turntable(page, { frames = TURN_FRAMES, side = TURN_SIDE, rate = TURN_RATE } = {}) {
-  const { orbit, ui } = page, { azimuth } = orbit;
+  const { orbit, ui } = page, { azimuth } = orbit, { time } = page, { moves } = page.saved.header;
+  page.controls.play(false);
   const shorter = Math.min(page.canvas.width, page.canvas.height), factor = Math.min(1, side / shorter);
   const even = (number) => Math.max(2, 2 * Math.round((number * factor) / 2)); // as coders of films want it
   const [width, height] = [even(page.canvas.width), even(page.canvas.height)];
   const pictures = [];
   try {
     for (let frame = 0; frame < frames; frame++) {
-      orbit.azimuth = azimuth + (360 * frame) / frames;
+      if (moves) {
+        page.time = frame / Math.max(1, frames - 1);
+        page.section.version++;
+      } else orbit.azimuth = azimuth + (360 * frame) / frames;
       if (!await page.still(width, height)) throw new PageError('The film was broken off.');
       pictures.push(await createImageBitmap(page.canvas));
       ui.state.textContent = `picture ${frame + 1} of ${frames}`;
@@ -68,6 +73,6 @@ async function turntable(page, { frames = TURN_FRAMES, side = TURN_SIDE, rate = 
   } finally {
     pictures.forEach((picture) => picture.close());
     orbit.azimuth = azimuth;
-    page.changed();
+    page.setTime(time);
   }
 }

@@ -41,12 +41,17 @@ ivec2 before(ivec2 at) {
 vec4 seenAt(ivec2 at) {
   return at.y < ready ? texelFetch(fine, at, 0) : texelFetch(coarse, before(at), 0);
 }
+// The pixel that was looked at for a place of the fine picture.
+vec2 askedAt(ivec2 at) {
+  if (at.y < ready) return (vec2(at) + 0.5) / vec2(textureSize(fine, 0)) * size - 0.5;
+  return (vec2(before(at)) + 0.5) / vec2(textureSize(coarse, 0)) * size - 0.5;
+}
 vec2 pixelOf(ivec2 at) { return (vec2(at) + 0.5) / vec2(textureSize(fine, 0)) * size - 0.5; }
 // What is near, and in front of the tangent plane, takes light away: sixteen looks around, along a spiral.
 float open(ivec2 at, vec4 seen, vec3 n) {
   const float REACH = 0.2;
   ivec2 grid = textureSize(fine, 0);
-  vec3 here = seen.w * ray(pixelOf(at));
+  vec3 here = seen.w * ray(askedAt(at));
   float wide = REACH * lens.x / seen.w * float(grid.x) / size.x, turn = 6.2831853 * fract(52.9829189 * fract(dot(vec2(at), vec2(0.06711056, 0.00583715))));
   float shut = 0.0;
   for (int k = 0; k < 16; k++) {
@@ -55,7 +60,7 @@ float open(ivec2 at, vec4 seen, vec3 n) {
     if (any(lessThan(there, ivec2(0))) || any(greaterThanEqual(there, grid))) continue;
     float depth = seenAt(there).w;
     if (depth <= 0.0) continue;
-    vec3 way = depth * ray(pixelOf(there)) - here;
+    vec3 way = depth * ray(askedAt(there)) - here;
     float far = length(way) + 1e-6;
     shut += max(dot(n, way) / far - 0.08, 0.0) * max(1.0 - far / REACH, 0.0);
   }

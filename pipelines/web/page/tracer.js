@@ -225,6 +225,10 @@ class Tracer {
     this.networks.counts = counts;
   }
 
+  at(time) {
+    this.networks.at(time);
+  }
+
   // The page hears of a lost context itself, and begins anew.
   isLost() {
     return false;

@@ -57,6 +57,13 @@ class GpuTracer {
     this.device.destroy();
   }
 
+  // The moment, of a field that moves: b + t w, the weights of time folded into the first biases.
+  at(time) {
+    this.nets.forEach(({ starts, bias, rate }, index) => {
+      if (rate) this.device.queue.writeBuffer(this.weights[index], 16 * starts.bias[0], bias.map((part, n) => part + time * rate[n]));
+    });
+  }
+
   get kind() {
     return 'WebGPU';
   }

@@ -1,0 +1,154 @@
+"""A field that moves: the mesh around all of its moments, and what the page shows of them, against a rigid motion."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+import torch
+from mplicits.datasets.cameras import turntable
+from mplicits.neural_fields import (
+    InputError,
+    MultiscaleSDF,
+    Siren,
+    extract_mesh,
+    save_field,
+    solve_sphere,
+    sphere_trace,
+)
+from mplicits.neural_fields.spacetime import SpaceTimeSDF
+from mplicits.pipelines.cli import main
+from mplicits.pipelines.web.export import web_run
+from mplicits.pipelines.web.film import Swept, fastest_change, swept_shell
+from mplicits.pipelines.web.networks import network_layers
+from pages import until
+
+VELOCITY = np.array([0.4, 0.2, -0.1])
+PRECISION = 1e-4
+
+
+def moving(*, residual=True):
+    """f(x − v t): with −W v for the weights of time every neuron sees x − v t, so the motion is exactly rigid."""
+    torch.manual_seed(0)
+    base = Siren(32, 2, omega=6.0)
+    solve_sphere(base, 0.4)
+    finer = [Siren(16, 2, omega=8.0, output_gain=0.3)] if residual else []
+    still = MultiscaleSDF(base, finer, [0.1] * residual, taper=0.3)
+    field = SpaceTimeSDF.from_static(still)
+    with torch.no_grad():
+        for level in field.sdf.levels:
+            weight = level.layers[0].weight
+            weight[:, 3] = -weight[:, :3] @ torch.tensor(VELOCITY, dtype=weight.dtype)
+    return field.requires_grad_(False)
+
+
+def test_the_first_bias_moves_with_time():
+    field = moving()
+    for level in field.sdf.levels:
+        first = network_layers(level, 16)[0]
+        weight = first.weight.astype(np.float64)
+        # Of three products of float32, in turns.
+        bound = 4 * 2**-24 * np.abs(weight).sum(axis=1)
+        assert (np.abs(first.rate + weight @ VELOCITY) <= bound + 1e-9).all()
+
+
+def test_the_swept_field_is_below_every_moment():
+    field = moving()
+    speed = fastest_change(field)
+    swept = Swept(field, speed)
+    x = torch.from_numpy(np.random.default_rng(0).uniform(-0.9, 0.9, (500, 3)).astype(np.float32))
+    x = x[field.at(0.5).value(x, level=0).abs() < 0.25]
+    lowest = swept.value(x, level=0)
+    for t in np.random.default_rng(1).uniform(0, 1, 20):
+        assert (lowest <= field.at(float(t)).value(x, level=0) + 1e-6).all()
+    # |∂f/∂t| = |v · ∇f|, and near the surface |∇f| is about 1.
+    assert 0.5 * np.linalg.norm(VELOCITY) < speed < 3 * np.linalg.norm(VELOCITY)
+    jet = swept.jet(x, level=0)
+    torch.testing.assert_close(jet.value, lowest)
+    step = 1e-2
+    ahead = swept.value(x + step * torch.tensor([1.0, 0.0, 0.0]), level=0)
+    behind = swept.value(x - step * torch.tensor([1.0, 0.0, 0.0]), level=0)
+    assert ((ahead - behind) / (2 * step) - jet.gradient[:, 0]).abs().median() < 1e-2
+
+
+def test_the_band_of_every_moment_is_inside():
+    field = moving()
+    mesh = swept_shell(field)
+    corners = mesh.vertices[mesh.faces]
+    points = np.concatenate((corners.reshape(-1, 3), corners.mean(axis=1))).astype(np.float32)
+    delta = float(field.deltas[0])
+    for t in np.linspace(0, 1, 12):
+        assert (field.at(float(t)).value(torch.from_numpy(points), level=0) > delta).all()
+    width = np.ptp(mesh.vertices, axis=0)
+    assert (width > 0.8 + np.abs(VELOCITY)).all()
+
+
+def test_a_film_is_written(tmp_path, capsys):
+    file = tmp_path / "moving.safetensors"
+    save_field(file, moving())
+    out = tmp_path / "film.html"
+    assert main(["web", str(file), "-o", str(out), "--levels", "1"]) == 0
+    header = json.loads(re.search(r'id="header">(.*?)</script>', out.read_text(encoding="utf-8"))[1])
+    assert header["moves"] is True
+    assert header["blocks"]["level0.0.rate"][:2] == ["f4", 32]
+    assert len(header["levels"]) == 1
+    assert "all of its moments" in capsys.readouterr().out
+
+
+def test_a_film_without_a_surface_is_refused(tmp_path):
+    field = moving(residual=False)
+    with torch.no_grad():
+        field.sdf.base.output.bias += 9
+    file = tmp_path / "empty.safetensors"
+    save_field(file, field)
+    with pytest.raises(InputError, match="no surface to show"):
+        web_run(file, tmp_path / "film.html")
+
+
+@pytest.fixture(scope="module")
+def film(browser, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("film")
+    save_field(folder / "moving.safetensors", moving())
+    web_run(folder / "moving.safetensors", folder / "film.html")
+    browser.get(f"{(folder / 'film.html').as_uri()}?pixel=16")
+    until(lambda: browser.execute_script("return !!window.mplicits"))
+    return browser
+
+
+@pytest.mark.parametrize("t", [0.0, 0.7])
+def test_the_page_shows_each_moment(film, t):
+    still = moving().at(t)
+    outline = extract_mesh(still, resolution=32, normals=False).vertices
+    camera = turntable(outline, 1, azimuth=20.0, elevation=10.0, width=48, height=36)[0]
+    fx, fy, cx, cy = camera.fx_fy_cx_cy
+    view = {name: getattr(camera, name).tolist() for name in ("eye", "right", "down", "forward")}
+    view |= {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "width": camera.width, "height": camera.height}
+    script = "return window.mplicits.render(arguments[0]).then(({seen}) => Array.from(seen))"
+    seen = film.execute_script(script, {"camera": view, "level": 1, "time": t, "precision": PRECISION})
+    found = np.array(seen).reshape(camera.height, camera.width, 4)
+    eye, directions = camera.rays()
+    hits = sphere_trace(still, eye, directions, level=1, tolerance=PRECISION, resolution=PRECISION)
+    mask = hits.mask.numpy().reshape(found.shape[:2])
+    assert ((found[..., 3] > 0) != mask).mean() <= 0.0005 + 1 / mask.size  # a pixel of this small picture
+    both = mask & (found[..., 3] > 0)
+    away = np.abs(found[..., 3] - hits.depth.numpy().reshape(mask.shape))[both]
+    assert (away < 1e-3).mean() > 0.99
+    assert mask.sum() > 200
+
+
+def test_the_slider_and_the_player(film):
+    values = "return window.mplicits.renderer.values(new Float32Array(arguments[0]), 0).then((f) => Array.from(f))"
+    place = [0.3, 0.1, 0.2]
+    film.execute_script(
+        "const t = document.getElementById('time'); t.value = 0.25; t.dispatchEvent(new Event('input'))"
+    )
+    expected = float(moving().at(0.25).value(torch.tensor([place]), level=0))
+    until(lambda: abs(film.execute_script(values, place)[0] - expected) < 1e-4)
+    play = film.find_element("id", "play")
+    play.click()
+    assert play.text == "Pause"
+    until(lambda: float(film.find_element("id", "time").get_attribute("value")) > 0.3)
+    play.click()
+    held = film.find_element("id", "time").get_attribute("value")
+    assert play.text == "Play"
+    assert film.find_element("id", "time").get_attribute("value") == held
