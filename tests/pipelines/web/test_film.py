@@ -32,7 +32,7 @@ def moving(*, residual=True):
     torch.manual_seed(0)
     base = Siren(32, 2, omega=6.0)
     solve_sphere(base, 0.4)
-    finer = [Siren(16, 2, omega=8.0, output_gain=0.3)] if residual else []
+    finer = [Siren(16, 2, omega=8.0, output_gain=0.1)] if residual else []
     still = MultiscaleSDF(base, finer, [0.1] * residual, taper=0.3)
     field = SpaceTimeSDF.from_static(still)
     with torch.no_grad():
@@ -56,10 +56,10 @@ def test_the_swept_field_is_below_every_moment():
     field = moving()
     speed = fastest_change(field)
     swept = Swept(field, speed)
-    x = torch.from_numpy(np.random.default_rng(0).uniform(-0.9, 0.9, (500, 3)).astype(np.float32))
+    x = torch.from_numpy(np.random.default_rng(0).uniform(-0.9, 0.9, (200, 3)).astype(np.float32))
     x = x[field.at(0.5).value(x, level=0).abs() < 0.25]
     lowest = swept.value(x, level=0)
-    for t in np.random.default_rng(1).uniform(0, 1, 20):
+    for t in np.random.default_rng(1).uniform(0, 1, 8):
         assert (lowest <= field.at(float(t)).value(x, level=0) + 1e-6).all()
     # |∂f/∂t| = |v · ∇f|, and near the surface |∇f| is about 1.
     assert 0.5 * np.linalg.norm(VELOCITY) < speed < 3 * np.linalg.norm(VELOCITY)
@@ -77,7 +77,7 @@ def test_the_band_of_every_moment_is_inside():
     corners = mesh.vertices[mesh.faces]
     points = np.concatenate((corners.reshape(-1, 3), corners.mean(axis=1))).astype(np.float32)
     delta = float(field.deltas[0])
-    for t in np.linspace(0, 1, 12):
+    for t in np.linspace(0, 1, 6):
         assert (field.at(float(t)).value(torch.from_numpy(points), level=0) > delta).all()
     width = np.ptp(mesh.vertices, axis=0)
     assert (width > 0.8 + np.abs(VELOCITY)).all()
@@ -110,13 +110,13 @@ def film(browser, tmp_path_factory):
     folder = tmp_path_factory.mktemp("film")
     save_field(folder / "moving.safetensors", moving())
     web_run(folder / "moving.safetensors", folder / "film.html")
-    browser.get(f"{(folder / 'film.html').as_uri()}?pixel=16")
+    browser.get(f"{(folder / 'film.html').as_uri()}?pixel=16&webgl")
     until(lambda: browser.execute_script("return !!window.mplicits"))
     return browser
 
 
-@pytest.mark.parametrize("t", [0.0, 0.7])
-def test_the_page_shows_each_moment(film, t):
+def differences(film, t):
+    """Wrong pixels of the mask, and by how much depths are off, of a small picture of a moment."""
     still = moving().at(t)
     outline = extract_mesh(still, resolution=32, normals=False).vertices
     camera = turntable(outline, 1, azimuth=20.0, elevation=10.0, width=48, height=36)[0]
@@ -129,11 +129,32 @@ def test_the_page_shows_each_moment(film, t):
     eye, directions = camera.rays()
     hits = sphere_trace(still, eye, directions, level=1, tolerance=PRECISION, resolution=PRECISION)
     mask = hits.mask.numpy().reshape(found.shape[:2])
-    assert ((found[..., 3] > 0) != mask).mean() <= 0.0005 + 1 / mask.size  # a pixel of this small picture
     both = mask & (found[..., 3] > 0)
-    away = np.abs(found[..., 3] - hits.depth.numpy().reshape(mask.shape))[both]
-    assert (away < 1e-3).mean() > 0.99
     assert mask.sum() > 200
+    return ((found[..., 3] > 0) != mask).sum(), np.abs(found[..., 3] - hits.depth.numpy().reshape(mask.shape))[both]
+
+
+@pytest.mark.parametrize("t", [0.0, 0.7])
+def test_the_page_shows_each_moment(film, t):
+    wrong, away = differences(film, t)
+    assert wrong <= 1  # 0.05 % of so few pixels
+    assert (away < 1e-3).mean() > 0.99
+
+
+@pytest.mark.slow
+def test_webgpu_shows_a_moment_too(film):
+    address = film.current_url
+    film.set_script_timeout(180)  # kernels are compiled for a software adapter
+    film.get(address.replace("&webgl", ""))
+    until(lambda: film.execute_script("return !!window.mplicits"))
+    wrong, away = differences(film, 0.7)
+    kind = film.execute_script("return window.mplicits.renderer.kind")
+    film.get(address)
+    until(lambda: film.execute_script("return !!window.mplicits"))
+    if kind != "WebGPU":
+        pytest.skip("this browser has no adapter for WebGPU")
+    assert wrong <= 1
+    assert (away < 1e-3).mean() > 0.99
 
 
 def test_the_slider_and_the_player(film):
