@@ -206,17 +206,16 @@ class FitBench(Benchmark[FitRow]):
         given = {"screened Poisson": False}  # smoothing is part of ours
         if run.record["cleaning"]["smoothed_noise"]:
             given["screened Poisson, smoothed"] = True  # and what it would do for others
-        for method, smooth in given.items():
-            oriented = prepare(cloud, dataclasses.replace(self.config, smooth_noise=smooth))
-            started = time.perf_counter()
-            surface = screened_poisson(oriented, depth=self.poisson_depth)
-            yield method, time.perf_counter() - started, 0.0, _in_input(surface, oriented.similarity)
+        prepared = {
+            smooth: prepare(cloud, dataclasses.replace(self.config, smooth_noise=smooth)) for smooth in given.values()
+        }
+        rows = [(method, prepared[smooth], False) for method, smooth in given.items()]
         if run.record["cleaning"]["normals_source"] == "estimated":
-            oriented = prepare(cloud, dataclasses.replace(self.config, smooth_noise=False))
+            rows.append(("screened Poisson, MeshLab's normals", prepared[False], True))
+        for method, oriented, own in rows:
             started = time.perf_counter()
-            surface = screened_poisson(oriented, depth=self.poisson_depth, own_normals=True)
-            seconds = time.perf_counter() - started
-            yield "screened Poisson, MeshLab's normals", seconds, 0.0, _in_input(surface, oriented.similarity)
+            surface = screened_poisson(oriented, depth=self.poisson_depth, own_normals=own)
+            yield method, time.perf_counter() - started, 0.0, _in_input(surface, oriented.similarity)
 
     def tables(self, rows: Sequence[FitRow], *, sgemm: float) -> tuple[Table, ...]:
         """See `Benchmark.tables`."""

@@ -59,6 +59,9 @@ SURE = 0.4
 # Normals estimated from noisy points are wrong by tens of degrees where parts are as thin as the noise, and there no
 # field of slope 1 is near the points either. Weights of both terms, in units of those of the settings.
 GUESSED_NORMAL, GUESSED_SLOPE = 0.1, 0.2
+# Of noise without normals, smoothing leaves this much: 0.3 to 0.7 of it in the root mean square on six shapes with 0.5
+# and 1 %, 0.4 in the median. Distances are that good.
+LEFT = 0.4
 # So few places that the level before gets wrong far from the cloud are not worth a share of the batch.
 FEWEST = 32
 
@@ -160,7 +163,8 @@ class Weights:
 
     def resolved(self, config: FitConfig, errors: Tensor, cloud: CloudDistance) -> tuple[float, float, float]:
         """Data, normal and eikonal weight, where the levels before miss the surface samples by ``errors`` ``(n,)``."""
-        data = config.data_weight_after(float(errors.square().mean()), cloud.noise)
+        noise = LEFT * cloud.noise if cloud.guessed else cloud.noise
+        data = config.data_weight_after(float(errors.square().mean()), noise)
         given = (self.data, self.normal, self.eikonal)
         normal, slope = (GUESSED_NORMAL, GUESSED_SLOPE) if cloud.guessed else (1.0, 1.0)
         usual = (data, normal * config.normal_weight, slope * config.eikonal_weight)

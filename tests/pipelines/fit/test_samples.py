@@ -7,6 +7,7 @@ from mplicits.neural_fields import MultiscaleSDF, Siren, Sphere, Torus, Union
 from mplicits.pipelines.fit.cloud import CloudDistance
 from mplicits.pipelines.fit.samples import (
     LEAST,
+    LEFT,
     SQUARES,
     Samples,
     Weights,
@@ -303,6 +304,16 @@ def test_near_a_cloud_of_guessed_normals_all_of_them_together_say_the_side() -> 
     fixed = Weights(normal=1.0, eikonal=2.0)
     sources = banded_sources(cloud, Sphere(radius=RADIUS - 0.01), delta, config, generator=generator(), weights=fixed)
     assert {(source.normal, source.eikonal) for source in sources} == {(1.0, 2.0)}
+
+
+@pytest.mark.parametrize(("guessed", "left"), [(True, LEFT), (False, 1.0)])
+def test_distances_are_weighed_by_the_noise_that_is_left(guessed: bool, left: float) -> None:
+    points, normals = sphere_points(2000)
+    cloud, config = CloudDistance(points, normals, noise=0.01, guessed=guessed), FitConfig()
+    errors = torch.full((2000,), 1e-3)  # far below the noise
+    assert Weights().resolved(config, errors, cloud)[0] == pytest.approx(config.data_weight_after(0.0, left * 0.01))
+    errors = torch.full((2000,), 0.1)
+    assert Weights().resolved(config, errors, cloud)[0] == pytest.approx(config.data_weight_after(0.01, 0.0))
 
 
 def test_usual_errors_are_those_of_the_smooth_places() -> None:
