@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-__all__ = ["noise_deviation", "noise_level", "smooth_along_normals"]
+__all__ = ["noise_deviation", "noise_level", "smooth_along_normals", "thick_of_estimated"]
 
 Float64 = NDArray[np.float64]
 Rows = NDArray[np.integer]
@@ -27,6 +27,10 @@ ALIKE = 0.7  # smallest cosine between normals of one surface
 # first it is narrower than a fourth of that, and levels average over it themselves; above the second there is no shape
 # left that it could be. Between them may be edges, the other side of a blade, or normals estimated there.
 THICK, THICKEST = 0.2, 0.35
+# The same where normals were estimated from the points: of half that noise they are wrong by five degrees and more, and
+# a network that is told of them does not average over that. Of so many points and more it sees several at once, and
+# smoothing them takes minutes.
+THICK_OF_ESTIMATED, DENSE = 0.1, 100_000
 # Those are the higher the further away, while noise is as high nearby: heights of the last four of sixteen neighbours
 # over those of the first four, medians, on a plane with noise of any direction, by that ratio. Six shapes with noise of
 # 0.1 to 1 % and estimated normals have 0.9 to 1.14 times as much; the same without noise 1.35 times and more.
@@ -58,7 +62,14 @@ class _Neighbors(NamedTuple):
     height: Float64
 
 
-def noise_level(points: Float64, normals: Float64, *, seed: int = 0, fitted: bool = False) -> float:
+def thick_of_estimated(count: int) -> float:
+    """From which thickness on there is noise in a cloud of ``count`` points with estimated normals: ``thick`` below."""
+    return THICK_OF_ESTIMATED if count < DENSE else THICK
+
+
+def noise_level(
+    points: Float64, normals: Float64, *, seed: int = 0, fitted: bool = False, thick: float = THICK
+) -> float:
     """How thick the layer of points is along the normals, or 0 where the spacing is wider than that.
 
     It is what smoothing measures in, and less than the noise's standard deviation, the more so the wider its
@@ -70,11 +81,12 @@ def noise_level(points: Float64, normals: Float64, *, seed: int = 0, fitted: boo
         seed: of the points that are asked.
         fitted: whether the normals were fitted to a few of these very neighbours. Those are nearer to their plane than
             the next ones in any case, and what grows with the distance is not taken for shape.
+        thick: heights of the eight nearest over their distance, from which on there is noise.
     """
-    return _measured(points, normals, seed, fitted=fitted)[0]
+    return _measured(points, normals, seed, fitted=fitted, thick=thick)[0]
 
 
-def noise_deviation(points: Float64, normals: Float64, *, seed: int = 0) -> float:
+def noise_deviation(points: Float64, normals: Float64, *, seed: int = 0, thick: float = THICK) -> float:
     """The standard deviation of the noise along the normals, or 0 where the spacing is wider than that.
 
     Whatever direction the noise has: what it does across the normals moves points within the surface, and is not
@@ -90,19 +102,26 @@ def noise_deviation(points: Float64, normals: Float64, *, seed: int = 0) -> floa
         points: ``(N, 3)``, around the origin.
         normals: ``(N, 3)`` unit normals.
         seed: of the points that are asked.
+        thick: see `noise_level`.
     """
-    level, near = _measured(points, normals, seed, thin=WHOLE)
+    level, near = _measured(points, normals, seed, thin=WHOLE, thick=thick)
     return _deviation(near) if level and near is not None else 0.0
 
 
 def _measured(
-    points: Float64, normals: Float64, seed: int, *, thin: float = THIN, fitted: bool = False
+    points: Float64,
+    normals: Float64,
+    seed: int,
+    *,
+    thin: float = THIN,
+    fitted: bool = False,
+    thick: float = THICK,
 ) -> tuple[float, _Neighbors | None]:
     """The layer's thickness, in neighbourhoods ``1/thin`` times as wide, and those; 0 and None if it is no layer."""
     order = np.random.default_rng(seed).permutation(len(points))
     layer = _Layer(points, normals, order)
     ratio = _thickness(layer.around(order[:ASKED], 8))[0]
-    if not ratio > THICK:
+    if not ratio > thick:
         return 0.0, None
     grown = GROWN * np.interp(ratio, RATIOS, GROWTHS)
     if ratio < THICKEST and not fitted and _growth(layer.around(order[:ASKED], 16)) > grown:

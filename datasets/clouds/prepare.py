@@ -233,7 +233,7 @@ def prepare_cloud(
         if smooth_noise:
             noisy = points
             points, unit, noise = denoise(noisy, unit)
-            deviation = noise_deviation(noisy, unit) * similarity.scale if noise else 0.0
+            deviation = noise_deviation(noisy, unit, thick=0.0) * similarity.scale if noise else 0.0
             noise *= similarity.scale
     report = CleaningReport(
         read=len(cloud),

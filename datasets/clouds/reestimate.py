@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from .noise import noise_level, smooth_along_normals
+from .noise import noise_level, smooth_along_normals, thick_of_estimated
 
 __all__ = ["denoise", "filter_normals", "has_edges", "refit_normals"]
 
@@ -53,13 +53,14 @@ def denoise(points: Float64, normals: Float64, *, rounds: int = ROUNDS) -> tuple
         The points, moved along the last normals ``(N, 3)``, unit normals ``(N, 3)``, and the noise's standard
         deviation; all as they were and 0 where there is none.
     """
-    level = noise_level(points, normals)
+    thick = thick_of_estimated(len(points))
+    level = noise_level(points, normals, thick=thick)
     if not level:
         return points, normals, 0.0
     reach = REACH * level
     for _ in range(rounds):
         normals = refit_normals(smooth_along_normals(points, normals, level), normals, reach)
-        level = noise_level(points, normals) or level
+        level = noise_level(points, normals, thick=thick) or level
     moved = smooth_along_normals(points, normals, level)
     tree = KDTree(moved)
     fitted = refit_normals(moved, normals, reach, tree=tree)
@@ -67,7 +68,7 @@ def denoise(points: Float64, normals: Float64, *, rounds: int = ROUNDS) -> tuple
         return moved, fitted, level
     for _ in range(rounds):
         normals = filter_normals(moved, fitted, tree=tree)
-        level = noise_level(points, normals) or level
+        level = noise_level(points, normals, thick=thick) or level
         moved = smooth_along_normals(points, normals, level, alike=ALIKE_AT_EDGES)
         tree = KDTree(moved)
         fitted = refit_normals(moved, normals, reach, tree=tree)

@@ -189,7 +189,7 @@ def signed(cloud: OrientedCloud, signs: Signs, *, smooth: bool) -> OrientedCloud
     if smooth:
         noisy = points
         points, normals, noise = denoise(noisy, normals)
-        deviation = noise_deviation(noisy, normals) * cloud.similarity.scale if noise else 0.0
+        deviation = noise_deviation(noisy, normals, thick=0.0) * cloud.similarity.scale if noise else 0.0
     report = dataclasses.replace(
         cloud.report,
         oriented_by="level" if signs.clear else cloud.report.oriented_by,
