@@ -125,6 +125,7 @@ class Verdict(NamedTuple):
         at: fraction of its schedule after which its weights were kept.
         fall: how sure the difference is.
         learnt: root mean square of |f| at the points that it has learnt from, over that without it.
+        guessed: whether the normals are guesses from noisy points, which cannot speak against a level.
     """
 
     points: int
@@ -133,15 +134,17 @@ class Verdict(NamedTuple):
     at: float
     fall: Fall
     learnt: float = 1.0
+    guessed: bool = False
 
     @property
     def better(self) -> bool:
         """Whether the level is worth having.
 
-        Either one error is surely less, and the other not surely more. Or both are less, surely or not, and it has
-        gained by far at the points that it has learnt from.
+        Either one error is surely less, and the other not surely more, unless that is the angle to guesses. Or both
+        are less, surely or not, and it has gained by far at the points that it has learnt from.
         """
-        sure = max(self.fall) > SURELY and min(self.fall) > -SURELY
+        against = self.fall.distance if self.guessed else min(self.fall)
+        sure = max(self.fall) > SURELY and against > -SURELY
         return sure or self.learns
 
     @property

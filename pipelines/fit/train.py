@@ -341,7 +341,8 @@ class _Fitting:
         silenced = level > 0 and _rms(self.errors) > WORSE * _rms(before)
         if verdict is not None:
             seen = ~self.held
-            verdict = verdict._replace(learnt=_rms(self.errors[seen]) / max(_rms(before[seen]), 1e-30))
+            learnt = _rms(self.errors[seen]) / max(_rms(before[seen]), 1e-30)
+            verdict = verdict._replace(learnt=learnt, guessed=self.cloud.guessed)
             silenced |= not verdict.better
         if silenced:
             nn.init.zeros_(siren.output.weight)

@@ -213,6 +213,13 @@ def test_a_level_is_kept_if_it_is_surely_better() -> None:
     assert verdict_of(math.inf, 0.0).better
 
 
+def test_angles_to_guessed_normals_do_not_speak_against_a_level() -> None:
+    assert verdict_of(5.0, -3.0)._replace(guessed=True).better
+    assert not verdict_of(1.5, -3.0)._replace(guessed=True).better
+    assert verdict_of(-1.0, 3.0)._replace(guessed=True).better
+    assert not verdict_of(-3.0, 5.0)._replace(guessed=True).better
+
+
 def test_where_held_out_points_are_not_sure_those_learnt_from_are_asked() -> None:
     assert verdict_of(1.5, 1.5)._replace(learnt=0.79).better
     assert not verdict_of(1.5, 1.5)._replace(learnt=0.81).better  # hardly more than what any level overfits
