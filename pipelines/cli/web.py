@@ -22,7 +22,7 @@ def _web_arguments(parser: argparse.ArgumentParser) -> None:
     add_flags(parser, "--out", help=f"{', '.join(PAGES)}, or a folder: field, module and page")
     add("--levels", type=whole(1), metavar="N", help="only the N coarsest levels (default: all)")
     add("--no-colors", dest="colors", action="store_false", help="leave out the colours of the run's texture")
-    add("--float32", action="store_true", help="keep the weights as they are (default: 16 bits each)")
+    add("--float32", action="store_true", help="keep the weights as they are (default: 13 bits each)")
     add_flags(parser, "--up")
     add("--title", metavar="TEXT", help="of the page (default: the name of the run)")
     add("--force", action="store_true", help="overwrite what was not written by this command")

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from ...neural_fields.files import write_whole
+from .payload import deflated
 
 __all__ = ["fill_page", "write_folder"]
 
@@ -37,8 +38,8 @@ MAGIC = b"mplicits-field\n"
 MARK = "// mplicits-field: written by `mplicits web`"
 # The whole page: nothing is fetched, nothing is sent, and only the scripts and styles with these digests run.
 POLICY = (
-    "default-src 'none'; script-src 'sha256-{script}'; style-src 'sha256-{style}'; img-src blob: data:; "
-    "base-uri 'none'; form-action 'none'"
+    "default-src 'none'; script-src 'sha256-{boot}' 'sha256-{script}'; style-src 'sha256-{style}'; "
+    "img-src blob: data:; base-uri 'none'; form-action 'none'"
 )
 
 
@@ -49,12 +50,13 @@ def fill_page(header: Mapping[str, Any], data: bytes) -> str:
     """
     script = "\n" + "\n".join(_bare(_source(name)) for name in (*SCRIPTS, "main.js"))
     style = "\n" + _source("style.css")
-    policy = POLICY.format(script=_digest(script), style=_digest(style))
+    boot = "\n" + _bare(_source("boot.js"))
+    policy = POLICY.format(boot=_digest(boot), script=_digest(script), style=_digest(style))
     parts = {
         "POLICY": policy,
         "STYLE": style,
-        "SHADERS": _shaders(),
-        "SCRIPT": script,
+        "BOOT": boot,
+        "CODE": base64.b64encode(deflated(f"{_shaders()}\0{script}".encode())).decode(),
         "HEADER": _header(header).replace("<", "\\u003c"),
         "DATA": base64.b64encode(data).decode(),
     }
@@ -65,8 +67,8 @@ def write_folder(out: Path, header: Mapping[str, Any], data: bytes) -> None:
     """Write what another page needs to show a field, and the page of its own beside it.
 
     ``field.bin`` is `MAGIC`, the length of the header as an unsigned number of four bytes, little-endian, the header in
-    JSON, and the bytes; ``mplicits-field.js`` an ES module that defines the element ``<mplicits-field>``; its types,
-    and a README that says how to use it, come with it.
+    JSON, and the deflated bytes; ``mplicits-field.js`` an ES module that defines the element ``<mplicits-field>``; its
+    types, and a README that says how to use it, come with it.
 
     Args:
         out: the folder, which is made if it is not there.

@@ -34,12 +34,12 @@ from .assembly import fill_page, write_folder
 from .film import MOMENTS, band_reach, swept_shell
 from .networks import Rounding, network_layers, rounding_error, shader_levels, taper_of
 from .payload import Payload
-from .shell import shell_mesh, surface_reach
+from .shell import GRID, shell_mesh, surface_reach
 
 __all__ = ["BITS", "PAGES", "WebOptions", "WebPage", "web_run"]
 
 PAGES = (".html", ".htm")
-BITS = 16
+BITS = 13
 VERSION = 1
 CHANNELS = 3
 ERROR_POINTS = 4000  # at which rounding is measured
@@ -186,8 +186,8 @@ def _content(
         colors["level"] = min(texture.geometry_level, shown.num_levels - 1)
         colors |= {"delta": float(texture.delta), "outside": texture.outside.tolist()}
     low, high = shell.vertices.min(axis=0), shell.vertices.max(axis=0)
-    payload.add("shell.vertices", np.rint((shell.vertices - low) / (high - low) * 65535), "u2")
-    payload.add("shell.faces", shell.faces, "u2" if len(shell.vertices) <= 65536 else "u4")
+    payload.add_steps("shell.vertices", np.rint((shell.vertices - low) / (high - low) * GRID).T)
+    payload.add_steps("shell.faces", shell.faces)
     data, described = payload.content()
     header = {
         "format": "mplicits-web",
@@ -201,7 +201,7 @@ def _content(
         # What a film's levels reach at every moment is not known; their bands are.
         "reach": surface_reach(shown) if moving is None else band_reach(shown),
         "radius": BOUNDING_RADIUS,
-        "shell": {"low": low.tolist(), "high": high.tolist(), "triangles": len(shell.faces)},
+        "shell": {"low": low.tolist(), "high": high.tolist(), "grid": GRID, "triangles": len(shell.faces)},
         "view": _view(outline, options.up),
         "unit": similarity.scale,
         "center": list(similarity.center),

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from .networks import Layer
 
-__all__ = ["Payload", "pack_codes"]
+__all__ = ["Payload", "deflated", "pack_codes"]
 
 
 @dataclass
@@ -19,7 +19,7 @@ class Payload:
     """Named arrays one behind the other, each beginning at a multiple of four bytes, little-endian.
 
     Attributes:
-        blocks: name → kind ("f4", "u2", "u4" or "i" and a number of bits), count of its numbers and first byte.
+        blocks: name → kind ("f4", "u2", "u4" or "i" or "d" and a number of bits), count of its numbers and first byte.
         parts: the bytes.
     """
 
@@ -42,6 +42,13 @@ class Payload:
         self.parts.append(data)
         self.size += len(data)
 
+    def add_steps(self, name: str, numbers: NDArray[Any]) -> None:
+        """Append whole numbers by how each differs from the one before; the first from 0."""
+        steps = np.diff(np.asarray(numbers).reshape(-1).astype(np.int64), prepend=0)
+        bits = max(2, int(np.abs(steps).max(initial=0)).bit_length() + 1)
+        self.add(name, steps, f"i{bits}")
+        self.blocks[name][0] = f"d{bits}"
+
     def add_network(self, name: str, layers: list[Layer]) -> dict[str, Any]:
         """Append the layers of a network.
 
@@ -62,12 +69,25 @@ class Payload:
         return {"name": name, "width": layers[0].weight.shape[0], "depth": len(layers) - 1}
 
     def content(self) -> tuple[bytes, dict[str, Any]]:
-        """All bytes, and for the header: the blocks, the number of bytes and their CRC-32."""
+        """All bytes, deflated; and for the header: the blocks, how many bytes there were, and their CRC-32."""
         data = b"".join(self.parts)
-        return data, {"blocks": self.blocks, "bytes": len(data), "crc32": zlib.crc32(data)}
+        return deflated(data), {"blocks": self.blocks, "bytes": len(data), "crc32": zlib.crc32(data)}
+
+
+def deflated(data: bytes) -> bytes:
+    """Bytes as a browser's ``DecompressionStream("deflate-raw")`` takes them."""
+    packer = zlib.compressobj(9, zlib.DEFLATED, -zlib.MAX_WBITS)
+    return packer.compress(data) + packer.flush()
 
 
 def pack_codes(codes: NDArray[np.integer], bits: int) -> bytes:
-    """Signed numbers ``(N,)`` in two's complement of ``bits`` bits, lowest bit first, without gaps."""
-    places = (codes.astype(np.int64)[:, None] >> np.arange(bits)) & 1
-    return np.packbits(places.astype(np.uint8).reshape(-1), bitorder="little").tobytes()
+    """Signed numbers ``(N,)`` in two's complement of ``bits`` bits, in two parts that deflate better than one.
+
+    First the upper eight bits of each, fewer if there are no more: small numbers are frequent, and these bits tell.
+    Then the lower ones, lowest bit first, without gaps.
+    """
+    whole = codes.astype(np.int64) & (2**bits - 1)
+    low = max(0, bits - 8)
+    places = (whole[:, None] >> np.arange(low)) & 1
+    upper = (whole >> low).astype(np.uint8)
+    return upper.tobytes() + np.packbits(places.astype(np.uint8).reshape(-1), bitorder="little").tobytes()

@@ -16,7 +16,7 @@ from ...neural_fields import Field, extract_mesh
 from ...neural_fields.mesh import Mesh
 from ...neural_fields.tracing import BOUNDING_RADIUS
 
-__all__ = ["CELLS", "shell_mesh", "surface_reach"]
+__all__ = ["CELLS", "GRID", "shell_mesh", "surface_reach"]
 
 RESOLUTION = 96  # of the meshes on which values of coarser levels are looked at
 # Between the corners of those meshes a coarser level may be this much further from zero.
@@ -25,6 +25,9 @@ CELLS = 36  # along the box: a few thousand triangles
 # Distance of the mesh from the band, in cells. No point of a cell is further than √3/2 of a cell from a corner, so
 # that a part of the band within a cell shows at its corners, and chords of the mesh do not cut into the band.
 ROOM = 0.9
+# Steps into which the box of the mesh is divided for the page. A corner is moved by at most √3/2 of one, 0.002 in the
+# largest box: a thirtieth of a cell, which `ROOM` leaves.
+GRID = 1023
 
 
 @torch.no_grad()

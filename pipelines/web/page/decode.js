@@ -28,8 +28,17 @@ function checksum(bytes) {
   return (crc ^ 0xffffffff) >>> 0;
 }
 
+// Bytes that were deflated; none of damaged ones.
+async function inflated(bytes) {
+  try {
+    return new Uint8Array(await new Response(new Blob([bytes]).stream().pipeThrough(new DecompressionStream('deflate-raw'))).arrayBuffer());
+  } catch {
+    return new Uint8Array(0);
+  }
+}
+
 // The header and the arrays of a page; what is cut off, changed or of another kind is refused.
-function decodeField(headerText, bytes) {
+async function decodeField(headerText, packed) {
   let header;
   try {
     header = JSON.parse(headerText);
@@ -38,6 +47,7 @@ function decodeField(headerText, bytes) {
   }
   if (header?.format !== 'mplicits-web') throw new PageError('The data in this page is no field of mplicits.');
   if (header.version !== 1) throw new PageError(`The field in this page is of version ${header.version}; this page reads 1.`);
+  const bytes = await inflated(packed);
   if (bytes.length !== header.bytes || checksum(bytes) !== header.crc32) {
     throw new PageError('The field in this page is damaged or cut off. Copy the page again, or write it again with `mplicits web`.');
   }
@@ -52,18 +62,20 @@ function numbersOf(bytes, kind, count, start) {
   if (kind === 'f4') return new Float32Array(bytes.buffer, start, count);
   if (kind === 'u2') return new Uint16Array(bytes.buffer, start, count);
   if (kind === 'u4') return new Uint32Array(bytes.buffer, start, count);
-  const bits = Number(kind.slice(1));
+  // Signed codes: the upper eight bits of each, then the lower ones without gaps; of kind d, what each adds to the last.
+  const bits = Number(kind.slice(1)), low = Math.max(0, bits - 8), places = 2 ** low;
   const numbers = new Int32Array(count);
-  let held = 0, pool = 0, at = start;
+  let held = 0, pool = 0, at = start + count, last = 0;
   for (let i = 0; i < count; i++) {
-    while (held < bits) {
+    while (held < low) {
       pool += bytes[at++] * 2 ** held;
       held += 8;
     }
-    const code = pool % 2 ** bits;
-    numbers[i] = code >= 2 ** (bits - 1) ? code - 2 ** bits : code;
-    pool = Math.floor(pool / 2 ** bits);
-    held -= bits;
+    const code = bytes[start + i] * places + (pool % places);
+    last = (kind[0] === 'd' ? last : 0) + (code >= 2 ** (bits - 1) ? code - 2 ** bits : code);
+    numbers[i] = last;
+    pool = Math.floor(pool / places);
+    held -= low;
   }
   return numbers;
 }

@@ -64,7 +64,7 @@ class MplicitsField extends HTMLElement {
     const ui = new Interface(this.shadowRoot.getElementById('stage'));
     try {
       if (!src) throw new PageError('This element has no field: <mplicits-field src="field.bin"> names one.');
-      const saved = splitFile(await fetched(new URL(src, document.baseURI).href, asked.signal));
+      const saved = await splitFile(await fetched(new URL(src, document.baseURI).href, asked.signal));
       if (asked.signal.aborted) return;
       this.page = new Page(saved, shaderParts(SHADERS), ui);
       this.apply();

@@ -1,11 +1,11 @@
 // A page of its own: the field lies in it.
 
-addEventListener('DOMContentLoaded', () => {
+async function start() {
   const text = (id) => document.getElementById(id)?.textContent ?? '';
   const ui = new Interface(document.getElementById('stage'));
-  ui.guarded(() => {
+  try {
     const search = new URLSearchParams(location.search);
-    const saved = decodeField(text('header'), bytesOf(text('data')));
+    const saved = await decodeField(text('header'), bytesOf(text('data')));
     document.title = saved.header.title;
     const page = new Page(saved, shaderParts(text('shaders')), ui, wishes(search));
     window.mplicits = { render: (wanted) => page.render(wanted), bench: (wanted) => page.bench(wanted), turntable: (wanted) => turntable(page, wanted), get renderer() { return page.renderer; }, header: saved.header };
@@ -13,5 +13,11 @@ addEventListener('DOMContentLoaded', () => {
       const size = Math.min(1024, Math.max(16, Number(search.get('bench')) || 512));
       page.bench({ size }).then((found) => page.describeBench(found)).catch((error) => ui.failed(error));
     }
-  });
-});
+  } catch (error) {
+    ui.failed(error);
+  }
+}
+
+// The script runs as soon as it is unpacked; the data behind it may not all be there yet.
+if (document.readyState === 'loading') addEventListener('DOMContentLoaded', start);
+else start();

@@ -35,8 +35,11 @@ function hitsOf({ eye, right, down, forward, fx, fy, cx, cy, width }, seen, firs
 // Corners and faces of the mesh around the band.
 function shellArrays({ shell }, arrays) {
   const codes = arrays.get('shell.vertices');
-  const places = Float32Array.from(codes, (code, i) => shell.low[i % 3] + (code / 65535) * (shell.high[i % 3] - shell.low[i % 3]));
-  return { places, faces: arrays.get('shell.faces') };
+  const places = Float32Array.from(codes, (_, i) => {
+    const c = i % 3, code = codes[(c * codes.length) / 3 + Math.floor(i / 3)];
+    return shell.low[c] + (code / shell.grid) * (shell.high[c] - shell.low[c]);
+  });
+  return { places, faces: Uint32Array.from(arrays.get('shell.faces')) };
 }
 
 const dot3 = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
@@ -152,7 +155,6 @@ class Hull {
     gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
     gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, faces, gl.STATIC_DRAW);
     gl.bindVertexArray(null);
-    this.kind = faces instanceof Uint32Array ? gl.UNSIGNED_INT : gl.UNSIGNED_SHORT;
     this.corners = faces.length;
     this.target = null;
   }
@@ -191,7 +193,7 @@ class Hull {
       gl.clearBufferfv(gl.DEPTH, 0, [clear]);
       gl.cullFace(face);
       gl.depthFunc(test);
-      gl.drawElements(gl.TRIANGLES, this.corners, this.kind, 0);
+      gl.drawElements(gl.TRIANGLES, this.corners, gl.UNSIGNED_INT, 0);
     }
     gl.colorMask(true, true, true, true);
     gl.disable(gl.DEPTH_TEST);

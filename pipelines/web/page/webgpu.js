@@ -127,7 +127,7 @@ class GpuTracer {
     const { STORAGE, UNIFORM, COPY_SRC, COPY_DST, VERTEX, INDEX } = GPUBufferUsage;
     this.weights = this.nets.map((net) => this.filled(net.numbers, STORAGE));
     this.corners = this.filled(this.shell.places, VERTEX);
-    this.faces = this.filled(Uint32Array.from(this.shell.faces), INDEX);
+    this.faces = this.filled(this.shell.faces, INDEX);
     this.view = this.buffer(96, UNIFORM | COPY_DST);
     this.frame = this.buffer(144, UNIFORM | COPY_DST);
     this.gates = this.nets.map(() => this.buffer(32, UNIFORM | COPY_DST));

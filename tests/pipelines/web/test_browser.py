@@ -11,6 +11,7 @@ import pytest
 import torch
 from mplicits.datasets.cameras import look_at, turntable
 from mplicits.neural_fields import extract_mesh, map_colors, sphere_trace
+from mplicits.pipelines.web.export import BITS
 from mplicits.pipelines.web.networks import rounded_field
 from pages import TITLE, bumpy, painted, until
 
@@ -74,7 +75,7 @@ DRAWN = [*((KINDS[0], name) for name in ("around", "coarse", "near")), (KINDS[1]
 @pytest.mark.parametrize(("kind", "name"), DRAWN, indirect=["kind"])
 def test_the_page_traces_what_this_package_traces(drawn, name):
     camera, level = cameras()[name]
-    field = rounded_field(bumpy(), 16)
+    field = rounded_field(bumpy(), BITS)
     found, counts = rendered(drawn, camera, level=level)
     eye, directions = camera.rays()
     hits = sphere_trace(field, eye, directions, level=level, tolerance=PRECISION, resolution=PRECISION)
@@ -118,7 +119,7 @@ def test_colours_are_those_of_the_texture(drawn):
     away = bumpy().value(points[seen]).abs() > 0.02
     assert 0 < int(away.sum()) < len(away)
     expected = map_colors(painted(), points[seen]).values.numpy()
-    # 16-bit weights, and depths in float32, change smooth colours by far less than a step of a display.
+    # Rounded weights, and depths in float32, change smooth colours by far less than a step of a display.
     close = np.abs(counts["color"].reshape(*seen.shape, 4)[seen][:, :3] - expected).max(axis=1) < 1 / 255
     assert close.mean() > 0.99
     assert np.ptp(expected, axis=0).max() > 0.1
@@ -161,7 +162,7 @@ def test_what_a_person_sees_and_does(opened):
     facts = opened.find_element(By.ID, "facts").text
     assert "SIRENs 32 × 2, 18 × 2, 16 × 3" in facts
     assert "δ = 12, 5 input units" in facts
-    assert "weights of 16 bits: off by ≤ " in facts
+    assert f"weights of {BITS} bits: off by ≤ " in facts
     canvas = opened.find_element(By.ID, "picture")
     level = opened.find_element(By.ID, "level")
     assert level.get_attribute("value") == "2"

@@ -11,6 +11,7 @@ import torch
 from mplicits.neural_fields import MultiscaleSDF, Similarity, Siren, Sphere, save_field, solve_sphere
 from mplicits.neural_fields.spacetime import SpaceTimeSDF
 from mplicits.pipelines.cli import main
+from mplicits.pipelines.web.export import BITS
 
 NASTY = '</script><img src=x onerror="document.title=1">@DATA@'
 
@@ -38,7 +39,7 @@ def parts(page):
     """Header, bytes, scripts and styles of a page, as a browser would find them."""
     text = page.read_text(encoding="utf-8")
     header = json.loads(re.search(r'id="header">(.*?)</script>', text)[1])
-    data = base64.b64decode(re.search(r'id="data">(.*?)</script>', text)[1])
+    data = zlib.decompress(base64.b64decode(re.search(r'id="data">(.*?)</script>', text)[1]), -zlib.MAX_WBITS)
     return text, header, data
 
 
@@ -46,7 +47,7 @@ def test_a_page_is_whole_and_lets_nothing_else_in(run, tmp_path, capsys):
     out = tmp_path / "page.html"
     assert web(run, "-o", out) == 0
     said = capsys.readouterr().out
-    assert "weights of 16 bits: distances change by at most" in said
+    assert f"weights of {BITS} bits: distances change by at most" in said
     assert "2 levels" in said
     text, header, data = parts(out)
     assert header["bytes"] == len(data)
@@ -55,12 +56,15 @@ def test_a_page_is_whole_and_lets_nothing_else_in(run, tmp_path, capsys):
     assert header["title"] == "ball"
     policy = re.search(r'Content-Security-Policy" content="([^"]*)"', text)[1]
     assert policy.startswith("default-src 'none'; ")
-    for kind, found in (("script", r"<script>(.*?)</script>"), ("style", r"<style>(.*?)</style>")):
-        digest = base64.b64encode(hashlib.sha256(re.search(found, text, re.DOTALL)[1].encode()).digest()).decode()
-        assert f"{kind}-src 'sha256-{digest}'" in policy
+    (boot,) = re.findall(r"<script>(.*?)</script>", text, re.DOTALL)
+    (style,) = re.findall(r"<style>(.*?)</style>", text, re.DOTALL)
+    packed = base64.b64decode(re.search(r'id="code">(.*?)</script>', text)[1])
+    script = zlib.decompress(packed, -zlib.MAX_WBITS).decode().split("\0")[1]
+    digests = [base64.b64encode(hashlib.sha256(part.encode()).digest()).decode() for part in (boot, script, style)]
+    assert "script-src 'sha256-{}' 'sha256-{}'; style-src 'sha256-{}';".format(*digests) in policy
     assert "unsafe" not in policy
-    assert "innerHTML" not in text
-    assert not re.search(r"https?://", text)  # not even the name of a namespace
+    assert "innerHTML" not in text + script
+    assert not re.search(r"https?://", text + script)  # not even the name of a namespace
     assert "a name of the user" not in text
 
 
@@ -79,7 +83,7 @@ def test_exact_weights_and_fewer_levels(run, tmp_path, capsys):
         assert web(run, "-o", out, *flags) == 0
         sizes[name], header = out.stat().st_size, parts(out)[1]
         assert len(header["levels"]) == (1 if name == "one" else 2)
-        assert header["bits"] == (None if name == "exact" else 16)
+        assert header["bits"] == (None if name == "exact" else BITS)
     assert sizes["one"] < sizes["all"] < sizes["exact"]
     assert "weights of" not in capsys.readouterr().out.splitlines()[-1]
 

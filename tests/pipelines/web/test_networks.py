@@ -1,6 +1,7 @@
 """Numbers for the shaders: turns, rounding and packing, against exact arithmetic."""
 
 import math
+import zlib
 
 import numpy as np
 import pytest
@@ -74,9 +75,10 @@ def test_packed_codes_come_back(bits):
     codes = np.random.default_rng(0).integers(-most, most + 1, 101)
     codes[:2] = -most, most
     data = pack_codes(codes, bits)
-    assert len(data) == math.ceil(101 * bits / 8)
-    number = int.from_bytes(data, "little")
-    found = [(number >> (bits * i)) & (2**bits - 1) for i in range(101)]
+    low = max(0, bits - 8)
+    assert len(data) == 101 + math.ceil(101 * low / 8)
+    number = int.from_bytes(data[101:], "little")
+    found = [(upper << low) + ((number >> (low * i)) & (2**low - 1)) for i, upper in enumerate(data[:101])]
     assert [code - 2**bits if code >> (bits - 1) else code for code in found] == codes.tolist()
 
 
@@ -86,5 +88,17 @@ def test_blocks_begin_at_multiples_of_four():
     payload.add("b", np.array([1.5]), "f4")
     data, described = payload.content()
     assert described["blocks"] == {"a": ["u2", 3, 0], "b": ["f4", 1, 8]}
+    data = zlib.decompress(data, -zlib.MAX_WBITS)
     assert described["bytes"] == len(data) == 12
     assert np.frombuffer(data, "<f4", 1, 8)[0] == 1.5
+
+
+def test_steps_come_back():
+    payload = Payload()
+    numbers = np.random.default_rng(0).integers(0, 1000, 50)
+    payload.add_steps("a", numbers)
+    kind, count, first = payload.blocks["a"]
+    assert (count, first) == (50, 0)
+    steps = np.diff(numbers, prepend=0)
+    assert payload.parts[0].startswith(pack_codes(steps, int(kind[1:])))
+    assert kind == f"d{int(np.abs(steps).max()).bit_length() + 1}"

@@ -7,6 +7,7 @@ import imageio.v3 as imageio
 import numpy as np
 import pytest
 import torch
+from mplicits.pipelines.web.export import BITS
 from mplicits.pipelines.web.networks import rounded_field
 from pages import bumpy, until
 
@@ -77,7 +78,7 @@ def reading(browser):
 def values_at(place):
     """Of all levels at a place of the input, in its units; the place is read to five digits of the radius."""
     x = torch.from_numpy((place - CENTER) / UNIT).float()[None]
-    field = rounded_field(bumpy(), 16)
+    field = rounded_field(bumpy(), BITS)
     return x, [field.value(x, level=level).item() * UNIT for level in range(3)]
 
 
@@ -90,7 +91,7 @@ def test_the_place_under_the_pointer(resting):
     # The ray is known to a tenth of a pixel of the coarse picture: 16 of its 300 pixels see about 2 units.
     assert abs(distances[2]) < 0.02 * UNIT
     assert np.allclose(distances, expected, atol=0.01 + 1e-2 * np.abs(expected).max())
-    gradient = torch.nn.functional.normalize(rounded_field(bumpy(), 16).jet(x).gradient, dim=-1)[0].numpy()
+    gradient = torch.nn.functional.normalize(rounded_field(bumpy(), BITS).jet(x).gradient, dim=-1)[0].numpy()
     assert normal @ gradient > 0.999
     assert place[0] > CENTER[0]  # the camera is at +x
     at(resting, 200, 0)
