@@ -1,5 +1,7 @@
 """SIRENs that begin as spheres."""
 
+import copy
+
 import pytest
 import torch
 from mplicits.neural_fields import NeuSGeometry, Siren
@@ -158,3 +160,37 @@ def test_a_trained_start_does_not_depend_on_units() -> None:
         assert network.units == units
         found.append(network.state_dict())
     assert all(torch.equal(found[0][name], found[1][name]) for name in found[0])
+
+
+def slopes_per_value(depth: int) -> float:
+    """By how much Adam's first step changes slopes, over how much it changes values, where values err at random."""
+    torch.manual_seed(0)
+    network = Siren(64, depth, omega=10.0)
+    fit_sphere(network, 0.35, steps=60, batch=256)
+    geometry = NeuSGeometry(network, learning_rate=5e-4)
+    x = torch.nn.functional.normalize(torch.randn(500, 3), dim=1) * torch.rand(500, 1) ** (1 / 3)
+    start = copy.deepcopy(geometry.state_dict())
+    squares = torch.zeros(2)
+    for draw in range(4):
+        geometry.load_state_dict(start)
+        adam = torch.optim.Adam(geometry.parameters(), lr=5e-4)
+        adam.zero_grad()
+        before = network.jet(x)
+        (before.value * torch.randn(500, generator=torch.Generator().manual_seed(draw))).sum().backward()
+        adam.step()
+        after = network.jet(x)
+        squares[0] += (after.value - before.value).detach().square().sum()
+        squares[1] += (after.gradient - before.gradient).detach().square().sum()
+    value, slope = squares.sqrt().tolist()
+    return slope / value
+
+
+def test_each_sine_layer_makes_steps_wave_more() -> None:
+    """Sines of sines: a layer's frequencies are those of the layer before, times its own phases.
+
+    What a step changes has that frequency. Hence two layers in level 0 where only values are asked for. Between seeds
+    a quotient differs by an eighth.
+    """
+    found = [slopes_per_value(depth) for depth in (1, 2, 4)]
+    assert found[0] * 1.125 < found[1]
+    assert found[1] * 1.5 < found[2]
