@@ -94,3 +94,65 @@ def test_kernels_compile(kind: str, sizes: list[tuple[int, int]], precision: str
     assert found["shared"] <= SHARED[capability]
     assert found["fast"] == 0
     assert (found["tensor"] > 0) == (precision != "ieee")
+
+
+LAUNCHED = """
+import json, sys
+import torch, triton
+from triton.backends.compiler import GPUTarget
+from triton.runtime import driver
+from mplicits.neural_fields import MultiscaleSDF
+from mplicits.neural_fields.kernels import cones, levels, paths, siren, tracing, training
+
+class Hopper:  # all that binding and compiling ask of a driver
+    def get_current_device(self):
+        return 0
+    def get_current_stream(self, device):
+        return 0
+    def get_current_target(self):
+        return GPUTarget("cuda", 90, 32)
+    def get_active_torch_device(self):
+        return torch.device("cpu")
+
+driver.set_active(Hopper())
+launched = []
+
+def stop_short(module, name):
+    kernel = getattr(module, name)
+    class Bound:
+        def __getitem__(self, grid):
+            def call(*arguments, **options):
+                kernel.warmup(*arguments, grid=grid, **options)
+                launched.append(f"{module.__name__.split('.')[-1]}.{name}")
+            return call
+    setattr(module, name, Bound())
+
+places = ((siren, "evaluate"), (levels, "walk"), (paths, "march_bands"), (tracing, "march"), (cones, "march"))
+for module, name in (*places, (training, "sweep")):
+    stop_short(module, name)
+field = MultiscaleSDF.from_widths([(16, 1), (24, 2)], omegas=[5, 5], taper=0.3).requires_grad_(False)
+x, depth, base, together = torch.rand(100, 3), torch.rand(100), field.base.as_network(), field.as_levels()
+siren.siren_jet(x, base, "ieee")
+levels.levels_value(x, together, "ieee", depth > 0.5)
+levels.levels_jet(x, together, "tf32x3")
+numbers = {"PATIENCE": 32, "BOLDNESS": 0.9, "STEEPEST_RISE": 0.6, "BAND_ENTRY": 0.5, "FLOOR": 1e-6}
+options = {"tolerance": 1e-3, "resolution": 1e-3, "lipschitz": 1.0, "max_steps": 9, "constants": numbers}
+rays = (x, x, depth, depth, depth + 1)
+tracing.march_rays(base, rays, precision="ieee", **options)
+paths.march_levels(together, rays, precision="ieee", **options)
+cones.march_cones(base, (x[0], x, depth, depth, depth), depth[0], 1.0, 9, "ieee")
+training.jet_backward(x, base, depth, x, "ieee")
+print(json.dumps(launched))
+"""
+
+
+@pytest.mark.slow
+def test_launches_are_bound_as_triton_binds_them() -> None:
+    """What the interpreter does not show: types of arguments, tuples of tuples, a view of bits; then they compile."""
+    environment = {name: value for name, value in os.environ.items() if name != "TRITON_INTERPRET"}
+    environment["TRITON_DEFAULT_FP_FUSION"] = "1"
+    words = [sys.executable, "-c", LAUNCHED]
+    done = subprocess.run(words, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
+    expected = ["siren.evaluate", "levels.walk", "levels.walk", "tracing.march", "paths.march_bands", "cones.march"]
+    assert json.loads(done.stdout) == [*expected, "training.sweep"]
