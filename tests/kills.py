@@ -60,7 +60,7 @@ class Case(NamedTuple):
 
 def words(command: str, place: Path, run: Path, *, resume: bool, force: bool) -> list[str]:
     """What is typed."""
-    more = " --resume" if resume else " --force" * (force and command != "texture")
+    more = " --resume" if resume else " --force" * force
     line = {
         "fit": f"fit {place}/ball.ply -o {run} " + ("" if resume else FIT),
         "texture": f"texture {run} {place}/ball.ply " + ("" if resume else TEXTURE),
@@ -142,7 +142,7 @@ def result(command: str, run: Path) -> dict[str, torch.Tensor] | None:
     if not is_fitted(run):
         return None
     tensors = load_file(run / "field.safetensors")
-    if command == "reconstruct":
+    if command == "reconstruct" and (run / "texture.safetensors").is_file():
         tensors |= {f"texture.{name}": part for name, part in load_file(run / "texture.safetensors").items()}
     return tensors
 
@@ -224,6 +224,8 @@ class Trial:
                 found.append("ended")
                 break
             found.append(self.look(command, run, old))
+            if found[-1] == "new run":  # it came to its end, but did not come to say so
+                break
             resume = found[-1] == "resumable"
         with contextlib.suppress(FileNotFoundError):
             if not is_same(result(command, run), self.wanted[command]):
@@ -298,7 +300,7 @@ def main() -> int:
                 outcome = trial.case(number, case)
             except (AssertionError, InputError) as error:
                 outcome = f"bad: {error}"
-            name = case.command + " --force" * (case.force and case.command not in ("bench", "texture"))
+            name = case.command + " --force" * (case.force and case.command != "bench")
             if outcome.startswith("bad"):
                 bad += 1
                 print(f"case {number}, {name}, killed at {case.moments}: {outcome}", flush=True)
