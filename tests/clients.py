@@ -51,7 +51,9 @@ def position(chance: random.Random) -> list[float]:
 async def good(address: str, seed: int, until: float) -> list[float]:
     """Move the camera, wait for an image, again → seconds that each took."""
     chance, waits = random.Random(seed), []
-    async with connect(address, subprotocols=PROTOCOL, max_size=None, open_timeout=LONGEST) as socket:
+    async with connect(
+        address, subprotocols=PROTOCOL, max_size=None, open_timeout=LONGEST, ping_interval=None
+    ) as socket:
         while time.monotonic() < until:
             await socket.send(hello(position(chance)))
             begun = time.monotonic()
