@@ -4,7 +4,7 @@
 const MOST_RAYS = 2 ** 18;    // of a strip
 const SLOT = 256, KIND = 8;   // bytes of a step's numbers in a list, and of those for values and for jets
 const STEPS = [6, 10, 16, 32, 64, 128, 256]; // that are sent at once; together as many as a ray may take
-const ACCEPT = 0.35, MOST_ACCEPT = 1e-3;  // Newton steps that a jet may end with: in pixels, and in units of the field
+const ACCEPT = 0.35, MOST_ACCEPT = 5e-4;  // Newton steps that a jet may end with: in pixels, and in units of the field
 const MOST_LEVELS = 5;
 const MARCH = 256; // rays that a workgroup looks at
 

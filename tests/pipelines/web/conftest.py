@@ -38,6 +38,7 @@ def browser(tmp_path_factory):
 @pytest.fixture
 def opened(browser, page):
     """The page, with rays of 16 pixels at rest: software is slow."""
+    browser.get_log("browser")  # what pages before this one said is not its own
     address = f"{page.as_uri()}?pixel=16&webgl"
     if browser.current_url != address:
         browser.get(address)
@@ -53,6 +54,7 @@ def kind(request):
 @pytest.fixture
 def drawn(browser, page, kind):
     """The page, with either of the two that trace: "WebGL 2" or "WebGPU"."""
+    browser.get_log("browser")  # what pages before this one said is not its own
     address = f"{page.as_uri()}?pixel=16{'&webgl' if kind == 'WebGL 2' else ''}"
     if browser.current_url != address:
         browser.get(address)
