@@ -66,7 +66,7 @@ WEB = Command(
     """  mplicits web runs/scan -o scan.html
   mplicits web runs/scan -o small.html --levels 1
   mplicits web runs/scan -o exact.html --float32 --up z
-  mplicits web runs/scan -o site/scan        # a folder: <mplicits-field> for other pages""",
+  mplicits web runs/scan -o site/scan""",
     _web_arguments,
     _web,
     "Write a fit as one HTML file that needs no network, no server and no Python: the networks themselves, traced by "
