@@ -9,12 +9,12 @@ PATIENCE = 60.0
 TITLE = "<img src=x onerror=alert(1)> & ball"
 
 
-def bumpy():
-    """A sphere of level 0 and bumps of two levels in its bands: no bump is larger than its band."""
+def bumpy(*, gain=0.5):
+    """A sphere of level 0 and bumps of two levels in its bands: no bump is larger than its band, unless ``gain`` is."""
     torch.manual_seed(3)
     base = Siren(32, 2, omega=6.0)
     solve_sphere(base, 0.6)
-    residuals = [Siren(18, 2, omega=8.0, output_gain=0.5), Siren(16, 3, omega=16.0, output_gain=0.1)]
+    residuals = [Siren(18, 2, omega=8.0, output_gain=gain), Siren(16, 3, omega=16.0, output_gain=0.1)]
     return MultiscaleSDF(base, residuals, [0.12, 0.05], taper=0.3).requires_grad_(False)
 
 

@@ -21,7 +21,8 @@ fn cosine(turns: vec4f) -> vec4f {
 struct Slot { count: atomic<u32>, step: u32 }
 struct Filled { count: u32, step: u32 }
 // Where a network is asked, and what it and those before it say: gradient and value. For values, `answer.x` is 1 where
-// the ray looks at level 0's root before any finer level is asked: it may where the value is below `point.w`.
+// the ray goes on to level 0's root before any finer level is asked: it may where the value is below `point.w`. Then
+// `answer.w` is level 0's alone.
 struct Place { point: vec4f, answer: vec4f }
 
 #part gpu.hull
@@ -56,7 +57,8 @@ struct Frame {
   eye: vec3f, radius: f32,
   lens: vec4f,
   tolerance: f32, resolution: f32, accept: f32, pixel: f32,
-  level: u32, within: u32, room: u32, spare: u32,
+  level: u32, within: u32, room: u32,
+  unseen: f32,    // how much of a way to level 0's root may lie outside the ball before it
   clip: vec4f,   // x, y, z of the plane's axis, and where on it; 0, 0, 0 is none
   reach: vec4f,   // beyond which values of each level the surface cannot be
 }
@@ -149,7 +151,8 @@ fn look(i: u32, step: u32) {
   let steep = min(1.0, abs(slope));
   let near = sound && delta == 0.0
     && (size <= max(frame.tolerance * steep, FLOOR) || (steady && abs(newton) <= frame.accept * min(1.0, STEEP * steep)));
-  let before = sound && value > 0.0;
+  // Finer levels may move the surface: level 0's value alone says where to look, and not that the ray is before it.
+  let before = sound && value > 0.0 && !hops;
   let behind = sound && value <= 0.0;
   let wasWidth = ray.high - ray.low;
   let wasLow = ray.low;
@@ -166,14 +169,13 @@ fn look(i: u32, step: u32) {
     return;
   }
   let hop = max(BAND_ENTRY * delta, least);
-  if (before && !closed && !near && !hops && t + room + hop >= ray.far) { return; }
+  if (before && !closed && !near && t + room + hop >= ray.far) { return; }
   let s = clamp(slope, -1.0, STEEPEST_RISE);
   var zero = NEVER;
   if (s < 0.0) { zero = value / -s; }
   var ahead = t;
   var stands = ray.stands & ~EXACT;
   var gap = hop;
-  var free = room;
   var asks = false; // for a jet
   if (near) {
     ahead = t + clamp(value / max(steep, 1e-6), -frame.tolerance, frame.tolerance);
@@ -185,19 +187,18 @@ fn look(i: u32, step: u32) {
     ahead = select(ray.low + 0.5 * width, chord, !enclosed || 2.0 * width <= wasWidth);
     let root = t + newton;
     if (steady && root > ray.low && root < ray.high) { ahead = root; }
+  } else if (hops && sound) {
+    ahead = t + zero;
+    gap = frame.unseen;
+    stands |= HOPPED;
   } else if (!before) {
     ahead = wasLow + ray.free; // the step left too wide a gap: it is taken back, and the next are less bold
-  } else if (hops) {
-    ahead = t + zero;
-    free = zero;
-    gap = NEVER;
-    stands |= HOPPED;
   } else {
     let widest = ray.boldness * room * (1.0 + s) / (1.0 - s);
     ahead = t + room + max(widest, min(hop, zero - room));
   }
   if (!sound && known) { ray.boldness *= 0.5; }
-  if (before) { ray.free = free; }
+  if (before) { ray.free = room; }
   ray.gap = gap;
   if (!jet && delta == 0.0) { stands |= HOPPED; }
   ray.t = min(ahead, ray.far);
@@ -206,10 +207,13 @@ fn look(i: u32, step: u32) {
   if (asks) { stands |= EXACT; }
   ray.stands = stands;
   rays[i] = ray;
-  // Whether it may look at level 0's root next: it falls to it steeply, and has not yet been there.
+  // Up to which value it may go on to level 0's root from there: it falls to it steeply, was not there before, and leaves
+  // no wider gap on its way, from the last place before the surface, than a step into the band may.
   var hopping = 0.0;
   if (frame.level > 0u && !closed && (stands & (HOPPED | INSIDE)) == 0u) {
-    hopping = max(0.0, ray.lowValue - STEEP_HOP * (ray.t - ray.low));
+    let way = ray.t - ray.low;
+    let most = ray.free + frame.unseen;
+    hopping = max(0.0, min(min(ray.lowValue - STEEP_HOP * way, ray.lowValue * (1.0 - way / most)), most - way));
   }
   places[i].point = vec4f(frame.eye + ray.t * ray.direction, hopping);
   let kind = u32(asks);

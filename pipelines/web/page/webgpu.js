@@ -382,7 +382,7 @@ class GpuTracer {
 
   setFrame(camera, { level, first, rows, precision, clip }) {
     const { eye, right, down, forward, fx, fy, cx, cy, width } = camera;
-    const { radius, reach } = this.header;
+    const { radius, reach, deltas } = this.header;
     const far = Math.hypot(...eye) + 3;
     const { queue } = this.device;
     queue.writeBuffer(this.view, 0, Float32Array.from([...right, 0, ...down, 0, ...forward, 0, ...eye, 0, fx, fy, cx, cy - first, width, rows, far / 4096, far]));
@@ -390,7 +390,8 @@ class GpuTracer {
     const numbers = new ArrayBuffer(144), real = new Float32Array(numbers), whole = new Uint32Array(numbers);
     real.set([...right, 0, ...down, 0, ...forward, 0, ...eye, radius, fx, fy, cx, cy, rule.tolerance, rule.resolution, rule.accept, rule.size]);
     [whole[3], whole[7], whole[11]] = [width, rows, first];
-    whole.set([level, Number(dot3(eye, eye) < (1.5 * radius) ** 2), this.room, 0], 24);
+    whole.set([level, Number(dot3(eye, eye) < (1.5 * radius) ** 2), this.room], 24);
+    real[27] = level ? BAND_ENTRY * deltas[0] : 0;
     if (clip) [real[28 + clip.axis], real[31]] = [1, clip.at];
     real.set(reach[level], 32);
     queue.writeBuffer(this.frame, 0, numbers);

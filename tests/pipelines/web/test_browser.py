@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import torch
 from mplicits.datasets.cameras import look_at, turntable
-from mplicits.neural_fields import extract_mesh, map_colors, sphere_trace
-from mplicits.pipelines.web.export import BITS
+from mplicits.neural_fields import extract_mesh, map_colors, save_field, sphere_trace
+from mplicits.pipelines.web.export import BITS, WebOptions, web_run
 from mplicits.pipelines.web.networks import rounded_field
 from pages import TITLE, bumpy, painted, until
 
@@ -75,8 +75,18 @@ DRAWN = [*((KINDS[0], name) for name in ("around", "coarse", "near")), (KINDS[1]
 @pytest.mark.parametrize(("kind", "name"), DRAWN, indirect=["kind"])
 def test_the_page_traces_what_this_package_traces(drawn, name):
     camera, level = cameras()[name]
-    field = rounded_field(bumpy(), BITS)
     found, counts = rendered(drawn, camera, level=level)
+    assert_same(found, rounded_field(bumpy(), BITS), camera, level)
+    # A finer level is asked in the band of the one before it alone, and no level that is not wanted.
+    for asked in (counts["values"][:3], counts["jets"][:3]):
+        assert all(fine <= before for before, fine in itertools.pairwise(asked))
+    assert counts["values"][level + 1 :] == [0] * (3 - level)  # the last are the colours
+    assert (found[..., 3] > 0).sum() <= counts["jets"][0] <= 3 * (found[..., 3] > 0).sum()
+    assert not complaints(drawn)
+
+
+def assert_same(found, field, camera, level):
+    """That a picture of a page shows what the tracer of this package finds."""
     eye, directions = camera.rays()
     hits = sphere_trace(field, eye, directions, level=level, tolerance=PRECISION, resolution=PRECISION)
     mask = hits.mask.numpy()
@@ -89,12 +99,23 @@ def test_the_page_traces_what_this_package_traces(drawn, name):
     normals[mask] = gradient.numpy()
     chord = np.linalg.norm(normals - found[..., :3], axis=-1)[both]
     assert (np.degrees(2 * np.arcsin(chord.clip(0, 2) / 2)) <= 2).mean() >= 0.99
-    # A finer level is asked in the band of the one before it alone, and no level that is not wanted.
-    for asked in (counts["values"][:3], counts["jets"][:3]):
-        assert all(fine <= before for before, fine in itertools.pairwise(asked))
-    assert counts["values"][level + 1 :] == [0] * (3 - level)  # the last are the colours
-    assert (found[..., 3] > 0).sum() <= counts["jets"][0] <= 3 * (found[..., 3] > 0).sum()
-    assert not complaints(drawn)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_residual_may_be_larger_than_its_band(browser, tmp_path, kind):
+    """Twice as large: then level 0 alone does not say on which side of the surface a place is."""
+    field = bumpy(gain=1.5)
+    places = torch.from_numpy(np.random.default_rng(0).uniform(-0.8, 0.8, (4000, 3)).astype(np.float32))
+    moved = (field.value(places, level=1) - field.value(places, level=0)).abs()
+    assert float(moved.max()) > 2 * float(field.deltas[0])
+    file, page = tmp_path / "large.safetensors", tmp_path / "large.html"
+    save_field(file, field)
+    web_run(file, page, WebOptions(levels=2, float32=True))
+    browser.get(f"{page.as_uri()}?pixel=16{'&webgl' if kind == 'WebGL 2' else ''}")
+    until(lambda: browser.execute_script("return window.mplicits?.renderer?.kind"))
+    assert browser.execute_script("return window.mplicits.renderer.kind") == kind
+    camera, level = cameras()["near"]
+    assert_same(rendered(browser, camera, level=level)[0], field, camera, level)
 
 
 def test_normals_of_the_finest_level_on_the_coarsest(opened):
