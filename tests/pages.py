@@ -1,9 +1,12 @@
-"""What the tests of pages show: a small field with colours, whose exact values are known, and patience."""
+"""What tests of pages share: a small field with colours, pictures that a page traces, what they are held against."""
 
+import base64
 import time
+from typing import NamedTuple
 
+import numpy as np
 import torch
-from mplicits.neural_fields import ColorSiren, MultiscaleSDF, Siren, TextureField, solve_sphere
+from mplicits.neural_fields import ColorSiren, MultiscaleSDF, Siren, TextureField, solve_sphere, sphere_trace
 
 PATIENCE = 60.0
 TITLE = "<img src=x onerror=alert(1)> & ball"
@@ -32,3 +35,57 @@ def until(condition):
         assert time.monotonic() < deadline, "waited in vain"
         time.sleep(0.05)
     return found
+
+
+RENDER = """
+return window.mplicits.render(arguments[0]).then((made) => {
+const bytes = new Uint8Array(made.seen.buffer);
+let text = '';
+for (let i = 0; i < bytes.length; i += 4096) text += String.fromCharCode(...bytes.subarray(i, i + 4096));
+return {seen: btoa(text), color: Array.from(made.color), counts: made.counts};
+});
+"""
+
+
+def rendered(browser, camera, **wanted):
+    """Normals and depths ``(H, W, 4)`` that the page traces, what they have cost, and among that the colours."""
+    fx, fy, cx, cy = camera.fx_fy_cx_cy
+    view = {name: getattr(camera, name).tolist() for name in ("eye", "right", "down", "forward")}
+    view |= {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "width": camera.width, "height": camera.height}
+    made = browser.execute_script(RENDER, {"camera": view, **wanted})
+    seen = np.frombuffer(base64.b64decode(made["seen"]), np.float32)
+    counts = made["counts"] | {"color": np.array(made["color"], np.float32).reshape(-1, 4)}
+    return seen.reshape(camera.height, camera.width, 4), counts
+
+
+class Differences(NamedTuple):
+    """Of a picture of a page from what the tracer of this package finds.
+
+    Attributes:
+        hits: how many rays meet the surface, by that tracer.
+        mask: share of the pixels that do in one alone.
+        depth: ``(N,)`` of those that do in both, in units of the field.
+        angle: ``(N,)`` between normals, in degrees.
+    """
+
+    hits: int
+    mask: float
+    depth: np.ndarray
+    angle: np.ndarray
+
+
+def differences(found, field, camera, level, *, tolerance, resolution) -> Differences:
+    eye, directions = camera.rays()
+    hits = sphere_trace(field, eye, directions, level=level, tolerance=tolerance, resolution=resolution)
+    mask = hits.mask.numpy()
+    both = (found[..., 3] > 0) & mask
+    normals = torch.nn.functional.normalize(
+        field.jet(hits.position[torch.from_numpy(both)], level=level).gradient, dim=-1
+    )
+    chord = np.linalg.norm(normals.numpy() - found[both][:, :3], axis=-1)
+    return Differences(
+        int(mask.sum()),
+        float(((found[..., 3] > 0) != mask).mean()),
+        np.abs(found[..., 3] - hits.depth.numpy())[both],
+        np.degrees(2 * np.arcsin(chord.clip(0, 2) / 2)),
+    )

@@ -61,7 +61,7 @@ export class MplicitsField extends HTMLElement {
   readonly header: Record<string, unknown> | null;
   readonly renderer: Renderer | null;
   render(wanted: Wanted): Promise<Picture>;
-  bench(wanted?: { size?: number; frames?: number; level?: number }): Promise<Record<string, unknown>>;
+  bench(wanted?: { size?: number; frames?: number; level?: number; rate?: number }): Promise<Record<string, unknown>>;
   turntable(wanted?: { frames?: number; side?: number; rate?: number }): Promise<{ blob: Blob; ending: string }>;
 }
 

@@ -237,26 +237,32 @@ class Page {
     return this.renderer.frame(camera, { level, normalLevel, precision, colored, time });
   }
 
-  // Pictures of a camera that goes around, one in each frame: how many in a second, and what one costs.
-  async bench({ size = 512, frames = 12, level = this.level } = {}) {
+  // Pictures of a camera that goes around, one in each frame: how many in a second, and what one costs; how long one takes
+  // by `frameTime`, here and on an adapter of `rate` TFLOP a second whose passes cost what they do here.
+  async bench({ size = 512, frames = 12, level = this.level, rate = 0 } = {}) {
     const orbit = new Orbit(this.saved.header.view);
-    let milliseconds = 0, operations = 0, passes = 0, read = 0;
+    let adapter = null, milliseconds = 0, operations = 0, passes = 0, read = 0;
     const evaluations = this.renderer.counts().values.map(() => 0);
     for (let frame = 0; frame < frames; frame++) {
       await new Promise((resolve) => { setTimeout(resolve, 0); });
       orbit.azimuth = (360 * frame) / frames;
-      const { counts, milliseconds: took } = await this.render({ camera: orbit.camera(size, size), level });
+      const camera = orbit.camera(size, size), made = await this.render({ camera, level });
+      const { counts, milliseconds: took } = made;
       milliseconds += took / frames;
       passes += counts.passes / frames;
       read += counts.read / frames;
       operations += this.renderer.operations(counts) / frames;
       evaluations.forEach((_, index) => { evaluations[index] += (counts.values[index] + counts.jets[index]) / frames / size ** 2; });
+      if (frame === frames - 1) adapter = await this.renderer.adapter(camera, made, level);
     }
-    return { size, level, frames, fps: 1000 / milliseconds, milliseconds, evaluations, passes, read, operations };
+    const model = frameTime({ operations, passes }, adapter);
+    const elsewhere = rate ? frameTime({ operations, passes }, { ...adapter, rate: 1e9 * rate }) : null;
+    return { size, level, frames, fps: 1000 / milliseconds, milliseconds, evaluations, passes, read, operations, ...adapter, model, elsewhere, wanted: rate };
   }
 
-  describeBench({ size, level, fps, evaluations, passes, read, operations }) {
+  describeBench({ size, level, fps, evaluations, passes, read, operations, rate, pass, model, elsewhere, wanted }) {
     const each = evaluations.map(digits).join(' + ');
-    this.ui.facts.textContent = `level ${level} at ${size} × ${size}: ${digits(fps)} pictures a second; ${each} evaluations per pixel, ${digits(operations / 1e9)} GFLOP, ${digits(passes)} passes, ${digits(read / 2 ** 20)} MiB read back, each picture`;
+    const other = elsewhere === null ? '' : `; ${digits(elsewhere)} ms at ${digits(wanted)} TFLOP/s`;
+    this.ui.facts.textContent = `level ${level} at ${size} × ${size}: ${digits(fps)} pictures a second; ${each} evaluations per pixel, ${digits(operations / 1e9)} GFLOP, ${digits(passes)} passes, ${digits(read / 2 ** 20)} MiB read back, each picture; by ${digits(rate / 1e6)} GFLOP/s and ${digits(1000 * pass)} µs a pass it would take ${digits(model)} ms${other}`;
   }
 }

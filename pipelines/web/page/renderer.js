@@ -108,6 +108,26 @@ class Renderer {
     return structuredClone(this.tally);
   }
 
+  // What `frameTime` wants to know of this adapter, measured: the networks up to a level at what a picture saw, and a
+  // picture of nothing.
+  async adapter(camera, { seen }, level) {
+    const { points } = hitsOf(camera, seen, 0), least = 3 * 16384;
+    const many = new Float32Array(points.length * Math.max(1, Math.ceil(least / Math.max(1, points.length))));
+    for (let at = 0; at < many.length; at += points.length) many.set(points, at);
+    const timed = async (work) => {
+      await work(); // once for what is made at the first time
+      this.clear();
+      const started = performance.now();
+      await work();
+      return performance.now() - started;
+    };
+    const computing = await timed(() => this.values(many, level));
+    const done = this.operations(this.counts());
+    const away = { ...camera, forward: camera.forward.map((part) => -part), right: camera.right.map((part) => -part) };
+    const empty = await timed(() => this.frame(away, { level }));
+    return { rate: done / computing, pass: empty / Math.max(1, this.counts().passes) };
+  }
+
   clear() {
     for (const kind of ['values', 'jets']) this.tally[kind].fill(0);
     Object.assign(this.tally, { passes: 0, read: 0 });
@@ -122,5 +142,9 @@ class Renderer {
     }, 0);
   }
 }
+
+// How long a picture takes by its counts, in milliseconds: an adapter does so many operations in one of them, and each
+// pass costs so much even if it has nothing to do.
+const frameTime = ({ operations, passes }, { rate, pass }) => operations / rate + passes * pass;
 
 const openRenderer = (gl, parts, saved) => new Renderer(gl, parts, saved);

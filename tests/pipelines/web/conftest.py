@@ -1,12 +1,10 @@
 """One browser, and one page of a field with colours, for all tests of pages; skipped where there is no Chromium."""
 
 import pytest
-from browser import CHROMEDRIVER, CHROMIUM, FLAGS
+from browser import start_browser
 from mplicits.neural_fields import Similarity, save_field, save_texture
 from mplicits.pipelines.cli import main
 from pages import TITLE, bumpy, painted, until
-
-WINDOW = ("--window-size=320,320",)
 
 
 @pytest.fixture(scope="session")
@@ -21,16 +19,10 @@ def page(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def browser(tmp_path_factory):
-    if CHROMIUM is None or CHROMEDRIVER is None:
+    pytest.importorskip("selenium")
+    driver = start_browser(tmp_path_factory.mktemp("chromium"))
+    if driver is None:
         pytest.skip("no chromium and chromedriver on this machine")
-    webdriver = pytest.importorskip("selenium.webdriver")
-    options = webdriver.ChromeOptions()
-    options.binary_location = CHROMIUM
-    for flag in (*FLAGS, *WINDOW, f"--user-data-dir={tmp_path_factory.mktemp('chromium')}"):
-        options.add_argument(flag)
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-    driver = webdriver.Chrome(options=options, service=webdriver.ChromeService(CHROMEDRIVER))
-    driver.set_script_timeout(120)  # software compiles shaders slowly where others hold the cores
     yield driver
     driver.quit()
 

@@ -3,17 +3,17 @@
 What it traces is compared with the tracer of this package, both to the same precision, from the same cameras.
 """
 
-import base64
 import itertools
 
 import numpy as np
+import pages
 import pytest
 import torch
 from mplicits.datasets.cameras import look_at, turntable
-from mplicits.neural_fields import extract_mesh, map_colors, save_field, sphere_trace
+from mplicits.neural_fields import extract_mesh, map_colors, save_field
 from mplicits.pipelines.web.export import BITS, WebOptions, web_run
 from mplicits.pipelines.web.networks import rounded_field
-from pages import TITLE, bumpy, painted, until
+from pages import TITLE, bumpy, differences, painted, until
 
 pytest.importorskip("selenium")
 
@@ -23,14 +23,6 @@ from selenium.webdriver.common.keys import Keys
 SIZE = (96, 72)
 # Depths of both tracers are known to this, in units of the field.
 PRECISION = 1e-4
-RENDER = """
-return window.mplicits.render(arguments[0]).then((made) => {
-const bytes = new Uint8Array(made.seen.buffer);
-let text = '';
-for (let i = 0; i < bytes.length; i += 4096) text += String.fromCharCode(...bytes.subarray(i, i + 4096));
-return {seen: btoa(text), color: Array.from(made.color), counts: made.counts};
-});
-"""
 
 
 def complaints(browser):
@@ -48,14 +40,7 @@ def pictures(browser):
 
 
 def rendered(browser, camera, **wanted):
-    """Normals and depths ``(H, W, 4)`` that the page traces, what they have cost, and among that the colours."""
-    fx, fy, cx, cy = camera.fx_fy_cx_cy
-    view = {name: getattr(camera, name).tolist() for name in ("eye", "right", "down", "forward")}
-    view |= {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "width": camera.width, "height": camera.height}
-    made = browser.execute_script(RENDER, {"camera": view, "precision": PRECISION, **wanted})
-    seen = np.frombuffer(base64.b64decode(made["seen"]), np.float32)
-    counts = made["counts"] | {"color": np.array(made["color"], np.float32).reshape(-1, 4)}
-    return seen.reshape(camera.height, camera.width, 4), counts
+    return pages.rendered(browser, camera, precision=PRECISION, **wanted)
 
 
 def cameras():
@@ -87,18 +72,11 @@ def test_the_page_traces_what_this_package_traces(drawn, name):
 
 def assert_same(found, field, camera, level):
     """That a picture of a page shows what the tracer of this package finds."""
-    eye, directions = camera.rays()
-    hits = sphere_trace(field, eye, directions, level=level, tolerance=PRECISION, resolution=PRECISION)
-    mask = hits.mask.numpy()
-    assert 500 < mask.sum() <= mask.size
-    assert ((found[..., 3] > 0) != mask).mean() <= 5e-4
-    both = (found[..., 3] > 0) & mask
-    assert (np.abs(found[..., 3] - hits.depth.numpy())[both] <= 1e-3).mean() >= 0.999
-    gradient = torch.nn.functional.normalize(field.jet(hits.position[mask], level=level).gradient, dim=-1)
-    normals = np.zeros((*mask.shape, 3), np.float32)
-    normals[mask] = gradient.numpy()
-    chord = np.linalg.norm(normals - found[..., :3], axis=-1)[both]
-    assert (np.degrees(2 * np.arcsin(chord.clip(0, 2) / 2)) <= 2).mean() >= 0.99
+    found = differences(found, field, camera, level, tolerance=PRECISION, resolution=PRECISION)
+    assert found.hits > 500
+    assert found.mask <= 5e-4
+    assert (found.depth <= 1e-3).mean() >= 0.999
+    assert (found.angle <= 2).mean() >= 0.99
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -163,7 +141,7 @@ def test_a_single_ray_finds_what_the_picture_shows(opened):
 
 def test_the_bench_counts_what_networks_are_asked(opened):
     found = opened.execute_async_script(
-        "const done = arguments[0]; window.mplicits.bench({size: 24, frames: 2, level: 1}).then(done);"
+        "const done = arguments[0]; window.mplicits.bench({size: 24, frames: 2, level: 1, rate: 2}).then(done);"
     )
     base, fine, none, colors = found["evaluations"]
     assert base > fine > 0
@@ -173,6 +151,12 @@ def test_the_bench_counts_what_networks_are_asked(opened):
     assert once < found["operations"] < 2 * once
     assert found["fps"] > 0
     assert found["read"] > 0
+    # The model of the time: operations at a rate, and passes.
+    assert found["rate"] > 0
+    assert found["pass"] > 0
+    passes = found["pass"] * found["passes"]
+    assert found["model"] == pytest.approx(found["operations"] / found["rate"] + passes)
+    assert found["elsewhere"] == pytest.approx(found["operations"] / 2e9 + passes)
 
 
 def test_what_a_person_sees_and_does(opened):
