@@ -29,8 +29,8 @@ def painted():
     )
 
 
-def until(condition):
-    deadline = time.monotonic() + PATIENCE
+def until(condition, seconds=PATIENCE):
+    deadline = time.monotonic() + seconds
     while not (found := condition()):
         assert time.monotonic() < deadline, "waited in vain"
         time.sleep(0.05)

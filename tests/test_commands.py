@@ -249,7 +249,7 @@ def reason_to_skip(line: str) -> str | None:
     for begin, reason in elsewhere.items():
         if line.startswith(f"{begin} "):
             return reason
-    needs = {"view": "viser", "poisson": "pymeshlab", "--texture": "xatlas"}
+    needs = {"view": "websockets", "poisson": "pymeshlab", "--texture": "xatlas"}
     for word, module in needs.items():
         if word in words and find_spec(module) is None:
             return f"{module} is not installed"

@@ -6,8 +6,8 @@ import argparse
 import re
 import threading
 import time
-from collections.abc import Callable, Sequence
-from contextlib import nullcontext
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -274,14 +274,16 @@ ANIMATE = Command(
 
 def _view_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add_flags(parser, "run", "--device")
+    add_flags(parser, "run", "--time")
     add_flags(parser, "--up", default="y")
-    add("--cloud", metavar="FILE", help="what errors are measured from (default: what the run was fitted to)")
-    what = "images of about N × N pixels (512)"
-    add("--size", type=whole(64, 4096), default=512, metavar="N", help=what)
     add("--host", default="127.0.0.1", help="address to listen on (127.0.0.1: this machine only)")
     add("--port", type=_port, metavar="N", help="port to listen on (default: a free one from 8080 up)")
     add("--open", action=argparse.BooleanOptionalAction, default=False, help="open a browser")
+    add("--stream", action="store_true", help="trace here, and send pictures: for browsers without a graphics adapter")
+    add("--cloud", metavar="FILE", help="streamed: what errors are measured from (default: what the run was fitted to)")
+    what = "streamed: images of about N × N pixels (512)"
+    add("--size", type=whole(64, 4096), metavar="N", help=what)
+    add_flags(parser, "--device", default=None, help="streamed: where to trace (auto)")
 
 
 def _port(text: str) -> int | None:
@@ -290,18 +292,17 @@ def _port(text: str) -> int | None:
 
 
 def _view(arguments: argparse.Namespace) -> int:
-    from ..run.machine import choose_device
-    from ..viewer.server import Viewer, open_run
-
-    device = choose_device(arguments.device)
-    shown = open_run(arguments.run, cloud=arguments.cloud, side=arguments.size, device=device)
-    with Viewer(shown, host=arguments.host, port=arguments.port, up=arguments.up) as viewer:
+    streamed = ("cloud", "size", "device")
+    stream = arguments.stream or any(getattr(arguments, name) is not None for name in streamed)
+    if stream and arguments.time is not None:
+        raise input_error("--time: is a slider in the streaming viewer; leave it out")
+    with _streamed(arguments) if stream else _served(arguments) as url:
         try:
-            print(f"{arguments.run}: open {viewer.url} in a browser; Ctrl-C ends it", flush=True)
+            print(f"{arguments.run}: open {url} in a browser; Ctrl-C ends it", flush=True)
             if arguments.open:
                 import webbrowser
 
-                webbrowser.open(viewer.url)
+                webbrowser.open(url)
             while not threading.Event().wait(3600):  # with a time limit, or Windows would not notice Ctrl-C
                 pass
         except KeyboardInterrupt:
@@ -309,12 +310,47 @@ def _view(arguments: argparse.Namespace) -> int:
     return 0
 
 
+@contextmanager
+def _served(arguments: argparse.Namespace) -> Iterator[str]:
+    """The page of a run, and where it is; of a field that no shader knows, pictures."""
+    from ..web.export import WebOptions
+    from ..web.networks import NoShaderError
+    from ..web.serve import PageServer
+    from ..web.watch import Watcher
+
+    options = WebOptions(time=arguments.time, up=arguments.up)
+    try:
+        server = PageServer(arguments.run, options, host=arguments.host, port=arguments.port)
+    except NoShaderError:
+        print(f"{arguments.run}: no shader knows this kind of field; it is traced here, and pictures are sent")
+        with _streamed(arguments) as url:
+            yield url
+        return
+    with Watcher(Path(arguments.run), options, server=server):
+        yield server.url
+
+
+@contextmanager
+def _streamed(arguments: argparse.Namespace) -> Iterator[str]:
+    """The viewer that traces on this machine, and where it is."""
+    from ..run.machine import choose_device
+    from ..viewer.server import Viewer, open_run
+
+    device = choose_device(arguments.device or "auto")
+    shown = open_run(arguments.run, cloud=arguments.cloud, side=arguments.size or 512, device=device)
+    with Viewer(shown, host=arguments.host, port=arguments.port, up=arguments.up) as viewer:
+        yield viewer.url
+
+
 VIEW = Command(
     "look at a fit in the browser",
     """  mplicits view runs/scan
   mplicits view runs/scan --up z --open
-  mplicits view runs/scan --port 9000""",
+  mplicits view runs/scan --port 9000
+  mplicits view runs/scan --stream""",
     _view_arguments,
     _view,
-    "Look at a fit in the browser: the traced field, its levels, meshes, bands and slices.",
+    "Look at a fit in the browser: the page of `mplicits web`, traced by the browser's own graphics adapter, with each "
+    "new checkpoint of a run that is still fitted. With --stream this machine traces, and shows meshes, bands and "
+    "errors too.",
 )

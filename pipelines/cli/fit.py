@@ -147,7 +147,7 @@ def _watched(arguments: argparse.Namespace) -> AbstractContextManager[object]:
     """The run in the browser while it grows, if that is asked for."""
     if not arguments.watch:
         return nullcontext()
-    from ..viewer.watch import Watcher
+    from ..web.watch import Watcher
 
     return Watcher(arguments.out, resume=arguments.resume, say=lambda line: print(line, file=sys.stderr))
 

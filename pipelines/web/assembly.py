@@ -15,7 +15,7 @@ from typing import Any
 from ...neural_fields.files import write_whole
 from .payload import deflated
 
-__all__ = ["fill_page", "write_folder"]
+__all__ = ["field_file", "fill_page", "write_folder"]
 
 SCRIPTS = (
     "decode.js",
@@ -41,17 +41,22 @@ POLICY = (
     "default-src 'none'; script-src 'sha256-{boot}' 'sha256-{script}'; style-src 'sha256-{style}'; "
     "img-src blob: data:; base-uri 'none'; form-action 'none'"
 )
+# A page that is served live hears of new fields, from where it came from and from nowhere else.
+LIVE_POLICY = "; connect-src 'self'"
 
 
-def fill_page(header: Mapping[str, Any], data: bytes) -> str:
+def fill_page(header: Mapping[str, Any], data: bytes, *, live: bool = False) -> str:
     """The page with a header and its bytes in it, and a policy that lets its own script and styles run, and no others.
 
     What comes from the run stands in blocks of data, which browsers do not run, and in which no "<" is left.
+    A ``live`` page also asks where it came from for new fields, by a WebSocket.
     """
-    script = "\n" + "\n".join(_bare(_source(name)) for name in (*SCRIPTS, "main.js"))
+    scripts = (*SCRIPTS, "main.js", *(("file.js", "live.js") if live else ()))
+    script = "\n" + "\n".join(_bare(_source(name)) for name in scripts)
     style = "\n" + _source("style.css")
     boot = "\n" + _bare(_source("boot.js"))
     policy = POLICY.format(boot=_digest(boot), script=_digest(script), style=_digest(style))
+    policy += LIVE_POLICY if live else ""
     parts = {
         "POLICY": policy,
         "STYLE": style,
@@ -66,9 +71,8 @@ def fill_page(header: Mapping[str, Any], data: bytes) -> str:
 def write_folder(out: Path, header: Mapping[str, Any], data: bytes) -> None:
     """Write what another page needs to show a field, and the page of its own beside it.
 
-    ``field.bin`` is `MAGIC`, the length of the header as an unsigned number of four bytes, little-endian, the header in
-    JSON, and the deflated bytes; ``mplicits-field.js`` an ES module that defines the element ``<mplicits-field>``; its
-    types, and a README that says how to use it, come with it.
+    ``field.bin`` is a `field_file`, ``mplicits-field.js`` an ES module that defines the element ``<mplicits-field>``;
+    its types, and a README that says how to use it, come with it.
 
     Args:
         out: the folder, which is made if it is not there.
@@ -79,19 +83,24 @@ def write_folder(out: Path, header: Mapping[str, Any], data: bytes) -> None:
         InputError: a file cannot be written.
     """
     out.mkdir(parents=True, exist_ok=True)
-    text = _header(header).encode()
     title = " ".join(str(header["title"]).split())
-    write_whole(out / "field.bin", MAGIC + struct.pack("<I", len(text)) + text + data)
+    write_whole(out / "field.bin", field_file(header, data))
     write_whole(out / "mplicits-field.js", _module())
     write_whole(out / "mplicits-field.d.ts", _source("mplicits-field.d.ts"))
     write_whole(out / "README.md", _source("embed.md").replace("@TITLE@", title))
     write_whole(out / "index.html", fill_page(header, data))
 
 
+def field_file(header: Mapping[str, Any], data: bytes) -> bytes:
+    """`MAGIC`, the length of the header as four bytes, little-endian, the header in JSON, and the deflated bytes."""
+    text = _header(header).encode()
+    return MAGIC + struct.pack("<I", len(text)) + text + data
+
+
 def _module() -> str:
     texts = {"STYLE": _source("style.css"), "SHADERS": _shaders()}
     known = "\n".join(f"const {name} = {json.dumps(text)};" for name, text in texts.items())
-    return "\n".join((MARK, known, *(_bare(_source(name)) for name in (*SCRIPTS, "element.js")))) + "\n"
+    return "\n".join((MARK, known, *(_bare(_source(name)) for name in (*SCRIPTS, "file.js", "element.js")))) + "\n"
 
 
 def _header(header: Mapping[str, Any]) -> str:

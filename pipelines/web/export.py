@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, overload
+from typing import Any, NamedTuple, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +36,7 @@ from .networks import Rounding, network_layers, rounding_error, shader_levels, t
 from .payload import Payload
 from .shell import GRID, shell_mesh, surface_reach
 
-__all__ = ["BITS", "PAGES", "WebOptions", "WebPage", "web_run"]
+__all__ = ["BITS", "PAGES", "Packed", "WebOptions", "WebPage", "pack_run", "web_run"]
 
 PAGES = (".html", ".htm")
 BITS = 13
@@ -85,6 +85,20 @@ class WebPage:
     rounding: tuple[Rounding, ...]
 
 
+class Packed(NamedTuple):
+    """A run as a page carries it.
+
+    Attributes:
+        header: what is shown, and what stands where among the bytes.
+        data: deflated.
+        page: what is told of it; the size is not known yet.
+    """
+
+    header: dict[str, Any]
+    data: bytes
+    page: WebPage
+
+
 def web_run(
     run: str | Path,
     out: str | Path,
@@ -104,6 +118,33 @@ def web_run(
         InputError: there is no such run, it has no surface or is of a kind that no shader knows, or the file cannot be
             written.
     """
+    header, data, page = pack_run(run, options)
+    out = Path(out)
+    if out.suffix.lower() in PAGES:
+        write_whole(out, fill_page(header, data))
+    else:
+        write_folder(out, header, data)
+    done = dataclasses.replace(page, size=sum(part.stat().st_size for part in _fetched(out)))
+    if say is not None and header["moves"]:
+        say("it moves: all of its moments are on the page; --time T shows one")
+    if say is not None and done.rounding:
+        worst = [max(getattr(part, key) for part in done.rounding) for key in ("value", "angle")]
+        length = worst[0] * header["unit"]
+        say(f"weights of {BITS} bits: distances change by at most {length:.2g} input units, normals by {worst[1]:.2g}°")
+    return done
+
+
+def pack_run(run: str | Path, options: WebOptions | None = None) -> Packed:
+    """What a page shows of a run.
+
+    Args:
+        run: run directory or .safetensors file.
+        options: what to show.
+
+    Raises:
+        NoShaderError: no shader knows this kind of field.
+        InputError: there is no such run, or it has no surface.
+    """
     options = options or WebOptions()
     file = find_field(run)
     shown, similarity = _shown(file, options.time)
@@ -112,21 +153,7 @@ def web_run(
     if options.levels is not None:
         chosen_level(shown, file, options.levels - 1, flag="--levels")
         shown = _coarse(shown, options.levels)
-    name = options.title or _name_of(file)
-    header, data, page = _content(shown, texture, similarity, name, file, options)
-    out = Path(out)
-    if out.suffix.lower() in PAGES:
-        write_whole(out, fill_page(header, data))
-    else:
-        write_folder(out, header, data)
-    done = dataclasses.replace(page, size=sum(part.stat().st_size for part in _fetched(out)))
-    if say is not None and shown.in_dim == 4:
-        say("it moves: all of its moments are on the page; --time T shows one")
-    if say is not None and done.rounding:
-        worst = [max(getattr(part, key) for part in done.rounding) for key in ("value", "angle")]
-        length = worst[0] * similarity.scale
-        say(f"weights of {BITS} bits: distances change by at most {length:.2g} input units, normals by {worst[1]:.2g}°")
-    return done
+    return _content(shown, texture, similarity, options.title or _name_of(file), file, options)
 
 
 def _fetched(out: Path) -> list[Path]:
@@ -163,8 +190,7 @@ def _name_of(file: Path) -> str:
 
 def _content(
     shown: Field, texture: TextureField | None, similarity: Similarity, name: str, file: Path, options: WebOptions
-) -> tuple[dict[str, Any], bytes, WebPage]:
-    """Header and bytes of the page, and what is told of it."""
+) -> Packed:
     moving = shown if isinstance(shown, SpaceTimeSDF) else None
     stills: list[Field] = [shown] if moving is None else [moving.at(float(t)) for t in MOMENTS]
     shader_levels(stills[0], file)
@@ -209,7 +235,7 @@ def _content(
         "rounding": [dataclasses.asdict(part) for part in rounding],
         **described,
     }
-    return header, data, WebPage(0, len(levels), colors is not None, len(shell.faces), tuple(rounding))
+    return Packed(header, data, WebPage(0, len(levels), colors is not None, len(shell.faces), tuple(rounding)))
 
 
 def _outlines(stills: list[Field]) -> list[tuple[Field, NDArray[np.floating]]]:

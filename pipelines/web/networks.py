@@ -18,9 +18,22 @@ from numpy.typing import NDArray
 from ...neural_fields import Field, InputError, MultiscaleSDF, Siren
 from ...neural_fields.multiscale import levels_of
 
-__all__ = ["Layer", "Rounding", "network_layers", "rounded_field", "rounding_error", "shader_levels", "taper_of"]
+__all__ = [
+    "Layer",
+    "NoShaderError",
+    "Rounding",
+    "network_layers",
+    "rounded_field",
+    "rounding_error",
+    "shader_levels",
+    "taper_of",
+]
 
 TURN = 2 * math.pi
+
+
+class NoShaderError(InputError):
+    """A field of a kind that the page's shaders do not know."""
 
 
 @dataclass(frozen=True)
@@ -63,15 +76,15 @@ def shader_levels(field: Field, name: object) -> list[Siren]:
         name: of its file, for the message.
 
     Raises:
-        InputError: a level is no SIREN, and no shader here knows it.
+        NoShaderError: a level is no SIREN, and no shader here knows it.
     """
     levels = levels_of(field)
     networks = [level for level in levels if isinstance(level, Siren)]
     if field.in_dim != 3 or len(networks) != len(levels):
         odd = next((level for level in levels if not isinstance(level, Siren)), field)
-        raise InputError(
+        raise NoShaderError(
             f"{name}: a page traces SIRENs and their levels, not a {type(odd).__name__}; "
-            "look at it with `mplicits view`, or fit its mesh"
+            "look at it with `mplicits view --stream`, or fit its mesh"
         )
     return networks
 

@@ -10,11 +10,13 @@ class Controls {
     this.tools = page.tools;
     this.held = new Map();
     this.fill();
+    this.themes();
     this.panel();
     this.pointers();
     this.keys();
   }
 
+  // What the field has: levels, colours, moments; again when another takes its place.
   fill() {
     const { ui, page } = this;
     const { levels, colors, moves } = page.saved.header;
@@ -23,16 +25,21 @@ class Controls {
     ui.levels.hidden = !last;
     ui.normals.replaceChildren(...levels.map((_, index) => new Option(index === last ? `${index} (finest)` : index, index)));
     ui.normals.parentNode.hidden = !last;
+    for (const option of [...ui.shading.options]) if (option.value > 2) option.remove();
     if (colors) ui.shading.prepend(new Option('colours', 3), new Option('bare colours', 4));
+    ui.times.hidden = !moves;
+    if (moves) ui.saveFilm.textContent = 'Save film';
+    this.show();
+  }
+
+  // Light or dark, as the system is.
+  themes() {
     const bright = matchMedia('(prefers-color-scheme: light)');
     this.setTheme(bright.matches ? 'light' : 'dark');
     bright.addEventListener('change', () => {
       this.setTheme(bright.matches ? 'light' : 'dark');
-      page.present();
+      this.page.present();
     }, this.heard);
-    ui.times.hidden = !moves;
-    if (moves) ui.saveFilm.textContent = 'Save film';
-    this.show();
   }
 
   // Listeners on what outlives the page end with it.

@@ -8,16 +8,21 @@ async function start() {
     const saved = await decodeField(text('header'), bytesOf(text('data')));
     document.title = saved.header.title;
     const page = new Page(saved, shaderParts(text('shaders')), ui, wishes(search));
-    window.mplicits = { render: (wanted) => page.render(wanted), bench: (wanted) => page.bench(wanted), turntable: (wanted) => turntable(page, wanted), get renderer() { return page.renderer; }, header: saved.header };
+    window.mplicits = { render: (wanted) => page.render(wanted), bench: (wanted) => page.bench(wanted), turntable: (wanted) => turntable(page, wanted), get renderer() { return page.renderer; }, get header() { return page.saved.header; } };
     if (search.has('bench')) {
       const size = Math.min(1024, Math.max(16, Number(search.get('bench')) || 512));
       page.bench({ size, rate: Math.max(0, Number(search.get('rate')) || 0) }).then((found) => page.describeBench(found)).catch((error) => ui.failed(error));
     }
+    return page;
   } catch (error) {
     ui.failed(error);
+    return null;
   }
 }
 
 // The script runs as soon as it is unpacked; the data behind it may not all be there yet.
-if (document.readyState === 'loading') addEventListener('DOMContentLoaded', start);
-else start();
+const loaded = new Promise((resolve) => {
+  if (document.readyState === 'loading') addEventListener('DOMContentLoaded', resolve);
+  else resolve();
+});
+const begun = loaded.then(start);

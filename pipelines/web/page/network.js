@@ -132,6 +132,20 @@ class Networks {
     return net;
   }
 
+  // Ends it: the adapter's memory is given back.
+  close() {
+    const { gl } = this;
+    for (const { program } of Object.values(this.programs)) gl.deleteProgram(program);
+    for (const { sines, output } of this.nets) {
+      for (const texture of [...sines.flatMap(({ forward, back, bias }) => [forward, back, bias]), output]) gl.deleteTexture(texture);
+    }
+    for (const held of [...this.work, ...this.phases, this.values, this.triples]) {
+      gl.deleteTexture(held.texture);
+      gl.deleteFramebuffer(held.buffer);
+    }
+    gl.deleteTexture(this.points);
+  }
+
   // The moment, of a field that moves: b + t w, the weights of time folded into the first biases.
   at(time) {
     const { gl } = this;

@@ -61,6 +61,28 @@ class Page {
     this.paint = new Paint(gl, this.parts);
   }
 
+  // Another field in the place of this one, seen from where this one was: a run that has grown. The finest level stays the
+  // finest, any other what it was.
+  async adopt(saved) {
+    const renderer = openRenderer(this.gl, this.parts, saved);
+    await renderer.open();
+    if (this.lost) return renderer.close();
+    const before = this.renderer, finest = this.saved.header.levels.length - 1, last = saved.header.levels.length - 1;
+    const { axis, at } = this.section;
+    this.section.drop();
+    Object.assign(this, { saved, renderer, section: new Section(saved.header) });
+    Object.assign(this.section, { axis, at });
+    before.close();
+    this.level = this.level === finest ? last : Math.min(this.level, last);
+    this.normals = this.normals === finest ? last : Math.min(this.normals, last);
+    if (!saved.header.colors) this.shading = Math.min(this.shading, 2);
+    this.describe();
+    this.controls.fill();
+    this.version++;
+    clearTimeout(this.timer);
+    return this.changed();
+  }
+
   describe() {
     const { header } = this.saved;
     this.ui.title.textContent = header.title;

@@ -159,6 +159,16 @@ class Hull {
     this.target = null;
   }
 
+  close() {
+    const { gl, target } = this;
+    gl.deleteVertexArray(this.places);
+    gl.deleteProgram(this.program.program);
+    if (!target) return;
+    gl.deleteTexture(target.texture);
+    gl.deleteFramebuffer(target.buffer);
+    gl.deleteRenderbuffer(this.depth);
+  }
+
   // For each pixel of rows [first, first + rows): r = nearest front face, g = farthest back face; 0 where there is none.
   crossings(camera, first, rows) {
     const { gl, program } = this;
@@ -236,7 +246,10 @@ class Tracer {
     return false;
   }
 
-  close() {}
+  close() {
+    this.networks.close();
+    this.hull.close();
+  }
 
   value(points, count, level) {
     return this.field.value(points, count, level);

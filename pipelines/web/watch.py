@@ -1,4 +1,4 @@
-"""``mplicits fit --watch``: a run in the browser while it grows, checkpoint by checkpoint."""
+"""A run in the browser while it grows, checkpoint by checkpoint: ``mplicits view``, and ``fit --watch``."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from pathlib import Path
 
 from ...neural_fields import InputError
 from ..run.folder import FIELD_FILE
-from .server import Viewer, import_viser, open_run
+from .export import WebOptions
+from .serve import PageServer, import_websockets
 
 __all__ = ["Watcher"]
 
@@ -18,37 +19,39 @@ LOOK_EVERY = 1.0  # seconds
 class Watcher:
     """Shows what a training writes into its run directory; use it as a context manager around the training.
 
-    A thread of its own looks for a new checkpoint once a second, and loads it if a browser is connected: nothing is
-    evaluated while nobody looks. The viewer begins with the first checkpoint. Whatever goes wrong in it is said once,
-    and leaves the training alone.
+    A thread of its own looks for a new checkpoint once a second, and makes a page of it if a browser is connected:
+    nothing is evaluated while nobody looks. The page begins with the first checkpoint. Whatever goes wrong in it is
+    said once, and leaves the training alone.
 
     Args:
-        run: directory of the run.
+        run: directory of the run, or its .safetensors file.
+        options: what is shown.
+        server: that shows the run already; it is closed at the end.
         resume: whether a field that is there already is of this run, and to be shown.
-        port: the viewer's, or None for the first free one.
-        up: the axis that points up, "y" or "z".
+        port: the server's, or None for the first free one.
         say: told where to look, and what went wrong.
         look_every: seconds between two looks.
 
     Raises:
-        InputError: viser is not installed.
+        InputError: websockets is not installed.
     """
 
     def __init__(
         self,
         run: Path,
+        options: WebOptions | None = None,
         *,
+        server: PageServer | None = None,
         resume: bool = False,
         port: int | None = None,
-        up: str = "y",
         say: Callable[[str], object] = print,
         look_every: float = LOOK_EVERY,
     ) -> None:
-        import_viser()
-        self.run, self.port, self.up, self.say = run, port, up, say
-        self.viewer: Viewer | None = None
+        import_websockets()
+        self.run, self.options, self.port, self.say = run, options, port, say
+        self.server = server
         self.shown = 0  # how many checkpoints were shown
-        self._every, self._seen = look_every, None if resume else self._state()
+        self._every, self._seen = look_every, None if resume and server is None else self._state()
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._look_on, daemon=True)
 
@@ -59,13 +62,14 @@ class Watcher:
     def __exit__(self, *_: object) -> None:
         self._over.set()
         self._thread.join()
-        if self.viewer is not None:
-            self.viewer.close()
+        if self.server is not None:
+            self.server.close()
 
     def _state(self) -> tuple[int, int] | None:
         """What tells one checkpoint from the next: the time of its file, and which file that is; None without one."""
+        file = self.run / FIELD_FILE if self.run.is_dir() else self.run
         try:
-            facts = (self.run / FIELD_FILE).stat()
+            facts = file.stat()
         except OSError:
             return None
         return facts.st_mtime_ns, facts.st_ino
@@ -79,16 +83,17 @@ class Watcher:
 
     def _look(self) -> None:
         state = self._state()
-        if state is None or state == self._seen or (self.viewer is not None and not self.viewer.num_clients):
+        if state is None or state == self._seen or (self.server is not None and not self.server.num_clients):
             return
         try:
-            shown = open_run(self.run, say=lambda _: None)
-        except InputError:  # replaced or removed just now: there will be another
-            return
+            if self.server is None:
+                self.server = PageServer(self.run, self.options, port=self.port)
+                self.say(f"--watch: open {self.server.url} in a browser")
+            else:
+                self.server.update()
+        except InputError as error:
+            if self.server is None and self.port is not None and "--port" in str(error):
+                raise
+            return  # replaced or removed just now, or without a surface yet: there will be another
         self._seen = state
-        if self.viewer is None:
-            self.viewer = Viewer(shown, port=self.port, up=self.up)
-            self.say(f"--watch: open {self.viewer.url} in a browser")
-        else:
-            self.viewer.show(shown)
         self.shown += 1
