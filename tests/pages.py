@@ -29,8 +29,8 @@ def painted():
     )
 
 
-def until(condition, seconds=PATIENCE):
-    deadline = time.monotonic() + seconds
+def until(condition):
+    deadline = time.monotonic() + PATIENCE
     while not (found := condition()):
         assert time.monotonic() < deadline, "waited in vain"
         time.sleep(0.05)
