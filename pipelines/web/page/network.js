@@ -107,6 +107,7 @@ class Networks {
     this.rows = 0;
     this.reserve(4);
     this.counts = { values: layersOfAll.map(() => 0), jets: layersOfAll.map(() => 0), passes: 0, read: 0 };
+    if (gl.getError() === gl.OUT_OF_MEMORY) throw new PageError('This graphics adapter has not the memory for these networks. `mplicits web --levels 1` writes a page of the coarsest alone.');
   }
 
   upload(layers) {

@@ -21,11 +21,13 @@ function wishes(search) {
 class Page {
   // A field, its shaders, where it is shown; and what is wished: {camera: [azimuth, elevation], pixel}.
   constructor(saved, parts, ui, { camera = null, pixel = 0 } = {}) {
-    this.saved = saved;
     this.parts = parts;
     this.ui = ui;
     this.ended = new AbortController();
     this.canvas = ui.picture;
+    this.context();
+    this.take(saved);
+    ({ saved } = this);
     this.orbit = new Orbit(saved.header.view);
     if (camera) Object.assign(this.orbit, { azimuth: camera[0], elevation: Math.min(90, Math.max(-90, camera[1])) });
     this.level = this.normals = saved.header.levels.length - 1;
@@ -48,29 +50,40 @@ class Page {
     this.changed();
   }
 
-  // A context and all that is in it; again after it was lost.
-  open() {
+  // A context of the adapter.
+  context() {
     const gl = this.canvas.getContext('webgl2', { antialias: false, depth: false, alpha: false, powerPreference: 'high-performance' });
     if (!gl) throw new PageError('This browser has no WebGL 2, with which the page draws. Any current Chrome, Edge, Firefox or Safari has, if graphics acceleration is not switched off.');
     if (!gl.getExtension('EXT_color_buffer_float')) {
       throw new PageError('This graphics adapter cannot draw into float textures (EXT_color_buffer_float), in which the page computes. Another device can.');
     }
     this.gl = gl;
-    this.renderer = openRenderer(gl, this.parts, this.saved);
+  }
+
+  // What of a field the adapter can hold.
+  take(field) {
+    const { saved, left } = fitting(field, this.gl.getParameter(this.gl.MAX_TEXTURE_SIZE));
+    Object.assign(this, { saved, left });
+  }
+
+  // All that is in the context; again after it was lost.
+  open() {
+    this.renderer = openRenderer(this.gl, this.parts, this.saved);
     this.section.forget();
-    this.paint = new Paint(gl, this.parts);
+    this.paint = new Paint(this.gl, this.parts);
   }
 
   // Another field in the place of this one, seen from where this one was: a run that has grown. The finest level stays the
   // finest, any other what it was.
-  async adopt(saved) {
+  async adopt(field) {
+    const { saved, left } = fitting(field, this.gl.getParameter(this.gl.MAX_TEXTURE_SIZE));
     const renderer = openRenderer(this.gl, this.parts, saved);
     await renderer.open();
     if (this.lost) return renderer.close();
     const before = this.renderer, finest = this.saved.header.levels.length - 1, last = saved.header.levels.length - 1;
     const { axis, at } = this.section;
     this.section.drop();
-    Object.assign(this, { saved, renderer, section: new Section(saved.header) });
+    Object.assign(this, { saved, left, renderer, section: new Section(saved.header) });
     Object.assign(this.section, { axis, at });
     before.close();
     this.level = this.level === finest ? last : Math.min(this.level, last);
@@ -91,7 +104,7 @@ class Page {
     const exact = header.bits === null
       ? 'weights in float32'
       : `weights of ${header.bits} bits: off by ≤ ${digits(Math.max(...header.rounding.map((part) => part.value)) * header.unit)} units, ${digits(Math.max(...header.rounding.map((part) => part.angle)))}°`;
-    this.ui.facts.textContent = `SIRENs ${sizes}${bands} · ${exact}`;
+    this.ui.facts.textContent = `${this.left}SIRENs ${sizes}${bands} · ${exact}`;
   }
 
   // The size of the canvas, and the adapter, may change under us.
@@ -108,6 +121,7 @@ class Page {
     });
     canvas.addEventListener('webglcontextrestored', () => ui.guarded(() => {
       this.lost = false;
+      this.context();
       this.open();
       ui.carryOn();
       this.changed();

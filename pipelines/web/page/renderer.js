@@ -147,4 +147,24 @@ class Renderer {
 // pass costs so much even if it has nothing to do.
 const frameTime = ({ operations, passes }, { rate, pass }) => operations / rate + passes * pass;
 
+// What of a field an adapter can hold whose textures are so many texels wide: the levels up to the first that is wider,
+// and a sentence about what is left out, or nothing. The widest of its textures has a column for each neuron.
+function fitting(saved, widest) {
+  const { header } = saved, fits = ({ width }) => width <= widest;
+  const odd = header.levels.findIndex((level) => !fits(level));
+  const limit = `this adapter holds ${widest} (MAX_TEXTURE_SIZE)`;
+  if (odd === 0) throw new PageError(`Level 0 has ${header.levels[0].width} neurons in a layer; ${limit}. Another device may hold more.`);
+  const colors = header.colors && fits(header.colors) ? header.colors : null;
+  const bare = header.colors && !colors ? `The colours have ${header.colors.width} neurons in a layer; ${limit}. ` : '';
+  if (odd < 0) return { saved: { ...saved, header: { ...header, colors } }, left: bare };
+  const shown = {
+    ...header, levels: header.levels.slice(0, odd), deltas: header.deltas.slice(0, odd - 1), reach: header.reach.slice(0, odd),
+    rounding: header.rounding.slice(0, odd), colors: colors && { ...colors, level: Math.min(colors.level, odd - 1) },
+  };
+  return {
+    saved: { ...saved, header: shown },
+    left: `${bare}Level ${odd} has ${header.levels[odd].width} neurons in a layer; ${limit}. Level ${odd - 1} is the finest that fits. `,
+  };
+}
+
 const openRenderer = (gl, parts, saved) => new Renderer(gl, parts, saved);

@@ -13,7 +13,9 @@ const wgsl = (number) => (Number.isInteger(number) ? `${number}.0` : String(numb
 async function gpuDevice() {
   try {
     const adapter = await navigator.gpu?.requestAdapter({ powerPreference: 'high-performance' });
-    return adapter ? await adapter.requestDevice() : null;
+    if (!adapter) return null;
+    const { maxStorageBufferBindingSize, maxBufferSize } = adapter.limits; // all that it has, for wide networks
+    return await adapter.requestDevice({ requiredLimits: { maxStorageBufferBindingSize, maxBufferSize } });
   } catch {
     return null;
   }
@@ -38,13 +40,15 @@ class GpuTracer {
     const device = await gpuDevice();
     if (!device) return null;
     device.pushErrorScope('validation');
+    device.pushErrorScope('out-of-memory');
     const tracer = new GpuTracer(device, parts, saved);
     try {
       await tracer.build();
     } catch {
       return null; // a driver that refuses a kernel; WebGL 2 may do
     }
-    return (await device.popErrorScope()) ? null : tracer;
+    const errors = [await device.popErrorScope(), await device.popErrorScope()];
+    return errors.some(Boolean) ? null : tracer;
   }
 
   // Whether the device is gone; what it had under way fails a moment before it says so.

@@ -10,7 +10,7 @@ import pages
 import pytest
 import torch
 from mplicits.datasets.cameras import look_at, turntable
-from mplicits.neural_fields import extract_mesh, map_colors, save_field
+from mplicits.neural_fields import MultiscaleSDF, Siren, extract_mesh, map_colors, save_field, solve_sphere
 from mplicits.pipelines.web.export import BITS, WebOptions, web_run
 from mplicits.pipelines.web.networks import rounded_field
 from pages import TITLE, bumpy, differences, painted, until
@@ -215,6 +215,63 @@ def test_a_lost_device_is_replaced(drawn):
     assert (before[..., 3] > 0).sum() > 500
     assert (before == after).all()
     assert message(drawn) == ""
+
+
+def test_a_tab_in_the_background_goes_on_where_it_was(opened):
+    """What changes meanwhile is drawn when it comes back."""
+    here = opened.current_window_handle
+    change = """const level = arguments[0];
+    document.addEventListener('visibilitychange', () => {
+    window.hid = document.hidden;
+    level.value = 0;
+    level.dispatchEvent(new Event('input'));
+    window.before = Number(document.documentElement.dataset.drawn); }, {once: true})"""
+    opened.execute_script(change, opened.find_element(By.ID, "level"))
+    opened.switch_to.new_window("tab")
+    opened.close()
+    opened.switch_to.window(here)
+    assert opened.execute_script("return window.hid") is True
+    until(lambda: pictures(opened) > opened.execute_script("return window.before"))
+    assert opened.find_element(By.ID, "levelName").text == "0"
+    assert message(opened) == ""
+    assert not complaints(opened)
+
+
+# What an adapter says of its textures, and what a page says then: the widest level of `widening` that is in it.
+LIMITS = {30: "Level 1 has 40 neurons in a layer; this adapter holds 30 (MAX_TEXTURE_SIZE). Level 0 is", 12: None}
+
+
+@pytest.mark.parametrize("widest", LIMITS)
+def test_a_field_too_wide_for_the_adapter(browser, tmp_path, widest):
+    torch.manual_seed(0)
+    base = Siren(16, 1, omega=4.0)
+    solve_sphere(base, 0.5)
+    field = MultiscaleSDF(base, [Siren(40, 1, omega=5.0, output_gain=0.05)], [0.2]).requires_grad_(False)
+    save_field(tmp_path / "wide.safetensors", field)
+    web_run(tmp_path / "wide.safetensors", tmp_path / "wide.html")
+    narrow = f"""const told = WebGL2RenderingContext.prototype.getParameter;
+    WebGL2RenderingContext.prototype.getParameter = function (name) {{
+    return name === this.MAX_TEXTURE_SIZE ? {widest} : told.call(this, name); }}"""
+    number = browser.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": narrow})
+    try:
+        browser.get(f"{(tmp_path / 'wide.html').as_uri()}?pixel=16&webgl")
+        if LIMITS[widest] is None:
+            assert "Level 0 has 16 neurons" in until(lambda: "has not run" not in message(browser) and message(browser))
+            return
+        until(lambda: browser.execute_script("return window.mplicits?.renderer?.kind"))
+        assert browser.find_element(By.ID, "facts").text.startswith(LIMITS[widest])
+        assert not browser.find_element(By.ID, "levels").is_displayed()  # there is one alone
+        camera = look_at((0.0, 0.0, 3.0), (0.0, 0.0, 0.0), fov=30.0, width=32, height=32)
+        assert_disc(rendered(browser, camera)[0], base, camera)
+    finally:
+        browser.execute_cdp_cmd("Page.removeScriptToEvaluateOnNewDocument", number)
+
+
+def assert_disc(found, field, camera):
+    """That a picture shows a field, by its silhouette."""
+    seen = differences(found, field, camera, 0, tolerance=PRECISION, resolution=PRECISION)
+    assert seen.hits > 100
+    assert seen.mask <= 2 / found[..., 0].size
 
 
 DAMAGES = {
