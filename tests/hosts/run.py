@@ -18,21 +18,23 @@ import json
 import subprocess
 import sys
 import tempfile
+from importlib import import_module
 from itertools import product
 from pathlib import Path
 from typing import Any
 
-import host_neus
-import host_nsr
-
-HOSTS = {"neus": host_neus, "nsr": host_nsr}
 ROWS = {"neus": ("host", "ours", "ours, 256 features", "ours, deeper"), "nsr": ("host", "ours")}
+
+
+def module(host: str) -> Any:
+    """How to set up and train a host; read when it is chosen, as each needs packages of its own."""
+    return import_module(f"host_{host}")
 
 
 def run(args: argparse.Namespace, host: str, scene: Path, row: str, seed: int) -> dict[str, Any]:
     """One training in a process and a temporary folder of its own."""
     with tempfile.TemporaryDirectory() as folder:
-        HOSTS[host].set_up(args, getattr(args, host), scene, row, Path(folder))
+        module(host).set_up(args, getattr(args, host), scene, row, Path(folder))
         words = [sys.executable, Path(__file__).resolve(), f"--{host}", ".", "--data", scene.resolve(), "--work", seed]
         words = [str(word) for word in words]
         done = subprocess.run(words, cwd=folder, capture_output=True, text=True, check=False)
@@ -59,7 +61,7 @@ def main() -> None:
     args = parser.parse_args()
     host = "neus" if args.neus else "nsr"
     if args.work is not None:
-        print("\n" + json.dumps(HOSTS[host].work(args.data[0], args.work)))
+        print("\n" + json.dumps(module(host).work(args.data[0], args.work)))
         return
     kept = args.keep.read_text().splitlines() if args.keep and args.keep.is_file() else []
     rows = {tuple(key): found for key, found in map(json.loads, kept)}
