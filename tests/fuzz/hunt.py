@@ -67,17 +67,18 @@ def outcome_of(number: int, specimen: Specimen, data: bytes, folder: Path) -> Ou
         (folder / name).write_bytes(content)
     said = io.StringIO()
     kind, text = "read", ""
-    with _stderr_of_all(folder / "stderr") as noise, contextlib.redirect_stdout(said), _limits(len(data)):
-        try:
-            specimen.read(path)
-        except InputError as error:
-            kind, text = "refused", str(error)
-        except _Hang:
-            kind, text = "hang", traceback.format_exc()
-        except MemoryError:
-            kind, text = "memory", traceback.format_exc()
-        except Exception:  # what a user would see as a traceback
-            kind, text = "traceback", traceback.format_exc()
+    try:
+        with _stderr_of_all(folder / "stderr") as noise, contextlib.redirect_stdout(said), _limits(len(data)):
+            try:
+                specimen.read(path)
+            except InputError as error:
+                kind, text = "refused", str(error)
+            except MemoryError:
+                kind, text = "memory", traceback.format_exc()
+            except Exception:  # what a user would see as a traceback
+                kind, text = "traceback", traceback.format_exc()
+    except _Hang:  # outside of the block too: the signal may come as reading ends
+        return Outcome(number, specimen.name, "hang", traceback.format_exc())
     if kind == "refused" and ("\n" in text or len(text) > LONGEST_LINE or str(folder) not in text):
         kind = "vague"
     if kind in ("read", "refused") and (noise() or said.getvalue()):

@@ -1,11 +1,13 @@
 """``read_cloud``: every format gives back what was written, and bad files give one line."""
 
+import re
 import struct
 
 import numpy as np
 import pytest
 import trimesh
 from mplicits.datasets import PointCloud, read_cloud, write_cloud_ply
+from mplicits.datasets.clouds.reading import open_stream
 from mplicits.neural_fields import InputError
 
 COUNT = 12
@@ -209,6 +211,42 @@ def test_las(tmp_path, cloud, extension):
     path = tmp_path / f"cloud.{extension}"
     las.write(path)
     same(read_cloud(path), PointCloud(cloud.points, None, cloud.colors), points=1e-4, colors=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("at", "form", "value", "said"),
+    [
+        (94, "<H", 60_000, "byte 94: a header of 60000 bytes"),
+        (96, "<I", 2**31, "byte 94: a header of 375 bytes before points at 2147483648"),
+        (100, "<I", 2**30, "byte 100: 1073741824 records in 0 bytes"),
+        (105, "<H", 3, "byte 105: points of 3 bytes"),
+        (235, "<Q", 2**60, "byte 243: 1 records after the points, from byte 1152921504606846976"),
+        (247, "<Q", 2**40, "1099511627776 points in 1200 bytes"),
+    ],
+)
+def test_las_headers_that_claim_more_than_the_file_holds(tmp_path, at, form, value, said):
+    laspy = pytest.importorskip("laspy")
+    las = laspy.LasData(laspy.LasHeader(point_format=6, version="1.4"))
+    las.x = las.y = las.z = np.arange(40.0)
+    path = tmp_path / "cloud.las"
+    las.write(path)
+    data = bytearray(path.read_bytes())
+    assert struct.unpack_from("<HI", data, 94) == (375, 375)
+    struct.pack_into("<I", data, 243, 1 if at == 235 else 0)
+    struct.pack_into(form, data, at, value)
+    path.write_bytes(data)
+    for read in (read_cloud, open_stream):
+        with pytest.raises(InputError, match=re.escape(said)):
+            read(path)
+
+
+def test_a_dense_laz_is_no_wrong_claim(tmp_path):
+    laspy = pytest.importorskip("laspy")
+    las = laspy.LasData(laspy.LasHeader(point_format=3, version="1.2"))
+    x, y = (axis.ravel() for axis in np.mgrid[:300, :300])
+    las.x, las.y, las.z = x, y, np.zeros(len(x))
+    las.write(tmp_path / "plane.laz")
+    assert len(read_cloud(tmp_path / "plane.laz")) == 90_000
 
 
 def test_missing_laspy_names_the_extra(tmp_path, monkeypatch):
