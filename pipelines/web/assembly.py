@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from ...neural_fields.files import write_whole
-from .payload import deflated
+from .payload import deflated, text_of
 
 __all__ = ["field_file", "fill_page", "write_folder"]
 
@@ -61,9 +61,9 @@ def fill_page(header: Mapping[str, Any], data: bytes, *, live: bool = False) -> 
         "POLICY": policy,
         "STYLE": style,
         "BOOT": boot,
-        "CODE": base64.b64encode(deflated(f"{_shaders()}\0{script}".encode())).decode(),
+        "CODE": text_of(deflated(f"{_shaders()}\0{script}".encode())),
         "HEADER": _header(header).replace("<", "\\u003c"),
-        "DATA": base64.b64encode(data).decode(),
+        "DATA": text_of(data),
     }
     return re.sub("@([A-Z]+)@", lambda found: parts[found[1]], _source("index.html"))
 

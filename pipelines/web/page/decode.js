@@ -3,18 +3,6 @@
 
 class PageError extends Error {}
 
-function bytesOf(text) {
-  let binary;
-  try {
-    binary = atob(text.trim());
-  } catch {
-    throw new PageError('The field in this page is damaged. Write the page again with `mplicits web`.');
-  }
-  const bytes = new Uint8Array(binary.length);
-  for (let i = 0; i < bytes.length; i++) bytes[i] = binary.charCodeAt(i);
-  return bytes;
-}
-
 // CRC-32 as in zip files; crypto.subtle is not there for pages from a disk in every browser.
 function checksum(bytes) {
   const table = new Uint32Array(256);
