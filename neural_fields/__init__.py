@@ -5,7 +5,16 @@ from .adapters import Deviation, InstantNSRGeometry, NerfstudioField, NeuSGeomet
 from .algebra import Bounded, Difference, Intersection, Offset, Placed, Shell, Union
 from .analytic import Box, Capsule, Plane, Sphere, Torus
 from .attributes import Mapped, map_attribute, map_colors, project_to_surface
-from .characteristics import IntegrationError, Solver, Tracks, flow, track, trajectories, transport_error
+from .characteristics import (
+    IntegrationError,
+    Solver,
+    Tracks,
+    flow,
+    flow_jacobian,
+    track,
+    trajectories,
+    transport_error,
+)
 from .checkpoint import SavedField, load_field, load_texture, save_field, save_texture
 from .color import ColorSiren, TextureField
 from .cones import cone_starts
@@ -25,6 +34,7 @@ from .siren import Siren
 from .spacetime import SpaceTimeJet, SpaceTimeSDF, TimeSlice, at_time, spacetime_jet
 from .sphere_start import fit_sphere, solve_sphere
 from .tracing import Hits, sphere_trace
+from .velocity import CarriedKeyframes, Velocity, VelocityJet, VelocitySiren
 from .volume_renderer import Rendered, Sampling, render_volume
 from .world import Closest, WorldField, WorldHits, in_one_frame
 
@@ -32,6 +42,7 @@ __all__ = [
     "Bounded",
     "Box",
     "Capsule",
+    "CarriedKeyframes",
     "Closest",
     "ColorSiren",
     "Deviation",
@@ -79,6 +90,9 @@ __all__ = [
     "Torus",
     "Tracks",
     "Union",
+    "Velocity",
+    "VelocityJet",
+    "VelocitySiren",
     "ViewColor",
     "WorldField",
     "WorldHits",
@@ -90,6 +104,7 @@ __all__ = [
     "fit_sphere",
     "fixed_shapes",
     "flow",
+    "flow_jacobian",
     "in_one_frame",
     "key_loss",
     "law_loss",

@@ -14,7 +14,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor, nn
@@ -25,7 +25,17 @@ from .evolution import VectorField
 from .field import Field
 from .spacetime import TimeSlice, at_time
 
-__all__ = ["IntegrationError", "Solver", "Tracks", "flow", "track", "trajectories", "transport_error"]
+__all__ = [
+    "IntegrationError",
+    "Solver",
+    "Tracks",
+    "flow",
+    "flow_jacobian",
+    "integrate_rows",
+    "track",
+    "trajectories",
+    "transport_error",
+]
 
 ADAPTIVE = ("dopri5", "dopri8", "bosh3", "fehlberg2", "adaptive_heun")
 FIXED = ("rk4", "heun3", "heun2", "midpoint", "euler")
@@ -127,11 +137,56 @@ def flow(
         >>> bool((there - torch.tensor([[-1.0, 0.0, 0.5]])).abs().max() < 1e-4)
         True
     """
-    start, end = (torch.as_tensor(t, dtype=points.dtype, device=points.device) for t in (start, end))
-    for name, time in (("start", start), ("end", end)):
-        if time.shape not in ((), points.shape[:1]):
-            raise ValueError(f"{name} has shape {tuple(time.shape)}; expected one number, or ({len(points)},)")
-    return _integrate(velocity, points, start, end, solver or Solver())
+    start, end = _ends(points, start, end)
+    _check_points(points)
+    return integrate_rows(velocity, points, start, end, solver or Solver())
+
+
+class VelocityWithJacobian(Protocol):
+    """A vector field that knows its derivatives, as `mplicits.neural_fields.Velocity`."""
+
+    def jet(self, x: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """V ``(N, 3)``, ∂V/∂x ``(N, 3, 3)`` and ∂V/∂t ``(N, 3)``."""
+        ...
+
+
+def flow_jacobian(
+    velocity: VelocityWithJacobian,
+    points: Tensor,
+    start: Tensor | float,
+    end: Tensor | float,
+    *,
+    solver: Solver | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Where the points of one time are at another, and how their neighbourhoods are strained on the way.
+
+    With φ the map from ``start`` to ``end`` and M = ∂φ/∂x, both are followed together: dM/dt = ∂V/∂x M, M = I at first
+    (the equation of variation). det M says how volume grows; Mᵀ∇f is the gradient of f∘φ.
+
+    Args:
+        velocity: V with its derivatives.
+        points: ``(N, 3)``.
+        start: a number or ``(N,)``.
+        end: a number or ``(N,)``.
+        solver: as in `flow`; tolerances hold for the entries of M too.
+
+    Returns:
+        Points ``(N, 3)`` and M, ``(N, 3, 3)``.
+
+    Raises:
+        ValueError: shapes do not fit.
+        IntegrationError: as in `flow`.
+    """
+    _check_points(points)
+    start, end = _ends(points, start, end)
+
+    def both(state: Tensor, t: Tensor) -> Tensor:
+        value, jacobian, _ = velocity.jet(state[:, :3], t)
+        return torch.cat((value, (jacobian @ state[:, 3:].reshape(-1, 3, 3)).flatten(1)), dim=1)
+
+    identity = torch.eye(3, dtype=points.dtype, device=points.device).reshape(1, 9).expand(len(points), -1)
+    moved = integrate_rows(both, torch.cat((points, identity), dim=1), start, end, solver or Solver())
+    return moved[:, :3], moved[:, 3:].reshape(-1, 3, 3)
 
 
 def trajectories(
@@ -143,10 +198,11 @@ def trajectories(
         ValueError: shapes do not fit, or the times do not run one way.
         IntegrationError: as in `flow`.
     """
+    _check_points(points)
     moments = _moments(times, points)
     path = [points]
     for start, end in itertools.pairwise(moments):
-        path.append(_integrate(velocity, path[-1], start, end, solver or Solver()))
+        path.append(integrate_rows(velocity, path[-1], start, end, solver or Solver()))
     return torch.stack(path)
 
 
@@ -214,11 +270,12 @@ def track(
         >>> [round(float(x), 4) for x in tracks.points[:, 0, 0]]
         [0.8, 0.6325, 0.4]
     """
+    _check_points(points)
     moments = _moments(times, points)
     velocity = _NormalVelocity(field, level, least_slope)
     path = [points]
     for start, end in itertools.pairwise(moments):
-        moved = _integrate(velocity, path[-1], start, end, solver or Solver())
+        moved = integrate_rows(velocity, path[-1], start, end, solver or Solver())
         path.append(project_to_surface(TimeSlice(field, end), moved, level=level)[0] if project else moved)
     walked = torch.stack(path)
     value, gradient, _ = field.jet(at_time(walked, moments[:, None]), level=level)
@@ -273,12 +330,10 @@ class _Progress(nn.Module):
         return (self.start + self.reached.to(self.start) * self.span).detach()
 
 
-def _integrate(velocity: VectorField, points: Tensor, start: Tensor, end: Tensor, solver: Solver) -> Tensor:
-    """Points ``(N, 3)`` at ``end``."""
+def integrate_rows(velocity: VectorField, points: Tensor, start: Tensor, end: Tensor, solver: Solver) -> Tensor:
+    """`flow` of rows ``(N, n)`` that hold anything that follows an equation of its own; unchecked."""
     import torchdiffeq  # here, so that the package can be imported without it
 
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise ValueError(f"points has shape {tuple(points.shape)}; expected (N, 3)")
     longest = float((end - start).detach().abs().max()) if len(points) else 0.0
     if longest == 0:
         return points.clone()
@@ -311,6 +366,20 @@ def _integrate(velocity: VectorField, points: Tensor, start: Tensor, end: Tensor
         reason = "steps became too small (see min_step)" if progress.finite else "the velocity is not finite"
         raise IntegrationError(reason, progress.reached_time(), progress.points) from error
     return moved
+
+
+def _check_points(points: Tensor) -> None:
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise ValueError(f"points has shape {tuple(points.shape)}; expected (N, 3)")
+
+
+def _ends(points: Tensor, start: Tensor | float, end: Tensor | float) -> tuple[Tensor, Tensor]:
+    """Both as tensors, each of one number or of one for each point."""
+    times = tuple(torch.as_tensor(t, dtype=points.dtype, device=points.device) for t in (start, end))
+    for name, time in zip(("start", "end"), times, strict=True):
+        if time.shape not in ((), points.shape[:1]):
+            raise ValueError(f"{name} has shape {tuple(time.shape)}; expected one number, or ({len(points)},)")
+    return times[0], times[1]
 
 
 def _moments(times: Sequence[float] | Tensor, points: Tensor) -> Tensor:

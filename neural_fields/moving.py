@@ -208,7 +208,7 @@ class Keyframes(OneLevelField):
         rows = self.check_points(x).reshape(-1, 4)
         value = rows.new_zeros(len(rows))
         for index in range(len(self.times)):
-            weight, _ = self._hat(index, rows[:, 3])
+            weight, _ = self.weight(index, rows[:, 3])
             heard = weight.nonzero()[:, 0]
             part = weight[heard] * self.key(index).value(rows[heard, :3])
             value = value.index_add(0, heard, part)
@@ -220,7 +220,7 @@ class Keyframes(OneLevelField):
         rows = self.check_points(x).reshape(-1, 4)
         value, gradient = rows.new_zeros(len(rows)), torch.zeros_like(rows)
         for index in range(len(self.times)):
-            weight, slope = self._hat(index, rows[:, 3])
+            weight, slope = self.weight(index, rows[:, 3])
             heard = ((weight != 0) | (slope != 0)).nonzero()[:, 0]
             jet = self.key(index).jet(rows[heard, :3])
             value = value.index_add(0, heard, weight[heard] * jet.value)
@@ -228,8 +228,8 @@ class Keyframes(OneLevelField):
             gradient = gradient.index_add(0, heard, part)
         return Jet(value.reshape(x.shape[:-1]), gradient.reshape(x.shape), x.new_empty((*x.shape[:-1], 0)))
 
-    def _hat(self, index: int, t: Tensor) -> tuple[Tensor, Tensor]:
-        """w_k(t) and its derivative; at a key time the derivative is that of the time after it."""
+    def weight(self, index: int, t: Tensor) -> tuple[Tensor, Tensor]:
+        """w_k(t) of key ``index`` and its derivative; at a key time the derivative is that of the time after it."""
         weight, slope = torch.ones_like(t), torch.zeros_like(t)
         here = self.times[index]
         if index > 0:

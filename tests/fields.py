@@ -7,6 +7,7 @@ from mplicits.neural_fields import (
     Bounded,
     Box,
     Capsule,
+    CarriedKeyframes,
     Difference,
     Field,
     FunctionField,
@@ -29,6 +30,7 @@ from mplicits.neural_fields import (
     TimeSlice,
     Torus,
     Union,
+    VelocitySiren,
 )
 from mplicits.neural_fields.baselines import BaconSDF, BandLimited, BanfSDF, HashGridSDF, NeusSDF
 from torch import Tensor
@@ -157,6 +159,10 @@ FIELDS: dict[str, Callable[[], Field]] = {
     "shrinking-sphere": lambda: ShrinkingSphere(radius=0.8, alpha=0.1),
     "growing-sphere-exact-law": lambda: ShrinkingSphere(radius=0.8, alpha=-0.001, exact_law=True),
     "keyframes": lambda: Keyframes([-0.4, 0.1, 0.5], [Sphere(radius=0.3), small_multiscale(0.4), Torus()]),
+    "carried-keyframes": lambda: CarriedKeyframes(
+        Keyframes([-0.4, 0.1, 0.5], [Sphere(radius=0.3), small_multiscale(0.4), Torus()]),
+        VelocitySiren(16, 2, gain=0.5),
+    ),
 }
 EXACT = {
     name: FIELDS[name] for name in ("sphere", "plane", "torus", "box", "capsule", "slice-of-moving")
