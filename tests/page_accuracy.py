@@ -2,7 +2,7 @@
 
 Each run is written as a page, drawn by a headless Chromium in software at the page's own precision, and traced with the
 same rounded weights to 2·10⁻⁵. With ``--siren`` also what a single SIREN of 400 × 4 costs in the same shaders, which is
-first taught the run's finest level.
+first taught the run's finest level; with ``--half`` how far values would be off in float16.
 """
 
 import argparse
@@ -14,9 +14,10 @@ import torch
 from browser import start_browser
 from mplicits.datasets.cameras import turntable
 from mplicits.neural_fields import Siren, extract_mesh, save_field
+from mplicits.neural_fields.multiscale import levels_of
 from mplicits.pipelines.run.folder import load_still
 from mplicits.pipelines.web.export import BITS, WebOptions, web_run
-from mplicits.pipelines.web.networks import rounded_field
+from mplicits.pipelines.web.networks import network_layers, rounded_field
 from pages import differences, rendered, until
 
 TOLERANCE, RESOLUTION = 2e-5, 1e-4
@@ -69,10 +70,40 @@ def described(name, told):
     )
 
 
+def half(weight, hidden):
+    """A product of float16 numbers, added up in float16."""
+    total = np.zeros((len(hidden), len(weight)), np.float16)
+    for column in range(weight.shape[1]):
+        total += hidden[:, column : column + 1] * weight[:, column]
+    return total
+
+
+def half_errors(network, points):
+    """How far values at points are off if weights and activations between sine layers are float16.
+
+    Returns:
+        The most where products are added up in float32, and in float16.
+    """
+    layers, found = network_layers(network, None), []
+    for wide in (True, False):
+        hidden = points
+        for index, layer in enumerate(layers[:-1]):
+            if index == 0:
+                turns = hidden @ layer.weight.T + layer.bias
+            else:
+                weight = layer.weight.astype(np.float16)
+                product = hidden.astype(np.float32) @ weight.astype(np.float32).T if wide else half(weight, hidden)
+                turns = product.astype(np.float32) + layer.bias
+            hidden = np.sin(2 * np.pi * (turns - np.round(turns))).astype(np.float16)
+        value = (hidden.astype(np.float32) @ layers[-1].weight.T + layers[-1].bias)[:, 0]
+        found.append(float(np.abs(value - network.value(torch.from_numpy(points)).numpy()).max()))
+    return found
+
+
 def costs(browser, size, levels):
     """What the page's own bench says of each level."""
     script = "const [wanted, done] = arguments; window.mplicits.bench(wanted).then(done)"
-    return [browser.execute_async_script(script, {"size": size, "frames": 3, "level": level}) for level in levels]
+    return [browser.execute_async_script(script, {"size": size, "frames": 1, "level": level}) for level in levels]
 
 
 def main():
@@ -82,6 +113,7 @@ def main():
     parser.add_argument("--size", type=int, nargs=2, default=[96, 72], metavar=("W", "H"))
     parser.add_argument("--webgl", action="store_true")
     parser.add_argument("--siren", action="store_true")
+    parser.add_argument("--half", action="store_true")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         browser = start_browser(Path(folder) / "profile")
@@ -99,6 +131,12 @@ def main():
                 opened(page)
                 print(f"{run}, {browser.execute_script('return window.mplicits.renderer.kind')}")
                 accuracy(browser, rounded_field(field, BITS), arguments.up, arguments.size)
+                if arguments.half:
+                    outline = extract_mesh(field, resolution=64, normals=False).vertices
+                    points = np.asarray(outline, np.float32)[:: max(1, len(outline) // POINTS)]
+                    for level, network in enumerate(levels_of(field)):
+                        wide, narrow = half_errors(network, points)
+                        print(f"| level {level} | {wide:.1e} | {narrow:.1e} |")
                 told = costs(browser, arguments.size[0], range(field.num_levels))
                 names = [f"level {level}" for level in range(field.num_levels)]
                 if arguments.siren:

@@ -2,6 +2,7 @@
 
 const COARSEST = 16, FINEST = 0.5; // canvas pixels per ray
 const FRAME = 40, STRIP = 60, REST = 180; // milliseconds: of a picture while it moves, of a strip, before it is refined
+const STRIPS = 12; // of a picture, at most
 
 const digits = (number) => Number(number.toPrecision(3)).toLocaleString('en', { maximumSignificantDigits: 3 });
 
@@ -174,9 +175,11 @@ class Page {
     const ratio = Math.min(2, devicePixelRatio || 1);
     const width = Math.max(1, Math.round(this.canvas.clientWidth * ratio)), height = Math.max(1, Math.round(this.canvas.clientHeight * ratio));
     if (this.canvas.width !== width || this.canvas.height !== height) Object.assign(this.canvas, { width, height });
-    // The shape stands in the middle of what the panel leaves free.
-    const free = height - ratio * (this.ui.panel.offsetHeight + 24);
-    this.camera = { ...this.orbit.camera(width, Math.max(height / 2, free)), height };
+    // The shape stands in the middle of what title and panel leave free, if that is most of it.
+    const above = ratio * (this.ui.facts.getBoundingClientRect().bottom - this.canvas.getBoundingClientRect().top);
+    const free = height - above - ratio * (this.ui.panel.offsetHeight + 24);
+    const camera = this.orbit.camera(width, Math.max(height / 2, free));
+    this.camera = { ...camera, height, cy: camera.cy + (free > height / 2 ? above : 0) };
   }
 
   grid(factor) {
@@ -207,7 +210,7 @@ class Page {
       for (let first = 0; first < grid.height;) {
         await new Promise((resolve) => { setTimeout(resolve, 0); });
         if (this.version !== version || this.lost || document.hidden) return;
-        const rows = Math.min(grid.height - first, Math.max(1, Math.floor((STRIP * this.speed) / grid.width)));
+        const rows = Math.min(grid.height - first, this.strip(grid));
         const started = performance.now();
         const seen = await this.renderer.frame(grid, { ...this.wanted(), first, rows });
         if (this.version !== version || this.lost) return;
@@ -222,6 +225,12 @@ class Page {
     }
     this.ui.told.finished = this.drawn;
     this.waiters.splice(0).forEach((resolve) => resolve());
+  }
+
+  // Rows that can be traced at a time. Thin strips cost what their passes cost, and a slow adapter would seem slower still
+  // by them, so that there are never more than `STRIPS`.
+  strip({ width, height }) {
+    return Math.max(Math.ceil(height / STRIPS), Math.floor((STRIP * this.speed) / width));
   }
 
   // When the picture is as fine as it gets.
@@ -242,7 +251,7 @@ class Page {
     const made = { seen: new Float32Array(size), color: new Float32Array(colored ? size : 0) };
     for (let first = 0; first < height;) {
       await new Promise((resolve) => { setTimeout(resolve, 0); });
-      const rows = Math.min(height - first, Math.max(1, Math.floor((STRIP * this.speed) / width)));
+      const rows = Math.min(height - first, this.strip(camera));
       const started = performance.now();
       const { seen, color } = await this.renderer.frame(camera, { ...this.wanted(), first, rows });
       if (this.version !== version || this.lost) return false;
