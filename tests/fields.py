@@ -3,6 +3,7 @@
 from collections.abc import Callable
 
 import torch
+from mplicits.datasets.synthetic.figures import DeformingField, Twisting
 from mplicits.neural_fields import (
     Bounded,
     Box,
@@ -154,6 +155,7 @@ FIELDS: dict[str, Callable[[], Field]] = {
     "slice": lambda: TimeSlice(small_spacetime(0.4), 0.3),
     "slice-at": lambda: small_spacetime().at(0.3),
     "slice-of-moving": lambda: TimeSlice(Moving(Torus(major=0.5, minor=0.2), SCREW), 0.7),
+    "deforming": lambda: DeformingField(Torus(major=0.5, minor=0.2), Twisting(angle=0.8, half=2.0)),
     "moving": lambda: Moving(Torus(major=0.5, minor=0.2), SCREW),
     "moving-multiscale": lambda: Moving(small_multiscale(0.4), SCREW),
     "shrinking-sphere": lambda: ShrinkingSphere(radius=0.8, alpha=0.1),

@@ -227,6 +227,8 @@ def _animate_arguments(parser: argparse.ArgumentParser) -> None:
     add_flags(parser, "--out", metavar="OUT", help=what)
     add_flags(parser, "--frames", help="times from 0 to 1 (48)")
     add_flags(parser, "--fps", help="frames per second (24)")
+    add("--ease", action="store_true", help="begin and end at rest, instead of times that are evenly spaced")
+    add("--loop", action="store_true", help="film: there and back, so that it can repeat without a jump")
     add_flags(parser, "--level", "--device")
     add("--colors", metavar="RUN", help="a textured run of the first shape, to ride along (default: RUN's own)")
     add("--no-colors", action="store_true", help="leave colours out")
@@ -244,6 +246,8 @@ def _animate(arguments: argparse.Namespace) -> int:
     for name in OF_FILMS:
         if not film and getattr(arguments, name) is not None:
             raise input_error(f"--{name}: goes with a film (.mp4, .gif) or a sheet (.png)")
+    if arguments.loop and arguments.out.suffix.lower() not in FILMS:
+        raise input_error("--loop: goes with a film (.mp4, .gif)")
     if film and arguments.resolution is not None:
         raise input_error("--resolution: goes with meshes; a film is traced in pixels (--size)")
     arguments.size = _pair(arguments.size)
@@ -261,7 +265,7 @@ def _animate(arguments: argparse.Namespace) -> int:
 ANIMATE = Command(
     "write a surface that moves: a film, meshes, or one mesh that moves",
     """  mplicits animate runs/morph -o morph.mp4 --frames 96
-  mplicits animate runs/morph -o morph.gif --size 320 --fps 12
+  mplicits animate runs/morph -o morph.gif --size 320 --fps 12 --ease --loop
   mplicits animate runs/morph -o morph.png --frames 14 --size 240
   mplicits animate runs/turn -o turn.glb --colors runs/spot
   mplicits animate runs/morph -o meshes --frames 20 --resolution 256""",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,7 +28,7 @@ from ..run.machine import choose_device
 from ..texture.riding import RidingColors, borrowed_texture, start_texture
 from .follow import follow_mesh
 
-__all__ = ["SequenceOptions", "animate_run", "check_sequence_path", "film_frames"]
+__all__ = ["SequenceOptions", "animate_run", "check_sequence_path", "film_frames", "there_and_back"]
 
 Tell = Callable[[int, int], None]
 
@@ -56,6 +56,8 @@ class SequenceOptions:
         shading: of a film.
         shadows: whether lambert has shadows and occlusion.
         samples: rays per pixel and direction.
+        ease: begin and end at rest: frames are evenly spaced in s, and show the time s² (3 − 2 s).
+        loop: of films, play there and back; each frame but both ends is shown twice, and traced once.
         device: where to evaluate the field, "auto" is CUDA where there is one.
     """
 
@@ -70,12 +72,15 @@ class SequenceOptions:
     shading: str = "lambert"
     shadows: bool = False
     samples: int = 2
+    ease: bool = False
+    loop: bool = False
     device: str = "auto"
 
     @property
     def times(self) -> list[float]:
         """When the frames are."""
-        return np.linspace(0, 1, self.frames).tolist()
+        even = np.linspace(0, 1, self.frames)
+        return (even**2 * (3 - 2 * even) if self.ease else even).tolist()
 
 
 def check_sequence_path(path: str | Path) -> Path:
@@ -126,8 +131,10 @@ def animate_run(
     if options.shading == "color" and riding is None:
         raise InputError(f"--shading color: {file} has no texture; name a textured run with --colors RUN")
     if out.suffix.lower() in ANIMATIONS:
-        write_animation(out, film_frames(file, field, riding, level, options, progress), fps=options.fps)
-        return f"{options.frames} frames of {options.size[0]}×{options.size[1]}"
+        frames = film_frames(file, field, riding, level, options, progress)
+        write_animation(out, there_and_back(frames) if options.loop else frames, fps=options.fps)
+        count = max(2 * options.frames - 2, 1) if options.loop else options.frames
+        return f"{count} frames of {options.size[0]}×{options.size[1]}"
     if out.suffix.lower() == SHEET:
         frames = film_frames(file, field, riding, level, options, progress)
         moments = [(f"t = {time:.2f}", frame) for time, frame in zip(options.times, frames, strict=True)]
@@ -179,6 +186,15 @@ def film_frames(
         if progress is not None:
             progress(index, options.frames)
         yield np.concatenate(parts)
+
+
+def there_and_back(frames: Iterable[Image]) -> Iterator[Image]:
+    """All frames, and those between both ends once more in reverse, so that a film that repeats has no jump."""
+    kept = []
+    for frame in frames:
+        kept.append(frame)
+        yield frame
+    yield from kept[-2:0:-1]
 
 
 def _tracer(field: Field, camera: Camera, level: int) -> DynamicTracer:

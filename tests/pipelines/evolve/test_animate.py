@@ -32,7 +32,13 @@ from mplicits.neural_fields import (
 )
 from mplicits.neural_fields.dynamic_tracing import moment
 from mplicits.pipelines.cli.draw import ANIMATE as COMMAND
-from mplicits.pipelines.evolve.animate import SequenceOptions, animate_run, check_sequence_path, film_frames
+from mplicits.pipelines.evolve.animate import (
+    SequenceOptions,
+    animate_run,
+    check_sequence_path,
+    film_frames,
+    there_and_back,
+)
 from mplicits.pipelines.evolve.follow import follow_mesh
 from mplicits.pipelines.mesh.extract import MeshOptions, mesh_run
 from mplicits.pipelines.render.draw import RenderOptions, render_run
@@ -337,6 +343,27 @@ def test_what_cannot_be_written_is_refused_first(run, still, tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "full"]
 
 
+def test_eased_times_begin_and_end_at_rest():
+    even, eased = (np.array(SequenceOptions(frames=201, ease=ease).times) for ease in (False, True))
+    assert (eased[0], eased[100], eased[-1]) == (0.0, 0.5, 1.0)
+    np.testing.assert_allclose(eased, 1 - eased[::-1], atol=1e-15)
+    slope = np.gradient(eased, even)
+    # ds²(3 − 2s) = 6 s (1 − s), to a cell's width at the ends and its square within.
+    assert max(slope[0], slope[-1]) < 6 / 200
+    np.testing.assert_allclose(slope[1:-1], (6 * even * (1 - even))[1:-1], atol=4 / 200**2)
+    assert SequenceOptions(frames=1, ease=True).times == [0.0]
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 6])
+def test_a_loop_goes_there_and_back_without_a_jump(count: int):
+    frames = [np.full((2, 2, 3), index, np.uint8) for index in range(count)]
+    shown = [int(frame[0, 0, 0]) for frame in there_and_back(iter(frames))]
+    assert shown[:count] == list(range(count))
+    assert len(shown) == max(2 * count - 2, 1)
+    jumps = np.abs(np.diff([*shown, shown[0]]))
+    assert (jumps == (count > 1)).all()
+
+
 def test_flags_of_films_go_with_films(run, tmp_path):
     import argparse
 
@@ -344,6 +371,8 @@ def test_flags_of_films_go_with_films(run, tmp_path):
     COMMAND.add_arguments(parser)
     for line, message in (
         ("-o meshes --size 64", "--size: goes with a film"),
+        ("-o meshes --loop", "--loop: goes with a film"),
+        ("-o sheet.png --loop", "--loop: goes with a film"),
         ("-o film.mp4 --resolution 64", "--resolution: goes with meshes"),
         ("-o film.mp4 --no-colors --colors x", "--colors: --no-colors leaves them out"),
     ):
@@ -353,3 +382,6 @@ def test_flags_of_films_go_with_films(run, tmp_path):
     line = f"-o {out} --frames 2 --size 24 --samples 1 --shading headlight --up z --no-colors"
     assert COMMAND.run(parser.parse_args([str(run), *line.split()])) == 0
     assert len(iio.imread(out, index=None)) == 2
+    line = line.replace("--frames 2", "--frames 3 --ease --loop")
+    assert COMMAND.run(parser.parse_args([str(run), *line.split()])) == 0
+    assert len(iio.imread(out, index=None)) == 4
