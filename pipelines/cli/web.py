@@ -70,5 +70,5 @@ WEB = Command(
     _web_arguments,
     _web,
     "Write a fit as one HTML file that needs no network, no server and no Python: the networks themselves, traced by "
-    "the GPU of whoever opens it (WebGL 2). With a folder's name it writes an element for other pages.",
+    "the GPU of whoever opens it (WebGPU or WebGL 2). With a folder's name it writes an element for other pages.",
 )
