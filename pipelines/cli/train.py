@@ -261,12 +261,14 @@ EVOLVE = Command(
     "train one surface that moves: morphs, motions, smoothing",
     """  mplicits evolve runs/spot runs/bob -o runs/morph
   mplicits evolve runs/a runs/b runs/c --times 0 0.3 1 --align pca -o runs/morph3
+  mplicits evolve runs/spot runs/bob --kind deform -o runs/deform
   mplicits evolve runs/spot --kind smooth --alpha 0.01 -o runs/smooth
   mplicits evolve runs/spot --kind transport --angle 3.14 --velocity 0.3 0 0 -o runs/turn
   mplicits evolve scene.yaml -o runs/scene
   mplicits evolve -o runs/morph --resume""",
     _evolve_arguments,
     _evolve,
-    "Train a field of space and time: a morph between two or more fits, a transport by rigid motions or twists, or "
-    "smoothing by mean curvature. RUN will hold field.safetensors and run.json, which says how well the ends are met.",
+    "Train a field of space and time: a morph or a deformation between two or more fits, a transport by rigid motions "
+    "or twists, or smoothing by mean curvature. RUN will hold field.safetensors and run.json, which says how well the "
+    "ends are met.",
 )

@@ -18,6 +18,9 @@ __all__ = ["FEWEST_STEPS", "EvolvePlan", "within"]
 ORDER_ONE, ORDER_TWO = 1.6, 2.8
 # A shape that is given as a field: what its coarse levels cost; and one that is a formula.
 USUAL, EXACT = Net.siren(256, 2), Net(2000, 60)
+# Of a step of a motion: evaluations on its paths, and of the shapes where they end. For each known sample of a
+# deformation: evaluations of the motion, by Runge and Kutta forth and back, with derivatives.
+PATHS, ENDS, CARRIED = 26_000, 1_500, 160
 MESHED = 128  # cells along the meshes of shapes
 ENDS_MESHED = 192
 # FLOPs that take as long as the Chamfer distance of an end; and as a mesh beside its values, by its resolution squared:
@@ -27,7 +30,8 @@ JUDGING, SQUARE = 2.0e10, 0.9e6
 FEWEST_STEPS = 40
 FEWEST_SAMPLES, FEWEST_FRAMES = 5_000, 3
 # Of a budget that is too small, what known samples and the checks at the end may take.
-SAMPLING_SHARE, CHECKING_SHARE = 0.25, 0.25
+SAMPLING_SHARE, CHECKING_SHARE, MOVING_SHARE = 0.25, 0.25, 0.3
+FEWEST_MOTION_STEPS = 50
 
 
 @dataclass(frozen=True)
@@ -52,11 +56,22 @@ class EvolvePlan:
         work = values(4 * MESHED**2, self._given())
         return Stage("shapes", "shapes", self.speed.points(work))
 
+    def moving(self, known: bool = False) -> list[Stage]:
+        """Learning the motion of a deformation, unless it is ``known``."""
+        if self.config.kind != "deform" or known:
+            return []
+        steps = self.config.motion_steps * max(len(self.config.shapes) - 1, 1)
+        work = training(steps, PATHS, [self._motion()]) + training(steps, ENDS, self._given()[:1])
+        return [Stage("motion", "steps", self.speed.networks(work, steps=steps))]
+
     def known(self) -> Stage:
         """Samples at which the field is known, and bounds."""
         config = self.config
         points = 4.5 * config.samples / max(len(config.shapes), 1) + 1e5
-        return Stage("known samples", "samples", self.speed.points(jets(points, self._given())))
+        work = jets(points, self._given())
+        if config.kind == "deform":
+            work += training(1, CARRIED * config.samples, [self._motion()])
+        return Stage("known samples", "samples", self.speed.points(work))
 
     def starting(self) -> Stage:
         """Learning the shape at time 0."""
@@ -87,6 +102,9 @@ class EvolvePlan:
         """The shapes' fields; exact ones, as "sphere:0.5", cost next to nothing."""
         return [USUAL if Path(shape).exists() else EXACT for shape in self.config.shapes]
 
+    def _motion(self) -> Net:
+        return Net.siren(self.config.motion_width, 2, inputs=4)
+
     def _net(self, level: int, *, inputs: int = 4) -> Net:
         return Net.siren(self.config.widths[level], self.config.depths[level], inputs=inputs)
 
@@ -100,6 +118,11 @@ def within(config: EvolveConfig, speed: Speed, seconds: float) -> tuple[EvolveCo
         seconds: that are left.
     """
     plan, notes = EvolvePlan(config, speed), list[str]()
+    for stage in plan.moving():
+        steps = max(int(MOVING_SHARE * seconds / stage.seconds * config.motion_steps), FEWEST_MOTION_STEPS)
+        if steps < config.motion_steps:
+            notes.append(f"{steps} steps of the motion instead of {config.motion_steps}")
+            config = replace(config, motion_steps=steps)
     share = SAMPLING_SHARE * seconds / plan.known().seconds
     if share < 1 and config.samples > FEWEST_SAMPLES:
         samples = max(int(share * config.samples), FEWEST_SAMPLES)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from ...neural_fields import (
+    CarriedKeyframes,
     Field,
     InputError,
     IntegrationError,
@@ -18,6 +19,7 @@ from ...neural_fields import (
     Law,
     RigidMotion,
     Similarity,
+    VelocitySiren,
     at_time,
     flow,
     mean_curvature,
@@ -26,7 +28,9 @@ from ...neural_fields import (
     transport,
 )
 from ...neural_fields.evolution import VectorField
+from ..run.schedule import Report
 from ..run.settings import EvolveConfig
+from .deform import carried_samples, learn_motion, motion_figures
 from .samples import Bounds, Carried, Known, around, joined, known_at, no_bounds, signs, uniform
 from .shapes import Placement, StaticShape, aligned, into_unit_sphere
 
@@ -68,6 +72,8 @@ class Problem:
         law: what holds in between, or None where enough is known.
         ends: the surfaces to be met.
         placements: where each shape was put, from its own unit sphere.
+        motion: the velocity that carries the shapes, where one was learnt.
+        motion_figures: how well it does that, for each two shapes.
     """
 
     similarity: Similarity
@@ -76,19 +82,35 @@ class Problem:
     law: Law | None
     ends: tuple[End, ...]
     placements: tuple[Placement, ...] = ()
+    motion: VelocitySiren | None = None
+    motion_figures: tuple[Mapping[str, float], ...] = ()
 
 
-def build_problem(shapes: Sequence[StaticShape], config: EvolveConfig) -> Problem:
+def build_problem(
+    shapes: Sequence[StaticShape],
+    config: EvolveConfig,
+    *,
+    motion: VelocitySiren | None = None,
+    progress: Report | None = None,
+) -> Problem:
     """The problem that a configuration means.
+
+    Args:
+        shapes: each in its own unit sphere.
+        config: settings.
+        motion: of a deformation, if it is learnt already.
+        progress: of learning it.
 
     Raises:
         InputError: too few or too many shapes for this kind, or a motion that cannot be followed.
     """
-    counts = {"morph": (2, math.inf), "transport": (1, math.inf), "smooth": (1, 1)}
+    counts = {"morph": (2, math.inf), "deform": (2, math.inf), "transport": (1, math.inf), "smooth": (1, 1)}
     least, most = counts[config.kind]
     if not least <= len(shapes) <= most:
         expected = f"{least}" if least == most else f"at least {least}"
         raise InputError(f"{len(shapes)} shapes for kind {config.kind}; expected {expected}")
+    if config.kind == "deform":
+        return _deform(list(shapes), config, motion, progress)
     build = {"morph": _morph, "transport": _transport, "smooth": _smooth}[config.kind]
     try:
         return build(list(shapes), config)
@@ -136,9 +158,27 @@ def velocity_field(motion: RigidMotion, twist: float = 0.0) -> VectorField:
     return velocity
 
 
-def _morph(shapes: list[StaticShape], config: EvolveConfig) -> Problem:
+def _deform(
+    shapes: list[StaticShape], config: EvolveConfig, motion: VelocitySiren | None, progress: Report | None
+) -> Problem:
+    placed, region = _together(shapes, config)
+    keys = config.key_times()
+    motion = motion or learn_motion(placed, keys, config, progress)
+    carried = CarriedKeyframes(Keyframes(keys, [shape.field for shape in placed]), motion)
+    known, bounds = carried_samples(carried, placed, config.samples, config.seed)
+    ends = tuple(_end(shape, time, config.seed) for shape, time in zip(placed, keys, strict=True))
+    similarity, figures = _composed(shapes[0].similarity, region), tuple(motion_figures(motion, placed, keys))
+    return Problem(similarity, known, bounds, None, ends, _placements(placed), motion, figures)
+
+
+def _together(shapes: list[StaticShape], config: EvolveConfig) -> tuple[list[StaticShape], Similarity]:
+    """Shapes aligned in one frame, and into the unit sphere of all."""
     placed = aligned(shapes, config.align)
-    placed, region = into_unit_sphere(placed, np.concatenate([shape.surface.vertices for shape in placed]))
+    return into_unit_sphere(placed, np.concatenate([shape.surface.vertices for shape in placed]))
+
+
+def _morph(shapes: list[StaticShape], config: EvolveConfig) -> Problem:
+    placed, region = _together(shapes, config)
     generator, keys = torch.Generator().manual_seed(config.seed), config.key_times()
     per_shape = -(-config.samples // len(placed))
     pairs = list(zip(placed, keys, strict=True))

@@ -32,6 +32,7 @@ from ..run.trainer import (
     without_prefix,
 )
 from .checks import check_evolution
+from .deform import VELOCITY_FILE, load_motion
 from .objective import LONGEST_GRADIENT, EvolveObjective, learn_start
 from .plan import FEWEST_STEPS, EvolvePlan, within
 from .problem import Problem, build_problem
@@ -89,7 +90,7 @@ def evolve(
     device, schedule = choose_device(config.device), Schedule.of(progress)
     machine, notes = speed(device), list[str]()
     plan, count, shapes = EvolvePlan(config, machine), len(config.shapes), []
-    schedule.plan([plan.shapes(), plan.known(), *plan.stages()], budget=config.time_budget)
+    schedule.plan([plan.shapes(), *plan.moving(resume), plan.known(), *plan.stages()], budget=config.time_budget)
     for index, text in enumerate(config.shapes):
         schedule(Progress("shapes", index, count, index / count, {}))
         shapes.append(read_shape(text))
@@ -97,8 +98,9 @@ def evolve(
     load_compiler()
     if config.time_budget is not None and not resume:  # what is resumed has its settings
         config, notes = within(config, machine, max(config.time_budget - (time.monotonic() - started), 0.0))
+    motion = load_motion(folder.path, config) if resume and folder.path and config.kind == "deform" else None
     schedule(Progress("known samples", 0, 0, 0.0, {}))
-    problem = build_problem(shapes, config)
+    problem = build_problem(shapes, config, motion=motion, progress=schedule)
     schedule(Progress("known samples", 0, 0, 1.0, {}))
     return train_evolution(
         problem, config, shapes=shapes, out=out, resume=resume, progress=schedule, started=started, notes=notes
@@ -125,9 +127,11 @@ def train_evolution(
     training = _Evolving(problem, names, config, device, folder, schedule)
     training.started = time.monotonic() if started is None else started
     training.notes = list(notes)
-    with folder.writing(), stop_on_signals() as flag:
+    with folder.writing(VELOCITY_FILE), stop_on_signals() as flag:
         if resume:
             training.restore()
+        elif problem.motion is not None:
+            folder.keep_tensors(VELOCITY_FILE, problem.motion.state_dict())
         return training.run(flag)
 
 
@@ -313,6 +317,7 @@ class _Evolving:
             "align": self.config.align,
             "placements": [placement.as_dict() for placement in self.problem.placements],
             "ends": [{"name": end.name, "time": end.time} for end in self.problem.ends],
+            **({"motion": list(map(dict, self.problem.motion_figures))} if self.problem.motion is not None else {}),
             "similarity": dataclasses.asdict(self.problem.similarity),
             "config": dataclasses.asdict(self.config),
             "stages": self.stages,

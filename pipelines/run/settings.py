@@ -202,15 +202,20 @@ class ReconstructConfig(Settings):
 class EvolveConfig(Settings):
     """Settings of ``evolve``; the defaults are the ``default`` preset. Raises as `Settings` does."""
 
-    kind: Literal["morph", "transport", "smooth"] = setting(
-        "morph", "morph (from shape to shape), transport (by a vector field) or smooth (by mean curvature)"
+    kind: Literal["morph", "deform", "transport", "smooth"] = setting(
+        "morph",
+        "morph (from shape to shape along normals), deform (from shape to shape by a motion that is learnt), transport "
+        "(by a vector field) or smooth (by mean curvature)",
     )
     shapes: tuple[str, ...] = setting(
         (), "run directories, .safetensors files, or exact shapes such as sphere:0.4@0.2,0,0"
     )
-    times: tuple[float, ...] = setting((), "morph: when each shape is reached, from 0 to 1 (default: evenly spaced)")
+    times: tuple[float, ...] = setting(
+        (), "morph, deform: when each shape is reached, from 0 to 1 (default: evenly spaced)"
+    )
     align: Literal["none", "center", "pca"] = setting(
-        "center", "morph: leave the shapes where they are, lay their unit spheres on each other, or turn them as well"
+        "center",
+        "morph, deform: leave the shapes where they are, lay their unit spheres on each other, or turn them as well",
     )
     velocity: tuple[float, ...] = setting((0.0, 0.0, 0.0), "transport: way per unit of time, three numbers per shape")
     axis: tuple[float, ...] = setting((0.0, 0.0, 1.0), "transport: axis of rotation, three numbers per shape")
@@ -218,6 +223,13 @@ class EvolveConfig(Settings):
     angle: tuple[float, ...] = setting((0.0,), "transport: radians per unit of time, one number per shape")
     twist: tuple[float, ...] = setting((0.0,), "transport: radians more per unit along the axis, one number per shape")
     alpha: float = setting(0.02, "smooth: how fast; a sphere has r(t)^2 = r^2 - 4 alpha t, in units of the field")
+    motion_steps: int = setting(600, "deform: steps in which the motion is learnt, for each two shapes", above=0)
+    motion_width: int = setting(64, "deform: neurons in each of the motion's two sine layers", above=0)
+    motion_omega: float = setting(3.0, "deform: frequency of the motion; a low one keeps it smooth", above=0)
+    motion_rate: float = setting(5e-3, "deform: peak learning rate of the motion", above=0)
+    guide_weight: float = setting(1.0, "deform: weight of the matched points, which fades", at_least=0)
+    rigid_weight: float = setting(0.01, "deform: weight of the Killing energy, as rigid as possible", at_least=0)
+    volume_weight: float = setting(0.0, "deform: weight of the squared divergence, as even in volume", at_least=0)
     widths: tuple[int, ...] = _per_level((128, 256), "neurons per layer, one number per level")
     depths: tuple[int, ...] = _per_level((2, 2), "sine layers, one number per level")
     omegas: tuple[float, ...] = _per_level((15.0, 40.0), "SIREN frequency of each level (Eq. 2)")

@@ -248,7 +248,7 @@ def test_a_yaml_file_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureF
         ("sphere -o RUN", "1 shapes for kind morph; expected at least 2"),
         ("sphere nothing -o RUN", "nothing: no such run directory or file"),
         ("sphere torus --shapes box -o RUN", "--shapes: the shapes are given already"),
-        ("sphere torus --kind melt -o RUN", "--kind: got 'melt', expected one of morph, transport, smooth"),
+        ("sphere torus --kind melt -o RUN", "--kind: got 'melt', expected one of morph, deform, transport, smooth"),
         ("sphere -o RUN --resume", "--resume: continues with the run's own shapes and settings"),
         ("sphere torus -o RUN --alpha x", "--alpha: got 'x', expected a finite number"),
     ],

@@ -1,0 +1,270 @@
+"""A morph by a velocity: a motion is learnt that takes each key shape to the next, and carries what lies in between.
+
+A level set knows no correspondence, so the morph of `problem` melts a leg here and lets another one condense there.
+Here a velocity v(x, t) is learnt first. Its characteristics φ take points of one shape to where they shall lie on the
+next one,
+
+    L = Σ_k |f_{k+1}(φ_{k→k+1}(x))|² over x on S_k, and |f_k(φ_{k+1→k}(x))|² over x on S_{k+1}      both ends are met
+      + w(step) Σ |φ(x) − T(x)|²                                                  a guide, which fades
+      + α ‖J + Jᵀ‖² / 2 + β (tr J)²                                         as rigid, as even in volume as can be
+
+along all paths. The guide T matches points by entropic optimal transport, of places, normals and what the two fields
+say at steps along the normals (how thick the shape is there, how far the next part); it only has to be about right.
+`CarriedKeyframes` then is the shape at any time, and what the field of space-time learns.
+
+After the velocities of Sang et al. 2025 ("Implicit Neural Surface Deformation with Explicit Velocity Fields", and
+"4Deform"), who learn both together; here the characteristics are taken first, so that both ends are met by construction
+and no loss has to hold in between.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+from torch.nn.functional import huber_loss, normalize, pad
+
+from ...neural_fields import CarriedKeyframes, Field, VelocitySiren, at_time, flow
+from ..run.folder import load_state
+from ..run.schedule import Report
+from ..run.settings import EvolveConfig
+from ..run.trainer import Group, Objective, Trainer, seeded, warm_cosine
+from .samples import Bounds, Known, around, joined, known_at, uniform
+from .shapes import StaticShape
+
+__all__ = [
+    "VELOCITY_FILE",
+    "MotionObjective",
+    "carried_samples",
+    "learn_motion",
+    "load_motion",
+    "match",
+    "motion_figures",
+]
+
+VELOCITY_FILE = "velocity.safetensors"
+POOL = 20_000  # points of each shape
+MATCHED = 1000  # of them, which the guide has partners for
+STEPS = 8  # of the midpoint rule between two keys, while it is learnt
+# Per step of the training: points with a partner and others, of each end; places where the regularity is asked for.
+GUIDED, LOOSE, REGULAR = 256, 512, 1024
+AROUND = 0.05  # how far from the paths it is asked for
+FADES = 0.6  # of the steps, after which the guide is gone
+FAR = 0.1  # residuals count linearly from here on: what has no partner does not pull at all others
+DATA = 20.0  # weight of the ends
+INSIDE = 0.98  # radius that no path should leave
+# The cost of a pair is the squared way, and this much for opposite normals; and for other surroundings.
+NORMALS, SURROUNDINGS = 0.1, 0.06
+DEPTHS = (0.05, 0.1, 0.2, 0.3)
+# Entropic optimal transport: from a blur of √0.1 to one of √0.003. To leave mass without a partner costs more than the
+# longest way in the unit sphere, 2²: where it costs less, of a shape that has travelled the rear stays behind.
+BLUR, LEAST_BLUR, COOLING, ROUNDS, LEFT = 0.1, 0.003, 0.93, 100, 5.0
+NEWTON = 2
+ROWS = 8192
+
+
+def match(first: StaticShape, second: StaticShape, seed: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Points of two shapes, and where the guide wants them on the other one, ``(M, 3)`` each: x, T(x), y, T(y).
+
+    Unbalanced entropic optimal transport (Sinkhorn's iterations in logarithms, Chizat et al. 2018) with a cooling blur;
+    T is the mean of what a point is matched with.
+    """
+    sides = [_surroundings(shape, seed + index) for index, shape in enumerate((first, second))]
+    (x, n, a), (y, m, b) = sides
+    cost = torch.cdist(x, y).square() + NORMALS / 2 * (1 - n @ m.T)
+    cost = cost + SURROUNDINGS * torch.cdist(a, b).square() / a.shape[1]
+    rows, columns, blur = torch.zeros(len(x)), torch.zeros(len(y)), BLUR
+    for step in range(ROUNDS):
+        blur = max(LEAST_BLUR, BLUR * COOLING**step)
+        damped = -blur * LEFT / (LEFT + blur)
+        rows = damped * (torch.logsumexp((columns - cost) / blur, dim=1) - math.log(len(y)))
+        columns = damped * (torch.logsumexp((rows[:, None] - cost) / blur, dim=0) - math.log(len(x)))
+    plan = (rows[:, None] + columns - cost) / blur
+    return x, torch.softmax(plan, dim=1) @ y, y, torch.softmax(plan, dim=0).T @ x
+
+
+@torch.no_grad()
+def _surroundings(shape: StaticShape, seed: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Points, normals, and ``(M, 8)`` of what the field says inward and outward, over what a plane would: 1."""
+    points = shape.points(MATCHED, seed)
+    normals = normalize(shape.field.jet(points).gradient, dim=-1)
+    ways = [sign * depth for depth in DEPTHS for sign in (-1.0, 1.0)]
+    said = [shape.field.value(points + way * normals) / way for way in ways]
+    return points, normals, torch.stack(said, dim=1)
+
+
+class MotionObjective(Objective):
+    """The loss of a velocity between key shapes, see the module.
+
+    Args:
+        velocity: trained.
+        shapes: in one frame.
+        keys: their times.
+        config: settings.
+        generator: CPU generator that draws the batches.
+    """
+
+    def __init__(
+        self,
+        velocity: VelocitySiren,
+        shapes: Sequence[StaticShape],
+        keys: Sequence[float],
+        config: EvolveConfig,
+        generator: torch.Generator,
+    ) -> None:
+        rate = warm_cosine(config.motion_rate)
+        super().__init__(velocity, [Group(list(velocity.parameters()), rate)], generator)
+        self.velocity, self.shapes, self.keys, self.config = velocity, shapes, keys, config
+        self.pools = [shape.points(POOL, config.seed + index) for index, shape in enumerate(shapes)]
+        pairs = itertools.pairwise(shapes)
+        self.guides = [match(*pair, config.seed + 17 * index) for index, pair in enumerate(pairs)]
+
+    def losses(self, step: int, done: float) -> tuple[dict[str, Tensor], Tensor]:
+        """See `Objective.losses`; one interval between two keys in each step."""
+        config, before = self.config, step % len(self.guides)
+        x, wanted_x, y, wanted_y = self.guides[before]
+        ends = ((before, before + 1, x, wanted_x), (before + 1, before, y, wanted_y))
+        met, guided, places, times = [], [], [], []
+        for start, end, points, wanted in ends:
+            chosen, pool = self._draw(len(points), GUIDED), self.pools[start]
+            begun = torch.cat((points[chosen], pool[self._draw(len(pool), LOOSE)]))
+            path, when = self._path(begun, self.keys[start], self.keys[end])
+            left = self.shapes[end].field.value(path[-1])
+            met.append(huber_loss(left, torch.zeros_like(left), delta=FAR))
+            guided.append((path[-1][:GUIDED] - wanted[chosen]).square().sum(dim=1).mean())
+            places.append(path.reshape(-1, 3))
+            times.append(when[:, None].expand(path.shape[:2]).reshape(-1))
+        x, t = torch.cat(places), torch.cat(times)
+        beyond = (x.norm(dim=1) - INSIDE).clamp(min=0).square().mean()
+        chosen = self._draw(len(x), REGULAR)
+        aside = AROUND * torch.randn(REGULAR, 3, generator=self.generator)
+        jet = self.velocity.jet(x[chosen].detach() + aside, t[chosen])
+        terms = {
+            "ends": met[0] + met[1],
+            "guide": guided[0] + guided[1],
+            "rigid": jet.killing.mean() / 2,
+            "volume": jet.divergence.square().mean(),
+            "steady": jet.rate.square().sum(dim=1).mean(),
+        }
+        total = DATA / 2 * terms["ends"] + config.guide_weight * max(0.0, 1 - done / FADES) * terms["guide"]
+        total = total + config.rigid_weight * terms["rigid"] + config.volume_weight * terms["volume"]
+        return terms, total + 1e-3 * terms["steady"] + DATA * beyond
+
+    def _path(self, points: Tensor, start: float, end: float) -> tuple[Tensor, Tensor]:
+        """Places ``(S + 1, N, 3)`` by the midpoint rule, and times ``(S + 1,)``."""
+        step, path = (end - start) / STEPS, [points]
+        for index in range(STEPS):
+            time = points.new_full((), start + index * step)
+            half = path[-1] + step / 2 * self.velocity(path[-1], time)
+            path.append(path[-1] + step * self.velocity(half, time + step / 2))
+        return torch.stack(path), torch.linspace(start, end, STEPS + 1)
+
+    def _draw(self, count: int, wanted: int) -> Tensor:
+        return torch.randint(count, (wanted,), generator=self.generator)
+
+
+def learn_motion(
+    shapes: Sequence[StaticShape], keys: Sequence[float], config: EvolveConfig, progress: Report | None = None
+) -> VelocitySiren:
+    """A velocity that takes each of the shapes to the next one, on the CPU."""
+    with seeded(config.seed):
+        velocity = VelocitySiren(config.motion_width, 2, omega=config.motion_omega)
+    generator = torch.Generator().manual_seed(config.seed * 1009 + 71)
+    for shape in shapes:
+        shape.field.requires_grad_(False)
+    objective = MotionObjective(velocity, shapes, keys, config, generator)
+    Trainer(objective, stage="motion", steps=config.motion_steps * (len(keys) - 1)).run(report=progress)
+    return velocity.requires_grad_(False)
+
+
+def load_motion(run: Path, config: EvolveConfig) -> VelocitySiren:
+    """The velocity that a run has learnt.
+
+    Raises:
+        InputError: the file is damaged.
+    """
+    velocity = VelocitySiren(config.motion_width, 2, omega=config.motion_omega)
+    velocity.load_state_dict(load_state(run, name=VELOCITY_FILE)[0])
+    return velocity.requires_grad_(False)
+
+
+def carried_samples(
+    carried: CarriedKeyframes, shapes: Sequence[StaticShape], count: int, seed: int
+) -> tuple[Known, Bounds]:
+    """Where shapes on their way are, and on which side of them other places lie.
+
+    About half of the known samples are the shapes themselves at their times, with their values; the others are points
+    carried to any time and moved to f = 0, with unit normals. Bounds are signs, as values in between are no distances.
+    """
+    generator, keys = torch.Generator().manual_seed(seed), carried.keys.times
+    each = -(-count // (2 * len(shapes)))
+    known = [known_at(shape, key, each, seed, generator) for shape, key in zip(shapes, keys, strict=True)]
+    sides: list[Tensor] = []
+    for index, shape in enumerate(shapes):
+        first, last = keys[max(index - 1, 0)], keys[min(index + 1, len(keys) - 1)]
+        t = first + (last - first) * torch.rand(each, generator=generator)
+        begun = around(shape, each, seed + 31 + index, generator)
+        begun = torch.cat((shape.points(each, seed + 57 + index), begun))
+        x = torch.cat([flow(carried.velocity, *part) for part in _parts(begun, keys[index], t.repeat(2))])
+        known.append(_on_surface(carried, at_time(x[:each], t)))
+        sides.append(at_time(x[each:], t))
+    anywhere = at_time(uniform(count // 2, generator), torch.rand(count // 2, generator=generator))
+    points = torch.cat((*sides, anywhere))
+    with torch.no_grad():
+        value = torch.cat([carried.value(part) for part in points.split(ROWS)])
+    sure = value.abs() > 1e-3
+    positive = value[sure] > 0
+    zero = torch.zeros(len(positive))
+    low, high = torch.where(positive, zero, -math.inf), torch.where(positive, math.inf, zero)
+    return joined(known), Bounds(points[sure], low, high)
+
+
+def _parts(points: Tensor, start: float, end: Tensor) -> list[tuple[Tensor, float, Tensor]]:
+    return [(x, start, t) for x, t in zip(points.split(ROWS), end.split(ROWS), strict=True)]
+
+
+def _on_surface(carried: Field, points: Tensor) -> Known:
+    """Those of the points that Newton's steps along ∇f bring to f = 0, with value 0 and unit normals."""
+    found = []
+    for part in points.split(ROWS):
+        here = part
+        for _ in range(NEWTON):
+            value, gradient, _ = carried.jet(here)
+            slope = gradient[:, :3].square().sum(dim=1).clamp(min=0.25)
+            here = here - pad((value / slope).clamp(-FAR, FAR)[:, None] * gradient[:, :3], (0, 1))
+        value, gradient, _ = carried.jet(here)
+        arrived = (value.abs() < 1e-3) & (gradient[:, :3].norm(dim=1) > 0.2)
+        normals = normalize(gradient[:, :3], dim=1)
+        found.append(Known(here[arrived], torch.zeros(int(arrived.sum())), normals[arrived]))
+    return joined(found)
+
+
+@torch.no_grad()
+def motion_figures(
+    velocity: VelocitySiren, shapes: Sequence[StaticShape], keys: Sequence[float]
+) -> list[dict[str, float]]:
+    """Of each way from a key to the next: rms and largest |f| where it ends, and how rigid and even it is."""
+    figures = []
+    for index in range(len(keys) - 1):
+        start, end = keys[index], keys[index + 1]
+        points = shapes[index].points(5000, 7)
+        there = flow(velocity, points, start, end)
+        middle = flow(velocity, points, start, (start + end) / 2)
+        left = shapes[index + 1].field.value(there)
+        jet = velocity.jet(middle, middle.new_full((), (start + end) / 2))
+        figures.append(
+            {
+                "from": start,
+                "to": end,
+                "rms_at_end": float(left.square().mean().sqrt()),
+                "max_at_end": float(left.abs().max()),
+                "mean_way": float((there - points).norm(dim=1).mean()),
+                "killing": float(jet.killing.mean()),
+                "divergence_rms": float(jet.divergence.square().mean().sqrt()),
+            }
+        )
+    return figures
