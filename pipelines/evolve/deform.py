@@ -6,6 +6,7 @@ next one,
 
     L = Σ_k |f_{k+1}(φ_{k→k+1}(x))|² over x on S_k, and |f_k(φ_{k+1→k}(x))|² over x on S_{k+1}      both ends are met
       + w(step) Σ |φ(x) − T(x)|²                                                  a guide, which fades
+      + l Σ |φ(a) − b|²                                                           landmarks, where there are any
       + α ‖J + Jᵀ‖² / 2 + β (tr J)²                                         as rigid, as even in volume as can be
 
 along all paths. The guide T matches points by entropic optimal transport, of places, normals and what the two fields
@@ -33,6 +34,7 @@ from ..run.folder import load_state
 from ..run.schedule import Report
 from ..run.settings import EvolveConfig
 from ..run.trainer import Group, Objective, Trainer, seeded, warm_cosine
+from .landmarks import Landmarks, nearness, placed_landmarks
 from .samples import Bounds, Known, around, joined, known_at, uniform
 from .shapes import StaticShape
 
@@ -59,6 +61,7 @@ DATA = 20.0  # weight of the ends
 INSIDE = 0.98  # radius that no path should leave
 # The cost of a pair is the squared way, and this much for opposite normals; and for other surroundings.
 NORMALS, SURROUNDINGS = 0.1, 0.06
+MARKED = 4.0  # for the squared differences of their nearness to landmarks, added up
 DEPTHS = (0.05, 0.1, 0.2, 0.3)
 # Entropic optimal transport: from a blur of √0.1 to one of √0.003. To leave mass without a partner costs more than the
 # longest way in the unit sphere, 2²: where it costs less, of a shape that has travelled the rear stays behind.
@@ -67,16 +70,20 @@ NEWTON = 2
 ROWS = 8192
 
 
-def match(first: StaticShape, second: StaticShape, seed: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def match(
+    first: StaticShape, second: StaticShape, seed: int, landmarks: Landmarks | None = None
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Points of two shapes, and where the guide wants them on the other one, ``(M, 3)`` each: x, T(x), y, T(y).
 
     Unbalanced entropic optimal transport (Sinkhorn's iterations in logarithms, Chizat et al. 2018) with a cooling blur;
-    T is the mean of what a point is matched with.
+    T is the mean of what a point is matched with. Landmarks make points near one prefer points near its partner.
     """
     sides = [_surroundings(shape, seed + index) for index, shape in enumerate((first, second))]
     (x, n, a), (y, m, b) = sides
     cost = torch.cdist(x, y).square() + NORMALS / 2 * (1 - n @ m.T)
     cost = cost + SURROUNDINGS * torch.cdist(a, b).square() / a.shape[1]
+    if landmarks is not None and len(landmarks.before):
+        cost = cost + MARKED * torch.cdist(nearness(x, landmarks.before), nearness(y, landmarks.after)).square()
     rows, columns, blur = torch.zeros(len(x)), torch.zeros(len(y)), BLUR
     for step in range(ROUNDS):
         blur = max(LEAST_BLUR, BLUR * COOLING**step)
@@ -120,20 +127,26 @@ class MotionObjective(Objective):
         super().__init__(velocity, [Group(list(velocity.parameters()), rate)], generator)
         self.velocity, self.shapes, self.keys, self.config = velocity, shapes, keys, config
         self.pools = [shape.points(POOL, config.seed + index) for index, shape in enumerate(shapes)]
-        pairs = itertools.pairwise(shapes)
-        self.guides = [match(*pair, config.seed + 17 * index) for index, pair in enumerate(pairs)]
+        self.landmarks = placed_landmarks(config.landmarks, shapes)
+        pairs = zip(itertools.pairwise(shapes), self.landmarks, strict=True)
+        self.guides = [match(*pair, config.seed + 17 * index, own) for index, (pair, own) in enumerate(pairs)]
 
     def losses(self, step: int, done: float) -> tuple[dict[str, Tensor], Tensor]:
         """See `Objective.losses`; one interval between two keys in each step."""
         config, before = self.config, step % len(self.guides)
         x, wanted_x, y, wanted_y = self.guides[before]
-        ends = ((before, before + 1, x, wanted_x), (before + 1, before, y, wanted_y))
-        met, guided, places, times = [], [], [], []
-        for start, end, points, wanted in ends:
+        own = self.landmarks[before]
+        marked = self._draw(len(own.before), min(len(own.before), GUIDED))
+        here, there = own.before[marked], own.after[marked]
+        ends = ((before, before + 1, x, wanted_x, here, there), (before + 1, before, y, wanted_y, there, here))
+        met, guided, places, times, missed = [], [], [], [], [x.new_zeros(())]
+        for start, end, points, wanted, leaves, arrives in ends:
             chosen, pool = self._draw(len(points), GUIDED), self.pools[start]
-            begun = torch.cat((points[chosen], pool[self._draw(len(pool), LOOSE)]))
+            begun = torch.cat((points[chosen], pool[self._draw(len(pool), LOOSE)], leaves))
             path, when = self._path(begun, self.keys[start], self.keys[end])
-            left = self.shapes[end].field.value(path[-1])
+            left = self.shapes[end].field.value(path[-1][: GUIDED + LOOSE])
+            if len(leaves):
+                missed.append((path[-1][GUIDED + LOOSE :] - arrives).square().sum(dim=1).mean())
             met.append(huber_loss(left, torch.zeros_like(left), delta=FAR))
             guided.append((path[-1][:GUIDED] - wanted[chosen]).square().sum(dim=1).mean())
             places.append(path.reshape(-1, 3))
@@ -146,12 +159,14 @@ class MotionObjective(Objective):
         terms = {
             "ends": met[0] + met[1],
             "guide": guided[0] + guided[1],
+            "landmarks": torch.stack(missed).sum(),
             "rigid": jet.killing.mean() / 2,
             "volume": jet.divergence.square().mean(),
             "steady": jet.rate.square().sum(dim=1).mean(),
         }
         total = DATA / 2 * terms["ends"] + config.guide_weight * max(0.0, 1 - done / FADES) * terms["guide"]
         total = total + config.rigid_weight * terms["rigid"] + config.volume_weight * terms["volume"]
+        total = total + config.landmark_weight * terms["landmarks"]
         return terms, total + 1e-3 * terms["steady"] + DATA * beyond
 
     def _path(self, points: Tensor, start: float, end: float) -> tuple[Tensor, Tensor]:
@@ -164,7 +179,7 @@ class MotionObjective(Objective):
         return torch.stack(path), torch.linspace(start, end, STEPS + 1)
 
     def _draw(self, count: int, wanted: int) -> Tensor:
-        return torch.randint(count, (wanted,), generator=self.generator)
+        return torch.randint(max(count, 1), (wanted,), generator=self.generator)
 
 
 def learn_motion(

@@ -33,6 +33,7 @@ from ..run.trainer import (
 )
 from .checks import check_evolution
 from .deform import VELOCITY_FILE, load_motion
+from .landmarks import read_landmarks
 from .objective import LONGEST_GRADIENT, EvolveObjective, learn_start
 from .plan import FEWEST_STEPS, EvolvePlan, within
 from .problem import Problem, build_problem
@@ -91,6 +92,8 @@ def evolve(
     machine, notes = speed(device), list[str]()
     plan, count, shapes = EvolvePlan(config, machine), len(config.shapes), []
     schedule.plan([plan.shapes(), *plan.moving(resume), plan.known(), *plan.stages()], budget=config.time_budget)
+    for path in config.landmarks:
+        read_landmarks(path)  # before the shapes, which take their time
     for index, text in enumerate(config.shapes):
         schedule(Progress("shapes", index, count, index / count, {}))
         shapes.append(read_shape(text))

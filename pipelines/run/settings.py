@@ -223,6 +223,10 @@ class EvolveConfig(Settings):
     angle: tuple[float, ...] = setting((0.0,), "transport: radians per unit of time, one number per shape")
     twist: tuple[float, ...] = setting((0.0,), "transport: radians more per unit along the axis, one number per shape")
     alpha: float = setting(0.02, "smooth: how fast; a sphere has r(t)^2 = r^2 - 4 alpha t, in units of the field")
+    landmarks: tuple[str, ...] = setting(
+        (), "deform: a file of points that are the same for each two shapes; a line is x y z of one, x y z of the next"
+    )
+    landmark_weight: float = setting(20.0, "deform: weight of the landmarks' squared distances", at_least=0)
     motion_steps: int = setting(600, "deform: steps in which the motion is learnt, for each two shapes", above=0)
     motion_width: int = setting(64, "deform: neurons in each of the motion's two sine layers", above=0)
     motion_omega: float = setting(3.0, "deform: frequency of the motion; a low one keeps it smooth", above=0)
@@ -267,6 +271,9 @@ class EvolveConfig(Settings):
                 raise ValueError(f"times: {len(self.times)} numbers for {count} shapes; expected one for each")
             if any(not a < b for a, b in itertools.pairwise(self.times)) or (self.times[0], self.times[-1]) != (0, 1):
                 raise ValueError(f"times: {self.times}; expected growing numbers from 0 to 1")
+        if self.landmarks and (self.kind != "deform" or len(self.landmarks) != count - 1):
+            files = f"{len(self.landmarks)} files for {count} shapes, kind {self.kind}"
+            raise ValueError(f"landmarks: {files}; expected kind deform, and one file for each two shapes")
         for name, size in _SIZES.items():
             if len(getattr(self, name)) not in (size, size * max(count, 1)):
                 raise ValueError(f"{name}: {len(getattr(self, name))} numbers; expected {size}, or {size} per shape")

@@ -1,0 +1,100 @@
+"""Points of two shapes that are known to be the same: a file of them, and what they say to a motion that is learnt.
+
+A few landmarks settle what geometry leaves open, as which leg is which or how far a round thing has turned. All
+vertices of two meshes with the same faces are landmarks too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ...datasets.files import readable
+from ...neural_fields import InputError
+from .shapes import StaticShape
+
+__all__ = ["Landmarks", "nearness", "placed_landmarks", "read_landmarks"]
+
+Float64 = NDArray[np.float64]
+FAR_OUT = 0.1  # how far from its surface a landmark may lie, in units of the field: fits and picks are not exact
+SPREAD = 0.3  # within which a landmark says something about its neighbours
+
+
+class Landmarks(NamedTuple):
+    """Pairs of points.
+
+    Attributes:
+        before: ``(P, 3)`` of a shape.
+        after: ``(P, 3)``, the same points of the next shape.
+    """
+
+    before: Tensor
+    after: Tensor
+
+
+def read_landmarks(path: str | Path) -> tuple[Float64, Float64]:
+    """Pairs of points from a text file, ``(P, 3)`` each, in the input coordinates of either shape.
+
+    A line has six numbers, x y z of the first shape and x y z of the second, with spaces or commas between them; what
+    follows a # is a comment.
+
+    Raises:
+        InputError: there is no such file, it has no pairs, or a line is no six finite numbers.
+    """
+    path = Path(path)
+    with readable(path):
+        lines = path.read_text(encoding="utf-8").splitlines()
+    pairs = []
+    for number, line in enumerate(lines, start=1):
+        words = line.partition("#")[0].replace(",", " ").split()
+        if not words:
+            continue
+        try:
+            pair = [float(word) for word in words]
+        except ValueError:
+            pair = []
+        if len(pair) != 6 or not np.isfinite(pair).all():
+            raise InputError(f"{path}, line {number}: expected six numbers, x y z of one shape and x y z of the next")
+        pairs.append(pair)
+    if not pairs:
+        raise InputError(f"{path}: no landmarks; write six numbers in a line, x y z of one shape and x y z of the next")
+    both = np.array(pairs)
+    return both[:, :3], both[:, 3:]
+
+
+def placed_landmarks(paths: Sequence[str], shapes: Sequence[StaticShape]) -> list[Landmarks]:
+    """The landmarks of each two shapes, in the frame that the shapes were put in; none where there are no files.
+
+    Raises:
+        InputError: a file cannot be read, or a landmark is not on its shape.
+    """
+    if not paths:
+        none = torch.empty(0, 3)
+        return [Landmarks(none, none)] * (len(shapes) - 1)
+    found = []
+    for index, path in enumerate(paths):
+        both = zip(read_landmarks(path), shapes[index : index + 2], strict=True)
+        found.append(Landmarks(*(_placed(path, points, shape) for points, shape in both)))
+    return found
+
+
+def nearness(points: Tensor, landmarks: Tensor) -> Tensor:
+    """exp(−|x − a|² / 2σ²) of points ``(N, 3)`` and landmarks ``(P, 3)``, ``(N, P)``: alike for points that match."""
+    return torch.exp(-torch.cdist(points, landmarks).square() / (2 * SPREAD**2))
+
+
+@torch.no_grad()
+def _placed(path: str, points: Float64, shape: StaticShape) -> Tensor:
+    placed = torch.from_numpy(shape.placement.apply(shape.similarity.to_unit(points))).float()
+    value = shape.field.value(placed).abs()
+    worst = int(value.argmax())
+    if not float(value[worst]) <= FAR_OUT:
+        where = " ".join(f"{number:g}" for number in points[worst])
+        raise InputError(f"{path}: landmark {where} is not on {shape.name}; give coordinates of that shape's own input")
+    return placed

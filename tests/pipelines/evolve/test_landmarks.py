@@ -1,0 +1,121 @@
+"""Landmarks: what a file may hold, where it lands, and that a ball turns which nothing else would turn."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from evolutions import BRIEF, few_points
+from mplicits.neural_fields import InputError, RigidMotion, flow
+from mplicits.pipelines.evolve import deform
+from mplicits.pipelines.evolve.deform import learn_motion, match
+from mplicits.pipelines.evolve.landmarks import Landmarks, nearness, placed_landmarks, read_landmarks
+from mplicits.pipelines.evolve.shapes import Placement, read_shape
+from mplicits.pipelines.evolve.train import evolve
+from mplicits.pipelines.run.settings import EvolveConfig
+
+BALL = "sphere:0.5"
+TURN = RigidMotion(axis=(0.0, 0.0, 1.0), angle=0.8)
+SMALL = replace(
+    BRIEF,
+    kind="deform",
+    velocity=(0.0, 0.0, 0.0),
+    shapes=(BALL, BALL),
+    align="none",
+    motion_steps=80,
+    motion_width=16,
+    motion_rate=2e-2,
+)
+
+
+@pytest.fixture(autouse=True)
+def _small(monkeypatch: pytest.MonkeyPatch) -> None:
+    few_points(monkeypatch)
+    for name, value in {"POOL": 500, "MATCHED": 150, "GUIDED": 64, "LOOSE": 32, "REGULAR": 64, "STEPS": 4}.items():
+        monkeypatch.setattr(deform, name, value)
+
+
+def corners() -> torch.Tensor:
+    """Six points of the ball, which a turn about z takes to six others."""
+    return 0.5 * torch.cat((torch.eye(3), -torch.eye(3)))
+
+
+def write(path: Path, before: torch.Tensor, after: torch.Tensor) -> str:
+    np.savetxt(path, torch.cat((before, after), dim=1).numpy())
+    return str(path)
+
+
+def test_lines_commas_and_comments(tmp_path: Path) -> None:
+    (tmp_path / "marks.txt").write_text(
+        "# head, then tail\n1 2 3 4 5 6\n\n-1, 0,1e-3, 0,0,7 # tail\n", encoding="utf-8"
+    )
+    before, after = read_landmarks(tmp_path / "marks.txt")
+    np.testing.assert_array_equal(before, [[1, 2, 3], [-1, 0, 1e-3]])
+    np.testing.assert_array_equal(after, [[4, 5, 6], [0, 0, 7]])
+
+
+@pytest.mark.parametrize(("text", "said"), [("1 2 3", "line 1"), ("1 2 3 4 5 x", "line 1"), ("# none", "no landmarks")])
+def test_other_lines_are_refused(tmp_path: Path, text: str, said: str) -> None:
+    (tmp_path / "marks.txt").write_text(text, encoding="utf-8")
+    with pytest.raises(InputError, match=said):
+        read_landmarks(tmp_path / "marks.txt")
+
+
+def test_nan_and_missing_files_are_refused_before_shapes_are_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mplicits.pipelines.evolve.train.read_shape", lambda _: pytest.fail("too late"))
+    (tmp_path / "nan.txt").write_text("1 2 3 4 5 nan", encoding="utf-8")
+    for name, said in (("nan.txt", "line 1"), ("none.txt", "none.txt")):
+        with pytest.raises(InputError, match=said):
+            evolve(replace(SMALL, landmarks=(str(tmp_path / name),)))
+
+
+def test_one_file_for_each_two_shapes_of_a_deformation() -> None:
+    with pytest.raises(ValueError, match="2 files for 2 shapes"):
+        replace(SMALL, landmarks=("a", "b"))
+    with pytest.raises(ValueError, match="kind morph"):
+        EvolveConfig(shapes=(BALL, BALL), landmarks=("a",))
+
+
+def test_they_go_where_their_shapes_go(tmp_path: Path) -> None:
+    path = write(tmp_path / "marks.txt", corners(), corners())
+    placement = Placement(
+        rotation=np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), scale=0.5, shift=np.array([0.1, 0, 0])
+    )
+    first, second = read_shape(BALL), read_shape(BALL).placed(placement)
+    (found,) = placed_landmarks([path], [first, second])
+    torch.testing.assert_close(found.before, corners())
+    expected = torch.from_numpy(placement.apply(corners().double().numpy())).float()
+    torch.testing.assert_close(found.after, expected)
+    assert [len(own.before) for own in placed_landmarks([], [first, second, first])] == [0, 0]
+    with pytest.raises(InputError, match="is not on sphere"):
+        placed_landmarks([write(tmp_path / "off.txt", corners(), 2 * corners())], [first, first])
+
+
+def test_the_guide_hears_them() -> None:
+    """Of a ball on itself the cheapest plan moves nothing, but that landmarks say that it has turned."""
+    ball, after = read_shape(BALL), TURN.forward(corners(), 1.0)
+    still = match(ball, ball, 0)
+    turned = match(ball, ball, 0, Landmarks(corners(), after))
+
+    def missed(found: tuple[torch.Tensor, ...]) -> float:
+        return float((found[1] - TURN.forward(found[0], 1.0)).norm(dim=1).mean())
+
+    assert missed(turned) < 0.5 * missed(still)
+    assert torch.equal(nearness(corners(), corners()).diagonal(), torch.ones(6))
+
+
+def test_a_ball_turns(tmp_path: Path) -> None:
+    ball, after = read_shape(BALL), TURN.forward(corners(), 1.0)
+    config = replace(SMALL, landmarks=(write(tmp_path / "marks.txt", corners(), after),))
+    velocity = learn_motion([ball, ball], (0.0, 1.0), config)
+    others = ball.points(300, 9)
+    with torch.no_grad():
+        marks, moved = (flow(velocity, points, 0.0, 1.0) for points in (corners(), others))
+    way = float((after - corners()).norm(dim=1).mean())
+    assert float((marks - after).norm(dim=1).mean()) < 0.25 * way
+    # What lies between landmarks turns with them, as nothing else strains so little.
+    truth = TURN.forward(others, 1.0)
+    assert float((moved - truth).norm(dim=1).mean()) < 0.5 * float((others - truth).norm(dim=1).mean())
