@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args, get_type_hints
 
 from ..run.config import add_config_flags, given_flags, input_error, load_config, preset_names
 from ..run.settings import EvolveConfig, FitConfig, ReconstructConfig, TextureConfig
@@ -445,6 +445,42 @@ def _evolve(arguments: argparse.Namespace) -> int:
     return _run(arguments, benches, out=arguments.out)
 
 
+def _motion_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--kinds", nargs="+", choices=_from_shape_to_shape(), metavar="KIND", help="of evolve (all from shape to shape)"
+    )
+    _number(parser, "--keys", whole(2, 100), 5, "exact key shapes, at even times")
+    _number(parser, "--moments", whole(1, 1000), 20, "held-out times that are measured")
+    _number(parser, "--mesh-resolution", whole(8, 2048), 96, "of the meshes that are measured")
+    _folder(parser)
+    add_flags(parser, "--json")
+    add_settings(parser, EvolveConfig, default="exact", about="of each training; overrides the preset")
+
+
+def _from_shape_to_shape() -> list[str]:
+    """The kinds of ``evolve`` that take several shapes, each at its time."""
+    kinds: tuple[str, ...] = get_args(get_type_hints(EvolveConfig)["kind"])
+    return [kind for kind in kinds if kind not in ("transport", "smooth")]
+
+
+def _motion(arguments: argparse.Namespace) -> int:
+    flags = given_flags(arguments, EvolveConfig)
+    for name in (*FROM_CASES, "align"):
+        if name in flags:
+            raise input_error(f"--{name}: the benchmark says what is trained; leave it out")
+    config = read_settings(arguments, EvolveConfig, default="exact")
+    from ..bench.motion import MotionBench
+
+    bench = MotionBench(
+        config=config,
+        kinds=tuple(arguments.kinds or _from_shape_to_shape()),
+        keys=arguments.keys,
+        moments=arguments.moments,
+        resolution=arguments.mesh_resolution,
+    )
+    return _run(arguments, [bench], out=arguments.out)
+
+
 def _scale_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("shape", nargs="?", metavar="SHAPE", help="a mesh (default: the bundled statue)")
     _number(parser, "--points", whole(1000), (100_000, 1_000_000, 10_000_000), "sizes of the clouds", nargs="+")
@@ -612,6 +648,16 @@ BENCH_COMMANDS: Mapping[str, Command] = MappingProxyType(
             "Train evolutions that are known in closed form and measure their surfaces at 20 times; with --meshes, fit "
             "two meshes, morph between the fits, measure both ends against the meshes, and time the dynamic tracer on "
             "the morph.",
+        ),
+        "bench motion": Command(
+            "motions between key shapes, at moments that were held out",
+            """  mplicits bench motion
+  mplicits bench motion --kinds morph --keys 3 --moments 12 -o bench_motion --json motion.json""",
+            _motion_arguments,
+            _motion,
+            "Train evolutions between key shapes of figures that bend and twist in closed form, and measure surface, "
+            "volume, area, components, carried points and stretched triangles at held-out moments, beside the blend "
+            "of the key shapes' distances.",
         ),
         "bench paper": PAPER,
         "bench scale": Command(
