@@ -1,15 +1,15 @@
 """``mplicits bench motion``: motions between key shapes of exact figures, judged at moments that were held out.
 
-The figures are known at all times (see `figures`), so is where each point of their surfaces goes. Only the key shapes
-are shown to ``evolve``; every kind of it that goes from shape to shape is trained on the same ones, and the level-set
-blend (`Keyframes`), which is trained by nothing, stands beside them.
+The figures are known at all times (see `figures`), so is where each point of their surfaces goes. Only the key shapes,
+or fits of their scans, are shown to ``evolve``. Every kind of it that goes from shape to shape is trained on the same
+ones, and the level-set blend (`Keyframes`), which is trained by nothing, stands beside them.
 """
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -18,7 +18,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ...datasets.clouds.ply import write_cloud_ply
 from ...datasets.synthetic.figures import DeformingField, bending_arm, twisting_bar
+from ...datasets.synthetic.scanner import simulate_scan
 from ...neural_fields import (
     Field,
     IntegrationError,
@@ -35,13 +37,14 @@ from ...neural_fields.carried import CarriedVelocity
 from ...neural_fields.evolution import VectorField
 from ..evolve.checks import volume
 from ..evolve.problem import build_problem
-from ..evolve.shapes import StaticShape
+from ..evolve.shapes import StaticShape, aligned, into_unit_sphere, read_shape
 from ..evolve.train import train_evolution
-from ..run.settings import EvolveConfig
+from ..run.settings import EvolveConfig, FitConfig
 from ..surface.distance import MeshDistance
 from ..surface.surface import Surface, components, face_normals, from_mesh, sample_points
 from .benchmark import Benchmark, Part
 from .cells import Workplace
+from .fits import fit_home, kept_fit
 from .tables import Column, Figure, Table, mean, tabulated
 
 __all__ = ["BLEND", "FIGURES", "MotionBench", "MotionRow", "measure_motion", "triangle_stretch"]
@@ -56,6 +59,7 @@ SAMPLES = 5000  # points of each surface that is compared
 # Points that are carried: near a change of topology adaptive steps would shrink to nothing, for the sake of a few.
 CARRY = Solver(method="rk4", step=0.02)
 STRETCHED = 4.0
+SCAN_RESOLUTION = 128  # rays along each side of a scanner's grid
 
 
 @dataclass(frozen=True)
@@ -96,6 +100,9 @@ class MotionBench(Benchmark[MotionRow]):
         kinds: of ``evolve``.
         figures: names in `FIGURES`.
         keys: how many key shapes.
+        noise: standard deviation of the ranges of scans of the key shapes, over the diagonal, which are fitted then;
+            None shows the exact key shapes.
+        fits: settings of those fits.
         moments: how many held-out times, spread evenly between the first key and the last, none of them a key.
         resolution: cells along each side of the meshes.
     """
@@ -108,6 +115,8 @@ class MotionBench(Benchmark[MotionRow]):
     kinds: Sequence[str]
     figures: Sequence[str] = tuple(FIGURES)
     keys: int = 5
+    noise: float | None = None
+    fits: FitConfig = field(default_factory=FitConfig)
     moments: int = 20
     resolution: int = 96
 
@@ -131,11 +140,14 @@ class MotionBench(Benchmark[MotionRow]):
         name, method = cell.parameters["figure"], cell.parameters["method"]
         truth = FIGURES[name]()
         keys = tuple(np.linspace(0, 1, self.keys).tolist())
+        shapes = self._key_shapes(truth, name, keys, work)
         if method == BLEND:
-            still: list[Field] = [TimeSlice(truth, time) for time in keys]
-            blend = Keyframes(keys, still)
-            return [measure_motion(name, method, blend, truth, self.held_out(), resolution=self.resolution)]
-        shapes = [_key_shape(truth, name, time, self.resolution) for time in keys]
+            blend, place = _blended(shapes, keys)
+            return [
+                measure_motion(
+                    name, method, blend, truth, self.held_out(), similarity=place, resolution=self.resolution
+                )
+            ]
         own = dataclasses.replace(
             self.config, kind=method, shapes=tuple(shape.name for shape in shapes), times=keys, align="none"
         )
@@ -148,11 +160,33 @@ class MotionBench(Benchmark[MotionRow]):
             run.field,
             truth,
             self.held_out(),
-            velocity=getattr(problem, "motion", None),
+            velocity=problem.motion,
             similarity=run.similarity,
             resolution=self.resolution,
         )
         return [dataclasses.replace(row, seconds=run.record["training_seconds"])]
+
+    def _shown(self) -> str:
+        return "exact key shapes" if self.noise is None else f"key scans with noise of {100 * self.noise:g} %"
+
+    def _key_shapes(
+        self, truth: DeformingField, name: str, keys: Sequence[float], work: Workplace
+    ) -> list[StaticShape]:
+        """The exact shapes, or fits of their scans, which are kept with the results."""
+        if self.noise is None:
+            return [_key_shape(truth, name, time, self.resolution) for time in keys]
+        deviation = self.noise * _diagonal(_rest(truth, self.resolution))
+        shapes = []
+        for index, time in enumerate(keys):
+            stem = f"{name.replace(' ', '-')}-{self.noise:g}-{time:.4f}"
+            path = work.out / "scans" / f"{stem}.ply"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            scan = simulate_scan(TimeSlice(truth, time), resolution=SCAN_RESOLUTION, noise=deviation, seed=index)
+            write_cloud_ply(path, scan)
+            home = fit_home(work.out, path, self.fits)
+            kept_fit(home, path, self.fits, progress=work.stage(stem))
+            shapes.append(read_shape(str(home)))
+        return shapes
 
     def tables(self, rows: Sequence[MotionRow], *, sgemm: float) -> tuple[Table, ...]:
         """Means over the moments, then the moments of the surface errors; see `Benchmark.tables`."""
@@ -175,7 +209,7 @@ class MotionBench(Benchmark[MotionRow]):
             (Column("train, s", ".0f"), lambda r: r.seconds),
         ]
         note = (
-            f"{len(rows[0].times)} held-out moments between {self.keys} exact key shapes; lengths in percent of the "
+            f"{len(rows[0].times)} held-out moments between {self.keys} {self._shown()}; lengths in percent of the "
             "diagonal; volume and area at the worst moment"
         )
         items = [(f"{row.figure}, {row.method}", row) for row in rows]
@@ -215,7 +249,7 @@ def measure_motion(
     """
     place = similarity or Similarity.identity()
     rest = _rest(truth, resolution)
-    diagonal = float(np.linalg.norm(np.ptp(rest.vertices, axis=0)))
+    diagonal = _diagonal(rest)
     frames = [_frame(field, truth, rest, place, time, resolution) for time in times]
     paths = _carried(field, place, velocity, rest.vertices, times)
     apart: list[float | None] = [None] * len(times)
@@ -301,6 +335,19 @@ def _key_shape(truth: DeformingField, name: str, time: float, resolution: int) -
     rest = _rest(truth, resolution)
     surface = Surface(_moved(truth, rest.vertices, time), rest.faces)
     return StaticShape(f"{name} at {time:g}", TimeSlice(truth, time), Similarity.identity(), surface)
+
+
+def _diagonal(surface: Surface) -> float:
+    return float(np.linalg.norm(np.ptp(surface.vertices, axis=0)))
+
+
+def _blended(shapes: Sequence[StaticShape], keys: tuple[float, ...]) -> tuple[Keyframes, Similarity]:
+    """The blend in the unit sphere that ``evolve`` works in, and the way from the shapes' own coordinates to it."""
+    first = shapes[0].similarity
+    placed = aligned(list(shapes), "none")
+    placed, region = into_unit_sphere(placed, np.concatenate([shape.surface.vertices for shape in placed]))
+    x, y, z = first.to_input(np.asarray(region.center)).tolist()
+    return Keyframes(keys, [shape.field for shape in placed]), Similarity((x, y, z), first.scale * region.scale)
 
 
 def _moved(truth: DeformingField, points: Float64, time: float) -> Float64:

@@ -449,7 +449,10 @@ def _motion_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--kinds", nargs="+", choices=_from_shape_to_shape(), metavar="KIND", help="of evolve (all from shape to shape)"
     )
-    _number(parser, "--keys", whole(2, 100), 5, "exact key shapes, at even times")
+    _number(parser, "--keys", whole(2, 100), 5, "key shapes, at even times")
+    _number(
+        parser, "--noise", positive, None, "fit scans of the key shapes, with this deviation in diagonals (no scans)"
+    )
     _number(parser, "--moments", whole(1, 1000), 20, "held-out times that are measured")
     _number(parser, "--mesh-resolution", whole(8, 2048), 96, "of the meshes that are measured")
     _folder(parser)
@@ -469,12 +472,16 @@ def _motion(arguments: argparse.Namespace) -> int:
         if name in flags:
             raise input_error(f"--{name}: the benchmark says what is trained; leave it out")
     config = read_settings(arguments, EvolveConfig, default="exact")
+    if arguments.noise is not None and arguments.out is None:
+        raise input_error("--noise: the fits need a folder; add -o DIR")
     from ..bench.motion import MotionBench
 
     bench = MotionBench(
         config=config,
         kinds=tuple(arguments.kinds or _from_shape_to_shape()),
         keys=arguments.keys,
+        noise=arguments.noise,
+        fits=load_config(FitConfig, "fast"),
         moments=arguments.moments,
         resolution=arguments.mesh_resolution,
     )
@@ -652,7 +659,8 @@ BENCH_COMMANDS: Mapping[str, Command] = MappingProxyType(
         "bench motion": Command(
             "motions between key shapes, at moments that were held out",
             """  mplicits bench motion
-  mplicits bench motion --kinds morph --keys 3 --moments 12 -o bench_motion --json motion.json""",
+  mplicits bench motion --kinds morph --keys 3 --moments 12 -o bench_motion --json motion.json
+  mplicits bench motion --noise 0.005 -o bench_scans""",
             _motion_arguments,
             _motion,
             "Train evolutions between key shapes of figures that bend and twist in closed form, and measure surface, "

@@ -13,6 +13,7 @@ from mplicits.neural_fields import Keyframes, Solver, TimeSlice
 from mplicits.pipelines.bench import motion as bench_motion
 from mplicits.pipelines.bench.motion import BLEND, MotionBench, measure_motion, triangle_stretch
 from mplicits.pipelines.bench.report import as_text
+from mplicits.pipelines.run.settings import FitConfig
 from torch import Tensor
 
 RESOLUTION = 32
@@ -117,13 +118,37 @@ def test_figures_are_trained_and_printed(monkeypatch: pytest.MonkeyPatch, tmp_pa
     assert bench.rows(tmp_path) == rows  # what is there is taken
 
 
+def test_scans_of_the_keys_are_fitted_and_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    monkeypatch.setattr(bench_motion, "SCAN_RESOLUTION", 40)
+    few = FitConfig(
+        widths=(24,), depths=(2,), omegas=(6.0,), steps=(300,), learning_rates=(5e-3,), batch=512, samples=4000
+    )
+    bench = MotionBench(
+        config=QUICK, kinds=(), figures=("bar that twists",), keys=2, noise=0.005, fits=few, moments=1, resolution=24
+    )
+    monkeypatch.setattr(bench_motion, "CARRY", Solver(method="rk4", step=0.25))
+    (row,) = bench.rows(tmp_path)
+    assert len(list((tmp_path / "scans").glob("bar-that-twists-0.005-*.ply"))) == 2
+    assert len(list((tmp_path / "runs").glob("*/field.safetensors"))) == 2
+    # In place and in size: a blend that is somewhere else, or twice as large, is off by much more.
+    assert row.errors[0] is not None
+    assert row.errors[0] < 10
+    assert row.volumes[0] == pytest.approx(1, abs=0.5)
+    assert "2 key scans with noise of 0.5 %" in as_text(bench.tables([row], sgemm=1e9)[0])
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         ("--align pca", "--align: the benchmark says what is trained"),
         ("--kind morph", "--kind: the benchmark says what is trained"),
         ("--json figures.txt", "unknown extension"),
+        ("--noise 0", "--noise"),
     ],
 )
 def test_bad_arguments(tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: str, message: str):
     assert message in fails(capsys, f"bench motion {arguments} -o {tmp_path / 'out'}")
+
+
+def test_fits_of_scans_need_a_folder(capsys: pytest.CaptureFixture[str]):
+    assert "--noise: the fits need a folder; add -o DIR" in fails(capsys, "bench motion --noise 0.005")
