@@ -226,7 +226,7 @@ class EvolveConfig(Settings):
     landmarks: tuple[str, ...] = setting(
         (), "deform: a file of points that are the same for each two shapes; a line is x y z of one, x y z of the next"
     )
-    landmark_weight: float = setting(20.0, "deform: weight of the landmarks' squared distances", at_least=0)
+    landmark_weight: float = setting(2.0, "deform: weight of the landmarks' squared distances", at_least=0)
     motion_steps: int = setting(600, "deform: steps in which the motion is learnt, for each two shapes", above=0)
     motion_width: int = setting(64, "deform: neurons in each of the motion's two sine layers", above=0)
     motion_omega: float = setting(3.0, "deform: frequency of the motion; a low one keeps it smooth", above=0)
