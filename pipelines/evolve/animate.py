@@ -25,6 +25,7 @@ from ..render.subject import Orbit, orbit_cameras, traced_part
 from ..render.trace import RESOLUTION, TOLERANCE, fine_strips, pixel_size, see_hits
 from ..run.folder import chosen_level, find_field
 from ..run.machine import choose_device
+from ..run.motion import load_motion
 from ..texture.riding import RidingColors, borrowed_texture, start_texture
 from .follow import follow_mesh
 
@@ -151,11 +152,13 @@ def _riding(
     """The colours that ride along, if there are any."""
     if options.no_colors:
         return None
+    motion = load_motion(file)
+    motion = None if motion is None else motion.to(field.like)
     if options.colors is not None:
         texture, placed = borrowed_texture(options.colors, field, similarity)
-        return RidingColors(field, texture, placed=placed, level=level)
+        return RidingColors(field, texture, placed=placed, level=level, motion=motion)
     texture = start_texture(file, field)
-    return None if texture is None else RidingColors(field, texture, level=level)
+    return None if texture is None else RidingColors(field, texture, level=level, motion=motion)
 
 
 def film_frames(

@@ -23,14 +23,12 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from pathlib import Path
 
 import torch
 from torch import Tensor
 from torch.nn.functional import huber_loss, normalize, pad
 
 from ...neural_fields import CarriedKeyframes, Field, VelocitySiren, at_time, flow
-from ..run.folder import load_state
 from ..run.schedule import Report
 from ..run.settings import EvolveConfig
 from ..run.trainer import Group, Objective, Trainer, seeded, warm_cosine
@@ -39,16 +37,13 @@ from .samples import Bounds, Known, around, joined, known_at, uniform
 from .shapes import StaticShape
 
 __all__ = [
-    "VELOCITY_FILE",
     "MotionObjective",
     "carried_samples",
     "learn_motion",
-    "load_motion",
     "match",
     "motion_figures",
 ]
 
-VELOCITY_FILE = "velocity.safetensors"
 POOL = 20_000  # points of each shape
 MATCHED = 1000  # of them, which the guide has partners for
 STEPS = 8  # of the midpoint rule between two keys, while it is learnt
@@ -193,17 +188,6 @@ def learn_motion(
         shape.field.requires_grad_(False)
     objective = MotionObjective(velocity, shapes, keys, config, generator)
     Trainer(objective, stage="motion", steps=config.motion_steps * (len(keys) - 1)).run(report=progress)
-    return velocity.requires_grad_(False)
-
-
-def load_motion(run: Path, config: EvolveConfig) -> VelocitySiren:
-    """The velocity that a run has learnt.
-
-    Raises:
-        InputError: the file is damaged.
-    """
-    velocity = VelocitySiren(config.motion_width, 2, omega=config.motion_omega)
-    velocity.load_state_dict(load_state(run, name=VELOCITY_FILE)[0])
     return velocity.requires_grad_(False)
 
 

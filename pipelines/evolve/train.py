@@ -18,6 +18,7 @@ from ..fit.level import new_level
 from ..fit.samples import delta_of
 from ..run.folder import RunFolder, digest_of
 from ..run.machine import choose_device, environment, speed
+from ..run.motion import VELOCITY_FILE, load_motion
 from ..run.schedule import Progress, Report, Schedule
 from ..run.settings import EvolveConfig
 from ..run.trainer import (
@@ -32,7 +33,6 @@ from ..run.trainer import (
     without_prefix,
 )
 from .checks import check_evolution
-from .deform import VELOCITY_FILE, load_motion
 from .landmarks import read_landmarks
 from .objective import LONGEST_GRADIENT, EvolveObjective, learn_start
 from .plan import FEWEST_STEPS, EvolvePlan, within
@@ -101,7 +101,7 @@ def evolve(
     load_compiler()
     if config.time_budget is not None and not resume:  # what is resumed has its settings
         config, notes = within(config, machine, max(config.time_budget - (time.monotonic() - started), 0.0))
-    motion = load_motion(folder.path, config) if resume and folder.path and config.kind == "deform" else None
+    motion = load_motion(folder.path) if resume and folder.path else None
     schedule(Progress("known samples", 0, 0, 0.0, {}))
     problem = build_problem(shapes, config, motion=motion, progress=schedule)
     schedule(Progress("known samples", 0, 0, 1.0, {}))

@@ -32,8 +32,10 @@ from ...neural_fields import (
 from ...neural_fields.attributes import project_to_surface
 from ...neural_fields.carried import CarriedVelocity
 from ...neural_fields.dynamic_tracing import moment
+from ...neural_fields.evolution import VectorField
 from ...neural_fields.meshing import NoSurfaceError
 from ..run.folder import find_field
+from ..run.motion import load_motion
 from .train import texture_of
 
 __all__ = ["RIDE", "Colors", "RidingColors", "borrowed_texture", "colors_of_run", "start_texture"]
@@ -42,6 +44,8 @@ __all__ = ["RIDE", "Colors", "RidingColors", "borrowed_texture", "colors_of_run"
 Colors = Callable[[Tensor], Tensor]
 # A fixed step: near a change of topology adaptive ones would shrink to nothing, for the sake of a few points.
 RIDE = Solver(method="rk4", step=0.05)
+# Along a velocity that was learnt: smooth, so that in float32 more steps are no nearer; so many points at once.
+ALONG, ROWS = Solver(method="rk4", step=1 / 12), 8192
 # The mesh whose vertices are carried, in cells along the box, and how many of them a point looks to.
 CARRIED = 48
 NEIGHBORS = 8
@@ -97,19 +101,28 @@ def borrowed_texture(run: str | Path, field: Field, similarity: Similarity) -> t
 
 
 class RidingColors:
-    """The colours of a surface that moves: its points go back with it (see `CarriedVelocity`) to time 0.
+    """The colours of a surface that moves: its points go back with it to time 0.
+
+    They go along the velocity that the run has learnt, or else along what the normal speeds say (`CarriedVelocity`).
 
     Args:
         field: four-dimensional.
         texture: of its surface at time 0.
         placed: from the texture's coordinates to the field's.
         level: whose surface.
+        motion: the velocity that was learnt.
     """
 
     def __init__(
-        self, field: Field, texture: TextureField, *, placed: Similarity | None = None, level: int = -1
+        self,
+        field: Field,
+        texture: TextureField,
+        *,
+        placed: Similarity | None = None,
+        level: int = -1,
+        motion: VectorField | None = None,
     ) -> None:
-        self._field, self._texture, self._level = field, texture, level
+        self._field, self._texture, self._level, self._motion = field, texture, level, motion
         self._placed = placed or Similarity.identity()
 
     @torch.no_grad()
@@ -121,6 +134,8 @@ class RidingColors:
         """
         if time == 0:
             return self._of_start
+        if self._motion is not None:
+            return self._carried(self._motion, time)
         try:
             mesh = extract_mesh(moment(self._field, time), resolution=CARRIED, level=self._level, normals=False)
         except NoSurfaceError:
@@ -139,6 +154,18 @@ class RidingColors:
                 return self._of_start(points)
             moved = points + torch.from_numpy(between(points.double().cpu().numpy())).to(points)
             return self._of_start(project_to_surface(start, moved, level=self._level)[0])
+
+        return colors
+
+    def _carried(self, motion: VectorField, time: float) -> Colors:
+        start = moment(self._field, 0.0)
+
+        @torch.no_grad()
+        def colors(points: Tensor) -> Tensor:
+            if not len(points):
+                return self._of_start(points)
+            back = torch.cat([flow(motion, part, time, 0.0, solver=ALONG) for part in points.split(ROWS)])
+            return self._of_start(project_to_surface(start, back, level=self._level)[0])
 
         return colors
 
@@ -190,4 +217,5 @@ def colors_of_run(run: str | Path, field: Field, time: float | None) -> Colors |
         return None
     if moving is None or time is None:
         return lambda points: map_colors(texture, points).values
-    return RidingColors(moving, texture).at(time)
+    motion = load_motion(find_field(run))
+    return RidingColors(moving, texture, motion=None if motion is None else motion.to(moving.like)).at(time)

@@ -30,6 +30,7 @@ from mplicits.neural_fields import (
     save_field,
     save_texture,
 )
+from mplicits.neural_fields.attributes import project_to_surface
 from mplicits.neural_fields.dynamic_tracing import moment
 from mplicits.pipelines.cli.draw import ANIMATE as COMMAND
 from mplicits.pipelines.evolve.animate import (
@@ -278,6 +279,19 @@ def test_colours_ride_along_with_a_rigid_motion(run):
     there = torch.from_numpy(extract_mesh(moment(field, 1.0), resolution=16).vertices).float()
     torch.testing.assert_close(riding.at(0.0)(points), texture.colors(points))
     torch.testing.assert_close(riding.at(1.0)(there), texture.colors(there - DRIFT), atol=0.01, rtol=0)
+
+
+def test_colours_ride_along_a_velocity_that_was_learnt(run):
+    """A turn of a ball, which no level set shows, turns its colours too."""
+    field = load_field(run / "field.safetensors").field
+    texture = load_texture(run / "texture.safetensors", moment(field, 0.0))
+    motion = RigidMotion(angle=1.0, center=tuple(START.tolist()), velocity=tuple(DRIFT.tolist()))
+    there = torch.from_numpy(extract_mesh(moment(field, 1.0), resolution=16).vertices).float()
+    found = RidingColors(field, texture, motion=motion.velocity).at(1.0)(there)
+    back = project_to_surface(moment(field, 0.0), motion.inverse(there, 1.0))[0]
+    # Runge and Kutta's error of a turn by 1/12, twelve times: (1/12)⁴ / 120 of the radius; times the colours' slope
+    torch.testing.assert_close(found, texture.colors(back), atol=1e-4, rtol=0)
+    assert (found - texture.colors(there - DRIFT)).abs().max() > 0.01
 
 
 def test_colours_are_borrowed_from_a_run_in_other_units(run, tmp_path):

@@ -10,11 +10,12 @@ import torch
 from evolutions import BRIEF, few_points
 from mplicits.neural_fields import CarriedKeyframes, Keyframes, VelocitySiren, at_time, flow, load_field
 from mplicits.pipelines.evolve import deform
-from mplicits.pipelines.evolve.deform import VELOCITY_FILE, carried_samples, learn_motion, load_motion, match
+from mplicits.pipelines.evolve.deform import carried_samples, learn_motion, match
 from mplicits.pipelines.evolve.plan import EvolvePlan, within
 from mplicits.pipelines.evolve.shapes import read_shape
 from mplicits.pipelines.evolve.train import evolve
 from mplicits.pipelines.run.costs import Speed
+from mplicits.pipelines.run.motion import VELOCITY_FILE, load_motion
 from mplicits.pipelines.run.settings import EvolveConfig
 from mplicits.pipelines.run.trainer import Interrupted, Progress
 
@@ -111,7 +112,7 @@ def test_a_run_keeps_its_motion_and_resumes_to_the_same_bits(tmp_path: Path, mon
     with monkeypatch.context() as patch:
         patch.setattr(deform, "match", lambda *_: pytest.fail("the motion is learnt already"))
         evolve(SMALL, out=broken, resume=True)
-    for load in (lambda run: load_field(run / "field.safetensors").field, lambda run: load_motion(run, SMALL)):
+    for load in (lambda run: load_field(run / "field.safetensors").field, load_motion):
         first, second = load(whole).state_dict(), load(broken).state_dict()
         assert all(torch.equal(second[name], value) for name, value in first.items())
     evolve(replace(SMALL, kind="morph"), out=broken)
