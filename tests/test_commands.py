@@ -40,7 +40,7 @@ FIT = (
 )
 EVOLVE = (
     "--widths 16 16 --depths 1 1 --omegas 5 10 --steps 20 10 --learning-rates 5e-3 1e-3 --data-weights 100 300"
-    " --start-steps 60 --batch 128 --samples 500 --frames 2 --resolution 16 --least-delta 0.1"
+    " --start-steps 60 --batch 128 --samples 500 --frames 2 --resolution 16 --least-delta 0.1 --motion-steps 3"
 )
 RECONSTRUCT = (
     "--widths 16 16 --depths 1 1 --color-width 16 --color-depth 1 --steps 3 --rays 16 --uniform 8 --importance 4"
