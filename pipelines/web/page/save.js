@@ -1,6 +1,7 @@
 // Pictures and films for the disk. Nothing leaves the page but as a download.
 
 const TURN_FRAMES = 96, TURN_RATE = 24, TURN_SIDE = 720; // of a turntable; pixels of its shorter side at most
+const CODER_PATIENCE = 20000; // ms
 const FILMS = [['video/webm;codecs=vp9', 'webm'], ['video/webm', 'webm'], ['video/mp4', 'mp4']];
 
 // A name that every system takes.
@@ -23,7 +24,9 @@ async function savedPicture(page) {
   return new Promise((resolve) => { sheet.toBlob(resolve, 'image/png'); });
 }
 
-// Pictures, one after the other at a steady rate, as a film; a film takes as long to record as to see.
+// Pictures, one after the other at a steady rate, as a film; a film takes as long to record as to see. A coder starts in its
+// own time, and drops what it holds when it is stopped: so the first picture stands until it gives what it coded (of two
+// pieces the second is no mere header), and the last one until two more have come.
 async function recorded(pictures, rate) {
   const [type, ending] = FILMS.find(([kind]) => globalThis.MediaRecorder?.isTypeSupported(kind)) ?? [];
   if (!type) throw new PageError('This browser records no films. Save pictures instead.');
@@ -34,18 +37,30 @@ async function recorded(pictures, rate) {
   const stream = sheet.captureStream();
   const recorder = new MediaRecorder(stream, { mimeType: type, videoBitsPerSecond: 8e6 });
   const parts = [];
-  recorder.addEventListener('dataavailable', ({ data }) => parts.push(data));
+  recorder.addEventListener('dataavailable', ({ data }) => { if (data.size) parts.push(data); });
   const ended = new Promise((resolve) => { recorder.addEventListener('stop', resolve); });
-  recorder.start();
-  const started = performance.now();
-  for (const [index, picture] of pictures.entries()) {
-    const wait = started + (1000 * index) / rate - performance.now();
-    await new Promise((resolve) => { setTimeout(resolve, Math.max(0, wait)); });
-    pen.drawImage(picture, 0, 0);
+  const until = (moment) => new Promise((resolve) => { setTimeout(resolve, Math.max(0, moment - performance.now())); });
+  const stand = async (picture, wanted) => {
+    const latest = performance.now() + CODER_PATIENCE;
+    while (parts.length < wanted) {
+      if (performance.now() > latest) throw new PageError('The browser coded no film in time. Try again, or save pictures.');
+      pen.drawImage(picture, 0, 0);
+      await until(performance.now() + 1000 / rate);
+    }
+  };
+  recorder.start(1000 / rate);
+  try {
+    await stand(pictures[0], 2);
+    const started = performance.now();
+    for (const [index, picture] of pictures.entries()) {
+      await until(started + (1000 * index) / rate);
+      pen.drawImage(picture, 0, 0);
+    }
+    await stand(pictures.at(-1), parts.length + 2);
+  } finally {
+    recorder.stop();
+    stream.getTracks().forEach((track) => track.stop());
   }
-  await new Promise((resolve) => { setTimeout(resolve, 1000 / rate); });
-  recorder.stop();
-  stream.getTracks().forEach((track) => track.stop());
   await ended;
   return { blob: new Blob(parts, { type }), ending };
 }
