@@ -449,6 +449,7 @@ def _motion_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--kinds", nargs="+", choices=_from_shape_to_shape(), metavar="KIND", help="of evolve (all from shape to shape)"
     )
+    parser.add_argument("--figures", nargs="+", metavar="NAME", help="of these figures alone: arm, bar (all)")
     _number(parser, "--keys", whole(2, 100), 5, "key shapes, at even times")
     _number(
         parser, "--noise", positive, None, "fit scans of the key shapes, with this deviation in diagonals (no scans)"
@@ -474,14 +475,14 @@ def _motion(arguments: argparse.Namespace) -> int:
     config = read_settings(arguments, EvolveConfig, default="exact")
     if arguments.noise is not None and arguments.out is None:
         raise input_error("--noise: the fits need a folder; add -o DIR")
-    from ..bench.motion import MotionBench
+    from ..bench.motion import FIGURES, MotionBench
 
     bench = MotionBench(
         config=config,
         kinds=tuple(arguments.kinds or _from_shape_to_shape()),
+        figures=tuple(arguments.figures or FIGURES),
         keys=arguments.keys,
         noise=arguments.noise,
-        fits=load_config(FitConfig, "fast"),
         moments=arguments.moments,
         resolution=arguments.mesh_resolution,
     )

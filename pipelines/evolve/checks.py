@@ -10,11 +10,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...neural_fields import Field, NoSurfaceError, TimeSlice, extract_mesh
+from ...neural_fields import Field, NoSurfaceError, Similarity, TimeSlice, extract_mesh
 from ..surface.measure import chamfer
-from ..surface.surface import Surface, components, from_mesh, sample_points
+from ..surface.surface import Surface, from_mesh, sample_points
 from .problem import End
 from .samples import band_points
+from .topology import Change, Topology, find_changes, surface_of, topology_of
 
 __all__ = ["FrameFigures", "check_evolution", "end_figures", "slope_figures", "volume", "warnings"]
 
@@ -31,18 +32,26 @@ class FrameFigures:
         time: when.
         volume: inside it, in units of the field; 0 where there is no surface.
         components: of it.
+        holes: through them.
         slope_error: mean of ||∇f| − 1| at its vertices; None where there are none.
     """
 
     time: float
     volume: float
     components: int
+    holes: int
     slope_error: float | None
+
+    @property
+    def topology(self) -> Topology:
+        """Of the surface."""
+        return Topology(self.components, self.holes)
 
 
 def check_evolution(
     field: Field,
     ends: Sequence[End],
+    similarity: Similarity | None = None,
     *,
     frames: int,
     resolution: int,
@@ -53,11 +62,12 @@ def check_evolution(
     Args:
         field: four-dimensional.
         ends: the surfaces that it should have met.
+        similarity: from input coordinates, in which places are given; None: those of the field.
         frames: at how many times it is meshed.
         resolution: of those meshes; ends are meshed finer.
         count: told how many frames, ends and slopes are done, and of how many.
     """
-    total = frames + len(ends) + 1
+    total = frames + len(ends) + 2
     count = count or (lambda _done, _total: None)
     shown, met = [], []
     for time in torch.linspace(0, 1, frames).tolist():
@@ -67,8 +77,18 @@ def check_evolution(
         met.append(end_figures(field, end))
         count(frames + len(met), total)
     slopes = slope_figures(field)
+    count(total - 1, total)
+    changes = find_changes(
+        field, [frame.time for frame in shown], [frame.topology for frame in shown], resolution=resolution
+    )
     count(total, total)
-    checks = {"ends": met, "slopes": slopes, "frames": [vars(frame) for frame in shown]}
+    place = similarity or Similarity.identity()
+    checks = {
+        "ends": met,
+        "slopes": slopes,
+        "frames": [vars(frame) for frame in shown],
+        "changes": [_as_dict(change, place) for change in changes],
+    }
     return checks | {"warnings": warnings(checks)}
 
 
@@ -123,11 +143,39 @@ def warnings(checks: dict[str, Any]) -> list[str]:
             f"no surface at {len(empty)} of {len(checks['frames'])} times, the first at t = {empty[0]:.3g}; align the "
             "shapes so that they overlap, or train longer"
         )
+    found.extend(_loose_parts(checks))
     for end in checks["ends"]:
         if end["ratio"] is None or end["ratio"] > MISSED:
             how = "nothing is there" if end["ratio"] is None else f"Chamfer {end['ratio']:.2f} times its floor"
             found.append(f"{end['name']} is not met at t = {end['time']:g} ({how}); train longer (--steps)")
     return found
+
+
+def _loose_parts(checks: dict[str, Any]) -> list[str]:
+    """A warning where there are more pieces than at any of the times at which a shape is met, if those are several."""
+    times = [end["time"] for end in checks["ends"]]
+    if len(times) < 2:
+        return []
+    frames = checks["frames"]
+    most = max(min(frames, key=lambda frame: abs(frame["time"] - time))["components"] for time in times)
+    worst = max(frames, key=lambda frame: frame["components"])
+    if worst["components"] <= most:
+        return []
+    return [
+        f"{worst['components']} pieces at t = {worst['time']:.3g}, and {most} at most where shapes are met; a motion "
+        "that is learnt carries parts instead (--kind deform)"
+    ]
+
+
+def _as_dict(change: Change, similarity: Similarity) -> dict[str, Any]:
+    """For JSON, its place in input coordinates."""
+    return {
+        "time": change.time,
+        "within": change.within,
+        "before": change.before._asdict(),
+        "after": change.after._asdict(),
+        "place": None if change.place is None else similarity.to_input(np.array([change.place]))[0].tolist(),
+    }
 
 
 def volume(surface: Surface) -> float:
@@ -138,13 +186,12 @@ def volume(surface: Surface) -> float:
 
 
 def _frame_figures(field: Field, time: float, resolution: int) -> FrameFigures:
-    slice_ = TimeSlice(field, time)
-    try:
-        surface = from_mesh(extract_mesh(slice_, resolution=resolution, normals=False))
-    except NoSurfaceError:
-        return FrameFigures(time, 0.0, 0, None)
-    slope = _slopes(slice_, torch.from_numpy(surface.vertices).float())
-    return FrameFigures(time, volume(surface), components(surface), float((slope - 1).abs().mean()))
+    still = TimeSlice(field, time)
+    surface = surface_of(still, resolution=resolution)
+    if surface is None:
+        return FrameFigures(time, 0.0, 0, 0, None)
+    slope = _slopes(still, torch.from_numpy(surface.vertices).float())
+    return FrameFigures(time, volume(surface), *topology_of(surface), float((slope - 1).abs().mean()))
 
 
 @torch.no_grad()

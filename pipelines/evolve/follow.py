@@ -14,7 +14,7 @@ from ...neural_fields import Field, InputError, IntegrationError, Solver, flow, 
 from ...neural_fields.carried import CarriedVelocity
 from ...neural_fields.dynamic_tracing import moment
 from ...neural_fields.meshing import NoSurfaceError, extract_mesh
-from ..surface.surface import components, from_mesh
+from .topology import surface_of, topology_of
 
 __all__ = ["TrackedMesh", "follow_mesh"]
 
@@ -77,7 +77,7 @@ def follow_mesh(
         mesh = extract_mesh(start, resolution=resolution, level=level)
     except NoSurfaceError as error:
         raise InputError(f"{name}: no surface at time {times[0]:.3g} ({error})") from error
-    shape = _topology(start, level)
+    shape = topology_of(surface_of(start, resolution=TOPOLOGY_RESOLUTION, level=level))
     # The mesher's vertices are on the edges of its lattice, and as near to the surface as one step along them brings.
     points = project_to_surface(start, torch.from_numpy(mesh.vertices).to(field.like), level=level)[0]
     cell = 2.0 / resolution
@@ -87,9 +87,9 @@ def follow_mesh(
     for index in range(1, len(times)):
         before, time = times[index - 1], times[index]
         still = moment(field, time)
-        now = _topology(still, level)
+        now = topology_of(surface_of(still, resolution=TOPOLOGY_RESOLUTION, level=level))
         if now != shape:
-            raise _lost(name, time, f"it has {_words(now)}, after {_words(shape)}")
+            raise _lost(name, time, f"it has {now}, after {shape}")
         try:
             moved = flow(velocity, path[-1], before, time, solver=FOLLOW)
         except IntegrationError as error:
@@ -113,22 +113,6 @@ def _lost(name: str, time: float, reason: str) -> InputError:
     return InputError(
         f"{name}: its mesh cannot be followed to time {time:.3g} ({reason}); write a folder of meshes, -o FOLDER"
     )
-
-
-def _topology(field: Field, level: int) -> tuple[int, int]:
-    """Pieces, and V − E + F; without a surface (0, 0)."""
-    try:
-        surface = from_mesh(extract_mesh(field, resolution=TOPOLOGY_RESOLUTION, level=level, normals=False)).merged
-    except NoSurfaceError:
-        return 0, 0
-    sides = np.sort(surface.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    edges = len(np.unique(sides, axis=0))
-    return components(surface), len(np.unique(surface.faces)) - edges + len(surface.faces)
-
-
-def _words(shape: tuple[int, int]) -> str:
-    pieces, euler = shape
-    return f"{pieces} piece{'s' * (pieces != 1)} with {pieces - euler // 2} hole{'s' * (pieces - euler // 2 != 1)}"
 
 
 def _normals(field: Field, points: Tensor, level: int) -> Tensor:

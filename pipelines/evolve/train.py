@@ -176,8 +176,9 @@ class _Evolving:
             self.schedule(Progress("checks", done, total, done / total, {}))
 
         count(0, 1)
+        frames, resolution = self.config.frames, self.config.resolution
         record["checks"] = check_evolution(
-            field, self.problem.ends, frames=self.config.frames, resolution=self.config.resolution, count=count
+            field, self.problem.ends, self.problem.similarity, frames=frames, resolution=resolution, count=count
         )
         record = self.folder.finish(field, self.problem.similarity, record)
         return Evolution(field, self.problem.similarity, self.folder.out, record)

@@ -1,0 +1,166 @@
+"""Where and when a surface that moves changes its topology: pieces and holes, and the moments at which they change.
+
+A closed surface of c pieces with h holes through them (the sum of their genera) has the Euler number
+χ = V − E + F = 2 (c − h). A smooth f(x, t) changes neither but where ∇f = 0 on the surface, at single points of
+space-time, so that two moments before and after a change differ near one place and nowhere else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ...neural_fields import Field, NoSurfaceError, TimeSlice, at_time, extract_mesh
+from ...neural_fields.function import FieldLike
+from ..surface.surface import Surface, components, from_mesh
+
+__all__ = ["Change", "Topology", "find_changes", "surface_of", "topology_of"]
+
+NARROW = 2e-3  # a change is sought until it lies between two moments that are no further apart
+ONE = 1e-2  # changes that follow each other so soon are one: on a lattice a neck closes in several places
+MOST = 60  # moments that are looked at on the way, of all changes together
+PLACED = 6  # changes whose place is sought, of the first ones; a field of more was not trained long enough
+CELLS = 2  # a place is sought until it lies in a box of so many cells
+
+
+class Topology(NamedTuple):
+    """What a surface is like as a whole.
+
+    Attributes:
+        components: pieces.
+        holes: through them, the sum of their genera.
+    """
+
+    components: int
+    holes: int
+
+    def __str__(self) -> str:
+        """As in "1 piece with 0 holes"."""
+        pieces, holes = self
+        return f"{pieces} piece{'s' * (pieces != 1)} with {holes} hole{'s' * (holes != 1)}"
+
+
+@dataclass(frozen=True)
+class Change:
+    """One change of topology.
+
+    Attributes:
+        time: the middle of the moments that it lies between.
+        within: how far they are from it.
+        before: the surface at the first of them.
+        after: at the second.
+        place: where, to two cells of the mesh; None of all but the first ones.
+    """
+
+    time: float
+    within: float
+    before: Topology
+    after: Topology
+    place: tuple[float, float, float] | None
+
+
+def topology_of(surface: Surface | None) -> Topology:
+    """Pieces and holes of a closed mesh; none where there is no surface. Smaller parts than its cells do not count."""
+    if surface is None:
+        return Topology(0, 0)
+    faces = surface.merged.faces
+    edges = np.unique(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
+    euler, pieces = len(np.unique(faces)) - len(edges) + len(faces), components(surface)
+    return Topology(pieces, pieces - euler // 2)
+
+
+def surface_of(field: FieldLike, *, resolution: int, level: int = -1) -> Surface | None:
+    """The mesh of a static field, or of a function of points; None without a surface."""
+    try:
+        return from_mesh(extract_mesh(field, resolution=resolution, level=level, normals=False))
+    except NoSurfaceError:
+        return None
+
+
+def find_changes(
+    field: Field, times: Sequence[float], found: Sequence[Topology], *, resolution: int = 96
+) -> list[Change]:
+    """The changes between moments whose topology is known, each by halving the interval that it lies in.
+
+    What happens and is undone between two of the given moments, or within 0.01, is not seen.
+
+    Args:
+        field: four-dimensional.
+        times: ``(T,)``, growing.
+        found: the topology at each, of meshes of the same ``resolution``.
+        resolution: cells along each side of the meshes.
+    """
+    pending = [
+        _Bracket(times[index - 1], times[index], found[index - 1], found[index])
+        for index in range(len(times) - 1, 0, -1)
+        if found[index - 1] != found[index]
+    ]
+    narrow: list[_Bracket] = []
+    looked = 0
+    while pending:
+        start, end, before, after = bracket = pending.pop()
+        if end - start > NARROW and looked < MOST:
+            looked += 1
+            middle = (start + end) / 2
+            now = topology_of(surface_of(TimeSlice(field, middle), resolution=resolution))
+            halves = (_Bracket(middle, end, now, after), _Bracket(start, middle, before, now))
+            pending.extend(half for half in halves if half.before != half.after)
+        elif narrow and start - narrow[-1].end < ONE:
+            narrow[-1] = _Bracket(narrow[-1].start, end, narrow[-1].before, after)
+        else:
+            narrow.append(bracket)
+    changes: list[Change] = []
+    for start, end, before, after in (bracket for bracket in narrow if bracket.before != bracket.after):
+        place = _place(field, start, end, before, resolution) if len(changes) < PLACED else None
+        changes.append(Change((start + end) / 2, (end - start) / 2, before, after, place))
+    return changes
+
+
+class _Bracket(NamedTuple):
+    """Two moments, and the topology at each."""
+
+    start: float
+    end: float
+    before: Topology
+    after: Topology
+
+
+def _place(field: Field, start: float, end: float, before: Topology, resolution: int) -> tuple[float, float, float]:
+    """Where the change between two moments is, by halving the box along one axis after the other.
+
+    The surface is meshed with what lies on one side of a plane at the later moment and the rest at the earlier one:
+    whether it has changed already says on which side the change is.
+    """
+    low, high = [-1.0] * 3, [1.0] * 3
+    for axis in range(3):
+        while high[axis] - low[axis] > CELLS * 2 / resolution:
+            middle = (low[axis] + high[axis]) / 2
+            passing = _Passing(field, start, end, tuple(low[:axis]), tuple(high[:axis]), middle)
+            changed = topology_of(surface_of(passing, resolution=resolution)) != before
+            (high if changed else low)[axis] = middle
+    x, y, z = ((a + b) / 2 for a, b in zip(low, high, strict=True))
+    return x, y, z
+
+
+@dataclass(frozen=True, eq=False)
+class _Passing:
+    """f(x, t(x)): the later moment below ``middle`` within a slab and before that slab, else the earlier one."""
+
+    field: Field
+    start: float
+    end: float
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    middle: float
+
+    def __call__(self, x: Tensor) -> Tensor:
+        later = x[..., len(self.low)] < self.middle
+        for axis in reversed(range(len(self.low))):
+            later = (x[..., axis] < self.low[axis]) | ((x[..., axis] < self.high[axis]) & later)
+        start, end = x.new_tensor(self.start), x.new_tensor(self.end)
+        return self.field.value(at_time(x, torch.where(later, end, start)))
