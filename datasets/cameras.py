@@ -192,6 +192,9 @@ class Camera:
 
     def pixels_at(self, slopes: Float64) -> Float64:
         """The pixels ``(N, 2)`` that look along slopes ``(N, 2)``: the inverse of `slopes_at`."""
+        if not self.distortion:  # an affine map, ten times as fast as OpenCV's
+            fx, fy, cx, cy = self.fx_fy_cx_cy
+            return slopes * (fx, fy) + (cx, cy)
         if not len(slopes):
             return slopes
         ahead = np.column_stack((slopes, np.ones(len(slopes))))

@@ -44,10 +44,10 @@ def rounding(field: Module, x: Tensor, evaluate: Callable[[Module, Tensor], Sequ
         evaluate: the field at the points → results of any shapes, floating point all of them.
 
     Returns:
-        A bound for each entry of each result, in float64.
+        A bound for each entry of each result, in float64, on the CPU: it is of numbers, wherever they are worked on.
     """
-    exact = copy.deepcopy(field).double().requires_grad_(False)
-    points = x.detach().double()
+    exact = copy.deepcopy(field).cpu().double().requires_grad_(False)
+    points = x.detach().cpu().double()
     terms = max([LEAST_TERMS, *(parameter.shape[-1] for parameter in exact.parameters() if parameter.ndim)])
     size = terms * unit_roundoff(x.dtype)
     generator = torch.Generator().manual_seed(0)

@@ -52,6 +52,7 @@ from mplicits.pipelines.run.settings import FitConfig
 from mplicits.pipelines.viewer.frames import Look
 from mplicits.pipelines.viewer.paint import Painter
 from test_commands import EVOLVE, FIT, RECONSTRUCT, TEXTURE
+from textures import small_textures
 from torch import Tensor, nn
 
 Result = Sequence[Tensor | np.ndarray]
@@ -278,8 +279,7 @@ PICTURES = ("lambert.png", "color.png", "error.png", "photographed/held_out.png"
 
 def test_commands(accelerator: torch.device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     few_points(monkeypatch)
-    monkeypatch.setattr("mplicits.pipelines.reconstruct.train.TEXTURE_SAMPLES", 500)
-    monkeypatch.setattr("mplicits.pipelines.reconstruct.train.TEXTURE_RESOLUTION", 32)
+    small_textures(monkeypatch)
     cloud = sample_torus(400)
     scene = render_scene(SCENES["painted-sphere"](), views=6, size=12, samples=2)
 

@@ -31,6 +31,7 @@ from mplicits.pipelines.mesh import finish
 from mplicits.pipelines.mesh.extract import MeshOptions
 from mplicits.pipelines.mesh.files import write_mesh
 from mplicits.pipelines.run.settings import TextureConfig
+from textures import small_textures
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -222,6 +223,7 @@ def stand_in(tmp_path_factory: pytest.TempPathFactory) -> Maker:
 def _small(monkeypatch: pytest.MonkeyPatch) -> None:
     """What has no flag: the bundled scan, checks, texture and mesh of ``fit --mesh``; and Ctrl-C ends ``view``."""
     few_points(monkeypatch)
+    small_textures(monkeypatch)
     scan = functools.partial(simulate_scan, Sphere(radius=0.7), scanners=3, resolution=24, colors=np.abs)
     monkeypatch.setattr(datasets, "statue_scan", scan)
     texture = TextureConfig(width=16, depth=1, steps=5, batch=64, band_batch=64, samples=500)

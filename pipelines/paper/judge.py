@@ -193,7 +193,7 @@ class Protocol:
 def protocol_of(preset: Preset) -> Protocol:
     """The sizes of a preset."""
     return {
-        "smoke": Protocol(resolution=32, samples=5_000, poisson_depth=5, columns=64, image=16),
+        "smoke": Protocol(resolution=32, samples=5_000, poisson_depth=5, columns=64, image=16, tile=96),
         # Thin parts need the paper's resolution: a blade of 0.6 cells' thickness at 256³ loses a quarter of its volume.
         "cpu": Protocol(resolution=512, samples=200_000, poisson_depth=10, columns=512, image=128),
         "paper": Protocol(resolution=512, samples=500_000, poisson_depth=10, columns=512, image=512),

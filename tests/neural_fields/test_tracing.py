@@ -145,7 +145,7 @@ def nested(field: Field) -> Field:
 @pytest.mark.parametrize("name", THREE_D)
 def test_every_field_against_a_dense_search(name):
     field = nested(THREE_D[name]()).double().requires_grad_(False)
-    origins, directions = random_rays(300, spread=0.6)
+    origins, directions = random_rays(100, spread=0.6)
     step = 5e-4
     origins = origins + 1.4 * directions  # some begin inside
     ladder = torch.arange(0.0, 2.2, step, dtype=torch.float64)

@@ -5,7 +5,6 @@ import os
 import signal
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import imageio.v3 as iio
@@ -19,12 +18,12 @@ from mplicits.datasets.views.writing import write_neus, write_transforms
 from mplicits.neural_fields import InputError, Similarity, extract_mesh, load_field, load_texture
 from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.mesh.extract import MeshOptions, mesh_run
-from mplicits.pipelines.reconstruct import train as reconstruct_texture
 from mplicits.pipelines.reconstruct.train import Reconstruction, reconstruct
 from mplicits.pipelines.run.config import load_config
-from mplicits.pipelines.run.settings import ReconstructConfig, TextureConfig
+from mplicits.pipelines.run.settings import ReconstructConfig
 from mplicits.pipelines.run.trainer import Interrupted, Progress
 from mplicits.pipelines.surface.measure import chamfer
+from textures import small_textures
 from torch import Tensor
 
 WORLD = Similarity(center=(120.0, -30.0, 8.0), scale=5.0)
@@ -46,14 +45,6 @@ TINY = ReconstructConfig(
 )
 FLAGS = "--widths 16 16 --depths 1 1 --omegas 10 15 --starts 0 0.4 --features 4 --color-width 16 --color-depth 1"
 FLAGS += " --color-frequencies 2 --steps 3 --rays 16 --uniform 8 --importance 4 --texture-steps 3 --quiet"
-
-
-def small_textures(patch: pytest.MonkeyPatch) -> None:
-    """Colour fewer points of a coarser mesh by a smaller network: how textures are trained is tested elsewhere."""
-    patch.setattr(reconstruct_texture, "TEXTURE_SAMPLES", 2000)
-    patch.setattr(reconstruct_texture, "TEXTURE_RESOLUTION", 32)
-    small = partial(TextureConfig, samples=2000, width=16, depth=1, batch=256, band_batch=256)
-    patch.setattr(reconstruct_texture, "TextureConfig", small)
 
 
 @pytest.fixture(autouse=True)
