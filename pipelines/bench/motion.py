@@ -10,8 +10,9 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from time import process_time
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -48,7 +49,18 @@ from .cells import Workplace
 from .fits import fit_home, kept_fit
 from .tables import Column, Figure, Table, mean, tabulated
 
-__all__ = ["BLEND", "FIGURES", "SCAN_FITS", "MotionBench", "MotionRow", "measure_motion", "triangle_stretch"]
+__all__ = [
+    "BLEND",
+    "FIGURES",
+    "SCAN_FITS",
+    "STRETCHED",
+    "MotionBench",
+    "MotionRow",
+    "blended",
+    "carried_points",
+    "measure_motion",
+    "triangle_stretch",
+]
 
 Float64 = NDArray[np.float64]
 
@@ -72,7 +84,7 @@ class MotionRow:
     Attributes:
         figure: its name.
         method: a kind of ``evolve``, or `BLEND`.
-        seconds: training, of the motion too.
+        seconds: of processors, of all that ``evolve`` does: motion, samples, training, checks.
         times: held-out moments.
         errors: mean distance between found and true surface, the mean of both ways, at each; None without a surface.
         volumes: found over true, at each.
@@ -148,7 +160,7 @@ class MotionBench(Benchmark[MotionRow]):
         keys = tuple(np.linspace(0, 1, self.keys).tolist())
         shapes = self._key_shapes(truth, name, keys, work)
         if method == BLEND:
-            blend, place = _blended(shapes, keys)
+            blend, place = blended(shapes, keys)
             return [
                 measure_motion(
                     name, method, blend, truth, self.held_out(), similarity=place, resolution=self.resolution
@@ -157,9 +169,10 @@ class MotionBench(Benchmark[MotionRow]):
         own = dataclasses.replace(
             self.config, kind=method, shapes=tuple(shape.name for shape in shapes), times=keys, align="none"
         )
-        told = work.stage(cell.name)
+        told, begun = work.stage(cell.name), process_time()
         problem = build_problem(shapes, own)
         run = train_evolution(problem, own, shapes=shapes, progress=told)
+        seconds = process_time() - begun
         row = measure_motion(
             name,
             method,
@@ -170,7 +183,7 @@ class MotionBench(Benchmark[MotionRow]):
             similarity=run.similarity,
             resolution=self.resolution,
         )
-        return [dataclasses.replace(row, seconds=run.record["training_seconds"])]
+        return [dataclasses.replace(row, seconds=seconds)]
 
     def _shown(self) -> str:
         return "exact key shapes" if self.noise is None else f"key scans with noise of {100 * self.noise:g} %"
@@ -212,7 +225,7 @@ class MotionBench(Benchmark[MotionRow]):
             (Column("area off, %", ".1f"), lambda r: drift(r.areas)),
             (Column("parts at most", "d"), most),
             (Column("stretch < 4, %", ".1f"), lambda r: None if r.calm is None else 100 * r.calm),
-            (Column("train, s", ".0f"), lambda r: r.seconds),
+            (Column("CPU, s", ".0f"), lambda r: r.seconds),
         ]
         note = (
             f"{len(rows[0].times)} held-out moments between {self.keys} {self._shown()}; lengths in percent of the "
@@ -257,7 +270,7 @@ def measure_motion(
     rest = _rest(truth, resolution)
     diagonal = _diagonal(rest)
     frames = [_frame(field, truth, rest, place, time, resolution) for time in times]
-    paths = _carried(field, place, velocity, rest.vertices, times)
+    paths = carried_points(field, velocity, rest.vertices, times, place)
     apart: list[float | None] = [None] * len(times)
     calm = None
     if paths is not None:
@@ -347,10 +360,12 @@ def _diagonal(surface: Surface) -> float:
     return float(np.linalg.norm(np.ptp(surface.vertices, axis=0)))
 
 
-def _blended(shapes: Sequence[StaticShape], keys: tuple[float, ...]) -> tuple[Keyframes, Similarity]:
-    """The blend in the unit sphere that ``evolve`` works in, and the way from the shapes' own coordinates to it."""
+def blended(
+    shapes: Sequence[StaticShape], keys: tuple[float, ...], align: Literal["none", "center", "pca"] = "none"
+) -> tuple[Keyframes, Similarity]:
+    """The blend in the unit sphere that ``evolve`` works in, and the way from the first shape's coordinates to it."""
     first = shapes[0].similarity
-    placed = aligned(list(shapes), "none")
+    placed = aligned(list(shapes), align)
     placed, region = into_unit_sphere(placed, np.concatenate([shape.surface.vertices for shape in placed]))
     x, y, z = first.to_input(np.asarray(region.center)).tolist()
     return Keyframes(keys, [shape.field for shape in placed]), Similarity((x, y, z), first.scale * region.scale)
@@ -361,10 +376,23 @@ def _moved(truth: DeformingField, points: Float64, time: float) -> Float64:
 
 
 @torch.no_grad()
-def _carried(
-    field: Field, place: Similarity, velocity: VectorField | None, points: Float64, times: Sequence[float]
+def carried_points(
+    field: Field,
+    velocity: VectorField | None,
+    points: Float64,
+    times: Sequence[float],
+    place: Similarity | None = None,
 ) -> list[Float64] | None:
-    """Where points of time 0 are at each time; None if they cannot be followed."""
+    """Where points of time 0 are at each of some growing times after it; None if they cannot be followed.
+
+    Args:
+        field: four-dimensional.
+        velocity: what carries points; None is what the field's normal speeds say (`CarriedVelocity`).
+        points: ``(N, 3)``.
+        times: ``(T,)``.
+        place: from the coordinates of the points to those of ``field`` and ``velocity``; None: they are the same.
+    """
+    place = place or Similarity.identity()
     start: Tensor = torch.from_numpy(place.to_unit(points)).float()
     try:
         path = trajectories(velocity or CarriedVelocity(field), start, [0.0, *times], solver=CARRY)

@@ -447,15 +447,21 @@ def _evolve(arguments: argparse.Namespace) -> int:
 
 def _motion_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
+        "meshes", nargs="*", type=Path, metavar="MESH", help="in place of figures: pairs of meshes, A B"
+    )
+    parser.add_argument(
         "--kinds", nargs="+", choices=_from_shape_to_shape(), metavar="KIND", help="of evolve (all from shape to shape)"
     )
     parser.add_argument("--figures", nargs="+", metavar="NAME", help="of these figures alone: arm, bar (all)")
-    _number(parser, "--keys", whole(2, 100), 5, "key shapes, at even times")
+    _number(parser, "--keys", whole(2, 100), None, "key shapes, at even times (5)")
     _number(
         parser, "--noise", positive, None, "fit scans of the key shapes, with this deviation in diagonals (no scans)"
     )
     _number(parser, "--moments", whole(1, 1000), 20, "held-out times that are measured")
     _number(parser, "--mesh-resolution", whole(8, 2048), 96, "of the meshes that are measured")
+    parser.add_argument(
+        "--pictures", type=Path, metavar="DIR", help="of pairs: sheets of moments, with carried colours"
+    )
     _folder(parser)
     add_flags(parser, "--json")
     add_settings(parser, EvolveConfig, default="exact", about="of each training; overrides the preset")
@@ -468,25 +474,39 @@ def _from_shape_to_shape() -> list[str]:
 
 
 def _motion(arguments: argparse.Namespace) -> int:
-    flags = given_flags(arguments, EvolveConfig)
-    for name in (*FROM_CASES, "align"):
+    flags, meshes = given_flags(arguments, EvolveConfig), arguments.meshes
+    for name in FROM_CASES if meshes else (*FROM_CASES, "align"):
         if name in flags:
             raise input_error(f"--{name}: the benchmark says what is trained; leave it out")
     config = read_settings(arguments, EvolveConfig, default="exact")
-    if arguments.noise is not None and arguments.out is None:
-        raise input_error("--noise: the fits need a folder; add -o DIR")
+    if (arguments.noise is not None or meshes) and arguments.out is None:
+        raise input_error(f"{'MESH' if meshes else '--noise'}: the fits need a folder; add -o DIR")
+    kinds, moments = tuple(arguments.kinds or _from_shape_to_shape()), arguments.moments
+    measured = {"config": config, "kinds": kinds, "moments": moments, "resolution": arguments.mesh_resolution}
+    if meshes:
+        return _motion_of_pairs(arguments, measured)
+    if arguments.pictures is not None:
+        raise input_error("--pictures: are of pairs of meshes; name two, or leave it out")
     from ..bench.motion import FIGURES, MotionBench
 
-    bench = MotionBench(
-        config=config,
-        kinds=tuple(arguments.kinds or _from_shape_to_shape()),
-        figures=tuple(arguments.figures or FIGURES),
-        keys=arguments.keys,
-        noise=arguments.noise,
-        moments=arguments.moments,
-        resolution=arguments.mesh_resolution,
-    )
+    figures, noise = tuple(arguments.figures or FIGURES), arguments.noise
+    bench = MotionBench(figures=figures, keys=arguments.keys or 5, noise=noise, **measured)
     return _run(arguments, [bench], out=arguments.out)
+
+
+def _motion_of_pairs(arguments: argparse.Namespace, measured: dict[str, Any]) -> int:
+    for name in ("figures", "keys", "noise"):
+        if getattr(arguments, name) is not None:
+            raise input_error(f"--{name}: is of figures; leave it out, or the meshes")
+    meshes = arguments.meshes
+    if len(meshes) % 2:
+        raise input_error(f"{len(meshes)} meshes: expected pairs, A B or A B C D and so on")
+    if arguments.moments < 2:
+        raise input_error(f"--moments {arguments.moments}: between two meshes 2 are measured at least, the ends")
+    from ..bench.pairs import PairBench
+
+    pairs = tuple(zip(meshes[::2], meshes[1::2], strict=True))
+    return _run(arguments, [PairBench(pairs=pairs, pictures=arguments.pictures, **measured)], out=arguments.out)
 
 
 def _scale_arguments(parser: argparse.ArgumentParser) -> None:
@@ -661,12 +681,14 @@ BENCH_COMMANDS: Mapping[str, Command] = MappingProxyType(
             "motions between key shapes, at moments that were held out",
             """  mplicits bench motion
   mplicits bench motion --kinds morph --keys 3 --moments 12 -o bench_motion --json motion.json
-  mplicits bench motion --noise 0.005 -o bench_scans""",
+  mplicits bench motion --noise 0.005 --figures arm -o bench_scans
+  mplicits bench motion spot.obj bob.obj -o bench_pairs --pictures sheets""",
             _motion_arguments,
             _motion,
             "Train evolutions between key shapes of figures that bend and twist in closed form, and measure surface, "
             "volume, area, components, carried points and stretched triangles at held-out moments, beside the blend "
-            "of the key shapes' distances.",
+            "of the key shapes' distances. Between two meshes there is no truth: then volume, area, components, "
+            "stretched triangles, and whether carried colours stay smooth.",
         ),
         "bench paper": PAPER,
         "bench scale": Command(

@@ -47,6 +47,7 @@ class EvolveObjective(Objective):
         rate = warm_cosine(config.learning_rates[level])
         super().__init__(field, [Group(trained, rate)], generator, {"pool": torch.empty(0, 4, device=device)})
         self.field, self.config, self.level, self.law = field, config, level, problem.law
+        self.keys = problem.keys
         self.known, self.bounds = problem.known.to(device), problem.bounds.to(device)
         # In a residual level the band is where anything can be learnt.
         self.width = config.near
@@ -88,7 +89,7 @@ class EvolveObjective(Objective):
         terms["eikonal"] = eikonal_loss(slopes).mean()
         total = total + config.eikonal_weight * terms["eikonal"]
         if self.law is not None and len(near):
-            terms["law"] = law_loss(obeying, self.law).mean()
+            terms["law"] = (self._interval(near[:, 3]).square() * law_loss(obeying, self.law)).mean()
             total = total + config.law_weight * terms["law"]
         if len(bounds):
             value = rest.value[len(known) : len(known) + len(bounds)]
@@ -96,6 +97,11 @@ class EvolveObjective(Objective):
             terms["bounds"] = outside.square().mean()
             total = total + config.bound_weight * terms["bounds"]
         return terms, total
+
+    def _interval(self, times: Tensor) -> Tensor:
+        """How long the interval between two keys is, at each of the times ``(N,)``."""
+        keys = times.new_tensor(self.keys)
+        return keys.diff()[torch.bucketize(times.contiguous(), keys[1:-1])]
 
     def _draw(self, size: int, count: int) -> Tensor:
         device = self.kept["pool"].device

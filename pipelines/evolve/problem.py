@@ -74,6 +74,8 @@ class Problem:
         placements: where each shape was put, from its own unit sphere.
         motion: the velocity that carries the shapes, where one was learnt.
         motion_figures: how well it does that, for each two shapes.
+        keys: moments between which the law moves a surface all the way from one shape to the next. The more of them,
+            the faster it moves: its error is taken per interval, not per unit of time, as what is known does not grow.
     """
 
     similarity: Similarity
@@ -84,6 +86,7 @@ class Problem:
     placements: tuple[Placement, ...] = ()
     motion: VelocitySiren | None = None
     motion_figures: tuple[Mapping[str, float], ...] = ()
+    keys: tuple[float, ...] = (0.0, 1.0)
 
 
 def build_problem(
@@ -190,9 +193,8 @@ def _morph(shapes: list[StaticShape], config: EvolveConfig) -> Problem:
     bounds = Bounds(at_time(x, t)[bounded], CAUTION * low[bounded], CAUTION * high[bounded])
     guide = Keyframes(keys, [shape.field for shape in placed]).requires_grad_(False)
     ends = tuple(_end(shape, time, config.seed) for shape, time in pairs)
-    return Problem(
-        _composed(shapes[0].similarity, region), joined(known), bounds, morph_law(guide), ends, _placements(placed)
-    )
+    similarity = _composed(shapes[0].similarity, region)
+    return Problem(similarity, joined(known), bounds, morph_law(guide), ends, _placements(placed), keys=keys)
 
 
 def morph_law(guide: Field) -> Law:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ...neural_fields import (
+    Bounded,
     Box,
     Capsule,
     Field,
@@ -179,7 +180,8 @@ def read_shape(text: str) -> StaticShape:
     field, similarity, _ = load_field(file)
     if field.in_dim != 3:
         raise InputError(f"{file}: moves already; evolve takes static fields, as `mplicits fit` makes them")
-    return _meshed(text, field, similarity)
+    # In the frame of a larger shape a network is asked far beyond where it was trained, and says anything there.
+    return _meshed(text, Bounded(field), similarity)
 
 
 def aligned(shapes: list[StaticShape], how: Literal["none", "center", "pca"]) -> list[StaticShape]:

@@ -38,10 +38,21 @@ from ..run.folder import find_field
 from ..run.motion import load_motion
 from .train import texture_of
 
-__all__ = ["RIDE", "Colors", "RidingColors", "borrowed_texture", "colors_of_run", "start_texture"]
+__all__ = [
+    "RIDE",
+    "Colors",
+    "Homeward",
+    "RidingColors",
+    "RidingPoints",
+    "borrowed_texture",
+    "colors_of_run",
+    "start_texture",
+]
 
 # Points (N, 3) to display colours (N, 3).
 Colors = Callable[[Tensor], Tensor]
+# Points (N, 3) of a moment to where they were at time 0, (N, 3).
+Homeward = Callable[[Tensor], Tensor]
 # A fixed step: near a change of topology adaptive ones would shrink to nothing, for the sake of a few points.
 RIDE = Solver(method="rk4", step=0.05)
 # Along a velocity that was learnt: smooth, so that in float32 more steps are no nearer; so many points at once.
@@ -95,22 +106,83 @@ def borrowed_texture(run: str | Path, field: Field, similarity: Similarity) -> t
     except NoSurfaceError:
         return texture, placed  # there is nothing to be coloured yet
     points = torch.from_numpy(placed.to_unit(start)).to(field.like)
-    if float(geometry.value(points).abs().mean()) > ASTRAY:
+    points = points[points.norm(dim=-1) < 1]  # what the texture's fit says elsewhere is no surface of anything
+    if not len(points) or float(geometry.value(points).abs().mean()) > ASTRAY:
         raise InputError(f"--colors {run}: is not where the motion starts; name the run of its first shape")
     return texture, placed
 
 
-class RidingColors:
-    """The colours of a surface that moves: its points go back with it to time 0.
+class RidingPoints:
+    """Where points of a surface that moves were at time 0.
 
     They go along the velocity that the run has learnt, or else along what the normal speeds say (`CarriedVelocity`).
+
+    Args:
+        field: four-dimensional.
+        level: whose surface.
+        motion: the velocity that was learnt.
+    """
+
+    def __init__(self, field: Field, *, level: int = -1, motion: VectorField | None = None) -> None:
+        self._field, self._level, self._motion = field, level, motion
+
+    @torch.no_grad()
+    def home(self, time: float) -> Homeward:
+        """The way back from a time, for points ``(N, 3)`` of its surface.
+
+        Raises:
+            InputError: the points cannot be followed back.
+        """
+        if time == 0:
+            return lambda points: points
+        if self._motion is not None:
+            return self._along(self._motion, time)
+        try:
+            mesh = extract_mesh(moment(self._field, time), resolution=CARRIED, level=self._level, normals=False)
+        except NoSurfaceError:
+            return lambda points: points  # there is nothing that could have come from anywhere
+        vertices = torch.from_numpy(mesh.vertices).to(self._field.like)
+        try:
+            displacement = flow(self._velocity, vertices, time, 0.0, solver=RIDE) - vertices
+        except IntegrationError as error:
+            raise InputError(f"colours cannot ride along to time {time:.3g} ({error}); leave them out") from error
+        between = _Between(mesh.vertices, displacement.double().cpu().numpy())
+
+        def moved(points: Tensor) -> Tensor:
+            return points + torch.from_numpy(between(points.double().cpu().numpy())).to(points)
+
+        return self._onto_start(moved)
+
+    def _along(self, motion: VectorField, time: float) -> Homeward:
+        def moved(points: Tensor) -> Tensor:
+            return torch.cat([flow(motion, part, time, 0.0, solver=ALONG) for part in points.split(ROWS)])
+
+        return self._onto_start(moved)
+
+    def _onto_start(self, moved: Homeward) -> Homeward:
+        """What has moved nearly to the surface of the start, on it."""
+        start = moment(self._field, 0.0)
+
+        @torch.no_grad()
+        def home(points: Tensor) -> Tensor:
+            return project_to_surface(start, moved(points), level=self._level)[0] if len(points) else points
+
+        return home
+
+    @cached_property
+    def _velocity(self) -> CarriedVelocity:
+        return CarriedVelocity(self._field, level=self._level)
+
+
+class RidingColors:
+    """The colours of a surface that moves: those that its points had at time 0.
 
     Args:
         field: four-dimensional.
         texture: of its surface at time 0.
         placed: from the texture's coordinates to the field's.
         level: whose surface.
-        motion: the velocity that was learnt.
+        motion: the velocity that was learnt; see `RidingPoints`.
     """
 
     def __init__(
@@ -122,61 +194,23 @@ class RidingColors:
         level: int = -1,
         motion: VectorField | None = None,
     ) -> None:
-        self._field, self._texture, self._level, self._motion = field, texture, level, motion
+        self._points, self._texture = RidingPoints(field, level=level, motion=motion), texture
         self._placed = placed or Similarity.identity()
 
-    @torch.no_grad()
     def at(self, time: float) -> Colors:
         """The colours of points of the surface at a time.
 
         Raises:
             InputError: the points cannot be followed back.
         """
-        if time == 0:
-            return self._of_start
-        if self._motion is not None:
-            return self._carried(self._motion, time)
-        try:
-            mesh = extract_mesh(moment(self._field, time), resolution=CARRIED, level=self._level, normals=False)
-        except NoSurfaceError:
-            return self._of_start  # there is nothing to be coloured
-        vertices = torch.from_numpy(mesh.vertices).to(self._field.like)
-        try:
-            displacement = flow(self._velocity, vertices, time, 0.0, solver=RIDE) - vertices
-        except IntegrationError as error:
-            raise InputError(f"colours cannot ride along to time {time:.3g} ({error}); leave them out") from error
-        between = _Between(mesh.vertices, displacement.double().cpu().numpy())
-        start = moment(self._field, 0.0)
+        home = self._points.home(time)
+        return lambda points: self._of_start(home(points))
 
-        @torch.no_grad()
-        def colors(points: Tensor) -> Tensor:
-            if not len(points):
-                return self._of_start(points)
-            moved = points + torch.from_numpy(between(points.double().cpu().numpy())).to(points)
-            return self._of_start(project_to_surface(start, moved, level=self._level)[0])
-
-        return colors
-
-    def _carried(self, motion: VectorField, time: float) -> Colors:
-        start = moment(self._field, 0.0)
-
-        @torch.no_grad()
-        def colors(points: Tensor) -> Tensor:
-            if not len(points):
-                return self._of_start(points)
-            back = torch.cat([flow(motion, part, time, 0.0, solver=ALONG) for part in points.split(ROWS)])
-            return self._of_start(project_to_surface(start, back, level=self._level)[0])
-
-        return colors
-
+    @torch.no_grad()
     def _of_start(self, points: Tensor) -> Tensor:
         """The colours of points of the surface at time 0."""
         center = points.new_tensor(self._placed.center)
         return map_colors(self._texture, (points - center) / self._placed.scale).values
-
-    @cached_property
-    def _velocity(self) -> CarriedVelocity:
-        return CarriedVelocity(self._field, level=self._level)
 
 
 class _Between:

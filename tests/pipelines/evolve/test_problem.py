@@ -12,17 +12,22 @@ from mplicits.neural_fields import (
     Box,
     InputError,
     Moving,
+    MultiscaleSDF,
     RigidMotion,
     ShrinkingSphere,
     Similarity,
+    Siren,
+    SpaceTimeSDF,
     Sphere,
     Torus,
+    Union,
     at_time,
     extract_mesh,
     save_field,
     spacetime_jet,
 )
 from mplicits.pipelines.evolve import problem as evolve_problem
+from mplicits.pipelines.evolve.objective import EvolveObjective
 from mplicits.pipelines.evolve.problem import between, build_problem, velocity_field
 from mplicits.pipelines.evolve.shapes import Placed, Placement, StaticShape, aligned, into_unit_sphere, read_shape
 from mplicits.pipelines.run.settings import EvolveConfig
@@ -93,6 +98,15 @@ def test_bad_shapes_are_named(text: str, message: str) -> None:
     assert "\n" not in str(caught.value)
 
 
+def test_beyond_its_unit_sphere_a_fit_has_no_parts(tmp_path) -> None:
+    file = tmp_path / "fit.safetensors"
+    save_field(file, Union(Sphere(radius=0.3), Sphere(radius=0.2, center=(2.0, 0.0, 0.0))))
+    field = read_shape(str(file)).field
+    assert float(field.value(torch.tensor([[2.0, 0.0, 0.0]]))) > 0.9  # its way from the ball of radius 1.05
+    x = torch.rand(50, 3) - 0.5
+    assert torch.equal(field.value(x), Sphere(radius=0.3).value(x))
+
+
 def test_a_field_that_moves_already_is_refused(tmp_path) -> None:
     file = tmp_path / "moving.safetensors"
     save_field(file, small_spacetime())
@@ -114,8 +128,6 @@ def test_alignment_none_keeps_input_coordinates() -> None:
 
 def test_alignment_pca_turns_a_shape_back() -> None:
     """The shape has no symmetry, so that only one of the four ways round is right."""
-    from mplicits.neural_fields import Union
-
     lump = Union(Box(half_size=(0.5, 0.3, 0.2)), Sphere(radius=0.2, center=(0.45, 0.3, 0.15)))
     first = shape_of(lump)
     second = shape_of(lump).placed(Placement(rotation=TURN))
@@ -251,6 +263,26 @@ def test_a_morph_knows_its_shapes_and_bounds_what_is_between() -> None:
     growing = ShrinkingSphere(radius=0.5, alpha=-1e-9)
     jet = spacetime_jet(growing, 0.1 + 0.8 * torch.rand(100, 4))
     assert torch.allclose(problem.law.rate(jet), torch.full((100,), -0.3), atol=1e-4)
+
+
+def test_the_law_counts_per_interval_between_keys() -> None:
+    config = replace(CONFIG, shapes=("sphere:0.4", "sphere:0.7"))
+    problem = build_problem([read_shape(text) for text in config.shapes], config)
+    assert problem.keys == (0.0, 1.0)
+
+    def law(keys: tuple[float, ...]) -> float:
+        generator = torch.Generator().manual_seed(0)
+        field = SpaceTimeSDF(MultiscaleSDF(Siren(8, 1, in_dim=4), [], []))
+        with torch.no_grad():
+            for parameter in field.parameters():
+                parameter.copy_(torch.randn(parameter.shape, generator=generator))
+        objective = EvolveObjective(field, replace(problem, keys=keys), config, level=0, generator=generator)
+        return float(objective.losses(0, 0.0)[0]["law"].detach())
+
+    once = law((0.0, 1.0))
+    assert once > 0
+    assert law((0.0, 0.5, 1.0)) == pytest.approx(once / 4)  # halves of a half: exact
+    assert once / 16 < law((0.0, 0.25, 1.0)) < once * 9 / 16
 
 
 def test_smoothing_is_bounded_by_the_sphere_around_the_shape() -> None:
