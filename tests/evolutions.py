@@ -8,6 +8,7 @@ import torch
 from mplicits.neural_fields import MultiscaleSDF, Similarity, Siren, Sphere, save_field
 from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.evolve import checks as evolve_checks
+from mplicits.pipelines.evolve import deform
 from mplicits.pipelines.evolve import problem as evolve_problem
 from mplicits.pipelines.run.settings import EvolveConfig
 
@@ -42,10 +43,12 @@ QUICK = replace(
 
 
 def few_points(patch: pytest.MonkeyPatch) -> None:
-    """Check ends on fewer points."""
+    """Match, and check ends, on fewer points."""
     patch.setattr(evolve_problem, "END_POINTS", 1000)
     patch.setattr(evolve_problem, "REACH_POINTS", 200)
     patch.setattr(evolve_checks, "END_RESOLUTION", 32)
+    patch.setattr(deform, "MATCHED", 200)
+    patch.setattr(deform, "POOL", 2000)
 
 
 def ball(path: Path, radius: float, *, levels: bool = False) -> None:

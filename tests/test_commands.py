@@ -25,12 +25,16 @@ import pytest
 from evolutions import few_points
 from mplicits import datasets
 from mplicits.datasets import PointCloud, sample_torus, simulate_scan, write_cloud_ply
+from mplicits.datasets.synthetic.scenes import scene_mesh
 from mplicits.neural_fields import Similarity, Sphere, Torus, extract_mesh
 from mplicits.pipelines.cli import main
 from mplicits.pipelines.mesh import finish
 from mplicits.pipelines.mesh.extract import MeshOptions
 from mplicits.pipelines.mesh.files import write_mesh
+from mplicits.pipelines.render import subject
 from mplicits.pipelines.run.settings import TextureConfig
+from mplicits.pipelines.texture import riding
+from mplicits.pipelines.web import export
 from textures import small_textures
 
 ROOT = Path(__file__).parent.parent
@@ -226,6 +230,10 @@ def _small(monkeypatch: pytest.MonkeyPatch) -> None:
     small_textures(monkeypatch)
     scan = functools.partial(simulate_scan, Sphere(radius=0.7), scanners=3, resolution=24, colors=np.abs)
     monkeypatch.setattr(datasets, "statue_scan", scan)
+    monkeypatch.setitem(scene_mesh.__kwdefaults__, "resolution", 48)
+    monkeypatch.setattr(riding, "ASTRAY", 1.0)  # a motion of thirty steps starts anywhere
+    for module in (subject, export):
+        monkeypatch.setattr(module, "FRAME_RESOLUTION", 24)
     texture = TextureConfig(width=16, depth=1, steps=5, batch=64, band_batch=64, samples=500)
     monkeypatch.setattr(finish, "TextureConfig", lambda: texture)
     monkeypatch.setattr(finish, "MeshOptions", functools.partial(MeshOptions, resolution=24))
