@@ -23,7 +23,17 @@ from torch import Tensor
 from ...neural_fields import Field, FunctionField, Jet
 from . import solids
 
-__all__ = ["Bending", "DeformingField", "Motion", "Twisting", "bending_arm", "twisting_bar"]
+__all__ = [
+    "Bending",
+    "DeformingField",
+    "Motion",
+    "Twisting",
+    "arc",
+    "arc_slopes",
+    "bending_arm",
+    "straightened",
+    "twisting_bar",
+]
 
 # Where a beam is so little bent (times the length of the arc: radians) its curvature is taken for this one; that shifts
 # points by 1e-6, at t = 0, where all are to rest, as at any other time, so that forward and inverse still agree.
@@ -86,7 +96,7 @@ class Bending:
         across, along, beyond = self._parts(x)
         phi = kappa * along
         sine, cosine = phi.sin(), phi.cos()
-        side, up = _arc(phi)
+        side, up = arc(phi)
         moved_x = along * side + across * cosine + beyond * sine
         moved_z = along * up - across * sine + beyond * cosine - self.half
         return torch.stack((moved_x, x[..., 1].expand(moved_x.shape), moved_z), dim=-1)
@@ -94,22 +104,8 @@ class Bending:
     def inverse(self, x: Tensor, t: Tensor | float) -> Tensor:
         """See `Motion.inverse`; behind the arc's centre it is that of the end that has turned."""
         kappa = self._curvature(x, t)
-        across, y, height = x[..., 0], x[..., 1], x[..., 2] + self.half
-        u, w = 1 - kappa * across, kappa * height
-        turn, end = torch.atan2(w, u), 2 * self.half * kappa
-        below = (height < 0) & (u > 0)
-        above = ~below & (torch.where(turn < 0, turn + 2 * math.pi, turn) > end)
-        # In the arc: the radius 1/κ − X, and the angle κa.
-        radius = torch.hypot(u, w)
-        arc_x = (2 * across - kappa * (across**2 + height**2)) / (1 + radius)
-        arc_z = turn / kappa - self.half
-        side, up = _arc(end)
-        dx, dz = across - 2 * self.half * side, height - 2 * self.half * up
-        sine, cosine = end.sin(), end.cos()
-        end_x, end_z = dx * cosine - dz * sine, self.half + dx * sine + dz * cosine
-        home_x = torch.where(below, across, torch.where(above, end_x, arc_x))
-        home_z = torch.where(below, x[..., 2], torch.where(above, end_z, arc_z))
-        return torch.stack((home_x, y.expand(home_x.shape), home_z), dim=-1)
+        home_x, home_z = straightened(x[..., 0], x[..., 2], kappa, self.half)
+        return torch.stack((home_x, x[..., 1].expand(home_x.shape), home_z), dim=-1)
 
     def gradient(self, home: Tensor, t: Tensor | float, covector: Tensor) -> Tensor:
         """See `Motion.gradient`: J is a turn by φ after a stretch of 1 − κX along the arc."""
@@ -126,7 +122,7 @@ class Bending:
         across, along, beyond = self._parts(home)
         phi = self._curvature(home, t) * along
         sine, cosine = phi.sin(), phi.cos()
-        side, up = _arc_slopes(phi)
+        side, up = arc_slopes(phi)
         rate = self.angle / (2 * self.half) * along  # ∂φ/∂t
         x = rate * (along * side - across * sine + beyond * cosine)
         z = rate * (along * up - across * cosine - beyond * sine)
@@ -264,17 +260,43 @@ def _bar(x: Tensor) -> Tensor:
     return solids.smooth_union(bar, knob, 0.04).value.reshape(x.shape[:-1])
 
 
-def _arc(phi: Tensor) -> tuple[Tensor, Tensor]:
+def straightened(x: Tensor, z: Tensor, kappa: Tensor, half: float) -> tuple[Tensor, Tensor]:
+    """Where points of a beam along z were before it was bent by a curvature κ > 0 between −h and h; see the module.
+
+    Args:
+        x: across the beam, ``(...,)``.
+        z: along it.
+        kappa: κ, ``(...,)``.
+        half: h.
+    """
+    height = z + half
+    u, w = 1 - kappa * x, kappa * height
+    turn, end = torch.atan2(w, u), 2 * half * kappa
+    below = (height < 0) & (u > 0)
+    above = ~below & (torch.where(turn < 0, turn + 2 * math.pi, turn) > end)
+    # In the arc: the radius 1/κ − X, and the angle κa.
+    radius = torch.hypot(u, w)
+    arc_x = (2 * x - kappa * (x**2 + height**2)) / (1 + radius)
+    arc_z = turn / kappa - half
+    side, up = arc(end)
+    dx, dz = x - 2 * half * side, height - 2 * half * up
+    sine, cosine = end.sin(), end.cos()
+    end_x, end_z = dx * cosine - dz * sine, half + dx * sine + dz * cosine
+    home_x = torch.where(below, x, torch.where(above, end_x, arc_x))
+    return home_x, torch.where(below, z, torch.where(above, end_z, arc_z))
+
+
+def arc(phi: Tensor) -> tuple[Tensor, Tensor]:
     """(1 − cos φ) / φ and sin φ / φ, for φ of 0 too."""
     half = torch.sinc(phi / (2 * math.pi))
     return phi / 2 * half.square(), torch.sinc(phi / math.pi)
 
 
-def _arc_slopes(phi: Tensor) -> tuple[Tensor, Tensor]:
+def arc_slopes(phi: Tensor) -> tuple[Tensor, Tensor]:
     """The derivatives of both by φ; near 0 by their series."""
     small = phi.abs() < _SERIES
     safe = torch.where(small, torch.ones_like(phi), phi)
-    side, up = _arc(safe)
+    side, up = arc(safe)
     square = phi.square()
     near_side = 0.5 - square / 8 + square.square() / 144
     near_up = phi * (-1 / 3 + square / 30 - square.square() / 840)

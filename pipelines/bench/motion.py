@@ -22,6 +22,7 @@ from torch import Tensor
 from ...datasets.clouds.ply import write_cloud_ply
 from ...datasets.synthetic.figures import DeformingField, bending_arm, twisting_bar
 from ...datasets.synthetic.scanner import simulate_scan
+from ...datasets.synthetic.walking import walker
 from ...neural_fields import (
     Field,
     InputError,
@@ -64,7 +65,9 @@ __all__ = [
 
 Float64 = NDArray[np.float64]
 
-FIGURES: Mapping[str, Callable[[], DeformingField]] = MappingProxyType({"arm": bending_arm, "bar": twisting_bar})
+FIGURES: Mapping[str, Callable[[], DeformingField]] = MappingProxyType(
+    {"arm": bending_arm, "bar": twisting_bar, "walker": walker}
+)
 BLEND = "blend of distances"
 SAMPLES = 5000  # points of each surface that is compared
 # Points that are carried: near a change of topology adaptive steps would shrink to nothing, for the sake of a few.

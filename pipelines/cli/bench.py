@@ -452,7 +452,7 @@ def _motion_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--kinds", nargs="+", choices=_from_shape_to_shape(), metavar="KIND", help="of evolve (all from shape to shape)"
     )
-    parser.add_argument("--figures", nargs="+", metavar="NAME", help="of these figures alone: arm, bar (all)")
+    parser.add_argument("--figures", nargs="+", metavar="NAME", help="of these figures alone: arm, bar, walker (all)")
     _number(parser, "--keys", whole(2, 100), None, "key shapes, at even times (5)")
     _number(
         parser, "--noise", positive, None, "fit scans of the key shapes, with this deviation in diagonals (no scans)"
@@ -685,9 +685,9 @@ BENCH_COMMANDS: Mapping[str, Command] = MappingProxyType(
   mplicits bench motion spot.obj bob.obj -o bench_pairs --pictures sheets""",
             _motion_arguments,
             _motion,
-            "Train evolutions between key shapes of figures that bend and twist in closed form, and measure surface, "
-            "volume, area, components, carried points and stretched triangles at held-out moments, beside the blend "
-            "of the key shapes' distances. Between two meshes there is no truth: then volume, area, components, "
+            "Train evolutions between key shapes of figures that bend, twist and walk in closed form, and measure "
+            "surface, volume, area, components, carried points and stretched triangles at held-out moments, beside "
+            "the blend of the key shapes' distances. Between two meshes there is no truth: then volume, area, parts, "
             "stretched triangles, and whether carried colours stay smooth.",
         ),
         "bench paper": PAPER,

@@ -144,7 +144,7 @@ def test_scans_of_the_keys_are_fitted_and_kept(monkeypatch: pytest.MonkeyPatch, 
         ("--kind morph", "--kind: the benchmark says what is trained"),
         ("--json figures.txt", "unknown extension"),
         ("--noise 0", "--noise"),
-        ("--figures bar leg", "no figure is called leg; there are arm, bar"),
+        ("--figures bar leg", "no figure is called leg; there are arm, bar, walker"),
     ],
 )
 def test_bad_arguments(tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: str, message: str):
