@@ -121,7 +121,7 @@ def test_figures_are_trained_and_printed(monkeypatch: pytest.MonkeyPatch, tmp_pa
 def test_scans_of_the_keys_are_fitted_and_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     monkeypatch.setattr(bench_motion, "SCAN_RESOLUTION", 40)
     few = FitConfig(
-        widths=(24,), depths=(2,), omegas=(6.0,), steps=(300,), learning_rates=(5e-3,), batch=512, samples=4000
+        widths=(24,), depths=(2,), omegas=(6.0,), steps=(120,), learning_rates=(1e-2,), batch=256, samples=2000
     )
     bench = MotionBench(
         config=QUICK, kinds=(), figures=("bar",), keys=2, noise=0.005, fits=few, moments=1, resolution=24

@@ -79,7 +79,7 @@ def test_meshes_are_fitted_and_measured(tmp_path: Path, monkeypatch: pytest.Monk
         files.append(tmp_path / f"{name}.ply")
         write_mesh(files[-1], extract_mesh(Box(half_size=size), resolution=16), Similarity.identity())
     few = FitConfig(
-        widths=(24,), depths=(2,), omegas=(6.0,), steps=(150,), learning_rates=(5e-3,), batch=512, samples=4000
+        widths=(24,), depths=(2,), omegas=(6.0,), steps=(80,), learning_rates=(1e-2,), batch=256, samples=2000
     )
     for name, value in {"POOL": 500, "MATCHED": 100, "GUIDED": 32, "LOOSE": 32, "REGULAR": 64, "STEPS": 2}.items():
         monkeypatch.setattr(deform, name, value)

@@ -1,5 +1,7 @@
 """Films, folders of meshes and moving meshes of surfaces whose motion is known."""
 
+import copy
+import functools
 import json
 import struct
 from pathlib import Path
@@ -55,6 +57,11 @@ PLACE = Similarity((100.0, -20.0, 3.0), 2.0)
 
 def travelling_ball() -> SpaceTimeSDF:
     """A small network that is a ball, nearly, and whose motion is exact: W(x − v t) + b."""
+    return copy.deepcopy(_trained_ball())
+
+
+@functools.cache
+def _trained_ball() -> SpaceTimeSDF:
     torch.manual_seed(0)
     siren = Siren(32, 2, omega=5.0)
     adam = torch.optim.Adam(siren.parameters(), lr=5e-3)
@@ -182,13 +189,12 @@ def test_films_are_written(run, tmp_path):
 
 
 def test_a_sheet_has_all_frames_with_their_times(run, tmp_path):
-    options = SequenceOptions(frames=9, size=(32, 24), samples=1)
+    options = SequenceOptions(frames=9, size=(32, 24), samples=1, no_colors=True)
     assert animate_run(run, tmp_path / "ball.png", options) == "9 moments of 32×24"
     sheet = iio.imread(tmp_path / "ball.png")
     assert sheet.shape == (2 * (24 + 40), 7 * (32 + 12), 3)
     field = load_field(run / "field.safetensors").field
-    texture = load_texture(run / "texture.safetensors", moment(field, 0.0))
-    frames = list(film_frames(run, field, RidingColors(field, texture), 0, options))
+    frames = list(film_frames(run, field, None, 0, options))
     np.testing.assert_array_equal(sheet[40:64, 6:38], frames[0])
     np.testing.assert_array_equal(sheet[104:128, 50:82], frames[8])
     assert (sheet[64:, 2 * 44 :] == 255).all()

@@ -1,5 +1,6 @@
 """What evolutions are taught: known samples, bounds and ends, against closed forms; and where shapes are put."""
 
+import functools
 import json
 import math
 from dataclasses import replace
@@ -17,6 +18,7 @@ from mplicits.neural_fields import (
     ShrinkingSphere,
     Similarity,
     Siren,
+    Solver,
     SpaceTimeSDF,
     Sphere,
     Torus,
@@ -25,6 +27,7 @@ from mplicits.neural_fields import (
     extract_mesh,
     save_field,
     spacetime_jet,
+    trajectories,
 )
 from mplicits.pipelines.evolve import problem as evolve_problem
 from mplicits.pipelines.evolve.objective import EvolveObjective
@@ -333,7 +336,9 @@ def test_key_times() -> None:
     assert EvolveConfig(shapes=("a", "b", "c"), times=(0.0, 0.2, 1.0)).key_times() == (0.0, 0.2, 1.0)
 
 
-def test_a_motion_that_cannot_be_followed_is_bad_input() -> None:
+def test_a_motion_that_cannot_be_followed_is_bad_input(monkeypatch: pytest.MonkeyPatch) -> None:
+    soon = functools.partial(trajectories, solver=Solver(max_steps=50))
+    monkeypatch.setattr(evolve_problem, "trajectories", soon)
     config = replace(CONFIG, kind="transport", shapes=("sphere",), angle=(1e7,))
     with pytest.raises(InputError, match=r"the motion cannot be followed .*reached time"):
         build_problem([read_shape("sphere")], config)
