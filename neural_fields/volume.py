@@ -28,6 +28,7 @@ __all__ = [
     "neus_optical_depth",
     "outside_depths",
     "ray_points",
+    "secant_weights",
     "sphere_span",
     "stratified_depths",
     "transmittance_weights",
@@ -153,14 +154,32 @@ def stratified_depths(near: Tensor, far: Tensor, count: int, *, generator: torch
     return near[:, None] + (far - near)[:, None] * upload(strata, near.device).to(near.dtype)
 
 
+def secant_weights(depths: Tensor, values: Tensor, inv_std: Tensor | float, *, cos_anneal: float = 1.0) -> Tensor:
+    """Weights ``(R, S − 1)`` of the sections between depths, from the field's values at their ends alone.
+
+    The slope is the lesser (steeper) one of the section's own secant and the one before, so that a section which the
+    surface enters through its end is found as well (NeuS, suppl. "hierarchical sampling").
+
+    Args:
+        depths: ``(R, S)`` increasing, S ≥ 2.
+        values: ``(R, S)`` the field there.
+        inv_std: s of the weights.
+        cos_anneal: see `neus_optical_depth`.
+    """
+    interval = depths.diff(dim=1)
+    secant = values.diff(dim=1) / interval.clamp(min=1e-9)
+    previous = torch.cat((torch.zeros_like(secant[:, :1]), secant[:, :-1]), dim=1)
+    slope = torch.minimum(secant, previous).clamp(-STEEPEST, 0)
+    middle = 0.5 * (values[:, 1:] + values[:, :-1])
+    return transmittance_weights(neus_optical_depth(middle, slope, interval, inv_std, cos_anneal=cos_anneal)).weights
+
+
 def importance_depths(
     depths: Tensor, values: Tensor, count: int, inv_std: Tensor | float, *, generator: torch.Generator | None = None
 ) -> Tensor:
     """``count`` more depths on each ray, where the field's weights say that its surface is → ``(R, count)``, sorted.
 
-    Between two known depths the slope is the lesser (steeper) one of the section's own secant and the one before,
-    so that a section which the surface enters through its end is found as well (NeuS, suppl. "hierarchical sampling").
-    The new depths are quantiles of the piecewise constant density of the weights.
+    The new depths are quantiles of the piecewise constant density of `secant_weights`.
 
     Args:
         depths: ``(R, S)`` increasing, S ≥ 2.
@@ -169,13 +188,8 @@ def importance_depths(
         inv_std: s of the weights; doubled from one round to the next.
         generator: draws stratified quantiles; without, they are the middles of ``count`` equal parts.
     """
-    before, after = depths[:, :-1], depths[:, 1:]
-    interval = after - before
-    secant = (values[:, 1:] - values[:, :-1]) / interval.clamp(min=1e-9)
-    previous = torch.cat((torch.zeros_like(secant[:, :1]), secant[:, :-1]), dim=1)
-    slope = torch.minimum(secant, previous).clamp(-STEEPEST, 0)
-    middle = 0.5 * (values[:, 1:] + values[:, :-1])
-    weights, _ = transmittance_weights(neus_optical_depth(middle, slope, interval, inv_std))
+    interval = depths.diff(dim=1)
+    weights = secant_weights(depths, values, inv_std)
     density = weights + EVEN_SHARE * interval / (depths[:, -1:] - depths[:, :1]).clamp(min=1e-9) + 1e-9
     cumulative = torch.nn.functional.pad(density.cumsum(dim=1), (1, 0))
     cumulative = cumulative / cumulative[:, -1:]

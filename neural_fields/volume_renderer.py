@@ -2,20 +2,21 @@
 
 Where to sample is asked of the coarsest level alone; then one jet per sample gives value, gradient and features, and
 inside a `MultiscaleSDF` the residual levels see only the samples in their bands. Colours are asked only for the samples
-that contribute to their pixel.
+that contribute to their pixel, and jets, if wanted, only where the values of the march say that there is weight.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
 from ._checks import at_least, positive
-from .devices import precise
+from .devices import precise, upload
 from .field import Field, Jet
 from .function import FieldLike, as_field
 from .volume import (
@@ -25,6 +26,7 @@ from .volume import (
     neus_optical_depth,
     outside_depths,
     ray_points,
+    secant_weights,
     sphere_span,
     stratified_depths,
     transmittance_weights,
@@ -34,6 +36,8 @@ __all__ = ["RayColor", "RayOutside", "Rendered", "Sampling", "render_volume", "s
 
 # Sharpness of the importance samples in units of 1/δ₀: half of them lie within δ₀ / 15 of the coarse surface.
 BAND_SHARPNESS = 16.0
+# The same where weights are estimated to find sections without any: a finer surface may lie δ₀ / 8 away.
+SKIP_SHARPNESS = 8.0
 
 RayColor = Callable[[Tensor, Tensor, Jet], Tensor]
 """Colours ``(N, 3)`` of points ``(N, 3)`` seen along unit directions ``(N, 3)``, given the geometry's jet there."""
@@ -85,7 +89,9 @@ class Rendered(NamedTuple):
         normal: ``(R, 3)`` Σ w ∇f/|∇f|; shorter than 1 where normals differ or the ray passes.
         weights: ``(R, S)``.
         depths: ``(R, S)`` the middles of the sections.
-        jet: of the field there, ``(R, S, …)``.
+        jet: of the field there, ``(R, S, …)``; 0 in sections that were skipped.
+        counts: ``(R, S)`` for how many sections each jet stands in a mean over all of them: 1 everywhere if none was
+            skipped, else 0 there and 1 / ``skip_share`` in those that were kept by chance.
     """
 
     color: Tensor
@@ -95,6 +101,7 @@ class Rendered(NamedTuple):
     weights: Tensor
     depths: Tensor
     jet: Jet
+    counts: Tensor
 
 
 def render_volume(
@@ -110,6 +117,9 @@ def render_volume(
     background: Tensor | None = None,
     outside: RayOutside | None = None,
     least_weight: float = 0.0,
+    skip: float = 0.0,
+    skip_share: float = 0.0,
+    guide: Callable[[Tensor], Tensor] | None = None,
     generator: torch.Generator | None = None,
 ) -> Rendered:
     """Render rays through the unit sphere; differentiable in the parameters of field, colour and ``inv_std``.
@@ -127,10 +137,18 @@ def render_volume(
         outside: what is behind the sphere; ``background`` is then behind that.
         least_weight: no colour is asked for samples of a smaller weight; a pixel's error is at most
             ``least_weight`` times the number of its samples.
+        skip: sections whose weight is estimated to be smaller, from values of the coarsest level at their ends, get no
+            jet and stop no light; 0 evaluates all. The neighbours of kept sections are kept, and of each ray the
+            section in which the field is smallest. Where the skipped sections of a ray had the weights w in the full
+            sum, each channel of its colour differs from the full one by Σ w at most.
+        skip_share: of those sections, this share is evaluated nevertheless, drawn by ``generator``; see
+            `Rendered.counts`.
+        guide: values of points ``(..., 3)`` → ``(...,)`` by which samples are placed and skipped; for example a
+            `ValueGrid`, which costs no network. By default the coarsest level of the field.
         generator: jitters the samples, for training; None is deterministic.
 
     Raises:
-        ValueError: shapes do not match, or there is no such level.
+        ValueError: shapes do not match, there is no such level, or ``skip_share`` is no share.
 
     Example:
         >>> import torch
@@ -145,22 +163,47 @@ def render_volume(
         raise ValueError(
             f"origins {tuple(origins.shape)}, directions {tuple(directions.shape)}: expected (R, 3) for both"
         )
+    if not 0 <= skip_share <= 1:
+        raise ValueError(f"skip_share={skip_share}: expected a share in [0, 1]")
     field = as_field(field)
     level, sampling = field.resolve_level(level), sampling or Sampling()
     near, far = sphere_span(origins, directions)
-    edges = sample_depths(field, origins, directions, near, far, sampling, level=level, generator=generator)
+    edges = sample_depths(
+        field, origins, directions, near, far, sampling, level=level, guide=guide, generator=generator
+    )
     interval = edges.diff(dim=1)
     depths = edges[:, :-1] + 0.5 * interval
-    points = ray_points(origins, directions, depths)  # (R, S, 3)
-    jet = field.jet(points, level=level)
-    slope = (jet.gradient * directions[:, None]).sum(dim=-1)
-    optical = neus_optical_depth(jet.value, slope, interval, inv_std, cos_anneal=cos_anneal)
-    weights, remaining = transmittance_weights(optical)
-    seen = _colors(color, points, directions, jet, weights, least_weight)
+    counts, rows = torch.ones_like(depths), None
+    if skip > 0:
+        values = _march(field, guide)(ray_points(origins, directions, edges))
+        estimated = secant_weights(edges, values, _estimate_sharpness(field, level, inv_std), cos_anneal=cos_anneal)
+        counts = _counts(estimated, values, skip, skip_share, generator)
+        rows = counts.flatten().nonzero()[:, 0]
+
+    def of_sections(tensor: Tensor) -> Tensor:
+        """``(R, S, …)`` → ``(K, …)``, those that are evaluated."""
+        flat = tensor.flatten(0, 1)
+        return flat if rows is None else flat[rows]
+
+    def in_place(found: Tensor) -> Tensor:
+        """The way back; 0 in sections that were skipped."""
+        shape = (*depths.shape, *found.shape[1:])
+        if rows is None:
+            return found.reshape(shape)
+        return found.new_zeros(depths.numel(), *found.shape[1:]).index_copy(0, rows, found).reshape(shape)
+
+    points = of_sections(ray_points(origins, directions, depths))  # (K, 3)
+    along = of_sections(directions[:, None].expand(-1, depths.shape[1], -1))
+    found = field.jet(points, level=level)
+    slope = (found.gradient * along).sum(dim=-1)
+    optical = neus_optical_depth(found.value, slope, of_sections(interval), inv_std, cos_anneal=cos_anneal)
+    weights, remaining = transmittance_weights(in_place(optical))
+    seen = in_place(_colors(color, points, along, found, of_sections(weights), least_weight))
     mixed = composite(weights, seen)
     behind = _behind(outside, origins, directions, far, sampling, background, generator)
     if behind is not None:
         mixed = mixed + remaining[:, None] * behind
+    jet = Jet(*(in_place(part) for part in found))
     normals = torch.nn.functional.normalize(jet.gradient, dim=-1)
     return Rendered(
         color=mixed,
@@ -170,6 +213,7 @@ def render_volume(
         weights=weights,
         depths=depths,
         jet=jet,
+        counts=counts,
     )
 
 
@@ -183,17 +227,19 @@ def sample_depths(
     sampling: Sampling,
     *,
     level: int = -1,
+    guide: Callable[[Tensor], Tensor] | None = None,
     generator: torch.Generator | None = None,
 ) -> Tensor:
     """The ends of the sections of each ray, ``(R, uniform + importance + 2)``, from ``near`` to ``far``, sorted.
 
-    Only the coarsest level is asked. If a finer one is meant, the sharpness ends at BAND_SHARPNESS / δ₀, so that
-    samples reach into the band in which the finer surface may lie.
+    Only the coarsest level is asked, or ``guide`` in its place. If a finer one is meant, the sharpness ends at
+    BAND_SHARPNESS / δ₀, so that samples reach into the band in which the finer surface may lie.
     """
     depths = stratified_depths(near, far, sampling.uniform, generator=generator)
     sharpest = BAND_SHARPNESS / field.deltas[0].to(precise(near.device)) if field.resolve_level(level) else None
     if sampling.importance:
-        values = field.value(ray_points(origins, directions, depths), level=0)
+        march = _march(field, guide)
+        values = march(ray_points(origins, directions, depths))
         share, extra = divmod(sampling.importance, sampling.rounds)
         for index in range(sampling.rounds):
             count = share + (index < extra)
@@ -202,22 +248,45 @@ def sample_depths(
             more = importance_depths(depths, values, count, sharpness, generator=generator)
             depths, order = torch.cat((depths, more), dim=1).sort(dim=1)
             if index + 1 < sampling.rounds:
-                found = field.value(ray_points(origins, directions, more), level=0)
+                found = march(ray_points(origins, directions, more))
                 values = torch.cat((values, found), dim=1).gather(1, order)
     return torch.cat((near[:, None], depths, far[:, None]), dim=1)
 
 
-def _colors(
-    color: RayColor, points: Tensor, directions: Tensor, jet: Jet, weights: Tensor, least_weight: float
-) -> Tensor:
-    """Colours ``(R, S, 3)`` of the samples that matter, 0 for the others."""
-    along = directions[:, None].expand_as(points).reshape(-1, 3)
-    flat = Jet(jet.value.flatten(), jet.gradient.flatten(0, 1), jet.features.flatten(0, 1))
+def _march(field: Field, guide: Callable[[Tensor], Tensor] | None) -> Callable[[Tensor], Tensor]:
+    """What is asked for values: points ``(..., 3)`` → ``(...,)``."""
+    return partial(field.value, level=0) if guide is None else guide
+
+
+def _estimate_sharpness(field: Field, level: int, inv_std: Tensor | float) -> Tensor:
+    """The s by which weights are estimated: a finer surface may lie beside the coarsest one, so it is bounded."""
+    known = torch.as_tensor(inv_std).detach()
+    if not level:
+        return known
+    return torch.minimum(known, (SKIP_SHARPNESS / field.deltas[0]).to(known))
+
+
+@torch.no_grad()
+def _counts(estimated: Tensor, values: Tensor, skip: float, share: float, generator: torch.Generator | None) -> Tensor:
+    """See `Rendered.counts`, from estimated weights ``(R, S)`` and the values ``(R, S + 1)`` at sections' ends."""
+    if not estimated.numel():
+        return torch.ones_like(estimated)
+    around = torch.nn.functional.max_pool1d(estimated[:, None], 3, stride=1, padding=1)[:, 0]
+    smallest = (values[:, 1:] + values[:, :-1]).argmin(dim=1, keepdim=True)
+    counts = (around >= skip).to(estimated).scatter(1, smallest, 1.0)
+    if share and generator is not None:
+        chance = upload(torch.rand(estimated.shape, generator=generator) < share, estimated.device)
+        counts = torch.where((counts == 0) & chance, 1 / share, counts)
+    return counts
+
+
+def _colors(color: RayColor, points: Tensor, along: Tensor, jet: Jet, weights: Tensor, least_weight: float) -> Tensor:
+    """Colours ``(K, 3)`` of the samples that matter, 0 for the others."""
     if least_weight <= 0:
-        return color(points.flatten(0, 1), along, flat).reshape(points.shape)
-    rows = (weights.detach().flatten() > least_weight).nonzero()[:, 0]
-    found = color(points.flatten(0, 1)[rows], along[rows], Jet(*(part[rows] for part in flat)))
-    return points.new_zeros(points.shape).flatten(0, 1).index_copy(0, rows, found).reshape(points.shape)
+        return color(points, along, jet)
+    rows = (weights.detach() > least_weight).nonzero()[:, 0]
+    found = color(points[rows], along[rows], Jet(*(part[rows] for part in jet)))
+    return points.new_zeros(points.shape).index_copy(0, rows, found)
 
 
 def _behind(

@@ -33,11 +33,38 @@ from ..run.settings import ReconstructConfig
 from ..run.trainer import Progress, StopFlag, Trainer
 from .speed import Counted, counted
 
-__all__ = ["Watched", "color_flops", "jet_flops", "outside_flops", "product_counter", "train_watched", "value_flops"]
+__all__ = [
+    "LateRows",
+    "Watched",
+    "color_flops",
+    "jet_flops",
+    "outside_flops",
+    "product_counter",
+    "train_watched",
+    "value_flops",
+]
 
 PROBE = 64  # rows on which the FLOPs of one are counted
 ENDLESS = 10**9  # steps that no training comes to the end of
 REPORT_EVERY = 20
+HALF = 0.5  # of the training, after which rows count as late
+
+
+@dataclass(frozen=True)
+class LateRows:
+    """Rows of the second half of a training, when the surface is known and rays cost what they will go on to cost.
+
+    Attributes:
+        steps: in which they were asked for.
+        values: of each level, without gradient.
+        jets: of each level, with gradient.
+        colors: of the colour network.
+    """
+
+    steps: int
+    values: tuple[int, ...]
+    jets: tuple[int, ...]
+    colors: int
 
 
 @dataclass(frozen=True)
@@ -51,7 +78,8 @@ class Watched:
         values: rows of each level without gradient.
         jets: rows of each level with gradient.
         colors: rows of the colour network.
-        finest_share: rows of the finest level over the samples of those steps in which it was switched on.
+        late: the rows of the second half of the training; None where it has fewer than two steps.
+        finest_share: rows of the finest level over those of the coarsest, in the steps in which it was switched on.
         geometry_flops: of the whole training.
         color_flops: the same of colours and of what is outside.
     """
@@ -62,6 +90,7 @@ class Watched:
     values: tuple[int, ...]
     jets: tuple[int, ...]
     colors: int
+    late: LateRows | None
     finest_share: float | None
     geometry_flops: float
     color_flops: float
@@ -94,7 +123,7 @@ def train_watched(
     if seconds is not None:
         config = replace(config, steps=ENDLESS)
     trainer = scene_trainer(model, pool, config, seconds=seconds)
-    watch = _Watch(trainer, levels, report)
+    watch = _Watch(trainer, levels, colors, report)
     try:
         finished = trainer.run(flag, report=watch, report_every=1)
     finally:
@@ -110,6 +139,7 @@ def train_watched(
         values=tuple(level.values for level in levels),
         jets=tuple(level.jets for level in levels),
         colors=colors.rows,
+        late=watch.late(),
         finest_share=levels[-1].jets / watch.samples if watch.samples else None,
         geometry_flops=geometry,
         color_flops=color_cost * colors.rows + outside_cost * outsides.rows,
@@ -123,9 +153,11 @@ class _Watch:
         self,
         trainer: Trainer[SceneObjective],
         levels: Sequence[Counted],
+        colors: _RowCounter,
         report: Callable[[Progress], None] | None,
     ) -> None:
-        self.trainer, self.levels, self.report = trainer, levels, report
+        self.trainer, self.levels, self.colors, self.report = trainer, levels, colors, report
+        self.half: LateRows | None = None  # what had been asked for when half was done
         self.times: list[float] = []
         self.samples = self.before = 0
         self.level, self.started = trainer.objective.level_at(trainer.fraction), time.perf_counter()
@@ -134,10 +166,28 @@ class _Watch:
         self.times.append(time.perf_counter() - self.started)
         if self.level == len(self.levels) - 1:  # the level of the step that has just been made
             self.samples += self.levels[0].jets - self.before
+        if self.half is None and progress.fraction >= HALF:
+            self.half = self._rows()
         if self.report is not None and (progress.step % REPORT_EVERY == 0 or progress.fraction >= 1):
             self.report(progress)
         self.before, self.level = self.levels[0].jets, self.trainer.objective.level_at(progress.fraction)
         self.started = time.perf_counter()
+
+    def _rows(self) -> LateRows:
+        """Those of all steps so far."""
+        values, jets = (tuple(getattr(level, kind) for level in self.levels) for kind in ("values", "jets"))
+        return LateRows(self.trainer.step, values, jets, self.colors.rows)
+
+    def late(self) -> LateRows | None:
+        """See `Watched`."""
+        now, half = self._rows(), self.half
+        if half is None or now.steps == half.steps:
+            return None
+        values, jets = (
+            tuple(b - a for a, b in zip(before, after, strict=True))
+            for before, after in ((half.values, now.values), (half.jets, now.jets))
+        )
+        return LateRows(now.steps - half.steps, values, jets, now.colors - half.colors)
 
 
 class _RowCounter:

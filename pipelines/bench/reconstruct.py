@@ -32,8 +32,16 @@ from ..surface.surface import Surface, from_mesh
 from ..surface.trim import in_region, keep_largest
 from .benchmark import Benchmark, Part, network_name, one_of_each, plain
 from .cells import Catalogue, Workplace, read_record, record_file
-from .flops import Watched, train_watched
-from .reconstruct_rows import EQUAL_TIME, MULTISCALE, NEUS, ReconstructRow, SurfaceFigures, reconstruct_tables
+from .flops import LateRows, Watched, train_watched
+from .reconstruct_rows import (
+    EQUAL_TIME,
+    MULTISCALE,
+    NEUS,
+    LateRates,
+    ReconstructRow,
+    SurfaceFigures,
+    reconstruct_tables,
+)
 from .tables import Table
 
 __all__ = ["BenchScene", "ReconstructBench", "common_sheet", "read_scene", "row_of", "surface_figures"]
@@ -77,7 +85,8 @@ def _exact_surface(scene: BenchScene, resolution: int) -> Surface | None:
 class ReconstructBench(Benchmark[ReconstructRow]):
     """NeuS's network, the multiscale one with as many steps, and again for as long as NeuS took, on every scene.
 
-    All see the same rays in the same order, with the same numbers of samples. NeuS has its own colour network,
+    All see the same rays in the same order, with the same numbers of samples and the same threshold below which
+    sections are skipped. NeuS has its own colour network,
     256 features and the position as it is, and one learning rate for everything but the uncertainty, which both
     sharpen alike. A sheet of all rows per scene is written into the folder of the results.
 
@@ -267,12 +276,25 @@ def row_of(
         values_per_ray=tuple(rows / rays for rows in watched.values),
         jets_per_ray=tuple(rows / rays for rows in watched.jets),
         colors_per_ray=watched.colors / rays,
+        late=late_rates(watched.late, config.rays),
         finest_share=watched.finest_share,
         exact=scene.exact is not None,
         surface=surface,
         inv_std=float(model.inv_std),
         deltas=tuple(model.geometry.deltas.tolist()),
         device=device,
+    )
+
+
+def late_rates(late: LateRows | None, rays: int) -> LateRates | None:
+    """Rows of the second half, per ray."""
+    if late is None:
+        return None
+    count = late.steps * rays
+    return LateRates(
+        values=tuple(rows / count for rows in late.values),
+        jets=tuple(rows / count for rows in late.jets),
+        colors=late.colors / count,
     )
 
 

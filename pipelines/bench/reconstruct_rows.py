@@ -14,6 +14,7 @@ __all__ = [
     "MULTISCALE",
     "NEUS",
     "Comparison",
+    "LateRates",
     "ReconstructRow",
     "SurfaceFigures",
     "comparisons",
@@ -47,6 +48,21 @@ class SurfaceFigures:
 
 
 @dataclass(frozen=True)
+class LateRates:
+    """Evaluations per ray in the second half of a training.
+
+    Attributes:
+        values: of each level, without gradient; those that keep the grid up to date are among them.
+        jets: of each level, with gradient.
+        colors: of the colour network.
+    """
+
+    values: tuple[float, ...]
+    jets: tuple[float, ...]
+    colors: float
+
+
+@dataclass(frozen=True)
 class ReconstructRow:
     """One geometry, trained on one scene.
 
@@ -73,8 +89,9 @@ class ReconstructRow:
         values_per_ray: evaluations of each level without gradient, to find out where to sample.
         jets_per_ray: evaluations of each level with gradient, which are trained.
         colors_per_ray: evaluations of the colour network.
-        finest_share: of the samples on a ray, how many the finest level saw while it was switched on; None if it never
-            was.
+        late: the same in the second half of the training alone; None if that had no step.
+        finest_share: of the samples that are evaluated, how many the finest level saw while it was switched on; None if
+            it never was.
         exact: whether the scene's surface is known in closed form.
         surface: None where it is not, or where the training found no surface.
         inv_std: s of NeuS at the end.
@@ -102,6 +119,7 @@ class ReconstructRow:
     values_per_ray: tuple[float, ...]
     jets_per_ray: tuple[float, ...]
     colors_per_ray: float
+    late: LateRates | None
     finest_share: float | None
     exact: bool
     surface: SurfaceFigures | None
@@ -236,8 +254,29 @@ def reconstruct_tables(name: str, rows: Sequence[ReconstructRow], *, sgemm: floa
     )
     items = [(f"{r.scene} {r.network}{', equal time' if r.kind == EQUAL_TIME else ''}", r) for r in rows]
     table = tabulated(name, "Geometries on the same rays", "scene, geometry", figures, items, notes=notes)
+    tables = (table, _evaluations(f"{name}-evaluations", items))
     found = comparisons(rows)
-    return (table, _against_neus(f"{name}-against-neus", found)) if found else (table,)
+    return (*tables, _against_neus(f"{name}-against-neus", found)) if found else tables
+
+
+def _evaluations(name: str, items: Sequence[tuple[str, ReconstructRow]]) -> Table:
+    """What a ray asks of the networks, in the whole training and in its second half."""
+
+    def late(kind: str, level: int) -> Callable[[ReconstructRow], float | None]:
+        return lambda row: None if row.late is None else getattr(row.late, kind)[level]
+
+    figures: list[Figure[ReconstructRow]] = [
+        (Column("values", ".1f"), lambda r: r.values_per_ray[0]),
+        (Column("jets", ".1f"), lambda r: r.jets_per_ray[0]),
+        (Column("finest jets", ".1f"), lambda r: r.jets_per_ray[-1]),
+        (Column("colours", ".1f"), lambda r: r.colors_per_ray),
+        (Column("late values", ".1f"), late("values", 0)),
+        (Column("late jets", ".1f"), late("jets", 0)),
+        (Column("late finest jets", ".1f"), late("jets", -1)),
+        (Column("late colours", ".1f"), lambda r: None if r.late is None else r.late.colors),
+    ]
+    notes = ("values and jets: of the coarsest level, the jets are trained. late: in the second half of the training.",)
+    return tabulated(name, "Evaluations per ray", "scene, geometry", figures, items, notes=notes)
 
 
 def _against_neus(name: str, found: Sequence[Comparison]) -> Table:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -65,6 +65,9 @@ class SceneModel(nn.Module):
         cos_anneal: float = 1.0,
         level: int = -1,
         least_weight: float = 0.0,
+        skip: float = 0.0,
+        skip_share: float = 0.0,
+        guide: Callable[[Tensor], Tensor] | None = None,
         generator: torch.Generator | None = None,
     ) -> Rendered:
         """`render_volume` of this scene, with colours in half precision on a GPU."""
@@ -85,6 +88,9 @@ class SceneModel(nn.Module):
             background=self.background,
             outside=self.outside,
             least_weight=least_weight,
+            skip=skip,
+            skip_share=skip_share,
+            guide=guide,
             generator=generator,
         )
 

@@ -6,10 +6,14 @@ import torch
 from torch import Tensor
 
 from ...neural_fields.losses import eikonal_loss
+from ...neural_fields.value_grid import ValueGrid
 from ...neural_fields.volume_renderer import Sampling
 from ..run.settings import ReconstructConfig
 from ..run.trainer import Group, Objective, Trainer, warm_cosine
 from .model import RayPool, SceneModel
+
+# Steps between two looks at the surface's surroundings, and such looks between two at everything.
+NEAR_EVERY, WHOLE_EVERY = 16, 8
 
 __all__ = ["SceneObjective", "scene_trainer"]
 
@@ -34,11 +38,23 @@ class SceneObjective(Objective):
         super().__init__(model, groups, torch.Generator().manual_seed(config.seed))
         self.model, self.pool, self.config = model, pool, config
         self.sampling = Sampling(uniform=config.uniform, importance=config.importance)
+        self.grid = ValueGrid(config.march_grid, pool.device) if config.march_grid else None
+        if self.grid is not None:
+            self.kept["march"] = self.grid.kept
 
     def level_at(self, done: float) -> int:
         """The finest level that is switched on when a fraction of the schedule is done."""
         started = sum(start <= done for start in self.config.starts)
         return min(started, self.model.geometry.num_levels) - 1
+
+    def look(self, step: int) -> ValueGrid | None:
+        """The grid that rays march on, brought up to date: its near part often, all of it now and then."""
+        if self.grid is None:
+            return None
+        self.grid.kept = self.kept["march"]  # that of a run which is resumed
+        if step % NEAR_EVERY == 0:
+            self.grid.refresh(self.model.geometry, whole=step % (NEAR_EVERY * WHOLE_EVERY) == 0)
+        return self.grid
 
     def losses(self, step: int, done: float) -> tuple[dict[str, Tensor], Tensor]:
         """See `Objective.losses`."""
@@ -52,13 +68,17 @@ class SceneObjective(Objective):
             cos_anneal=min(1.0, done / config.anneal) if config.anneal else 1.0,
             level=self.level_at(done),
             least_weight=config.least_weight,
+            skip=config.skip,
+            skip_share=config.skip_share,
+            guide=self.look(step),
             generator=self.generator,
         )
         target = rays.color
         if self.pool.has_masks:
             target = torch.lerp(self.model.background.expand_as(target), target, rays.mask[:, None])
         color = (seen.color - target).abs().mean()
-        eikonal = eikonal_loss(seen.jet.gradient).mean()
+        # A mean over all sections, those that were skipped included: some of them stand for the others.
+        eikonal = (seen.counts * eikonal_loss(seen.jet.gradient)).mean()
         terms = {"color": color, "eikonal": eikonal}
         total = color + config.eikonal_weight * eikonal
         if self.pool.has_masks and config.mask_weight:

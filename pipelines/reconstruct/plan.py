@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from ..run.costs import Net, Speed, jets, training, values
 from ..run.schedule import Stage
 from ..run.settings import ReconstructConfig, TextureConfig
 from ..texture.train import texture_stages
+from .objective import NEAR_EVERY, WHOLE_EVERY
 
 __all__ = ["SPHERE", "ReconstructPlan", "level_stage"]
 
@@ -15,6 +17,8 @@ SPHERE = "a sphere to begin with"
 SPHERE_STEPS, SPHERE_BATCH = 200, 1024
 # Of the samples of a ray: those in the band of the next level, those that get a colour, and rays that meet the region.
 IN_BAND, COLOURED, MET = 0.4, 0.6, 0.8
+# Where sections are skipped: those that are left.
+EVALUATED = 0.2
 NEUS = Net(parameters=459_000, neurons=2048)  # its 8 layers of 256
 MESHED = 128  # cells along the mesh whose points are coloured
 
@@ -22,6 +26,12 @@ MESHED = 128  # cells along the mesh whose points are coloured
 def level_stage(level: int) -> str:
     """The name of the stage in which a level is the finest that is switched on."""
     return f"reconstruct, level {level}"
+
+
+def grid_rows(resolution: int) -> float:
+    """Values per step that keep the grid up to date: of the ball now and then, else of the twelfth near the surface."""
+    ball = 4 / 3 * math.pi * (resolution / 2 + math.sqrt(3)) ** 3
+    return ball * (1 / WHOLE_EVERY + (1 - 1 / WHOLE_EVERY) / 12) / NEAR_EVERY
 
 
 @dataclass(frozen=True)
@@ -83,15 +93,20 @@ class ReconstructPlan:
         config = self.config
         samples = config.rays * (config.uniform + config.importance)
         # Values find where importance samples belong; then jets of the samples that are left are trained.
-        looked = values(samples, self._on(level)) if config.importance else 0.0
-        trained = training(1, samples, self._on(level)) + training(1, COLOURED * samples / 2, [self._color()])
+        marched = grid_rows(config.march_grid) if config.march_grid else samples if config.importance else 0.0
+        looked = values(marched, self.nets[:1])
+        evaluated = EVALUATED * samples if config.skip else samples
+        # Those that get a colour are half of all samples at most.
+        coloured = COLOURED * min(evaluated, samples / 2)
+        trained = training(1, evaluated, self._on(level)) + training(1, coloured, [self._color()])
         return self.speed.networks(MET * (looked + trained), steps=2)
 
     def view_seconds(self) -> float:
         """One picture of a view."""
         samples = self.pixels * (self.config.uniform + self.config.importance)
         nets = self._on(len(self.nets) - 1)
-        work = values(samples, nets) + jets(samples, nets) + values(COLOURED * samples, [self._color()])
+        evaluated = EVALUATED * samples if self.config.skip else samples
+        work = values(samples, nets[:1]) + jets(evaluated, nets) + values(COLOURED * evaluated, [self._color()])
         return self.speed.networks(MET * work)
 
     def _on(self, level: int) -> list[Net]:

@@ -50,6 +50,7 @@ def render_image(
     *,
     level: int = -1,
     least_weight: float = 1e-4,
+    skip: float = 1e-4,
     progress: Callable[[int, int], None] | None = None,
 ) -> ViewImage:
     """Render a view with the model's volume renderer.
@@ -61,6 +62,7 @@ def render_image(
         sampling: where to sample.
         level: of the geometry.
         least_weight: see `render_volume`.
+        skip: the same.
         progress: told (rays done, rays in all).
     """
     device = model.background.device
@@ -72,7 +74,9 @@ def render_image(
     asked = (far > near).nonzero()[:, 0] if model.outside is None else torch.arange(len(origins), device=device)
     done = 0
     for rows in asked.split(RAYS):
-        seen = model.render(origins[rows], directions[rows], sampling, level=level, least_weight=least_weight)
+        seen = model.render(
+            origins[rows], directions[rows], sampling, level=level, least_weight=least_weight, skip=skip
+        )
         color[rows], normal[rows], opacity[rows] = seen.color, seen.normal, seen.opacity
         done += len(rows)
         if progress:

@@ -170,8 +170,8 @@ class ReconstructConfig(Settings):
     )
     steps: int = setting(5000, "training steps", above=0)
     rays: int = setting(256, "rays per training step", above=0)
-    uniform: int = setting(32, "evenly spaced samples per ray", at_least=2)
-    importance: int = setting(32, "samples per ray near the surface", at_least=0)
+    uniform: int = setting(48, "evenly spaced samples per ray", at_least=2)
+    importance: int = setting(8, "samples per ray near the surface", at_least=0)
     texture_steps: int = setting(
         500, "training steps of the texture of the finished surface; 0 leaves it uncoloured", at_least=0
     )
@@ -184,6 +184,18 @@ class ReconstructConfig(Settings):
         0.2, "share of the training in which slopes are annealed (cos_anneal)", at_least=0, at_most=1
     )
     least_weight: float = setting(1e-4, "samples that contribute less to their pixel get no colour", at_least=0)
+    skip: float = setting(
+        1e-3, "sections of a ray whose estimated weight is smaller are not evaluated; 0: all are", at_least=0, at_most=1
+    )
+    skip_share: float = setting(
+        0.03,
+        "share of the skipped sections that is evaluated nevertheless, for the eikonal term",
+        at_least=0,
+        at_most=1,
+    )
+    march_grid: int = setting(
+        64, "cells along the grid of coarse values by which samples are placed; 0 asks the network", at_least=0
+    )
     width: int | None = setting(None, "shrink the pictures to this many pixels across before training", above=0)
     test_every: int = setting(8, "every n-th picture is held out and measured; 0 trains on all", at_least=0)
     time_budget: float | None = setting(None, "end training after about this many seconds", above=0)

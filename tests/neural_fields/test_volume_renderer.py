@@ -1,9 +1,23 @@
 """Rendered rays against exact surfaces, a loop over rays and samples, and every kind of field."""
 
+from typing import Any
+
 import pytest
 import torch
 from fields import FIELDS
-from mplicits.neural_fields import Jet, MultiscaleSDF, OneLevelField, Sampling, Siren, Sphere, ViewColor, render_volume
+from mplicits.neural_fields import (
+    Jet,
+    MultiscaleSDF,
+    OneLevelField,
+    Rendered,
+    Sampling,
+    Siren,
+    Sphere,
+    ViewColor,
+    render_volume,
+)
+from mplicits.neural_fields.function import as_field
+from mplicits.neural_fields.value_grid import ValueGrid
 from mplicits.neural_fields.volume import sphere_span
 from mplicits.neural_fields.volume_renderer import sample_depths
 from mplicits.pipelines.bench.speed import counted
@@ -182,3 +196,76 @@ def test_gradients_reach_the_field_through_the_weights() -> None:
     )
     (slope,) = torch.autograd.grad(seen.depth.sum(), field.bias)
     assert float(slope) == pytest.approx(1, abs=0.02)
+
+
+class TestSkipping:
+    """Sections without weight get no jet; the full sum is what all of it is held against."""
+
+    def field(self) -> MultiscaleSDF:
+        """The finer surface lies 0.01 inside the coarser one, where the weights are estimated."""
+        return MultiscaleSDF(
+            Sphere(radius=0.5).double(), [as_field(lambda x: 0.01 + 0 * x[..., 0])], [0.08], taper=0.3
+        ).double()
+
+    def seen(self, **options: Any) -> Rendered:
+        origins, directions = (part.double() for part in rays(300))
+        white = torch.ones(3, dtype=torch.float64)
+        return render_volume(
+            self.field(), position_color, origins, directions, inv_std=150.0, background=white, **options
+        )
+
+    @pytest.mark.parametrize("skip", [1e-2, 1e-4])
+    def test_colours_are_off_by_the_skipped_weight_at_most(self, skip: float) -> None:
+        full, some = self.seen(), self.seen(skip=skip)
+        assert torch.equal(full.depths, some.depths)
+        skipped = some.counts == 0
+        lost = (full.weights * skipped).sum(dim=1)
+        assert float(skipped.double().mean()) > 0.3
+        assert float(lost.max()) > 0
+        error = (some.color - full.color).abs().amax(dim=1)
+        assert bool((error <= lost + 1e-12).all())
+        torch.testing.assert_close(some.weights.sum(dim=1) + (1 - some.opacity), torch.ones(300).double())
+        assert float(some.weights[skipped].abs().max()) == 0
+        # Each neighbourhood that was found light has less than its estimate; 129 sections are on a ray.
+        assert float(lost.max()) < 129 * skip
+
+    def test_nothing_changes_where_nothing_is_skipped(self) -> None:
+        full = self.seen(generator=torch.Generator().manual_seed(1))
+        every = self.seen(skip=1e-3, skip_share=1.0, generator=torch.Generator().manual_seed(1))
+        assert bool((full.counts == 1).all())
+        assert bool((every.counts == 1).all())
+        torch.testing.assert_close(every.color, full.color, atol=1e-12, rtol=0)
+        torch.testing.assert_close(every.jet.gradient, full.jet.gradient, atol=1e-12, rtol=0)
+
+    def test_those_kept_by_chance_stand_for_the_others(self) -> None:
+        counts = self.seen(skip=1e-3, skip_share=0.25, generator=torch.Generator().manual_seed(1)).counts
+        assert {*counts.unique().tolist()} == {0.0, 1.0, 4.0}
+        light = counts[counts != 1]
+        # Each is 4 with a probability of 1/4, so of n the mean is 1 with a variance of 3/n.
+        assert abs(float(light.mean()) - 1) < 5 * (3 / len(light)) ** 0.5
+        assert {*self.seen(skip=1e-3, skip_share=0.25).counts.unique().tolist()} == {0.0, 1.0}  # no generator
+
+    def test_rays_that_miss_keep_where_they_come_nearest(self) -> None:
+        field, origins = Sphere(radius=0.5), torch.tensor([[0.0, 0.7, 2.0], [0.0, 0.9, 2.0]])
+        seen = render_volume(
+            field, position_color, origins, torch.tensor([[0.0, 0, -1]]).expand(2, 3), inv_std=1e3, skip=1e-3
+        )
+        assert (seen.counts == 1).sum(dim=1).tolist() == [1, 1]
+        assert bool((seen.depths[seen.counts == 1] - 2.0).abs().max() < 0.05)
+
+    def test_a_guide_saves_the_march_its_network(self) -> None:
+        field = self.field().float()
+        wrapped, (base, residual) = counted(field)
+        origins, directions = rays(100)
+        grid = ValueGrid(48)
+        grid.refresh(field)
+        guided = render_volume(wrapped, position_color, origins, directions, inv_std=150.0, skip=1e-4, guide=grid)
+        assert base.values == residual.values == 0
+        assert base.jets == int((guided.counts > 0).sum())
+        full = render_volume(field, position_color, origins, directions, inv_std=150.0)
+        # Both place sections of their own around the same surface: 1/s is what they may differ by in depth.
+        assert float((guided.color - full.color).abs().max()) < 1 / 150
+
+    def test_shares_out_of_range_are_refused(self) -> None:
+        with pytest.raises(ValueError, match=r"skip_share=1\.5"):
+            self.seen(skip=0.1, skip_share=1.5)

@@ -44,12 +44,14 @@ TINY = ReconstructConfig(
     rays=8,
     uniform=4,
     importance=4,
+    skip=0.0,
+    march_grid=0,
     test_every=3,
     device="cpu",
 )
 FLAGS = ["--widths", "16", "24", "--depths", "1", "1", "--omegas", "5", "10", "--starts", "0", "0.5"]
 FLAGS += ["--features", "4", "--color-width", "16", "--color-depth", "1", "--steps", "4", "--rays", "8"]
-FLAGS += ["--uniform", "4", "--importance", "4", "--test-every", "3", "--device", "cpu"]
+FLAGS += ["--uniform", "4", "--importance", "4", "--march-grid", "4", "--test-every", "3", "--device", "cpu"]
 FLAGS += ["--views", "6", "--size", "8", "--resolution", "16", "--eval-samples", "2000"]
 
 
@@ -139,6 +141,9 @@ def test_rows(bench):
         # Four rounds of one more sample; after the last one nobody asks for the values there.
         assert row.values_per_ray[0] == 4 + 3
         assert row.jets_per_ray[0] == 4 + 4 + 1
+        assert row.late is not None
+        assert (row.late.values[0], row.late.jets[0]) == (4 + 3, 4 + 4 + 1)
+        assert 0 < row.late.colors <= 9
         assert row.views == 1
         assert 0 < row.psnr < 40
         assert 0 < row.psnr_object < 40
@@ -152,6 +157,8 @@ def test_rows(bench):
     assert 0 < ours.finest_share < 1
     assert ours.jets_per_ray[1] == pytest.approx(ours.finest_share * 9 / 2)
     assert ours.values_per_ray[1] == 0
+    # In the second half the second level was on throughout.
+    assert 0 < ours.late.jets[1] == pytest.approx(2 * ours.jets_per_ray[1])
     assert len(ours.deltas) == 1
     assert len(neus.deltas) == 0
 
@@ -278,8 +285,10 @@ def test_the_tables(bench):
     assert (other.step, other.equal_time, other.chamfer) == (pytest.approx(1.5), None, None)
     assert (mean.neus, mean.ours, mean.step) == pytest.approx((24.0, 25.25, 4.5**0.5))
     assert (mean.equal_time, mean.chamfer) == (None, None)
-    table, against = bench[1].tables([neus, ours, timed, *second], sgemm=50e9)
+    table, evaluations, against = bench[1].tables([neus, ours, timed, *second], sgemm=50e9)
     text = "\n".join(map(as_text, (table, against)))
+    assert evaluations.rows[0].values[:2] == (7.0, 9.0)
+    assert evaluations.rows[0].values[4:6] == (7.0, 9.0)
     for part in ("+1.50", "+3.00", "-38%", "12.5%", "   6.0 ", " 100.0 ", "mean of 2 scenes"):
         assert part in text
     assert table.rows[0].values[-1] == pytest.approx(1.2e8 / 50e9)
@@ -289,7 +298,7 @@ def test_the_tables(bench):
     assert "paper, DTU scan 24 28.20 31.50 +3.30 – – -37% – – – – –" in lines
     assert "paper, mean of 5 DTU scans 28.86 29.94 +1.08 – – -37% – – – – –" in lines
     assert "no surface" in text
-    assert len(bench[1].tables([neus], sgemm=50e9)) == 1
+    assert len(bench[1].tables([neus], sgemm=50e9)) == 2
 
 
 def rows_in(file: Path) -> list[dict]:

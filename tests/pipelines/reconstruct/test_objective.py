@@ -29,6 +29,7 @@ TINY = ReconstructConfig(
     rays=32,
     uniform=8,
     importance=4,
+    march_grid=8,
     learning_rate=2e-3,
 )
 
@@ -96,7 +97,7 @@ def test_some_steps_lower_the_errors(images: PosedImages) -> None:
 
 
 def test_the_softplus_network_of_neus_is_trained_by_the_same_steps(images: PosedImages) -> None:
-    trainer = make(images, replace(TINY, geometry="neus", steps=3, rays=16))
+    trainer = make(images, replace(TINY, geometry="neus", steps=3, rays=16, march_grid=0))
     before = weights(trainer)
     assert [reached for _, reached in train(trainer)] == [0, 0, 0]
     assert all(0 <= value < 10 for value in trainer.losses.values())
@@ -163,6 +164,26 @@ def test_the_seed_decides(images: PosedImages) -> None:
     first, again, other = (weights(trainer)["geometry.base.output.weight"] for trainer in trainers)
     assert torch.equal(first, again)
     assert not torch.equal(first, other)
+
+
+def test_the_grid_that_rays_march_on_is_that_of_the_coarse_level(images: PosedImages) -> None:
+    trainer = make(images, TINY)
+    points = 0.5 * torch.rand(50, 3, generator=torch.Generator().manual_seed(0))
+    before = trainer.objective.model.geometry.value(points, level=0).detach()
+    train(trainer, until=1)  # which looks at all of it, and then takes a step
+    grid = trainer.objective.grid
+    assert grid is not None
+    # An eighth of the cube is 0.25 across: for the curvature 2/r of a sphere at r ≥ 0.1, 3/8 · h² · 10.
+    assert float((grid(points) - before)[points.norm(dim=1) > 0.1].abs().max()) < 3 / 8 * 0.25**2 * 10
+    assert torch.equal(trainer.state()["march"], grid.kept)
+
+
+def test_skipping_nothing_is_the_training_without_it(images: PosedImages) -> None:
+    plain, every = (make(images, replace(TINY, skip=skip, skip_share=1.0, march_grid=0)) for skip in (0.0, 1e-3))
+    for trainer in (plain, every):
+        terms, _ = trainer.objective.losses(0, 0.0)
+        trainer.losses = {name: float(value.detach()) for name, value in terms.items()}
+    assert every.losses == pytest.approx(plain.losses, rel=1e-5)
 
 
 def test_a_time_budget_ends_the_schedule(images: PosedImages) -> None:
