@@ -58,6 +58,7 @@ def test_a_tutorial_runs_in_an_empty_folder(name: str, tmp_path: Path) -> None:
     check_kept(tmp_path)
 
 
+@pytest.mark.slow
 def test_a_scan_of_ones_own(tmp_path: Path) -> None:
     mplicits.datasets.write_cloud_ply(tmp_path / "mine.ply", mplicits.datasets.sample_torus(500))
     run([str(FOLDER / "scan_to_mesh.py"), "mine.ply", "--small"], tmp_path)

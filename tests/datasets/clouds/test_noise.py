@@ -199,7 +199,7 @@ def test_flipped_normals_of_a_thin_part_are_no_noise():
 
 @pytest.mark.parametrize("given", [True, False])
 def test_a_noisy_cloud_is_smoothed_and_says_so(given):
-    clean = sample_sphere(20000)
+    clean = sample_sphere(8000)
     noisy = add_noise(clean, 0.01)
     cloud = PointCloud(noisy.points, noisy.normals if given else None)
     prepared = prepare_cloud(cloud, smooth_noise=True)

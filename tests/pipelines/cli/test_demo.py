@@ -55,11 +55,11 @@ def test_errors_are_those_of_closed_forms(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(module, "CHECKED", 40)
     monkeypatch.setattr(module, "EVEN", 500)
     statue = Statue()
-    exact = sample_surface(statue, 20_000)
+    exact = sample_surface(statue, 5000)
     assert exact.normals is not None
     off = 5e-4
     points = STATUE_PLACEMENT.to_input(exact.points + off * exact.normals.astype(np.float64))
-    mesh = extract_mesh(statue, resolution=96)
+    mesh = extract_mesh(statue, resolution=64)
     scan = replace(exact, points=points, normals=None)
     table = figures(module._true_errors(scan, statue, mesh, STATUE_PLACEMENT))
     noise, at, near, whole = table.values()
@@ -69,7 +69,7 @@ def test_errors_are_those_of_closed_forms(monkeypatch: pytest.MonkeyPatch) -> No
     assert max(at) <= 1e-6 * STATUE_PLACEMENT.scale + 1e-3
     assert max(near) <= 1e-6 * STATUE_PLACEMENT.scale + 1e-3
     # Interpolation along an edge of length h is off by h² κ / 8 at most; most of the statue has κ below 10.
-    assert whole[1] < (2 / 96) ** 2 * 10 / 8 * STATUE_PLACEMENT.scale
+    assert whole[1] < (2 / 64) ** 2 * 10 / 8 * STATUE_PLACEMENT.scale
     names = list(table)
     assert names[0] == "the scan's points themselves"
     assert names[1] == "level 0, at the scan's points"
