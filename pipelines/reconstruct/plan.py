@@ -9,6 +9,7 @@ from ..run.costs import Net, Speed, jets, training, values
 from ..run.schedule import Stage
 from ..run.settings import ReconstructConfig, TextureConfig
 from ..texture.train import texture_stages
+from .hull import STEPS as HULL_STEPS
 from .objective import NEAR_EVERY, WHOLE_EVERY
 
 __all__ = ["SPHERE", "ReconstructPlan", "level_stage"]
@@ -65,8 +66,9 @@ class ReconstructPlan:
 
     def before(self) -> list[Stage]:
         """What comes before the training."""
-        work = training(SPHERE_STEPS, SPHERE_BATCH, self.nets[:1])
-        return [Stage(SPHERE, "rays", self.speed.networks(work, steps=SPHERE_STEPS))]
+        hull = 0 if self.config.start == "sphere" or self.config.geometry == "neus" else HULL_STEPS
+        steps = SPHERE_STEPS + hull
+        return [Stage(SPHERE, "rays", self.speed.networks(training(steps, SPHERE_BATCH, self.nets[:1]), steps=steps))]
 
     def levels(self) -> list[Stage]:
         """The training, in a stage for each level that joins."""

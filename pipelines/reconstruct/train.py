@@ -30,6 +30,7 @@ from ..run.trainer import Interrupted, load_compiler, parameter_count, stop_on_s
 from ..surface.surface import from_mesh, sample_points
 from ..surface.trim import in_region
 from ..texture.train import FittedTexture, fit_texture
+from .hull import begin
 from .model import RayPool, SceneModel, build_scene
 from .objective import scene_trainer
 from .plan import SPHERE, ReconstructPlan, level_stage
@@ -113,7 +114,9 @@ def reconstruct(
     images = data if isinstance(data, PosedImages) else read_posed_images(data, width=config.width)
     schedule(Progress(reading.name, 0, 0, 1.0, {}))
     load_compiler()
-    training = _Reconstruction(images, config, device, folder, schedule, machine=machine, started=started)
+    training = _Reconstruction(
+        images, config, device, folder, schedule, machine=machine, started=started, resume=resume
+    )
     with folder.writing(HELD_OUT_FILE, PREVIEW_FILE, MESH_FILE):
         if resume:
             training.restore()
@@ -133,6 +136,7 @@ class _Reconstruction:
         *,
         machine: Speed,
         started: float,
+        resume: bool,
     ) -> None:
         self.images, self.config, self.device = images, config, device
         self.folder, self.schedule, self.started = folder, schedule, started
@@ -144,6 +148,7 @@ class _Reconstruction:
         pool = RayPool(self.train_views, images.similarity, device)
         schedule(Progress(SPHERE, 0, 0, 0.0, {}))
         self.model = build_scene(config, has_masks=pool.has_masks).to(device)
+        self.start = "sphere" if resume else begin(self.model, self.train_views, images, config)
         schedule(Progress(SPHERE, 0, 0, 1.0, {}))
         self.trainer = scene_trainer(self.model, pool, config, seconds=self.training_seconds())
         # Of the training pixels, their masks and the cameras.
@@ -250,7 +255,12 @@ class _Reconstruction:
     def _save(self) -> None:
         """Write a usable field and all that `restore` needs."""
         trainer = self.trainer
-        progress = {"fingerprint": self.fingerprint, "shown": self.shown, "losses": trainer.losses}
+        progress = {
+            "fingerprint": self.fingerprint,
+            "shown": self.shown,
+            "losses": trainer.losses,
+            "start": self.start,
+        }
         record = self._record(finished=False)
         self.folder.save(self.model.geometry, self.images.similarity, record, trainer.state(), progress)
 
@@ -259,6 +269,7 @@ class _Reconstruction:
         path, source = self.folder.path, self.images.source
         mismatch = f"{source}: not the pictures that {path} was trained on; resume with those"
         tensors, progress = self.folder.restore(self.fingerprint, mismatch)
+        self.start = progress.get("start", self.start)
         self.shown, self.trainer.losses = progress["shown"], progress["losses"]
         self.trainer.restore(tensors)
 
@@ -271,6 +282,7 @@ class _Reconstruction:
             "data": str(self.images.source),
             "views": {"trained": len(self.train_views), "held_out": len(self.test_views)},
             "region": self.images.region,
+            "start": self.start,
             "similarity": dataclasses.asdict(self.images.similarity),
             "config": dataclasses.asdict(self.config),
             "parameters": {name: parameter_count(part) for name, part in parts.items()},

@@ -161,6 +161,9 @@ class ReconstructConfig(Settings):
     taper: float = setting(0.3, "share of a band over which the next level fades out", at_least=0, at_most=1)
     band: float = setting(4.0, "half-width of the bands in units of the surface's uncertainty 1/s", above=0)
     least_delta: float = setting(0.02, "half-width that a band keeps, in units of the region's radius", above=0)
+    start: Literal["auto", "hull", "sphere"] = setting(
+        "auto", "what the geometry begins as: hull (of the masks) or sphere; auto is hull where masks give one"
+    )
     radius: float = setting(0.5, "of the sphere that the geometry begins as, in units of the region's radius", above=0)
     color_width: int = setting(256, "neurons per layer of the colour network", above=0)
     color_depth: int = setting(4, "layers of the colour network", above=0)

@@ -41,13 +41,13 @@ TINY = ReconstructConfig(
     uniform=8,
     importance=4,
     march_grid=8,
+    start="sphere",
     texture_steps=3,
     test_every=3,
 )
 FLAGS = "--widths 16 16 --depths 1 1 --omegas 10 15 --starts 0 0.4 --features 4 --color-width 16 --color-depth 1"
-FLAGS += (
-    " --color-frequencies 2 --steps 3 --rays 16 --uniform 8 --importance 4 --march-grid 8 --texture-steps 3 --quiet"
-)
+FLAGS += " --color-frequencies 2 --steps 3 --rays 16 --uniform 8 --importance 4 --texture-steps 3 --quiet"
+FLAGS += " --march-grid 8 --start sphere"
 
 
 @pytest.fixture(autouse=True)

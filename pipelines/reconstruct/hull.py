@@ -1,0 +1,142 @@
+"""The visual hull of masks, as a start of the geometry: what all pictures take for object, carved out of a grid."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
+from torch import Tensor, nn
+
+from ...datasets.views.images import PosedImage, PosedImages
+from ...neural_fields import InputError, MultiscaleSDF, Similarity, Siren
+from ...neural_fields.losses import data_loss, eikonal_loss
+from ...neural_fields.value_grid import ValueGrid
+from ..run.settings import ReconstructConfig
+from ..run.trainer import seeded
+from .model import SceneModel
+
+__all__ = ["begin", "carve", "start_at_hull"]
+
+RESOLUTION = 48  # cells along the grid that is carved
+AGREE = 0.95  # share of the views that must take a point for object: one wrong picture of twenty takes nothing away
+SEEING = 0.25  # of all views that must see it
+OBJECT = 0.5  # a pixel with a larger share of object counts as one
+LEAST, MOST = 1e-3, 0.5  # shares of the unit ball that a hull fills; others are no start
+STEPS, BATCH, RATE = 250, 1024, 2e-3
+DATA_WEIGHT, EIKONAL_WEIGHT = 100.0, 0.1
+
+
+def begin(model: SceneModel, views: Sequence[PosedImage], images: PosedImages, config: ReconstructConfig) -> str:
+    """Give an untrained scene the start that its settings ask for; it is a sphere already.
+
+    Args:
+        model: its geometry is trained in place.
+        views: those that are trained on.
+        images: of which these are a part; for the coordinates and the name.
+        config: ``start``, ``geometry`` and ``seed`` are used.
+
+    Returns:
+        What it is now, "hull" or "sphere".
+
+    Raises:
+        InputError: a hull was asked for, but there is none.
+    """
+    base = model.geometry.base if isinstance(model.geometry, MultiscaleSDF) else None
+    if config.start != "sphere" and isinstance(base, Siren) and all(view.mask is not None for view in views):
+        distances = carve(views, images.similarity)
+        if distances is not None:
+            start_at_hull(base, distances, seed=config.seed)
+            return "hull"
+    if config.start == "hull":
+        raise InputError(
+            f"{images.source}: no visual hull to begin with, which wants masks on all pictures that leave a part of "
+            "the region, and --geometry multiscale; see `mplicits check-cameras`, or take --start sphere"
+        )
+    return "sphere"
+
+
+def carve(
+    views: Sequence[PosedImage], similarity: Similarity, *, resolution: int = RESOLUTION
+) -> NDArray[np.float64] | None:
+    """Signed distances to the visual hull at the vertices of a grid over [−1, 1]³, negative inside.
+
+    A vertex of the unit ball is inside where AGREE of the views that see it find object within half a cell around it.
+    So the hull is up to a cell too large, and thin parts stay.
+
+    Args:
+        views: pictures with masks.
+        similarity: from world to unit-sphere coordinates.
+        resolution: cells along an edge.
+
+    Returns:
+        ``(resolution + 1,) * 3`` distances by x, y and z, exact to about a cell; or None where the masks leave less
+        than LEAST or more than MOST of the ball, as empty and full ones do.
+    """
+    count, edge = resolution + 1, 2 / resolution
+    axis = torch.linspace(-1, 1, count, dtype=torch.float64)
+    points = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1).reshape(-1, 3)
+    in_ball = (points.square().sum(dim=1) <= 1).nonzero()[:, 0]
+    points = points[in_ball]
+    seen, object_in = torch.zeros(len(points)), torch.zeros(len(points))
+    for view in views:
+        if view.mask is None:
+            continue
+        camera = view.camera.moved(similarity)
+        reach = math.ceil(0.5 * edge * float(camera.intrinsics[0, 0]) / float(camera.eye.norm().clamp(min=edge)))
+        mask = torch.from_numpy(view.mask > OBJECT).float()
+        cut = bool(mask[[0, -1]].any() or mask[:, [0, -1]].any())
+        mask = nn.functional.max_pool2d(mask[None, None], 2 * reach + 1, stride=1, padding=reach)[0, 0]
+        pixels, depth = camera.project(points)
+        column, row = pixels.round().long().unbind(dim=1)
+        inside = (depth > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+        # What a picture does not show is no object, unless its rim cuts the object.
+        seen += inside if cut else depth > 0
+        found = mask[row.clamp(0, camera.height - 1), column.clamp(0, camera.width - 1)]
+        object_in += torch.where(inside, found, 0.0)
+    kept = (seen >= max(1.0, SEEING * len(views))) & (object_in >= AGREE * seen)
+    if not LEAST < float(kept.double().mean()) < MOST:
+        return None
+    solid = np.zeros(count**3, dtype=bool)
+    solid[in_ball[kept].numpy()] = True
+    solid = solid.reshape(count, count, count)
+    # The surface lies half a cell from the outermost vertices inside.
+    outer, inner = (np.asarray(distance_transform_edt(part), dtype=np.float64) for part in (~solid, solid))
+    return edge * np.where(solid, 0.5 - inner, outer - 0.5)
+
+
+def start_at_hull(network: Siren, distances: NDArray[np.float64], *, seed: int = 0, steps: int = STEPS) -> None:
+    """Train a SIREN in place to signed distances on a grid, smoothed as far as it cannot follow them.
+
+    Args:
+        network: the coarse level, on any device.
+        distances: as `carve` returns them.
+        seed: of the points.
+        steps: of Adam, its rate falling linearly.
+    """
+    place = network.output.weight
+    grid = ValueGrid(len(distances) - 1, place.device)
+    grid.kept.copy_(torch.from_numpy(distances).to(place))
+    units = network.units
+    network.set_units()
+    adam = torch.optim.Adam(network.parameters(), lr=RATE, betas=(0.9, 0.99))
+    with seeded(seed):
+        for step in range(steps):
+            points = _in_ball(BATCH).to(place)
+            jet = network.jet(points)
+            loss = DATA_WEIGHT * data_loss(jet.value, grid(points)) + EIKONAL_WEIGHT * eikonal_loss(jet.gradient)
+            for group in adam.param_groups:
+                group["lr"] = RATE * (1 - step / steps)
+            adam.zero_grad(set_to_none=True)
+            loss.mean().backward()
+            adam.step()
+    network.set_units(*units)
+
+
+def _in_ball(count: int) -> Tensor:
+    """Points ``(count, 3)``, evenly spread in the unit ball."""
+    directions = nn.functional.normalize(torch.randn(count, 3), dim=1)
+    return torch.rand(count, 1) ** (1 / 3) * directions

@@ -1,0 +1,114 @@
+"""The visual hull of a sphere's masks, against the sphere, and what is done where masks give no hull."""
+
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+import pytest
+import torch
+from mplicits.datasets.synthetic.scenes import SCENES, render_scene
+from mplicits.datasets.views.images import PosedImages
+from mplicits.neural_fields import InputError, Siren
+from mplicits.pipelines.reconstruct import hull
+from mplicits.pipelines.reconstruct import model as scene_model
+from mplicits.pipelines.reconstruct.hull import begin, carve, start_at_hull
+from mplicits.pipelines.reconstruct.model import build_scene
+from mplicits.pipelines.run.settings import ReconstructConfig
+
+SMALL = ReconstructConfig(
+    widths=(16, 16), depths=(1, 1), features=2, color_width=8, color_depth=1, color_frequencies=1, radius=0.3
+)
+RADIUS = 0.6  # of the painted sphere
+
+
+@pytest.fixture(autouse=True)
+def _no_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What it is before does not matter."""
+    monkeypatch.setattr(scene_model, "fit_sphere", lambda *_: None)
+
+
+@lru_cache
+def images() -> PosedImages:
+    return render_scene(SCENES["painted-sphere"](), views=12, size=24, samples=1)
+
+
+def inverted() -> PosedImages:
+    def other(mask: np.ndarray | None) -> np.ndarray:
+        assert mask is not None
+        return 1 - mask
+
+    return replace(images(), views=tuple(replace(view, mask=other(view.mask)) for view in images().views))
+
+
+def filled(share: float) -> PosedImages:
+    """With masks that are the same everywhere."""
+    views = tuple(replace(view, mask=np.full_like(view.color[..., 0], share)) for view in images().views)
+    return replace(images(), views=views)
+
+
+def lengths(count: int) -> np.ndarray:
+    """Of the vertices of a grid."""
+    axis = np.linspace(-1, 1, count)
+    return np.sqrt(axis[:, None, None] ** 2 + axis[:, None] ** 2 + axis**2)
+
+
+def test_a_sphere_is_carved_out() -> None:
+    resolution = 20
+    distances = carve(images().views, images().similarity, resolution=resolution)
+    assert distances is not None
+    cell, length = 2 / resolution, lengths(resolution + 1)
+    # Nothing of the object is carved away: up to half a cell of a vertex's neighbourhood sees object.
+    assert bool((distances[length < RADIUS] < 0).all())
+    # A pixel sees 2 tan(fov / 2) · distance / 24 of the sphere; half of one and half a cell (times √2, as windows are
+    # squares) is what masks are too large by. Twelve views leave corners between their cones, 1 / cos of half the
+    # angle between neighbours: at most 60°.
+    camera = images().views[0].camera
+    pixel = float(camera.eye.norm() / camera.intrinsics[0, 0])
+    most = (RADIUS + 2**0.5 * (1.5 * pixel + 0.5 * cell)) / np.cos(np.pi / 6)
+    assert bool((distances[length > most] > 0).all())
+    assert float(distances[resolution // 2, resolution // 2, resolution // 2]) < -RADIUS + cell
+
+
+def test_one_wrong_mask_in_thirty_takes_nothing_away() -> None:
+    views = list(images().views) * 3
+    views[0] = inverted().views[0]
+    right, wrong = (carve(some, images().similarity, resolution=16) for some in (images().views, views))
+    assert right is not None
+    assert wrong is not None
+    assert bool(((wrong < 0) | (right > 0)).all())
+
+
+def test_masks_that_leave_nothing_are_no_start() -> None:
+    for share in (0.0, 1.0):
+        assert carve(filled(share).views, images().similarity, resolution=12) is None
+
+
+def test_a_network_is_trained_to_it() -> None:
+    torch.manual_seed(0)
+    network, state = Siren(24, 2, omega=6.0), torch.get_rng_state()
+    length = lengths(13)
+    start_at_hull(network, length - RADIUS, steps=80)
+    points = 0.9 * hull._in_ball(200)
+    with torch.no_grad():
+        error = network.value(points) - (points.norm(dim=1) - RADIUS)
+    assert float(error.abs().mean()) < 0.03  # it has begun at about ± 0.5
+    torch.set_rng_state(state)
+
+
+@pytest.mark.parametrize(("start", "masks", "expected"), [("auto", True, "hull"), ("auto", False, "sphere")])
+def test_settings_say_what_it_begins_as(
+    start: str, masks: bool, expected: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(hull, "start_at_hull", lambda *_, **__: None)
+    some = images() if masks else replace(images(), views=tuple(replace(v, mask=None) for v in images().views))
+    model = build_scene(SMALL, has_masks=masks)
+    assert begin(model, some.views, some, replace(SMALL, start=start)) == expected
+    assert begin(model, some.views, some, replace(SMALL, start="sphere")) == "sphere"
+    neus = replace(SMALL, geometry="neus")
+    assert begin(build_scene(neus, has_masks=masks), some.views, some, neus) == "sphere"
+
+
+def test_a_hull_that_is_not_there_is_refused() -> None:
+    model = build_scene(SMALL, has_masks=True)
+    with pytest.raises(InputError, match="no visual hull to begin with"):
+        begin(model, filled(0.0).views, filled(0.0), replace(SMALL, start="hull"))
