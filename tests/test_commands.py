@@ -47,6 +47,7 @@ EVOLVE = (
     "--widths 16 16 --depths 1 1 --omegas 5 10 --steps 20 10 --learning-rates 5e-3 1e-3 --data-weights 100 300"
     " --start-steps 60 --batch 128 --samples 500 --frames 2 --resolution 16 --least-delta 0.1 --motion-steps 3"
 )
+FEW = "{widths: [16], depths: [1], omegas: [5], steps: [20], learning_rates: [1.0e-2], batch: 128, samples: 500}"
 RECONSTRUCT = (
     "--widths 16 16 --depths 1 1 --color-width 16 --color-depth 1 --steps 3 --rays 16 --uniform 8 --importance 4"
     " --texture-steps 2 --width 16"
@@ -56,6 +57,7 @@ SMALLEST = {  # by what a line begins with, or holds
     "mplicits fit *": f"{FIT} --quiet",
     "mplicits texture *": f"{TEXTURE} --quiet",
     "mplicits evolve *": f"{EVOLVE} --quiet",
+    "mplicits evolve *.ply *": "--fits few.yaml",
     "mplicits reconstruct *": f"{RECONSTRUCT} --quiet",
     "mplicits mesh *": "--resolution 24",
     "mplicits render *": "--size 24 --samples 1",
@@ -283,6 +285,7 @@ def test_commands_of_a_page_run(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    Path("few.yaml").write_text(FEW, encoding="utf-8")
     for name, content in files_of(page):
         Path(name).write_text(content, encoding="utf-8")
     for line in shell_lines(page):

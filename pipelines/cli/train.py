@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..run.config import given_flags, input_error, load_config
-from ..run.settings import EvolveConfig, ReconstructConfig, TextureConfig
+from ..run.settings import EvolveConfig, FitConfig, ReconstructConfig, TextureConfig
 from .common import (
     Command,
     Stopped,
@@ -187,19 +187,33 @@ CONFIG_SUFFIXES = (".yaml", ".yml")
 
 
 def _evolve_arguments(parser: argparse.ArgumentParser) -> None:
-    what = "runs or .safetensors files of `mplicits fit`, exact shapes such as sphere:0.4@0.2,0,0, or one YAML file"
+    what = (
+        "runs or .safetensors files of `mplicits fit`, clouds or meshes, which are fitted first, exact shapes such as "
+        "sphere:0.4@0.2,0,0, or one YAML file"
+    )
     parser.add_argument("inputs", nargs="*", metavar="SHAPE|CONFIG", help=what)
+    fits = "settings of the fits of clouds and meshes, a preset of `mplicits fit` or a YAML file (default: fast)"
+    parser.add_argument("--fits", metavar="NAME|FILE", default="fast", help=fits)
     add_new_run(parser)
     add_tensorboard(parser)
     add_settings(parser, EvolveConfig)
 
 
 def _evolve(arguments: argparse.Namespace) -> int:
-    config = _evolve_settings(arguments)
+    config, fits = _evolve_settings(arguments), load_config(FitConfig, arguments.fits)
+    from ..evolve.scans import fits_beside, fitted_scans, scans_among
     from ..evolve.train import evolve
     from ..run.folder import check_new_run
 
     directory = check_new_run(arguments.out, resume=arguments.resume, force=arguments.force)
+    scans = {} if arguments.resume else scans_among(config.shapes)
+    if scans:
+        folder, given = fits_beside(directory), config.landmarks
+        with training("to continue: the same command", quiet=arguments.quiet) as report:
+            config = fitted_scans(config, scans, folder, fits, progress=report)
+        print(f"{folder}: the fits of {', '.join(scans)}")
+        if config.landmarks != given:
+            print("all of them have the same faces: vertices are landmarks (pairs-00.txt and so on, beside the fits)")
     again = f"to continue: mplicits evolve -o {directory} --resume"
     with (
         tensorboard(arguments.tensorboard) as heard,
@@ -273,6 +287,7 @@ EVOLVE = Command(
     """  mplicits evolve runs/spot runs/bob -o runs/morph
   mplicits evolve runs/a runs/b runs/c --times 0 0.3 1 --align pca -o runs/morph3
   mplicits evolve runs/spot runs/bob --kind deform -o runs/deform
+  mplicits evolve s0.ply s1.ply s2.ply --times 0 0.4 1 --kind deform --align none -o runs/series
   mplicits evolve runs/spot --kind smooth --alpha 0.01 -o runs/smooth
   mplicits evolve runs/spot --kind transport --angle 3.14 --velocity 0.3 0 0 -o runs/turn
   mplicits evolve scene.yaml -o runs/scene

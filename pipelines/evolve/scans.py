@@ -1,0 +1,128 @@
+"""Scans and meshes as shapes of an evolution: each file is fitted once, beside the run, and the fits are evolved.
+
+Meshes with the same faces are one mesh in several poses: their vertices are known to be the same, and some of them
+become the landmarks of a deformation.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ...neural_fields import load_field
+from ...neural_fields.files import write_whole
+from ..fit.train import fit
+from ..run.config import load_config
+from ..run.folder import FIELD_FILE, STATE_FILE, find_field, is_fitted, read_record
+from ..run.schedule import Report
+from ..run.settings import EvolveConfig, FitConfig
+from ..surface.surface import Surface, read_surface
+from .landmarks import FAR_OUT
+
+__all__ = ["fits_beside", "fitted_scans", "scans_among"]
+
+PAIRS = 400  # vertices that are landmarks; more say nothing new of a smooth motion
+
+
+def scans_among(shapes: Sequence[str]) -> dict[str, Surface]:
+    """Those of the shapes that are files of points or triangles, read.
+
+    Raises:
+        InputError: one of them cannot be read.
+    """
+    files = [text for text in dict.fromkeys(shapes) if Path(text).is_file() and Path(text).suffix != ".safetensors"]
+    return {text: read_surface(text) for text in files}
+
+
+def fits_beside(run: Path) -> Path:
+    """The folder for the fits of a run."""
+    return run.with_name(f"{run.name}-fits")
+
+
+def fitted_scans(
+    config: EvolveConfig,
+    scans: Mapping[str, Surface],
+    folder: Path,
+    fits: FitConfig,
+    *,
+    progress: Report | None = None,
+) -> EvolveConfig:
+    """The same evolution of fits: what is in the folder already is taken, or goes on.
+
+    Where all shapes of a deformation are meshes with the same faces, and no landmarks were given, up to 400 vertices
+    become landmarks, files of which are written beside the fits.
+
+    Args:
+        config: whose shapes are files, among others.
+        scans: what `scans_among` has read.
+        folder: see `fits_beside`.
+        fits: settings of the fits.
+        progress: called now and then with how far a fit is.
+
+    Raises:
+        InputError: a cloud cannot be used.
+        Interrupted: a fit was asked to stop; the next call goes on with it.
+    """
+    runs = {}
+    for index, text in enumerate(scans):
+        runs[text] = folder / f"{index:02d}-{Path(text).stem}"
+        if not _is_fit_of(runs[text], Path(text), fits):
+            begun = (runs[text] / STATE_FILE).is_file() and _is_of(runs[text], Path(text), fits)
+            fit(Path(text), fits, out=runs[text], resume=begun, progress=progress)
+    shapes = tuple(str(runs.get(text, text)) for text in config.shapes)
+    landmarks = config.landmarks or _pairs(config, scans, runs, folder)
+    return dataclasses.replace(config, shapes=shapes, landmarks=landmarks)
+
+
+def _is_fit_of(run: Path, scan: Path, fits: FitConfig) -> bool:
+    """Whether a fit of this file with these settings lies there, newer than the file."""
+    if not is_fitted(run) or not _is_of(run, scan, fits):
+        return False
+    return (run / FIELD_FILE).stat().st_mtime >= scan.stat().st_mtime
+
+
+def _is_of(run: Path, scan: Path, fits: FitConfig) -> bool:
+    record = read_record(run)
+    return record.get("cloud") == str(scan.absolute()) and load_config(FitConfig, None, record["config"]) == fits
+
+
+def _pairs(
+    config: EvolveConfig, scans: Mapping[str, Surface], runs: Mapping[str, Path], folder: Path
+) -> tuple[str, ...]:
+    """Files of vertices that are the same, for each two shapes; none where shapes are no poses of one mesh."""
+    poses = [scans.get(text) for text in config.shapes]
+    first = poses[0] if poses else None
+    if config.kind != "deform" or len(poses) < 2 or first is None or not len(first.faces):
+        return ()
+    same = [pose is not None and np.array_equal(pose.faces, first.faces) for pose in poses]
+    if not all(same):
+        return ()
+    chosen = np.sort(np.random.default_rng(0).permutation(np.unique(first.faces))[:PAIRS])
+    near = np.ones(len(chosen), bool)
+    for text, pose in zip(config.shapes, poses, strict=True):
+        if pose is not None:
+            near &= _on_fit(runs[text], pose.vertices[chosen])
+    if not near.any():
+        return ()
+    files = []
+    for index, (before, after) in enumerate(itertools.pairwise(pose for pose in poses if pose is not None)):
+        rows = np.hstack((before.vertices[chosen[near]], after.vertices[chosen[near]]))
+        lines = [f"# the same vertices of {config.shapes[index]} and {config.shapes[index + 1]}"]
+        lines += [" ".join(f"{number:.9g}" for number in row) for row in rows]
+        files.append(folder / f"pairs-{index:02d}.txt")
+        write_whole(files[-1], "\n".join(lines) + "\n")
+    return tuple(map(str, files))
+
+
+@torch.no_grad()
+def _on_fit(run: Path, vertices: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Which vertices the fit has kept: a thin part may be lost."""
+    field, similarity, _ = load_field(find_field(run))
+    points = torch.from_numpy(similarity.to_unit(vertices)).float()
+    return (field.value(points).abs() < FAR_OUT).numpy()
