@@ -1,6 +1,7 @@
 """What every `Field` promises, over every field × level × dtype × batch shape."""
 
 import functools
+from collections.abc import Callable
 
 import pytest
 import torch
@@ -15,23 +16,23 @@ def points(field: Field, shape: tuple[int, ...], **options: object) -> Tensor:
 
 
 @functools.cache
-def jet_rounding(name: str, dtype: torch.dtype, level: int) -> tuple[Tensor, list[Tensor]]:
+def jet_rounding(make: Callable[[], Field], dtype: torch.dtype, level: int) -> tuple[Tensor, list[Tensor]]:
     """Points ``(200, d)``, and how far rounding may move a field's jets there: the same for all who ask."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)  # as before each test
-        field = FIELDS[name]().to(dtype)
+        field = make().to(dtype)
     x = 2 * torch.rand(200, field.in_dim, dtype=dtype, generator=torch.Generator().manual_seed(0)) - 1
     return x, rounding(field, x, lambda field, x: field.jet(x, level=level))
 
 
 @pytest.fixture(params=FIELDS)
-def name(request: pytest.FixtureRequest) -> str:
-    return request.param
+def make(request: pytest.FixtureRequest) -> Callable[[], Field]:
+    return FIELDS[request.param]
 
 
 @pytest.fixture
-def field(name: str, dtype: torch.dtype, device: torch.device) -> Field:
-    return FIELDS[name]().to(device=device, dtype=dtype)
+def field(make: Callable[[], Field], dtype: torch.dtype, device: torch.device) -> Field:
+    return make().to(device=device, dtype=dtype)
 
 
 @pytest.mark.parametrize("shape", [(), (1,), (0,), (7,), (2, 3), (3, 0, 2)])
@@ -53,9 +54,11 @@ def test_shapes_and_types_follow_the_input(
             assert tensor.device.type == device.type
 
 
-def test_jet_agrees_with_value_and_autograd(field: Field, name: str, dtype: torch.dtype, device: torch.device) -> None:
+def test_jet_agrees_with_value_and_autograd(
+    field: Field, make: Callable[[], Field], dtype: torch.dtype, device: torch.device
+) -> None:
     for level in range(field.num_levels):
-        x, (off, slope_off, _) = jet_rounding(name, dtype, level)
+        x, (off, slope_off, _) = jet_rounding(make, dtype, level)
         x = x.to(device).clone().requires_grad_()
         value, jet = field.value(x, level=level), field.jet(x, level=level)
         (gradient,) = torch.autograd.grad(value.sum(), x)
@@ -64,10 +67,10 @@ def test_jet_agrees_with_value_and_autograd(field: Field, name: str, dtype: torc
 
 
 def test_features_without_gradients_are_those_of_the_jet(
-    field: Field, name: str, dtype: torch.dtype, device: torch.device
+    field: Field, make: Callable[[], Field], dtype: torch.dtype, device: torch.device
 ) -> None:
     for level in range(field.num_levels):
-        x, (off, _, feature_off) = jet_rounding(name, dtype, level)
+        x, (off, _, feature_off) = jet_rounding(make, dtype, level)
         x = x.to(device)
         jet = field.jet(x, level=level)
         for graph in (True, False):
@@ -85,9 +88,9 @@ def test_points_can_be_brought_to_a_field(field: Field, dtype: torch.dtype, devi
 
 
 def test_results_without_a_graph_are_the_same(
-    field: Field, name: str, dtype: torch.dtype, device: torch.device
+    field: Field, make: Callable[[], Field], dtype: torch.dtype, device: torch.device
 ) -> None:
-    x, off = jet_rounding(name, dtype, field.num_levels - 1)
+    x, off = jet_rounding(make, dtype, field.num_levels - 1)
     x = x.to(device)
     with_graph = field.jet(x.clone().requires_grad_())
     with torch.inference_mode():

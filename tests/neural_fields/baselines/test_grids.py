@@ -27,10 +27,18 @@ from test_field_contract import (  # noqa: F401
 from torch import Tensor
 
 
+def three_grids() -> Field:
+    return BanfSDF([Torus(), HashGridSDF(levels=2, coarsest=2, finest=8, width=8), Sphere()], [4, 8, 16])
+
+
 @pytest.fixture
-def field(dtype: torch.dtype, device: torch.device) -> Field:
-    networks = [Torus(), HashGridSDF(levels=2, coarsest=2, finest=8, width=8), Sphere()]
-    return BanfSDF(networks, [4, 8, 16]).to(device=device, dtype=dtype)
+def make() -> Callable[[], Field]:
+    return three_grids
+
+
+@pytest.fixture
+def field(make: Callable[[], Field], dtype: torch.dtype, device: torch.device) -> Field:
+    return make().to(device=device, dtype=dtype)
 
 
 def reads_its_table(*, table_size: int, resolution: int) -> HashGridSDF:

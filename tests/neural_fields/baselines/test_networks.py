@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
@@ -55,8 +56,13 @@ LEVELS = {"bacon": small_bacon, "idf": small_idf}
 
 
 @pytest.fixture(params=LEVELS)
-def field(request: pytest.FixtureRequest, dtype: torch.dtype, device: torch.device) -> Field:
-    return LEVELS[request.param]().to(device=device, dtype=dtype)
+def make(request: pytest.FixtureRequest) -> Callable[[], Field]:
+    return LEVELS[request.param]
+
+
+@pytest.fixture
+def field(make: Callable[[], Field], dtype: torch.dtype, device: torch.device) -> Field:
+    return make().to(device=device, dtype=dtype)
 
 
 def test_levels_are_alternatives_everywhere(field: Field, dtype: torch.dtype, device: torch.device) -> None:

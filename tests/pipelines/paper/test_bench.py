@@ -85,7 +85,7 @@ def test_a_bench(ball: Path, tmp_path: Path, exact, capsys: pytest.CaptureFixtur
     kept = json.loads((out / "comparison.json").read_text())
     assert [record["outputs"][0]["name"] for record in kept["records"]] == ["Ours fine", "SIREN"]
     assert kept["records"][0]["outputs"][0]["chamfer"] == first["values"][0]
-    assert iio.imread(out / "sheets" / "comparison-ball.jpg").shape == (360, 4 * 332, 3)
+    assert iio.imread(out / "sheets" / "comparison-ball.jpg").shape == (136, 4 * 108, 3)
     assert (out / "plots" / "comparison-per-mesh-all.svg").read_text().startswith("<svg")
     for link in ("sheets/comparison-ball.jpg", "plots/comparison-per-mesh-all.svg"):
         assert f"]({link})" in page
