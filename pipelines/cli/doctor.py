@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import importlib.metadata
 import os
 import platform
@@ -51,6 +52,7 @@ def examine(folder: Path | None = None) -> list[Finding]:
         _python(),
         *(_requirement(line) for line in importlib.metadata.requires(PACKAGE) or [] if _is_asked_of_users(line)),
         _cv2(),
+        *_torchvision(),
         _threads(),
         _cuda(),
         _kernels(),
@@ -119,6 +121,20 @@ def _cv2() -> Finding:
         fix = f"pip uninstall {names} {OWN_CV2}, then pip install {OWN_CV2}"
         return Finding("warning", "cv2", f"{names} and {OWN_CV2} overwrite each other's files; {fix}")
     return Finding("ok", "cv2", "one wheel only")
+
+
+def _torchvision() -> list[Finding]:
+    """nerfstudio's; its operators are compiled for one build of torch, and from two indexes pip takes two builds."""
+    version = _installed("torchvision")
+    if version is None:
+        return []
+    try:
+        importlib.import_module("torchvision")
+    except (ImportError, RuntimeError) as error:
+        fix = "install both from one index, PyPI or PyTorch's"
+        text = f"{version} does not work with torch {torch.__version__} ({str(error).splitlines()[0]}); {fix}"
+        return [Finding("warning", "torchvision", text)]
+    return [Finding("ok", "torchvision", f"{version}, made for this torch")]
 
 
 def _threads() -> Finding:

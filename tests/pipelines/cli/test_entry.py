@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 from mplicits.datasets import sample_sphere
 from mplicits.neural_fields import MultiscaleSDF, Similarity, save_field
@@ -470,6 +471,26 @@ def test_opencv_under_several_names_is_fine_in_one_version_only(monkeypatch, tmp
     ]
     versions["opencv-python"] = "5.0.0"
     assert doctor._cv2().level == "warning"
+
+
+def test_doctor_tells_two_builds_of_torch_apart(monkeypatch, tmp_path):
+    """As torchvision does where torch came without CUDA and torchvision with it."""
+    package = tmp_path / "torchvision"
+    package.mkdir()
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setattr(doctor, "_installed", {"torchvision": "0.28.0"}.get)
+    (package / "__init__.py").write_text("raise RuntimeError('operator torchvision::nms does not exist')")
+    (found,) = doctor._torchvision()
+    assert (found.level, found.topic) == ("warning", "torchvision")
+    assert (
+        f"0.28.0 does not work with torch {torch.__version__} (operator torchvision::nms does not exist)" in found.text
+    )
+    (package / "__init__.py").write_text("\n")
+    (found,) = doctor._torchvision()
+    assert found.level == "ok"
+    monkeypatch.delitem(sys.modules, "torchvision")
+    monkeypatch.setattr(doctor, "_installed", lambda name: None)
+    assert doctor._torchvision() == []
 
 
 def test_doctor_names_what_is_missing_and_what_clashes(monkeypatch, tmp_path):
