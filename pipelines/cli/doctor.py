@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import importlib.metadata
 import os
 import platform
@@ -129,7 +128,7 @@ def _torchvision() -> list[Finding]:
     if version is None:
         return []
     try:
-        importlib.import_module("torchvision")
+        import torchvision  # noqa: F401  # pyright: ignore[reportMissingImports]
     except (ImportError, RuntimeError) as error:
         fix = "install both from one index, PyPI or PyTorch's"
         text = f"{version} does not work with torch {torch.__version__} ({str(error).splitlines()[0]}); {fix}"
