@@ -6,6 +6,8 @@ import importlib.metadata
 import os
 import platform
 import re
+import subprocess
+import sys
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -127,12 +129,12 @@ def _torchvision() -> list[Finding]:
     version = _installed("torchvision")
     if version is None:
         return []
-    try:
-        import torchvision  # noqa: F401  # pyright: ignore[reportMissingImports]
-    except (ImportError, RuntimeError) as error:
-        fix = "install both from one index, PyPI or PyTorch's"
-        text = f"{version} does not work with torch {torch.__version__} ({str(error).splitlines()[0]}); {fix}"
-        return [Finding("warning", "torchvision", text)]
+    asked = subprocess.run([sys.executable, "-c", "import torchvision"], capture_output=True, text=True, check=False)
+    if asked.returncode:
+        why, fix = asked.stderr.strip().splitlines()[-1], "install both from one index, PyPI or PyTorch's"
+        return [
+            Finding("warning", "torchvision", f"{version} does not work with torch {torch.__version__} ({why}); {fix}")
+        ]
     return [Finding("ok", "torchvision", f"{version}, made for this torch")]
 
 
