@@ -19,7 +19,7 @@ def _mesh_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add_flags(parser, "run", "--time", "--level")
     add_flags(parser, "--out", help=", ".join(MESH_FILES))
-    add_flags(parser, "--resolution", help="cells per side (256)")
+    add_flags(parser, "--resolution", help="cells per side (256, up to 1024 where parts are thin)")
     add_flags(parser, "--normal-level", help="normals of this level on the mesh (default: of its own)")
     what = "leave out the colours of the run's texture"
     add("--no-colors", dest="colors", action="store_false", help=what)

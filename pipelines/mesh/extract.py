@@ -24,6 +24,7 @@ from ..texture.riding import Colors, colors_of_run
 from .bake import check_texture_size, textured_mesh
 from .decimation import Decimation, check_decimation_tool, decimated
 from .files import check_mesh_path, check_textured_path, write_mesh
+from .fineness import LEAST, RESOLUTIONS, fineness, thin_share
 from .printing import PrintReport, print_report
 
 __all__ = ["Exported", "MeshOptions", "export_run", "mesh_run", "normals_near"]
@@ -34,7 +35,8 @@ class MeshOptions:
     """How to mesh a run.
 
     Attributes:
-        resolution: cells along each side of the cube around the unit sphere.
+        resolution: cells along each side of the cube around the unit sphere; None is 256, or up to 1024 where a run has
+            parts too thin for that (see `fineness`).
         time: the moment, for a surface that moves.
         level: counted from 0, the coarsest; None is the finest.
         normal_level: the level whose gradients are the normals (neural normal mapping); None is ``level``.
@@ -53,7 +55,7 @@ class MeshOptions:
         center: whether the middle of the mesh goes to the origin.
     """
 
-    resolution: int = 256
+    resolution: int | None = None
     time: float | None = None
     level: int | None = None
     normal_level: int | None = None
@@ -145,22 +147,21 @@ def export_run(
     check(out, similarity, centered=placement.center)  # again: not every format can hold every place
     level = chosen_level(field, file, options.level)
     normal_level = chosen_level(field, file, options.normal_level, otherwise=level, flag="--normal-level")
-    support = None
-    if not options.keep_unsupported and options.time is None:
-        support = read_support(file, metadata.get("run", {}), level)
+    support = None if options.time is not None else read_support(file, metadata.get("run", {}), level)
     points = None
     if options.trim_distance is not None:
         cloud = read_cloud(options.cloud or fitted_cloud(file, metadata, remedy="name it with --cloud FILE"))
         points = similarity.to_unit(cloud.points[np.isfinite(cloud.points).all(axis=1)])
+    resolution = _resolution(field, options.resolution, support, level, say)
     try:
-        mesh = extract_mesh(field, resolution=options.resolution, level=level)
+        mesh = extract_mesh(field, resolution=resolution, level=level)
     except NoSurfaceError as error:
         raise InputError(f"{file}: no surface to mesh ({error})") from error
     if "region" in metadata.get("run", {}):
         mesh = in_region(mesh)
         if mesh is None:
             raise InputError(f"{file}: no surface in the region of interest; train it longer (--steps)")
-    if support is not None:
+    if support is not None and not options.keep_unsupported:
         mesh = _supported(mesh, support, say)
     if normal_level != level:
         mesh = map_normals(mesh, field, level=normal_level)
@@ -189,6 +190,30 @@ def export_run(
     if options.report or (options.report is None and suffix == ".stl"):
         printing = print_report(mesh, field, similarity, placement, suffix, level=level)
     return Exported(mesh, decimation, printing)
+
+
+def _resolution(
+    field: Field, asked: int | None, support: Support | None, level: int, say: Callable[[str], None] | None
+) -> int:
+    """Cells per side; ``say`` hears of parts that are too thin for those that were asked for, or usual."""
+    say = say or (lambda _: None)
+    if support is None:
+        return asked or RESOLUTIONS[0]
+    if asked is None:
+        chosen = fineness(field, support.points, level=level)
+        if chosen.resolution != RESOLUTIONS[0]:
+            say(
+                f"{chosen.missed:.0%} of the points lie on parts thinner than the cells of {RESOLUTIONS[0]} per side: "
+                f"taken are {chosen.resolution} (--resolution takes another number)"
+            )
+        return chosen.resolution
+    missed = thin_share(field, support.points, asked, level=level)
+    if missed > LEAST and asked < RESOLUTIONS[-1]:
+        say(
+            f"{missed:.0%} of the points lie on parts thinner than the cells of --resolution {asked}, and may come out "
+            f"torn; leave it out, or take {RESOLUTIONS[-1]}"
+        )
+    return asked
 
 
 def _supported(mesh: Mesh, support: Support, say: Callable[[str], None] | None) -> Mesh:
