@@ -23,6 +23,7 @@ from ...datasets.views.images import PosedImage, PosedImages, read_posed_images
 from ...neural_fields import InputError, Similarity
 from ..mesh.files import write_mesh
 from .frustums import camera_mesh
+from .silhouettes import contradictions
 
 __all__ = ["CameraCheck", "check_cameras", "check_files", "format_check"]
 
@@ -137,7 +138,11 @@ def check_cameras(images: PosedImages) -> CameraCheck:
     mask_inside = _mask_inside(images.views, cameras)
     warnings = list(_placement(eyes, forward, middle))
     # Where the cameras are wrong, what the masks see of the region says nothing.
-    warnings += [*_masks(images.views, None if warnings else mask_inside), *_exposure(images.views)]
+    warnings += [
+        *_masks(images.views, None if warnings else mask_inside),
+        *([] if warnings else _silhouettes(images)),
+        *_exposure(images.views),
+    ]
     return CameraCheck(
         np.array([_field_of_view(camera) for camera in cameras]),
         np.linalg.norm(eyes, axis=1),
@@ -248,6 +253,22 @@ def _masks(views: Sequence[PosedImage], inside: float | None) -> Iterator[str]:
     if inside is not None and inside < 1 - PAST_REGION and len(full) < len(shares):
         past = 100 * (1 - inside)
         yield f"{past:.0f} % of the object's pixels see past the region of interest, which cuts it; enlarge it"
+
+
+def _silhouettes(images: PosedImages) -> Iterator[str]:
+    """Warnings about masks that contradict each other."""
+    views = [view for view in images.views if view.mask is not None and EMPTY <= view.mask.mean() <= FULL]
+    if not views:
+        return
+    inverted, odd = contradictions(views, images.similarity)
+    if inverted:
+        yield "the masks cover the borders of the pictures and not their middles: they look inverted; white is object"
+    if odd:
+        names = _named([view.name for view in odd])
+        yield (
+            f"{len(odd)} of {len(views)} silhouettes contradict the others: {names}; is that the right picture, the "
+            "right way round, and its pose and mask right?"
+        )
 
 
 def _mask_inside(views: Sequence[PosedImage], cameras: Sequence[Camera]) -> float | None:

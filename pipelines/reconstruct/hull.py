@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -18,13 +17,13 @@ from ...neural_fields.value_grid import ValueGrid
 from ..run.settings import ReconstructConfig
 from ..run.trainer import seeded
 from .model import SceneModel
+from .silhouettes import grid_in_ball, silhouettes
 
 __all__ = ["begin", "carve", "start_at_hull"]
 
 RESOLUTION = 48  # cells along the grid that is carved
 AGREE = 0.95  # share of the views that must take a point for object: one wrong picture of twenty takes nothing away
 SEEING = 0.25  # of all views that must see it
-OBJECT = 0.5  # a pixel with a larger share of object counts as one
 LEAST, MOST = 1e-3, 0.5  # shares of the unit ball that a hull fills; others are no start
 STEPS, BATCH, RATE = 250, 1024, 2e-3
 DATA_WEIGHT, EIKONAL_WEIGHT = 100.0, 0.1
@@ -77,26 +76,11 @@ def carve(
         than LEAST or more than MOST of the ball, as empty and full ones do.
     """
     count, edge = resolution + 1, 2 / resolution
-    axis = torch.linspace(-1, 1, count, dtype=torch.float64)
-    points = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1).reshape(-1, 3)
-    in_ball = (points.square().sum(dim=1) <= 1).nonzero()[:, 0]
-    points = points[in_ball]
+    points, in_ball = grid_in_ball(resolution)
     seen, object_in = torch.zeros(len(points)), torch.zeros(len(points))
-    for view in views:
-        if view.mask is None:
-            continue
-        camera = view.camera.moved(similarity)
-        reach = math.ceil(0.5 * edge * float(camera.intrinsics[0, 0]) / float(camera.eye.norm().clamp(min=edge)))
-        mask = torch.from_numpy(view.mask > OBJECT).float()
-        cut = bool(mask[[0, -1]].any() or mask[:, [0, -1]].any())
-        mask = nn.functional.max_pool2d(mask[None, None], 2 * reach + 1, stride=1, padding=reach)[0, 0]
-        pixels, depth = camera.project(points)
-        column, row = pixels.round().long().unbind(dim=1)
-        inside = (depth > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-        # What a picture does not show is no object, unless its rim cuts the object.
-        seen += inside if cut else depth > 0
-        found = mask[row.clamp(0, camera.height - 1), column.clamp(0, camera.width - 1)]
-        object_in += torch.where(inside, found, 0.0)
+    for sees, objects in silhouettes([view for view in views if view.mask is not None], similarity, points, edge):
+        seen += sees
+        object_in += objects
     kept = (seen >= max(1.0, SEEING * len(views))) & (object_in >= AGREE * seen)
     if not LEAST < float(kept.double().mean()) < MOST:
         return None

@@ -34,7 +34,7 @@ from .hull import begin
 from .model import RayPool, SceneModel, build_scene
 from .objective import scene_trainer
 from .plan import SPHERE, ReconstructPlan, level_stage
-from .views import ViewImage, comparison_sheet, held_out, measure, render_image
+from .views import ViewImage, comparison_sheet, held_out, measure, render_image, spread
 
 __all__ = [
     "HELD_OUT_FILE",
@@ -57,6 +57,7 @@ BATCH = 1 << 15
 # Of pictures that are not read yet.
 USUAL_PIXELS, USUAL_HELD_OUT, USUAL_READING = 60_000, 6, 2.0
 LEAST_SECONDS = 0.5  # of training, where a time budget leaves none
+AFTER_SHARE = 0.15  # of a time budget, at most, for what comes after the training
 
 
 @dataclass(frozen=True)
@@ -162,12 +163,12 @@ class _Reconstruction:
         return None if budget is None else max(budget - (time.monotonic() - self.started), 0.0)
 
     def training_seconds(self) -> float | None:
-        """How long the training may take within the time budget: all but what comes after it, but half at least."""
+        """How long the training may take within the time budget: all but what comes after it, which is held short."""
         left = self.left()
         if left is None:
             return None
         after = sum(self.schedule.predicted(stage) for stage in self.plan.after())
-        return max(left - min(after, left / 2), LEAST_SECONDS)
+        return max(left - min(after, AFTER_SHARE * left), LEAST_SECONDS)
 
     @property
     def level(self) -> int:
@@ -210,15 +211,20 @@ class _Reconstruction:
         return comparison_sheet(pairs, self.model.background)
 
     def _image(self, view: PosedImage) -> ViewImage:
-        return render_image(self.model, view, self.images.similarity, self.trainer.objective.sampling, level=self.level)
+        objective = self.trainer.objective
+        return render_image(
+            self.model, view, self.images.similarity, objective.sampling, level=self.level, guide=objective.grid
+        )
 
     def _render_held_out(self) -> list[tuple[PosedImage, ViewImage]]:
         pairs, count, limit = [], len(self.test_views), self.left()
         begun = time.monotonic()
+        if self.trainer.objective.grid is not None:
+            self.trainer.objective.grid.refresh(self.model.geometry)
         self.schedule.plan(self.plan.after(), budget=limit)
         if count:
             self.schedule(Progress("held-out views", 0, count, 0.0, {}))
-        for index, view in enumerate(self.test_views):
+        for index, view in enumerate(spread(self.test_views)):
             # Half of what is left of a time budget is for the texture.
             if pairs and limit is not None and time.monotonic() - begun > limit / 2:
                 self.notes.append(f"{index} of {count} held-out views are measured")

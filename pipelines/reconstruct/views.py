@@ -17,12 +17,13 @@ from ...neural_fields.volume_renderer import Sampling
 from ..render.picture import Image, stacked
 from .model import SceneModel, camera_rays
 
-__all__ = ["ViewImage", "comparison_sheet", "held_out", "measure", "render_image", "target_of"]
+__all__ = ["ViewImage", "comparison_sheet", "held_out", "measure", "render_image", "spread", "target_of"]
 
 Float32 = NDArray[np.float32]
 
 RAYS = 4096  # rendered at a time
 SSIM_WINDOW = 11
+GOLDEN = (5**0.5 - 1) / 2
 OBJECT = 0.5  # a pixel with a larger share of object counts as one
 
 
@@ -51,6 +52,7 @@ def render_image(
     level: int = -1,
     least_weight: float = 1e-4,
     skip: float = 1e-4,
+    guide: Callable[[Tensor], Tensor] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> ViewImage:
     """Render a view with the model's volume renderer.
@@ -63,6 +65,7 @@ def render_image(
         level: of the geometry.
         least_weight: see `render_volume`.
         skip: the same.
+        guide: the same.
         progress: told (rays done, rays in all).
     """
     device = model.background.device
@@ -75,7 +78,13 @@ def render_image(
     done = 0
     for rows in asked.split(RAYS):
         seen = model.render(
-            origins[rows], directions[rows], sampling, level=level, least_weight=least_weight, skip=skip
+            origins[rows],
+            directions[rows],
+            sampling,
+            level=level,
+            least_weight=least_weight,
+            skip=skip,
+            guide=guide,
         )
         color[rows], normal[rows], opacity[rows] = seen.color, seen.normal, seen.opacity
         done += len(rows)
@@ -99,6 +108,12 @@ def held_out(views: Sequence[PosedImage], every: int) -> tuple[list[PosedImage],
     chosen = set(range(0, len(views), max(2, every)))
     train = [view for index, view in enumerate(views) if index not in chosen]
     return train, [view for index, view in enumerate(views) if index in chosen]
+
+
+def spread(views: Sequence[PosedImage]) -> list[PosedImage]:
+    """The views in an order whose first few, however many, are spread over all of them."""
+    order = sorted(range(len(views)), key=lambda index: index * GOLDEN % 1)
+    return [views[index] for index in order]
 
 
 def target_of(view: PosedImage, background: Tensor) -> Float32:

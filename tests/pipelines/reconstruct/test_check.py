@@ -17,6 +17,7 @@ from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.cli.views import SCENE_NAMES
 from mplicits.pipelines.reconstruct.check import check_cameras, check_files
 from mplicits.pipelines.reconstruct.frustums import camera_mesh, frustum_size
+from mplicits.pipelines.reconstruct.silhouettes import contradictions
 from mplicits.pipelines.surface.surface import read_surface
 
 WRITERS = {"neus": write_neus, "transforms": write_transforms, "colmap": write_colmap}
@@ -162,6 +163,37 @@ def test_masks_that_are_empty_or_full(good):
     check = check_cameras(bare)
     assert check.warnings == ()
     assert check.mask_inside is None
+
+
+def test_masks_that_are_inverted(good, torus):
+    """All of them, and one of them."""
+    for images in (good, torus):
+        turned_round = with_views(images, lambda _, v: dataclasses.replace(v, mask=1 - v.mask))
+        assert any("they look inverted" in line for line in check_cameras(turned_round).warnings)
+        one = with_views(images, lambda k, v: dataclasses.replace(v, mask=1 - v.mask) if k == 3 else v)
+        assert "1 of" in (line := next(line for line in check_cameras(one).warnings if "contradict" in line))
+        assert images.views[3].name in line
+
+
+def test_a_picture_of_something_else(torus):
+    """In the place of a picture that sees the ring from its side, one that sees it from above."""
+    height = [abs(float(view.camera.eye[2])) for view in torus.views]
+    side, above = int(np.argmin(height)), int(np.argmax(height))
+    other = torus.views[above]
+    wrong = with_views(
+        torus, lambda k, v: dataclasses.replace(v, color=other.color, mask=other.mask) if k == side else v
+    )
+    inverted, odd = contradictions(wrong.views, torus.similarity)
+    assert not inverted
+    assert odd == []  # a larger silhouette contradicts nobody: all that the others leave is in it
+    other = torus.views[side]
+    wrong = with_views(
+        torus, lambda k, v: dataclasses.replace(v, color=other.color, mask=other.mask) if k == above else v
+    )
+    assert the_warning(wrong) == (
+        f"1 of 12 silhouettes contradict the others: {torus.views[above].name}; is that the right picture, the right "
+        "way round, and its pose and mask right?"
+    )
 
 
 def test_exposures_two_stops_apart(good):

@@ -429,7 +429,7 @@ def test_stages_are_those_that_are_announced(data: Path) -> None:
     assert shares[-1] == 1.0
 
 
-def test_a_budget_counts_all_but_leaves_half_for_the_training(data: Path, tmp_path: Path) -> None:
+def test_a_budget_counts_all_but_leaves_most_for_the_training(data: Path, tmp_path: Path) -> None:
     """The texture alone would take longer: it gets what is left."""
     config = replace(TINY, steps=10**6, texture_steps=10**6, time_budget=2.0)
     record = reconstruct(data, config, out=tmp_path / "run").record
