@@ -20,11 +20,30 @@ from ...neural_fields.volume_renderer import Rendered, Sampling, render_volume
 from ..run.settings import ReconstructConfig
 from ..run.trainer import seeded
 
-__all__ = ["RayPool", "Rays", "SceneModel", "build_scene", "camera_rays"]
+__all__ = ["Exposures", "RayPool", "Rays", "SceneModel", "build_scene", "camera_rays"]
 
 # s = exp(10 v): one learning rate serves this number and the networks (NeuS begins at v = 0.3, s = 20).
 SHARPENING = 10.0
 FIRST_VARIANCE = 0.3
+
+
+class Exposures(nn.Module):
+    """Brightness and white balance of each photograph: p = g_v c + o_v for each channel, g_v > 0.
+
+    A longer exposure multiplies light, and display RGB is nearly a power of it: that is a gain again. The geometric
+    mean of all gains is 1 and the mean of all offsets 0, so that colours stay those of the usual photograph.
+
+    Args:
+        views: how many photographs there are.
+    """
+
+    def __init__(self, views: int) -> None:
+        super().__init__()
+        self.logs, self.shifts = nn.Parameter(torch.zeros(views, 3)), nn.Parameter(torch.zeros(views, 3))
+
+    def forward(self) -> tuple[Tensor, Tensor]:
+        """Gains and offsets, ``(V, 3)`` each."""
+        return (self.logs - self.logs.mean(dim=0)).exp(), self.shifts - self.shifts.mean(dim=0)
 
 
 class SceneModel(nn.Module):
@@ -35,11 +54,19 @@ class SceneModel(nn.Module):
         color: colour of its surface.
         outside: what is outside the unit sphere; None if nothing is.
         background: ``(3,)`` behind everything.
+        exposures: of the photographs; None if all are alike.
     """
 
-    def __init__(self, geometry: Field, color: ViewColor, outside: Outside | None, background: Tensor) -> None:
+    def __init__(
+        self,
+        geometry: Field,
+        color: ViewColor,
+        outside: Outside | None,
+        background: Tensor,
+        exposures: Exposures | None = None,
+    ) -> None:
         super().__init__()
-        self.geometry, self.color, self.outside = geometry, color, outside
+        self.geometry, self.color, self.outside, self.exposures = geometry, color, outside, exposures
         self.variance = nn.Parameter(torch.tensor(FIRST_VARIANCE))
         self.register_buffer("background", background)
         self.background: Tensor
@@ -55,6 +82,19 @@ class SceneModel(nn.Module):
             inv_std = self.inv_std.detach()
             width = (band / inv_std.to(precise(inv_std.device))).clamp(min=least)
             self.geometry.deltas.copy_(width.expand_as(self.geometry.deltas))
+
+    def photographed(self, seen: Rendered, view: Tensor) -> Tensor:
+        """Colours ``(R, 3)`` of rendered rays as photographs with the numbers ``view`` ``(R,)`` show them.
+
+        A background that is known has the same colour in all of them; one that is learnt is a part of the photograph.
+        """
+        if self.exposures is None:
+            return seen.color
+        gain, offset = (part[view] for part in self.exposures())
+        if self.outside is not None:
+            return gain * seen.color + offset
+        behind = (1 - seen.opacity)[:, None] * self.background
+        return gain * (seen.color - behind) + seen.opacity[:, None] * offset + behind
 
     def render(
         self,
@@ -95,8 +135,8 @@ class SceneModel(nn.Module):
         )
 
 
-def build_scene(config: ReconstructConfig, *, has_masks: bool) -> SceneModel:
-    """An untrained scene: a sphere of unknown colour."""
+def build_scene(config: ReconstructConfig, *, has_masks: bool, views: int = 0) -> SceneModel:
+    """An untrained scene: a sphere of unknown colour, and so many photographs where exposures are learnt."""
     background = config.background
     if background == "auto":
         background = "white" if has_masks else "outside"
@@ -124,7 +164,8 @@ def build_scene(config: ReconstructConfig, *, has_masks: bool) -> SceneModel:
             point_frequencies=config.color_frequencies,
         )
         outside = Outside() if background == "outside" else None
-    return SceneModel(geometry, color, outside, torch.full((3,), float(background == "white")))
+    exposures = Exposures(views) if config.exposure == "affine" else None
+    return SceneModel(geometry, color, outside, torch.full((3,), float(background == "white")), exposures)
 
 
 class Rays(NamedTuple):
@@ -135,12 +176,14 @@ class Rays(NamedTuple):
         directions: ``(R, 3)`` unit vectors.
         color: ``(R, 3)`` display RGB in [0, 1].
         mask: ``(R,)`` how much of the pixel is object; 1 everywhere if nobody said.
+        view: ``(R,)`` number of the picture.
     """
 
     origins: Tensor
     directions: Tensor
     color: Tensor
     mask: Tensor
+    view: Tensor
 
 
 def camera_rays(view: PosedImage, similarity: Similarity) -> tuple[Tensor, Tensor]:
@@ -200,7 +243,7 @@ class RayPool:
         seen = torch.stack(((x - cx) / fx, (y - cy) / fy, torch.ones_like(fx)), dim=1)
         directions = torch.nn.functional.normalize(torch.einsum("rij,rj->ri", self.axes[view], seen), dim=1)
         mask = torch.ones(count, device=self.device) if self.masks is None else self.masks[rows] / 255
-        return Rays(self.eyes[view], directions, self.colors[rows] / 255, mask)
+        return Rays(self.eyes[view], directions, self.colors[rows] / 255, mask, view)
 
 
 def _bytes(numbers: np.ndarray) -> Tensor:

@@ -29,7 +29,8 @@ class SceneObjective(Objective):
 
     def __init__(self, model: SceneModel, pool: RayPool, config: ReconstructConfig) -> None:
         rate = warm_cosine(config.learning_rate)
-        colors = [*model.color.parameters(), *(model.outside.parameters() if model.outside else ())]
+        parts = [part for part in (model.color, model.outside, model.exposures) if part is not None]
+        colors = [parameter for part in parts for parameter in part.parameters()]
         groups = [
             Group(list(model.geometry.parameters()), rate),
             Group(colors, lambda done: config.color_rate * rate(done)),
@@ -76,7 +77,7 @@ class SceneObjective(Objective):
         target = rays.color
         if self.pool.has_masks:
             target = torch.lerp(self.model.background.expand_as(target), target, rays.mask[:, None])
-        color = (seen.color - target).abs().mean()
+        color = (self.model.photographed(seen, rays.view) - target).abs().mean()
         # A mean over all sections, those that were skipped included: some of them stand for the others.
         eikonal = (seen.counts * eikonal_loss(seen.jet.gradient)).mean()
         terms = {"color": color, "eikonal": eikonal}

@@ -31,10 +31,10 @@ from ..surface.surface import from_mesh, sample_points
 from ..surface.trim import in_region
 from ..texture.train import FittedTexture, fit_texture
 from .hull import begin
-from .model import RayPool, SceneModel, build_scene
+from .model import Exposures, RayPool, SceneModel, build_scene
 from .objective import scene_trainer
 from .plan import SPHERE, ReconstructPlan, level_stage
-from .views import ViewImage, comparison_sheet, held_out, measure, render_image, spread
+from .views import ViewImage, comparison_sheet, exposed_as, held_out, measure, render_image, spread
 
 __all__ = [
     "HELD_OUT_FILE",
@@ -148,7 +148,7 @@ class _Reconstruction:
         schedule.plan([*self.plan.before(), *self.plan.levels(), *self.plan.after()], budget=self.left())
         pool = RayPool(self.train_views, images.similarity, device)
         schedule(Progress(SPHERE, 0, 0, 0.0, {}))
-        self.model = build_scene(config, has_masks=pool.has_masks).to(device)
+        self.model = build_scene(config, has_masks=pool.has_masks, views=len(self.train_views)).to(device)
         self.start = "sphere" if resume else begin(self.model, self.train_views, images, config)
         schedule(Progress(SPHERE, 0, 0, 1.0, {}))
         self.trainer = scene_trainer(self.model, pool, config, seconds=self.training_seconds())
@@ -212,9 +212,11 @@ class _Reconstruction:
 
     def _image(self, view: PosedImage) -> ViewImage:
         objective = self.trainer.objective
-        return render_image(
+        image = render_image(
             self.model, view, self.images.similarity, objective.sampling, level=self.level, guide=objective.grid
         )
+        # A view that is not trained on has an exposure that nobody knows.
+        return image if self.model.exposures is None else exposed_as(image, view, self.model.background)
 
     def _render_held_out(self) -> list[tuple[PosedImage, ViewImage]]:
         pairs, count, limit = [], len(self.test_views), self.left()
@@ -279,6 +281,12 @@ class _Reconstruction:
         self.shown, self.trainer.losses = progress["shown"], progress["losses"]
         self.trainer.restore(tensors)
 
+    def _exposures(self, exposures: Exposures) -> dict[str, Any]:
+        """Gain and offset of each photograph, for red, green and blue."""
+        gains, offsets = (part.detach().cpu().double().numpy().round(4).tolist() for part in exposures())
+        names = [view.name for view in self.train_views]
+        return {name: {"gain": gains[k], "offset": offsets[k]} for k, name in enumerate(names)}
+
     def _record(self, *, finished: bool) -> dict[str, Any]:
         """What ``run.json`` holds."""
         model, trainer, limit = self.model, self.trainer, self.config.time_budget
@@ -293,6 +301,7 @@ class _Reconstruction:
             "config": dataclasses.asdict(self.config),
             "parameters": {name: parameter_count(part) for name, part in parts.items()},
             "deltas": model.geometry.deltas.tolist(),
+            **({} if model.exposures is None else {"exposures": self._exposures(model.exposures)}),
             "inv_std": float(model.inv_std.detach()),
             "steps": trainer.step,
             "training_seconds": round(trainer.elapsed, 3),

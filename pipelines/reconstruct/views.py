@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -17,7 +17,7 @@ from ...neural_fields.volume_renderer import Sampling
 from ..render.picture import Image, stacked
 from .model import SceneModel, camera_rays
 
-__all__ = ["ViewImage", "comparison_sheet", "held_out", "measure", "render_image", "spread", "target_of"]
+__all__ = ["ViewImage", "comparison_sheet", "exposed_as", "held_out", "measure", "render_image", "spread", "target_of"]
 
 Float32 = NDArray[np.float32]
 
@@ -122,6 +122,27 @@ def target_of(view: PosedImage, background: Tensor) -> Float32:
         return view.color
     share = view.mask[..., None]
     return (share * view.color + (1 - share) * background.cpu().numpy()).astype(np.float32)
+
+
+def exposed_as(image: ViewImage, view: PosedImage, background: Tensor) -> ViewImage:
+    """A rendered view with the gain and offset of each channel that bring it nearest to its photograph.
+
+    By least squares over the object's pixels: g C + α o = p − (1 − α) b of the rendered object C, its opacity α and the
+    known background b, both 1 and 0 where there is none. The background stays as it is.
+    """
+    target, share = target_of(view, background), np.ones_like(image.opacity)
+    behind = np.zeros_like(image.color)
+    chosen = np.ones(share.shape, bool)
+    if view.mask is not None:
+        share, chosen = image.opacity, view.mask > 0
+        behind = (1 - share)[..., None] * background.cpu().numpy()
+    color = image.color.copy()
+    for channel in range(3):
+        columns = np.stack((image.color[..., channel] - behind[..., channel], share), axis=-1)
+        wanted = (target - behind)[..., channel]
+        solved = np.linalg.lstsq(columns[chosen], wanted[chosen])[0]
+        color[..., channel] = columns @ solved + behind[..., channel]
+    return replace(image, color=np.clip(color, 0, 1))
 
 
 def measure(image: ViewImage, view: PosedImage, background: Tensor) -> dict[str, float]:

@@ -171,6 +171,9 @@ class ReconstructConfig(Settings):
     background: Literal["auto", "black", "white", "outside"] = setting(
         "auto", "what is behind the object: black, white, or a learnt outside; auto is white with masks, else outside"
     )
+    exposure: Literal["off", "affine"] = setting(
+        "off", "affine: each photograph has a gain and an offset for each colour, as automatic exposure makes them"
+    )
     steps: int = setting(5000, "training steps", above=0)
     rays: int = setting(256, "rays per training step", above=0)
     uniform: int = setting(48, "evenly spaced samples per ray", at_least=2)
