@@ -5,7 +5,7 @@ import pytest
 import torch
 from bounds import unit_roundoff
 from mplicits.datasets import PointCloud, prepare_cloud, sample_sphere, sample_surface
-from mplicits.datasets.clouds.reestimate import denoise, filter_normals, has_edges, refit_normals
+from mplicits.datasets.clouds.reestimate import denoise, filter_normals, has_edges, refit_normals, sharper_normals
 from mplicits.neural_fields import Box
 
 RNG = np.random.default_rng(0)
@@ -118,6 +118,30 @@ def test_without_noise_nothing_changes():
     assert level == 0
     assert moved is sphere.points
     assert normals is exact
+
+
+def test_normals_of_a_clean_box_and_a_thin_bar_lose_what_other_sides_gave_them():
+    """Planes through all neighbours round edges; like neighbours of a face lie in it, and leave its exact normal.
+
+    Signs are the exact ones: here is asked for directions. A face of the bar is four spacings wide.
+    """
+    for half in (np.array([0.6, 0.5, 0.4]), np.array([0.8, 0.05, 0.05])):
+        points, exact, _ = box_with_normals(6000)
+        points *= half / (0.6, 0.5, 0.4)
+        estimated = prepare_cloud(PointCloud(points), normals="estimate", isolation=None).normals.astype(np.float64)
+        signed = np.where((estimated * exact).sum(axis=1, keepdims=True) < 0, -estimated, estimated)
+        before, after = angles(signed, exact), angles(sharper_normals(points, signed), exact)
+        assert (before > 5).mean() > 0.1
+        assert (after > 5).mean() < (before > 5).mean() / 2
+
+
+def test_normals_of_slightly_noisy_points_stay():
+    """A tenth of the spacing: too little to be smoothed, and fewer points make worse planes."""
+    sphere = sample_sphere(6000)
+    noisy = PointCloud(sphere.points + RNG.normal(0, 0.0015, (6000, 3)))
+    left, given = (prepare_cloud(noisy, smooth_noise=choice) for choice in (False, True))
+    assert given.noise == 0
+    assert (left.normals == given.normals).all()
 
 
 def test_estimated_normals_are_fitted_again_where_noise_is_smoothed():
