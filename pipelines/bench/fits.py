@@ -223,10 +223,16 @@ class FitBench(Benchmark[FitRow]):
         def of(name: str) -> Callable[[FitRow], Any]:
             return lambda row: None if row.metrics is None else getattr(row.metrics, name)
 
+        def above(row: FitRow) -> float | None:
+            """What of the distance is the mesh's, and not the samples'."""
+            floor = of("chamfer_floor")(row)
+            return None if row.metrics is None or floor is None else row.metrics.chamfer - floor
+
         figures: list[Figure[FitRow]] = [
             (Column("method", "s"), lambda row: row.method),
             (Column("Chamfer", ".2e"), lambda row: "no surface" if row.metrics is None else row.metrics.chamfer),
             (Column("floor", ".2e"), of("chamfer_floor")),
+            (Column("above it", ".2e"), above),
             (Column("Hausdorff", ".1e"), of("hausdorff")),
             (Column("IoU", ".4f"), of("iou")),
             (Column("shell IoU", ".3f"), of("shell_iou")),
