@@ -2,8 +2,8 @@
 
 Each mesh is fitted, and every kind of ``evolve`` that goes from shape to shape is trained between the fits; the blend
 of their distances stands beside them. Parts, holes, volume and area are taken at moments on the way, a mesh of the
-start is carried to the end, and pictures are looked at pixel by pixel: a surface whose points have moved together shows
-colours that are as smooth as those of the start.
+start is carried to the end, and pictures are looked at pixel by pixel: both ends are painted, each with smooth waves of
+its own, and carried colours should be as smooth as those of the ends.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from time import process_time
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from ...datasets.cameras import Camera
 from ...neural_fields import Field, InputError, TimeSlice
@@ -32,14 +33,14 @@ from ..render.rasterise import mesh_view, picture_of
 from ..render.subject import Orbit, orbit_cameras
 from ..run.settings import EvolveConfig, FitConfig
 from ..surface.surface import Surface, face_normals, read_reference
-from ..texture.riding import Homeward, RidingPoints
+from ..texture.riding import Colors, RidingColors
 from .benchmark import Benchmark, Part
 from .cells import Workplace
 from .fits import fit_home, kept_fit
 from .motion import BLEND, STRETCHED, blended, carried_points, triangle_stretch
 from .tables import Column, Figure, Table, mean, tabulated
 
-__all__ = ["PAIR_FITS", "PairBench", "PairRow", "color_jumps", "measure_pair"]
+__all__ = ["PAIR_FITS", "PairBench", "PairRow", "color_jumps", "measure_pair", "paint"]
 
 Float64 = NDArray[np.float64]
 
@@ -50,7 +51,8 @@ PAIR_FITS = FitConfig(
 PIXELS = 256  # on each side of the pictures whose neighbouring pixels are compared
 VIEWS = 2  # from opposite sides
 APART = 3.0  # neighbours whose points are further apart than so many pixels are on two sides of an outline
-JUMP = 1.5  # of the start's largest, which neighbours should not exceed
+JUMP = 1.5  # of the ends' largest, which neighbours should not exceed
+WAVES, CRESTS = 6, 5.0  # of the paint in each channel, and their wave numbers' deviation along each axis
 TILE, ACROSS = 200, 7  # pixels of a picture on a contact sheet, and pictures in a row
 
 
@@ -69,8 +71,8 @@ class PairRow:
         holes: through it, the sum of genera.
         calm: share of the triangles of a mesh of the start that are stretched by less than 4 until the end; None where
             they cannot be carried.
-        jumps: the largest step of the carried colours between neighbouring pixels at each time, over that at time 0;
-            None where they cannot be carried.
+        jumps: the largest step of the carried colours between neighbouring pixels at each time, over the larger of
+            those at both ends; None where they cannot be carried.
         cracked: share of the neighbours at each that step by more than 1.5 times that.
     """
 
@@ -179,7 +181,7 @@ class PairBench(Benchmark[PairRow]):
         notes = [
             f"{len(rows[0].times)} moments; volume and area: the least over that of the smaller end, the most over "
             f"that of the larger; jump: the largest step of carried colours between neighbouring pixels, over that of "
-            f"the start; cracked: neighbours above {JUMP:g} times that, of all moments"
+            f"both ends; cracked: neighbours above {JUMP:g} times that, of all moments"
         ]
         items = [(f"{row.pair}, {row.method}", row) for row in rows]
         moments: list[Figure[tuple[PairRow, int]]] = [
@@ -233,17 +235,15 @@ def measure_pair(
     cameras = orbit_cameras(
         np.concatenate([mesh.vertices for mesh in seen]), Orbit(), size=(PIXELS, PIXELS), frames=VIEWS
     )
-    homes = [_way_home(field, velocity, time) for time in times]
+    riding = RidingColors(field, paint(0), last=paint(1), motion=velocity)
+    colors = [_carried(riding, time) for time in times]
     steps = [
-        None
-        if mesh is None or home is None
-        else np.concatenate([color_jumps(mesh, home, camera) for camera in cameras])
-        for mesh, home in zip(meshes, homes, strict=True)
+        None if mesh is None or at is None else np.concatenate([color_jumps(mesh, at, camera) for camera in cameras])
+        for mesh, at in zip(meshes, colors, strict=True)
     ]
-    assert steps[0] is not None  # at time 0 points are at home
-    largest = float(steps[0].max())
+    largest = max(float(found.max()) for found in (steps[0], steps[-1]) if found is not None)
     if sheet is not None:
-        _draw(sheet, times, meshes, homes, cameras[0])
+        _draw(sheet, times, meshes, colors, cameras[0])
     volumes = tuple(0.0 if mesh is None else volume(mesh) for mesh in meshes)
     areas = tuple(0.0 if mesh is None else float(face_normals(mesh)[1].sum()) for mesh in meshes)
     return PairRow(
@@ -261,15 +261,31 @@ def measure_pair(
     )
 
 
-def color_jumps(mesh: Surface, home: Homeward, camera: Camera) -> Float64:
-    """How far apart neighbouring pixels of a picture were at time 0, ``(N,)``: steps of colours that are coordinates.
+def paint(seed: int) -> Colors:
+    """Smooth colours of points ``(N, 3)``, from 0 to 1: in each channel the mean of six waves, drawn at random.
+
+    Wave numbers have a deviation of 5 along each axis, so a shape in the unit sphere is some three waves long.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    numbers = CRESTS * torch.randn(3, 3 * WAVES, generator=generator)
+    phases = 2 * torch.pi * torch.rand(3 * WAVES, generator=generator)
+
+    def colors(points: Tensor) -> Tensor:
+        waves = torch.sin(points @ numbers.to(points) + phases.to(points))
+        return 0.5 + 0.5 * waves.reshape(-1, 3, WAVES).mean(dim=2)
+
+    return colors
+
+
+def color_jumps(mesh: Surface, colors: Colors, camera: Camera) -> Float64:
+    """How far apart the colours of neighbouring pixels of a picture are, ``(N,)``: lengths of differences.
 
     Neighbours beside and below each other count, where both see the surface and their points are no further apart than
-    three pixels: else an outline lies between them, where colours may step.
+    three pixels: else an outline lies between them, where colours may step. That is so at the ends as in between.
 
     Args:
         mesh: of a moment.
-        home: where its points were at time 0.
+        colors: of points of its surface.
         camera: of the picture.
     """
     seen = mesh_view(mesh, camera)
@@ -281,16 +297,16 @@ def color_jumps(mesh: Surface, home: Homeward, camera: Camera) -> Float64:
     first, second = (np.concatenate([pair[side].ravel() for pair in pairs]) for side in (0, 1))
     both = (first >= 0) & (second >= 0)
     first, second = first[both], second[both]
-    here, before = seen.position.double().numpy(), home(seen.position).double().numpy()
+    here, found = seen.position.double().numpy(), colors(seen.position).double().numpy()
     reach = APART / float(camera.intrinsics[0, 0]) * seen.depth.double().numpy()[first]
     near = np.linalg.norm(here[first] - here[second], axis=1) <= reach
-    return np.linalg.norm(before[first[near]] - before[second[near]], axis=1)
+    return np.linalg.norm(found[first[near]] - found[second[near]], axis=1)
 
 
-def _way_home(field: Field, velocity: VectorField | None, time: float) -> Homeward | None:
-    """The way back to time 0 as colours take it; None where they cannot."""
+def _carried(riding: RidingColors, time: float) -> Colors | None:
+    """None where colours cannot be carried."""
     try:
-        return RidingPoints(field, motion=velocity).home(time)
+        return riding.at(time)
     except InputError:
         return None
 
@@ -299,16 +315,16 @@ def _draw(
     path: Path,
     times: Sequence[float],
     meshes: Sequence[Surface | None],
-    homes: Sequence[Homeward | None],
+    colors: Sequence[Colors | None],
     camera: Camera,
 ) -> None:
-    """A contact sheet of the moments; the colour of a point is where it was at time 0."""
+    """A contact sheet of the moments, painted."""
     small, tiles = camera.resized(TILE, TILE), []
-    for time, mesh, home in zip(times, meshes, homes, strict=True):
+    for time, mesh, at in zip(times, meshes, colors, strict=True):
         if mesh is None:
             continue
-        colors = None
-        if home is not None:
-            colors = 0.5 + 0.5 * np.clip(home(torch.from_numpy(mesh.vertices).float()).double().numpy(), -1, 1)
-        tiles.append((f"t = {time:.2f}", picture_of(Surface(mesh.vertices, mesh.faces, None, colors), small)))
+        painted = None
+        if at is not None:
+            painted = at(torch.from_numpy(mesh.vertices).float()).double().numpy()
+        tiles.append((f"t = {time:.2f}", picture_of(Surface(mesh.vertices, mesh.faces, None, painted), small)))
     write_picture(path, contact_sheet(*in_rows(tiles, ACROSS)))

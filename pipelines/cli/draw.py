@@ -231,6 +231,7 @@ def _animate_arguments(parser: argparse.ArgumentParser) -> None:
     add("--loop", action="store_true", help="film: there and back, so that it can repeat without a jump")
     add_flags(parser, "--level", "--device")
     add("--colors", metavar="RUN", help="a textured run of the first shape, to ride along (default: RUN's own)")
+    add("--last-colors", metavar="RUN", help="a textured run of the last shape, whose colours fade in on the way")
     add("--no-colors", action="store_true", help="leave colours out")
     add_flags(parser, "--resolution", help="meshes: cells per side (128)")
     add_flags(parser, "--size", type=whole(16, 8192), help="film: width, or width and height (640)")
@@ -251,8 +252,9 @@ def _animate(arguments: argparse.Namespace) -> int:
     if film and arguments.resolution is not None:
         raise input_error("--resolution: goes with meshes; a film is traced in pixels (--size)")
     arguments.size = _pair(arguments.size)
-    if arguments.no_colors and arguments.colors is not None:
-        raise input_error("--colors: --no-colors leaves them out; leave one of the two out")
+    for name in ("colors", "last_colors"):
+        if arguments.no_colors and getattr(arguments, name) is not None:
+            raise input_error(f"--{name.replace('_', '-')}: --no-colors leaves them out; leave one of the two out")
 
     from ..evolve.animate import SequenceOptions, animate_run
     from ..render.subject import Orbit

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from ...datasets.cameras import Camera
 from ...neural_fields import Field, InputError, Placement, Similarity, load_field
@@ -23,13 +24,14 @@ from ..render.picture import Image, contact_sheet, in_rows, write_picture
 from ..render.shade import ShadeOptions, compose, downsample, shade
 from ..render.subject import Orbit, orbit_cameras, traced_part
 from ..render.trace import RESOLUTION, TOLERANCE, fine_strips, pixel_size, see_hits
-from ..run.folder import chosen_level, find_field
+from ..run.folder import FIELD_FILE, RECORD_FILE, chosen_level, find_field, read_record
 from ..run.machine import choose_device
 from ..run.motion import load_motion
-from ..texture.riding import RidingColors, borrowed_texture, start_texture
+from ..texture.riding import Colors, RidingColors, borrowed_texture, pinned_texture, start_texture
 from .follow import follow_mesh
+from .shapes import Placement as ShapePlacement
 
-__all__ = ["SequenceOptions", "animate_run", "check_sequence_path", "film_frames", "there_and_back"]
+__all__ = ["SequenceOptions", "animate_run", "check_sequence_path", "film_frames", "last_colors", "there_and_back"]
 
 Tell = Callable[[int, int], None]
 
@@ -52,6 +54,7 @@ class SequenceOptions:
         resolution: of meshes, in cells along the cube.
         colors: a run that does not move, the first shape's, whose texture is the surface's at time 0; None is the
             run's own, if it has one.
+        last_colors: the last shape's run, whose texture fades in on the way; of runs that go from shape to shape.
         no_colors: leave colours out.
         orbit: where the camera of a film stands.
         shading: of a film.
@@ -68,6 +71,7 @@ class SequenceOptions:
     level: int | None = None
     resolution: int = 128
     colors: str | Path | None = None
+    last_colors: str | Path | None = None
     no_colors: bool = False
     orbit: Orbit = dataclasses.field(default_factory=Orbit)
     shading: str = "lambert"
@@ -154,11 +158,32 @@ def _riding(
         return None
     motion = load_motion(file)
     motion = None if motion is None else motion.to(field.like)
+    placed = None
     if options.colors is not None:
         texture, placed = borrowed_texture(options.colors, field, similarity)
-        return RidingColors(field, texture, placed=placed, level=level, motion=motion)
-    texture = start_texture(file, field)
-    return None if texture is None else RidingColors(field, texture, level=level, motion=motion)
+    else:
+        texture = start_texture(file, field)
+    last = None if options.last_colors is None else last_colors(options.last_colors, file, field)
+    if texture is None and last is not None:
+        raise InputError(f"--last-colors: {file} has no colours at the start; name the first shape's run with --colors")
+    if texture is None:
+        return None
+    return RidingColors(field, texture, placed=placed, last=last, level=level, motion=motion)
+
+
+def last_colors(run: str | Path, file: Path, field: Field) -> Colors:
+    """The texture of the last shape's own run, where that shape was put."""
+    known = file.name == FIELD_FILE and (file.parent / RECORD_FILE).is_file()
+    placements = read_record(file.parent).get("placements", []) if known else []
+    if len(placements) < 2:
+        raise InputError(f"--last-colors {run}: {file} is not known to go from shape to shape")
+    back = ShapePlacement.from_dict(placements[-1]).inverse()
+
+    def own(points: Tensor) -> Tensor:
+        return torch.from_numpy(back.apply(points.double().cpu().numpy())).to(points)
+
+    colors = pinned_texture(run, field, 1.0, own)
+    return lambda points: colors(own(points))
 
 
 def film_frames(

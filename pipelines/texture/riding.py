@@ -1,8 +1,10 @@
 """Colours that ride along with a surface that moves: a texture is asked where a point was at the start.
 
-Where it was is integrated back in time for the vertices of a coarse mesh of the moment. What lies between them moves by
-the affine map that fits the nearest ones best, and is then laid onto the surface of the start: displacements are
-smooth, colours need not be.
+Where it was is integrated back in time along the velocity that was learnt, or else for the vertices of a coarse mesh of
+the moment; what lies between them then moves by the affine map that fits the nearest ones best: displacements are
+smooth, colours need not be. Where surface is made anew, points come from places that are on no surface. Their nearest
+point would jump, so colours are averaged there, the wider the further away (`SpreadColors`). With the colours of the
+end too, both are carried and fade into each other with time.
 """
 
 from __future__ import annotations
@@ -36,6 +38,7 @@ from ...neural_fields.evolution import VectorField
 from ...neural_fields.meshing import NoSurfaceError
 from ..run.folder import find_field
 from ..run.motion import load_motion
+from .spread import CELL, SpreadColors
 from .train import texture_of
 
 __all__ = [
@@ -46,12 +49,14 @@ __all__ = [
     "RidingPoints",
     "borrowed_texture",
     "colors_of_run",
+    "pinned_texture",
     "start_texture",
+    "texture_colors",
 ]
 
 # Points (N, 3) to display colours (N, 3).
 Colors = Callable[[Tensor], Tensor]
-# Points (N, 3) of a moment to where they were at time 0, (N, 3).
+# Points (N, 3) of a moment to where they were at another time, (N, 3).
 Homeward = Callable[[Tensor], Tensor]
 # A fixed step: near a change of topology adaptive ones would shrink to nothing, for the sake of a few points.
 RIDE = Solver(method="rk4", step=0.05)
@@ -65,6 +70,8 @@ RIDGE = 1e-3
 # Whether a texture is that of the start is looked at on so coarse a mesh; its vertices may be this far off on average.
 CHECKED = 48
 ASTRAY = 0.03
+# The mesh from which colours are spread, in cells along the box.
+SPREAD = 64
 
 
 def start_texture(run: str | Path, field: Field) -> TextureField | None:
@@ -96,24 +103,53 @@ def borrowed_texture(run: str | Path, field: Field, similarity: Similarity) -> t
     """
     file = find_field(run)
     geometry, own, _ = load_field(file, device=field.deltas.device)
-    texture = texture_of(file, geometry) if geometry.in_dim == 3 else None
-    if texture is None:
-        raise InputError(f"--colors {run}: has no texture; make one with `mplicits texture {run} COLORS`")
     center = (np.asarray(own.center) - similarity.center) / similarity.scale
     placed = Similarity((center[0], center[1], center[2]), own.scale / similarity.scale)
-    try:
-        start = extract_mesh(moment(field, 0.0), resolution=CHECKED, normals=False).vertices
-    except NoSurfaceError:
-        return texture, placed  # there is nothing to be coloured yet
-    points = torch.from_numpy(placed.to_unit(start)).to(field.like)
-    points = points[points.norm(dim=-1) < 1]  # what the texture's fit says elsewhere is no surface of anything
-    if not len(points) or float(geometry.value(points).abs().mean()) > ASTRAY:
-        raise InputError(f"--colors {run}: is not where the motion starts; name the run of its first shape")
+    texture = _texture_at(
+        "--colors", run, geometry, field, 0.0, lambda points: (points - points.new_tensor(placed.center)) / placed.scale
+    )
     return texture, placed
 
 
+def pinned_texture(run: str | Path, field: Field, time: float, own: Callable[[Tensor], Tensor]) -> Colors:
+    """The colours of a run that does not move, for a moment of a motion.
+
+    Args:
+        run: run directory or .safetensors file.
+        field: four-dimensional.
+        time: when its surface is that of the run.
+        own: brings points of it ``(N, 3)`` into the run's coordinates.
+
+    Returns:
+        What its texture says, of points in the run's coordinates.
+
+    Raises:
+        InputError: it has no texture, or its surface is not that of the field then.
+    """
+    geometry = load_field(find_field(run), device=field.deltas.device).field
+    return texture_colors(_texture_at("--last-colors", run, geometry, field, time, own))
+
+
+def _texture_at(
+    flag: str, run: str | Path, geometry: Field, field: Field, time: float, own: Callable[[Tensor], Tensor]
+) -> TextureField:
+    texture = texture_of(find_field(run), geometry) if geometry.in_dim == 3 else None
+    if texture is None:
+        raise InputError(f"{flag} {run}: has no texture; make one with `mplicits texture {run} COLORS`")
+    try:
+        mesh = extract_mesh(moment(field, time), resolution=CHECKED, normals=False)
+    except NoSurfaceError:
+        return texture  # there is nothing to be coloured
+    points = own(torch.from_numpy(mesh.vertices).to(field.like))
+    points = points[points.norm(dim=-1) < 1]  # what the texture's fit says elsewhere is no surface of anything
+    if not len(points) or float(geometry.value(points).abs().mean()) > ASTRAY:
+        which = ("starts", "first") if time == 0 else ("ends", "last")
+        raise InputError(f"{flag} {run}: is not where the motion {which[0]}; name the run of its {which[1]} shape")
+    return texture
+
+
 class RidingPoints:
-    """Where points of a surface that moves were at time 0.
+    """Where points of a surface that moves were at time 0, or will be at another.
 
     They go along the velocity that the run has learnt, or else along what the normal speeds say (`CarriedVelocity`).
 
@@ -127,47 +163,32 @@ class RidingPoints:
         self._field, self._level, self._motion = field, level, motion
 
     @torch.no_grad()
-    def home(self, time: float) -> Homeward:
-        """The way back from a time, for points ``(N, 3)`` of its surface.
+    def home(self, time: float, to: float = 0.0) -> Homeward:
+        """The way from one time to another, for points ``(N, 3)`` of the surface at the first.
+
+        Where surface is made or vanishes on the way they arrive beside the other surface.
 
         Raises:
-            InputError: the points cannot be followed back.
+            InputError: the points cannot be followed.
         """
-        if time == 0:
+        if time == to:
             return lambda points: points
-        if self._motion is not None:
-            return self._along(self._motion, time)
+        motion = self._motion
+        if motion is not None:
+            return lambda points: torch.cat(
+                [flow(motion, part, time, to, solver=ALONG) for part in points.split(ROWS)] or [points]
+            )
         try:
             mesh = extract_mesh(moment(self._field, time), resolution=CARRIED, level=self._level, normals=False)
         except NoSurfaceError:
             return lambda points: points  # there is nothing that could have come from anywhere
         vertices = torch.from_numpy(mesh.vertices).to(self._field.like)
         try:
-            displacement = flow(self._velocity, vertices, time, 0.0, solver=RIDE) - vertices
+            displacement = flow(self._velocity, vertices, time, to, solver=RIDE) - vertices
         except IntegrationError as error:
             raise InputError(f"colours cannot ride along to time {time:.3g} ({error}); leave them out") from error
         between = _Between(mesh.vertices, displacement.double().cpu().numpy())
-
-        def moved(points: Tensor) -> Tensor:
-            return points + torch.from_numpy(between(points.double().cpu().numpy())).to(points)
-
-        return self._onto_start(moved)
-
-    def _along(self, motion: VectorField, time: float) -> Homeward:
-        def moved(points: Tensor) -> Tensor:
-            return torch.cat([flow(motion, part, time, 0.0, solver=ALONG) for part in points.split(ROWS)])
-
-        return self._onto_start(moved)
-
-    def _onto_start(self, moved: Homeward) -> Homeward:
-        """What has moved nearly to the surface of the start, on it."""
-        start = moment(self._field, 0.0)
-
-        @torch.no_grad()
-        def home(points: Tensor) -> Tensor:
-            return project_to_surface(start, moved(points), level=self._level)[0] if len(points) else points
-
-        return home
+        return lambda points: points + torch.from_numpy(between(points.double().cpu().numpy())).to(points)
 
     @cached_property
     def _velocity(self) -> CarriedVelocity:
@@ -179,8 +200,9 @@ class RidingColors:
 
     Args:
         field: four-dimensional.
-        texture: of its surface at time 0.
+        texture: of its surface at time 0, or any colours of the points of that.
         placed: from the texture's coordinates to the field's.
+        last: colours of the points of its surface at time 1, for a blend: they weigh t, those of the start 1 − t.
         level: whose surface.
         motion: the velocity that was learnt; see `RidingPoints`.
     """
@@ -188,29 +210,84 @@ class RidingColors:
     def __init__(
         self,
         field: Field,
-        texture: TextureField,
+        texture: TextureField | Colors,
         *,
         placed: Similarity | None = None,
+        last: Colors | None = None,
         level: int = -1,
         motion: VectorField | None = None,
     ) -> None:
-        self._points, self._texture = RidingPoints(field, level=level, motion=motion), texture
-        self._placed = placed or Similarity.identity()
+        self._points = RidingPoints(field, level=level, motion=motion)
+        first = texture_colors(texture, placed) if isinstance(texture, TextureField) else texture
+        self._ends = [_Pinned(field, 0.0, first, level)]
+        if last is not None:
+            self._ends.append(_Pinned(field, 1.0, last, level))
 
     def at(self, time: float) -> Colors:
         """The colours of points of the surface at a time.
 
         Raises:
-            InputError: the points cannot be followed back.
+            InputError: the points cannot be followed.
         """
-        home = self._points.home(time)
-        return lambda points: self._of_start(home(points))
+        shares = [1.0] if len(self._ends) == 1 else [1 - time, time]
+        for end in self._ends:
+            if time == end.time:
+                return end.colors
+        parts = [(share, end, self._points.home(time, end.time)) for share, end in zip(shares, self._ends, strict=True)]
+
+        @torch.no_grad()
+        def colors(points: Tensor) -> Tensor:
+            return torch.stack([share * end(home(points)) for share, end, home in parts]).sum(dim=0)
+
+        return colors
+
+
+class _Pinned:
+    """Colours that a surface has at one moment, and of places beside it."""
+
+    def __init__(self, field: Field, time: float, colors: Colors, level: int) -> None:
+        self._still, self.time, self.colors, self._level = moment(field, time), time, colors, level
+
+    def __call__(self, points: Tensor) -> Tensor:
+        """Colours ``(N, 3)`` of points ``(N, 3)``, on the surface or about there."""
+        if not len(points):
+            return self.colors(points)
+        away = self._still.value(points, level=self._level).abs()
+        feet, arrived = project_to_surface(self._still, points, level=self._level)
+        own = self.colors(feet)
+        if self._spread is None:
+            return own
+        # Within half a cell the texture speaks, from one cell on the average.
+        share = (2 * away / CELL - 1).clamp(0, 1).masked_fill(~arrived, 1.0)
+        share = (share.square() * (3 - 2 * share))[:, None]
+        return torch.lerp(own, self._spread(points, away).to(own), share)
+
+    @cached_property
+    def _spread(self) -> SpreadColors | None:
+        """None without a surface."""
+        try:
+            mesh = extract_mesh(self._still, resolution=SPREAD, level=self._level, normals=False)
+        except NoSurfaceError:
+            return None
+        points = project_to_surface(self._still, torch.from_numpy(mesh.vertices).to(self._still.like))[0]
+        return SpreadColors(points, self.colors(points))
+
+
+def texture_colors(texture: TextureField, placed: Similarity | None = None) -> Colors:
+    """What a texture says at points.
+
+    Args:
+        texture: the texture.
+        placed: from its coordinates to those of the points.
+    """
+    placed = placed or Similarity.identity()
 
     @torch.no_grad()
-    def _of_start(self, points: Tensor) -> Tensor:
-        """The colours of points of the surface at time 0."""
-        center = points.new_tensor(self._placed.center)
-        return map_colors(self._texture, (points - center) / self._placed.scale).values
+    def colors(points: Tensor) -> Tensor:
+        center = points.new_tensor(placed.center)
+        return map_colors(texture, (points - center) / placed.scale).values
+
+    return colors
 
 
 class _Between:

@@ -27,7 +27,8 @@ def _small(monkeypatch: pytest.MonkeyPatch) -> None:
     few_points(monkeypatch)
     monkeypatch.setattr(pairs, "PIXELS", 48)
     monkeypatch.setattr(pairs, "TILE", 32)
-    monkeypatch.setattr(riding, "CARRIED", 12)
+    for name in ("CARRIED", "SPREAD"):
+        monkeypatch.setattr(riding, name, 12)
     for module, name in ((riding, "RIDE"), (motion, "CARRY")):
         monkeypatch.setattr(module, name, Solver(method="rk4", step=0.25))
 
@@ -35,9 +36,9 @@ def _small(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_rigid_motion_has_no_jumps(tmp_path: Path):
     field, sheet = Moving(Box(half_size=(0.5, 0.3, 0.4)), TURN), tmp_path / "sheet.png"
     row = measure_pair("a", "turn", field, (0.0, 0.5, 1.0), velocity=TURN.velocity, resolution=RESOLUTION, sheet=sheet)
-    # Distances between points stay, so no neighbours that are near can have been three pixels apart, at the depth of
-    # the furthest; what they were at the start is at least the two pixels between a face and its own edge.
-    assert row.jumps[0] == 1
+    # Distances between points stay, and a blend of two paints is no steeper than the steeper one; but where it is
+    # steepest need not be in view at the ends.
+    assert max(row.jumps[0] or 0, row.jumps[-1] or 0) == 1
     assert all(jump is not None and jump < 1.5 for jump in row.jumps)
     assert row.cracked == (0, 0, 0)
     assert row.calm == 1
@@ -66,7 +67,7 @@ def test_steps_are_those_of_the_places_at_the_start():
 
 def test_colours_that_cannot_be_carried_are_none(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(pairs, "carried_points", lambda *_: None)
-    monkeypatch.setattr(pairs, "_way_home", lambda _field, _velocity, time: None if time else lambda points: points)
+    monkeypatch.setattr(pairs, "_carried", lambda _riding, time: None if time else lambda points: points)
     field = Keyframes([0.0, 1.0], [Sphere(radius=0.5), Sphere(radius=0.4)])
     row = measure_pair("a", "blend", field, (0.0, 1.0), resolution=RESOLUTION)
     assert (row.calm, row.jumps, row.cracked) == (None, (1.0, None), (0.0, None))

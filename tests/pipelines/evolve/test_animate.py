@@ -16,6 +16,7 @@ from mplicits.datasets import linear_to_srgb
 from mplicits.neural_fields import (
     ColorSiren,
     InputError,
+    Keyframes,
     Moving,
     RigidMotion,
     ShrinkingSphere,
@@ -40,6 +41,7 @@ from mplicits.pipelines.evolve.animate import (
     animate_run,
     check_sequence_path,
     film_frames,
+    last_colors,
     there_and_back,
 )
 from mplicits.pipelines.evolve.follow import follow_mesh
@@ -325,6 +327,31 @@ def test_colours_are_borrowed_from_a_run_in_other_units(run, tmp_path):
         borrowed_texture(tmp_path, field, place)
 
 
+def test_colours_of_the_last_shape_are_where_it_was_put(run, tmp_path):
+    """The ball arrives where the second shape was put: turned, moved and of half its size in its own run."""
+    (tmp_path / "run").mkdir()
+    for name in ("field.safetensors", "texture.safetensors"):
+        (tmp_path / "run" / name).write_bytes((run / name).read_bytes())
+    turn, end = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), START + DRIFT
+    placed = {"rotation": turn.tolist(), "scale": 0.5, "shift": end.tolist()}
+    (tmp_path / "run" / "run.json").write_text(json.dumps({"config": {}, "placements": [placed, placed]}))
+    field, own = load_field(run / "field.safetensors").field, travelling_ball().at(0.0)
+    first = own.base.layers[0]
+    with torch.no_grad():  # x = s R y + c is where the ball of time 1 is; at time 0 it is there less the drift
+        first.bias += first.weight[:, :3] @ START
+        first.weight[:, :3] = 0.5 * first.weight[:, :3] @ turn
+    texture = TextureField(own, ColorSiren(16, 1, omega=4.0), delta=0.1).requires_grad_(False)
+    save_field(tmp_path / "last.safetensors", own)
+    save_texture(tmp_path / "texture.safetensors", texture)
+    last = last_colors(tmp_path / "last.safetensors", tmp_path / "run" / "field.safetensors", field)
+    points = torch.from_numpy(extract_mesh(moment(field, 1.0), resolution=16).vertices).float()
+    torch.testing.assert_close(last(points), texture.colors((points - end) @ turn / 0.5), atol=1e-4, rtol=0)
+    sheet = SequenceOptions(frames=2, size=(24, 24), samples=1, last_colors=tmp_path / "last.safetensors")
+    assert "2 moments" in animate_run(tmp_path / "run", tmp_path / "sheet.png", sheet)
+    with pytest.raises(InputError, match=r"--last-colors .* is not known to go from shape to shape"):
+        animate_run(run, tmp_path / "film.gif", sheet)
+
+
 def test_colours_ride_along_the_normals():
     """The points of a sphere that shrinks go straight inward."""
     field, start = ShrinkingSphere(radius=0.8, alpha=0.12), Sphere(radius=0.8)
@@ -335,6 +362,29 @@ def test_colours_ride_along_the_normals():
     for t in (0.0, 0.3, 1.0):
         points = towards * field.radius_at(torch.tensor(t))
         torch.testing.assert_close(RidingColors(field, texture).at(t)(points), expected, atol=2e-3, rtol=0)
+
+
+def test_colours_of_both_ends_fade_into_each_other():
+    """On a sphere that a velocity turns: a point of time t was elsewhere t before, and will be 1 − t after."""
+    field = Keyframes([0.0, 1.0], [Sphere(radius=0.5), Sphere(radius=0.5)])
+    turn = RigidMotion(angle=1.0)
+    riding = RidingColors(field, lambda x: 0.5 + x, last=lambda x: 0.5 - x, motion=turn.velocity)
+    points = 0.5 * torch.nn.functional.normalize(torch.randn(100, 3), dim=-1)
+    for t in (0.0, 0.25, 1.0):
+        before, after = turn.inverse(points, t), turn.forward(points, 1 - t)
+        torch.testing.assert_close(riding.at(t)(points), 0.5 + (1 - t) * before - t * after, atol=1e-5, rtol=0)
+
+
+def test_colours_do_not_tear_where_points_leave_the_surface():
+    """Of points that come from a sphere's axis the nearest ones lie all around; those of one colour keep it."""
+    sphere = Sphere(radius=0.5)
+    field, shift = Keyframes([0.0, 1.0], [sphere, sphere]), RigidMotion(velocity=(0.5, 0.0, 0.0))
+    across = torch.tensor([0.5, 0.0, 0.0]) + torch.linspace(-1e-3, 1e-3, 20)[:, None] * torch.tensor([0.0, 1.0, 0.0])
+    torn = RidingColors(field, lambda x: (x[:, 1:2] > 0).float().expand(-1, 3), motion=shift.velocity)
+    # Between cells of a half the slope is at most 2 for each unit.
+    assert torn.at(1.0)(across).diff(dim=0).abs().max() < 4 * 2e-3 / 19
+    plain = RidingColors(field, lambda x: torch.full_like(x, 0.7), motion=shift.velocity)
+    torch.testing.assert_close(plain.at(1.0)(across), torch.full_like(across, 0.7))
 
 
 # Bad input
@@ -395,6 +445,7 @@ def test_flags_of_films_go_with_films(run, tmp_path):
         ("-o sheet.png --loop", "--loop: goes with a film"),
         ("-o film.mp4 --resolution 64", "--resolution: goes with meshes"),
         ("-o film.mp4 --no-colors --colors x", "--colors: --no-colors leaves them out"),
+        ("-o film.mp4 --no-colors --last-colors x", "--last-colors: --no-colors leaves them out"),
     ):
         with pytest.raises(InputError, match=message):
             COMMAND.run(parser.parse_args([str(run), *line.split()]))
