@@ -122,7 +122,7 @@ def render_volume(
     guide: Callable[[Tensor], Tensor] | None = None,
     generator: torch.Generator | None = None,
 ) -> Rendered:
-    """Render rays through the unit sphere; differentiable in the parameters of field, colour and ``inv_std``.
+    """Render rays through the unit sphere; differentiable in the rays and all parameters, ``inv_std`` too.
 
     Args:
         field: the geometry, in unit-sphere coordinates; or any function of points ``(..., 3)`` → ``(...,)``.
@@ -175,9 +175,10 @@ def render_volume(
     depths = edges[:, :-1] + 0.5 * interval
     counts, rows = torch.ones_like(depths), None
     if skip > 0:
-        values = _march(field, guide)(ray_points(origins, directions, edges))
-        estimated = secant_weights(edges, values, _estimate_sharpness(field, level, inv_std), cos_anneal=cos_anneal)
-        counts = _counts(estimated, values, skip, skip_share, generator)
+        with torch.no_grad():  # an estimate chooses sections and teaches nobody
+            values = _march(field, guide)(ray_points(origins, directions, edges))
+            estimated = secant_weights(edges, values, _estimate_sharpness(field, level, inv_std), cos_anneal=cos_anneal)
+            counts = _counts(estimated, values, skip, skip_share, generator)
         rows = counts.flatten().nonzero()[:, 0]
 
     def of_sections(tensor: Tensor) -> Tensor:

@@ -20,7 +20,7 @@ from ...neural_fields.volume_renderer import Rendered, Sampling, render_volume
 from ..run.settings import ReconstructConfig
 from ..run.trainer import seeded
 
-__all__ = ["Exposures", "RayPool", "Rays", "SceneModel", "build_scene", "camera_rays"]
+__all__ = ["Exposures", "PoseCorrections", "RayPool", "Rays", "SceneModel", "build_scene", "camera_rays"]
 
 # s = exp(10 v): one learning rate serves this number and the networks (NeuS begins at v = 0.3, s = 20).
 SHARPENING = 10.0
@@ -46,6 +46,33 @@ class Exposures(nn.Module):
         return (self.logs - self.logs.mean(dim=0)).exp(), self.shifts - self.shifts.mean(dim=0)
 
 
+class PoseCorrections(nn.Module):
+    """Small rotations and shifts of the cameras: v → exp([ω_v]×) v for directions, o → o + t_v for eyes.
+
+    The means of all ω and of all t are 0, so that the scene as a whole stays where it is (to the first order).
+
+    Args:
+        views: how many cameras there are.
+    """
+
+    def __init__(self, views: int) -> None:
+        super().__init__()
+        self.turns, self.shifts = nn.Parameter(torch.zeros(views, 3)), nn.Parameter(torch.zeros(views, 3))
+
+    def forward(self) -> tuple[Tensor, Tensor]:
+        """Rotation vectors ω in radians, and shifts in radii of the region, ``(V, 3)`` each."""
+        return self.turns - self.turns.mean(dim=0), self.shifts - self.shifts.mean(dim=0)
+
+    def moved(self, origins: Tensor, directions: Tensor, view: Tensor) -> tuple[Tensor, Tensor]:
+        """Origins and directions ``(R, 3)`` of rays of the cameras with the numbers ``view`` ``(R,)``, corrected."""
+        turns, shifts = self()
+        x, y, z = turns.unbind(dim=1)
+        none = torch.zeros_like(x)
+        cross = torch.stack((none, -z, y, z, none, -x, -y, x, none), dim=1).reshape(-1, 3, 3)
+        turned = torch.linalg.matrix_exp(cross)[view] @ directions[:, :, None]
+        return origins + shifts[view], turned[:, :, 0]
+
+
 class SceneModel(nn.Module):
     """Everything that a pixel's colour depends on, in unit-sphere coordinates.
 
@@ -55,6 +82,7 @@ class SceneModel(nn.Module):
         outside: what is outside the unit sphere; None if nothing is.
         background: ``(3,)`` behind everything.
         exposures: of the photographs; None if all are alike.
+        poses: corrections of the cameras; None if they are right.
     """
 
     def __init__(
@@ -64,9 +92,11 @@ class SceneModel(nn.Module):
         outside: Outside | None,
         background: Tensor,
         exposures: Exposures | None = None,
+        poses: PoseCorrections | None = None,
     ) -> None:
         super().__init__()
-        self.geometry, self.color, self.outside, self.exposures = geometry, color, outside, exposures
+        self.geometry, self.color, self.outside = geometry, color, outside
+        self.exposures, self.poses = exposures, poses
         self.variance = nn.Parameter(torch.tensor(FIRST_VARIANCE))
         self.register_buffer("background", background)
         self.background: Tensor
@@ -136,7 +166,7 @@ class SceneModel(nn.Module):
 
 
 def build_scene(config: ReconstructConfig, *, has_masks: bool, views: int = 0) -> SceneModel:
-    """An untrained scene: a sphere of unknown colour, and so many photographs where exposures are learnt."""
+    """An untrained scene: a sphere of unknown colour, and so many photographs to learn exposures or poses of."""
     background = config.background
     if background == "auto":
         background = "white" if has_masks else "outside"
@@ -165,7 +195,8 @@ def build_scene(config: ReconstructConfig, *, has_masks: bool, views: int = 0) -
         )
         outside = Outside() if background == "outside" else None
     exposures = Exposures(views) if config.exposure == "affine" else None
-    return SceneModel(geometry, color, outside, torch.full((3,), float(background == "white")), exposures)
+    poses = PoseCorrections(views) if config.cameras == "refined" else None
+    return SceneModel(geometry, color, outside, torch.full((3,), float(background == "white")), exposures, poses)
 
 
 class Rays(NamedTuple):

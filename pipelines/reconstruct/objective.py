@@ -14,6 +14,7 @@ from .model import RayPool, SceneModel
 
 # Steps between two looks at the surface's surroundings, and such looks between two at everything.
 NEAR_EVERY, WHOLE_EVERY = 16, 8
+POSES_FROM = 0.1  # share of the training after which cameras are moved
 
 __all__ = ["SceneObjective", "scene_trainer"]
 
@@ -36,6 +37,8 @@ class SceneObjective(Objective):
             Group(colors, lambda done: config.color_rate * rate(done)),
             Group([model.variance], lambda done: config.sharpening * rate(done)),
         ]
+        if model.poses is not None:  # not before there is something to be compared with
+            groups.append(Group(list(model.poses.parameters()), lambda done: rate(done) if done > POSES_FROM else 0.0))
         super().__init__(model, groups, torch.Generator().manual_seed(config.seed))
         self.model, self.pool, self.config = model, pool, config
         self.sampling = Sampling(uniform=config.uniform, importance=config.importance)
@@ -62,9 +65,12 @@ class SceneObjective(Objective):
         config = self.config
         self.model.widen(config.band, config.least_delta)
         rays = self.pool.draw(config.rays, self.generator)
+        origins, directions = rays.origins, rays.directions
+        if self.model.poses is not None:
+            origins, directions = self.model.poses.moved(origins, directions, rays.view)
         seen = self.model.render(
-            rays.origins,
-            rays.directions,
+            origins,
+            directions,
             self.sampling,
             cos_anneal=min(1.0, done / config.anneal) if config.anneal else 1.0,
             level=self.level_at(done),

@@ -31,7 +31,7 @@ from ..surface.surface import from_mesh, sample_points
 from ..surface.trim import in_region
 from ..texture.train import FittedTexture, fit_texture
 from .hull import begin
-from .model import Exposures, RayPool, SceneModel, build_scene
+from .model import RayPool, SceneModel, build_scene
 from .objective import scene_trainer
 from .plan import SPHERE, ReconstructPlan, level_stage
 from .views import ViewImage, comparison_sheet, exposed_as, held_out, measure, render_image, spread
@@ -281,11 +281,11 @@ class _Reconstruction:
         self.shown, self.trainer.losses = progress["shown"], progress["losses"]
         self.trainer.restore(tensors)
 
-    def _exposures(self, exposures: Exposures) -> dict[str, Any]:
-        """Gain and offset of each photograph, for red, green and blue."""
-        gains, offsets = (part.detach().cpu().double().numpy().round(4).tolist() for part in exposures())
-        names = [view.name for view in self.train_views]
-        return {name: {"gain": gains[k], "offset": offsets[k]} for k, name in enumerate(names)}
+    def _by_view(self, names: tuple[str, str], found: tuple[Tensor, Tensor]) -> dict[str, dict[str, list[float]]]:
+        """What was learnt of each photograph, three numbers each."""
+        rows = [part.detach().cpu().double().numpy().round(5).tolist() for part in found]
+        views = [view.name for view in self.train_views]
+        return {view: {name: row[k] for name, row in zip(names, rows, strict=True)} for k, view in enumerate(views)}
 
     def _record(self, *, finished: bool) -> dict[str, Any]:
         """What ``run.json`` holds."""
@@ -301,7 +301,8 @@ class _Reconstruction:
             "config": dataclasses.asdict(self.config),
             "parameters": {name: parameter_count(part) for name, part in parts.items()},
             "deltas": model.geometry.deltas.tolist(),
-            **({} if model.exposures is None else {"exposures": self._exposures(model.exposures)}),
+            **({} if model.exposures is None else {"exposures": self._by_view(("gain", "offset"), model.exposures())}),
+            **({} if model.poses is None else {"poses": self._by_view(("turn", "shift"), model.poses())}),
             "inv_std": float(model.inv_std.detach()),
             "steps": trainer.step,
             "training_seconds": round(trainer.elapsed, 3),

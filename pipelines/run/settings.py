@@ -174,6 +174,9 @@ class ReconstructConfig(Settings):
     exposure: Literal["off", "affine"] = setting(
         "off", "affine: each photograph has a gain and an offset for each colour, as automatic exposure makes them"
     )
+    cameras: Literal["given", "refined"] = setting(
+        "given", "refined: a small rotation and shift of each camera is learnt with the scene"
+    )
     steps: int = setting(5000, "training steps", above=0)
     rays: int = setting(256, "rays per training step", above=0)
     uniform: int = setting(48, "evenly spaced samples per ray", at_least=2)
