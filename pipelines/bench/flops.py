@@ -20,6 +20,7 @@ import statistics
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -31,6 +32,7 @@ from ..reconstruct.model import RayPool, SceneModel
 from ..reconstruct.objective import SceneObjective, scene_trainer
 from ..run.settings import ReconstructConfig
 from ..run.trainer import Progress, StopFlag, Trainer
+from .reconstruct_rows import StepParts
 from .speed import Counted, counted
 
 __all__ = [
@@ -79,6 +81,7 @@ class Watched:
         jets: rows of each level with gradient.
         colors: rows of the colour network.
         late: the rows of the second half of the training; None where it has fewer than two steps.
+        parts: the seconds of its steps; None on a GPU too, which works while Python goes on.
         finest_share: rows of the finest level over those of the coarsest, in the steps in which it was switched on.
         geometry_flops: of the whole training.
         color_flops: the same of colours and of what is outside.
@@ -91,6 +94,7 @@ class Watched:
     jets: tuple[int, ...]
     colors: int
     late: LateRows | None
+    parts: StepParts | None
     finest_share: float | None
     geometry_flops: float
     color_flops: float
@@ -123,12 +127,17 @@ def train_watched(
     if seconds is not None:
         config = replace(config, steps=ENDLESS)
     trainer = scene_trainer(model, pool, config, seconds=seconds)
-    watch = _Watch(trainer, levels, colors, report)
+    clocks = None
+    if pool.device.type == "cpu":
+        clocks = (_Clock(trainer.objective, "losses"), _Clock(model.geometry, "jet"), _Clock(model.color, "forward"))
+    watch = _Watch(trainer, levels, colors, report, clocks)
     try:
         finished = trainer.run(flag, report=watch, report_every=1)
     finally:
         colors.remove()
         outsides.remove()
+        for clock in clocks or ():
+            clock.remove()
         plain.deltas.copy_(model.geometry.deltas)
         model.geometry = plain
     geometry = sum(v * level.values + j * level.jets for (v, j), level in zip(costs, levels, strict=True))
@@ -140,6 +149,7 @@ def train_watched(
         jets=tuple(level.jets for level in levels),
         colors=colors.rows,
         late=watch.late(),
+        parts=watch.parts(),
         finest_share=levels[-1].jets / watch.samples if watch.samples else None,
         geometry_flops=geometry,
         color_flops=color_cost * colors.rows + outside_cost * outsides.rows,
@@ -155,9 +165,11 @@ class _Watch:
         levels: Sequence[Counted],
         colors: _RowCounter,
         report: Callable[[Progress], None] | None,
+        clocks: tuple[_Clock, _Clock, _Clock] | None,
     ) -> None:
-        self.trainer, self.levels, self.colors, self.report = trainer, levels, colors, report
+        self.trainer, self.levels, self.colors, self.report, self.clocks = trainer, levels, colors, report, clocks
         self.half: LateRows | None = None  # what had been asked for when half was done
+        self.half_times: tuple[float, ...] = ()
         self.times: list[float] = []
         self.samples = self.before = 0
         self.level, self.started = trainer.objective.level_at(trainer.fraction), time.perf_counter()
@@ -167,7 +179,7 @@ class _Watch:
         if self.level == len(self.levels) - 1:  # the level of the step that has just been made
             self.samples += self.levels[0].jets - self.before
         if self.half is None and progress.fraction >= HALF:
-            self.half = self._rows()
+            self.half, self.half_times = self._rows(), self._seconds()
         if self.report is not None and (progress.step % REPORT_EVERY == 0 or progress.fraction >= 1):
             self.report(progress)
         self.before, self.level = self.levels[0].jets, self.trainer.objective.level_at(progress.fraction)
@@ -177,6 +189,19 @@ class _Watch:
         """Those of all steps so far."""
         values, jets = (tuple(getattr(level, kind) for level in self.levels) for kind in ("values", "jets"))
         return LateRows(self.trainer.step, values, jets, self.colors.rows)
+
+    def _seconds(self) -> tuple[float, ...]:
+        """Of all steps so far: whole, forward, jets, colours."""
+        return (math.fsum(self.times), *(clock.seconds for clock in self.clocks or ()))
+
+    def parts(self) -> StepParts | None:
+        """See `Watched`."""
+        half = self.half
+        if half is None or self.clocks is None or self.trainer.step == half.steps:
+            return None
+        now, steps = self._seconds(), self.trainer.step - half.steps
+        whole, forward, jets, colors = ((b - a) / steps for a, b in zip(self.half_times, now, strict=True))
+        return StepParts(march=forward - jets - colors, jets=jets, colors=colors, backward=whole - forward)
 
     def late(self) -> LateRows | None:
         """See `Watched`."""
@@ -204,6 +229,27 @@ class _RowCounter:
         """Stop counting."""
         if self.hook is not None:
             self.hook.remove()
+
+
+class _Clock:
+    """Adds up the seconds that calls of one method of an object take."""
+
+    def __init__(self, owner: Any, method: str) -> None:
+        self.owner, self.method, self.seconds = owner, method, 0.0
+        asked = getattr(owner, method)
+
+        def timed(*args: Any, **options: Any) -> Any:
+            begun = time.perf_counter()
+            try:
+                return asked(*args, **options)
+            finally:
+                self.seconds += time.perf_counter() - begun
+
+        vars(owner)[method] = timed  # before the method of its class
+
+    def remove(self) -> None:
+        """The method of the class is asked again."""
+        del vars(self.owner)[self.method]
 
 
 def value_flops(level: Field) -> float:

@@ -181,7 +181,7 @@ class ReconstructBench(Benchmark[ReconstructRow]):
         report = work.progress or (lambda _: None)
         report(Progress(stage, 0, config.steps, 0.0, {}))
         pool, started = RayPool(train, similarity, device), time.perf_counter()
-        model = build_scene(config, has_masks=pool.has_masks).to(device)
+        model = build_scene(config, has_masks=pool.has_masks, views=len(train)).to(device)
         start_seconds = time.perf_counter() - started
 
         def told(progress: Progress) -> None:
@@ -277,6 +277,7 @@ def row_of(
         jets_per_ray=tuple(rows / rays for rows in watched.jets),
         colors_per_ray=watched.colors / rays,
         late=late_rates(watched.late, config.rays),
+        parts=watched.parts,
         finest_share=watched.finest_share,
         exact=scene.exact is not None,
         surface=surface,

@@ -16,6 +16,7 @@ __all__ = [
     "Comparison",
     "LateRates",
     "ReconstructRow",
+    "StepParts",
     "SurfaceFigures",
     "comparisons",
     "reconstruct_tables",
@@ -63,6 +64,23 @@ class LateRates:
 
 
 @dataclass(frozen=True)
+class StepParts:
+    """Seconds of a step in the second half of a training, by what it spends them on.
+
+    Attributes:
+        march: placing and skipping samples, the grid of values included, and composing what they see.
+        jets: forward.
+        colors: forward.
+        backward: through all of it, and the optimiser.
+    """
+
+    march: float
+    jets: float
+    colors: float
+    backward: float
+
+
+@dataclass(frozen=True)
 class ReconstructRow:
     """One geometry, trained on one scene.
 
@@ -90,6 +108,7 @@ class ReconstructRow:
         jets_per_ray: evaluations of each level with gradient, which are trained.
         colors_per_ray: evaluations of the colour network.
         late: the same in the second half of the training alone; None if that had no step.
+        parts: seconds of a step there, by what they are spent on; None on a GPU.
         finest_share: of the samples that are evaluated, how many the finest level saw while it was switched on; None if
             it never was.
         exact: whether the scene's surface is known in closed form.
@@ -120,6 +139,7 @@ class ReconstructRow:
     jets_per_ray: tuple[float, ...]
     colors_per_ray: float
     late: LateRates | None
+    parts: StepParts | None
     finest_share: float | None
     exact: bool
     surface: SurfaceFigures | None
@@ -254,7 +274,7 @@ def reconstruct_tables(name: str, rows: Sequence[ReconstructRow], *, sgemm: floa
     )
     items = [(f"{r.scene} {r.network}{', equal time' if r.kind == EQUAL_TIME else ''}", r) for r in rows]
     table = tabulated(name, "Geometries on the same rays", "scene, geometry", figures, items, notes=notes)
-    tables = (table, _evaluations(f"{name}-evaluations", items))
+    tables = (table, _evaluations(f"{name}-evaluations", items), _parts(f"{name}-parts", items))
     found = comparisons(rows)
     return (*tables, _against_neus(f"{name}-against-neus", found)) if found else tables
 
@@ -277,6 +297,23 @@ def _evaluations(name: str, items: Sequence[tuple[str, ReconstructRow]]) -> Tabl
     ]
     notes = ("values and jets: of the coarsest level, the jets are trained. late: in the second half of the training.",)
     return tabulated(name, "Evaluations per ray", "scene, geometry", figures, items, notes=notes)
+
+
+def _parts(name: str, items: Sequence[tuple[str, ReconstructRow]]) -> Table:
+    """What the time of a step is spent on."""
+
+    def milliseconds(part: str) -> Callable[[ReconstructRow], float | None]:
+        return lambda row: None if row.parts is None else 1e3 * getattr(row.parts, part)
+
+    columns = {"march": "march", "jets": "jets", "colours": "colors", "backward": "backward"}
+    figures: list[Figure[ReconstructRow]] = [
+        (Column(title, ".1f"), milliseconds(part)) for title, part in columns.items()
+    ]
+    notes = (
+        "Milliseconds of a step, means over the second half of the training. march: samples are placed, skipped and "
+        "composed, the grid kept up to date. backward: the optimiser too. Nothing is said of a GPU.",
+    )
+    return tabulated(name, "What a step is spent on", "scene, geometry", figures, items, notes=notes)
 
 
 def _against_neus(name: str, found: Sequence[Comparison]) -> Table:

@@ -144,6 +144,9 @@ def test_rows(bench):
         assert row.late is not None
         assert (row.late.values[0], row.late.jets[0]) == (4 + 3, 4 + 4 + 1)
         assert 0 < row.late.colors <= 9
+        assert row.parts is not None
+        assert min(row.parts.march, row.parts.jets, row.parts.colors, row.parts.backward) > 0
+        assert row.parts.march + row.parts.jets + row.parts.colors + row.parts.backward < row.seconds
         assert row.views == 1
         assert 0 < row.psnr < 40
         assert 0 < row.psnr_object < 40
@@ -285,10 +288,11 @@ def test_the_tables(bench):
     assert (other.step, other.equal_time, other.chamfer) == (pytest.approx(1.5), None, None)
     assert (mean.neus, mean.ours, mean.step) == pytest.approx((24.0, 25.25, 4.5**0.5))
     assert (mean.equal_time, mean.chamfer) == (None, None)
-    table, evaluations, against = bench[1].tables([neus, ours, timed, *second], sgemm=50e9)
+    table, evaluations, parts, against = bench[1].tables([neus, ours, timed, *second], sgemm=50e9)
     text = "\n".join(map(as_text, (table, against)))
     assert evaluations.rows[0].values[:2] == (7.0, 9.0)
     assert evaluations.rows[0].values[4:6] == (7.0, 9.0)
+    assert parts.rows[0].values[0] == pytest.approx(1e3 * neus.parts.march)
     for part in ("+1.50", "+3.00", "-38%", "12.5%", "   6.0 ", " 100.0 ", "mean of 2 scenes"):
         assert part in text
     assert table.rows[0].values[-1] == pytest.approx(1.2e8 / 50e9)
@@ -298,7 +302,7 @@ def test_the_tables(bench):
     assert "paper, DTU scan 24 28.20 31.50 +3.30 – – -37% – – – – –" in lines
     assert "paper, mean of 5 DTU scans 28.86 29.94 +1.08 – – -37% – – – – –" in lines
     assert "no surface" in text
-    assert len(bench[1].tables([neus], sgemm=50e9)) == 2
+    assert len(bench[1].tables([neus], sgemm=50e9)) == 3
 
 
 def rows_in(file: Path) -> list[dict]:
