@@ -280,7 +280,10 @@ ANIMATE = Command(
 
 def _view_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add_flags(parser, "run", "--time")
+    add_flags(parser, "run")
+    add("other", nargs="?", metavar="OTHER", help="with --landmarks: the run to pick the same points on")
+    add("--landmarks", type=Path, metavar="FILE", help="click pairs of points on RUN and OTHER, kept for `evolve`")
+    add_flags(parser, "--time")
     add_flags(parser, "--up", default="y")
     add("--host", default="127.0.0.1", help="address to listen on (127.0.0.1: this machine only)")
     add("--port", type=_port, metavar="N", help="port to listen on (default: a free one from 8080 up)")
@@ -302,6 +305,16 @@ def _view(arguments: argparse.Namespace) -> int:
     stream = arguments.stream or any(getattr(arguments, name) is not None for name in streamed)
     if stream and arguments.time is not None:
         raise input_error("--time: is a slider in the streaming viewer; leave it out")
+    if (arguments.other is None) != (arguments.landmarks is None):
+        raise input_error("--landmarks: goes with two runs, `mplicits view RUN OTHER --landmarks FILE`")
+    if arguments.landmarks is not None:
+        for name in ("cloud", "time"):
+            if getattr(arguments, name) is not None:
+                raise input_error(f"--{name}: does not go with --landmarks; leave one of the two out")
+        from ...neural_fields.files import check_place
+
+        check_place(arguments.landmarks)
+        stream = True
     with _streamed(arguments) if stream else _served(arguments) as url:
         try:
             print(f"{arguments.run}: open {url} in a browser; Ctrl-C ends it", flush=True)
@@ -340,10 +353,15 @@ def _served(arguments: argparse.Namespace) -> Iterator[str]:
 def _streamed(arguments: argparse.Namespace) -> Iterator[str]:
     """The viewer that traces on this machine, and where it is."""
     from ..run.machine import choose_device
-    from ..viewer.server import Viewer, open_run
+    from ..viewer.picks import open_picks
+    from ..viewer.server import Viewer, open_run, show_field
 
-    device = choose_device(arguments.device or "auto")
-    shown = open_run(arguments.run, cloud=arguments.cloud, side=arguments.size or 512, device=device)
+    device, side = choose_device(arguments.device or "auto"), arguments.size or 512
+    if arguments.landmarks is None:
+        shown = open_run(arguments.run, cloud=arguments.cloud, side=side, device=device)
+    else:
+        picks = open_picks((arguments.run, arguments.other), arguments.landmarks, device=device)
+        shown = show_field(picks.field, name="landmarks", side=side, picks=picks)
     with Viewer(shown, host=arguments.host, port=arguments.port, up=arguments.up) as viewer:
         yield viewer.url
 
@@ -353,10 +371,11 @@ VIEW = Command(
     """  mplicits view runs/scan
   mplicits view runs/scan --up z --open
   mplicits view runs/scan --port 9000
-  mplicits view runs/scan --stream""",
+  mplicits view runs/scan --stream
+  mplicits view runs/cat runs/dog --landmarks pairs.txt""",
     _view_arguments,
     _view,
     "Look at a fit in the browser: the page of `mplicits web`, traced by the browser's own graphics adapter, with each "
     "new checkpoint of a run that is still fitted. With --stream this machine traces, and shows meshes, bands and "
-    "errors too.",
+    "errors too. With --landmarks two fits stand side by side, and pairs of clicks are kept for `evolve --landmarks`.",
 )

@@ -1,4 +1,4 @@
-"""Points of two shapes that are known to be the same: a file of them, and what they say to a motion that is learnt.
+"""Points of two shapes that are known to be the same, and what they say to a motion that is learnt.
 
 A few landmarks settle what geometry leaves open, as which leg is which or how far a round thing has turned. All
 vertices of two meshes with the same faces are landmarks too.
@@ -7,7 +7,6 @@ vertices of two meshes with the same faces are landmarks too.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ...datasets.files import readable
+from ...datasets.landmarks import read_landmarks
 from ...neural_fields import InputError
 from .shapes import StaticShape
 
@@ -36,36 +35,6 @@ class Landmarks(NamedTuple):
 
     before: Tensor
     after: Tensor
-
-
-def read_landmarks(path: str | Path) -> tuple[Float64, Float64]:
-    """Pairs of points from a text file, ``(P, 3)`` each, in the input coordinates of either shape.
-
-    A line has six numbers, x y z of the first shape and x y z of the second, with spaces or commas between them; what
-    follows a # is a comment.
-
-    Raises:
-        InputError: there is no such file, it has no pairs, or a line is no six finite numbers.
-    """
-    path = Path(path)
-    with readable(path):
-        lines = path.read_text(encoding="utf-8").splitlines()
-    pairs = []
-    for number, line in enumerate(lines, start=1):
-        words = line.partition("#")[0].replace(",", " ").split()
-        if not words:
-            continue
-        try:
-            pair = [float(word) for word in words]
-        except ValueError:
-            pair = []
-        if len(pair) != 6 or not np.isfinite(pair).all():
-            raise InputError(f"{path}, line {number}: expected six numbers, x y z of one shape and x y z of the next")
-        pairs.append(pair)
-    if not pairs:
-        raise InputError(f"{path}: no landmarks; write six numbers in a line, x y z of one shape and x y z of the next")
-    both = np.array(pairs)
-    return both[:, :3], both[:, 3:]
 
 
 def placed_landmarks(paths: Sequence[str], shapes: Sequence[StaticShape]) -> list[Landmarks]:

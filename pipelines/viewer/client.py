@@ -18,6 +18,7 @@ from .camera import describe_reading, image_size, probe, viser_camera
 from .controls import LARGEST_PICTURE_SIDE, Controls
 from .frames import Frame, FrameScheduler, Superseded, View
 from .paint import Painter
+from .picks import Picks
 from .scene import SceneNodes, Shapes
 
 __all__ = ["Client", "Shown"]
@@ -89,6 +90,7 @@ class Shown:
         shapes: meshes and points beside the traced image.
         painter: draws the traced image.
         side: images have about ``side``² pixels.
+        picks: the landmarks that are picked, where two shapes are shown for that.
     """
 
     name: str
@@ -97,6 +99,7 @@ class Shown:
     shapes: Shapes
     painter: Painter
     side: int
+    picks: Picks | None = None
 
     @property
     def shadings(self) -> list[str]:
@@ -130,6 +133,7 @@ class Client:
             moves=shown.field.in_dim == 4,
             similarity=shown.similarity,
             deltas=shown.field.deltas.tolist(),
+            picks=shown.picks is not None,
         )
         scale = shown.similarity.scale
         self._scene = SceneNodes(handle.scene, shown.shapes, self._controls, scale=scale, check=self._check)
@@ -141,6 +145,8 @@ class Client:
             self._redraw()
 
         handle.scene.on_click()(self._read)
+        self._controls.on_undo(self._undo)
+        self._show_picks()
         self._redraw()
 
     def leave(self) -> None:
@@ -227,8 +233,30 @@ class Client:
             plane=self._controls.slice,
         )
         self._controls.read(describe_reading(reading, self._shown.similarity.scale))
+        had_depth, picks = self._scene.is_filled, self._shown.picks
+        if picks is None:
+            self._scene.mark(reading)
+            self._update_depth(had_depth)
+        elif reading is not None and not reading.on_plane:
+            self._change_picks(lambda: picks.pick(reading.point))
+
+    def _undo(self) -> None:
+        if self._shown.picks is not None:
+            self._change_picks(self._shown.picks.undo)
+
+    def _change_picks(self, change: Callable[[], None]) -> None:
+        try:
+            change()
+        except InputError as error:
+            self._controls.say(f"**{error}**")
+        self._show_picks()
+
+    def _show_picks(self) -> None:
+        if self._shown.picks is None:
+            return
         had_depth = self._scene.is_filled
-        self._scene.mark(reading)
+        self._controls.tell_picks(self._shown.picks.text())
+        self._scene.pin(self._shown.picks.places())
         self._update_depth(had_depth)
 
     def _save_picture(self) -> None:

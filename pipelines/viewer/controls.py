@@ -58,6 +58,7 @@ class Controls:
         moves: whether the field moves.
         similarity: from input to unit-sphere coordinates: what the panel says is in input units.
         deltas: half-widths of the bands, in units of the field.
+        picks: whether landmarks are picked.
     """
 
     def __init__(
@@ -70,11 +71,15 @@ class Controls:
         moves: bool = False,
         similarity: Similarity | None = None,
         deltas: Sequence[float] = (),
+        picks: bool = False,
     ) -> None:
         self._similarity = similarity or Similarity.identity()
         self._names = names = [str(level) for level in range(levels)]
         self._shadings = tuple(shadings)
         self._moves = moves
+        with gui.add_folder("Landmarks", visible=picks):
+            self._picks = gui.add_markdown("")
+            self._undo = gui.add_button("Undo", hint="take back the last click, or the last pair")
         with gui.add_folder("Time", visible=moves):
             self._time = gui.add_slider("Time", min=0.0, max=1.0, step=0.001, initial_value=0.0)
             self._play = gui.add_checkbox("Play", False, hint="while the traced surface is shown")
@@ -210,6 +215,14 @@ class Controls:
         """Width of the picture to be saved, and whether without a background."""
         width = min(max(16, int(self._width.value)), LARGEST_PICTURE_SIDE)
         return width, bool(self._transparent.value)
+
+    def on_undo(self, undo: Callable[[], None]) -> None:
+        """Call this when a landmark is taken back."""
+        self._undo.on_click(lambda _event: undo())
+
+    def tell_picks(self, text: str) -> None:
+        """Show which landmark is picked next, in Markdown."""
+        self._picks.content = text
 
     def read(self, text: str) -> None:
         """Show what is under the pointer, in Markdown."""

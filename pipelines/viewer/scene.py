@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -237,6 +237,12 @@ class SceneNodes:
         with self._lock:
             self._want("mark", reading, self._add_mark)
 
+    def pin(self, places: Sequence[tuple[int, NDArray[np.float64]]]) -> None:
+        """Mark landmarks: a ball at each, with its number."""
+        wanted = tuple((number, *point.tolist()) for number, point in places)
+        with self._lock:
+            self._want("pins", wanted or None, self._add_pins)
+
     def _want(
         self, name: str, wanted: T | None, add: Callable[[T], list[Any]], busy: Callable[[], None] = lambda: None
     ) -> None:
@@ -285,6 +291,13 @@ class SceneNodes:
         self._check()
         look: dict[str, Any] = {"format": "png", "cast_shadow": False, "receive_shadow": False}
         return [self._scene.add_image("/slice", image, *pose.size, wxyz=pose.wxyz, position=pose.center, **look)]
+
+    def _add_pins(self, wanted: tuple[tuple[int, float, float, float], ...]) -> list[Any]:
+        nodes = []
+        for index, (number, *place) in enumerate(wanted):
+            nodes.append(self._scene.add_icosphere(f"/pins/{index}", MARK_RADIUS, MARK_COLOR, position=place))
+            nodes.append(self._scene.add_label(f"/pins/{index}/number", str(number)))
+        return nodes
 
     def _add_mark(self, reading: Reading) -> list[Any]:
         point, tip = reading.point, reading.point + MARK_LENGTH * reading.normal

@@ -26,6 +26,7 @@ from .frames import Frame, FrameScheduler
 from .gate import Gate
 from .guard import connection_of_this_task, guarded
 from .paint import Painter
+from .picks import Picks
 from .scene import Shapes
 
 __all__ = ["FIRST_PORT", "Viewer", "free_port", "import_viser", "open_run", "show_field"]
@@ -183,11 +184,12 @@ def show_field(
     cloud: Path | None = None,
     texture: TextureField | None = None,
     side: int = 512,
+    picks: Picks | None = None,
 ) -> Shown:
     """What a `Viewer` needs to show any field in three dimensions, or in space and time, such as one in a script."""
     field, similarity = as_field(field), similarity or Similarity.identity()
     shapes = Shapes(field, similarity, cloud=cloud)
-    return Shown(name, field, similarity, shapes, Painter(field, shapes.cloud, texture), side)
+    return Shown(name, field, similarity, shapes, Painter(field, shapes.cloud, texture), side, picks)
 
 
 def import_viser() -> Any:
