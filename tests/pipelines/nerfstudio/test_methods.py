@@ -97,6 +97,7 @@ def test_the_entry_points_lead_to_the_methods(plugin: Any) -> None:
         assert (
             method.config.pipeline.model.sdf_field.learning_rate == method.config.optimizers["fields"]["optimizer"].lr
         )
+        assert method.config.pipeline.datamanager.dataparser.center_method == "focus"
         assert method.description
 
 
