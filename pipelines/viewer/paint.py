@@ -18,6 +18,7 @@ from torch import Tensor
 from ...datasets.cameras import Camera, look_at
 from ...neural_fields import Field, TextureField, map_colors
 from ...neural_fields.dynamic_tracing import moment
+from ...neural_fields.evolution import VectorField
 from ..render.light import load_matcap
 from ..render.shade import ShadeOptions, compose, measure, shade
 from ..render.trace import Seen, merge_strips, strips, trace_view
@@ -45,12 +46,18 @@ class Painter:
         field: what to draw, three- or four-dimensional.
         reference: loads the cloud ``(N, 3)`` that "error" measures from, when it is first needed.
         texture: its colours, if it has some; of a field that moves, those at time 0.
+        motion: the velocity along which they ride, where one was learnt.
     """
 
     def __init__(
-        self, field: Field, reference: Callable[[], NDArray[np.float32]], texture: TextureField | None = None
+        self,
+        field: Field,
+        reference: Callable[[], NDArray[np.float32]],
+        texture: TextureField | None = None,
+        motion: VectorField | None = None,
     ) -> None:
         self._moments, self._load_reference, self._texture = Moments(field), reference, texture
+        self._motion = motion
 
     @property
     def colored(self) -> bool:
@@ -112,7 +119,7 @@ class Painter:
     @cached_property
     def _riding(self) -> RidingColors:
         assert self._texture is not None
-        return RidingColors(self._moments.field, self._texture)
+        return RidingColors(self._moments.field, self._texture, motion=self._motion)
 
     def _reference(self, look: Look) -> KDTree | None:
         return self._tree if look.shading == "error" else None

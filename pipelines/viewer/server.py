@@ -18,7 +18,9 @@ import torch
 from ...datasets.cameras import UP_AXES
 from ...datasets.clouds.reading import check_cloud_path
 from ...neural_fields import FieldLike, InputError, Similarity, TextureField, as_field, load_field
+from ...neural_fields.evolution import VectorField
 from ..run.folder import find_field, fitted_cloud
+from ..run.motion import load_motion
 from ..texture.riding import start_texture
 from .camera import first_eye
 from .client import Client, Shown
@@ -171,9 +173,10 @@ def open_run(
         except InputError as missing:
             say(str(missing))
     name = Path(run).resolve().stem if Path(run).is_dir() else path.stem
-    return show_field(
-        field, name=name, similarity=similarity, cloud=cloud, texture=start_texture(path, field), side=side
-    )
+    texture, motion = start_texture(path, field), load_motion(path)
+    if motion is not None:
+        motion = motion.to(field.like)
+    return show_field(field, name=name, similarity=similarity, cloud=cloud, texture=texture, motion=motion, side=side)
 
 
 def show_field(
@@ -183,13 +186,14 @@ def show_field(
     similarity: Similarity | None = None,
     cloud: Path | None = None,
     texture: TextureField | None = None,
+    motion: VectorField | None = None,
     side: int = 512,
     picks: Picks | None = None,
 ) -> Shown:
     """What a `Viewer` needs to show any field in three dimensions, or in space and time, such as one in a script."""
     field, similarity = as_field(field), similarity or Similarity.identity()
     shapes = Shapes(field, similarity, cloud=cloud)
-    return Shown(name, field, similarity, shapes, Painter(field, shapes.cloud, texture), side, picks)
+    return Shown(name, field, similarity, shapes, Painter(field, shapes.cloud, texture, motion), side, picks)
 
 
 def import_viser() -> Any:

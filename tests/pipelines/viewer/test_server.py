@@ -15,7 +15,9 @@ import pytest
 import torch
 from mplicits.datasets.cameras import look_at
 from mplicits.neural_fields import (
+    ColorSiren,
     InputError,
+    Keyframes,
     Moving,
     MultiscaleSDF,
     RigidMotion,
@@ -23,6 +25,7 @@ from mplicits.neural_fields import (
     Siren,
     SpaceTimeSDF,
     Sphere,
+    TextureField,
     TimeSlice,
     save_field,
 )
@@ -360,6 +363,19 @@ class Panel:
 
     def add_markdown(self, text):
         return self._add(text, None, content=text)
+
+
+def test_colours_of_a_motion_that_was_learnt_ride_along_it():
+    """A ball that turns about z, by a velocity beside its field, which itself stands still."""
+    still, turn = Sphere(radius=0.5), RigidMotion(angle=1.0)
+    texture = TextureField(still, ColorSiren(8, 1, omega=4.0), delta=0.1).requires_grad_(False)
+    painter = Painter(
+        Keyframes([0.0, 1.0], [still, still]), lambda: np.zeros((0, 3), np.float32), texture, turn.velocity
+    )
+    points = 0.5 * torch.nn.functional.normalize(torch.randn(50, 3), dim=1)
+    colors = painter._colors(replace(LOOK, time=1.0))
+    assert colors is not None
+    torch.testing.assert_close(colors(points), texture.colors(turn.inverse(points, 1.0)), atol=1e-4, rtol=0)
 
 
 def test_the_slice_slider_and_the_readout_are_in_the_same_units():
