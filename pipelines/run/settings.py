@@ -152,8 +152,8 @@ class ReconstructConfig(Settings):
         "multiscale", "multiscale (a coarse SIREN and residuals in bands) or neus (the 8 x 256 softplus network)"
     )
     widths: tuple[int, ...] = _per_level((128, 256), "neurons per layer, one number per level")
-    depths: tuple[int, ...] = _per_level((4, 5), "sine layers, one number per level")
-    omegas: tuple[float, ...] = _per_level((10.0, 25.0), "SIREN frequency of each level (Eq. 2)")
+    depths: tuple[int, ...] = _per_level((2, 3), "sine layers, one number per level")
+    omegas: tuple[float, ...] = _per_level((10.0, 30.0), "SIREN frequency of each level (Eq. 2)")
     starts: tuple[float, ...] = setting(
         (0.0, 0.25), "when each level is switched on, as shares of the training", per_level=True
     )
@@ -167,7 +167,7 @@ class ReconstructConfig(Settings):
     radius: float = setting(0.5, "of the sphere that the geometry begins as, in units of the region's radius", above=0)
     color_width: int = setting(256, "neurons per layer of the colour network", above=0)
     color_depth: int = setting(4, "layers of the colour network", above=0)
-    color_frequencies: int = setting(6, "octaves of the position that the colour network sees; NeuS has 0", at_least=0)
+    color_frequencies: int = setting(8, "octaves of the position that the colour network sees; NeuS has 0", at_least=0)
     background: Literal["auto", "black", "white", "outside"] = setting(
         "auto", "what is behind the object: black, white, or a learnt outside; auto is white with masks, else outside"
     )
@@ -185,7 +185,7 @@ class ReconstructConfig(Settings):
         500, "training steps of the texture of the finished surface; 0 leaves it uncoloured", at_least=0
     )
     learning_rate: float = setting(3e-4, "peak learning rate of the geometry", above=0)
-    color_rate: float = setting(6.0, "learning rate of the colours, in units of the geometry's", above=0)
+    color_rate: float = setting(12.0, "learning rate of the colours, in units of the geometry's", above=0)
     sharpening: float = setting(8.0, "learning rate of the surface's uncertainty, in units of the others'", above=0)
     eikonal_weight: float = setting(0.05, "weight of (|grad f| - 1)^2", at_least=0)
     mask_weight: float = setting(0.1, "weight of the masks' cross-entropy, where there are masks", at_least=0)

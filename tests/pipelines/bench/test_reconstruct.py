@@ -134,9 +134,9 @@ def test_rows(bench):
     assert timed.seconds >= neus.seconds
     assert neus.parameters == 529_076
     assert ours.parameters == timed.parameters == (4 * 16 + 17 * 5) + (4 * 24 + 25 * 5)
-    # NeuS's colours see 256 features and the bare position, ours 4 and six octaves.
+    # NeuS's colours see 256 features and the bare position, ours 4 and eight octaves.
     assert neus.color_parameters == (3 + 27 + 3 + 256 + 1) * 16 + 17 * 3
-    assert ours.color_parameters == (39 + 27 + 3 + 4 + 1) * 16 + 17 * 3
+    assert ours.color_parameters == (51 + 27 + 3 + 4 + 1) * 16 + 17 * 3
     for row in bench[2]:
         # Four rounds of one more sample; after the last one nobody asks for the values there.
         assert row.values_per_ray[0] == 4 + 3
