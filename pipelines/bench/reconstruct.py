@@ -174,6 +174,10 @@ class ReconstructBench(Benchmark[ReconstructRow]):
         write_picture(work.out / f"{scene.name}.png", common_sheet(there, self.views(scene)[1][:SHEET_VIEWS]))
         return [row]
 
+    def build(self, config: ReconstructConfig, *, has_masks: bool, views: int) -> SceneModel:
+        """An untrained scene; see `build_scene`."""
+        return build_scene(config, has_masks=has_masks, views=views)
+
     def trained(self, scene: BenchScene, kind: str, seconds: float | None, work: Workplace) -> ReconstructRow:
         """Train, measure, write pictures and the mesh."""
         config, similarity, device = self.config_of(kind), scene.images.similarity, choose_device(self.device)
@@ -181,7 +185,7 @@ class ReconstructBench(Benchmark[ReconstructRow]):
         report = work.progress or (lambda _: None)
         report(Progress(stage, 0, config.steps, 0.0, {}))
         pool, started = RayPool(train, similarity, device), time.perf_counter()
-        model = build_scene(config, has_masks=pool.has_masks, views=len(train)).to(device)
+        model = self.build(config, has_masks=pool.has_masks, views=len(train)).to(device)
         start_seconds = time.perf_counter() - started
 
         def told(progress: Progress) -> None:

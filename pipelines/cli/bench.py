@@ -366,6 +366,12 @@ def _reconstruct_arguments(parser: argparse.ArgumentParser) -> None:
     )
     _measured(parser, 256)
     _number(parser, "--neus-learning-rate", positive, 1e-3, "peak rate of the NeuS rows")
+    alone = parser.add_argument_group("the geometry alone")
+    about = "the same colour network, encodings and rates for the multiscale geometry, NeuS's and one SIREN of its size"
+    alone.add_argument("--geometry-only", action="store_true", help=about)
+    _number(alone, "--seeds", whole(2, 100), 3, "trainings of each geometry with each rate")
+    about = "peak rates that every geometry is trained with; its best one counts (--learning-rate)"
+    alone.add_argument("--rates", nargs="+", type=positive, metavar="RATE", help=about)
     add_flags(parser, "--json")
     add_settings(parser, ReconstructConfig, about="of all rows; the geometry is chosen by the benchmark")
 
@@ -373,6 +379,8 @@ def _reconstruct_arguments(parser: argparse.ArgumentParser) -> None:
 def _reconstruct(arguments: argparse.Namespace) -> int:
     if "geometry" in given_flags(arguments, ReconstructConfig):
         raise input_error("--geometry: the benchmark trains both; leave it out")
+    if arguments.rates and not arguments.geometry_only:
+        raise input_error("--rates: only --geometry-only tries several; add it, or give --learning-rate")
     config = read_settings(arguments, ReconstructConfig)
     if config.time_budget is not None:
         raise input_error("--time-budget: rows are compared after as many steps; leave it out, and give --steps")
@@ -385,10 +393,15 @@ def _reconstruct(arguments: argparse.Namespace) -> int:
             scenes.append(
                 read_scene(name, views=arguments.views, size=arguments.size, width=config.width, progress=progress)
             )
-    options = {
-        name: getattr(arguments, name) for name in ("equal_time", "test_views", "resolution", "neus_learning_rate")
-    }
+    options = {name: getattr(arguments, name) for name in ("test_views", "resolution")}
     options |= {"samples": arguments.eval_samples, "device": config.device}
+    if arguments.geometry_only:
+        from ..bench.geometries import GeometryBench
+
+        rates = tuple(dict.fromkeys(arguments.rates or (config.learning_rate,)))
+        alone = GeometryBench(scenes=scenes, config=config, rates=rates, seeds=arguments.seeds, **options)
+        return _run(arguments, [alone], out=arguments.out)
+    options |= {name: getattr(arguments, name) for name in ("equal_time", "neus_learning_rate")}
     return _run(arguments, [ReconstructBench(scenes=scenes, config=config, **options)], out=arguments.out)
 
 

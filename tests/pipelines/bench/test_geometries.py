@@ -1,0 +1,110 @@
+"""Geometries with the same colour network: what is equal, whose rate counts, and the intervals."""
+
+import dataclasses
+import statistics
+
+import pytest
+import torch
+from mplicits.neural_fields.baselines import NeusSDF
+from mplicits.pipelines.bench.cells import Workplace
+from mplicits.pipelines.bench.geometries import (
+    GEOMETRIES,
+    SINGLE,
+    GeometryBench,
+    GeometryRow,
+    best_trainings,
+    interval,
+    single_siren,
+)
+from mplicits.pipelines.bench.reconstruct import read_scene
+from mplicits.pipelines.bench.reconstruct_rows import MULTISCALE, NEUS, SurfaceFigures
+from mplicits.pipelines.cli.entry import main
+from mplicits.pipelines.reconstruct import model as module
+from mplicits.pipelines.reconstruct.model import build_scene
+from mplicits.pipelines.run.settings import ReconstructConfig
+from mplicits.pipelines.run.trainer import parameter_count
+
+TINY = ReconstructConfig(
+    widths=(16, 24), depths=(1, 1), omegas=(5.0, 10.0), features=4, color_width=16, color_depth=1, steps=2, rays=8,
+    uniform=4, importance=4, march_grid=4, test_every=3, start="sphere", device="cpu",
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def bench() -> GeometryBench:
+    scene = read_scene("painted-sphere", views=4, size=8)
+    return GeometryBench(scenes=[scene], config=TINY, rates=(3e-4, 1e-3), seeds=2, resolution=16, samples=500)
+
+
+@pytest.mark.parametrize(("widths", "depths"), [((128, 256), (4, 5)), ((32, 48), (2, 2)), ((16, 24), (1, 1))])
+def test_one_siren_is_as_large_as_all_levels(monkeypatch, widths, depths):
+    monkeypatch.setattr(module, "fit_sphere", lambda *_: None)
+    config = dataclasses.replace(ReconstructConfig(), widths=widths, depths=depths)
+    single = single_siren(config)
+    levels, one, wider = (
+        parameter_count(build_scene(each, has_masks=True).geometry)
+        for each in (config, single, dataclasses.replace(single, widths=(single.widths[0] + 1,)))
+    )
+    # Whole neurons: no other width comes nearer.
+    assert abs(one - levels) <= (wider - one) / 2 + single.widths[0]
+    assert single.omegas == (config.omegas[-1],)
+
+
+def test_colours_begin_alike_and_learn_at_one_rate(bench, monkeypatch):
+    monkeypatch.setattr(module, "fit_sphere", lambda *_: None)
+    weights, rates = [], set()
+    for geometry in GEOMETRIES:
+        for rate in bench.rates:
+            training = bench._training(bench.scenes[0], geometry, rate, seed=1)
+            config = training.config_of(geometry)
+            model = training.build(config, has_masks=True, views=3)
+            weights.append(torch.cat([p.detach().flatten() for p in model.color.parameters()]))
+            rates.add(round(config.learning_rate * config.color_rate, 12))
+            assert isinstance(model.geometry, NeusSDF) == (geometry == NEUS)
+            assert len(model.geometry.deltas) == (geometry == MULTISCALE)
+    assert all(torch.equal(weights[0], other) for other in weights)
+    assert rates == {round(TINY.learning_rate * TINY.color_rate, 12)}
+
+
+def test_the_interval_is_students():
+    # t of 95 % and two degrees of freedom is 4.30265; the spread of 1, 2, 3 is 1.
+    assert interval([1.0, 2.0, 3.0]).mean == 2
+    assert interval([1.0, 2.0, 3.0]).half == pytest.approx(4.30265 / 3**0.5, rel=1e-5)
+    with pytest.raises(statistics.StatisticsError):
+        interval([1.0])
+
+
+def test_the_best_rate_of_each_counts_and_gains_are_paired(bench, tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "fit_sphere", lambda *_: None)
+    first = bench.run(bench.cells()[0], Workplace(tmp_path, "one"))
+    row = bench.read([{"outputs": list(first.outputs)}])[0]
+    assert (row.geometry, row.rate, row.seed, row.result.steps) == (MULTISCALE, 3e-4, 0, 2)
+
+    def scored(geometry: str, rate: float, seed: int, psnr: float) -> GeometryRow:
+        surface = SurfaceFigures(3e-3, 1e-4, 2e-3, 0.9, 0.5, 2)
+        result = dataclasses.replace(row.result, psnr=psnr, kind=geometry, surface=surface)
+        return GeometryRow(geometry, rate, seed, result)
+
+    rows = [scored(MULTISCALE, rate, seed, 20 + seed) for rate in (3e-4,) for seed in (0, 1)]
+    rows += [scored(NEUS, 3e-4, seed, 10) for seed in (0, 1)]
+    rows += [scored(NEUS, 1e-3, seed, 18 + seed) for seed in (0, 1)]
+    rows += [scored(SINGLE, 3e-4, seed, 19 + 3 * seed) for seed in (0, 1)]
+    rows += [scored(SINGLE, 1e-3, 0, 40)]  # not as often as the other rate so far
+    best = best_trainings(rows)
+    assert [best["painted-sphere", geometry][0].rate for geometry in GEOMETRIES] == [3e-4, 1e-3, 3e-4]
+    table, gains = bench.tables(rows, sgemm=1.0)
+    assert table.rows[0].values[4] == "20.50 ± 6.35"  # t is 12.7062 with one degree of freedom
+    assert table.rows[0].values[6:8] == ("2.00 ± 0.00", "60.00 ± 0.00")  # thousandths, and arccos 0.5
+    assert [line.values for line in gains.rows] == [(2, "+2.00 ± 0.00", "2 better"), (2, "+0.00 ± 12.71", "1 better")]
+
+
+def test_cells_are_whole_seeds_first(bench):
+    cells = [cell.parameters for cell in bench.cells()]
+    assert len(cells) == 2 * 2 * 3
+    assert [one["seed"] for one in cells] == 6 * [0] + 6 * [1]
+    assert {one["geometry"] for one in cells[:3]} == set(GEOMETRIES)
+
+
+def test_rates_without_the_geometry_alone_are_refused(capsys):
+    assert main(["bench", "reconstruct", "figure", "--rates", "1e-3"]) == 2
+    assert "--rates: only --geometry-only tries several" in capsys.readouterr().err
