@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from ._checks import at_least
 from .field import Jet
+from .hash_encoding import HashEncoding
 
 __all__ = ["Outside", "ViewColor", "encode", "encoded_size"]
 
@@ -36,6 +37,7 @@ class ViewColor(nn.Module):
         depth: hidden layers.
         view_frequencies: octaves of the direction's encoding.
         point_frequencies: octaves of the position's encoding; NeuS has 0 and leaves detail to the features.
+        grid: a learnt encoding of the position beside it, which becomes a part of this module; None for none.
 
     Raises:
         ValueError: an argument is out of range.
@@ -56,13 +58,16 @@ class ViewColor(nn.Module):
         depth: int = 4,
         view_frequencies: int = 4,
         point_frequencies: int = 0,
+        grid: HashEncoding | None = None,
     ) -> None:
         super().__init__()
         at_least(1, width=width, depth=depth)
         at_least(0, num_features=num_features, view_frequencies=view_frequencies, point_frequencies=point_frequencies)
         self.num_features, self.width, self.depth = num_features, width, depth
         self.view_frequencies, self.point_frequencies = view_frequencies, point_frequencies
+        self.grid = grid
         inputs = encoded_size(3, point_frequencies) + encoded_size(3, view_frequencies) + 3 + num_features
+        inputs += 0 if grid is None else grid.size
         self.layers = nn.ModuleList(_relu_layers([inputs, *[width] * depth, 3]))
 
     def forward(self, x: Tensor, direction: Tensor, jet: Jet) -> Tensor:
@@ -79,7 +84,9 @@ class ViewColor(nn.Module):
         if jet.features.shape[-1] != self.num_features:
             raise ValueError(f"jet.features: {jet.features.shape[-1]} of them; expected {self.num_features}")
         normal = nn.functional.normalize(jet.gradient, dim=-1)
-        inputs = (encode(x, self.point_frequencies), encode(direction, self.view_frequencies), normal, jet.features)
+        inputs = [encode(x, self.point_frequencies), encode(direction, self.view_frequencies), normal, jet.features]
+        if self.grid is not None:
+            inputs.append(self.grid(x))
         return _relu_network(torch.cat(inputs, dim=-1), self.layers).sigmoid()
 
 
@@ -91,15 +98,25 @@ class Outside(nn.Module):
         depth: hidden layers.
         point_frequencies: octaves of the encoding of (x/r, 1/r).
         view_frequencies: octaves of the encoding of the direction.
+        grid: a learnt encoding beside that of (x/r, 1/r), which becomes a part of this module; None for none. It is
+            asked at (2 − 1/r) x/r, the ball of radius 2 into which mip-NeRF 360 contracts space.
     """
 
     def __init__(
-        self, *, width: int = 128, depth: int = 4, point_frequencies: int = 8, view_frequencies: int = 4
+        self,
+        *,
+        width: int = 128,
+        depth: int = 4,
+        point_frequencies: int = 8,
+        view_frequencies: int = 4,
+        grid: HashEncoding | None = None,
     ) -> None:
         super().__init__()
         self.width, self.depth = width, depth
         self.point_frequencies, self.view_frequencies = point_frequencies, view_frequencies
-        self.trunk = nn.ModuleList(_relu_layers([encoded_size(4, point_frequencies), *[width] * depth, 1 + width]))
+        self.grid = grid
+        inputs = encoded_size(4, point_frequencies) + (0 if grid is None else grid.size)
+        self.trunk = nn.ModuleList(_relu_layers([inputs, *[width] * depth, 1 + width]))
         self.head = nn.ModuleList(_relu_layers([width + encoded_size(3, view_frequencies), width // 2, 3]))
 
     def forward(self, inverted: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
@@ -109,7 +126,11 @@ class Outside(nn.Module):
             inverted: ``(..., 4)``, of `volume.invert_outside`.
             direction: ``(..., 3)`` unit vectors.
         """
-        hidden = _relu_network(encode(inverted, self.point_frequencies), self.trunk)
+        inputs = encode(inverted, self.point_frequencies)
+        if self.grid is not None:
+            contracted = (2 - inverted[..., 3:]) * inverted[..., :3]
+            inputs = torch.cat((inputs, self.grid(contracted)), dim=-1)
+        hidden = _relu_network(inputs, self.trunk)
         density = nn.functional.softplus(hidden[..., 0] - 1)
         seen = _relu_network(torch.cat((hidden[..., 1:], encode(direction, self.view_frequencies)), dim=-1), self.head)
         return density, seen.sigmoid()

@@ -135,8 +135,8 @@ def render_volume(
         level: level of the field to render.
         background: ``(3,)`` or ``(R, 3)`` colour of what light passes the sphere; None is black.
         outside: what is behind the sphere; ``background`` is then behind that.
-        least_weight: no colour is asked for samples of a smaller weight; a pixel's error is at most
-            ``least_weight`` times the number of its samples.
+        least_weight: no colour is asked for samples of a smaller weight, nor what is outside of rays of which less
+            light is left; a pixel's error is at most ``least_weight`` times the number of its samples and one.
         skip: sections whose weight is estimated to be smaller, from values of the coarsest level at their ends, get no
             jet and stop no light; 0 evaluates all. The neighbours of kept sections are kept, and of each ray the
             section in which the field is smallest. Where the skipped sections of a ray had the weights w in the full
@@ -201,9 +201,15 @@ def render_volume(
     weights, remaining = transmittance_weights(in_place(optical))
     seen = in_place(_colors(color, points, along, found, of_sections(weights), least_weight))
     mixed = composite(weights, seen)
-    behind = _behind(outside, origins, directions, far, sampling, background, generator)
-    if behind is not None:
-        mixed = mixed + remaining[:, None] * behind
+    if outside is not None:
+        # As for colours: where next to no light gets there, nobody asks what is there.
+        through = (remaining.detach() > least_weight).nonzero()[:, 0]
+        eyes, along, ends = origins[through], directions[through], far[through]
+        last = background if background is None or background.ndim == 1 else background[through]
+        behind = _behind(outside, eyes, along, ends, sampling, last, generator)
+        mixed = mixed.index_add(0, through, remaining[through, None] * behind)
+    elif background is not None:
+        mixed = mixed + remaining[:, None] * background
     jet = Jet(*(in_place(part) for part in found))
     normals = torch.nn.functional.normalize(jet.gradient, dim=-1)
     return Rendered(
@@ -291,17 +297,15 @@ def _colors(color: RayColor, points: Tensor, along: Tensor, jet: Jet, weights: T
 
 
 def _behind(
-    outside: RayOutside | None,
+    outside: RayOutside,
     origins: Tensor,
     directions: Tensor,
     far: Tensor,
     sampling: Sampling,
     background: Tensor | None,
     generator: torch.Generator | None,
-) -> Tensor | None:
-    """The colour ``(R, 3)`` of what lies behind the unit sphere, or None for black."""
-    if outside is None:
-        return background
+) -> Tensor:
+    """The colour ``(R, 3)`` of what lies behind the unit sphere."""
     # A ray that misses the sphere begins to see the outside where it is nearest to the centre.
     nearest = torch.maximum(far, -(origins * directions).sum(dim=-1))
     depths = outside_depths(nearest, sampling.outside, generator=generator)

@@ -1,6 +1,7 @@
 """Device and dtype fixtures. A stand-in takes the place of a GPU, and CUDA comes beside it where there is one."""
 
 import os
+import signal
 from importlib.util import find_spec
 
 import pytest
@@ -10,6 +11,10 @@ import torch
 if not torch.cuda.is_available():
     # Before Triton is imported by anything: its kernels run by its interpreter then, where a test asks for them.
     os.environ["TRITON_INTERPRET"] = "1"
+
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    # So a shell starts what is in the background. Tests send Ctrl-C to themselves and to children, which inherit this.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 ACCELERATORS = [standin.NAME, *(["cuda"] if torch.cuda.is_available() else [])]
 

@@ -45,7 +45,8 @@ EVOLVE = (
 TEXTURE = "--width 8 --depth 1 --steps 80 --batch 64 --band-batch 32 --samples 400 --device cpu --quiet"
 RECONSTRUCT = (
     "--steps 60 --widths 8 8 --depths 1 1 --omegas 5 10 --texture-steps 20 --test-every 4 --width 24 "
-    "--features 4 --color-width 8 --color-depth 1 --rays 16 --uniform 8 --importance 4 --device cpu --quiet"
+    "--features 4 --color-width 8 --color-depth 1 --color-grid 8 --rays 16 --uniform 8 --importance 4 --device cpu "
+    "--quiet"
 )
 COMMANDS = ("fit", "texture", "reconstruct", "evolve", "bench")
 

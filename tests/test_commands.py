@@ -49,8 +49,8 @@ EVOLVE = (
 )
 FEW = "{widths: [16], depths: [1], omegas: [5], steps: [20], learning_rates: [1.0e-2], batch: 128, samples: 500}"
 RECONSTRUCT = (
-    "--widths 16 16 --depths 1 1 --color-width 16 --color-depth 1 --steps 3 --rays 16 --uniform 8 --importance 4"
-    " --texture-steps 2 --width 16 --march-grid 12"
+    "--widths 16 16 --depths 1 1 --color-width 16 --color-depth 1 --color-grid 8 --steps 3 --rays 16 --uniform 8"
+    " --importance 4 --texture-steps 2 --width 16 --march-grid 12"
 )
 TEXTURE = "--width 16 --depth 1 --steps 5 --batch 64 --band-batch 64 --samples 500"
 SMALLEST = {  # by what a line begins with, or holds

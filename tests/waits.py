@@ -30,7 +30,9 @@ from torch import Tensor
 DEVICE = torch.device(standin.NAME)
 FIT = "--widths 16 16 16 --depths 1 1 1 --omegas 5 10 20 --steps 40 20 20 --learning-rates 1e-2 1e-3 1e-3"
 FIT += " --batch 128 --samples 500 --quiet"
-RECONSTRUCT = "--widths 16 16 --depths 1 1 --color-width 16 --color-depth 1 --steps 20 --rays 16 --uniform 8"
+RECONSTRUCT = (
+    "--widths 16 16 --depths 1 1 --color-width 16 --color-depth 1 --color-grid 8 --steps 20 --rays 16 --uniform 8"
+)
 RECONSTRUCT += " --importance 4 --texture-steps 20 --quiet"
 
 

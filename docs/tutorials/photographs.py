@@ -30,7 +30,8 @@ else:
 # --- Training -------------------------------------------------------------------------------------------
 if small:
     config = ReconstructConfig(
-        widths=(32, 32), depths=(2, 2), omegas=(5.0, 10.0), color_width=32, color_depth=1, steps=20, rays=64,
+        widths=(32, 32), depths=(2, 2), omegas=(5.0, 10.0), color_width=32, color_depth=1, color_grid=8,
+        steps=20, rays=64,
         uniform=16, importance=8, texture_steps=10, test_every=3,
     )  # fmt: skip
 else:

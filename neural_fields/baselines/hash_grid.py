@@ -1,13 +1,11 @@
 """Instant-NGP's multiresolution hash encoding with its small network (Müller et al. 2022), in plain PyTorch.
 
-Every level is a grid whose vertices own entries of a table: one each where the grid fits into the table (Sec. 3), or
-else the one that a spatial hash says (Eq. 4), which they share. Entries are interpolated, those of all levels joined,
-and a small network reads them.
+What `HashEncoding` says of grids and tables holds here too; a small network reads the features of all levels, and both
+have derivatives in closed form.
 """
 
 from __future__ import annotations
 
-import math
 from itertools import pairwise
 
 import torch
@@ -15,30 +13,10 @@ from torch import Tensor, nn
 
 from .._checks import at_least, positive
 from ..field import Jet, OneLevelField
+from ..hash_encoding import INITIAL, check_table, grid_resolutions, spatial_hash
 from ._trilinear import Place, interpolate, interpolate_jet, locate, vertices
 
-__all__ = ["HashGridSDF", "grid_resolutions", "spatial_hash"]
-
-# The factors of Eq. 4; the first is 1 so that neighbours along x stay neighbours in memory.
-PRIMES = (1, 2_654_435_761, 805_459_861)
-INITIAL = 1e-4  # entries begin uniform in ±INITIAL (Sec. 4)
-
-
-def grid_resolutions(levels: int, coarsest: int, finest: int) -> list[int]:
-    """Cells along a side on each level, ``⌊N_min bˡ⌋`` with ``b = (N_max / N_min)^(1 / (L − 1))`` (Eqs. 2 and 3).
-
-    Example:
-        >>> grid_resolutions(4, 16, 128)
-        [16, 32, 64, 128]
-    """
-    growth = (finest / coarsest) ** (1 / max(1, levels - 1))
-    # A power that should be whole may come out a rounding error below.
-    return [math.floor(coarsest * growth**level * (1 + 1e-12)) for level in range(levels)]
-
-
-def spatial_hash(x: Tensor, y: Tensor, z: Tensor, size: int) -> Tensor:
-    """``(x π₁ ⊕ y π₂ ⊕ z π₃) mod T`` (Eq. 4) of whole coordinates that broadcast; ``size`` is T, a power of two."""
-    return (x * PRIMES[0] ^ y * PRIMES[1] ^ z * PRIMES[2]) & (size - 1)
+__all__ = ["HashGridSDF"]
 
 
 class HashGridSDF(OneLevelField):
@@ -84,10 +62,7 @@ class HashGridSDF(OneLevelField):
     ) -> None:
         super().__init__()
         at_least(1, levels=levels, features=features, width=width, depth=depth)
-        if table_size < 1 or table_size & (table_size - 1):
-            raise ValueError(f"table_size={table_size}: expected a power of two")
-        if not 1 <= coarsest <= finest:
-            raise ValueError(f"coarsest={coarsest}, finest={finest}: expected 1 ≤ coarsest ≤ finest")
+        check_table(table_size, coarsest, finest)
         positive(extent=extent)
         self.table_size, self.extent, self.radius = table_size, float(extent), radius
         self.resolutions = grid_resolutions(levels, coarsest, finest)

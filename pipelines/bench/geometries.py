@@ -17,7 +17,7 @@ from ..run.settings import ReconstructConfig
 from ..run.trainer import seeded
 from .benchmark import Benchmark, Part, one_of_each, plain
 from .cells import Workplace
-from .reconstruct import UNUSED, BenchScene, ReconstructBench
+from .reconstruct import ALIKE, UNUSED, BenchScene, ReconstructBench
 from .reconstruct_rows import MULTISCALE, NEUS, ReconstructRow
 from .tables import Column, Figure, Table, tabulated
 
@@ -25,6 +25,7 @@ __all__ = ["GEOMETRIES", "SINGLE", "GeometryBench", "GeometryRow", "Interval", "
 
 SINGLE = "single"
 GEOMETRIES = (MULTISCALE, NEUS, SINGLE)
+FACTORS = ("color_rate", "sharpening")  # rates in units of the geometry's
 APART = (*UNUSED, "seed", "learning_rate")  # settings that are in the cells, or change no row
 
 
@@ -103,8 +104,9 @@ class _Training(ReconstructBench):
     geometry: str
 
     def config_of(self, kind: str) -> ReconstructConfig:
-        """The settings as they are, but for the levels."""
-        return single_siren(self.config) if self.geometry == SINGLE else self.config
+        """The settings as they are, but for the levels, and with the same rays for all."""
+        config = dataclasses.replace(self.config, **ALIKE)
+        return single_siren(config) if self.geometry == SINGLE else config
 
     def build(self, config: ReconstructConfig, *, has_masks: bool, views: int) -> SceneModel:
         """The multiscale scene, with the geometry exchanged."""
@@ -128,7 +130,8 @@ class GeometryBench(Benchmark[GeometryRow]):
     Attributes:
         scenes: of different names.
         config: settings of all rows; seed and learning rate are chosen here.
-        rates: peak learning rates of the geometry; that of colours stays ``color_rate · learning_rate`` of the config.
+        rates: peak learning rates of the geometry; those of colours and uncertainty stay ``color_rate · learning_rate``
+            and ``sharpening · learning_rate`` of the config.
         seeds: 0, 1, … below it, two at least.
         test_views: at most so many of the held-out views are measured, evenly chosen.
         resolution: of the marching cubes, of the exact surface as well.
@@ -163,12 +166,12 @@ class GeometryBench(Benchmark[GeometryRow]):
     def settings(self, cell: Part) -> Mapping[str, Any]:
         """See `Benchmark.settings`; with the rate of the colours, which the cell's own does not change."""
         config = {name: value for name, value in plain(self.config).items() if name not in APART}
-        colors = self.config.color_rate * self.config.learning_rate
-        return {**super().settings(cell), "config": config, "colors": colors}
+        fixed = {name: self.config.learning_rate * getattr(self.config, name) for name in FACTORS}
+        return {**super().settings(cell), "config": config, "rates": fixed}
 
     def _training(self, scene: BenchScene, geometry: str, rate: float, seed: int) -> _Training:
-        colors = self.config.color_rate * self.config.learning_rate / rate
-        changes = {"geometry": "multiscale", "seed": seed, "learning_rate": rate, "color_rate": colors}
+        fixed = {name: self.config.learning_rate / rate * getattr(self.config, name) for name in FACTORS}
+        changes = {"geometry": "multiscale", "seed": seed, "learning_rate": rate, **fixed}
         names = ("test_views", "resolution", "samples", "device")
         options: dict[str, Any] = {name: getattr(self, name) for name in names}
         config = dataclasses.replace(self.config, **changes)

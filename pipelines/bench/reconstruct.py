@@ -49,6 +49,7 @@ __all__ = ["BenchScene", "ReconstructBench", "common_sheet", "read_scene", "row_
 SHEET_VIEWS = 4  # rows of a sheet of held-out views
 COMMON_VIEWS = 2  # on the sheet of all rows
 UNUSED = ("texture_steps", "time_budget", "device", "width")  # settings that change no row of one data set
+ALIKE: Mapping[str, Any] = {"jets": 0, "focus": 0.0}  # or each network would have rays of its own
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,11 +129,12 @@ class ReconstructBench(Benchmark[ReconstructRow]):
         return Part(self.name, f"{scene.name}, {kind}", options=(*what, ("views", len(self.views(scene)[1]))))
 
     def config_of(self, kind: str) -> ReconstructConfig:
-        """The settings of a row."""
+        """The settings of a row; all of them see the same rays."""
         if kind != NEUS:
-            return dataclasses.replace(self.config, geometry="multiscale")
+            return dataclasses.replace(self.config, geometry="multiscale", **ALIKE)
         rates = {"learning_rate": self.neus_learning_rate, "color_rate": 1.0}
-        return dataclasses.replace(self.config, geometry="neus", color_frequencies=0, **rates)
+        colors = {"color_width": 256, "color_depth": 4, "color_frequencies": 0, "color_grid": 0}
+        return dataclasses.replace(self.config, geometry="neus", **ALIKE, **colors, **rates)
 
     def settings(self, cell: Part) -> Mapping[str, Any]:
         """See `Benchmark.settings`; of the row's own settings those that change it."""

@@ -13,12 +13,14 @@ from ...datasets.views.images import PosedImage
 from ...neural_fields import Field, InputError, Jet, MultiscaleSDF, Similarity, Siren
 from ...neural_fields.baselines import NeusSDF
 from ...neural_fields.devices import precise, upload
+from ...neural_fields.hash_encoding import HashEncoding
 from ...neural_fields.radiance import Outside, ViewColor
 from ...neural_fields.sphere_start import fit_sphere
 from ...neural_fields.volume import sphere_span
 from ...neural_fields.volume_renderer import Rendered, Sampling, render_volume
 from ..run.settings import ReconstructConfig
 from ..run.trainer import seeded
+from .focus import Focus
 
 __all__ = ["Exposures", "PoseCorrections", "RayPool", "Rays", "SceneModel", "build_scene", "camera_rays"]
 
@@ -187,13 +189,20 @@ def build_scene(config: ReconstructConfig, *, has_masks: bool, views: int = 0) -
             base = geometry.base
             assert isinstance(base, Siren)
             fit_sphere(base, config.radius)
+        finest = config.color_grid
         color = ViewColor(
             features,
             width=config.color_width,
             depth=config.color_depth,
             point_frequencies=config.color_frequencies,
+            grid=HashEncoding(coarsest=min(16, finest), finest=finest) if finest else None,
         )
-        outside = Outside() if background == "outside" else None
+        outside = None
+        if background == "outside" and finest:
+            around = HashEncoding(coarsest=min(16, finest), finest=finest, extent=2.0)
+            outside = Outside(width=64, depth=2, point_frequencies=4, grid=around)
+        elif background == "outside":
+            outside = Outside()
     exposures = Exposures(views) if config.exposure == "affine" else None
     poses = PoseCorrections(views) if config.cameras == "refined" else None
     return SceneModel(geometry, color, outside, torch.full((3,), float(background == "white")), exposures, poses)
@@ -208,6 +217,7 @@ class Rays(NamedTuple):
         color: ``(R, 3)`` display RGB in [0, 1].
         mask: ``(R,)`` how much of the pixel is object; 1 everywhere if nobody said.
         view: ``(R,)`` number of the picture.
+        row: ``(R,)`` number of the pixel in the pool.
     """
 
     origins: Tensor
@@ -215,6 +225,7 @@ class Rays(NamedTuple):
     color: Tensor
     mask: Tensor
     view: Tensor
+    row: Tensor
 
 
 def camera_rays(view: PosedImage, similarity: Similarity) -> tuple[Tensor, Tensor]:
@@ -264,9 +275,11 @@ class RayPool:
     def __len__(self) -> int:
         return len(self.pixels)
 
-    def draw(self, count: int, generator: torch.Generator) -> Rays:
-        """``count`` rays at random, with replacement."""
-        rows = torch.randint(len(self), (count,), generator=generator)
+    def draw(self, count: int, generator: torch.Generator, focus: Focus | None = None) -> Rays:
+        """``count`` rays at random, with replacement; ``focus`` says where, if not anywhere."""
+        rows = (
+            torch.randint(len(self), (count,), generator=generator) if focus is None else focus.rows(count, generator)
+        )
         rows = upload(rows, self.device)
         view, pixel = self.owners[rows].long(), self.pixels[rows].long()
         fx, fy, cx, cy = self.lens[view].unbind(dim=1)
@@ -274,7 +287,7 @@ class RayPool:
         seen = torch.stack(((x - cx) / fx, (y - cy) / fy, torch.ones_like(fx)), dim=1)
         directions = torch.nn.functional.normalize(torch.einsum("rij,rj->ri", self.axes[view], seen), dim=1)
         mask = torch.ones(count, device=self.device) if self.masks is None else self.masks[rows] / 255
-        return Rays(self.eyes[view], directions, self.colors[rows] / 255, mask, view)
+        return Rays(self.eyes[view], directions, self.colors[rows] / 255, mask, view, rows)
 
 
 def _bytes(numbers: np.ndarray) -> Tensor:

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
+from ...neural_fields.hash_encoding import HashEncoding
 from ...neural_fields.losses import eikonal_loss
 from ...neural_fields.value_grid import ValueGrid
 from ...neural_fields.volume_renderer import Sampling
 from ..run.settings import ReconstructConfig
 from ..run.trainer import Group, Objective, Trainer, warm_cosine
+from .focus import Focus
 from .model import RayPool, SceneModel
 
 # Steps between two looks at the surface's surroundings, and such looks between two at everything.
 NEAR_EVERY, WHOLE_EVERY = 16, 8
+LEAST_SHARE = 0.25  # of the rays of a step, however many sections they have
 POSES_FROM = 0.1  # share of the training after which cameras are moved
 
 __all__ = ["SceneObjective", "scene_trainer"]
@@ -30,18 +35,24 @@ class SceneObjective(Objective):
 
     def __init__(self, model: SceneModel, pool: RayPool, config: ReconstructConfig) -> None:
         rate = warm_cosine(config.learning_rate)
+        grid = [part.table for part in model.modules() if isinstance(part, HashEncoding)]
         parts = [part for part in (model.color, model.outside, model.exposures) if part is not None]
-        colors = [parameter for part in parts for parameter in part.parameters()]
+        colors = [p for part in parts for p in part.parameters() if all(p is not entries for entries in grid)]
         groups = [
             Group(list(model.geometry.parameters()), rate),
             Group(colors, lambda done: config.color_rate * rate(done)),
             Group([model.variance], lambda done: config.sharpening * rate(done)),
         ]
+        if grid:
+            groups.append(Group(grid, lambda done: config.grid_rate * config.color_rate * rate(done)))
         if model.poses is not None:  # not before there is something to be compared with
             groups.append(Group(list(model.poses.parameters()), lambda done: rate(done) if done > POSES_FROM else 0.0))
         super().__init__(model, groups, torch.Generator().manual_seed(config.seed))
         self.model, self.pool, self.config = model, pool, config
         self.sampling = Sampling(uniform=config.uniform, importance=config.importance)
+        self.kept["sections"] = torch.zeros(())  # of a ray that are evaluated, as of late; on the CPU, which reads it
+        self.focus = Focus(len(pool), config.focus, pool.device)
+        self.kept |= {"errors": self.focus.errors, "bounds": self.focus.bounds}
         self.grid = ValueGrid(config.march_grid, pool.device) if config.march_grid else None
         if self.grid is not None:
             self.kept["march"] = self.grid.kept
@@ -60,11 +71,27 @@ class SceneObjective(Objective):
             self.grid.refresh(self.model.geometry, whole=step % (NEAR_EVERY * WHOLE_EVERY) == 0)
         return self.grid
 
+    def watch(self, step: int) -> Focus:
+        """What says where to draw pixels, brought up to date now and then."""
+        self.focus.errors, self.focus.bounds = self.kept["errors"], self.kept["bounds"]  # of a run which is resumed
+        if step % NEAR_EVERY == 0:
+            self.focus.refresh()
+            self.kept["bounds"] = self.focus.bounds
+        return self.focus
+
+    def batch(self) -> int:
+        """Rays of the next step: fewer while their sections are many, as they are while the surface is unsure."""
+        rays, jets = self.config.rays, self.config.jets
+        if not jets:
+            return rays
+        sections = float(self.kept["sections"])
+        return min(max(round(jets / sections) if sections else 0, math.ceil(LEAST_SHARE * rays)), rays)
+
     def losses(self, step: int, done: float) -> tuple[dict[str, Tensor], Tensor]:
         """See `Objective.losses`."""
         config = self.config
         self.model.widen(config.band, config.least_delta)
-        rays = self.pool.draw(config.rays, self.generator)
+        rays = self.pool.draw(self.batch(), self.generator, self.watch(step))
         origins, directions = rays.origins, rays.directions
         if self.model.poses is not None:
             origins, directions = self.model.poses.moved(origins, directions, rays.view)
@@ -80,10 +107,14 @@ class SceneObjective(Objective):
             guide=self.look(step),
             generator=self.generator,
         )
+        if (step + 1) % NEAR_EVERY == 0:
+            self.kept["sections"] = ((seen.counts > 0).sum() / len(origins)).cpu()
         target = rays.color
         if self.pool.has_masks:
             target = torch.lerp(self.model.background.expand_as(target), target, rays.mask[:, None])
-        color = (self.model.photographed(seen, rays.view) - target).abs().mean()
+        wrong = (self.model.photographed(seen, rays.view) - target).abs().mean(dim=1)
+        self.focus.learn(rays.row, wrong.detach())
+        color = wrong.mean()
         # A mean over all sections, those that were skipped included: some of them stand for the others.
         eikonal = (seen.counts * eikonal_loss(seen.jet.gradient)).mean()
         terms = {"color": color, "eikonal": eikonal}

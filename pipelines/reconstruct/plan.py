@@ -21,6 +21,7 @@ IN_BAND, COLOURED, MET = 0.4, 0.6, 0.8
 # Where sections are skipped: those that are left.
 EVALUATED = 0.2
 NEUS = Net(parameters=459_000, neurons=2048)  # its 8 layers of 256
+GRID = Net(parameters=6_000, neurons=256)  # as long as looking up the hash encoding takes
 MESHED = 128  # cells along the mesh whose points are coloured
 
 
@@ -119,4 +120,7 @@ class ReconstructPlan:
 
     def _color(self) -> Net:
         width, depth = self.config.color_width, self.config.color_depth
-        return Net(parameters=width * (width * (depth - 1) + 100), neurons=width * depth)
+        grid = GRID if self.config.color_grid else Net(0, 0)
+        return Net(
+            parameters=grid.parameters + width * (width * (depth - 1) + 100), neurons=grid.neurons + width * depth
+        )

@@ -34,7 +34,7 @@ from .hull import begin
 from .model import RayPool, SceneModel, build_scene
 from .objective import scene_trainer
 from .plan import SPHERE, ReconstructPlan, level_stage
-from .views import ViewImage, comparison_sheet, exposed_as, held_out, measure, render_image, spread
+from .views import ViewImage, comparison_sheet, exposed_as, held_out, measure, reduced, render_image, spread
 
 __all__ = [
     "HELD_OUT_FILE",
@@ -50,6 +50,7 @@ HELD_OUT_FILE = "held_out.png"
 PREVIEW_FILE = "preview.png"
 MESH_FILE = "mesh.ply"  # that the command makes of a finished run
 PREVIEWS = 5  # pictures of the first view on the way
+PREVIEW_PIXELS = 4096  # of each: through fog, which a scene is at first, every pixel costs as much as one in training
 SHEET_VIEWS = 4  # rows of the sheet of held-out views
 TEXTURE_RESOLUTION = 128  # of the mesh whose points are coloured: finer than the texture's band is wide
 TEXTURE_SAMPLES = 100_000
@@ -202,7 +203,7 @@ class _Reconstruction:
         done = progress.fraction
         if self.folder.out is not None and done * (PREVIEWS + 1) >= self.shown + 1 and done < 1:
             self.shown = int(done * (PREVIEWS + 1))
-            view = (self.test_views or self.train_views)[0]
+            view = reduced((self.test_views or self.train_views)[0], PREVIEW_PIXELS)
             if not self.folder.has_checkpoint:  # or the picture would lie beside the run that was there
                 self._save()
             write_picture(self.folder.out / PREVIEW_FILE, self._sheet([(view, self._image(view))]))

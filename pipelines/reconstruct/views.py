@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -11,13 +13,24 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ...datasets.views.images import PosedImage
+from ...datasets.views.pictures import resample, shrink
 from ...neural_fields import Similarity
 from ...neural_fields.volume import sphere_span
 from ...neural_fields.volume_renderer import Sampling
 from ..render.picture import Image, stacked
 from .model import SceneModel, camera_rays
 
-__all__ = ["ViewImage", "comparison_sheet", "exposed_as", "held_out", "measure", "render_image", "spread", "target_of"]
+__all__ = [
+    "ViewImage",
+    "comparison_sheet",
+    "exposed_as",
+    "held_out",
+    "measure",
+    "reduced",
+    "render_image",
+    "spread",
+    "target_of",
+]
 
 Float32 = NDArray[np.float32]
 
@@ -114,6 +127,18 @@ def spread(views: Sequence[PosedImage]) -> list[PosedImage]:
     """The views in an order whose first few, however many, are spread over all of them."""
     order = sorted(range(len(views)), key=lambda index: index * GOLDEN % 1)
     return [views[index] for index in order]
+
+
+def reduced(view: PosedImage, pixels: int) -> PosedImage:
+    """A view in about so many pixels, in linear light; as it is, if it has no more."""
+    camera = view.camera
+    share = math.sqrt(pixels / (camera.width * camera.height))
+    if share >= 1:
+        return view
+    small = camera.resized(max(1, round(share * camera.width)), max(1, round(share * camera.height)))
+    step = partial(shrink, width=small.width, height=small.height)
+    mask = None if view.mask is None else step(view.mask)
+    return PosedImage(view.name, small, resample(view.color, None, step)[0], mask)
 
 
 def target_of(view: PosedImage, background: Tensor) -> Float32:

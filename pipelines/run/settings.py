@@ -152,7 +152,7 @@ class ReconstructConfig(Settings):
         "multiscale", "multiscale (a coarse SIREN and residuals in bands) or neus (the 8 x 256 softplus network)"
     )
     widths: tuple[int, ...] = _per_level((128, 256), "neurons per layer, one number per level")
-    depths: tuple[int, ...] = _per_level((2, 3), "sine layers, one number per level")
+    depths: tuple[int, ...] = _per_level((4, 3), "sine layers, one number per level")
     omegas: tuple[float, ...] = _per_level((10.0, 30.0), "SIREN frequency of each level (Eq. 2)")
     starts: tuple[float, ...] = setting(
         (0.0, 0.25), "when each level is switched on, as shares of the training", per_level=True
@@ -165,9 +165,12 @@ class ReconstructConfig(Settings):
         "auto", "what the geometry begins as: hull (of the masks) or sphere; auto is hull where masks give one"
     )
     radius: float = setting(0.5, "of the sphere that the geometry begins as, in units of the region's radius", above=0)
-    color_width: int = setting(256, "neurons per layer of the colour network", above=0)
-    color_depth: int = setting(4, "layers of the colour network", above=0)
-    color_frequencies: int = setting(8, "octaves of the position that the colour network sees; NeuS has 0", at_least=0)
+    color_width: int = setting(128, "neurons per layer of the colour network", above=0)
+    color_depth: int = setting(2, "layers of the colour network", above=0)
+    color_frequencies: int = setting(4, "octaves of the position that the colour network sees; NeuS has 0", at_least=0)
+    color_grid: int = setting(
+        512, "cells along the finest grid of the hash encoding that the colour network sees; 0 for none", at_least=0
+    )
     background: Literal["auto", "black", "white", "outside"] = setting(
         "auto", "what is behind the object: black, white, or a learnt outside; auto is white with masks, else outside"
     )
@@ -179,6 +182,15 @@ class ReconstructConfig(Settings):
     )
     steps: int = setting(5000, "training steps", above=0)
     rays: int = setting(256, "rays per training step", above=0)
+    jets: int = setting(
+        3072,
+        "sections of rays that a step evaluates, about; it has fewer rays, down to a quarter, while the surface is "
+        "unsure; 0: as many always",
+        at_least=0,
+    )
+    focus: float = setting(
+        0.5, "share of the rays that go by how wrong the picture was there; 0: all by chance", at_least=0, at_most=1
+    )
     uniform: int = setting(48, "evenly spaced samples per ray", at_least=2)
     importance: int = setting(8, "samples per ray near the surface", at_least=0)
     texture_steps: int = setting(
@@ -186,6 +198,7 @@ class ReconstructConfig(Settings):
     )
     learning_rate: float = setting(3e-4, "peak learning rate of the geometry", above=0)
     color_rate: float = setting(12.0, "learning rate of the colours, in units of the geometry's", above=0)
+    grid_rate: float = setting(2.5, "learning rate of the hash encoding, in units of the colours'", above=0)
     sharpening: float = setting(8.0, "learning rate of the surface's uncertainty, in units of the others'", above=0)
     eikonal_weight: float = setting(0.05, "weight of (|grad f| - 1)^2", at_least=0)
     mask_weight: float = setting(0.1, "weight of the masks' cross-entropy, where there are masks", at_least=0)

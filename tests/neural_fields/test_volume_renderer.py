@@ -152,6 +152,10 @@ class TestBands:
         assert float((only.color - everywhere.color).detach().abs().max()) > 0
 
 
+def red(x: Tensor, direction: Tensor, jet: Jet) -> Tensor:
+    return torch.tensor([1.0, 0, 0]).expand_as(x)
+
+
 def test_the_outside_is_seen_past_the_sphere_only() -> None:
     def fog(inverted: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
         assert inverted.shape[-1] == 4
@@ -160,11 +164,25 @@ def test_the_outside_is_seen_past_the_sphere_only() -> None:
     origins = torch.tensor([[0.0, 0, 2], [1.5, 0, 2]])
     ahead = torch.tensor([0.0, 0, -1]).expand(2, 3)
 
-    def red(x: Tensor, direction: Tensor, jet: Jet) -> Tensor:
-        return torch.tensor([1.0, 0, 0]).expand_as(x)
-
     seen = render_volume(Sphere(radius=0.5), red, origins, ahead, inv_std=1000.0, outside=fog)
     torch.testing.assert_close(seen.color, torch.tensor([[1.0, 0, 0], [0, 1, 0]]), atol=1e-3, rtol=0)
+
+
+def test_what_is_behind_something_opaque_is_not_asked_for() -> None:
+    asked = []
+
+    def fog(inverted: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
+        asked.append(direction)
+        return torch.ones(len(inverted)), torch.ones(len(inverted), 3)
+
+    origins = torch.tensor([[0.0, 0.0, 2.0], [0.9, 0.0, 2.0], [0.0, 0.0, 2.0]])
+    ahead = torch.tensor([[0.0, 0.0, -1.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    sampling, options = Sampling(outside=4), {"inv_std": 1000.0, "outside": fog, "background": torch.zeros(3)}
+    seen = render_volume(Sphere(radius=0.5), red, origins, ahead, sampling=sampling, least_weight=1e-4, **options)
+    assert torch.equal(asked[0], ahead[1:].repeat_interleave(4, dim=0))
+    expected = render_volume(Sphere(radius=0.5), red, origins, ahead, sampling=sampling, **options)
+    # A ray of S sections loses 1e-4 of each at most, and of the light that is left.
+    torch.testing.assert_close(seen.color, expected.color, rtol=0, atol=1e-4 * (expected.weights.shape[1] + 1))
 
 
 @pytest.mark.parametrize(

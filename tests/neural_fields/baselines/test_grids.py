@@ -10,7 +10,7 @@ from fields import Watched
 from mplicits.datasets import prepare_cloud, sample_sphere
 from mplicits.neural_fields import Field, Plane, Siren, Sphere, Torus, extract_mesh, sphere_trace
 from mplicits.neural_fields.baselines import BandLimited, BanfSDF, HashGridSDF
-from mplicits.neural_fields.baselines.hash_grid import grid_resolutions, spatial_hash
+from mplicits.neural_fields.hash_encoding import spatial_hash
 from mplicits.pipelines.paper.grids import NGP_COARSE, NGP_FINE, BanfRecipe, GridSettings, InstantNgpRecipe
 from mplicits.pipelines.paper.recipe import Recipe, SignedPools, differences, mape_loss, stencil
 from mplicits.pipelines.run.trainer import Progress
@@ -67,20 +67,6 @@ def lattice(resolution: int) -> Tensor:
     """Vertices ``(R + 1, R + 1, R + 1, 3)`` over [-1, 1]³."""
     line = torch.linspace(-1, 1, resolution + 1, dtype=torch.float64)
     return torch.stack(torch.meshgrid(line, line, line, indexing="ij"), dim=-1)
-
-
-def test_resolutions_grow_geometrically() -> None:
-    assert grid_resolutions(16, 16, 2048)[:4] == [16, 22, 30, 42]
-    assert grid_resolutions(16, 16, 2048)[-1] == 2048
-    assert grid_resolutions(8, 16, 2048) == [16, 32, 64, 128, 256, 512, 1024, 2048]
-    assert grid_resolutions(1, 7, 7) == [7]
-
-
-def test_hash_is_the_published_one() -> None:
-    """On the low 19 bits: π₂ = 0x9E3779B1 and π₃ = 0x30025795."""
-    x, y, z = torch.tensor([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1], [1234, 777, 2048]]).unbind(dim=1)
-    last = (1234 ^ (777 * 0x9E3779B1 % 2**32) ^ (2048 * 0x30025795 % 2**32)) % 2**19
-    assert spatial_hash(x, y, z, 1 << 19).tolist() == [1, 0x779B1, 0x25795, 0x779B1 ^ 0x25795 ^ 1, last]
 
 
 def test_dense_grid_reproduces_a_linear_function_and_its_gradient() -> None:

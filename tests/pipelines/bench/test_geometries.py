@@ -25,7 +25,8 @@ from mplicits.pipelines.run.settings import ReconstructConfig
 from mplicits.pipelines.run.trainer import parameter_count
 
 TINY = ReconstructConfig(
-    widths=(16, 24), depths=(1, 1), omegas=(5.0, 10.0), features=4, color_width=16, color_depth=1, steps=2, rays=8,
+    widths=(16, 24), depths=(1, 1), omegas=(5.0, 10.0), features=4, color_width=16, color_depth=1, color_grid=8,
+    steps=2, rays=8,
     uniform=4, importance=4, march_grid=4, test_every=3, start="sphere", device="cpu",
 )  # fmt: skip
 
@@ -60,10 +61,11 @@ def test_colours_begin_alike_and_learn_at_one_rate(bench, monkeypatch):
             model = training.build(config, has_masks=True, views=3)
             weights.append(torch.cat([p.detach().flatten() for p in model.color.parameters()]))
             rates.add(round(config.learning_rate * config.color_rate, 12))
+            rates.add(round(config.learning_rate * config.sharpening, 12))
             assert isinstance(model.geometry, NeusSDF) == (geometry == NEUS)
             assert len(model.geometry.deltas) == (geometry == MULTISCALE)
     assert all(torch.equal(weights[0], other) for other in weights)
-    assert rates == {round(TINY.learning_rate * TINY.color_rate, 12)}
+    assert rates == {round(TINY.learning_rate * factor, 12) for factor in (TINY.color_rate, TINY.sharpening)}
 
 
 def test_the_interval_is_students():

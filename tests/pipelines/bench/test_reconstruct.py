@@ -40,6 +40,7 @@ TINY = ReconstructConfig(
     features=4,
     color_width=16,
     color_depth=1,
+    color_grid=8,
     steps=4,
     rays=8,
     uniform=4,
@@ -50,7 +51,20 @@ TINY = ReconstructConfig(
     device="cpu",
 )
 FLAGS = ["--widths", "16", "24", "--depths", "1", "1", "--omegas", "5", "10", "--starts", "0", "0.5"]
-FLAGS += ["--features", "4", "--color-width", "16", "--color-depth", "1", "--steps", "4", "--rays", "8"]
+FLAGS += [
+    "--features",
+    "4",
+    "--color-width",
+    "16",
+    "--color-depth",
+    "1",
+    "--color-grid",
+    "8",
+    "--steps",
+    "4",
+    "--rays",
+    "8",
+]
 FLAGS += ["--uniform", "4", "--importance", "4", "--march-grid", "4", "--test-every", "3", "--device", "cpu"]
 FLAGS += ["--views", "6", "--size", "8", "--resolution", "16", "--eval-samples", "2000"]
 
@@ -115,8 +129,8 @@ def bench(scene, tmp_path_factory) -> tuple[Path, ReconstructBench, list[Reconst
     drawn: list[torch.Tensor] = []
     draw = RayPool.draw
 
-    def spy(self, count, generator):
-        rays = draw(self, count, generator)
+    def spy(self, count, generator, focus=None):
+        rays = draw(self, count, generator, focus)
         drawn.append(rays.directions)
         return rays
 
@@ -134,9 +148,10 @@ def test_rows(bench):
     assert timed.seconds >= neus.seconds
     assert neus.parameters == 529_076
     assert ours.parameters == timed.parameters == (4 * 16 + 17 * 5) + (4 * 24 + 25 * 5)
-    # NeuS's colours see 256 features and the bare position, ours 4 and eight octaves.
-    assert neus.color_parameters == (3 + 27 + 3 + 256 + 1) * 16 + 17 * 3
-    assert ours.color_parameters == (51 + 27 + 3 + 4 + 1) * 16 + 17 * 3
+    # NeuS's colours are its own (256, 4) and see 256 features and the bare position. Ours see 4, four octaves of the
+    # position, and the hash encoding: twelve grids that are no finer than the coarsest here, two numbers in each entry.
+    assert neus.color_parameters == (3 + 27 + 3 + 256 + 1) * 256 + 3 * 257 * 256 + 257 * 3
+    assert ours.color_parameters == (27 + 24 + 27 + 3 + 4 + 1) * 16 + 17 * 3 + 12 * 9**3 * 2
     for row in bench[2]:
         # Four rounds of one more sample; after the last one nobody asks for the values there.
         assert row.values_per_ray[0] == 4 + 3

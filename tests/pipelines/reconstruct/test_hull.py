@@ -16,7 +16,14 @@ from mplicits.pipelines.reconstruct.model import build_scene
 from mplicits.pipelines.run.settings import ReconstructConfig
 
 SMALL = ReconstructConfig(
-    widths=(16, 16), depths=(1, 1), features=2, color_width=8, color_depth=1, color_frequencies=1, radius=0.3
+    widths=(16, 16),
+    depths=(1, 1),
+    features=2,
+    color_width=8,
+    color_depth=1,
+    color_grid=8,
+    color_frequencies=1,
+    radius=0.3,
 )
 RADIUS = 0.6  # of the painted sphere
 

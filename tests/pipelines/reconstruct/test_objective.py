@@ -24,6 +24,7 @@ TINY = ReconstructConfig(
     features=4,
     color_width=16,
     color_depth=1,
+    color_grid=8,
     color_frequencies=2,
     steps=8,
     rays=32,
@@ -94,6 +95,35 @@ def test_some_steps_lower_the_errors(images: PosedImages) -> None:
     assert trainer.step == 60
     assert trainer.fraction == 1
     assert set(trainer.losses) == {"color", "eikonal", "mask", "uncertainty"}
+
+
+def test_a_step_has_fewer_rays_while_each_has_many_sections(images: PosedImages) -> None:
+    trainer = make(images, replace(TINY, rays=32, jets=64, steps=20))
+    objective = trainer.objective
+    for sections, rays in ((0.0, 8), (100.0, 8), (4.0, 16), (1.0, 32)):
+        objective.kept["sections"] = torch.tensor(sections)
+        assert objective.batch() == rays
+    train(trainer, until=16)
+    found = float(objective.kept["sections"])
+    assert 1 < found < TINY.uniform + TINY.importance + 2
+    assert objective.batch() == min(max(round(64 / found), 8), 32)
+    assert make(images, replace(TINY, jets=0)).objective.batch() == TINY.rays
+
+
+def test_the_hash_encoding_has_its_own_rate_and_may_be_left_out(images: PosedImages) -> None:
+    trainer = make(images, replace(TINY, color_rate=6.0, grid_rate=3.0))
+    grid = trainer.objective.model.color.grid
+    assert grid is not None
+    _, colors, _, own = trainer.objective.groups
+    assert [p is grid.table for p in own.parameters] == [True]
+    assert all(p is not grid.table for p in colors.parameters)
+    assert own.rate(0.5) == pytest.approx(3 * colors.rate(0.5))
+    before = grid.table.detach().clone()
+    train(trainer, until=2)
+    assert not torch.equal(grid.table, before)
+    without = make(images, replace(TINY, color_grid=0))
+    assert without.objective.model.color.grid is None
+    assert len(without.objective.groups) == 3
 
 
 def test_the_softplus_network_of_neus_is_trained_by_the_same_steps(images: PosedImages) -> None:

@@ -18,7 +18,8 @@ from mplicits.pipelines.run.settings import ReconstructConfig
 from torch import Tensor, nn
 
 TINY = ReconstructConfig(
-    widths=(16, 16), depths=(1, 1), omegas=(10.0, 15.0), features=4, color_width=16, color_depth=1, texture_steps=0,
+    widths=(16, 16), depths=(1, 1), omegas=(10.0, 15.0), features=4, color_width=16, color_depth=1, color_grid=8,
+    texture_steps=0,
     exposure="affine", cameras="refined", steps=6, rays=64, uniform=16, importance=8, march_grid=0, start="sphere",
 )  # fmt: skip
 GAINS = (1.3, 0.65, 1.0, 1.3 / 1.0985)

@@ -35,6 +35,7 @@ TINY = ReconstructConfig(
     features=4,
     color_width=16,
     color_depth=1,
+    color_grid=8,
     color_frequencies=2,
     steps=40,
     rays=16,
@@ -46,7 +47,9 @@ TINY = ReconstructConfig(
     test_every=3,
 )
 FLAGS = "--widths 16 16 --depths 1 1 --omegas 10 15 --starts 0 0.4 --features 4 --color-width 16 --color-depth 1"
-FLAGS += " --color-frequencies 2 --steps 3 --rays 16 --uniform 8 --importance 4 --texture-steps 3 --quiet"
+FLAGS += (
+    " --color-frequencies 2 --color-grid 8 --steps 3 --rays 16 --uniform 8 --importance 4 --texture-steps 3 --quiet"
+)
 FLAGS += " --march-grid 8 --start sphere"
 
 

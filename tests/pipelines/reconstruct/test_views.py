@@ -18,6 +18,7 @@ from mplicits.pipelines.reconstruct.views import (
     comparison_sheet,
     held_out,
     measure,
+    reduced,
     render_image,
     spread,
     target_of,
@@ -218,3 +219,16 @@ def test_a_sheet_shows_photograph_rendering_and_normals() -> None:
 def test_large_pictures_keep_their_size() -> None:
     color = noise(4, 700)
     assert comparison_sheet([(picture(color), rendered(color))], WHITE).shape == (8, 2100, 3)
+
+
+def test_a_reduced_view_sees_the_same_in_fewer_pixels() -> None:
+    full = render_scene(SCENES["painted-sphere"](), views=1, size=64, samples=1).views[0]
+    small = reduced(full, 256)
+    assert small.name == full.name
+    assert torch.equal(small.camera.intrinsics, full.camera.resized(16, 16).intrinsics)
+    assert small.color.shape == (16, 16, 3)
+    assert full.mask is not None
+    assert small.mask is not None
+    assert np.allclose(small.mask, full.mask.reshape(16, 4, 16, 4).mean(axis=(1, 3)), atol=1e-6)
+    assert reduced(full, 4096) is full  # as many pixels as there are
+    assert reduced(picture(noise(7, 300)), 100).color.shape == (2, 65, 3)

@@ -1,0 +1,60 @@
+"""Where a training looks: pixels at random, and more of them where its pictures were wrong of late."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+__all__ = ["Focus"]
+
+STRIP = 16  # neighbouring pixels of a line share one error
+
+
+class Focus:
+    """Pixels of a pool, drawn evenly or by the errors of their strips.
+
+    The chance of a pixel, one of the n in a strip with the error e, is ``(1 - share) / N + share · e / (n Σ e)`` of N
+    pixels. What few photographs show, and fine detail, is learnt late from even samples, because most of those show
+    what is learnt long since. With ``share`` below one no pixel is forgotten, and none that is always wrong (a person
+    who walked by) has all.
+
+    Args:
+        pixels: how many there are, line after line.
+        share: of the draws that go by errors, from 0 to 1.
+        device: of the errors.
+
+    Attributes:
+        errors: ``(S,)`` of the strips, running means; 1 in the beginning.
+        bounds: ``(S,)`` their running sums when `refresh` was called last, in float64 on the CPU.
+    """
+
+    def __init__(self, pixels: int, share: float, device: torch.device) -> None:
+        self.pixels, self.share = pixels, share
+        self.errors = torch.ones(-(-pixels // STRIP), device=device)
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Draw by the errors as they are now; a GPU is waited for."""
+        self.bounds = self.errors.double().cumsum(0).cpu()
+
+    def rows(self, count: int, generator: torch.Generator) -> Tensor:
+        """``(count,)`` numbers of pixels on the CPU, with replacement."""
+        if not self.share:
+            return torch.randint(self.pixels, (count,), generator=generator)
+        place, within = torch.rand(2, count, generator=generator, dtype=torch.float64)
+        # The first (1 - share) of the unit interval stands for even draws, and the rest for those by errors.
+        by_error = ((place - (1 - self.share)) / self.share).clamp_min(0) * self.bounds[-1]
+        strips = torch.searchsorted(self.bounds, by_error, right=True).clamp_max(len(self.bounds) - 1)
+        length = (self.pixels - strips * STRIP).clamp_max(STRIP)  # the last one may be shorter
+        rows = strips * STRIP + (within * length).long()
+        return torch.where(place < 1 - self.share, (within * self.pixels).long(), rows)
+
+    def learn(self, rows: Tensor, errors: Tensor) -> None:
+        """Take note of how wrong pixels were: the mean of what is said and of what was known, for each strip.
+
+        Args:
+            rows: ``(R,)`` numbers of the pixels, on the device of the errors.
+            errors: ``(R,)``, not negative.
+        """
+        if self.share:
+            self.errors.scatter_reduce_(0, rows // STRIP, errors, "mean", include_self=True)
