@@ -21,7 +21,7 @@ from .fit import FIT
 from .mesh import EVALUATE, MESH
 from .solids import BOOLEAN, OFFSET
 from .train import EVOLVE, RECONSTRUCT, TEXTURE
-from .views import CHECK_CAMERAS, SCENE
+from .views import CHECK_CAMERAS, FIND_CAMERAS, SCENE
 from .web import WEB
 
 __all__ = ["COMMANDS"]
@@ -151,6 +151,7 @@ COMMANDS: Mapping[str, Command] = MappingProxyType(
         "slice": SLICE,
         "view": VIEW,
         "web": WEB,
+        "find-cameras": FIND_CAMERAS,
         "check-cameras": CHECK_CAMERAS,
         "evaluate": EVALUATE,
         "info": Command(

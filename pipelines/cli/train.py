@@ -19,11 +19,13 @@ from .common import (
     add_tensorboard,
     check_output,
     read_settings,
+    stoppable,
     tell_budget,
     tensorboard,
     training,
     were_given,
 )
+from .views import tell_found
 
 __all__ = ["EVOLVE", "RECONSTRUCT", "TEXTURE", "tell_texture"]
 
@@ -127,6 +129,11 @@ def _reconstruct_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("data", metavar="DATA", help=what)
     add_new_run(parser)
+    what = (
+        "colmap: DATA is a folder of photographs, or a film, whose cameras are found first and written to RUN-cameras "
+        "(see find-cameras; needs mplicits[poses])"
+    )
+    parser.add_argument("--poses", choices=("given", "colmap"), default="given", help=what)
     add_tensorboard(parser)
     add_settings(parser, ReconstructConfig)
 
@@ -137,22 +144,27 @@ def _reconstruct(arguments: argparse.Namespace) -> int:
     config = None if arguments.resume else read_settings(arguments, ReconstructConfig)
     from ..mesh.extract import mesh_run
     from ..mesh.plan import mesh_stage, meshing
-    from ..reconstruct.train import HELD_OUT_FILE, MESH_FILE, reconstruct
+    from ..reconstruct.posing import find_cameras_timed
+    from ..reconstruct.train import HELD_OUT_FILE, MESH_FILE, reconstruct, usual_stages
     from ..run.costs import Net
     from ..run.folder import check_new_run, read_record
     from ..run.machine import choose_device, speed
 
     directory = check_new_run(arguments.out, resume=arguments.resume, force=arguments.force)
-    again = f"to continue: mplicits reconstruct {arguments.data} -o {directory} --resume"
-    with (
-        tensorboard(arguments.tensorboard) as heard,
-        training(again, quiet=arguments.quiet, heard=heard) as report,
-    ):
+    data = arguments.data
+    with tensorboard(arguments.tensorboard) as heard, training(quiet=arguments.quiet, heard=heard) as report:
+        used = config or load_config(ReconstructConfig, None, read_record(directory)["config"])
+        machine = speed(choose_device(used.device))
         if report is not None:
-            used = config or load_config(ReconstructConfig, None, read_record(directory)["config"])
             nets = [Net.siren(*size) for size in zip(used.widths, used.depths, strict=True)]
-            report.follow([mesh_stage(nets, speed(choose_device(used.device)))])
-        run = reconstruct(arguments.data, config, out=directory, resume=arguments.resume, progress=report)
+            report.follow([mesh_stage(nets, machine)])
+        if arguments.poses == "colmap":
+            data = directory.with_name(f"{directory.name}-cameras")
+            with stoppable("the same command continues", at_any_time=True):
+                found = find_cameras_timed(arguments.data, data, progress=report, then=usual_stages(used, machine))
+            tell_found(found)
+        with stoppable(f"to continue: mplicits reconstruct {data} -o {directory} --resume"):
+            run = reconstruct(data, config, out=directory, resume=arguments.resume, progress=report)
         with meshing(report):
             mesh = mesh_run(directory, directory / MESH_FILE)
     tell_budget(run.record)
@@ -175,7 +187,8 @@ RECONSTRUCT = Command(
     "train a surface and its colours on posed photographs",
     """  mplicits reconstruct data/dtu_scan24 -o runs/scan24 --preset fast
   mplicits reconstruct fox/transforms.json -o runs/fox --width 200 --time-budget 1800
-  mplicits reconstruct colmap_project -o runs/statue --geometry neus""",
+  mplicits reconstruct colmap_project -o runs/statue --geometry neus
+  mplicits reconstruct walk_around.mp4 -o runs/chair --poses colmap""",
     _reconstruct_arguments,
     _reconstruct,
     "Train a surface and its colours on posed photographs. RUN then holds the field, its texture, a coloured mesh in "

@@ -1,13 +1,63 @@
-"""``mplicits check-cameras`` and ``mplicits scene``: posed photographs looked at, and exact ones to try things on."""
+"""Posed photographs: ``mplicits find-cameras``, ``check-cameras``, and ``scene``, exact ones to try things on."""
 
 from __future__ import annotations
 
 import argparse
 import sys
+from dataclasses import asdict
+from typing import TYPE_CHECKING
 
-from .common import Command, add_flags, check_output, whole, write_json
+from ..run.config import input_error
+from .common import Command, add_flags, check_output, training, whole, write_json
 
-__all__ = ["CHECK_CAMERAS", "SCENE"]
+__all__ = ["CHECK_CAMERAS", "FIND_CAMERAS", "SCENE", "tell_found"]
+
+if TYPE_CHECKING:
+    from ...datasets.views.find_cameras import FoundCameras
+
+
+def _find_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("photos", metavar="PHOTOS", help="a folder of photographs, or a film")
+    add_flags(parser, "--out", metavar="PROJECT", help="folder of the COLMAP project; an interrupted one is continued")
+    what = "of a film: the sharpest frames of so many stretches (100)"
+    parser.add_argument("--frames", type=whole(3, 10_000), default=100, metavar="N", help=what)
+    what = "whether all photographs were taken with one lens, or each has its own (auto: one, where sizes are alike)"
+    parser.add_argument("--lens", choices=("auto", "one", "each"), default="auto", help=what)
+    add_flags(parser, "--json", "--quiet")
+
+
+def _find_cameras(arguments: argparse.Namespace) -> int:
+    from ..reconstruct.posing import find_cameras_timed
+
+    out = arguments.out
+    with training("the same command continues", quiet=arguments.quiet, at_any_time=True) as report:
+        found = find_cameras_timed(arguments.photos, out, frames=arguments.frames, lens=arguments.lens, progress=report)
+    tell_found(found)
+    print(f"next: mplicits check-cameras {out} -o cameras.glb")
+    write_json(arguments.json, asdict(found) | {"project": str(out)})
+    return 0
+
+
+def tell_found(found: FoundCameras) -> None:
+    """Print what `find_cameras` has found, and warn on stderr."""
+    from ..reconstruct.posing import said_of
+
+    line, warnings = said_of(found)
+    print(line)
+    for warning in warnings:
+        print(f"warning: {warning}", file=sys.stderr)
+
+
+FIND_CAMERAS = Command(
+    "find the cameras of photographs, or of a film, with COLMAP",
+    """  mplicits find-cameras photos -o project
+  mplicits find-cameras walk_around.mp4 -o project --frames 150
+  mplicits reconstruct photos -o runs/chair --poses colmap""",
+    _find_arguments,
+    _find_cameras,
+    "Find where photographs were taken, and with which lens, by structure from motion: COLMAP's, through pycolmap "
+    "(pip install 'mplicits[poses]'). The project is read by all commands that take posed photographs.",
+)
 
 
 def _check_arguments(parser: argparse.ArgumentParser) -> None:
@@ -46,6 +96,7 @@ CHECK_CAMERAS = Command(
 
 
 SCENE_NAMES = ("painted-sphere", "striped-torus", "figure", "statue")
+FAULTS = ("poses", "pose", "image", "mirrored", "masks", "exposure")
 FORMATS = ("neus", "transforms", "colmap", "colmap-text")
 TRUTH = "surface.ply"
 
@@ -60,16 +111,21 @@ def _scene_arguments(parser: argparse.ArgumentParser) -> None:
     add_flags(parser, "--samples", type=whole(1, 16), default=3, help="rays per pixel and direction (3)")
     what = "light the shape by a fixed lamp, instead of the bare paint"
     parser.add_argument("--shaded", action="store_true", help=what)
+    what = "what is wrong with them, to see what is said of it and survived: " + ", ".join(FAULTS)
+    parser.add_argument("--fault", choices=FAULTS, metavar="FAULT", help=what)
     add_flags(parser, "--seed", help="of the cameras (0)")
 
 
 def _scene(arguments: argparse.Namespace) -> int:
     from ...datasets.synthetic.scenes import SCENES, render_scene, scene_mesh
+    from ...datasets.synthetic.view_faults import with_fault
     from ...datasets.views.writing import check_new_folder, write_colmap, write_neus, write_transforms
     from ..mesh.files import write_mesh
     from ..run.progress import counter_bar
 
     folder = check_new_folder(arguments.out)
+    if arguments.fault and arguments.views < 3:
+        raise input_error("--fault: one of three views at least has it; --views 3 or more")
     scene = SCENES[arguments.name]()
     with counter_bar("render") as progress:
         images = render_scene(
@@ -81,6 +137,8 @@ def _scene(arguments: argparse.Namespace) -> int:
             shaded=arguments.shaded,
             progress=progress,
         )
+    if arguments.fault:
+        images = with_fault(images, arguments.fault, arguments.seed)
     if arguments.format == "neus":
         write_neus(folder, images)
     elif arguments.format == "transforms":
@@ -97,7 +155,8 @@ SCENE = Command(
     "write posed images of an exact synthetic scene",
     """  mplicits scene painted-sphere -o sphere
   mplicits scene figure -o figure --format transforms --views 40 --size 200
-  mplicits scene statue -o statue --format colmap --shaded""",
+  mplicits scene statue -o statue --format colmap --shaded
+  mplicits scene figure -o unsharp --fault poses""",
     _scene_arguments,
     _scene,
     "Draw a shape whose surface and colours are known in closed form from cameras all around it, and write images, "

@@ -44,10 +44,12 @@ __all__ = [
     "reconstruct",
     "scene_texture",
     "surface_colors",
+    "usual_stages",
 ]
 
 HELD_OUT_FILE = "held_out.png"
 PREVIEW_FILE = "preview.png"
+READING = "reading the pictures"
 MESH_FILE = "mesh.ply"  # that the command makes of a finished run
 PREVIEWS = 5  # pictures of the first view on the way
 PREVIEW_PIXELS = 4096  # of each: through fog, which a scene is at first, every pixel costs as much as one in training
@@ -109,12 +111,10 @@ def reconstruct(
     config = folder.config(ReconstructConfig, config)
     device, schedule = choose_device(config.device), Schedule.of(progress)
     machine = speed(device)
-    plan = ReconstructPlan(config, machine, USUAL_PIXELS, USUAL_HELD_OUT, texture_settings(config))
-    reading = Stage("reading the pictures", "reading", USUAL_READING)
-    schedule.plan([reading, *plan.before(), *plan.levels(), *plan.after()], budget=config.time_budget)
-    schedule(Progress(reading.name, 0, 0, 0.0, {}))
+    schedule.plan(usual_stages(config, machine), budget=config.time_budget)
+    schedule(Progress(READING, 0, 0, 0.0, {}))
     images = data if isinstance(data, PosedImages) else read_posed_images(data, width=config.width)
-    schedule(Progress(reading.name, 0, 0, 1.0, {}))
+    schedule(Progress(READING, 0, 0, 1.0, {}))
     load_compiler()
     training = _Reconstruction(
         images, config, device, folder, schedule, machine=machine, started=started, resume=resume
@@ -123,6 +123,12 @@ def reconstruct(
         if resume:
             training.restore()
         return training.run()
+
+
+def usual_stages(config: ReconstructConfig, machine: Speed) -> list[Stage]:
+    """What `reconstruct` will do, of photographs of which nothing is known yet."""
+    plan = ReconstructPlan(config, machine, USUAL_PIXELS, USUAL_HELD_OUT, texture_settings(config))
+    return [Stage(READING, "reading", USUAL_READING), *plan.before(), *plan.levels(), *plan.after()]
 
 
 class _Reconstruction:

@@ -1,0 +1,102 @@
+"""What goes wrong with posed photographs, one thing at a time: to see what a check says and a training survives."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from ..cameras import Camera
+from ..color_space import linear_to_srgb, srgb_to_linear
+from ..views.images import PosedImage, PosedImages
+
+__all__ = ["VIEW_FAULTS", "with_fault"]
+
+TURN = 0.5  # degrees, standard deviation of an inexact pose about each axis
+SHIFT = 0.005  # the same of its eye along each axis, in radii of the region
+LOST = 30.0  # degrees that one camera looks past the object
+DARKER = 0.5  # light of every other photograph
+
+
+def with_fault(images: PosedImages, fault: str, seed: int = 0) -> PosedImages:
+    """The data set with one of the `VIEW_FAULTS`.
+
+    ``poses``: each camera is turned about its eye, by 0.5° (standard deviation) about each axis, and moved by 0.5 % of
+    the region's radius along each; ``pose``: one camera looks 30° past the object; ``image``: one photograph is that of
+    another camera; ``mirrored``: all pictures are, left to right; ``masks``: object and background have changed places;
+    ``exposure``: every other photograph has half of the light. What concerns one picture concerns the third, which is
+    not held out.
+
+    Args:
+        images: of one size, three at least.
+        fault: which.
+        seed: of the poses.
+
+    Raises:
+        KeyError: there is no such fault.
+        ValueError: there are fewer than three views.
+    """
+    change = VIEW_FAULTS[fault]
+    if len(images.views) < 3:
+        raise ValueError(f"{len(images.views)} views; a fault needs three")
+    return replace(images, views=tuple(change(images, np.random.default_rng(seed))))
+
+
+def _poses(images: PosedImages, random: np.random.Generator) -> list[PosedImage]:
+    radius = images.similarity.scale
+    return [
+        replace(view, camera=_turned(view.camera, random.normal(0, TURN, 3), random.normal(0, SHIFT * radius, 3)))
+        for view in images.views
+    ]
+
+
+def _pose(images: PosedImages, _: np.random.Generator) -> list[PosedImage]:
+    views = list(images.views)
+    views[2] = replace(views[2], camera=_turned(views[2].camera, np.array([0, LOST, 0]), np.zeros(3)))
+    return views
+
+
+def _turned(camera: Camera, degrees: np.ndarray, shift: np.ndarray) -> Camera:
+    """Turned about its eye, in its own axes, and moved in the world's."""
+    pose = camera.world_from_camera.clone()
+    turn = torch.from_numpy(Rotation.from_rotvec(degrees, degrees=True).as_matrix()).to(pose)
+    pose[:3, :3] = pose[:3, :3] @ turn
+    pose[:3, 3] += torch.from_numpy(shift).to(pose)
+    return replace(camera, world_from_camera=pose)
+
+
+def _image(images: PosedImages, _: np.random.Generator) -> list[PosedImage]:
+    views = list(images.views)
+    views[2] = replace(views[2], color=views[1].color, mask=views[1].mask)
+    return views
+
+
+def _mirrored(images: PosedImages, _: np.random.Generator) -> list[PosedImage]:
+    return [
+        replace(view, color=view.color[:, ::-1], mask=None if view.mask is None else view.mask[:, ::-1])
+        for view in images.views
+    ]
+
+
+def _masks(images: PosedImages, _: np.random.Generator) -> list[PosedImage]:
+    return [replace(view, mask=None if view.mask is None else 1 - view.mask) for view in images.views]
+
+
+def _exposure(images: PosedImages, _: np.random.Generator) -> list[PosedImage]:
+    return [
+        replace(view, color=linear_to_srgb(DARKER * srgb_to_linear(view.color)).astype(np.float32)) if odd % 2 else view
+        for odd, view in enumerate(images.views)
+    ]
+
+
+VIEW_FAULTS: dict[str, Callable[[PosedImages, np.random.Generator], list[PosedImage]]] = {
+    "poses": _poses,
+    "pose": _pose,
+    "image": _image,
+    "mirrored": _mirrored,
+    "masks": _masks,
+    "exposure": _exposure,
+}

@@ -1,0 +1,70 @@
+"""Cameras for photographs that have none, with progress: `find_cameras` as a stage of longer work."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal
+
+from ...datasets.views.find_cameras import FEATURES, MATCHING, PLACING, FoundCameras, find_cameras
+from ...datasets.views.shots import list_images
+from ..run.schedule import Progress, Report, Schedule, Stage
+
+__all__ = ["find_cameras_timed", "said_of"]
+
+# Seconds of a core for the features of a photograph and for matching two, and of the whole for placing one.
+FEATURE_SECONDS, PAIR_SECONDS, PLACE_SECONDS = 1.5, 0.05, 0.5
+FEW_POINTS = 100
+
+
+def find_cameras_timed(
+    source: str | Path,
+    project: str | Path,
+    *,
+    frames: int = 100,
+    lens: Literal["auto", "one", "each"] = "auto",
+    progress: Report | None = None,
+    then: Sequence[Stage] = (),
+) -> FoundCameras:
+    """`find_cameras`, that says how far it is and how long it will take.
+
+    Args:
+        source: see `find_cameras`.
+        project: the same.
+        frames: the same.
+        lens: the same.
+        progress: told of every stage.
+        then: what will be done after it.
+    """
+    source, schedule = Path(source), Schedule.of(progress)
+    count, cores = len(list_images(source)) or frames, os.cpu_count() or 1
+    schedule.plan(
+        [
+            Stage(FEATURES, "features", FEATURE_SECONDS * count / cores),
+            Stage(MATCHING, "matching", PAIR_SECONDS * count * (count - 1) / 2 / cores),
+            Stage(PLACING, "placing", PLACE_SECONDS * count),
+            *then,
+        ]
+    )
+
+    def report(stage: str, done: int, total: int) -> None:
+        schedule(Progress(stage, done, total, done / max(total, 1), {}))
+
+    return find_cameras(source, project, frames=frames, lens=lens, report=report)
+
+
+def said_of(found: FoundCameras) -> tuple[str, list[str]]:
+    """What was found, in a line, and what is to be warned of."""
+    placed = found.photographs - len(found.left_out)
+    line = (
+        f"{found.project}: {placed} of {found.photographs} photographs placed by {found.points:,} points that are seen "
+        f"{found.error:.2f} pixels off"
+    )
+    warnings = []
+    if found.left_out:
+        names = ", ".join(found.left_out[:3]) + (", …" if len(found.left_out) > 3 else "")
+        warnings.append(f"not placed: {names}; too little in them is in others too, or they are blurred")
+    if found.points < FEW_POINTS:
+        warnings.append(f"{found.points} points are few: cameras may be wrong; see `mplicits check-cameras`")
+    return line, warnings

@@ -1,0 +1,100 @@
+"""The commands for photographs: cameras that are found first, and pictures with something wrong."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from mplicits.datasets.synthetic.scenes import SCENES, render_scene
+from mplicits.datasets.views.find_cameras import FEATURES, FoundCameras
+from mplicits.datasets.views.writing import write_colmap
+from mplicits.neural_fields import InputError
+from mplicits.pipelines.cli import main
+from mplicits.pipelines.reconstruct import posing
+
+TINY = (
+    "--widths 8 8 --depths 1 1 --color-width 8 --color-depth 1 --color-grid 8 --steps 3 --rays 8 --uniform 8"
+    " --importance 2 --texture-steps 0 --march-grid 12 --quiet"
+)
+
+
+@pytest.fixture
+def finder(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
+    """In COLMAP's place somebody who knows the cameras."""
+    calls: list[dict[str, Any]] = []
+
+    def find(source: Path, project: Path, **options: Any) -> FoundCameras:
+        calls.append({"source": source, "project": project, **options})
+        if not project.exists():
+            images = render_scene(SCENES["painted-sphere"](), views=4, size=16, samples=1)
+            write_colmap(project, images)
+        options["report"](FEATURES, 1, 4)
+        return FoundCameras(project, 5, ("4.png",), 40, 0.5)
+
+    monkeypatch.setattr(posing, "find_cameras", find)
+    return calls
+
+
+def test_cameras_are_found_and_what_is_doubtful_is_said(
+    tmp_path: Path, finder: list[dict[str, Any]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    project, said = tmp_path / "project", tmp_path / "said.json"
+    words = ["find-cameras", "photos", "-o", project, "--frames", 7, "--lens", "each", "--json", said, "--quiet"]
+    assert main([str(word) for word in words]) == 0
+    out, err = capsys.readouterr()
+    assert f"{project}: 4 of 5 photographs placed by 40 points that are seen 0.50 pixels off" in out
+    assert "not placed: 4.png" in err
+    assert "40 points are few" in err
+    assert (finder[0]["frames"], finder[0]["lens"]) == (7, "each")
+    assert json.loads(said.read_text())["left_out"] == ["4.png"]
+
+
+def test_a_reconstruction_begins_with_its_cameras(
+    tmp_path: Path, finder: list[dict[str, Any]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "run"
+    assert main(["reconstruct", "film.mp4", "-o", str(run), "--poses", "colmap", *TINY.split()]) == 0
+    assert [(str(call["source"]), call["project"]) for call in finder] == [("film.mp4", tmp_path / "run-cameras")]
+    assert "4 of 5 photographs placed" in capsys.readouterr().out
+    assert json.loads((run / "run.json").read_text())["data"].startswith(str(tmp_path / "run-cameras"))
+
+
+def test_an_interruption_of_the_search_says_how_to_go_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(*_: Any, **__: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(posing, "find_cameras", interrupted)
+    assert main(["reconstruct", "photos", "-o", str(tmp_path / "run"), "--poses", "colmap", *TINY.split()]) == 130
+    assert "interrupted; the same command continues" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
+def test_photographs_that_hang_together_badly_are_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def failed(*_: Any, **__: Any) -> None:
+        raise InputError("project: no photographs could be placed")
+
+    monkeypatch.setattr(posing, "find_cameras", failed)
+    assert main(["find-cameras", "photos", "-o", str(tmp_path / "project"), "--quiet"]) == 2
+    assert capsys.readouterr().err.strip() == "mplicits: error: project: no photographs could be placed"
+
+
+def test_a_scene_has_the_fault_that_is_asked_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    small = ["--views", "3", "--size", "16", "--samples", "1"]
+    assert main(["scene", "figure", "-o", str(tmp_path / "right"), *small]) == 0
+    assert main(["scene", "figure", "-o", str(tmp_path / "wrong"), *small, "--fault", "mirrored"]) == 0
+    right, wrong = (
+        cv2.imdecode(np.fromfile(tmp_path / name / "image" / "000.png", np.uint8), cv2.IMREAD_COLOR)
+        for name in ("right", "wrong")
+    )
+    assert right is not None
+    assert np.array_equal(wrong, right[:, ::-1])
+    capsys.readouterr()
+    few = ["--views", "2", "--fault", "image"]
+    assert main(["scene", "figure", "-o", str(tmp_path / "few"), *few]) == 2
+    assert "--views 3 or more" in capsys.readouterr().err
