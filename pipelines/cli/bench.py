@@ -365,7 +365,8 @@ def _reconstruct_arguments(parser: argparse.ArgumentParser) -> None:
         help="train ours once more, for as long as NeuS took (yes)",
     )
     _measured(parser, 256)
-    _number(parser, "--neus-learning-rate", positive, 1e-3, "peak rate of the NeuS rows")
+    what = "peak rate of the NeuS rows (0.001)"
+    parser.add_argument("--neus-learning-rate", type=positive, metavar="RATE", help=what)
     alone = parser.add_argument_group("the geometry alone")
     about = "the same colour network, encodings and rates for the multiscale geometry, NeuS's and one SIREN of its size"
     alone.add_argument("--geometry-only", action="store_true", help=about)
@@ -379,8 +380,13 @@ def _reconstruct_arguments(parser: argparse.ArgumentParser) -> None:
 def _reconstruct(arguments: argparse.Namespace) -> int:
     if "geometry" in given_flags(arguments, ReconstructConfig):
         raise input_error("--geometry: the benchmark trains both; leave it out")
+    for name in ("jets", "focus"):
+        if name in given_flags(arguments, ReconstructConfig):
+            raise input_error(f"--{name}: rows see the same rays, as many in every step; leave it out")
     if arguments.rates and not arguments.geometry_only:
         raise input_error("--rates: only --geometry-only tries several; add it, or give --learning-rate")
+    if arguments.geometry_only and arguments.neus_learning_rate is not None:
+        raise input_error("--neus-learning-rate: --geometry-only tries the same rates for all; give --rates")
     config = read_settings(arguments, ReconstructConfig)
     if config.time_budget is not None:
         raise input_error("--time-budget: rows are compared after as many steps; leave it out, and give --steps")
@@ -401,7 +407,9 @@ def _reconstruct(arguments: argparse.Namespace) -> int:
         rates = tuple(dict.fromkeys(arguments.rates or (config.learning_rate,)))
         alone = GeometryBench(scenes=scenes, config=config, rates=rates, seeds=arguments.seeds, **options)
         return _run(arguments, [alone], out=arguments.out)
-    options |= {name: getattr(arguments, name) for name in ("equal_time", "neus_learning_rate")}
+    options["equal_time"] = arguments.equal_time
+    if arguments.neus_learning_rate is not None:
+        options["neus_learning_rate"] = arguments.neus_learning_rate
     return _run(arguments, [ReconstructBench(scenes=scenes, config=config, **options)], out=arguments.out)
 
 

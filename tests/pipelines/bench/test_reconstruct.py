@@ -360,6 +360,12 @@ def test_the_command_goes_on_after_an_interruption(tmp_path, capsys, monkeypatch
     [
         (["painted-shpere"], "painted-shpere: no such data set, and no scene of that name; did you mean"),
         (["figure", "--geometry", "neus"], "--geometry: the benchmark trains both; leave it out"),
+        (["figure", "--jets", "9"], "--jets: rows see the same rays, as many in every step; leave it out"),
+        (["figure", "--focus", "1"], "--focus: rows see the same rays"),
+        (
+            ["figure", "--geometry-only", "--neus-learning-rate", "1e-3"],
+            "--neus-learning-rate: --geometry-only tries the same rates for all; give --rates",
+        ),
         (["figure", "--time-budget", "9"], "--time-budget: rows are compared after as many steps"),
         (["figure", "--views", "2", "--size", "8", "--test-every", "0"], "figure: no picture is held out"),
         (["figure", "--json", "rows.txt"], "rows.txt: unknown extension '.txt'"),
