@@ -90,8 +90,8 @@ class Rendered(NamedTuple):
         weights: ``(R, S)``.
         depths: ``(R, S)`` the middles of the sections.
         jet: of the field there, ``(R, S, …)``; 0 in sections that were skipped.
-        counts: ``(R, S)`` for how many sections each jet stands in a mean over all of them: 1 everywhere if none was
-            skipped, else 0 there and 1 / ``skip_share`` in those that were kept by chance.
+        counts: ``(R, S)`` for how many sections each jet stands in a mean over all of them: 1 if none was skipped, else
+            0 there and 1 / ``skip_share`` in those that were kept by chance. 0 on rays that miss the unit sphere.
     """
 
     color: Tensor
@@ -173,12 +173,13 @@ def render_volume(
     )
     interval = edges.diff(dim=1)
     depths = edges[:, :-1] + 0.5 * interval
-    counts, rows = torch.ones_like(depths), None
+    # Sections of a ray that misses the sphere have no length, and stand for nothing.
+    counts, rows = (far > near).to(depths)[:, None].expand_as(depths), None
     if skip > 0:
         with torch.no_grad():  # an estimate chooses sections and teaches nobody
             values = _march(field, guide)(ray_points(origins, directions, edges))
             estimated = secant_weights(edges, values, _estimate_sharpness(field, level, inv_std), cos_anneal=cos_anneal)
-            counts = _counts(estimated, values, skip, skip_share, generator)
+            counts = counts * _counts(estimated, values, skip, skip_share, generator)
         rows = counts.flatten().nonzero()[:, 0]
 
     def of_sections(tensor: Tensor) -> Tensor:

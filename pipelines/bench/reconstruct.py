@@ -186,8 +186,9 @@ class ReconstructBench(Benchmark[ReconstructRow]):
         (train, tests), stage = self.views(scene), f"{scene.name}, {kind}"
         report = work.progress or (lambda _: None)
         report(Progress(stage, 0, config.steps, 0.0, {}))
-        pool, started = RayPool(train, similarity, device), time.perf_counter()
-        model = self.build(config, has_masks=pool.has_masks, views=len(train)).to(device)
+        started, has_masks = time.perf_counter(), all(view.mask is not None for view in train)
+        model = self.build(config, has_masks=has_masks, views=len(train)).to(device)
+        pool = RayPool(train, similarity, device, whole=model.outside is not None)
         start_seconds = time.perf_counter() - started
 
         def told(progress: Progress) -> None:

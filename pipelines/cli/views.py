@@ -51,12 +51,12 @@ def tell_found(found: FoundCameras) -> None:
 FIND_CAMERAS = Command(
     "find the cameras of photographs, or of a film, with COLMAP",
     """  mplicits find-cameras photos -o project
-  mplicits find-cameras walk_around.mp4 -o project --frames 150
-  mplicits reconstruct photos -o runs/chair --poses colmap""",
+  mplicits find-cameras walk_around.mp4 -o project --frames 150""",
     _find_arguments,
     _find_cameras,
     "Find where photographs were taken, and with which lens, by structure from motion: COLMAP's, through pycolmap "
-    "(pip install 'mplicits[poses]'). The project is read by all commands that take posed photographs.",
+    "(pip install 'mplicits[poses]'). The project is read by all commands that take posed photographs; `mplicits "
+    "reconstruct --poses colmap` does both.",
 )
 
 

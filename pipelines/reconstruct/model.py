@@ -235,7 +235,7 @@ def camera_rays(view: PosedImage, similarity: Similarity) -> tuple[Tensor, Tenso
 
 
 class RayPool:
-    """The pixels whose rays meet the unit sphere.
+    """The pixels whose rays meet the unit sphere; or all of them, where what lies outside is learnt too.
 
     Directions are worked out when rays are drawn, from the pixel's number: of all pixels only the colours are kept.
 
@@ -243,12 +243,15 @@ class RayPool:
         views: the pictures.
         similarity: from world to unit-sphere coordinates.
         device: where the rays are wanted.
+        whole: keep the pixels that do not see the region, too.
 
     Raises:
         InputError: no ray of any picture meets the region of interest.
     """
 
-    def __init__(self, views: Sequence[PosedImage], similarity: Similarity, device: torch.device) -> None:
+    def __init__(
+        self, views: Sequence[PosedImage], similarity: Similarity, device: torch.device, *, whole: bool = False
+    ) -> None:
         self.device, self.has_masks = device, all(view.mask is not None for view in views)
         cameras = [view.camera.moved(similarity) for view in views]
         self.eyes = torch.stack([camera.eye for camera in cameras]).float().to(device)
@@ -256,10 +259,12 @@ class RayPool:
         lens = [camera.intrinsics[[0, 1, 0, 1], [0, 1, 2, 2]] for camera in cameras]
         self.lens = torch.stack(lens).float().to(device)  # (V, 4): fx, fy, cx, cy
         self.widths = torch.tensor([camera.width for camera in cameras], device=device)
-        colors, masks, pixels, owners = [], [], [], []
+        colors, masks, pixels, owners, hits = [], [], [], [], 0
         for index, view in enumerate(views):
             near, far = sphere_span(*camera_rays(view, similarity))
-            kept = (far > near).nonzero()[:, 0]
+            hit = far > near
+            hits += int(hit.sum())
+            kept = torch.arange(len(hit)) if whole else hit.nonzero()[:, 0]
             pixels.append(kept.int())
             owners.append(torch.full_like(kept, index, dtype=torch.int16))
             # Eight bits hold what pictures hold; a pool of float32 would be four times as large.
@@ -269,7 +274,7 @@ class RayPool:
         self.colors, self.pixels = torch.cat(colors).to(device), torch.cat(pixels).to(device)
         self.owners = torch.cat(owners).to(device)
         self.masks = torch.cat(masks).to(device) if masks else None
-        if not len(self.pixels):
+        if not hits:
             raise InputError("no pixel of any picture sees the region of interest; see `mplicits check-cameras`")
 
     def __len__(self) -> int:

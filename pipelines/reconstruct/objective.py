@@ -115,8 +115,9 @@ class SceneObjective(Objective):
         wrong = (self.model.photographed(seen, rays.view) - target).abs().mean(dim=1)
         self.focus.learn(rays.row, wrong.detach())
         color = wrong.mean()
-        # A mean over all sections, those that were skipped included: some of them stand for the others.
-        eikonal = (seen.counts * eikonal_loss(seen.jet.gradient)).mean()
+        # A mean over all sections within the region, those that were skipped included: some stand for the others.
+        within = (seen.counts > 0).any(dim=1).sum().clamp(min=1) * seen.counts.shape[1]
+        eikonal = (seen.counts * eikonal_loss(seen.jet.gradient)).sum() / within
         terms = {"color": color, "eikonal": eikonal}
         total = color + config.eikonal_weight * eikonal
         if self.pool.has_masks and config.mask_weight:

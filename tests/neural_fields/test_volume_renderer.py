@@ -168,6 +168,30 @@ def test_the_outside_is_seen_past_the_sphere_only() -> None:
     torch.testing.assert_close(seen.color, torch.tensor([[1.0, 0, 0], [0, 1, 0]]), atol=1e-3, rtol=0)
 
 
+@pytest.mark.parametrize("skip", [0.0, 1e-3])
+def test_sections_of_rays_that_miss_the_sphere_stand_for_nothing(skip: float) -> None:
+    def fog(inverted: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
+        return torch.full(inverted.shape[:1], 1e3), inverted[:, :3].abs()
+
+    # Through the middle, past the sphere, and away from it.
+    origins = torch.tensor([[0.0, 0.0, 2.0], [1.5, 0.0, 2.0], [0.0, 0.0, 2.0]])
+    along = torch.tensor([[0.0, 0.0, -1.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    options = {"inv_std": 50.0, "outside": fog, "skip": skip, "skip_share": 0.5}
+    field = MultiscaleSDF.from_widths([(8, 1), (8, 1)], omegas=[5, 10], deltas=[0.2])
+
+    def seen(rows: list[int]) -> Rendered:
+        generator = torch.Generator().manual_seed(0)
+        return render_volume(field, red, origins[rows], along[rows], generator=generator, **options)
+
+    both = seen([0, 1, 2])
+    assert (both.counts > 0).any(dim=1).tolist() == [True, False, False]
+    assert both.opacity[1:].tolist() == [0.0, 0.0]
+    nothing = seen([1, 2])  # no section at all is evaluated
+    assert not nothing.counts.any()
+    assert bool(torch.isfinite(nothing.color).all())
+    nothing.color.sum().backward()
+
+
 def test_what_is_behind_something_opaque_is_not_asked_for() -> None:
     asked = []
 

@@ -7,8 +7,10 @@ import pytest
 import torch
 from mplicits.datasets.synthetic.scenes import SCENES, render_scene
 from mplicits.datasets.views.images import PosedImages
-from mplicits.neural_fields import MultiscaleSDF
+from mplicits.neural_fields import MultiscaleSDF, Similarity
+from mplicits.neural_fields.losses import eikonal_loss
 from mplicits.neural_fields.sphere_start import fit_sphere
+from mplicits.neural_fields.volume import sphere_span
 from mplicits.pipelines.reconstruct import model as scene_model
 from mplicits.pipelines.reconstruct.model import RayPool, build_scene
 from mplicits.pipelines.reconstruct.objective import SceneObjective, scene_trainer
@@ -233,3 +235,45 @@ def test_masks_are_trained_for_only_where_they_are(images: PosedImages) -> None:
     trainer = make(images, replace(TINY, mask_weight=0.0))
     train(trainer)
     assert "mask" not in trainer.losses
+
+
+def narrow(images: PosedImages) -> Similarity:
+    """A region that is too small for the pictures: rays pass it, some of them through the object."""
+    return replace(images.similarity, scale=images.similarity.scale / 3)
+
+
+def test_what_lies_beside_the_region_is_learnt(images: PosedImages) -> None:
+    views = [replace(view, mask=None) for view in images.views]
+    config = replace(TINY, steps=60, rays=64, learning_rate=5e-3, background="outside")
+    pool = RayPool(views, narrow(images), torch.device("cpu"), whole=True)
+    trainer = scene_trainer(build_scene(config, has_masks=False), pool, config)
+    rays = pool.draw(1500, torch.Generator().manual_seed(5))
+    near, far = sphere_span(rays.origins, rays.directions)
+    past = far <= near
+    assert 0.2 < float(past.float().mean()) < 0.98
+
+    def wrong() -> float:
+        with torch.no_grad():
+            seen = trainer.objective.model.render(rays.origins, rays.directions, trainer.objective.sampling)
+        assert not seen.counts[past].any()
+        return float((seen.color - rays.color)[past].abs().mean())
+
+    before = wrong()
+    train(trainer)
+    assert wrong() < 0.5 * before
+
+
+def test_rays_that_miss_the_region_leave_the_eikonal_term_alone(images: PosedImages) -> None:
+    config = replace(TINY, background="outside", march_grid=0, skip=0.0, focus=0.0, jets=0)
+    pool = RayPool(images.views, narrow(images), torch.device("cpu"), whole=True)
+    objective = scene_trainer(build_scene(config, has_masks=True), pool, config).objective
+    terms, _ = objective.losses(0, 0.5)
+    generator = torch.Generator().manual_seed(config.seed)  # the same rays, and the same sections
+    rays = pool.draw(objective.batch(), generator, objective.focus)
+    near, far = sphere_span(rays.origins, rays.directions)
+    hits = far > near
+    assert 0 < int(hits.sum()) < len(hits)
+    seen = objective.model.render(
+        rays.origins, rays.directions, objective.sampling, level=objective.level_at(0.5), generator=generator
+    )
+    torch.testing.assert_close(terms["eikonal"], eikonal_loss(seen.jet.gradient[hits]).mean())

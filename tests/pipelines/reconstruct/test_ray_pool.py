@@ -77,6 +77,14 @@ def test_pixels_that_miss_the_sphere_are_never_drawn_and_all_others_are() -> Non
     assert set(places(pool)[0]) == expected
 
 
+def test_all_pixels_are_drawn_where_the_outside_is_learnt() -> None:
+    pictures = views()
+    pool = RayPool(pictures, WORLD, CPU, whole=True)
+    every = {(index, y, x) for index, picture in enumerate(pictures) for y, x in np.ndindex(*picture.color.shape[:2])}
+    assert len(pool) == len(every)
+    assert set(places(pool)[0]) == every
+
+
 def test_all_pixels_are_equally_likely() -> None:
     pool = RayPool(views(), WORLD, CPU)
     where, _, _ = places(pool, 100 * len(pool))
@@ -113,5 +121,7 @@ def test_cameras_that_all_look_away_are_refused() -> None:
     away = [view(number, 8, 8, masked=True, back=True) for number in range(3)]
     with pytest.raises(InputError, match="sees the region of interest; see `mplicits check-cameras`"):
         RayPool(away, WORLD, CPU)
+    with pytest.raises(InputError, match="sees the region of interest"):
+        RayPool(away, WORLD, CPU, whole=True)
     mixed = RayPool([away[0], *views()[1:]], WORLD, CPU)
     assert {number for number, _, _ in places(mixed)[0]} == {1, 2}
