@@ -23,7 +23,7 @@ from ...datasets.views.images import PosedImage, PosedImages, read_posed_images
 from ...neural_fields import InputError, Similarity
 from ..mesh.files import write_mesh
 from .frustums import camera_mesh
-from .silhouettes import contradictions
+from .silhouettes import contradictions, how_turned
 
 __all__ = ["CameraCheck", "check_cameras", "check_files", "format_check"]
 
@@ -263,7 +263,9 @@ def _silhouettes(images: PosedImages) -> Iterator[str]:
     inverted, odd = contradictions(views, images.similarity)
     if inverted:
         yield "the masks cover the borders of the pictures and not their middles: they look inverted; white is object"
-    if odd:
+    elif turned := how_turned(views, images.similarity):
+        yield f"the silhouettes contradict each other, and would not if the pictures were not {turned}"
+    elif odd:
         names = _named([view.name for view in odd])
         yield (
             f"{len(odd)} of {len(views)} silhouettes contradict the others: {names}; is that the right picture, the "

@@ -10,6 +10,7 @@ import torch
 import trimesh
 from mplicits.datasets.cameras import Camera, look_at
 from mplicits.datasets.synthetic.scenes import SCENES, render_scene
+from mplicits.datasets.synthetic.view_faults import with_fault
 from mplicits.datasets.views.images import PosedImage
 from mplicits.datasets.views.writing import write_colmap, write_neus, write_transforms
 from mplicits.neural_fields import Similarity
@@ -194,6 +195,35 @@ def test_a_picture_of_something_else(torus):
         f"1 of 12 silhouettes contradict the others: {torus.views[above].name}; is that the right picture, the right "
         "way round, and its pose and mask right?"
     )
+
+
+@pytest.fixture(scope="module")
+def figure():
+    return render_scene(SCENES["figure"](), 24, 64, samples=1)
+
+
+@pytest.mark.parametrize(
+    ("axes", "said"), [((1,), "mirrored, left to right"), ((0,), "mirrored, top to bottom"), ((0, 1), "upside down")]
+)
+def test_pictures_that_are_turned(figure, axes, said):
+    assert check_cameras(figure).warnings == ()
+    flipped = with_views(
+        figure, lambda _, v: dataclasses.replace(v, color=np.flip(v.color, axes), mask=np.flip(v.mask, axes).copy())
+    )
+    assert the_warning(flipped) == (
+        f"the silhouettes contradict each other, and would not if the pictures were not {said}"
+    )
+
+
+def test_pictures_of_a_thing_that_mirrored_looks_the_same(good):
+    flipped = with_views(good, lambda _, v: dataclasses.replace(v, mask=v.mask[:, ::-1].copy()))
+    assert check_cameras(flipped).warnings == ()
+
+
+def test_inexact_poses_are_not_taken_for_turned_pictures(figure):
+    for seed in range(3):
+        inexact = with_fault(figure, "poses", seed)
+        assert not any("contradict" in line for line in check_cameras(inexact).warnings)
 
 
 def test_exposures_two_stops_apart(good):
