@@ -206,6 +206,8 @@ def importance_depths(
 def outside_depths(far: Tensor, count: int, *, generator: torch.Generator | None = None) -> Tensor:
     """Depths ``(R, count)`` behind the region of interest, evenly spaced in 1/t from ``far`` towards infinity."""
     shares = stratified_depths(torch.zeros_like(far), torch.ones_like(far), count, generator=generator)
+    # One ray in a million has its last share rounded to 1, which would be at infinity.
+    shares = shares.clamp(max=1 - 2.0**-20)
     return far[:, None].clamp(min=1e-6) / (1 - shares)
 
 

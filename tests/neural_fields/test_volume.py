@@ -144,6 +144,16 @@ class TestDepths:
         depths = outside_depths(torch.tensor([2.0]), 4)
         torch.testing.assert_close(1 / depths, torch.tensor([[7 / 16, 5 / 16, 3 / 16, 1 / 16]]))
 
+    def test_no_outside_depth_is_infinite(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        # (31 + u) / 32 rounds to 1 where the random u is within a millionth of 1.
+        monkeypatch.setattr(torch, "rand", lambda *size, **_: torch.full(size, 1 - 2.0**-24))
+        far = torch.tensor([1.0, 2.0])
+        depths = outside_depths(far, 32, generator=torch.Generator())
+        assert bool((depths.diff(dim=1) > 0).all())
+        assert bool((depths[:, -1] <= far * 2**20).all())
+        points = ray_points(torch.zeros(2, 3), torch.nn.functional.normalize(torch.ones(2, 3), dim=1), depths)
+        assert bool(torch.isfinite(invert_outside(points)).all())
+
     def test_inverted_points_lie_in_the_unit_box(self) -> None:
         inverted = invert_outside(torch.tensor([[0.0, 0.0, 4.0], [3.0, 0.0, 4.0]]))
         torch.testing.assert_close(inverted, torch.tensor([[0, 0, 1, 0.25], [0.6, 0, 0.8, 0.2]]))
