@@ -132,6 +132,7 @@ def _without_hull(views: Sequence[PosedImage], similarity: Similarity) -> float:
     hull = points[(count >= max(1.0, MAY_DIFFER * len(views))) & ((seen & ~objects).sum(dim=0) <= SURE * count)]
     shares = []
     for view in views:
+        assert view.mask is not None
         camera = view.camera.moved(similarity)
         reach = math.ceil(edge * float(camera.intrinsics[0, 0]) / float(camera.eye.norm().clamp(min=edge)))
         pixels, depth = camera.project(hull)
