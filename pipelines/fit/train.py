@@ -222,7 +222,7 @@ class _Fitting:
         self.fingerprint = digest_of((cloud.points, cloud.normals))
         self.points, self.normals = torch.from_numpy(cloud.points), torch.from_numpy(cloud.normals)
         self.index: CloudDistance | None = None  # of the points above
-        self.held = torch.zeros(len(self.points), dtype=torch.bool)  # those of them that it leaves out
+        self.held = torch.zeros(len(self.points), dtype=torch.bool)  # those of them that residual levels leave out
         self.signs: Signs | None = None  # that the points without normals were given
         self.spacing = 0.0  # of all of them
         self.frozen: MultiscaleSDF | None = None
@@ -285,16 +285,16 @@ class _Fitting:
 
     def share(self, level: int) -> Share | None:
         """Samples of a level, and seconds for it all in the time budget; None if none are left that are worth it."""
-        share = self.timing.share(level, self.indexed, begun=bool(self.trainer_state))
+        share = self.timing.share(level, lambda: self.indexed(level), begun=bool(self.trainer_state))
         if share is not None and self.trainer_state:  # it goes on with what it has learnt from, and the time it took
             took = float(self.trainer_state["progress"][1])
             share = Share(share.seconds + took, self.samples or share.samples)
         self.samples = None if share is None else share.samples
         return share
 
-    def indexed(self) -> CloudDistance:
-        """`distances`, made once."""
-        self.index = self.index or self.distances()
+    def indexed(self, level: int) -> CloudDistance:
+        """`distances` of a level, made once."""
+        self.index = self.index or self.distances(level)
         return self.index
 
     def train_level(self, level: int, share: Share, flag: StopFlag) -> None:
@@ -304,7 +304,7 @@ class _Fitting:
         work = self.timing.sampling(level, share.samples)
         band = None if self.frozen is None else self.next_band()
         delta = None if band is None else band.delta
-        index = self.indexed()
+        index = self.indexed(level)
         gain = SMALL_GAIN if index.filled and config.robust_normals else RESIDUAL_GAIN
         siren = new_level(config, level, residual=level > 0, gain=gain).to(self.device)
         work.indexed()
@@ -337,6 +337,8 @@ class _Fitting:
         verdict = objective.take_best()
         self.frozen = self.grown(siren, delta).requires_grad_(False)
         review = self.review() if level == 0 else None
+        if level == 0 and config.hold_out:
+            self.index = None  # the next level leaves some points out
         before, self.errors = self.errors, self.values_at_cloud()
         silenced = level > 0 and _rms(self.errors) > WORSE * _rms(before)
         if verdict is not None:
@@ -372,12 +374,16 @@ class _Fitting:
         if self.level_done is not None:
             self.level_done(self.frozen, self.cloud.similarity)
 
-    def distances(self) -> CloudDistance:
-        """The points that are trained on, and where they are sparse, what they say of the places between them."""
+    def distances(self, level: int) -> CloudDistance:
+        """The points that are trained on, and where they are sparse, what they say of the places between them.
+
+        Nobody judges level 0, so it learns from all of them: a voxel may be all that there is of a small face.
+        """
         config, all_points = self.config, self.points.numpy()
         noise, guessed = self.cloud.noise, self.cloud.guessed
         self.spacing = spacing_of(all_points.astype(np.float64))
-        self.held = torch.from_numpy(held_out(all_points, self.spacing, config.hold_out, seed=config.seed))
+        share = config.hold_out if level else 0.0
+        self.held = torch.from_numpy(held_out(all_points, self.spacing, share, seed=config.seed))
         points, normals = self.points[~self.held], self.normals[~self.held]
         if not config.between:
             return CloudDistance(points, normals, noise=noise, guessed=guessed)

@@ -14,6 +14,7 @@ from mplicits.datasets import PointCloud
 from mplicits.neural_fields import InputError, load_field
 from mplicits.neural_fields.meshing import extract_mesh
 from mplicits.pipelines.cli.info import describe
+from mplicits.pipelines.fit.heldout import FEWEST
 from mplicits.pipelines.fit.train import fit
 from mplicits.pipelines.run.folder import read_record
 from mplicits.pipelines.run.machine import choose_device
@@ -115,6 +116,15 @@ def test_a_level_that_is_worse_than_none_adds_nothing(fitted: Path, tmp_path: Pa
     assert torch.equal(run.field.jet(x).gradient, run.field.jet(x, level=0).gradient)
     assert "level 1 set to zero: further from the points" in describe(tmp_path / "run")
     assert not any(stage["silenced"] for stage in read_record(fitted)["stages"])
+
+
+def test_the_level_that_nobody_judges_learns_from_all_points() -> None:
+    run = fit(sphere_cloud(), replace(SMALL, steps=(3, 2), between=False))
+    first, second = run.record["stages"]
+    kept = len(sphere_cloud()) - run.record["cleaning"]["dropped_outliers"]
+    assert first["samples"]["surface"] == kept
+    assert second["held_out"]["points"] <= kept - second["samples"]["surface"]
+    assert FEWEST <= kept - second["samples"]["surface"] < 0.1 * kept
 
 
 def test_levels_are_handed_out_as_they_are_finished() -> None:
