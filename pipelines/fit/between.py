@@ -43,6 +43,10 @@ AGREED = 0.9
 # sum of weights that must be across it. The points along an edge have each other's mean normals: a line is no patch.
 COMPANY, WIDE, ENOUGH = 4, 0.1, 0.2
 RIDGE = 0.02  # of that fit, in the same units
+# Height of a point over the plane of a patch, over its distance, below which it is in its rim whatever its normal: on a
+# smooth surface normals that are not alike are at heights above a quarter. Such a patch must have so many neighbours
+# of its own in the row, and as many in the rim as another has company.
+RIM, ROW = 0.03, 2
 # All in units of the distance to the fourth nearest point: how much patches may differ at a new point, how far one may
 # be beyond another's plane, and how near two must pass to a point of an edge.
 SPREAD, BEYOND, THROUGH = 0.05, 0.03, 0.1
@@ -154,14 +158,18 @@ class _Patches:
         mirrored = np.abs(0.5 * ((own + theirs) * edge).sum(axis=2)) < MIRRORED * distance
         scale = np.maximum(np.median(distance, axis=1), 1e-300)[:, None]
         weight = mirrored & ((own * theirs).sum(axis=2) > ALIKE)
-        company = weight.sum(axis=1)
-        weight = weight * np.exp(-((distance / scale) ** 2) / 2)
+        near = np.exp(-((distance / scale) ** 2) / 2)
         across = (edge - (edge * own).sum(axis=2, keepdims=True) * own) / scale[..., None]
         turn = theirs - (theirs * own).sum(axis=2, keepdims=True) * own
-        weighted = (weight[..., None] * across).transpose(0, 2, 1)  # (n, 3, k)
-        spread, mixed = weighted @ across, weighted @ turn
-        values = np.linalg.eigvalsh(spread)  # the first is across the plane: 0
-        self.sound[rows] = (values[:, 1] > np.maximum(WIDE * values[:, 2], ENOUGH)) & (company >= COMPANY)
+        spread, mixed, sound = _fitted(weight, near, across, turn)
+        # A face as narrow as two spacings has one row of points of its own. Those of its edges have the normals of
+        # other faces, but lie in its plane, where it is flat up to them.
+        rim = ~weight & (np.abs((edge * own).sum(axis=2)) < RIM * distance)
+        turn = np.where(weight[..., None], turn, 0.0)
+        wider, mixed_too, sound_too = _fitted(weight | rim, near, across, turn)
+        spread = np.where(sound[:, None, None], spread, wider)
+        mixed = np.where(sound[:, None, None], mixed, mixed_too)
+        self.sound[rows] = sound | (sound_too & (weight.sum(axis=1) >= ROW) & (rim.sum(axis=1) >= COMPANY))
         solved = np.linalg.solve(spread + RIDGE * np.eye(3), mixed)
         self.shape[rows] = 0.5 * (solved + solved.transpose(0, 2, 1)) / scale[..., None]
         self.reach[rows] = distance[:, 5]
@@ -183,6 +191,22 @@ class _Patches:
         own = self.normals[found]
         value = ((own + 0.5 * bent) * offset).sum(axis=2)
         return distance, found, offset, value, _unit(own + bent)
+
+
+def _fitted(chosen: Mask, near: Float64, across: Float64, turn: Float64) -> tuple[Float64, Float64, Mask]:
+    """What the shape of patches is solved from, and which have company on all sides.
+
+    Args:
+        chosen: ``(n, k)`` which neighbours are asked.
+        near: ``(n, k)`` weights by distance.
+        across: ``(n, k, 3)`` where they are in the plane.
+        turn: ``(n, k, 3)`` how their normals are turned.
+    """
+    weighted = ((chosen * near)[..., None] * across).transpose(0, 2, 1)  # (n, 3, k)
+    spread = weighted @ across
+    values = np.linalg.eigvalsh(spread)  # the first is across the plane: 0
+    sound = (values[:, 1] > np.maximum(WIDE * values[:, 2], ENOUGH)) & (chosen.sum(axis=1) >= COMPANY)
+    return spread, weighted @ turn, sound
 
 
 def _repaired(patches: _Patches) -> tuple[Float64, int]:

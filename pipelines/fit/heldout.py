@@ -125,7 +125,7 @@ class Verdict(NamedTuple):
         at: fraction of its schedule after which its weights were kept.
         fall: how sure the difference is.
         learnt: root mean square of |f| at the points that it has learnt from, over that without it.
-        guessed: whether the normals are guesses from noisy points, which cannot speak against a level.
+        guessed: whether the normals were estimated from the points, which cannot speak against a level.
     """
 
     points: int
@@ -140,7 +140,7 @@ class Verdict(NamedTuple):
     def better(self) -> bool:
         """Whether the level is worth having.
 
-        Either one error is surely less, and the other not surely more, unless that is the angle to guesses. Or both
+        Either one error is surely less, and the other not surely more, unless that is the angle to estimates. Or both
         are less, surely or not, and it has gained by far at the points that it has learnt from.
         """
         against = self.fall.distance if self.guessed else min(self.fall)

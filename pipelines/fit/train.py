@@ -344,7 +344,7 @@ class _Fitting:
         if verdict is not None:
             seen = ~self.held
             learnt = _rms(self.errors[seen]) / max(_rms(before[seen]), 1e-30)
-            verdict = verdict._replace(learnt=learnt, guessed=self.cloud.guessed)
+            verdict = verdict._replace(learnt=learnt, guessed=self.cloud.estimated)
             silenced |= not verdict.better
         if silenced:
             nn.init.zeros_(siren.output.weight)

@@ -103,6 +103,26 @@ def test_the_mean_normals_of_edges_become_those_of_a_side() -> None:
     assert kept.mean() > 0.998
 
 
+def test_faces_with_one_row_of_points_are_filled_and_nothing_beyond_them() -> None:
+    """A plate two spacings thick, whose edges have the normals of its large faces."""
+    half, thin, cells = 0.5, 0.05, 20
+    line = np.linspace(-half, half, cells + 1)
+    points = np.stack(np.meshgrid(line, line, [-thin, 0, thin], indexing="ij"), axis=-1).reshape(-1, 3)
+    rim = np.abs(points[:, :2]) == half
+    points, rim = points[rim.any(axis=1) | (points[:, 2] != 0)], rim[rim.any(axis=1) | (points[:, 2] != 0)]
+    normals = np.zeros_like(points)
+    normals[:, 2] = np.sign(points[:, 2])
+    row = points[:, 2] == 0
+    normals[row, :2] = np.sign(points[row, :2]) * rim[row]
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    found = densified(points, normals, 20_000)
+    outside = np.abs(found.points) - [half, half, thin]
+    assert np.abs(outside.max(axis=1)).max() < 0.1 * thin  # on the plate, up to the corners' mean normals
+    low = np.abs(found.points[:, 2]) < 0.8 * thin
+    share = 4 * (2 * half) * (1.6 * thin) / (2 * (2 * half) ** 2 + 4 * (2 * half) * (2 * thin))
+    assert low.mean() > 0.5 * share
+
+
 def test_contradictions_are_not_filled() -> None:
     points = sample_sphere(2000).points
     random = np.random.default_rng(4).normal(size=points.shape)
