@@ -100,6 +100,7 @@ def test_interrupted_runs_are_resumed_and_finished_ones_left_alone(
     assert read_record(again / "ring")["config"]["seed"] == 4
 
 
+@pytest.mark.slow  # test_jobs has two workers in each run; here each loads everything for a fit
 @pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="Ray is an extra")
 def test_two_workers_fit_as_one_does(clouds: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     broken = tmp_path / "broken.ply"
