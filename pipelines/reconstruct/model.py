@@ -19,6 +19,7 @@ from ...neural_fields.sphere_start import fit_sphere
 from ...neural_fields.volume import sphere_span
 from ...neural_fields.volume_renderer import Rendered, Sampling, render_volume
 from ..run.settings import ReconstructConfig
+from ..run.team import my_share
 from ..run.trainer import seeded
 from .focus import Focus
 
@@ -281,17 +282,17 @@ class RayPool:
         return len(self.pixels)
 
     def draw(self, count: int, generator: torch.Generator, focus: Focus | None = None) -> Rays:
-        """``count`` rays at random, with replacement; ``focus`` says where, if not anywhere."""
+        """``count`` rays at random, with replacement, or a team's share of them; ``focus`` says where."""
         rows = (
             torch.randint(len(self), (count,), generator=generator) if focus is None else focus.rows(count, generator)
         )
-        rows = upload(rows, self.device)
+        rows = upload(my_share(rows), self.device)
         view, pixel = self.owners[rows].long(), self.pixels[rows].long()
         fx, fy, cx, cy = self.lens[view].unbind(dim=1)
         x, y = pixel % self.widths[view], pixel // self.widths[view]
         seen = torch.stack(((x - cx) / fx, (y - cy) / fy, torch.ones_like(fx)), dim=1)
         directions = torch.nn.functional.normalize(torch.einsum("rij,rj->ri", self.axes[view], seen), dim=1)
-        mask = torch.ones(count, device=self.device) if self.masks is None else self.masks[rows] / 255
+        mask = torch.ones(len(rows), device=self.device) if self.masks is None else self.masks[rows] / 255
         return Rays(self.eyes[view], directions, self.colors[rows] / 255, mask, view, rows)
 
 

@@ -12,6 +12,7 @@ from ...neural_fields.losses import eikonal_loss
 from ...neural_fields.value_grid import ValueGrid
 from ...neural_fields.volume_renderer import Sampling
 from ..run.settings import ReconstructConfig
+from ..run.team import gathered, mean_of_all, own_generator, whole_batch
 from ..run.trainer import Group, Objective, Trainer, warm_cosine
 from .focus import Focus
 from .model import RayPool, SceneModel
@@ -91,7 +92,8 @@ class SceneObjective(Objective):
         """See `Objective.losses`."""
         config = self.config
         self.model.widen(config.band, config.least_delta)
-        rays = self.pool.draw(self.batch(), self.generator, self.watch(step))
+        rays = self.pool.draw(whole_batch(self.batch()), self.generator, self.watch(step))
+        generator = own_generator(self.generator)
         origins, directions = rays.origins, rays.directions
         if self.model.poses is not None:
             origins, directions = self.model.poses.moved(origins, directions, rays.view)
@@ -105,18 +107,18 @@ class SceneObjective(Objective):
             skip=config.skip,
             skip_share=config.skip_share,
             guide=self.look(step),
-            generator=self.generator,
+            generator=generator,
         )
         if (step + 1) % NEAR_EVERY == 0:
-            self.kept["sections"] = ((seen.counts > 0).sum() / len(origins)).cpu()
+            self.kept["sections"] = mean_of_all((seen.counts > 0).sum() / len(origins)).cpu()
         target = rays.color
         if self.pool.has_masks:
             target = torch.lerp(self.model.background.expand_as(target), target, rays.mask[:, None])
         wrong = (self.model.photographed(seen, rays.view) - target).abs().mean(dim=1)
-        self.focus.learn(rays.row, wrong.detach())
+        self.focus.learn(gathered(rays.row), gathered(wrong.detach()))
         color = wrong.mean()
         # A mean over all sections within the region, those that were skipped included: some stand for the others.
-        within = (seen.counts > 0).any(dim=1).sum().clamp(min=1) * seen.counts.shape[1]
+        within = mean_of_all((seen.counts > 0).any(dim=1).sum().to(wrong)).clamp(min=1) * seen.counts.shape[1]
         eikonal = (seen.counts * eikonal_loss(seen.jet.gradient)).sum() / within
         terms = {"color": color, "eikonal": eikonal}
         total = color + config.eikonal_weight * eikonal

@@ -26,6 +26,7 @@ from ..run.folder import TEXTURE_FILE, RunFolder, digest_of
 from ..run.machine import choose_device, environment, speed
 from ..run.schedule import Progress, Report, Schedule, Stage
 from ..run.settings import ReconstructConfig, TextureConfig
+from ..run.team import agreed, apart, is_leader
 from ..run.trainer import Interrupted, load_compiler, parameter_count, stop_on_signals
 from ..surface.surface import from_mesh, sample_points
 from ..surface.trim import in_region
@@ -98,6 +99,9 @@ def reconstruct(
         out: run directory for field, texture, pictures, checkpoints and ``run.json``; None writes nothing.
         resume: continue the interrupted run in ``out`` with its own settings; ``config`` is then ignored.
         progress: called now and then with how far the training is.
+
+    Within a `team` of processes each renders its share of the rays. All end with the same model; only the first one
+    measures, makes the texture and writes.
 
     Raises:
         InputError: the data cannot be read or used, or there is nothing to resume.
@@ -176,7 +180,8 @@ class _Reconstruction:
         if left is None:
             return None
         after = sum(self.schedule.predicted(stage) for stage in self.plan.after())
-        return max(left - min(after, AFTER_SHARE * left), LEAST_SECONDS)
+        # A team agrees, or one would go on while another has ended.
+        return agreed(False, max(left - min(after, AFTER_SHARE * left), LEAST_SECONDS), self.device)[1]
 
     @property
     def level(self) -> int:
@@ -191,6 +196,13 @@ class _Reconstruction:
             # What was trained is safe before pictures and texture are made, which may be interrupted or fail too.
             self._save()
         self.model.requires_grad_(False)
+        if not is_leader():
+            return Reconstruction(self.model.cpu(), None, self.images, None, self._record(finished=True))
+        with apart():
+            return self._finish()
+
+    def _finish(self) -> Reconstruction:
+        """Measure, colour, write."""
         pairs = self._render_held_out()
         record = self._record(finished=True) | {"held_out": self._figures(pairs)}
         self.model.cpu()

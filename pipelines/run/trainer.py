@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from ...neural_fields.devices import precise
 from .schedule import Progress, Report
-from .team import agreed, average_gradients, is_alone
+from .team import agreed, as_the_leader, average_gradients, is_alone
 
 __all__ = [
     "Group",
@@ -241,6 +241,7 @@ class Trainer(Generic[O]):
         start, saved = time.monotonic() - self.elapsed, time.monotonic()
         told = saved
         device = self.trained[0].device
+        as_the_leader(self.trained)
         stop, self.elapsed = agreed(flag.requested, self.elapsed, device)
         if self.fraction < 1:
             report(self.progress)  # so that displays know when it began
