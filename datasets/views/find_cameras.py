@@ -270,8 +270,12 @@ def _film_pairs(count: int) -> int:
 
 
 def _rows(database: Path, table: str) -> int:
+    """How many rows are in COLMAP's database, but for the last few megabytes that it has written.
+
+    Read as immutable, no lock is taken. COLMAP does not wait for one: it would end, if it opened the file meanwhile.
+    """
     try:
-        with closing(sqlite3.connect(f"{database.resolve().as_uri()}?mode=ro", uri=True, timeout=0.1)) as opened:
+        with closing(sqlite3.connect(f"{database.resolve().as_uri()}?immutable=1", uri=True)) as opened:
             return int(opened.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0])
     except sqlite3.Error:  # not there yet, or being written
         return 0
@@ -299,12 +303,14 @@ def _reconstructed(project: Path, one: bool, film: bool, told: Connection) -> di
     extraction.max_image_size = LARGEST_SIDE
     pycolmap.extract_features(database, images, camera_mode=mode, extraction_options=extraction)
     told.send(("stage", (MATCHING, 0)))
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = 0  # else every run has matches of its own
     if film:
         pairing = pycolmap.SequentialPairingOptions()
         pairing.overlap, pairing.quadratic_overlap = OVERLAP, True
-        pycolmap.match_sequential(database, pairing_options=pairing)
+        pycolmap.match_sequential(database, pairing_options=pairing, verification_options=verification)
     else:
-        pycolmap.match_exhaustive(database)
+        pycolmap.match_exhaustive(database, verification_options=verification)
     options = pycolmap.IncrementalPipelineOptions()
     options.min_model_size, options.random_seed = LEAST, 0
     placed = itertools.count(3)  # two are placed together, of which one is told

@@ -1,8 +1,10 @@
 """Cameras found by COLMAP against those that drew the pictures; what can be read, continued and refused."""
 
 import math
+import sqlite3
 import sys
 from collections.abc import Callable
+from contextlib import closing
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -16,7 +18,8 @@ from mplicits.datasets.views import find_cameras as module
 from mplicits.datasets.views.find_cameras import FoundCameras, find_cameras
 from mplicits.neural_fields import InputError, Sphere
 
-VIEWS, SIZE, DISTANCE = 6, 240, 3.0
+VIEWS, SIZE, DISTANCE = 6, 240, 2.4
+FOV = math.degrees(2 * math.atan(0.5 / 1.2))  # of a lens as COLMAP expects it: six small pictures say little of theirs
 SPECKLES = np.random.default_rng(0).uniform(0, 1, (64, 64, 64, 3))
 
 
@@ -38,7 +41,7 @@ def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("photographs")
     scene = Scene("speckled", Sphere(radius=0.8), speckled, 0.85)
     for number in range(VIEWS):
-        camera = look_at(eye(number), (0, 0, 0), fov=36, width=SIZE, height=SIZE)
+        camera = look_at(eye(number), (0, 0, 0), fov=FOV, width=SIZE, height=SIZE)
         write(folder / f"{number}.png", render_view(scene, camera, samples=2)[0])
     return folder
 
@@ -186,6 +189,20 @@ def test_without_pycolmap_the_extra_is_named(
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     with pytest.raises(InputError, match=r"pip install 'mplicits\[poses\]'"):
         find_cameras(photographs, tmp_path / "project")
+
+
+def test_progress_is_read_without_a_lock(tmp_path: Path) -> None:
+    """As long as somebody writes exclusively, nobody else may open the database: COLMAP would find it locked."""
+    database = tmp_path / "a b?.db"
+    assert module._rows(database, "keypoints") == 0
+    with closing(sqlite3.connect(database, isolation_level=None)) as theirs:
+        theirs.execute("CREATE TABLE keypoints (image INTEGER)")
+        theirs.executemany("INSERT INTO keypoints VALUES (?)", [(1,), (2,)])
+        theirs.execute("BEGIN EXCLUSIVE")
+        assert module._rows(database, "keypoints") == 2
+        theirs.execute("ROLLBACK")
+        assert module._rows(database, "matches") == 0
+    assert [file.name for file in tmp_path.iterdir()] == ["a b?.db"]
 
 
 @pytest.mark.parametrize("count", [3, 11, 40])
