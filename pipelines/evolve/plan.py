@@ -21,6 +21,8 @@ USUAL, EXACT = Net.siren(256, 2), Net(2000, 60)
 # Of a step of a motion: evaluations on its paths, and of the shapes where they end. For each known sample of a
 # deformation: evaluations of the motion, by Runge and Kutta forth and back, with derivatives.
 PATHS, ENDS, CARRIED = 26_000, 1_500, 160
+# Grid of the pace between two shapes: its vertices, and how often the motion is asked for each, most not at all.
+PACED, PACED_WAYS = 97**3, 8
 MESHED = 128  # cells along the meshes of shapes
 ENDS_MESHED = 192
 # FLOPs that take as long as the Chamfer distance of an end; and as a mesh beside its values, by its resolution squared:
@@ -71,6 +73,8 @@ class EvolvePlan:
         work = jets(points, self._given())
         if config.kind == "deform":
             work += training(1, CARRIED * config.samples, [self._motion()])
+            pairs = max(len(config.shapes) - 1, 1)
+            work += values(pairs * PACED, self._given()) + values(pairs * PACED * PACED_WAYS, [self._motion()])
         return Stage("known samples", "samples", self.speed.points(work))
 
     def starting(self) -> Stage:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,7 +12,6 @@ import torch
 from torch import Tensor
 
 from ...neural_fields import (
-    CarriedKeyframes,
     Field,
     InputError,
     IntegrationError,
@@ -33,6 +33,7 @@ from ..run.settings import EvolveConfig
 from .deform import carried_samples, learn_motion, motion_figures
 from .samples import Bounds, Carried, Known, around, joined, known_at, no_bounds, signs, uniform
 from .shapes import Placement, StaticShape, aligned, into_unit_sphere
+from .source import PacedKeyframes, pace_of
 
 __all__ = ["End", "Problem", "between", "build_problem", "morph_law", "velocity_field"]
 
@@ -167,7 +168,10 @@ def _deform(
     placed, region = _together(shapes, config)
     keys = config.key_times()
     motion = motion or learn_motion(placed, keys, config, progress)
-    carried = CarriedKeyframes(Keyframes(keys, [shape.field for shape in placed]), motion)
+    frames = Keyframes(keys, [shape.field for shape in placed])
+    between_keys = zip(itertools.pairwise(placed), itertools.pairwise(keys), strict=True)
+    paces = [pace_of([shape.field for shape in pair], times, motion) for pair, times in between_keys]
+    carried = PacedKeyframes(frames, motion, paces)
     known, bounds = carried_samples(carried, placed, config.samples, config.seed)
     ends = tuple(_end(shape, time, config.seed) for shape, time in zip(placed, keys, strict=True))
     similarity, figures = _composed(shapes[0].similarity, region), tuple(motion_figures(motion, placed, keys))
