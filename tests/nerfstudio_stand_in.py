@@ -43,6 +43,8 @@ class Lpips(nn.Module):
 @dataclass
 class ModelConfig(Config):
     sdf_field: Any = None
+    num_samples: int = 64
+    num_samples_importance: int = 64
     eval_num_rays_per_chunk: int = 4096
     background_model: str = "mlp"
 
@@ -70,6 +72,9 @@ class Model(nn.Module):
             self.field.set_cos_anneal_ratio(min(1.0, step / self.anneal_end))
 
         return [Kept(where_to_run=[Location.BEFORE_TRAIN_ITERATION], update_every_num_iters=1, func=anneal)]
+
+    def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
+        return {"fields": list(self.field.parameters())}
 
     def step(self, depths: Tensor) -> Tensor:
         samples = ray_samples(depths)

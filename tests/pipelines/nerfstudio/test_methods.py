@@ -38,8 +38,19 @@ def test_a_model_trains_and_its_bands_follow(plugin: Any, name: str, capsys: pyt
     field = model.field
     assert isinstance(field, NerfstudioField)
     assert field.scale == pytest.approx(12**-0.5)  # a corner lies 2 √3 away
-    optimizer = torch.optim.Adam(field.parameters(), lr=5e-4)
-    callbacks = model.get_training_callbacks(None)
+    groups = model.get_param_groups()
+    named = {id(parameter) for group in groups.values() for parameter in group}
+    assert named == {id(parameter) for parameter in field.parameters()}
+    assert sum(map(len, groups.values())) == len(named)
+    optimizer = torch.optim.Adam([{"params": groups[name], "lr": plugin.RATES[name]} for name in groups])
+    schedule = importlib.import_module(f"{PLUGIN}schedule").WarmCosineConfig().setup()
+    schedulers = {"fields": schedule.get_scheduler(optimizer, 1.0)}
+    trainer = SimpleNamespace(_start_step=40, config=SimpleNamespace(max_num_iterations=10))
+    callbacks = model.get_training_callbacks(
+        SimpleNamespace(trainer=trainer, optimizers=SimpleNamespace(schedulers=schedulers))
+    )
+    assert schedule.steps == 50
+    assert schedule.factor(50) == pytest.approx(0.05)
     losses = []
     for step in range(4):
         for callback in callbacks:
@@ -73,8 +84,8 @@ def test_the_start_is_a_sphere_in_the_scene_box(plugin: Any) -> None:
 
 def test_schedules_are_plain_numbers(plugin: Any) -> None:
     """NumPy's would be in the checkpoints, which PyTorch then refuses to read."""
-    methods = importlib.import_module(f"{PLUGIN}methods")
-    schedule = methods.WarmCosineConfig(methods.WarmCosine, warm_up_end=9, max_steps=109, least=0.1).setup()
+    schedules = importlib.import_module(f"{PLUGIN}schedule")
+    schedule = schedules.WarmCosineConfig(schedules.WarmCosine, warm_up_end=9, max_steps=109, least=0.1).setup()
     found = [schedule.factor(step) for step in (0, 9, 59, 109, 500)]
     assert found == pytest.approx([0.1, 1.0, 0.55, 0.1, 0.1])
     assert {type(factor) for factor in found} == {float}
@@ -92,12 +103,13 @@ def test_the_entry_points_lead_to_the_methods(plugin: Any) -> None:
         module, attribute = place.split(":")
         method = getattr(importlib.import_module(module), attribute)
         assert method.config.method_name == name
-        groups = {"fields", "field_background"} | ({"proposal_networks"} if "facto" in name else set())
+        groups = set(plugin.RATES) | ({"proposal_networks"} if "facto" in name else set())
         assert set(method.config.optimizers) == groups
         assert (
             method.config.pipeline.model.sdf_field.learning_rate == method.config.optimizers["fields"]["optimizer"].lr
         )
-        assert method.config.pipeline.datamanager.dataparser.center_method == "focus"
+        parser = method.config.pipeline.datamanager.dataparser
+        assert (parser.center_method, parser.scale_factor) == ("focus", 2.0)
         assert method.description
 
 
