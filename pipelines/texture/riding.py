@@ -71,7 +71,7 @@ RIDGE = 1e-3
 CHECKED = 48
 ASTRAY = 0.03
 # The mesh from which colours are spread, in cells along the box.
-SPREAD = 64
+SPREAD = 128
 
 
 def start_texture(run: str | Path, field: Field) -> TextureField | None:

@@ -15,7 +15,7 @@ from torch.nn.functional import avg_pool3d, grid_sample, interpolate
 
 __all__ = ["CELL", "SpreadColors"]
 
-FINEST = 64  # cells on each side of the cube [-1, 1]³
+FINEST = 128  # cells on each side of the cube [-1, 1]³
 CELL = 2.0 / FINEST
 
 

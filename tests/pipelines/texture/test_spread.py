@@ -16,7 +16,7 @@ def test_one_colour_is_everywhere():
 
 def test_near_samples_their_colours():
     """What is linear stays so between cells that all have samples in their middles."""
-    middles = (torch.arange(64) + 0.5) * CELL - 1
+    middles = (torch.arange(round(2 / CELL)) + 0.5) * CELL - 1
     points = torch.cartesian_prod(middles, middles, middles)
     spread = SpreadColors(points, points)
     asked = 1.8 * torch.rand(200, 3) - 0.9
@@ -29,7 +29,7 @@ def test_no_jump_between_two_sides():
     Between cells of width c, of colours from 0 to 1, the slope is at most 1 / c, and c is at least r / 2; along log₂ r
     it is at most 1, with a slope of 1 / (r ln 2).
     """
-    sheet = torch.cartesian_prod(torch.linspace(-1, 1, 120), torch.linspace(-1, 1, 120))
+    sheet = torch.cartesian_prod(torch.linspace(-1, 1, 240), torch.linspace(-1, 1, 240))  # in every cell
     planes = [torch.cat((sheet, torch.full((len(sheet), 1), z)), dim=1) for z in (-0.4, 0.4)]
     white = torch.cat([torch.full((len(sheet), 1), float(side)) for side in (0, 1)])
     spread = SpreadColors(torch.cat(planes), white)
@@ -39,7 +39,8 @@ def test_no_jump_between_two_sides():
     found = spread(points, reach)[:, 0]
     assert (found.diff().abs() <= (2 + 1 / math.log(2)) / reach[1:].minimum(reach[:-1]) * across.diff() + 1e-5).all()
     torch.testing.assert_close(found + found.flip(0), torch.ones_like(found))  # the lattice is symmetric
-    middles = torch.tensor([[CELL / 2, CELL / 2, z] for z in (-12.5 * CELL, 12.5 * CELL)])  # cells with a plane in them
+    depth = (math.floor(0.4 / CELL) + 0.5) * CELL  # in cells with a plane in them
+    middles = torch.tensor([[CELL / 2, CELL / 2, z] for z in (-depth, depth)])
     torch.testing.assert_close(spread(middles, torch.zeros(2))[:, 0], torch.tensor([0.0, 1.0]))
 
 
