@@ -93,16 +93,20 @@ class PacedKeyframes(CarriedKeyframes):
     def value(self, x: Tensor, *, level: int = -1) -> Tensor:
         """See `Field.value`."""
         rows = self.check_points(x).reshape(-1, 4)
-        value = super().value(rows, level=level)
+        value, blended = rows.new_zeros(len(rows)), torch.ones(len(rows), dtype=torch.bool, device=rows.device)
         for index, (pace, (start, end)) in enumerate(zip(self.paces, itertools.pairwise(self.keys.times), strict=True)):
-            heard = ((rows[:, 3] > start) & (rows[:, 3] < end)).nonzero()[:, 0]
-            if pace is None or not len(heard):
+            if pace is None:
                 continue
+            between = (rows[:, 3] > start) & (rows[:, 3] < end)
+            blended &= ~between
+            heard = between.nonzero()[:, 0]
             place, time = rows[heard, :3], rows[heard, 3]
             homes = [self.home(place, time, key) for key in (index, index + 1)]
             first, second = (self.keys.key(index + key).value(home) for key, home in enumerate(homes))
             share = pace.progress(homes[0], (time - start) / (end - start), first, second)
             value = value.index_copy(0, heard, torch.lerp(first, second, share))
+        others = blended.nonzero()[:, 0]
+        value = value.index_copy(0, others, super().value(rows[others], level=level))
         return value.reshape(x.shape[:-1])
 
     def jet(self, x: Tensor, *, level: int = -1) -> Jet:
@@ -201,7 +205,8 @@ def _waits(first: Float64, second: Float64, cells: int) -> Float64:
     further = np.stack([around[place] > away for place in beside])
     furthest = spread(places, lambda others: np.maximum(np.where(further, others, -np.inf).max(axis=0), away))
     pace = min(PACE, LAST / (2 * float(away[led].max())))
-    begins = np.minimum(crossing, LAST - pace * np.where(led, furthest - away, 0.0))
+    ahead = np.subtract(furthest, away, out=np.zeros_like(away), where=led)
+    begins = np.minimum(crossing, LAST - pace * ahead)
     due = spread(begun, lambda others: np.maximum(begins, others.min(axis=0) + pace * edge))
     waits = np.zeros(first.shape)
     waits[comes] = np.where(np.isfinite(due), np.minimum(due, LAST) - crossing, 0.0)
