@@ -18,10 +18,10 @@ from ...neural_fields.radiance import Outside, ViewColor
 from ...neural_fields.sphere_start import fit_sphere
 from ...neural_fields.volume import sphere_span
 from ...neural_fields.volume_renderer import Rendered, Sampling, render_volume
+from ..run.focus import Focus
 from ..run.settings import ReconstructConfig
 from ..run.team import my_share
 from ..run.trainer import seeded
-from .focus import Focus
 
 __all__ = ["Exposures", "PoseCorrections", "RayPool", "Rays", "SceneModel", "build_scene", "camera_rays"]
 

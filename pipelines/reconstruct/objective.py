@@ -11,10 +11,10 @@ from ...neural_fields.hash_encoding import HashEncoding
 from ...neural_fields.losses import eikonal_loss
 from ...neural_fields.value_grid import ValueGrid
 from ...neural_fields.volume_renderer import Sampling
+from ..run.focus import Focus
 from ..run.settings import ReconstructConfig
 from ..run.team import gathered, mean_of_all, own_generator, whole_batch
 from ..run.trainer import Group, Objective, Trainer, warm_cosine
-from .focus import Focus
 from .model import RayPool, SceneModel
 
 # Steps between two looks at the surface's surroundings, and such looks between two at everything.

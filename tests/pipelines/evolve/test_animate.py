@@ -51,6 +51,7 @@ from mplicits.pipelines.render.subject import Orbit
 from mplicits.pipelines.run.folder import load_still
 from mplicits.pipelines.surface.surface import read_surface
 from mplicits.pipelines.texture.riding import RidingColors, borrowed_texture
+from mplicits.pipelines.texture.spread import CELL
 
 RADIUS, DRIFT = 0.3, torch.tensor([0.5, 0.0, 0.0])
 START = torch.tensor([-0.25, 0.0, 0.0])
@@ -296,9 +297,12 @@ def test_colours_ride_along_a_velocity_that_was_learnt(run):
     motion = RigidMotion(angle=1.0, center=tuple(START.tolist()), velocity=tuple(DRIFT.tolist()))
     there = torch.from_numpy(extract_mesh(moment(field, 1.0), resolution=16).vertices).float()
     found = RidingColors(field, texture, motion=motion.velocity).at(1.0)(there)
-    back = project_to_surface(moment(field, 0.0), motion.inverse(there, 1.0))[0]
+    start, home = moment(field, 0.0), motion.inverse(there, 1.0)
+    back = project_to_surface(start, home)[0]
+    near = start.value(home).abs() < 0.4 * CELL  # from half a cell on colours are averaged
+    assert near.float().mean() > 0.5
     # Runge and Kutta's error of a turn by 1/12, twelve times: (1/12)⁴ / 120 of the radius; times the colours' slope
-    torch.testing.assert_close(found, texture.colors(back), atol=1e-4, rtol=0)
+    torch.testing.assert_close(found[near], texture.colors(back)[near], atol=1e-4, rtol=0)
     assert (found - texture.colors(there - DRIFT)).abs().max() > 0.01
 
 

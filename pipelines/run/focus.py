@@ -1,4 +1,4 @@
-"""Where a training looks: pixels at random, and more of them where its pictures were wrong of late."""
+"""Where a training looks: pixels or samples at random, and more of them where it was wrong of late."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from torch import Tensor
 
 __all__ = ["Focus"]
 
-STRIP = 16  # neighbouring pixels of a line share one error
+STRIP = 16  # neighbouring pixels of a line share one error; samples that are no neighbours have one each
 
 
 class Focus:
@@ -22,15 +22,16 @@ class Focus:
         pixels: how many there are, line after line.
         share: of the draws that go by errors, from 0 to 1.
         device: of the errors.
+        strip: how many pixels after one another share an error.
 
     Attributes:
         errors: ``(S,)`` of the strips, running means; 1 in the beginning.
         bounds: ``(S,)`` their running sums when `refresh` was called last, in float64 on the CPU.
     """
 
-    def __init__(self, pixels: int, share: float, device: torch.device) -> None:
-        self.pixels, self.share = pixels, share
-        self.errors = torch.ones(-(-pixels // STRIP), device=device)
+    def __init__(self, pixels: int, share: float, device: torch.device, *, strip: int = STRIP) -> None:
+        self.pixels, self.share, self.strip = pixels, share, strip
+        self.errors = torch.ones(-(-pixels // strip), device=device)
         self.refresh()
 
     def refresh(self) -> None:
@@ -45,8 +46,8 @@ class Focus:
         # The first (1 - share) of the unit interval stands for even draws, and the rest for those by errors.
         by_error = ((place - (1 - self.share)) / self.share).clamp_min(0) * self.bounds[-1]
         strips = torch.searchsorted(self.bounds, by_error, right=True).clamp_max(len(self.bounds) - 1)
-        length = (self.pixels - strips * STRIP).clamp_max(STRIP)  # the last one may be shorter
-        rows = strips * STRIP + (within * length).long()
+        length = (self.pixels - strips * self.strip).clamp_max(self.strip)  # the last one may be shorter
+        rows = strips * self.strip + (within * length).long()
         return torch.where(place < 1 - self.share, (within * self.pixels).long(), rows)
 
     def learn(self, rows: Tensor, errors: Tensor) -> None:
@@ -57,4 +58,4 @@ class Focus:
             errors: ``(R,)``, not negative.
         """
         if self.share:
-            self.errors.scatter_reduce_(0, rows // STRIP, errors, "mean", include_self=True)
+            self.errors.scatter_reduce_(0, rows // self.strip, errors, "mean", include_self=True)

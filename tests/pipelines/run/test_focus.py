@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from mplicits.pipelines.reconstruct.focus import STRIP, Focus
+from mplicits.pipelines.run.focus import STRIP, Focus
 
 PIXELS, DRAWS = 5 * STRIP + 3, 40_000
 CPU = torch.device("cpu")
