@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from ._checks import at_least, positive
 
-__all__ = ["HashEncoding", "check_table", "grid_resolutions", "spatial_hash"]
+__all__ = ["HashEncoding", "check_table", "grid_resolutions", "spatial_hash", "tables_apart"]
 
 # The factors of Eq. 4; the first is 1 so that neighbours along x stay neighbours in memory.
 PRIMES = (1, 2_654_435_761, 805_459_861)
@@ -45,6 +45,13 @@ def check_table(table_size: int, coarsest: int, finest: int) -> None:
         raise ValueError(f"table_size={table_size}: expected a power of two")
     if not 1 <= coarsest <= finest:
         raise ValueError(f"coarsest={coarsest}, finest={finest}: expected 1 ≤ coarsest ≤ finest")
+
+
+def tables_apart(*modules: nn.Module) -> tuple[list[nn.Parameter], list[nn.Parameter]]:
+    """The tables of hash encodings among the parameters of modules, and all others: each wants a rate of its own."""
+    tables = [part.table for module in modules for part in module.modules() if isinstance(part, HashEncoding)]
+    known = {id(table) for table in tables}
+    return tables, [p for module in modules for p in module.parameters() if id(p) not in known]
 
 
 class HashEncoding(nn.Module):
@@ -97,6 +104,11 @@ class HashEncoding(nn.Module):
         self.cells: Tensor
         self.starts: Tensor
         self.own: Tensor
+
+    @classmethod
+    def up_to(cls, finest: int, *, extent: float = 1.0) -> HashEncoding:
+        """One from 16 cells along a side, or fewer if the last grid has fewer, to ``finest``."""
+        return cls(coarsest=min(16, finest), finest=finest, extent=extent)
 
     @property
     def size(self) -> int:

@@ -20,7 +20,7 @@ REFRESH = 25  # steps after which the points near the surface are drawn anew, si
 POOL_STEPS = 6  # batches that a pool near the surface holds
 # Of the known samples of a batch, where nothing but them says what lies between the shapes: the share that is drawn by
 # how wrong the field was there. Thin parts are few samples of many, and smoothed away where all count alike.
-FOCUS, FOCUS_EVERY = 0.5, 16
+FOCUS = 0.5
 # Norm of the gradient by the weights. Second derivatives have spikes, and a single one, at the peak of the learning
 # rate, would throw the field so far from any distance that it does not come back.
 LONGEST_GRADIENT = 1.0
@@ -61,7 +61,7 @@ class EvolveObjective(Objective):
             if not len(self.known):
                 raise ValueError(f"level {level}: no known samples in its band")
         self.focus = Focus(len(self.known), 0.0 if self.law else FOCUS, device, strip=1)
-        self.kept |= {"errors": self.focus.errors, "bounds": self.focus.bounds}
+        self.kept |= self.focus.kept
 
     def losses(self, step: int, done: float) -> tuple[dict[str, Tensor], Tensor]:
         """See `Objective.losses`."""
@@ -71,7 +71,7 @@ class EvolveObjective(Objective):
             self.kept["pool"] = band_points(self.field, count, self.width, self.generator, level=self.level)
         pool = self.kept["pool"]
         half, part = config.batch // 2, config.batch // 16
-        rows = upload(self._watch(step).rows(half, self.generator), pool.device)
+        rows = upload(self.focus.watched(step, self.kept).rows(half, self.generator), pool.device)
         known = self.known.take(rows)
         bounds = self.bounds.take(self._draw(len(self.bounds), part if len(self.bounds) and not self.level else 0))
         anywhere = uniform_spacetime(0 if self.level else part, self.generator).to(pool.device)
@@ -106,14 +106,6 @@ class EvolveObjective(Objective):
             terms["bounds"] = outside.square().mean()
             total = total + config.bound_weight * terms["bounds"]
         return terms, total
-
-    def _watch(self, step: int) -> Focus:
-        """What says where to draw known samples, brought up to date now and then."""
-        self.focus.errors, self.focus.bounds = self.kept["errors"], self.kept["bounds"]  # of a run which is resumed
-        if step % FOCUS_EVERY == 0:
-            self.focus.refresh()
-            self.kept["bounds"] = self.focus.bounds
-        return self.focus
 
     def _interval(self, times: Tensor) -> Tensor:
         """How long the interval between two keys is, at each of the times ``(N,)``."""

@@ -11,6 +11,7 @@ from pathlib import Path
 from ..run.costs import Net, Speed, jets, training, values
 from ..run.schedule import Stage
 from ..run.settings import EvolveConfig
+from .source import CELLS
 
 __all__ = ["FEWEST_STEPS", "EvolvePlan", "within"]
 
@@ -22,7 +23,7 @@ USUAL, EXACT = Net.siren(256, 2), Net(2000, 60)
 # deformation: evaluations of the motion, by Runge and Kutta forth and back, with derivatives.
 PATHS, ENDS, CARRIED = 26_000, 1_500, 160
 # Grid of the pace between two shapes: its vertices, and how often the motion is asked for each, most not at all.
-PACED, PACED_WAYS = 97**3, 8
+PACED, PACED_WAYS = (CELLS + 1) ** 3, 8
 MESHED = 128  # cells along the meshes of shapes
 ENDS_MESHED = 192
 # FLOPs that take as long as the Chamfer distance of an end; and as a mesh beside its values, by its resolution squared:

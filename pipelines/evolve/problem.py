@@ -31,7 +31,7 @@ from ...neural_fields.evolution import VectorField
 from ..run.schedule import Report
 from ..run.settings import EvolveConfig
 from .deform import carried_samples, learn_motion, motion_figures
-from .samples import Bounds, Carried, Known, around, joined, known_at, no_bounds, signs, uniform
+from .samples import Bounds, Carried, Known, around, joined, known_at, no_bounds, signs, uniform, values_at
 from .shapes import Placement, StaticShape, aligned, into_unit_sphere
 from .source import PacedKeyframes, pace_of
 
@@ -191,7 +191,7 @@ def _morph(shapes: list[StaticShape], config: EvolveConfig) -> Problem:
     pairs = list(zip(placed, keys, strict=True))
     known = [known_at(shape, time, per_shape, config.seed, generator) for shape, time in pairs]
     x, t = uniform(config.samples, generator), torch.rand(config.samples, generator=generator)
-    values = torch.stack([_values(shape.field, x) for shape in placed], dim=1)
+    values = torch.stack([values_at(shape.field, x) for shape in placed], dim=1)
     low, high = between(t, keys, values)
     bounded = torch.isfinite(low) | torch.isfinite(high)
     bounds = Bounds(at_time(x, t)[bounded], CAUTION * low[bounded], CAUTION * high[bounded])
@@ -269,11 +269,6 @@ def _velocity(config: EvolveConfig, index: int, region: Similarity) -> VectorFie
         velocity=(drift[0] / region.scale, drift[1] / region.scale, drift[2] / region.scale),
     )
     return velocity_field(motion, config.per_shape("twist", index)[0] * region.scale)
-
-
-@torch.no_grad()
-def _values(field: Field, points: Tensor) -> Tensor:
-    return torch.cat([field.value(part) for part in points.split(1 << 17)])
 
 
 def _end(shape: StaticShape, time: float, seed: int) -> End:

@@ -27,6 +27,7 @@ __all__ = [
     "signs",
     "uniform",
     "uniform_spacetime",
+    "values_at",
 ]
 
 FLOW_ROWS = 8192  # characteristics that are differentiated at a time
@@ -139,6 +140,12 @@ def uniform_spacetime(count: int, generator: torch.Generator) -> Tensor:
     """Points ``(count, 4)`` anywhere in the cube, at any time."""
     x = uniform(count, generator)
     return torch.cat((x, torch.rand(count, 1, generator=generator)), dim=1)
+
+
+@torch.no_grad()
+def values_at(field: Field, points: Tensor) -> Tensor:
+    """Values ``(N,)`` of a field at points ``(N, d)``, in blocks that fit into memory however many there are."""
+    return torch.cat([field.value(part) for part in points.split(1 << 17)])
 
 
 def joined(parts: Sequence[Known]) -> Known:

@@ -30,6 +30,7 @@ from scipy import ndimage
 from torch import Tensor
 
 from ...neural_fields import CarriedKeyframes, Field, Jet, Keyframes, Solver, Velocity, flow
+from .samples import values_at
 
 __all__ = ["Pace", "PacedKeyframes", "pace_of"]
 
@@ -49,17 +50,14 @@ COARSER, REFINED = 4, 0.2
 
 
 class Pace(NamedTuple):
-    """How far each place is on its way; values at the vertices of a grid over [−1, 1]³, ``(n, n, n)`` by x, y, z.
+    """How far each place is on its way, by a grid over [−1, 1]³.
 
     Attributes:
-        coming: by how much what comes is later than in the blend, τ − b.
-        going: by how much what goes is sooner.
-        hurry: by how much coming is hastened and going put off, from 0 to 1.
+        waits: ``(3, n, n, n)`` at its vertices by x, y and z: by how much what comes is later than in the blend, τ − b;
+            by how much what goes is sooner; and by how much coming is hastened and going put off, from 0 to 1.
     """
 
-    coming: Tensor
-    going: Tensor
-    hurry: Tensor
+    waits: Tensor
 
     def progress(self, x: Tensor, s: Tensor, first: Tensor, second: Tensor) -> Tensor:
         """σ at places ``(N, 3)`` of the first key, of which the keys say ``first`` and ``second`` ``(N,)``.
@@ -70,10 +68,9 @@ class Pace(NamedTuple):
             first: A.
             second: B.
         """
-        grids = torch.stack(tuple(self))[None].to(x)
         at = x.flip(-1)[None, None, None]  # the last axis of the grid first
-        waits = torch.nn.functional.grid_sample(grids, at, padding_mode="border", align_corners=True).reshape(3, -1)
-        return _progress(s, first, second, *waits)
+        found = torch.nn.functional.grid_sample(self.waits[None].to(x), at, padding_mode="border", align_corners=True)
+        return _progress(s, first, second, *found.reshape(3, -1))
 
 
 class PacedKeyframes(CarriedKeyframes):
@@ -133,29 +130,28 @@ def pace_of(keys: Sequence[Field], times: Sequence[float], velocity: Velocity, *
 
     def carried(part: Tensor) -> Tensor:
         ends = (flow(velocity, rows, *times, solver=solver) for rows in part.split(ROWS))
-        return torch.cat([keys[1].value(rows) for rows in ends])
+        return values_at(keys[1], torch.cat(list(ends)))
 
     shape, solver = (cells + 1,) * 3, Solver(method="rk4", step=(times[1] - times[0]) / STEPS)
     x = _lattice(cells)
-    values = torch.cat([keys[0].value(part) for part in x.split(ROWS)])
+    values = values_at(keys[0], x)
     # Most of the cube is far outside both shapes. On a coarse grid that can be seen of the second one, too.
     coarse = carried(_lattice(cells // COARSER)).reshape(1, 1, *(cells // COARSER + 1,) * 3)
     others = torch.nn.functional.interpolate(coarse, shape, mode="trilinear", align_corners=True).flatten()
     near = (torch.minimum(values, others) < REFINED).nonzero()[:, 0]
     others[near] = carried(x[near])
     first, second = (part.double().numpy().reshape(shape) for part in (values, others))
-    if not _cut_off(first, second, np.zeros((3, *shape))):
+    if not _cut_off(first, second, np.zeros((3, *shape))).any():
         return None
     coming, going = _waits(first, second, cells), _waits(second, first, cells)
     waits = np.stack([coming, going, np.zeros(shape)])
     for reach in REACHES:
         pieces = _cut_off(first, second, waits)
-        for piece in pieces:
-            away = 2 / cells * np.asarray(ndimage.distance_transform_edt(~piece))
-            waits[2] = np.maximum(waits[2], np.clip(2 - away / reach, 0, 1))
-        if not pieces:
+        if not pieces.any():
             break
-    return Pace(*(torch.from_numpy(part).float() for part in waits))
+        away = 2 / cells * np.asarray(ndimage.distance_transform_edt(~pieces))
+        waits[2] = np.maximum(waits[2], np.clip(2 - away / reach, 0, 1))
+    return Pace(torch.from_numpy(waits).float())
 
 
 def _lattice(cells: int) -> Tensor:
@@ -214,16 +210,16 @@ def _waits(first: Float64, second: Float64, cells: int) -> Float64:
     return np.where(ndimage.binary_dilation(comes, np.ones((3, 3, 3))), waits[tuple(nearest)], 0.0)
 
 
-def _cut_off(first: Float64, second: Float64, waits: Float64) -> list[Bools]:
-    """The pieces that are more than the ends have, at moments on the way: all but the largest ones."""
+def _cut_off(first: Float64, second: Float64, waits: Float64) -> Bools:
+    """Where there are pieces more than the ends have at some moment on the way: all but the largest ones."""
     a, b, *rest = (torch.from_numpy(part) for part in (first, second, *waits))
     most = max(_pieces(first < 0)[1], _pieces(second < 0)[1], 1)
-    found = []
+    found = np.zeros(first.shape, dtype=bool)
     for s in torch.linspace(0, 1, MOMENTS, dtype=a.dtype)[1:-1]:
         share = _progress(s, a, b, *rest)
         labels, count, sizes = _pieces((torch.lerp(a, b, share) < 0).numpy())
         if count > most:
-            found += [labels == label + 1 for label in np.argsort(-sizes)[most:count]]
+            found |= np.isin(labels, np.argsort(-sizes)[most:count] + 1)
     return found
 
 

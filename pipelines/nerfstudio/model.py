@@ -22,8 +22,9 @@ from nerfstudio.models.neus_facto import NeuSFactoModel, NeuSFactoModelConfig  #
 from torch import Tensor, nn
 
 from ...neural_fields import MultiscaleSDF, NerfstudioField, Siren, ViewColor, fit_sphere
-from ...neural_fields.hash_encoding import HashEncoding
+from ...neural_fields.hash_encoding import HashEncoding, tables_apart
 from ...neural_fields.rates import HOST_RATE
+from ..run.settings import ReconstructConfig
 from .schedule import WarmCosine
 
 __all__ = [
@@ -36,9 +37,16 @@ __all__ = [
     "build_field",
 ]
 
-# Peak rates of Adam for the groups of parameters. The geometry is made to suit its own (`share_rate`); the others are
-# those of `mplicits reconstruct`, which learns colours twelve times as fast as the surface that they are to move.
-RATES = {"fields": HOST_RATE, "colors": 3.6e-3, "color_grid": 9e-3, "deviation": 2.4e-3, "field_background": HOST_RATE}
+OURS = ReconstructConfig()  # colours are those of `mplicits reconstruct`
+COLOR_RATE = OURS.color_rate * OURS.learning_rate
+# Peak rates of Adam for the groups of parameters; the geometry is made to suit its own (`share_rate`).
+RATES = {
+    "fields": HOST_RATE,
+    "colors": COLOR_RATE,
+    "color_grid": OURS.grid_rate * COLOR_RATE,
+    "deviation": OURS.sharpening * OURS.learning_rate,
+    "field_background": HOST_RATE,
+}
 
 
 @dataclass
@@ -64,13 +72,13 @@ class MultiscaleFieldConfig(InstantiateConfig):
     """Half-width that a band keeps, in units of the sphere around the scene box."""
     widest_band: float = 0.3
     """Half-width that a band begins with and does not exceed, in the same units."""
-    color_width: int = 128
+    color_width: int = OURS.color_width
     """Neurons per layer of the colour network."""
-    color_depth: int = 2
+    color_depth: int = OURS.color_depth
     """Layers of the colour network."""
-    color_frequencies: int = 4
+    color_frequencies: int = OURS.color_frequencies
     """Octaves of the position that the colour network sees."""
-    color_grid: int = 512
+    color_grid: int = OURS.color_grid
     """Cells along the finest grid of the hash encoding that the colour network sees; 0 for none."""
     deviation: float = 0.3
     """Where the deviation begins: s = exp(10 v)."""
@@ -102,7 +110,7 @@ def build_field(config: MultiscaleFieldConfig, *, aabb: Tensor, **_: object) -> 
         width=config.color_width,
         depth=config.color_depth,
         point_frequencies=config.color_frequencies,
-        grid=HashEncoding(coarsest=min(16, finest), finest=finest, extent=extent) if finest else None,
+        grid=HashEncoding.up_to(finest, extent=extent) if finest else None,
     )
     shell = NerfstudioField(
         sdf,
@@ -133,11 +141,9 @@ class _Multiscale:
     def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
         """Those of nerfstudio, its "fields" in parts which want rates of their own: see `RATES`."""
         groups: dict[str, list[nn.Parameter]] = super().get_param_groups()  # pyright: ignore[reportAttributeAccessIssue]
-        parts = self.field
-        grid = [part.table for part in parts.color.modules() if isinstance(part, HashEncoding)]
-        groups["fields"] = list(parts.field.parameters())
-        groups["colors"] = [p for p in parts.color.parameters() if all(p is not table for table in grid)]
-        groups["deviation"] = list(parts.deviation_network.parameters())
+        grid, groups["colors"] = tables_apart(self.field.color)
+        groups["fields"] = list(self.field.field.parameters())
+        groups["deviation"] = list(self.field.deviation_network.parameters())
         return groups | ({"color_grid": grid} if grid else {})
 
     def get_training_callbacks(self, training_callback_attributes: Any) -> list[Any]:

@@ -196,11 +196,11 @@ def build_scene(config: ReconstructConfig, *, has_masks: bool, views: int = 0) -
             width=config.color_width,
             depth=config.color_depth,
             point_frequencies=config.color_frequencies,
-            grid=HashEncoding(coarsest=min(16, finest), finest=finest) if finest else None,
+            grid=HashEncoding.up_to(finest) if finest else None,
         )
         outside = None
         if background == "outside" and finest:
-            around = HashEncoding(coarsest=min(16, finest), finest=finest, extent=2.0)
+            around = HashEncoding.up_to(finest, extent=2.0)
             outside = Outside(width=64, depth=2, point_frequencies=4, grid=around)
         elif background == "outside":
             outside = Outside()

@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from ...neural_fields.hash_encoding import HashEncoding
+from ...neural_fields.hash_encoding import tables_apart
 from ...neural_fields.losses import eikonal_loss
 from ...neural_fields.value_grid import ValueGrid
 from ...neural_fields.volume_renderer import Sampling
@@ -36,9 +36,8 @@ class SceneObjective(Objective):
 
     def __init__(self, model: SceneModel, pool: RayPool, config: ReconstructConfig) -> None:
         rate = warm_cosine(config.learning_rate)
-        grid = [part.table for part in model.modules() if isinstance(part, HashEncoding)]
         parts = [part for part in (model.color, model.outside, model.exposures) if part is not None]
-        colors = [p for part in parts for p in part.parameters() if all(p is not entries for entries in grid)]
+        grid, colors = tables_apart(*parts)
         groups = [
             Group(list(model.geometry.parameters()), rate),
             Group(colors, lambda done: config.color_rate * rate(done)),
@@ -53,7 +52,7 @@ class SceneObjective(Objective):
         self.sampling = Sampling(uniform=config.uniform, importance=config.importance)
         self.kept["sections"] = torch.zeros(())  # of a ray that are evaluated, as of late; on the CPU, which reads it
         self.focus = Focus(len(pool), config.focus, pool.device)
-        self.kept |= {"errors": self.focus.errors, "bounds": self.focus.bounds}
+        self.kept |= self.focus.kept
         self.grid = ValueGrid(config.march_grid, pool.device) if config.march_grid else None
         if self.grid is not None:
             self.kept["march"] = self.grid.kept
@@ -72,14 +71,6 @@ class SceneObjective(Objective):
             self.grid.refresh(self.model.geometry, whole=step % (NEAR_EVERY * WHOLE_EVERY) == 0)
         return self.grid
 
-    def watch(self, step: int) -> Focus:
-        """What says where to draw pixels, brought up to date now and then."""
-        self.focus.errors, self.focus.bounds = self.kept["errors"], self.kept["bounds"]  # of a run which is resumed
-        if step % NEAR_EVERY == 0:
-            self.focus.refresh()
-            self.kept["bounds"] = self.focus.bounds
-        return self.focus
-
     def batch(self) -> int:
         """Rays of the next step: fewer while their sections are many, as they are while the surface is unsure."""
         rays, jets = self.config.rays, self.config.jets
@@ -92,7 +83,7 @@ class SceneObjective(Objective):
         """See `Objective.losses`."""
         config = self.config
         self.model.widen(config.band, config.least_delta)
-        rays = self.pool.draw(whole_batch(self.batch()), self.generator, self.watch(step))
+        rays = self.pool.draw(whole_batch(self.batch()), self.generator, self.focus.watched(step, self.kept))
         generator = own_generator(self.generator)
         origins, directions = rays.origins, rays.directions
         if self.model.poses is not None:

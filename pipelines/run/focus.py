@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, MutableMapping
+
 import torch
 from torch import Tensor
 
 __all__ = ["Focus"]
 
+EVERY = 16  # steps after which a training draws by newer errors
 STRIP = 16  # neighbouring pixels of a line share one error; samples that are no neighbours have one each
 
 
@@ -33,6 +36,24 @@ class Focus:
         self.pixels, self.share, self.strip = pixels, share, strip
         self.errors = torch.ones(-(-pixels // strip), device=device)
         self.refresh()
+
+    @property
+    def kept(self) -> Mapping[str, Tensor]:
+        """What later steps depend on, for `Objective.kept`."""
+        return {"errors": self.errors, "bounds": self.bounds}
+
+    def watched(self, step: int, kept: MutableMapping[str, Tensor]) -> Focus:
+        """This one at a step of a training, which may be resumed, brought up to date now and then.
+
+        Args:
+            step: number of the step.
+            kept: the objective's, with what `kept` has put there.
+        """
+        self.errors, self.bounds = kept["errors"], kept["bounds"]
+        if step % EVERY == 0:
+            self.refresh()
+            kept["bounds"] = self.bounds
+        return self
 
     def refresh(self) -> None:
         """Draw by the errors as they are now; a GPU is waited for."""

@@ -3,7 +3,7 @@
 import pytest
 import torch
 from mplicits.neural_fields.baselines import HashGridSDF
-from mplicits.neural_fields.hash_encoding import HashEncoding, grid_resolutions, spatial_hash
+from mplicits.neural_fields.hash_encoding import HashEncoding, grid_resolutions, spatial_hash, tables_apart
 
 
 def small(**options: int) -> HashEncoding:
@@ -101,3 +101,13 @@ def test_any_leading_shape_and_any_device(device: torch.device) -> None:
 def test_sizes_out_of_range_are_refused(options: dict[str, int], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         HashEncoding(**{"finest": 16} | options)
+
+
+def test_tables_are_told_from_all_other_parameters() -> None:
+    encodings = [HashEncoding.up_to(finest) for finest in (8, 32)]
+    assert [encoding.resolutions[0] for encoding in encodings] == [8, 16]
+    assert [encoding.resolutions[-1] for encoding in encodings] == [8, 32]
+    readers = [torch.nn.Sequential(encoding, torch.nn.Linear(encoding.size, 3)) for encoding in encodings]
+    tables, others = tables_apart(*readers)
+    assert all(found is encoding.table for found, encoding in zip(tables, encodings, strict=True))
+    assert [tuple(parameter.shape) for parameter in others] == 2 * [(3, encodings[0].size), (3,)]

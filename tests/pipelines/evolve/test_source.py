@@ -142,7 +142,7 @@ def test_a_grid_is_read_by_x_y_and_z() -> None:
     axis = torch.linspace(-1, 1, 5)
     x, y, z = torch.meshgrid(axis, axis, axis, indexing="ij")
     hurry = (1 + 0.5 * x + 0.2 * y - 0.1 * z) / 4
-    pace = Pace(torch.zeros_like(x), torch.zeros_like(x), hurry)
+    pace = Pace(torch.stack((torch.zeros_like(x), torch.zeros_like(x), hurry)))
     points, early = torch.rand(20, 3) * 2 - 1, torch.full((20,), 0.25)
     share = pace.progress(points, early, torch.ones(20), -torch.ones(20))
     assert share.tolist() == pytest.approx((0.25 * (1 + (1 + points @ torch.tensor([0.5, 0.2, -0.1])) / 4)).tolist())
