@@ -30,6 +30,8 @@ class ValueGrid:
 
     Attributes:
         kept: ``(resolution + 1, resolution + 1, resolution + 1)`` values, by x, y and z; 1 where none was asked for.
+        moved: 0-d, the most by which `refresh` has last changed a value that was at most ``reach`` from 0; ∞ if there
+            was none.
 
     Raises:
         ValueError: a number is out of range.
@@ -50,6 +52,7 @@ class ValueGrid:
         self.resolution, self.reach = resolution, reach
         count = resolution + 1
         self.kept = torch.ones(count, count, count, device=device)
+        self.moved = torch.tensor(torch.inf, device=device)
 
     @torch.no_grad()
     def refresh(self, field: Field, *, level: int = 0, whole: bool = True) -> None:
@@ -61,6 +64,7 @@ class ValueGrid:
             whole: at all vertices that a point of the unit ball can ask for; otherwise only at those near the kept
                 surface.
         """
+        near = self.kept.abs() <= self.reach
         edge = 2 / self.resolution
         axis = torch.linspace(-1, 1, self.resolution + 1, device=self.kept.device)
         if whole:
@@ -68,13 +72,17 @@ class ValueGrid:
             length = (squared[:, None, None] + squared[:, None] + squared).sqrt()
             asked = length <= 1 + 3**0.5 * edge
         else:
-            asked = self.kept.abs() <= self.reach
+            asked = near
         cells = asked.nonzero()
         flat = self.kept.view(-1)
+        self.moved = torch.where(near.any(), 0.0, torch.inf).to(flat)
         for part in cells.split(CHUNK):
             x, y, z = part.unbind(dim=1)
             place = (x * len(axis) + y) * len(axis) + z
-            flat.index_copy_(0, place, field.value(axis[part], level=level).to(flat))
+            before, now = flat[place], field.value(axis[part], level=level).to(flat)
+            step = torch.where(before.abs() <= self.reach, (now - before).abs(), 0.0)
+            self.moved = torch.maximum(self.moved, step.amax() if len(step) else self.moved)
+            flat.index_copy_(0, place, now)
 
     def __call__(self, x: Tensor) -> Tensor:
         """Interpolated values ``(...,)`` of points ``(..., 3)``; outside the cube, the value at its nearest point."""

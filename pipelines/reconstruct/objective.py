@@ -17,8 +17,10 @@ from ..run.team import gathered, mean_of_all, own_generator, whole_batch
 from ..run.trainer import Group, Objective, Trainer, warm_cosine
 from .model import RayPool, SceneModel
 
-# Steps between two looks at the surface's surroundings, and such looks between two at everything.
-NEAR_EVERY, WHOLE_EVERY = 16, 8
+# Steps between two looks at the surface's surroundings, at least and at most, and such looks between two at everything.
+NEAR_EVERY, NEAR_REST, WHOLE_EVERY = 16, 128, 8
+# How far values near the surface may move from look to look, in units of its uncertainty 1/s.
+MOVED = 0.25
 LEAST_SHARE = 0.25  # of the rays of a step, however many sections they have
 POSES_FROM = 0.1  # share of the training after which cameras are moved
 
@@ -55,7 +57,7 @@ class SceneObjective(Objective):
         self.kept |= self.focus.kept
         self.grid = ValueGrid(config.march_grid, pool.device) if config.march_grid else None
         if self.grid is not None:
-            self.kept["march"] = self.grid.kept
+            self.kept |= {"march": self.grid.kept, "looks": torch.tensor([0, NEAR_EVERY, 0])}
 
     def level_at(self, done: float) -> int:
         """The finest level that is switched on when a fraction of the schedule is done."""
@@ -63,12 +65,21 @@ class SceneObjective(Objective):
         return min(started, self.model.geometry.num_levels) - 1
 
     def look(self, step: int) -> ValueGrid | None:
-        """The grid that rays march on, brought up to date: its near part often, all of it now and then."""
+        """The grid that rays march on, brought up to date: its near part often, all of it now and then.
+
+        While the surface moves, often is every `NEAR_EVERY` steps; the less it moved, the longer it is left alone.
+        """
         if self.grid is None:
             return None
         self.grid.kept = self.kept["march"]  # that of a run which is resumed
-        if step % NEAR_EVERY == 0:
-            self.grid.refresh(self.model.geometry, whole=step % (NEAR_EVERY * WHOLE_EVERY) == 0)
+        due, pause, looks = self.kept["looks"].tolist()
+        if step >= due:
+            self.grid.refresh(self.model.geometry, whole=looks % WHOLE_EVERY == 0)
+            moved = float(self.grid.moved)
+            allowed = MOVED / float(self.model.inv_std.detach())
+            pause = pause // 2 if moved > allowed else 2 * pause if moved < allowed / 2 else pause
+            pause = min(max(pause, NEAR_EVERY), NEAR_REST)
+            self.kept["looks"] = torch.tensor([step + pause, pause, looks + 1])
         return self.grid
 
     def batch(self) -> int:

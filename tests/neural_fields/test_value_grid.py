@@ -43,13 +43,18 @@ def test_points_outside_the_cube_count_as_its_nearest() -> None:
 
 def test_the_near_part_is_that_around_the_kept_surface() -> None:
     grid = ValueGrid(16, reach=0.2)
-    grid.refresh(Sphere(radius=0.5))
+    for whole in (False, True):
+        grid.refresh(Sphere(radius=0.5), whole=whole)
+        assert grid.moved.isinf()  # nothing was known of a surface
     before = grid.kept.clone()
     grid.refresh(Sphere(radius=0.6), whole=False)
+    torch.testing.assert_close(grid.moved, torch.tensor(0.1), atol=1e-6, rtol=0)
     near = before.abs() <= 0.2
     assert 0.02 < float(near.float().mean()) < 0.5
     torch.testing.assert_close(grid.kept[near], before[near] - 0.1, atol=1e-6, rtol=0)
     assert torch.equal(grid.kept[~near], before[~near])
+    grid.refresh(Sphere(radius=0.6))
+    assert float(grid.moved) == 0.0  # what was far off, and out of date, does not count
 
 
 @pytest.mark.parametrize(("resolution", "reach"), [(0, 0.1), (8, 0.0)])

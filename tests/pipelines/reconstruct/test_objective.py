@@ -7,7 +7,7 @@ import pytest
 import torch
 from mplicits.datasets.synthetic.scenes import SCENES, render_scene
 from mplicits.datasets.views.images import PosedImages
-from mplicits.neural_fields import MultiscaleSDF, Similarity
+from mplicits.neural_fields import MultiscaleSDF, Similarity, Siren
 from mplicits.neural_fields.losses import eikonal_loss
 from mplicits.neural_fields.sphere_start import fit_sphere
 from mplicits.neural_fields.volume import sphere_span
@@ -208,6 +208,29 @@ def test_the_grid_that_rays_march_on_is_that_of_the_coarse_level(images: PosedIm
     # An eighth of the cube is 0.25 across: for the curvature 2/r of a sphere at r ≥ 0.1, 3/8 · h² · 10.
     assert float((grid(points) - before)[points.norm(dim=1) > 0.1].abs().max()) < 3 / 8 * 0.25**2 * 10
     assert torch.equal(trainer.state()["march"], grid.kept)
+
+
+def test_the_grid_is_left_alone_while_the_surface_rests(images: PosedImages) -> None:
+    objective = make(images, TINY).objective
+    geometry = objective.model.geometry
+    looked = []
+    for step in range(600):
+        before = objective.kept["looks"]
+        objective.look(step)
+        if objective.kept["looks"] is not before:
+            looked.append(step)
+    assert looked == [0, 16, 48, 112, 240, 368, 496]  # twice as long each time, 128 steps at most
+    assert isinstance(geometry, MultiscaleSDF)
+    assert isinstance(geometry.base, Siren)
+    with torch.no_grad():  # a surface that has moved by 1/s, and then goes on moving
+        for step in range(600, 760):
+            geometry.base.output.bias[0] += 1 / (16 * objective.model.inv_std)
+            objective.look(step)
+    assert objective.kept["looks"][1] == 16
+    again = make(images, TINY)
+    again.objective.kept = dict(objective.kept)
+    assert again.objective.look(760) is again.objective.grid
+    assert torch.equal(again.objective.grid.kept, objective.grid.kept)
 
 
 def test_skipping_nothing_is_the_training_without_it(images: PosedImages) -> None:
