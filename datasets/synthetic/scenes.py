@@ -33,6 +33,7 @@ Rgb = tuple[float, float, float]
 
 LAMP = (0.4, 0.7, 0.6)  # towards the lamp, for shaded scenes
 AMBIENT = 0.35  # share of the light that comes from everywhere
+GLOSS, SHARPNESS = 0.6, 40  # light in the middle of a lamp's reflection, and how narrow it is (Blinn 1977)
 DISTANCE = 4.0  # of the eyes from the middle, in radii of the shape
 MARGIN = 1.1  # radius of the ball that just fills the images, in radii of the shape
 RAYS_AT_ONCE = 1 << 17
@@ -94,6 +95,7 @@ def render_scene(
     seed: int = 0,
     samples: int = 3,
     shaded: bool = False,
+    glossy: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> PosedImages:
     """Posed images of a scene, with exact poses, colours and masks, and a few points of its surface.
@@ -105,6 +107,7 @@ def render_scene(
         seed: of the cameras and the points.
         samples: rays per pixel and direction.
         shaded: whether a fixed lamp lights the shape; without, the images show the paint itself.
+        glossy: whether the lamp is reflected, in a highlight that moves with the eye.
         progress: called with ``(done, total)`` after every image.
 
     Raises:
@@ -112,7 +115,7 @@ def render_scene(
     """
     images = []
     for index, camera in enumerate(scene_cameras(scene, views=views, size=size, seed=seed)):
-        color, mask = render_view(scene, camera, samples=samples, shaded=shaded)
+        color, mask = render_view(scene, camera, samples=samples, shaded=shaded, glossy=glossy)
         images.append(PosedImage(f"{index:03d}.png", camera, color, mask))
         if progress is not None:
             progress(index + 1, views)
@@ -120,7 +123,9 @@ def render_scene(
     return PosedImages(tuple(images), Similarity.identity(), "the unit sphere", points, Path(scene.name))
 
 
-def render_view(scene: Scene, camera: Camera, *, samples: int = 3, shaded: bool = False) -> tuple[Float32, Float32]:
+def render_view(
+    scene: Scene, camera: Camera, *, samples: int = 3, shaded: bool = False, glossy: bool = False
+) -> tuple[Float32, Float32]:
     """Draw a scene from one camera.
 
     The colour of a pixel is the mean light of those of its rays that hit (straight alpha, black where none does), the
@@ -131,6 +136,7 @@ def render_view(scene: Scene, camera: Camera, *, samples: int = 3, shaded: bool 
         camera: in the scene's coordinates.
         samples: rays per pixel and direction.
         shaded: whether a fixed lamp lights the shape.
+        glossy: whether the lamp is reflected.
 
     Returns:
         Display RGB ``(H, W, 3)`` and the mask ``(H, W)``, both in [0, 1].
@@ -142,7 +148,7 @@ def render_view(scene: Scene, camera: Camera, *, samples: int = 3, shaded: bool 
         raise ValueError(f"samples={samples}: expected at least one")
     rows = max(1, RAYS_AT_ONCE // (camera.width * samples**2))
     strips = [
-        _strip(scene, camera.strip(first, min(rows, camera.height - first)), samples, shaded)
+        _strip(scene, camera.strip(first, min(rows, camera.height - first)), samples, shaded, glossy)
         for first in range(0, camera.height, rows)
     ]
     light, hits = (np.concatenate(part) for part in zip(*strips, strict=True))
@@ -150,28 +156,36 @@ def render_view(scene: Scene, camera: Camera, *, samples: int = 3, shaded: bool 
     return linear_to_srgb(mean).clip(0, 1).astype(np.float32), (hits / samples**2).astype(np.float32)
 
 
-def _strip(scene: Scene, camera: Camera, samples: int, shaded: bool) -> tuple[Float64, NDArray[np.int64]]:
+def _strip(scene: Scene, camera: Camera, samples: int, shaded: bool, glossy: bool) -> tuple[Float64, NDArray[np.int64]]:
     """Sum of the light ``(H, W, 3)`` of the rays of each pixel that hit, and their number ``(H, W)``."""
     fine = camera.resized(samples * camera.width, samples * camera.height)
     eye, directions = fine.rays(dtype=torch.float64)
     hits = sphere_trace(scene.field, eye, directions, tolerance=1e-9, lipschitz=scene.lipschitz)
     mask, position = hits.mask.numpy(), hits.position.numpy()
     light = np.zeros((*mask.shape, 3))
-    light[mask] = _light(scene, position[mask], shaded)
+    light[mask] = _light(scene, position[mask], directions.numpy()[mask], shaded, glossy)
     tiles = (camera.height, samples, camera.width, samples)
     return light.reshape(*tiles, 3).sum(axis=(1, 3)), mask.reshape(tiles).sum(axis=(1, 3))
 
 
-def _light(scene: Scene, points: Float64, shaded: bool) -> Float64:
-    """Linear light ``(N, 3)`` that points ``(N, 3)`` of the surface send everywhere."""
+def _light(scene: Scene, points: Float64, directions: Float64, shaded: bool, glossy: bool) -> Float64:
+    """Linear light ``(N, 3)`` that points ``(N, 3)`` of the surface send to eyes that look along ``(N, 3)``."""
     light = srgb_to_linear(scene.color(points))
-    if not shaded:
+    if not (shaded or glossy):
         return light
     with torch.inference_mode():
         gradient = scene.field.jet(torch.from_numpy(points)).gradient.numpy()
+    normals = gradient / np.maximum(np.linalg.norm(gradient, axis=1, keepdims=True), 1e-12)
     towards = np.array(LAMP) / np.linalg.norm(LAMP)
-    cosine = (gradient @ towards) / np.maximum(np.linalg.norm(gradient, axis=1), 1e-12)
-    return light * (AMBIENT + (1 - AMBIENT) * np.maximum(cosine, 0))[:, None]
+    cosine = normals @ towards
+    if shaded:
+        light = light * (AMBIENT + (1 - AMBIENT) * np.maximum(cosine, 0))[:, None]
+    if glossy:
+        halfway = towards - directions
+        halfway /= np.maximum(np.linalg.norm(halfway, axis=1, keepdims=True), 1e-12)
+        aligned = np.maximum((normals * halfway).sum(axis=1), 0)
+        light = light + (GLOSS * np.where(cosine > 0, aligned**SHARPNESS, 0.0))[:, None]
+    return light
 
 
 def scene_mesh(scene: Scene, *, resolution: int = 256) -> Mesh:

@@ -111,6 +111,8 @@ def _scene_arguments(parser: argparse.ArgumentParser) -> None:
     add_flags(parser, "--samples", type=whole(1, 16), default=3, help="rays per pixel and direction (3)")
     what = "light the shape by a fixed lamp, instead of the bare paint"
     parser.add_argument("--shaded", action="store_true", help=what)
+    what = "let the shape reflect the lamp, in a highlight that moves with the eye"
+    parser.add_argument("--glossy", action="store_true", help=what)
     what = "what is wrong with them, to see what is said of it and survived: " + ", ".join(FAULTS)
     parser.add_argument("--fault", choices=FAULTS, metavar="FAULT", help=what)
     add_flags(parser, "--seed", help="of the cameras (0)")
@@ -135,6 +137,7 @@ def _scene(arguments: argparse.Namespace) -> int:
             seed=arguments.seed,
             samples=arguments.samples,
             shaded=arguments.shaded,
+            glossy=arguments.glossy,
             progress=progress,
         )
     if arguments.fault:

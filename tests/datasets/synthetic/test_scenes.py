@@ -9,8 +9,10 @@ from mplicits.datasets.cameras import look_at
 from mplicits.datasets.color_space import linear_to_srgb, srgb_to_linear
 from mplicits.datasets.synthetic.scenes import (
     AMBIENT,
+    GLOSS,
     LAMP,
     SCENES,
+    SHARPNESS,
     Scene,
     render_scene,
     render_view,
@@ -69,6 +71,29 @@ def test_shading_is_lambert_times_the_paint(sphere):
     assert cosine.min() < -0.05  # some of it lies in the shade
     assert np.array_equal(mask > 0, hit)
     assert np.abs(color[hit] - linear_to_srgb(light)).max() < 1e-6
+
+
+def test_gloss_is_the_mirror_image_of_the_lamp(sphere):
+    """On a sphere it is brightest where the normal halves the angle between the lamp and the eye, from any side."""
+    lamp = np.array(LAMP) / np.linalg.norm(LAMP)
+    for eye in ((0.5, 1.0, 2.0), (2.0, 1.0, 1.0)):
+        camera = look_at(eye, (0, 0, 0), fov=32, width=41, height=41)
+        plain, shiny = (render_view(sphere, camera, samples=1, glossy=glossy)[0] for glossy in (False, True))
+        more = (srgb_to_linear(shiny) - srgb_to_linear(plain))[..., 0]
+        hit, points = sphere_hits(camera)
+        assert not more[~hit].any()
+        normals = points / 0.6
+        back = np.array(eye) - points
+        halfway = lamp + back / np.linalg.norm(back, axis=2, keepdims=True)
+        halfway /= np.linalg.norm(halfway, axis=2, keepdims=True)
+        lit = hit & (normals @ lamp > 0)
+        wanted = np.where(lit, GLOSS * (normals * halfway).sum(axis=2).clip(0) ** SHARPNESS, 0)
+        clipped = srgb_to_linear(plain)[..., 0] + wanted > 1
+        assert np.abs(more - wanted)[hit & ~clipped].max() < 1e-5
+        assert wanted.max() > 0.5
+        lit_too, _ = render_view(sphere, camera, samples=1, shaded=True, glossy=True)
+        shade, _ = render_view(sphere, camera, samples=1, shaded=True)
+        assert (lit_too >= shade - 1e-6).all()
 
 
 def test_the_mask_has_the_area_of_the_projected_sphere(sphere):
