@@ -15,7 +15,15 @@ from .characteristics import (
     trajectories,
     transport_error,
 )
-from .checkpoint import SavedField, load_field, load_texture, save_field, save_texture
+from .checkpoint import (
+    SavedField,
+    load_field,
+    load_radiance,
+    load_texture,
+    save_field,
+    save_radiance,
+    save_texture,
+)
 from .color import ColorSiren, TextureField
 from .cones import cone_starts
 from .errors import InputError
@@ -27,7 +35,7 @@ from .meshing import NoSurfaceError, extract_mesh, map_normals
 from .moving import Keyframes, Moving, RigidMotion, ShrinkingSphere
 from .multiscale import MultiscaleSDF, levels_of
 from .placement import Placement
-from .radiance import Outside, ViewColor
+from .radiance import Outside, Radiance, ViewColor
 from .rates import parameter_groups, share_rate
 from .similarity import Similarity
 from .siren import Siren
@@ -72,6 +80,7 @@ __all__ = [
     "Placed",
     "Placement",
     "Plane",
+    "Radiance",
     "Rendered",
     "RigidMotion",
     "Sampling",
@@ -110,6 +119,7 @@ __all__ = [
     "law_loss",
     "levels_of",
     "load_field",
+    "load_radiance",
     "load_texture",
     "map_attribute",
     "map_colors",
@@ -122,6 +132,7 @@ __all__ = [
     "project_to_surface",
     "render_volume",
     "save_field",
+    "save_radiance",
     "save_texture",
     "share_rate",
     "solve_sphere",

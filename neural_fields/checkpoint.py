@@ -10,7 +10,7 @@ import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from safetensors import safe_open
@@ -24,7 +24,9 @@ from .color import ColorSiren, TextureField
 from .errors import InputError
 from .field import Field, plain
 from .files import write_whole
+from .hash_encoding import HashEncoding, grid_resolutions
 from .multiscale import MultiscaleSDF
+from .radiance import Outside, Radiance, ViewColor
 from .similarity import Similarity
 from .siren import Siren
 from .spacetime import SpaceTimeSDF
@@ -34,11 +36,16 @@ __all__ = [
     "checksum_of",
     "field_bytes",
     "load_field",
+    "load_radiance",
     "load_texture",
+    "radiance_bytes",
     "save_field",
+    "save_radiance",
     "save_texture",
     "texture_bytes",
 ]
+
+M = TypeVar("M", bound=nn.Module)
 
 # Closed forms are made again of their definition; what is put together of fields, of that and of its parts.
 CLOSED: Mapping[str, Callable[..., Field]] = {cls.__name__: cls for cls in (Box, Capsule, Plane, Sphere, Torus)}
@@ -47,8 +54,20 @@ COMBINED: Mapping[str, Callable[..., Field]] = {
 }
 FORMAT = "mplicits-field"
 TEXTURE_FORMAT = "mplicits-texture"
+RADIANCE_FORMAT = "mplicits-radiance"
 VERSION = 1
-_AGAIN = {FORMAT: "take it from a backup, or fit again", TEXTURE_FORMAT: "run `mplicits texture` again"}
+_AGAIN = {
+    FORMAT: "take it from a backup, or fit again",
+    TEXTURE_FORMAT: "run `mplicits texture` again",
+    RADIANCE_FORMAT: "take it from a backup, or run `mplicits reconstruct` again",
+}
+_FILES = {
+    FORMAT: "field.safetensors",
+    TEXTURE_FORMAT: "texture.safetensors",
+    RADIANCE_FORMAT: "radiance.safetensors",
+}
+COLOR_SIZES = ("num_features", "width", "depth", "view_frequencies", "point_frequencies")
+OUTSIDE_SIZES = ("width", "depth", "point_frequencies", "view_frequencies")
 
 
 class SavedField(NamedTuple):
@@ -185,6 +204,98 @@ def load_texture(path: str | os.PathLike[str], geometry: Field) -> TextureField:
         return texture
 
 
+def save_radiance(
+    path: str | os.PathLike[str], radiance: Radiance, geometry: Field, *, metadata: Mapping[str, Any] | None = None
+) -> None:
+    """Write what rays see of a geometry to a safetensors file, whole or not at all; see `radiance_bytes`."""
+    write_whole(Path(path), radiance_bytes(radiance, geometry, metadata=metadata))
+
+
+def radiance_bytes(radiance: Radiance, geometry: Field, *, metadata: Mapping[str, Any] | None = None) -> bytes:
+    """What a file of a radiance holds.
+
+    Args:
+        radiance: colours by direction, and what is behind.
+        geometry: of it; not stored but as a digest, so that no other geometry gets these colours.
+        metadata: JSON values to keep with it.
+    """
+    color, outside = radiance.color, radiance.outside
+    of_color = {name: getattr(color, name) for name in COLOR_SIZES}
+    of_outside = None if outside is None else {name: getattr(outside, name) for name in OUTSIDE_SIZES}
+    header = {
+        "format": RADIANCE_FORMAT,
+        "version": VERSION,
+        "color": of_color | {"grid": _grid_of(color.grid)},
+        "outside": None if of_outside is None or outside is None else of_outside | {"grid": _grid_of(outside.grid)},
+        "inv_std": float(radiance.inv_std),
+        "geometry": {"digest": _digest(geometry)},
+        "metadata": dict(metadata or {}),
+    }
+    tensors = {f"color.{name}": tensor for name, tensor in color.state_dict().items()}
+    if outside is not None:
+        tensors |= {f"outside.{name}": tensor for name, tensor in outside.state_dict().items()}
+    return _packed(tensors | {"background": radiance.background}, RADIANCE_FORMAT, header)
+
+
+def load_radiance(path: str | os.PathLike[str], geometry: Field) -> tuple[Radiance, dict[str, Any]]:
+    """Read what `save_radiance` wrote, and its metadata.
+
+    Args:
+        path: a file written by `save_radiance`.
+        geometry: the field that was trained with it; left as it is. All of the radiance is put on its device.
+
+    Raises:
+        InputError: there is no such file, it is damaged, no radiance, or one of another geometry.
+    """
+    path = Path(path)
+    device = geometry.like.device
+    with _reading(path, RADIANCE_FORMAT, "a radiance", "mplicits reconstruct", device) as (header, tensors):
+        if header["geometry"]["digest"] != _digest(geometry):
+            raise InputError(f"{path}: the colours of another field than this one; run `mplicits reconstruct` again")
+        inv_std = float(header["inv_std"])
+        if not 0 < inv_std < math.inf or tensors["background"].shape != (3,):
+            raise ValueError(f"inv_std {inv_std:g}, background of shape {tuple(tensors['background'].shape)}")
+        color = _radiant(path, ViewColor, "color", header, tensors)
+        outside = None if header["outside"] is None else _radiant(path, Outside, "outside", header, tensors)
+        metadata = header["metadata"]
+        if not isinstance(metadata, dict):
+            raise TypeError(f"metadata is a {type(metadata).__name__}")
+        return Radiance(color, outside, tensors["background"], inv_std), metadata
+
+
+def _grid_of(grid: HashEncoding | None) -> dict[str, Any] | None:
+    """What `_radiant` needs to construct one again."""
+    if grid is None:
+        return None
+    return {
+        "levels": len(grid.resolutions),
+        "table_size": grid.table_size,
+        "features": grid.table.shape[1],
+        "coarsest": grid.resolutions[0],
+        "finest": grid.resolutions[-1],
+        "extent": grid.extent,
+    }
+
+
+def _radiant(
+    path: Path, kind: Callable[..., M], name: str, header: Mapping[str, Any], tensors: Mapping[str, Tensor]
+) -> M:
+    """A network of a radiance, of its description and its tensors."""
+    own = {key.removeprefix(f"{name}."): held for key, held in tensors.items() if key.startswith(f"{name}.")}
+    sizes = dict(header[name])
+    grid = sizes.pop("grid")
+    _check_size(sizes, own)
+    if grid is not None:
+        _check_size({"levels": grid["levels"], "features": grid["features"]}, own)
+        resolutions = grid_resolutions(grid["levels"], grid["coarsest"], grid["finest"])
+        entries = sum(min((cells + 1) ** 3, grid["table_size"]) for cells in resolutions)
+        _check_size({"entries": entries}, own)
+        grid = HashEncoding(**grid)
+    network = kind(**sizes, grid=grid)
+    _restore(path, network, own, "run `mplicits reconstruct` again")
+    return network.to(tensors["background"].device).requires_grad_(False)
+
+
 def _digest(field: Field) -> str:
     """SHA-256 of a field's tensors in float32, the same on every device and in every precision above it."""
     digest = hashlib.sha256()
@@ -216,8 +327,7 @@ def _reading(
 ) -> Iterator[tuple[dict[str, Any], dict[str, Tensor]]]:
     """Header and tensors of a file; whatever goes wrong with them becomes an `InputError`."""
     if not path.is_file():
-        name = "texture.safetensors" if form == TEXTURE_FORMAT else "field.safetensors"
-        raise InputError(f"{path}: no such file; expected {thing} written by `{command}` ({name})")
+        raise InputError(f"{path}: no such file; expected {thing} written by `{command}` ({_FILES[form]})")
     try:
         with safe_open(path, framework="pt") as file:  # it knows few devices by name; torch moves to any
             header_text = (file.metadata() or {}).get(form)

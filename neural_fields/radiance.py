@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
@@ -12,7 +13,7 @@ from ._checks import at_least
 from .field import Jet
 from .hash_encoding import HashEncoding
 
-__all__ = ["Outside", "ViewColor", "encode", "encoded_size"]
+__all__ = ["Outside", "Radiance", "ViewColor", "encode", "encoded_size"]
 
 
 def encode(x: Tensor, frequencies: int) -> Tensor:
@@ -134,6 +135,23 @@ class Outside(nn.Module):
         density = nn.functional.softplus(hidden[..., 0] - 1)
         seen = _relu_network(torch.cat((hidden[..., 1:], encode(direction, self.view_frequencies)), dim=-1), self.head)
         return density, seen.sigmoid()
+
+
+@dataclass(frozen=True, eq=False)
+class Radiance:
+    """What rays see of a geometry: with it, all that `render_volume` needs.
+
+    Attributes:
+        color: of the surface, by direction.
+        outside: what is outside the unit sphere; None if nothing is.
+        background: ``(3,)`` display RGB in [0, 1] behind everything.
+        inv_std: s of NeuS; 1/s is how unsure the surface is.
+    """
+
+    color: ViewColor
+    outside: Outside | None
+    background: Tensor
+    inv_std: float
 
 
 def _relu_layers(sizes: list[int]) -> list[nn.Linear]:

@@ -21,6 +21,7 @@ PICTURES = (".png", ".jpg", ".jpeg")
 FILMS = (".mp4", ".gif")
 BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), "gray": (0.5, 0.5, 0.5), "transparent": None}
 ORBIT_FLAGS = ("azimuth", "elevation", "up", "fov", "zoom")
+RADIANCE = "radiance"
 # Settings that one shading alone heeds.
 MEASURED = ("depth", "curvature", "error")
 OWNED = {"limits": MEASURED, "matcap": ("matcap",), "reference": ("error",)}
@@ -68,12 +69,14 @@ def _render_arguments(parser: argparse.ArgumentParser) -> None:
     add_flags(parser, "--normal-level", help="take the normals of this level (neural normal mapping)")
     add("--levels", action="store_true", help="all levels side by side, and the coarsest with the finest's normals")
     shadings = "; ".join(f"{name}: {text}" for name, text in SHADINGS.items())
-    add("--shading", choices=tuple(SHADINGS), help=f"{shadings} (lambert)")
+    photographed = f"{RADIANCE}: of a reconstruct run, as photographs show it, by volume rendering"
+    add("--shading", choices=(*SHADINGS, RADIANCE), help=f"{shadings}; {photographed} (lambert)")
     add("--fast", action="store_true", help="no shadows, no occlusion")
     add("--reference", metavar="FILE", help="cloud or mesh for the error (default: what the run was fitted to)")
     add_flags(parser, "--azimuth", "--elevation", "--up")
     add("--fov", type=between(0.1, 170), metavar="F", help="vertical angle of view, degrees (25)")
     add_flags(parser, "--zoom", help="magnification of the middle (1: the whole shape)")
+    add("--sides", type=whole(1, 12), metavar="N", help="from N directions around it, side by side (1)")
     add("--cameras", metavar="FILE", help="look from posed images instead: transforms.json or cameras_sphere.npz")
     add("--frame", metavar="NAME", help="which of them: a name, or an index from 0; a film goes through all")
     colors = f"#rrggbb or {', '.join(BACKGROUNDS)} (white)"
@@ -95,11 +98,16 @@ def _render(arguments: argparse.Namespace) -> int:
     from ..render.draw import RenderOptions, render_run
     from ..render.subject import Orbit
 
-    chosen = given_flags(arguments, RenderOptions) | {"background": arguments.background}
+    chosen: dict[str, Any] = given_flags(arguments, RenderOptions) | {"background": arguments.background}
+    draw = render_run
+    if arguments.shading == RADIANCE:
+        from ..reconstruct.photograph import photograph
+
+        draw = photograph
+        # A photograph's ray goes through the middle of its pixel, as in training; more cost as much again.
+        chosen = {"samples": 1} | chosen
     options = RenderOptions(shade=shade, orbit=Orbit(**given_flags(arguments, Orbit)), **chosen)
-    return _draw(
-        arguments.out, "render", lambda bar: render_run(arguments.source, arguments.out, options, progress=bar)
-    )
+    return _draw(arguments.out, "render", lambda bar: draw(arguments.source, arguments.out, options, progress=bar))
 
 
 def _shading(arguments: argparse.Namespace, given: dict[str, object]) -> str | None:
@@ -119,8 +127,12 @@ def _check(arguments: argparse.Namespace) -> None:
     for name in ("level", "normal_level"):
         if arguments.levels and getattr(arguments, name) is not None:
             raise input_error(f"--{name.replace('_', '-')}: --levels draws all of them; leave one of the two out")
-    if arguments.background is None and (arguments.levels or arguments.out.suffix.lower() != ".png"):
-        raise input_error("--background transparent: needs a .png of a single level; give it a colour")
+    if arguments.shading == RADIANCE and arguments.background != BACKGROUNDS["white"]:
+        raise input_error(f"--background: --shading {RADIANCE} has that of the photographs; leave it out")
+    if arguments.background is None and (
+        arguments.levels or (arguments.sides or 1) > 1 or arguments.out.suffix.lower() != ".png"
+    ):
+        raise input_error("--background transparent: needs a .png of a single level and side; give it a colour")
     for name in ORBIT_FLAGS:
         if arguments.cameras is not None and getattr(arguments, name) is not None:
             raise input_error(f"--{name}: the cameras of {arguments.cameras} say where to look from; leave it out")
@@ -135,6 +147,7 @@ RENDER = Command(
   mplicits render runs/scan -o cutout.png --background transparent --size 1600 1200 --azimuth -40
   mplicits render runs/scan -o turntable.mp4 --frames 120 --fps 30
   mplicits render scan.ply -o mesh.png --up z
+  mplicits render scan.ply -o sides.png --sides 4 --azimuth 0 --size 400
   mplicits render runs/scan -o view.png --cameras transforms.json --frame 12""",
     _render_arguments,
     _render,

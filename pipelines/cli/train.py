@@ -188,7 +188,8 @@ def _reconstruct_here(arguments: argparse.Namespace, config: ReconstructConfig |
         with stoppable(f"to continue: mplicits reconstruct {data} -o {directory} --resume"):
             run = reconstruct(data, config, out=directory, resume=arguments.resume, progress=report)
         with meshing(report):
-            mesh = mesh_run(directory, directory / MESH_FILE)
+            lines: list[str] = []
+            mesh = mesh_run(directory, directory / MESH_FILE, say=lines.append)
     tell_budget(run.record)
     views, held_out = run.record["views"], run.record["held_out"]
     print(
@@ -201,6 +202,8 @@ def _reconstruct_here(arguments: argparse.Namespace, config: ReconstructConfig |
             f"({directory / HELD_OUT_FILE})"
         )
     print(f"{directory / MESH_FILE}: {len(mesh.vertices):,} vertices, {len(mesh.faces):,} faces")
+    for line in lines:
+        print(f"  {line}")
     print(f"next: mplicits view {directory}")
     return 0
 

@@ -19,7 +19,7 @@ from ...datasets.clouds.point_cloud import unit_rows
 from ...neural_fields import Field, InputError, Placement, Similarity, map_attribute
 from ...neural_fields.meshing import Mesh, NoSurfaceError, extract_mesh, map_normals
 from ..run.folder import chosen_level, find_field, fitted_cloud, load_still
-from ..surface.trim import Support, drop_unsupported, in_region, keep_largest, read_support, trim_distance
+from ..surface.trim import Support, drop_unsupported, in_region, keep_largest, read_support, seen_part, trim_distance
 from ..texture.riding import Colors, colors_of_run
 from .bake import check_texture_size, textured_mesh
 from .decimation import Decimation, check_decimation_tool, decimated
@@ -28,6 +28,8 @@ from .fineness import LEAST, RESOLUTIONS, fineness, thin_share
 from .printing import PrintReport, print_report
 
 __all__ = ["Exported", "MeshOptions", "export_run", "mesh_run", "normals_near"]
+
+MUCH = 0.05  # share of a surface that photographs have not seen, above which that is said
 
 
 @dataclass(frozen=True)
@@ -47,6 +49,7 @@ class MeshOptions:
         faces: triangles to keep of one that is not; None keeps all.
         report: whether to look at the mesh as a printer would; None does so for STL.
         keep_unsupported: whether to keep components that no input points support.
+        seen: whether to leave out what fewer than two photographs have seen, of a run of ``reconstruct``.
         keep_largest: whether to keep only the component of largest area.
         trim_distance: drop faces further than this from the points, in input units.
         cloud: the points for that; by default the file that was fitted.
@@ -65,6 +68,7 @@ class MeshOptions:
     faces: int | None = None
     report: bool | None = None
     keep_unsupported: bool = False
+    seen: bool = False
     keep_largest: bool = False
     trim_distance: float | None = None
     cloud: str | Path | None = None
@@ -148,6 +152,8 @@ def export_run(
     level = chosen_level(field, file, options.level)
     normal_level = chosen_level(field, file, options.normal_level, otherwise=level, flag="--normal-level")
     support = None if options.time is not None else read_support(file, metadata.get("run", {}), level)
+    if options.seen and (support is None or not support.seen):
+        raise InputError(f"--seen: {file} keeps nothing of what photographs see, as runs of `mplicits reconstruct` do")
     points = None
     if options.trim_distance is not None:
         cloud = read_cloud(options.cloud or fitted_cloud(file, metadata, remedy="name it with --cloud FILE"))
@@ -163,6 +169,8 @@ def export_run(
             raise InputError(f"{file}: no surface in the region of interest; train it longer (--steps)")
     if support is not None and not options.keep_unsupported:
         mesh = _supported(mesh, support, say)
+    if support is not None and support.seen:
+        mesh = _seen(mesh, support, say, cut=options.seen)
     if normal_level != level:
         mesh = map_normals(mesh, field, level=normal_level)
     if points is not None and options.trim_distance is not None:
@@ -197,7 +205,7 @@ def _resolution(
 ) -> int:
     """Cells per side; ``say`` hears of parts that are too thin for those that were asked for, or usual."""
     say = say or (lambda _: None)
-    if support is None:
+    if support is None or support.seen:
         return asked or RESOLUTIONS[0]
     if asked is None:
         chosen = fineness(field, support.points, level=level)
@@ -223,6 +231,18 @@ def _supported(mesh: Mesh, support: Support, say: Callable[[str], None] | None) 
         parts = f"{left.dropped:,} component{'s' * (left.dropped > 1)}"
         say(f"removed {parts} that no points support ({left.area:.2g} of the area); --keep-unsupported keeps them")
     return left.mesh
+
+
+def _seen(mesh: Mesh, support: Support, say: Callable[[str], None] | None, *, cut: bool) -> Mesh:
+    """What photographs have seen of a mesh, if that is wanted; ``say`` hears how much they have not, if it is much."""
+    part, missed = seen_part(mesh, support)
+    if not cut or part is None:
+        if say is not None and missed > MUCH:
+            say(f"{missed:.0%} of the surface is seen by fewer than two photographs; --seen leaves it out")
+        return mesh
+    if say is not None and missed > 0:
+        say(f"left out {missed:.2g} of the area, which fewer than two photographs see")
+    return part
 
 
 def _evaluated(colors: Colors, points: NDArray[np.float64]) -> NDArray[np.float32]:

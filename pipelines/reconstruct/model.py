@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -9,12 +10,13 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from ...datasets.cameras import Camera
 from ...datasets.views.images import PosedImage
 from ...neural_fields import Field, InputError, Jet, MultiscaleSDF, Similarity, Siren
 from ...neural_fields.baselines import NeusSDF
 from ...neural_fields.devices import precise, upload
 from ...neural_fields.hash_encoding import HashEncoding
-from ...neural_fields.radiance import Outside, ViewColor
+from ...neural_fields.radiance import Outside, Radiance, ViewColor
 from ...neural_fields.sphere_start import fit_sphere
 from ...neural_fields.volume import sphere_span
 from ...neural_fields.volume_renderer import Rendered, Sampling, render_volume
@@ -103,6 +105,18 @@ class SceneModel(nn.Module):
         self.variance = nn.Parameter(torch.tensor(FIRST_VARIANCE))
         self.register_buffer("background", background)
         self.background: Tensor
+
+    @classmethod
+    def of(cls, geometry: Field, radiance: Radiance) -> SceneModel:
+        """A scene that was trained, of its geometry and its `Radiance`."""
+        model = cls(geometry, radiance.color, radiance.outside, radiance.background).to(radiance.background.device)
+        with torch.no_grad():
+            model.variance.fill_(math.log(radiance.inv_std) / SHARPENING)
+        return model.requires_grad_(False)
+
+    def radiance(self) -> Radiance:
+        """What rays see of the geometry; without exposures and poses, which are the photographs'."""
+        return Radiance(self.color, self.outside, self.background, float(self.inv_std.detach()))
 
     @property
     def inv_std(self) -> Tensor:
@@ -229,9 +243,9 @@ class Rays(NamedTuple):
     row: Tensor
 
 
-def camera_rays(view: PosedImage, similarity: Similarity) -> tuple[Tensor, Tensor]:
-    """Origins and unit directions, both ``(H · W, 3)`` float32, of a picture's pixels in unit-sphere coordinates."""
-    eye, directions = view.camera.moved(similarity).rays()
+def camera_rays(camera: Camera) -> tuple[Tensor, Tensor]:
+    """Origins and unit directions, both ``(H · W, 3)`` float32, of a camera's pixels."""
+    eye, directions = camera.rays()
     return eye.expand(directions.shape[:2].numel(), 3), directions.reshape(-1, 3)
 
 
@@ -261,8 +275,8 @@ class RayPool:
         self.lens = torch.stack(lens).float().to(device)  # (V, 4): fx, fy, cx, cy
         self.widths = torch.tensor([camera.width for camera in cameras], device=device)
         colors, masks, pixels, owners, hits = [], [], [], [], 0
-        for index, view in enumerate(views):
-            near, far = sphere_span(*camera_rays(view, similarity))
+        for index, (view, camera) in enumerate(zip(views, cameras, strict=True)):
+            near, far = sphere_span(*camera_rays(camera))
             hit = far > near
             hits += int(hit.sum())
             kept = torch.arange(len(hit)) if whole else hit.nonzero()[:, 0]

@@ -11,10 +11,13 @@ from ..run.settings import ReconstructConfig, TextureConfig
 from ..texture.train import texture_stages
 from .hull import STEPS as HULL_STEPS
 from .objective import NEAR_EVERY, WHOLE_EVERY
+from .seen import RAYS as SEEN_RAYS
 
-__all__ = ["SPHERE", "ReconstructPlan", "level_stage"]
+__all__ = ["SEEING", "SPHERE", "WITNESSES", "ReconstructPlan", "level_stage"]
 
 SPHERE = "a sphere to begin with"
+SEEING = "what photographs see"
+TRACED = 8  # values along a ray that is traced to the surface
 SPHERE_STEPS, SPHERE_BATCH = 200, 1024
 # Of the samples of a ray: those in the band of the next level, those that get a colour, and rays that meet the region.
 IN_BAND, COLOURED, MET = 0.4, 0.6, 0.8
@@ -22,6 +25,7 @@ IN_BAND, COLOURED, MET = 0.4, 0.6, 0.8
 EVALUATED = 0.2
 NEUS = Net(parameters=459_000, neurons=2048)  # its 8 layers of 256
 GRID = Net(parameters=6_000, neurons=256)  # as long as looking up the hash encoding takes
+WITNESSES = 9  # cameras that are asked for the colour of a point of the texture, at most
 MESHED = 128  # cells along the mesh whose points are coloured
 
 
@@ -85,8 +89,10 @@ class ReconstructPlan:
         stages = []
         if self.held_out:
             stages.append(Stage("held-out views", "rays", self.held_out * self.view_seconds()))
+        stages.append(Stage(SEEING, "rays", self.speed.points(values(SEEN_RAYS * TRACED, self.nets))))
         if self.config.texture_steps:
             meshed = values(4 * MESHED**2, self.nets) + jets(self.texture.samples, self.nets)
+            meshed += values((WITNESSES + 1) * self.texture.samples, [self._color()])
             stages.append(Stage("texture: surface", "mesh", self.speed.points(meshed)))
             stages += texture_stages(self.texture, self.texture.samples, self.nets, self.speed)
         return stages

@@ -1,6 +1,7 @@
 """``reconstruct``: from posed photographs to a surface with colours, by volume rendering (NeuS) of a multiscale SDF.
 
-Colours are learnt by direction; at the end a texture learns those seen head-on, which every other command can use.
+Colours are learnt by direction; at the end a texture learns those that most cameras see, which every other command can
+use.
 """
 
 from __future__ import annotations
@@ -19,22 +20,23 @@ from torch import Tensor
 from ...datasets import PointCloud
 from ...datasets.views.images import PosedImage, PosedImages, read_posed_images
 from ...neural_fields import InputError, Jet, NoSurfaceError, TextureField, extract_mesh
-from ...neural_fields.checkpoint import texture_bytes
+from ...neural_fields.checkpoint import radiance_bytes, texture_bytes
 from ..render.picture import Image, picture_bytes, write_picture
 from ..run.costs import Speed
-from ..run.folder import TEXTURE_FILE, RunFolder, digest_of
+from ..run.folder import RADIANCE_FILE, SUPPORT_FILE, TEXTURE_FILE, RunFolder, digest_of
 from ..run.machine import choose_device, environment, speed
 from ..run.schedule import Progress, Report, Schedule, Stage
 from ..run.settings import ReconstructConfig, TextureConfig
 from ..run.team import agreed, apart, is_leader
 from ..run.trainer import Interrupted, load_compiler, parameter_count, stop_on_signals
 from ..surface.surface import from_mesh, sample_points
-from ..surface.trim import in_region
+from ..surface.trim import in_region, thinned
 from ..texture.train import FittedTexture, fit_texture
 from .hull import begin
 from .model import RayPool, SceneModel, build_scene
 from .objective import scene_trainer
-from .plan import SPHERE, ReconstructPlan, level_stage
+from .plan import SEEING, SPHERE, WITNESSES, ReconstructPlan, level_stage
+from .seen import seen_points
 from .views import ViewImage, comparison_sheet, exposed_as, held_out, measure, reduced, render_image, spread
 
 __all__ = [
@@ -57,7 +59,9 @@ PREVIEW_PIXELS = 4096  # of each: through fog, which a scene is at first, every 
 SHEET_VIEWS = 4  # rows of the sheet of held-out views
 TEXTURE_RESOLUTION = 128  # of the mesh whose points are coloured: finer than the texture's band is wide
 TEXTURE_SAMPLES = 100_000
-BATCH = 1 << 15
+BATCH = 1 << 13
+# Of the cameras whose median is the colour of a point, at least; and the cosine within which they face it.
+LEAST_WITNESSES, FACING = 3, 0.5
 # Of pictures that are not read yet.
 USUAL_PIXELS, USUAL_HELD_OUT, USUAL_READING = 60_000, 6, 2.0
 LEAST_SECONDS = 0.5  # of training, where a time budget leaves none
@@ -205,11 +209,20 @@ class _Reconstruction:
         """Measure, colour, write."""
         pairs = self._render_held_out()
         record = self._record(finished=True) | {"held_out": self._figures(pairs)}
+        self.schedule(Progress(SEEING, 0, 0, 0.0, {}))
+        points, within = seen_points(self.model.geometry, self.train_views, self.images.similarity)
+        if len(points):
+            self.folder.keep_tensors(SUPPORT_FILE, thinned(points.numpy(), seen_within=within))
+        self.schedule(Progress(SEEING, 0, 0, 1.0, {}))
         self.model.cpu()
         texture, record["texture"] = self._texture()
         out = self.folder.out
         if texture is not None:
             self.folder.keep(TEXTURE_FILE, texture_bytes(texture, metadata={"texture": record["texture"]}))
+        about = {name: getattr(self.config, name) for name in ("uniform", "importance", "march_grid")}
+        self.folder.keep(
+            RADIANCE_FILE, radiance_bytes(self.model.radiance(), self.model.geometry, metadata={"sampling": about})
+        )
         if pairs:
             self.folder.keep(HELD_OUT_FILE, picture_bytes(self._sheet(pairs[:SHEET_VIEWS])))
         record = self.folder.finish(self.model.geometry, self.images.similarity, record, gone=(PREVIEW_FILE,))
@@ -333,12 +346,34 @@ class _Reconstruction:
 
 
 @torch.no_grad()
-def surface_colors(model: SceneModel, points: Tensor) -> Tensor:
-    """Colours ``(N, 3)`` of points ``(N, 3)`` near the surface, each seen along its normal, from outside."""
+def surface_colors(model: SceneModel, points: Tensor, eyes: Tensor) -> Tensor:
+    """Colours ``(N, 3)`` of points ``(N, 3)`` near the surface as most of the cameras that face them see them.
+
+    The median, for each channel, of what up to `WITNESSES` cameras see whose rays are within 60° of the normal: paint
+    is the same for all of them, and few see a highlight. Where fewer than three face it, the colour along the normal.
+
+    Args:
+        model: trained.
+        points: ``(N, 3)``.
+        eyes: ``(V, 3)`` of the cameras, in unit-sphere coordinates; in an order in which the first ones are all around.
+    """
     parts = []
     for part in points.split(BATCH):
         jet: Jet = model.geometry.jet(part)
-        parts.append(model.color(part, -torch.nn.functional.normalize(jet.gradient, dim=-1), jet))
+        normal = torch.nn.functional.normalize(jet.gradient, dim=-1)
+        along = torch.nn.functional.normalize(part[:, None] - eyes, dim=-1)  # (B, V, 3)
+        facing = -(along * normal[:, None]).sum(dim=-1) >= FACING
+        # The first of the cameras that face a point: they count the more, the earlier they come.
+        count = min(WITNESSES, len(eyes))
+        rank = torch.arange(len(eyes), 0, -1, device=part.device) * facing
+        found, chosen = rank.topk(count, dim=1)
+        directions = along.gather(1, chosen[:, :, None].expand(-1, -1, 3))
+        row, witness = (found > 0).nonzero(as_tuple=True)
+        seen = part.new_full((len(part), count, 3), torch.nan)
+        seen[row, witness] = model.color(part[row], directions[row, witness], Jet(*(held[row] for held in jet)))
+        ahead = model.color(part, -normal, jet)
+        enough = (found > 0).sum(dim=1, keepdim=True) >= LEAST_WITNESSES
+        parts.append(torch.where(enough, seen.nanmedian(dim=1).values, ahead))
     return torch.cat(parts)
 
 
@@ -350,11 +385,11 @@ def scene_texture(
     progress: Report | None = None,
     seconds: float | None = None,
 ) -> FittedTexture:
-    """Train a `TextureField` on the head-on colours of a scene's surface.
+    """Train a `TextureField` on the colours of a scene's surface; see `surface_colors`.
 
     Args:
         model: trained, on the CPU.
-        images: of it; for the coordinates and the name.
+        images: of it; for the cameras, the coordinates and the name.
         config: the reconstruction's; ``texture_steps``, seed and device are used.
         progress: see `fit_texture`.
         seconds: a time budget; None for none.
@@ -368,7 +403,10 @@ def scene_texture(
     if mesh is None:
         raise NoSurfaceError("all of it is outside the region of interest")
     points, _ = sample_points(from_mesh(mesh), TEXTURE_SAMPLES, np.random.default_rng(config.seed))
-    colors = surface_colors(model, torch.from_numpy(points).float()).numpy()
+    random = np.random.default_rng(config.seed)
+    eyes = np.stack([view.camera.eye.numpy() for view in images.views])[random.permutation(len(images.views))]
+    seen_from = torch.from_numpy(images.similarity.to_unit(eyes)).float()
+    colors = surface_colors(model, torch.from_numpy(points).float(), seen_from).numpy()
     cloud = PointCloud(images.similarity.to_input(points), colors=colors, source=str(images.source))
     report(Progress("texture: surface", 0, 0, 1.0, {}))
     settings = texture_settings(config)

@@ -6,12 +6,14 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ...datasets.cameras import Camera
 from ...datasets.views.images import PosedImage
 from ...datasets.views.pictures import resample, shrink
 from ...neural_fields import Similarity
@@ -27,6 +29,7 @@ __all__ = [
     "held_out",
     "measure",
     "reduced",
+    "render_camera",
     "render_image",
     "spread",
     "target_of",
@@ -55,18 +58,12 @@ class ViewImage:
     opacity: Float32
 
 
-@torch.no_grad()
 def render_image(
     model: SceneModel,
     view: PosedImage,
     similarity: Similarity,
     sampling: Sampling,
-    *,
-    level: int = -1,
-    least_weight: float = 1e-4,
-    skip: float = 1e-4,
-    guide: Callable[[Tensor], Tensor] | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    **options: Any,
 ) -> ViewImage:
     """Render a view with the model's volume renderer.
 
@@ -75,6 +72,29 @@ def render_image(
         view: whose camera it is.
         similarity: from world to unit-sphere coordinates.
         sampling: where to sample.
+        options: of `render_camera`.
+    """
+    return render_camera(model, view.camera.moved(similarity), sampling, **options)
+
+
+@torch.no_grad()
+def render_camera(
+    model: SceneModel,
+    camera: Camera,
+    sampling: Sampling,
+    *,
+    level: int = -1,
+    least_weight: float = 1e-4,
+    skip: float = 1e-4,
+    guide: Callable[[Tensor], Tensor] | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> ViewImage:
+    """Render what a camera sees with the model's volume renderer, a ray through the middle of each pixel.
+
+    Args:
+        model: on any device.
+        camera: in unit-sphere coordinates.
+        sampling: where to sample.
         level: of the geometry.
         least_weight: see `render_volume`.
         skip: the same.
@@ -82,7 +102,7 @@ def render_image(
         progress: told (rays done, rays in all).
     """
     device = model.background.device
-    origins, directions = (part.to(device) for part in camera_rays(view, similarity))
+    origins, directions = (part.to(device) for part in camera_rays(camera))
     color = model.background.expand(len(origins), 3).clone()
     normal, opacity = torch.zeros_like(color), torch.zeros_like(color[:, 0])
     near, far = sphere_span(origins, directions)
@@ -103,7 +123,7 @@ def render_image(
         done += len(rows)
         if progress:
             progress(done, len(asked))
-    shape = view.color.shape[:2]
+    shape = (camera.height, camera.width)
     return ViewImage(
         color.clamp(0, 1).reshape(*shape, 3).cpu().numpy(),
         normal.reshape(*shape, 3).cpu().numpy(),

@@ -24,12 +24,15 @@ from .shade import ShadeOptions, compose, default_shading, downsample, measure, 
 from .subject import Orbit, Panel, Subject, open_subject, orbit_cameras, posed_cameras, reference_distance, subject_of
 from .trace import Seen, fine_strips
 
-__all__ = ["RenderOptions", "render_run"]
+__all__ = ["Painter", "RenderOptions", "render_run"]
 
 Color = tuple[float, float, float]
+Painter = Callable[[Camera, int], Image]
+"""What a camera, in unit-sphere coordinates, sees of a level: a picture of its size."""
 
 PREVIEW = 160  # pixels on the longer side of the pictures from which colour maps take their limits
 PREVIEWS = 12  # of a film
+PAINTED = 1 << 14  # pixels that a painter is given at a time, between two reports
 # What colours show, as the legend calls it, and the power of the input's unit it is measured in.
 MEASURES = {
     "depth": ("distance from the camera", 1),
@@ -49,6 +52,8 @@ class RenderOptions:
         level: of a field; None is the finest.
         normal_level: whose normals (neural normal mapping); None is ``level``.
         levels: all levels side by side, and the coarsest with the normals of the finest.
+        sides: from so many directions side by side, evenly around the up axis from the orbit's azimuth on; each level
+            then has a row of its own. Not of a film, nor from posed cameras.
         shading: one of `SHADINGS`; None is "lambert", or what a cloud without normals can show.
         shade: settings of the shading; ``limits`` in input units (curvature: in their inverse). Of a mesh or a cloud,
             shadows and occlusion are left out, as they are traced in a field.
@@ -69,6 +74,7 @@ class RenderOptions:
     level: int | None = None
     normal_level: int | None = None
     levels: bool = False
+    sides: int = 1
     shading: str | None = None
     shade: ShadeOptions = dataclasses.field(default_factory=lambda: ShadeOptions(shadows=True, occlusion=True))
     reference: str | Path | None = None
@@ -88,6 +94,7 @@ def render_run(
     out: str | Path,
     options: RenderOptions | None = None,
     *,
+    painter: Painter | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> str:
     """Draw a run, a mesh or a cloud.
@@ -98,6 +105,7 @@ def render_run(
         source: run directory, .safetensors file, mesh or cloud.
         out: a .png or .jpg picture, or an .mp4 or .gif film.
         options: what, and how.
+        painter: draws in place of the shadings, background included; the subject then says where to look from.
         progress: called with how many parts are drawn, and of how many.
 
     Returns:
@@ -112,6 +120,8 @@ def render_run(
         check_picture_path(out, transparent=options.background is None)
     elif options.background is None:
         raise InputError(f"{out}: films know no transparency; write a .png, or give a background")
+    if options.sides > 1 and (film or options.cameras is not None):
+        raise InputError("--sides: goes with a picture of the orbit, not with a film or --cameras; leave it out")
     subject = open_subject(
         source,
         time=options.time,
@@ -120,13 +130,13 @@ def render_run(
         levels=options.levels,
         device=choose_device(options.device),
     )
-    artist = _Artist(subject, options)
+    artist = _Artist(subject, options, painter)
     cameras = _cameras(subject, options, film=film)
     artist.fit_limits(cameras)
     if film:
-        write_animation(out, artist.pictures(cameras, progress), fps=options.fps)
+        write_animation(out, artist.pictures([[camera] for camera in cameras], progress), fps=options.fps)
     else:
-        write_picture(out, next(artist.pictures(cameras, progress)))
+        write_picture(out, next(artist.pictures([cameras], progress)))
     return artist.caption(cameras)
 
 
@@ -153,7 +163,7 @@ def render_shape(
     subject = subject_of(shape.field, shape.similarity, name=Path(path or "shape"), panels=panels)
     orbit = Orbit(azimuth=azimuth, elevation=elevation, up=up)
     options = RenderOptions(size=size if isinstance(size, tuple) else (size,), orbit=orbit)
-    picture = next(_Artist(subject, options).pictures(_cameras(subject, options, film=False), None))
+    picture = next(_Artist(subject, options).pictures([_cameras(subject, options, film=False)], None))
     if path is not None:
         write_picture(path, picture)
     return picture
@@ -169,20 +179,20 @@ def _cameras(subject: Subject, options: RenderOptions, *, film: bool) -> list[Ca
         raise InputError(f"--frame {options.frame}: goes with --cameras FILE")
     size = (640,) if options.size is None else options.size
     return orbit_cameras(
-        subject.outline(), options.orbit, size=(size[0], size[-1]), frames=options.frames if film else 1
+        subject.outline(), options.orbit, size=(size[0], size[-1]), frames=options.frames if film else options.sides
     )
 
 
 class _Artist:
     """Draws a subject in one manner, with one scale of colours for all pictures."""
 
-    def __init__(self, subject: Subject, options: RenderOptions) -> None:
+    def __init__(self, subject: Subject, options: RenderOptions, painter: Painter | None = None) -> None:
         """Check that the subject can be drawn so, and read what that needs.
 
         Raises:
             InputError: it cannot.
         """
-        self.subject, self.options = subject, options
+        self.subject, self.options, self.painter = subject, options, painter
         self.shading = options.shading or default_shading(oriented=subject.oriented, colored=subject.colored)
         # Normals do not show in depths and errors: another level's would only repeat a picture.
         mapped = self.shading not in ("depth", "error")
@@ -219,33 +229,58 @@ class _Artist:
         if limits[0] < limits[1]:  # else all pixels show one number, and any limits will do
             self.shade_options = dataclasses.replace(self.shade_options, limits=limits)
 
-    def pictures(self, cameras: Sequence[Camera], progress: Callable[[int, int], None] | None) -> Iterator[Image]:
-        """The picture from each camera."""
-        samples, done = self.options.samples, 0
-        total = len(self.panels) * sum(len(fine_strips(camera, samples)) for camera in cameras)
-        for camera in cameras:
-            tiles = []
+    def pictures(
+        self, views: Sequence[Sequence[Camera]], progress: Callable[[int, int], None] | None
+    ) -> Iterator[Image]:
+        """Each picture, from the cameras that are to be on it: one, or several of one size, side by side."""
+        done = 0
+        total = len(self.panels) * sum(len(self._strips(camera)) for cameras in views for camera in cameras)
+        for cameras in views:
+            lines: list[list[tuple[str, Image]]] = []
             for panel in self.panels:
-                parts = []
-                for strip in fine_strips(camera, samples):
-                    parts.append(self._draw(strip, panel))
-                    done += 1
-                    if progress is not None:
-                        progress(done, total)
-                tiles.append((panel.label, np.concatenate(parts)))
-            yield self._with_legend(tiles[0][1] if len(tiles) == 1 else contact_sheet(tiles), camera)
+                lines.append([])
+                for index, camera in enumerate(cameras):
+                    parts = []
+                    for strip in self._strips(camera):
+                        parts.append(self._draw(strip, panel))
+                        done += 1
+                        if progress is not None:
+                            progress(done, total)
+                    turned = f"{panel.label}, {self._azimuth(index, len(cameras)):.4g}°"
+                    lines[-1].append((turned if len(cameras) > 1 else panel.label, np.concatenate(parts)))
+            if len(cameras) == 1:
+                lines = [[tile for line in lines for tile in line]]
+            alone = len(lines) == len(lines[0]) == 1
+            yield self._with_legend(lines[0][0][1] if alone else contact_sheet(*lines), cameras[0], alone=alone)
+
+    @property
+    def _views(self) -> str:
+        """What several cameras are called."""
+        return "sides" if self.options.sides > 1 else "frames"
+
+    def _azimuth(self, index: int, sides: int) -> float:
+        """Of one of the sides, in degrees from -180 to 180."""
+        return (self.options.orbit.azimuth + 360 * index / sides + 180) % 360 - 180
 
     def caption(self, cameras: Sequence[Camera]) -> str:
         """What was drawn, in a few words."""
         first, count = cameras[0], len(cameras)
         what = ", ".join(panel.label for panel in self.panels)
-        words = [what, self.shading, f"{first.width}×{first.height}" + (f", {count} frames" if count > 1 else "")]
+        shading = "radiance" if self.painter else self.shading
+        words = [what, shading, f"{first.width}×{first.height}" + (f", {count} {self._views}" if count > 1 else "")]
         if self.shading in MEASURES and self.shade_options.limits is not None:
             low, high = (limit * self.unit for limit in self.shade_options.limits)
             words[1] += f" from {low:.4g} to {high:.4g}"
         return ", ".join(words) + ("" if self.anything else "; nothing of it is in view")
 
+    def _strips(self, camera: Camera) -> list[Camera]:
+        """What is drawn at a time; little by little, where each ray costs as much as a painter's."""
+        return fine_strips(camera, self.options.samples, pixels=PAINTED if self.painter else None)
+
     def _draw(self, camera: Camera, panel: Panel) -> Image:
+        if self.painter is not None:
+            self.anything = True
+            return downsample(self.painter(camera, panel.level), self.options.samples)
         seen = self.subject.view(camera, panel)
         rgb = seen.position
         if len(seen.pixel):
@@ -278,13 +313,13 @@ class _Artist:
             detail=self.shade_options.detail,
         )
 
-    def _with_legend(self, picture: Image, camera: Camera) -> Image:
+    def _with_legend(self, picture: Image, camera: Camera, *, alone: bool) -> Image:
         limits = self.shade_options.limits
         if not self.options.legend or self.shading not in MEASURES or limits is None:
             return picture
         title = MEASURES[self.shading][0]
         shown = (limits[0] * self.unit, limits[1] * self.unit)
-        paper = self.options.background if len(self.panels) == 1 else (1.0, 1.0, 1.0)
+        paper = self.options.background if alone else (1.0, 1.0, 1.0)
         return with_color_bar(picture, self._scale(camera, limits), shown, title=title, background=paper)
 
     def _scale(self, camera: Camera, limits: tuple[float, float]) -> NDArray[np.float32]:

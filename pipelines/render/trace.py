@@ -85,9 +85,9 @@ def strips(camera: Camera, pixels: Callable[[], int]) -> Iterator[tuple[int, Cam
         first += rows
 
 
-def fine_strips(camera: Camera, samples: int) -> list[Camera]:
-    """A camera as strips of `STRIP` pixels at most, each with ``samples`` pixels per pixel and direction."""
-    parts = (part for _, part in strips(camera, lambda: STRIP // samples**2))
+def fine_strips(camera: Camera, samples: int, *, pixels: int | None = None) -> list[Camera]:
+    """A camera as strips of ``pixels`` (`STRIP`) at most, each with ``samples`` pixels per pixel and direction."""
+    parts = (part for _, part in strips(camera, lambda: (pixels or STRIP) // samples**2))
     return [part.resized(part.width * samples, part.height * samples) for part in parts]
 
 

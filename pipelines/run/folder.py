@@ -39,6 +39,7 @@ __all__ = [
     "FIELD_FILE",
     "MAY_CHANGE",
     "MERGED_FILE",
+    "RADIANCE_FILE",
     "RECORD_FILE",
     "STATE_FILE",
     "SUPPORT_FILE",
@@ -69,6 +70,7 @@ FIELD_FILE = "field.safetensors"
 RECORD_FILE = "run.json"
 STATE_FILE = "resume.safetensors"
 TEXTURE_FILE = "texture.safetensors"
+RADIANCE_FILE = "radiance.safetensors"
 SUPPORT_FILE = "support.safetensors"
 CLOUD_FILE = "cloud.ply"  # what was made of depth maps
 MERGED_FILE = "merged_cloud.npz"  # of a large cloud, made again where it is missing
@@ -364,7 +366,7 @@ class RunFolder:
         record = {"generation": self._generation, **record}
         short = {name: value for name, value in record.items() if name not in LONG}
         files = {**self._kept, FIELD_FILE: field_bytes(field, similarity=similarity, metadata={"run": short})}
-        gone = {*self._gone, TEXTURE_FILE, texture_state_file(Path(TEXTURE_FILE)).name} - {*files}
+        gone = {*self._gone, TEXTURE_FILE, RADIANCE_FILE, texture_state_file(Path(TEXTURE_FILE)).name} - {*files}
         if record.get("cloud") == str((out / CLOUD_FILE).absolute()):
             gone.discard(CLOUD_FILE)  # it is what is fitted
         digests = {name: old for name, old in self._digests.items() if name not in gone}

@@ -31,6 +31,7 @@ __all__ = [
     "keep_faces",
     "keep_largest",
     "read_support",
+    "seen_part",
     "support_radius",
     "thinned",
     "trim_distance",
@@ -185,16 +186,37 @@ def trim_distance(mesh: Mesh, points: NDArray[np.floating], distance: float) -> 
 
 
 class Support(NamedTuple):
-    """Points ``(N, 3)`` in the unit sphere, and how near some of them a surface that they support passes."""
+    """What a surface rests on.
+
+    Attributes:
+        points: ``(N, 3)`` in the unit sphere.
+        radius: how near some of them a surface that they support passes.
+        seen: whether they are all that photographs have seen, so that what is further off was seen by none.
+    """
 
     points: NDArray[np.float64]
     radius: float
+    seen: bool = False
 
 
-def thinned(points: NDArray[np.floating]) -> dict[str, Tensor]:
-    """What is kept of the points ``(N, 3)`` of a fit in `SUPPORT_FILE`: one per voxel."""
+def thinned(points: NDArray[np.floating], *, seen_within: float | None = None) -> dict[str, Tensor]:
+    """What is kept in `SUPPORT_FILE` of the points ``(N, 3)`` of a fit, or of what photographs see: one per voxel.
+
+    Args:
+        points: in the unit sphere.
+        seen_within: of what photographs see, how far from some point that may be.
+    """
     kept = points[voxel_representatives(np.asarray(points, np.float64), VOXEL)]
-    return {"points": torch.from_numpy(kept).half()}
+    seen = {} if seen_within is None else {"seen_within": torch.tensor(float(np.hypot(seen_within, VOXEL)))}
+    return {"points": torch.from_numpy(kept).half(), **seen}
+
+
+def seen_part(mesh: Mesh, support: Support) -> tuple[Mesh | None, float]:
+    """The faces of a mesh that photographs have seen, and the share of its area that they have not; None of none."""
+    near = KDTree(support.points).query(mesh.vertices, distance_upper_bound=support.radius, workers=-1)[0]
+    kept = np.isfinite(near)[mesh.faces].all(axis=1)
+    areas = face_normals(mesh)[1]
+    return (keep_faces(mesh, kept) if kept.any() else None), float(areas[~kept].sum() / max(areas.sum(), 1e-300))
 
 
 def read_support(field: Path, record: dict[str, Any], level: int) -> Support | None:
@@ -210,7 +232,8 @@ def read_support(field: Path, record: dict[str, Any], level: int) -> Support | N
     """
     path = field.with_name(SUPPORT_FILE)
     stages = record.get("stages", [])
-    if field.name != FIELD_FILE or not path.is_file() or level >= len(stages):
+    photographed = "region" in record
+    if field.name != FIELD_FILE or not path.is_file() or not (photographed or level < len(stages)):
         return None
     tensors, about = load_state(field.parent, name=SUPPORT_FILE)
     if about.get("generation") != record.get("generation"):
@@ -218,5 +241,9 @@ def read_support(field: Path, record: dict[str, Any], level: int) -> Support | N
     if "points" not in tensors or tensors["points"].ndim != 2 or tensors["points"].shape[1] != 3:
         raise InputError(f"{path}: damaged (no points); remove it, or fit again")
     points = tensors["points"].double().numpy()
+    if photographed:
+        if "seen_within" not in tensors or not 0 < float(tensors["seen_within"]) < np.inf:
+            raise InputError(f"{path}: damaged (no length); remove it, or reconstruct again")
+        return Support(points, float(tensors["seen_within"]), seen=True) if len(points) else None
     error = stages[level]["rms_at_points"] / record["similarity"]["scale"]
     return Support(points, support_radius(points, error=error))

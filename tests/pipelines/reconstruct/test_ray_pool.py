@@ -54,7 +54,7 @@ def test_a_drawn_ray_is_that_of_its_pixel_with_its_colour_and_mask() -> None:
 
 def test_rays_in_the_unit_sphere_pass_through_the_world_points_of_the_camera() -> None:
     picture = view(0, 14, 9, masked=False)
-    origins, directions = camera_rays(picture, WORLD)
+    origins, directions = camera_rays(picture.camera.moved(WORLD))
     assert origins.shape == directions.shape == (14 * 9, 3)
     there = WORLD.to_input((origins + 2.5 * directions).double().numpy())
     pixels, depth = picture.camera.project(torch.from_numpy(there))
@@ -68,7 +68,7 @@ def test_pixels_that_miss_the_sphere_are_never_drawn_and_all_others_are() -> Non
     pool = RayPool(pictures, WORLD, CPU)
     expected = set()
     for index, picture in enumerate(pictures):
-        near, far = sphere_span(*camera_rays(picture, WORLD))
+        near, far = sphere_span(*camera_rays(picture.camera.moved(WORLD)))
         meets = (far > near).reshape(picture.color.shape[:2])
         expected |= {(index, y, x) for y, x in meets.nonzero().tolist()}
     everything = sum(picture.color.shape[0] * picture.color.shape[1] for picture in pictures)

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 from collections.abc import Callable
 from dataclasses import replace
@@ -12,14 +13,26 @@ import numpy as np
 import pytest
 import torch
 from mplicits.datasets import read_cloud
+from mplicits.datasets.clouds.orientation import fibonacci_directions
 from mplicits.datasets.synthetic.scenes import SCENES, render_scene, sample_scene
 from mplicits.datasets.views.images import PosedImages
 from mplicits.datasets.views.writing import write_neus, write_transforms
-from mplicits.neural_fields import InputError, Similarity, extract_mesh, load_field, load_texture
+from mplicits.neural_fields import (
+    InputError,
+    Jet,
+    Similarity,
+    Sphere,
+    ViewColor,
+    extract_mesh,
+    load_field,
+    load_texture,
+)
 from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.mesh.extract import MeshOptions, mesh_run
-from mplicits.pipelines.reconstruct.train import Reconstruction, reconstruct
+from mplicits.pipelines.reconstruct.model import SceneModel
+from mplicits.pipelines.reconstruct.train import Reconstruction, reconstruct, surface_colors
 from mplicits.pipelines.run.config import load_config
+from mplicits.pipelines.run.folder import load_state, state_bytes
 from mplicits.pipelines.run.settings import ReconstructConfig
 from mplicits.pipelines.run.trainer import Interrupted, Progress
 from mplicits.pipelines.surface.measure import chamfer
@@ -125,7 +138,14 @@ def fails(capsys: pytest.CaptureFixture[str], line: str) -> str:
 
 
 def test_the_run_directory(finished: Path, data: Path) -> None:
-    names = ["field.safetensors", "held_out.png", "run.json", "texture.safetensors"]
+    names = [
+        "field.safetensors",
+        "held_out.png",
+        "radiance.safetensors",
+        "run.json",
+        "support.safetensors",
+        "texture.safetensors",
+    ]
     assert sorted(path.name for path in finished.iterdir()) == names
     record = json.loads((finished / "run.json").read_text())
     assert record["finished"] is True
@@ -195,7 +215,12 @@ def test_the_softplus_network_of_neus_takes_the_same_way(data: Path, tmp_path: P
 
 def test_all_views_can_be_trained_on_and_colours_left_out(data: Path, tmp_path: Path) -> None:
     run = reconstruct(data, replace(TINY, steps=2, test_every=0, texture_steps=0), out=tmp_path)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["field.safetensors", "run.json"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "field.safetensors",
+        "radiance.safetensors",
+        "run.json",
+        "support.safetensors",
+    ]
     assert run.record["views"] == {"trained": 6, "held_out": 0}
     assert run.record["held_out"] is None
     assert run.record["texture"] is None
@@ -322,7 +347,13 @@ def test_the_command_leaves_a_coloured_mesh(data: Path, tmp_path: Path, capsys: 
     # A new one leaves nothing of it.
     again = f"reconstruct {data} -o {run} --force {FLAGS} --texture-steps 0 --test-every 0"
     assert main(again.split()) == 0
-    assert sorted(path.name for path in run.iterdir()) == ["field.safetensors", "mesh.ply", "run.json"]
+    assert sorted(path.name for path in run.iterdir()) == [
+        "field.safetensors",
+        "mesh.ply",
+        "radiance.safetensors",
+        "run.json",
+        "support.safetensors",
+    ]
     assert "is finished, so there is nothing to resume" in fails(capsys, f"reconstruct {data} -o {run} --resume")
 
 
@@ -421,6 +452,7 @@ def test_stages_are_those_that_are_announced(data: Path) -> None:
         "reconstruct, level 0",
         "reconstruct, level 1",
         "held-out views",
+        "what photographs see",
         "texture: surface",
         "texture: samples",
         "texture",
@@ -441,3 +473,73 @@ def test_a_budget_counts_all_but_leaves_most_for_the_training(data: Path, tmp_pa
     assert record["steps"] < config.steps
     assert record["texture"]["steps"] < config.texture_steps
     assert record["texture"]["budget"]["seconds"] < 2.0
+
+
+class Glossy(ViewColor):
+    """Paint that is known in closed form, under a lamp that is reflected."""
+
+    def __init__(self) -> None:
+        super().__init__(0, width=1, depth=1)
+
+    def paint(self, x: Tensor) -> Tensor:
+        return 0.3 + 0.4 * x
+
+    def forward(self, x: Tensor, direction: Tensor, jet: Jet) -> Tensor:
+        normal = torch.nn.functional.normalize(jet.gradient, dim=-1)
+        halfway = torch.nn.functional.normalize(torch.tensor([0.6, 0.8, 0.0]) - direction, dim=-1)
+        return self.paint(x) + 0.5 * (normal * halfway).sum(dim=-1, keepdim=True).clamp(min=0) ** 40
+
+
+def test_colours_of_the_surface_are_without_highlights() -> None:
+    color = Glossy()
+    model = SceneModel(Sphere(radius=0.5), color, None, torch.zeros(3))
+    points = 0.5 * torch.from_numpy(fibonacci_directions(500)).float()
+    turn = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(0)))[0]
+    eyes = 2 * torch.from_numpy(fibonacci_directions(40)).float() @ turn.T
+    order = torch.randperm(40, generator=torch.Generator().manual_seed(1))
+    wrong = (surface_colors(model, points, eyes[order]) - color.paint(points)).abs().amax(dim=1)
+    ahead = (surface_colors(model, points, eyes[:2]) - color.paint(points)).abs().amax(dim=1)  # no three eyes
+    assert float(ahead.max()) > 0.45  # the highlight, head-on
+    # It is 0.5 high where n · h = 1 and half of that 11° away, which turns the eye by twice as much: of nine eyes
+    # within 60° few are there, and the fifth brightest is well off its middle.
+    assert float(wrong.max()) < 0.5 * float(ahead.max())
+    assert float(wrong.mean()) < 0.2 * float(ahead.mean())
+
+
+def test_the_colour_is_the_median_of_those_that_face_a_point() -> None:
+    class Direction(ViewColor):
+        """Everything is coloured by where it is seen from."""
+
+        def forward(self, x: Tensor, direction: Tensor, jet: Jet) -> Tensor:
+            return 0.5 - 0.5 * direction
+
+    model = SceneModel(Sphere(radius=0.5), Direction(0, width=1, depth=1), None, torch.zeros(3))
+    top = torch.tensor([[0.0, 0.0, 0.5]])
+    eyes = torch.tensor([[0.3, 0.1, 2.0], [0.0, 0.0, -2.0], [0.1, -0.4, 2.0], [-0.2, 0.2, 2.0], [5.0, 0.0, 0.6]])
+    facing = torch.nn.functional.normalize(eyes[[0, 2, 3]] - top, dim=1)
+    wanted = 0.5 + 0.5 * facing.median(dim=0).values
+    torch.testing.assert_close(surface_colors(model, top, eyes)[0], wanted, atol=1e-6, rtol=0)
+    alone = surface_colors(model, top, eyes[:3])[0]  # two of them face it: the colour along the normal
+    torch.testing.assert_close(alone, torch.tensor([0.5, 0.5, 1.0]), atol=1e-6, rtol=0)
+
+
+def test_the_mesh_can_be_cut_to_what_was_seen(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Cameras stand all around the sphere, so that its mesh stays; with the points of a side, that side is left."""
+    run = tmp_path / "run"
+    shutil.copytree(finished, run)
+    whole = mesh_run(run, tmp_path / "whole.ply", MeshOptions(resolution=32))
+    assert main(["mesh", str(run), "-o", str(tmp_path / "seen.ply"), "--resolution", "32", "--seen"]) == 0
+    held, about = load_state(run, name="support.safetensors")
+    upper = held["points"][:, 2] > 0
+    (run / "support.safetensors").write_bytes(state_bytes({**held, "points": held["points"][upper]}, about))
+    said: list[str] = []
+    part = mesh_run(run, tmp_path / "part.ply", MeshOptions(resolution=32, seen=True), say=said.append)
+    assert len(part.faces) < 0.8 * len(whole.faces)
+    assert part.vertices[:, 2].min() > -0.2
+    assert any("fewer than two photographs" in line for line in said)
+    (run / "support.safetensors").write_bytes(state_bytes({"points": held["points"]}, about))
+    capsys.readouterr()
+    assert main(["mesh", str(run), "-o", str(tmp_path / "seen.ply"), "--seen"]) == 2
+    assert "support.safetensors: damaged" in capsys.readouterr().err

@@ -322,6 +322,35 @@ def test_levels_stand_side_by_side(shapes, tmp_path, capsys):
     assert (picture[40:, 6:30] == one).all()
 
 
+def test_sides_stand_side_by_side_as_they_look_alone(shapes, tmp_path, capsys):
+    plain = ("--shading", "normals", "--azimuth", "100")
+    picture = render(shapes, "blob.safetensors", tmp_path / "a.png", *plain, "--sides", "4")
+    assert "level 1, normals, 24×24, 4 sides" in capsys.readouterr().out
+    assert picture.shape == (24 + 40, 4 * (24 + 12), 3)
+    tiles = [picture[40:, 36 * side + 6 : 36 * side + 30] for side in range(4)]
+    # All stand as far off as the one that must stand furthest; that one looks as it does alone.
+    alone = [
+        render(shapes, "blob.safetensors", tmp_path / "b.png", *plain[:3], azimuth)
+        for azimuth in ("100", "-170", "-80", "10")
+    ]
+    assert any((tile == one).all() for tile, one in zip(tiles, alone, strict=True))
+    for tile, one in zip(tiles, alone, strict=True):  # the others look a little smaller, from the same side
+        assert np.abs(tile[12, 12] - one[12, 12]).max() < 40
+    assert min(np.abs(tiles[a] - tiles[b]).mean() for a in range(4) for b in range(a)) > 5
+    both = render(shapes, "blob.safetensors", tmp_path / "c.png", *plain, "--sides", "3", "--levels")
+    assert both.shape == (3 * (24 + 40), 3 * (24 + 12), 3)  # two levels, and one with the other's normals
+
+
+@pytest.mark.parametrize(
+    ("out", "arguments"),
+    [("a.gif", ("--frames", "2")), ("a.png", ("--cameras", "transforms.json", "--frame", "0"))],
+)
+def test_sides_are_those_of_a_picture_of_the_orbit(shapes, tmp_path, capsys, out, arguments):
+    arguments = [str(shapes / word) if word.endswith(".json") else word for word in arguments]
+    assert main(["render", str(shapes / "plain.obj"), "-o", str(tmp_path / out), "--sides", "2", *arguments]) == 2
+    assert "--sides: goes with a picture of the orbit" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("source", ["blob.safetensors", "plain.obj"])
 def test_posed_cameras_are_in_input_coordinates(shapes, tmp_path, source):
     around = ("--azimuth", "50", "--elevation", "30", "--fov", "20", "--size", "40", "30")

@@ -1,0 +1,104 @@
+"""New photographs of a reconstruction: its colours by direction, through the volume renderer, from any camera."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from ...datasets.cameras import Camera
+from ...neural_fields import InputError, Similarity, load_radiance
+from ...neural_fields.files import damage
+from ...neural_fields.value_grid import ValueGrid
+from ...neural_fields.volume_renderer import Sampling
+from ..render.draw import RenderOptions, render_run
+from ..render.picture import Image
+from ..run.folder import RADIANCE_FILE, find_field, load_still
+from ..run.machine import choose_device
+from .model import SceneModel
+from .views import render_camera
+
+__all__ = ["TrainedScene", "open_scene", "photograph"]
+
+MOST_CELLS = 1024  # along the grid of a file
+
+
+class TrainedScene(NamedTuple):
+    """What a reconstruction has left to be rendered.
+
+    Attributes:
+        model: geometry, colours and what is behind, in unit-sphere coordinates.
+        similarity: the way back to world coordinates.
+        sampling: where its rays are sampled.
+        guide: values of the coarsest level by which they are, or None.
+    """
+
+    model: SceneModel
+    similarity: Similarity
+    sampling: Sampling
+    guide: ValueGrid | None
+
+    def paint(self, camera: Camera, level: int = -1) -> Image:
+        """What a camera, in unit-sphere coordinates, sees; as photographs of the usual exposure show it."""
+        seen = render_camera(self.model, camera, self.sampling, level=level, guide=self.guide)
+        return (255 * seen.color).round().astype(np.uint8)
+
+
+def open_scene(run: str | Path, *, device: torch.device | str = "cpu") -> TrainedScene:
+    """Load what `reconstruct` has left in a run directory.
+
+    Args:
+        run: the directory, or the field in it.
+        device: where to put it.
+
+    Raises:
+        InputError: there is no such run, it is damaged, or it keeps no colours by direction.
+    """
+    file = find_field(run)
+    geometry, similarity, _ = load_still(file, device=device)
+    path = file.with_name(RADIANCE_FILE)
+    if not path.is_file():
+        raise InputError(
+            f"{file.parent}: keeps no colours by direction (no {RADIANCE_FILE}); a finished `mplicits reconstruct` does"
+        )
+    radiance, metadata = load_radiance(path, geometry)
+    with damage(path, "take it from a backup, or run `mplicits reconstruct` again"):
+        about = {"uniform": 64, "importance": 64, "march_grid": 0} | dict(metadata.get("sampling", {}))
+        sampling = Sampling(uniform=int(about["uniform"]), importance=int(about["importance"]))
+        cells = int(about["march_grid"])
+        if cells > MOST_CELLS:
+            raise ValueError(f"a grid of {cells}³ cells")
+    guide = ValueGrid(cells, geometry.like.device) if cells else None
+    if guide is not None:
+        guide.refresh(geometry)
+    return TrainedScene(SceneModel.of(geometry, radiance), similarity, sampling, guide)
+
+
+def photograph(
+    run: str | Path,
+    out: str | Path,
+    options: RenderOptions | None = None,
+    *,
+    progress: Callable[[int, int], None] | None = None,
+) -> str:
+    """Render a reconstruction as its photographs show it: highlights move with the eye, and what is behind is there.
+
+    Args:
+        run: the directory of a finished `reconstruct`.
+        out: see `render_run`, as for all that follows.
+        options: from where, how large, and which level; the background is the scene's.
+        progress: called with how many parts are drawn, and of how many.
+
+    Returns:
+        What was drawn, in a few words.
+
+    Raises:
+        InputError: see `open_scene` and `render_run`.
+    """
+    options = dataclasses.replace(options or RenderOptions(), shading=None)
+    scene = open_scene(run, device=choose_device(options.device))
+    return render_run(run, out, options, painter=scene.paint, progress=progress)
