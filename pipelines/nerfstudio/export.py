@@ -7,18 +7,22 @@ import dataclasses
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
+from ...datasets.cameras import Camera
 from ...neural_fields import InputError, Mesh, NerfstudioField, NoSurfaceError, Similarity
 from ...neural_fields.mesh_files import check_mesh_path
 from ..mesh.bake import check_texture_size, textured_mesh
 from ..mesh.extract import normals_near
 from ..mesh.files import check_textured_path
+from ..reconstruct.seen import seen_points
+from ..surface.trim import Support, seen_part
 
-__all__ = ["colored_mesh", "export_mesh", "in_data_coordinates", "main"]
+__all__ = ["colored", "export_mesh", "host_cameras", "in_data_coordinates", "main", "part_seen"]
 
 Float64 = NDArray[np.float64]
 Move = tuple[Float64, float]  # (3, 4) and a scale: see `in_data_coordinates`
@@ -32,6 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--load-config", type=Path, required=True, help="config.yml of the training")
     parser.add_argument("--output-path", type=Path, required=True, help="PLY, OBJ, STL or GLB")
     parser.add_argument("--resolution", type=int, default=512, help="cells along the longest side of the scene box")
+    parser.add_argument("--seen", action="store_true", help="leave out what fewer than two photographs have seen")
     parser.add_argument("--texture", type=int, metavar="N", help="colours and normals as images of N × N (GLB, OBJ)")
     parser.add_argument("--texture-faces", type=int, default=50_000, help="triangles below the texture")
     parser.add_argument("--level", type=int, default=-1, help="of detail, 0 the coarsest, -1 the finest")
@@ -40,6 +45,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         mesh = export_mesh(
             *(options.load_config, options.output_path, options.resolution),
             level=options.level,
+            seen=options.seen,
             texture=options.texture,
             faces=options.texture_faces,
         )
@@ -56,6 +62,7 @@ def export_mesh(
     resolution: int = 512,
     *,
     level: int = -1,
+    seen: bool = False,
     texture: int | None = None,
     faces: int = 50_000,
 ) -> Mesh:
@@ -69,6 +76,7 @@ def export_mesh(
         path: the file; its extension chooses the format.
         resolution: cells along the longest side of the scene box.
         level: of detail.
+        seen: leave out what fewer than two of the photographs that were trained on see; masks are not asked.
         texture: texels along each side of two images, colours and normals, that take the place of vertex colours; for
             GLB and OBJ, with ``mplicits[texture]``.
         faces: triangles to keep below the texture.
@@ -94,10 +102,13 @@ def export_mesh(
         raise InputError(f"{config}: trained by another method; expected mplicits or mplicits-facto")
     outputs = pipeline.datamanager.train_dataparser_outputs
     move = np.asarray(outputs.dataparser_transform, np.float64), float(outputs.dataparser_scale)
+    mesh = field.mesh(resolution, level=level, normals=texture is None)
+    if seen:
+        mesh = part_seen(mesh, field, host_cameras(outputs.cameras))
     if texture is not None:
-        mesh = in_data_coordinates(field.mesh(resolution, level=level, normals=False), *move)
+        mesh = in_data_coordinates(mesh, *move)
         return _textured(path, mesh, field.cpu(), move, texture, faces, level % field.field.num_levels)
-    mesh = in_data_coordinates(colored_mesh(field, resolution, level=level), *move)
+    mesh = in_data_coordinates(colored(mesh, field), *move)
     mesh.export(path)
     return mesh
 
@@ -120,17 +131,43 @@ def _textured(path: Path, mesh: Mesh, field: NerfstudioField, move: Move, size: 
 
 
 @torch.no_grad()
-def colored_mesh(field: NerfstudioField, resolution: int, *, level: int = -1) -> Mesh:
-    """The surface in nerfstudio's coordinates, with the colours that it has when it is seen from the front.
-
-    Raises:
-        NoSurfaceError: there is none in the scene box.
-        ValueError: there is no such level.
-    """
-    mesh = field.mesh(resolution, level=level)
+def colored(mesh: Mesh, field: NerfstudioField) -> Mesh:
+    """A mesh in nerfstudio's coordinates with the colours that the surface has when it is seen from the front."""
     points = torch.from_numpy(mesh.vertices).to(field.field.like)
     colors = torch.cat([field.frontal_colors(part) for part in points.split(BATCH)])
     return dataclasses.replace(mesh, colors=colors.float().cpu().numpy())
+
+
+def host_cameras(cameras: Any) -> list[Camera]:
+    """Those of nerfstudio's ``Cameras``, in its coordinates, as pinholes: a lens moves what is seen by little.
+
+    Its cameras look along −z with y up, and count pixels from the corner of the first one.
+    """
+    lens = [getattr(cameras, name).flatten().tolist() for name in ("fx", "fy", "cx", "cy", "width", "height")]
+    found = []
+    for pose, fx, fy, cx, cy, width, height in zip(cameras.camera_to_worlds.double().cpu(), *lens, strict=True):
+        world_from_camera = torch.eye(4, dtype=torch.float64)
+        world_from_camera[:3] = pose * torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64)
+        intrinsics = torch.tensor([[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]], dtype=torch.float64)
+        found.append(Camera(intrinsics, world_from_camera, int(width), int(height)))
+    return found
+
+
+def part_seen(mesh: Mesh, field: NerfstudioField, cameras: Sequence[Camera]) -> Mesh:
+    """What two cameras see at least of a mesh; all in nerfstudio's coordinates.
+
+    Raises:
+        NoSurfaceError: nothing of it.
+    """
+    unit = Similarity((0.0, 0.0, 0.0), 1 / field.scale)
+    points, within = seen_points(field.field, [(camera.moved(unit), None) for camera in cameras])
+    part = None
+    if len(points):
+        moved = dataclasses.replace(mesh, vertices=mesh.vertices * field.scale)
+        part, _ = seen_part(moved, Support(points.numpy(), within, seen=True))
+    if part is None:
+        raise NoSurfaceError("no two photographs see any of it; leave out --seen")
+    return dataclasses.replace(part, vertices=part.vertices / field.scale)
 
 
 def in_data_coordinates(mesh: Mesh, transform: ArrayLike, scale: float) -> Mesh:

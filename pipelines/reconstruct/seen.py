@@ -7,13 +7,18 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from ...datasets.views.images import PosedImage
-from ...neural_fields import Field, Similarity, sphere_trace
-from .views import OBJECT, reduced
+from ...datasets.cameras import Camera
+from ...datasets.views.pictures import shrink
+from ...neural_fields import Field, sphere_trace
+from .views import OBJECT
 
-__all__ = ["seen_points"]
+__all__ = ["SeenFrom", "seen_points"]
+
+SeenFrom = tuple[Camera, NDArray[np.float32] | None]
+"""A camera in unit-sphere coordinates, and the mask ``(H, W)`` of its picture, which says what is object."""
 
 RAYS = 300_000  # traced, of all views together
 MOST_PIXELS = 10_000  # of a view
@@ -24,15 +29,14 @@ TOLERANCE = 1e-3
 
 
 @torch.no_grad()
-def seen_points(field: Field, views: Sequence[PosedImage], similarity: Similarity) -> tuple[Tensor, float]:
+def seen_points(field: Field, views: Sequence[SeenFrom]) -> tuple[Tensor, float]:
     """Points of the surface that two photographs see at least, and how far apart neighbours among them may be.
 
     Every view is traced in up to 10,000 pixels of what its mask calls object.
 
     Args:
         field: in unit-sphere coordinates.
-        views: the photographs that it was trained on.
-        similarity: from world to unit-sphere coordinates.
+        views: the photographs that it was trained on: cameras in the same coordinates, and masks if there are any.
 
     Returns:
         ``(N, 3)`` points in the unit sphere, on the CPU, and a length there.
@@ -41,13 +45,12 @@ def seen_points(field: Field, views: Sequence[PosedImage], similarity: Similarit
     points: list[Tensor] = []
     owners: list[Tensor] = []
     pitches: list[Tensor] = []
-    for number, view in enumerate(views):
-        small = reduced(view, pixels)
-        camera = small.camera.moved(similarity)
+    for number, (whole, mask) in enumerate(views):
+        camera = _coarse(whole, pixels)
         eye, directions = camera.rays(device=field.like.device)
         asked = torch.ones(directions.shape[:2], dtype=torch.bool)
-        if small.mask is not None:
-            asked = torch.from_numpy(small.mask > OBJECT)
+        if mask is not None:
+            asked = torch.from_numpy(shrink(mask, camera.width, camera.height) > OBJECT)
         rays = directions[asked.to(directions.device)].to(field.like)
         hits = sphere_trace(
             field, eye.to(rays).expand_as(rays), rays, tolerance=TOLERANCE, resolution=TOLERANCE, radius=1.0
@@ -66,3 +69,9 @@ def seen_points(field: Field, views: Sequence[PosedImage], similarity: Similarit
     known, count = torch.unique(pairs // len(views), return_counts=True)
     witnessed = torch.isin(place, known[count >= min(WITNESSES, len(views))])
     return every[witnessed], GRAZING * float(np.median(torch.cat(pitches)))
+
+
+def _coarse(camera: Camera, pixels: int) -> Camera:
+    """A camera in about so many pixels; as it is, if it has no more."""
+    share = min(1.0, math.sqrt(pixels / (camera.width * camera.height)))
+    return camera.resized(max(1, round(share * camera.width)), max(1, round(share * camera.height)))

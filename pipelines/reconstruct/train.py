@@ -210,7 +210,8 @@ class _Reconstruction:
         pairs = self._render_held_out()
         record = self._record(finished=True) | {"held_out": self._figures(pairs)}
         self.schedule(Progress(SEEING, 0, 0, 0.0, {}))
-        points, within = seen_points(self.model.geometry, self.train_views, self.images.similarity)
+        views = [(view.camera.moved(self.images.similarity), view.mask) for view in self.train_views]
+        points, within = seen_points(self.model.geometry, views)
         if len(points):
             self.folder.keep_tensors(SUPPORT_FILE, thinned(points.numpy(), seen_within=within))
         self.schedule(Progress(SEEING, 0, 0, 1.0, {}))

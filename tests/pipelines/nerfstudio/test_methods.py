@@ -11,8 +11,9 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from mplicits.neural_fields import InputError, Mesh, NerfstudioField, Sphere, ViewColor
-from mplicits.pipelines.nerfstudio.export import export_mesh, in_data_coordinates, main
+from mplicits.neural_fields import InputError, Mesh, NerfstudioField, NoSurfaceError, Sphere, ViewColor
+from mplicits.pipelines.nerfstudio.export import export_mesh, host_cameras, in_data_coordinates, main, part_seen
+from mplicits.pipelines.surface.surface import read_surface
 from nerfstudio_stand_in import PLUGIN, Heads, stand_in
 from torch import Tensor, nn
 
@@ -121,11 +122,23 @@ class Red(nn.Module):
         return torch.cat((front, torch.zeros_like(front), 1 - front), dim=-1)
 
 
+def cameras(places: list[float]) -> SimpleNamespace:
+    """As nerfstudio keeps them: they stand at z = 4 and so many along x, and look down."""
+    poses = torch.tensor([[[1.0, 0, 0, place], [0, 1, 0, 0], [0, 0, 1, 4]] for place in places])
+    numbers = {"fx": 60.0, "fy": 60.0, "cx": 40.0, "cy": 30.0, "width": 80, "height": 60}
+    lens = {name: torch.full((len(places), 1), number) for name, number in numbers.items()}
+    return SimpleNamespace(camera_to_worlds=poses, **lens)
+
+
 def exported(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, field: nn.Module) -> tuple[Path, np.ndarray]:
     stand_in(monkeypatch)
     turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     transform = np.concatenate([turn, [[1.0], [2.0], [3.0]]], axis=1)
-    outputs = SimpleNamespace(dataparser_transform=torch.from_numpy(transform).float(), dataparser_scale=0.5)
+    outputs = SimpleNamespace(
+        dataparser_transform=torch.from_numpy(transform).float(),
+        dataparser_scale=0.5,
+        cameras=cameras([-0.05, 0.05]),
+    )
     pipeline = SimpleNamespace(
         model=SimpleNamespace(field=field), datamanager=SimpleNamespace(train_dataparser_outputs=outputs)
     )
@@ -148,6 +161,21 @@ def test_the_mesh_is_where_the_data_are(monkeypatch: pytest.MonkeyPatch, tmp_pat
     assert mesh.colors is not None
     assert (mesh.colors == [1, 0, 0]).all()
     assert (tmp_path / "ball.ply").stat().st_size > 0
+
+
+def test_only_what_cameras_see_is_left(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Two stand above the sphere, in nerfstudio's z: below where the rays graze it, at r² / d, nothing is left."""
+    field = NerfstudioField(Sphere(radius=0.25), Red(), heads=Heads, scale=0.5)
+    config, middle = exported(monkeypatch, tmp_path, field)
+    out = tmp_path / "ball.ply"
+    words = ["--load-config", str(config), "--output-path", str(out), "--resolution", "64", "--seen"]
+    assert main(words) == 0
+    height = (read_surface(out).vertices - middle)[:, 2]  # the move turns about z, and makes it half as large
+    pixel = 2 * 2 * (4 / 60)  # of two, twice the width in the data's units, in which the place of a point may be
+    assert height.max() == pytest.approx(1, abs=0.01)
+    assert height.min() == pytest.approx(1 / 8, abs=2 * pixel)
+    with pytest.raises(NoSurfaceError, match="no two photographs see any of it"):
+        part_seen(field.mesh(16), field, host_cameras(cameras([50.0, 51.0])))
 
 
 def test_a_texture_has_the_colours_and_normals_of_the_field(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

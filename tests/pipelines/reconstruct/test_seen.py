@@ -5,32 +5,27 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
-from mplicits.datasets.cameras import Camera, look_at
-from mplicits.datasets.views.images import PosedImage
-from mplicits.neural_fields import Similarity, Sphere, Union, extract_mesh
+from mplicits.datasets.cameras import look_at
+from mplicits.neural_fields import Sphere, Union, extract_mesh, save_field
 from mplicits.pipelines.cli.entry import main
-from mplicits.pipelines.reconstruct.seen import seen_points
+from mplicits.pipelines.reconstruct.seen import SeenFrom, seen_points
 from mplicits.pipelines.surface.trim import Support, seen_part, thinned
 
-WORLD = Similarity(center=(5.0, 0.0, -2.0), scale=3.0)
 RADIUS, DISTANCE = 0.5, 2.0
 
 
-def photograph(eye: tuple[float, float, float], *, masked: bool = False) -> PosedImage:
-    """Of the unit sphere as the world sees it; its mask, if it has one, is the left half of the picture."""
-    place = WORLD.to_input(np.array([eye]))[0]
-    camera: Camera = look_at(torch.from_numpy(place), WORLD.center, fov=40, width=160, height=120)
-    color = np.zeros((120, 160, 3), np.float32)
+def photograph(eye: tuple[float, float, float], *, masked: bool = False) -> SeenFrom:
+    """Of the unit sphere; its mask, if it has one, is the left half of the picture."""
+    camera = look_at(eye, (0.0, 0.0, 0.0), fov=40, width=160, height=120)
     mask = np.zeros((120, 160), np.float32)
     mask[:, :80] = 1
-    return PosedImage("view", camera, color, mask if masked else None)
+    return camera, mask if masked else None
 
 
-def share_seen(views: list[PosedImage]) -> tuple[float, np.ndarray]:
+def share_seen(views: list[SeenFrom]) -> tuple[float, np.ndarray]:
     """Of the area of the sphere; and the points."""
     field = Sphere(radius=RADIUS)
-    points, within = seen_points(field, views, WORLD)
+    points, within = seen_points(field, views)
     assert points.norm(dim=1).numpy() == pytest.approx(RADIUS, abs=2e-3)
     mesh = extract_mesh(field, resolution=64)
     _, missed = seen_part(mesh, Support(points.numpy(), within, seen=True))
@@ -68,8 +63,7 @@ def test_masks_say_what_of_it_is_the_object() -> None:
 
 def test_nothing_in_view_is_nothing_seen() -> None:
     aside = look_at((50.0, 0.0, 0.0), (100.0, 0.0, 0.0), fov=20, width=16, height=12)
-    view = PosedImage("view", aside, np.zeros((12, 16, 3), np.float32), None)
-    points, _ = seen_points(Sphere(radius=RADIUS), [view, view], WORLD)
+    points, _ = seen_points(Sphere(radius=RADIUS), [(aside, None), (aside, None)])
     assert len(points) == 0
 
 
@@ -88,8 +82,6 @@ def test_the_part_that_was_seen() -> None:
 
 
 def test_other_runs_do_not_know(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from mplicits.neural_fields import save_field
-
     save_field(tmp_path / "field.safetensors", Sphere(radius=RADIUS))
     assert main(["mesh", str(tmp_path), "-o", str(tmp_path / "a.ply"), "--seen"]) == 2
     assert "--seen: " in capsys.readouterr().err
