@@ -148,6 +148,8 @@ def host_cameras(cameras: Any) -> list[Camera]:
     for pose, fx, fy, cx, cy, width, height in zip(cameras.camera_to_worlds.double().cpu(), *lens, strict=True):
         world_from_camera = torch.eye(4, dtype=torch.float64)
         world_from_camera[:3] = pose * torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64)
+        left, _, right = torch.linalg.svd(world_from_camera[:3, :3])  # its float32 axes are at right angles to 1e-6
+        world_from_camera[:3, :3] = left @ right
         intrinsics = torch.tensor([[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]], dtype=torch.float64)
         found.append(Camera(intrinsics, world_from_camera, int(width), int(height)))
     return found

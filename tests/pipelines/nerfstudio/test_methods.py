@@ -124,7 +124,7 @@ class Red(nn.Module):
 
 def cameras(places: list[float]) -> SimpleNamespace:
     """As nerfstudio keeps them: they stand at z = 4 and so many along x, and look down."""
-    poses = torch.tensor([[[1.0, 0, 0, place], [0, 1, 0, 0], [0, 0, 1, 4]] for place in places])
+    poses = torch.tensor([[[1.0, 3e-6, 0, place], [0, 1, 0, 0], [0, 0, 1, 4]] for place in places])  # of float32
     numbers = {"fx": 60.0, "fy": 60.0, "cx": 40.0, "cy": 30.0, "width": 80, "height": 60}
     lens = {name: torch.full((len(places), 1), number) for name, number in numbers.items()}
     return SimpleNamespace(camera_to_worlds=poses, **lens)
