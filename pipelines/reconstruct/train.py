@@ -60,8 +60,9 @@ SHEET_VIEWS = 4  # rows of the sheet of held-out views
 TEXTURE_RESOLUTION = 128  # of the mesh whose points are coloured: finer than the texture's band is wide
 TEXTURE_SAMPLES = 100_000
 BATCH = 1 << 13
-# Of the cameras whose median is the colour of a point, at least; and the cosine within which they face it.
-LEAST_WITNESSES, FACING = 3, 0.5
+# Of the cameras that decide the colour of a point, at least; the cosine within which they face it; and which of their
+# colours it is, from dark to light.
+LEAST_WITNESSES, FACING, DARKER = 3, 0.5, 0.25
 # Of pictures that are not read yet.
 USUAL_PIXELS, USUAL_HELD_OUT, USUAL_READING = 60_000, 6, 2.0
 LEAST_SECONDS = 0.5  # of training, where a time budget leaves none
@@ -348,10 +349,11 @@ class _Reconstruction:
 
 @torch.no_grad()
 def surface_colors(model: SceneModel, points: Tensor, eyes: Tensor) -> Tensor:
-    """Colours ``(N, 3)`` of points ``(N, 3)`` near the surface as most of the cameras that face them see them.
+    """Colours ``(N, 3)`` of points ``(N, 3)`` near the surface as the cameras that face them see them, without highlights.
 
-    The median, for each channel, of what up to `WITNESSES` cameras see whose rays are within 60° of the normal: paint
-    is the same for all of them, and few see a highlight. Where fewer than three face it, the colour along the normal.
+    The lower quartile, for each channel, of what up to `WITNESSES` cameras see whose rays are within 60° of the normal:
+    paint is the same for all of them, and a highlight, which up to half of them may see, only adds light. Where fewer
+    than three face it, the colour along the normal.
 
     Args:
         model: trained.
@@ -374,7 +376,7 @@ def surface_colors(model: SceneModel, points: Tensor, eyes: Tensor) -> Tensor:
         seen[row, witness] = model.color(part[row], directions[row, witness], Jet(*(held[row] for held in jet)))
         ahead = model.color(part, -normal, jet)
         enough = (found > 0).sum(dim=1, keepdim=True) >= LEAST_WITNESSES
-        parts.append(torch.where(enough, seen.nanmedian(dim=1).values, ahead))
+        parts.append(torch.where(enough, seen.nanquantile(DARKER, dim=1), ahead))
     return torch.cat(parts)
 
 

@@ -501,12 +501,12 @@ def test_colours_of_the_surface_are_without_highlights() -> None:
     ahead = (surface_colors(model, points, eyes[:2]) - color.paint(points)).abs().amax(dim=1)  # no three eyes
     assert float(ahead.max()) > 0.45  # the highlight, head-on
     # It is 0.5 high where n · h = 1 and half of that 11° away, which turns the eye by twice as much: of nine eyes
-    # within 60° few are there, and the fifth brightest is well off its middle.
-    assert float(wrong.max()) < 0.5 * float(ahead.max())
-    assert float(wrong.mean()) < 0.2 * float(ahead.mean())
+    # within 60° some are there, and the third darkest is well off its middle.
+    assert float(wrong.max()) < 0.2 * float(ahead.max())
+    assert float(wrong.mean()) < 0.05 * float(ahead.mean())
 
 
-def test_the_colour_is_the_median_of_those_that_face_a_point() -> None:
+def test_the_colour_is_the_lower_quartile_of_those_that_face_a_point() -> None:
     class Direction(ViewColor):
         """Everything is coloured by where it is seen from."""
 
@@ -517,7 +517,7 @@ def test_the_colour_is_the_median_of_those_that_face_a_point() -> None:
     top = torch.tensor([[0.0, 0.0, 0.5]])
     eyes = torch.tensor([[0.3, 0.1, 2.0], [0.0, 0.0, -2.0], [0.1, -0.4, 2.0], [-0.2, 0.2, 2.0], [5.0, 0.0, 0.6]])
     facing = torch.nn.functional.normalize(eyes[[0, 2, 3]] - top, dim=1)
-    wanted = 0.5 + 0.5 * facing.median(dim=0).values
+    wanted = 0.5 + 0.5 * facing.quantile(0.25, dim=0)
     torch.testing.assert_close(surface_colors(model, top, eyes)[0], wanted, atol=1e-6, rtol=0)
     alone = surface_colors(model, top, eyes[:3])[0]  # two of them face it: the colour along the normal
     torch.testing.assert_close(alone, torch.tensor([0.5, 0.5, 1.0]), atol=1e-6, rtol=0)
