@@ -349,7 +349,7 @@ class _Reconstruction:
 
 @torch.no_grad()
 def surface_colors(model: SceneModel, points: Tensor, eyes: Tensor) -> Tensor:
-    """Colours ``(N, 3)`` of points ``(N, 3)`` near the surface as the cameras that face them see them, without highlights.
+    """Colours ``(N, 3)`` of points ``(N, 3)`` near the surface, as cameras that face them see them, but for highlights.
 
     The lower quartile, for each channel, of what up to `WITNESSES` cameras see whose rays are within 60° of the normal:
     paint is the same for all of them, and a highlight, which up to half of them may see, only adds light. Where fewer
