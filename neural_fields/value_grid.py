@@ -26,12 +26,13 @@ class ValueGrid:
     Args:
         resolution: cells along an edge.
         device: where the values are kept.
-        reach: `refresh` of the near part evaluates the vertices whose kept value is at most this far from 0.
+        reach: `refresh` of the near part evaluates the vertices whose kept value is at most this far from 0; it may be
+            changed, and should not be below the diagonal of a cell, or some beside the surface are left out.
 
     Attributes:
         kept: ``(resolution + 1, resolution + 1, resolution + 1)`` values, by x, y and z; 1 where none was asked for.
-        moved: 0-d, the most by which `refresh` has last changed a value that was at most ``reach`` from 0; ∞ if there
-            was none.
+        moved: 0-d, by how much `refresh` has last changed the values that were at most ``reach`` from 0: the root mean
+            square; ∞ if there were none.
 
     Raises:
         ValueError: a number is out of range.
@@ -75,14 +76,15 @@ class ValueGrid:
             asked = near
         cells = asked.nonzero()
         flat = self.kept.view(-1)
-        self.moved = torch.where(near.any(), 0.0, torch.inf).to(flat)
+        squares = flat.new_zeros(())
         for part in cells.split(CHUNK):
             x, y, z = part.unbind(dim=1)
             place = (x * len(axis) + y) * len(axis) + z
             before, now = flat[place], field.value(axis[part], level=level).to(flat)
-            step = torch.where(before.abs() <= self.reach, (now - before).abs(), 0.0)
-            self.moved = torch.maximum(self.moved, step.amax() if len(step) else self.moved)
+            squares += torch.where(before.abs() <= self.reach, (now - before).square(), 0.0).sum()
             flat.index_copy_(0, place, now)
+        count = near.sum()
+        self.moved = torch.where(count > 0, (squares / count.clamp(min=1)).sqrt(), torch.inf)
 
     def __call__(self, x: Tensor) -> Tensor:
         """Interpolated values ``(...,)`` of points ``(..., 3)``; outside the cube, the value at its nearest point."""

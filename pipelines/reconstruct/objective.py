@@ -17,10 +17,13 @@ from ..run.team import gathered, mean_of_all, own_generator, whole_batch
 from ..run.trainer import Group, Objective, Trainer, warm_cosine
 from .model import RayPool, SceneModel
 
-# Steps between two looks at the surface's surroundings, at least and at most, and such looks between two at everything.
-NEAR_EVERY, NEAR_REST, WHOLE_EVERY = 16, 128, 8
-# How far values near the surface may move from look to look, in units of its uncertainty 1/s.
-MOVED = 0.25
+# Steps between two looks at the surface's surroundings, at least and at most.
+NEAR_EVERY, NEAR_REST = 16, 128
+# Such looks between two at everything: in the share of the training in which the surface comes to its place, and later.
+WHOLE_EVERY, WHOLE_LATER, EARLY = 8, 64, 0.125
+# How far values near the surface may move from look to look, and how far off they have to be known (no light is stopped
+# further off), in units of its uncertainty 1/s; the latter in radii of the region, at most.
+MOVED, KNOWN, FURTHEST = 0.125, 8.0, 0.15
 LEAST_SHARE = 0.25  # of the rays of a step, however many sections they have
 POSES_FROM = 0.1  # share of the training after which cameras are moved
 
@@ -64,7 +67,7 @@ class SceneObjective(Objective):
         started = sum(start <= done for start in self.config.starts)
         return min(started, self.model.geometry.num_levels) - 1
 
-    def look(self, step: int) -> ValueGrid | None:
+    def look(self, step: int, done: float) -> ValueGrid | None:
         """The grid that rays march on, brought up to date: its near part often, all of it now and then.
 
         While the surface moves, often is every `NEAR_EVERY` steps; the less it moved, the longer it is left alone.
@@ -74,9 +77,12 @@ class SceneObjective(Objective):
         self.grid.kept = self.kept["march"]  # that of a run which is resumed
         due, pause, looks = self.kept["looks"].tolist()
         if step >= due:
-            self.grid.refresh(self.model.geometry, whole=looks % WHOLE_EVERY == 0)
-            moved = float(self.grid.moved)
-            allowed = MOVED / float(self.model.inv_std.detach())
+            unsure = 1 / float(self.model.inv_std.detach())
+            cell = 2 * math.sqrt(3) / self.grid.resolution  # its diagonal: all corners beside the surface are that near
+            self.grid.reach = min(max(KNOWN * unsure, cell), max(FURTHEST, cell))
+            whole = looks % (WHOLE_EVERY if done < EARLY else WHOLE_LATER) == 0
+            self.grid.refresh(self.model.geometry, whole=whole)
+            moved, allowed = float(self.grid.moved), MOVED * unsure
             pause = pause // 2 if moved > allowed else 2 * pause if moved < allowed / 2 else pause
             pause = min(max(pause, NEAR_EVERY), NEAR_REST)
             self.kept["looks"] = torch.tensor([step + pause, pause, looks + 1])
@@ -108,7 +114,7 @@ class SceneObjective(Objective):
             least_weight=config.least_weight,
             skip=config.skip,
             skip_share=config.skip_share,
-            guide=self.look(step),
+            guide=self.look(step, done),
             generator=generator,
         )
         if (step + 1) % NEAR_EVERY == 0:

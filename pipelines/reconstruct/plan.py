@@ -10,7 +10,7 @@ from ..run.schedule import Stage
 from ..run.settings import ReconstructConfig, TextureConfig
 from ..texture.train import texture_stages
 from .hull import STEPS as HULL_STEPS
-from .objective import NEAR_EVERY, WHOLE_EVERY
+from .objective import EARLY, NEAR_EVERY, WHOLE_EVERY, WHOLE_LATER
 from .seen import RAYS as SEEN_RAYS
 
 __all__ = ["SEEING", "SPHERE", "WITNESSES", "ReconstructPlan", "level_stage"]
@@ -37,7 +37,7 @@ def level_stage(level: int) -> str:
 def grid_rows(resolution: int) -> float:
     """Values per step that keep the grid up to date: of the ball now and then, else of the twelfth near the surface."""
     ball = 4 / 3 * math.pi * (resolution / 2 + math.sqrt(3)) ** 3
-    return ball * (1 / WHOLE_EVERY + (1 - 1 / WHOLE_EVERY) / 12) / NEAR_EVERY
+    return ball * (EARLY / WHOLE_EVERY + (1 - EARLY) / WHOLE_LATER + 1 / 12) / NEAR_EVERY
 
 
 @dataclass(frozen=True)

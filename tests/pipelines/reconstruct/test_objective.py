@@ -216,7 +216,7 @@ def test_the_grid_is_left_alone_while_the_surface_rests(images: PosedImages) -> 
     looked = []
     for step in range(600):
         before = objective.kept["looks"]
-        objective.look(step)
+        objective.look(step, step / 1000)
         if objective.kept["looks"] is not before:
             looked.append(step)
     assert looked == [0, 16, 48, 112, 240, 368, 496]  # twice as long each time, 128 steps at most
@@ -225,11 +225,11 @@ def test_the_grid_is_left_alone_while_the_surface_rests(images: PosedImages) -> 
     with torch.no_grad():  # a surface that has moved by 1/s, and then goes on moving
         for step in range(600, 760):
             geometry.base.output.bias[0] += 1 / (16 * objective.model.inv_std)
-            objective.look(step)
+            objective.look(step, step / 1000)
     assert objective.kept["looks"][1] == 16
     again = make(images, TINY)
     again.objective.kept = dict(objective.kept)
-    assert again.objective.look(760) is again.objective.grid
+    assert again.objective.look(760, 0.76) is again.objective.grid
     assert torch.equal(again.objective.grid.kept, objective.grid.kept)
 
 
