@@ -298,7 +298,8 @@ class Trainer(Generic[O]):
             if moments:
                 self.adam.state[parameter] = {name: tensor.to(parameter.device) for name, tensor in moments.items()}
         objective.generator.set_state(state["generator"].cpu())
-        objective.kept = {name: state[name].to(tensor) for name, tensor in objective.kept.items()}
+        # What an older version did not keep begins anew.
+        objective.kept = {name: state.get(name, tensor).to(tensor) for name, tensor in objective.kept.items()}
         self.step, self.elapsed = int(state["progress"][0]), float(state["progress"][1])
 
 

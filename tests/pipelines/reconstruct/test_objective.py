@@ -300,3 +300,14 @@ def test_rays_that_miss_the_region_leave_the_eikonal_term_alone(images: PosedIma
         rays.origins, rays.directions, objective.sampling, level=objective.level_at(0.5), generator=generator
     )
     torch.testing.assert_close(terms["eikonal"], eikonal_loss(seen.jet.gradient[hits]).mean())
+
+
+def test_what_an_older_version_did_not_keep_begins_anew(images: PosedImages) -> None:
+    before, after = make(images, TINY), make(images, TINY)
+    train(before, until=3)
+    state = before.state()
+    assert state.pop("looks").tolist() != [0, 16, 0]
+    after.restore(state)
+    assert after.objective.kept["looks"].tolist() == [0, 16, 0]
+    assert torch.equal(after.objective.kept["march"], before.objective.kept["march"])
+    train(after)
