@@ -153,7 +153,7 @@ def export_run(
     normal_level = chosen_level(field, file, options.normal_level, otherwise=level, flag="--normal-level")
     support = None if options.time is not None else read_support(file, metadata.get("run", {}), level)
     if options.seen and (support is None or not support.seen):
-        raise InputError(f"--seen: {file} keeps nothing of what photographs see, as runs of `mplicits reconstruct` do")
+        raise InputError(f"--seen: {file} keeps no place that two photographs see; runs of `mplicits reconstruct` do")
     points = None
     if options.trim_distance is not None:
         cloud = read_cloud(options.cloud or fitted_cloud(file, metadata, remedy="name it with --cloud FILE"))

@@ -55,12 +55,13 @@ class SceneObjective(Objective):
         super().__init__(model, groups, torch.Generator().manual_seed(config.seed))
         self.model, self.pool, self.config = model, pool, config
         self.sampling = Sampling(uniform=config.uniform, importance=config.importance)
-        self.kept["sections"] = torch.zeros(())  # of a ray that are evaluated, as of late; on the CPU, which reads it
+        # As of late, on the CPU, which reads them: sections of a ray that are evaluated, and the surface's uncertainty.
+        self.kept["lately"] = torch.tensor([0.0, 1 / float(model.inv_std.detach())])
         self.focus = Focus(len(pool), config.focus, pool.device)
         self.kept |= self.focus.kept
         self.grid = ValueGrid(config.march_grid, pool.device) if config.march_grid else None
         if self.grid is not None:
-            self.kept |= {"march": self.grid.kept, "looks": torch.tensor([0, NEAR_EVERY, 0])}
+            self.kept |= {"march": self.grid.kept, "moved": self.grid.moved, "looks": torch.tensor([0, NEAR_EVERY, 0])}
 
     def level_at(self, done: float) -> int:
         """The finest level that is switched on when a fraction of the schedule is done."""
@@ -75,25 +76,42 @@ class SceneObjective(Objective):
         if self.grid is None:
             return None
         self.grid.kept = self.kept["march"]  # that of a run which is resumed
-        due, pause, looks = self.kept["looks"].tolist()
-        if step >= due:
-            unsure = 1 / float(self.model.inv_std.detach())
+        looked, pause, looks = self.kept["looks"].tolist()
+        if step >= looked + pause or not looks:
+            unsure = float(self.kept["lately"][1])
             cell = 2 * math.sqrt(3) / self.grid.resolution  # its diagonal: all corners beside the surface are that near
             self.grid.reach = min(max(KNOWN * unsure, cell), max(FURTHEST, cell))
             whole = looks % (WHOLE_EVERY if done < EARLY else WHOLE_LATER) == 0
             self.grid.refresh(self.model.geometry, whole=whole)
-            moved, allowed = float(self.grid.moved), MOVED * unsure
-            pause = pause // 2 if moved > allowed else 2 * pause if moved < allowed / 2 else pause
-            pause = min(max(pause, NEAR_EVERY), NEAR_REST)
-            self.kept["looks"] = torch.tensor([step + pause, pause, looks + 1])
+            self.kept |= {"moved": self.grid.moved, "looks": torch.tensor([step, pause, looks + 1])}
         return self.grid
+
+    def remember(self, step: int, sections: Tensor) -> None:
+        """Fetch what the next steps depend on, all at once: a GPU is waited for.
+
+        Args:
+            step: number of the step.
+            sections: 0-d, evaluated per ray in it.
+        """
+        unsure = 1 / self.model.inv_std.detach()
+        known = [sections, unsure.to(sections)]
+        if self.grid is None:
+            self.kept["lately"] = torch.stack(known).cpu()
+            return
+        *lately, moved = torch.stack([*known, self.kept["moved"].to(sections)]).tolist()
+        self.kept["lately"] = torch.tensor(lately)
+        looked, pause, looks = self.kept["looks"].tolist()
+        if looked > step - NEAR_EVERY:  # since this was done last
+            allowed = MOVED * lately[1]
+            pause = pause // 2 if moved > allowed else 2 * pause if moved < allowed / 2 else pause
+            self.kept["looks"] = torch.tensor([looked, min(max(pause, NEAR_EVERY), NEAR_REST), looks])
 
     def batch(self) -> int:
         """Rays of the next step: fewer while their sections are many, as they are while the surface is unsure."""
         rays, jets = self.config.rays, self.config.jets
         if not jets:
             return rays
-        sections = float(self.kept["sections"])
+        sections = float(self.kept["lately"][0])
         return min(max(round(jets / sections) if sections else 0, math.ceil(LEAST_SHARE * rays)), rays)
 
     def losses(self, step: int, done: float) -> tuple[dict[str, Tensor], Tensor]:
@@ -118,7 +136,7 @@ class SceneObjective(Objective):
             generator=generator,
         )
         if (step + 1) % NEAR_EVERY == 0:
-            self.kept["sections"] = mean_of_all((seen.counts > 0).sum() / len(origins)).cpu()
+            self.remember(step, mean_of_all((seen.counts > 0).sum() / len(origins)))
         target = rays.color
         if self.pool.has_masks:
             target = torch.lerp(self.model.background.expand_as(target), target, rays.mask[:, None])

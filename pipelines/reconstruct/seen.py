@@ -22,7 +22,7 @@ SeenFrom = tuple[Camera, NDArray[np.float32] | None]
 
 RAYS = 300_000  # traced, of all views together
 MOST_PIXELS = 10_000  # of a view
-PLACES = 32  # along the radius of the region: places this far apart are told apart when views are counted
+PLACE = 1 / 32  # in radii of the region: places this far apart are told apart when views are counted, if pixels do
 WITNESSES = 2  # views that must see a place: what one alone sees, it cannot measure
 GRAZING = 2.0  # how much further apart than a pixel its neighbours' points may be, on a surface that is seen obliquely
 TOLERANCE = 1e-3
@@ -62,13 +62,15 @@ def seen_points(field: Field, views: Sequence[SeenFrom]) -> tuple[Tensor, float]
     every = torch.cat(points)
     if not len(every):
         return every, math.inf
-    cells = ((every + 1) * PLACES).floor().long()
-    place = (cells[:, 0] * 2 * PLACES + cells[:, 1]) * 2 * PLACES + cells[:, 2]
+    within = GRAZING * float(np.median(torch.cat(pitches)))
+    cells = ((every + 1) / max(PLACE, within)).floor().long()
+    across = 1 + int(cells.max())
+    place = (cells[:, 0] * across + cells[:, 1]) * across + cells[:, 2]
     # A view counts once in a place, however many of its pixels see it.
     pairs = torch.unique(place * len(views) + torch.cat(owners))
     known, count = torch.unique(pairs // len(views), return_counts=True)
     witnessed = torch.isin(place, known[count >= min(WITNESSES, len(views))])
-    return every[witnessed], GRAZING * float(np.median(torch.cat(pitches)))
+    return every[witnessed], within
 
 
 def _coarse(camera: Camera, pixels: int) -> Camera:

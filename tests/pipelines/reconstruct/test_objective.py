@@ -103,10 +103,11 @@ def test_a_step_has_fewer_rays_while_each_has_many_sections(images: PosedImages)
     trainer = make(images, replace(TINY, rays=32, jets=64, steps=20))
     objective = trainer.objective
     for sections, rays in ((0.0, 8), (100.0, 8), (4.0, 16), (1.0, 32)):
-        objective.kept["sections"] = torch.tensor(sections)
+        objective.kept["lately"] = torch.tensor([sections, 0.1])
         assert objective.batch() == rays
     train(trainer, until=16)
-    found = float(objective.kept["sections"])
+    found, unsure = objective.kept["lately"].tolist()
+    assert unsure == pytest.approx(1 / float(objective.model.inv_std.detach()), rel=0.05)  # a step later
     assert 1 < found < TINY.uniform + TINY.importance + 2
     assert objective.batch() == min(max(round(64 / found), 8), 32)
     assert make(images, replace(TINY, jets=0)).objective.batch() == TINY.rays
@@ -214,22 +215,28 @@ def test_the_grid_is_left_alone_while_the_surface_rests(images: PosedImages) -> 
     objective = make(images, TINY).objective
     geometry = objective.model.geometry
     looked = []
-    for step in range(600):
-        before = objective.kept["looks"]
+
+    def take(step: int) -> None:
         objective.look(step, step / 1000)
-        if objective.kept["looks"] is not before:
+        if (step + 1) % 16 == 0:
+            objective.remember(step, torch.tensor(3.0))
+
+    for step in range(600):
+        before = int(objective.kept["looks"][0])
+        take(step)
+        if int(objective.kept["looks"][0]) != before:
             looked.append(step)
-    assert looked == [0, 16, 48, 112, 240, 368, 496]  # twice as long each time, 128 steps at most
+    assert looked == [16, 48, 112, 240, 368, 496]  # after that at 0; twice as long each time, 128 steps at most
     assert isinstance(geometry, MultiscaleSDF)
     assert isinstance(geometry.base, Siren)
     with torch.no_grad():  # a surface that has moved by 1/s, and then goes on moving
-        for step in range(600, 760):
+        for step in range(600, 768):
             geometry.base.output.bias[0] += 1 / (16 * objective.model.inv_std)
-            objective.look(step, step / 1000)
+            take(step)
     assert objective.kept["looks"][1] == 16
     again = make(images, TINY)
     again.objective.kept = dict(objective.kept)
-    assert again.objective.look(760, 0.76) is again.objective.grid
+    assert again.objective.look(768, 0.768) is again.objective.grid
     assert torch.equal(again.objective.grid.kept, objective.grid.kept)
 
 
@@ -306,7 +313,7 @@ def test_what_an_older_version_did_not_keep_begins_anew(images: PosedImages) -> 
     before, after = make(images, TINY), make(images, TINY)
     train(before, until=3)
     state = before.state()
-    assert state.pop("looks").tolist() != [0, 16, 0]
+    assert state.pop("looks").tolist() == [0, 16, 1]
     after.restore(state)
     assert after.objective.kept["looks"].tolist() == [0, 16, 0]
     assert torch.equal(after.objective.kept["march"], before.objective.kept["march"])

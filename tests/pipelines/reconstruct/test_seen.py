@@ -53,6 +53,17 @@ def test_what_one_camera_sees_alone_is_not_seen() -> None:
     assert len(points) > 100
 
 
+def test_pictures_of_few_pixels_meet_in_places_as_wide_as_those() -> None:
+    few = [look_at((x, 0.0, DISTANCE), (0.0, 0.0, 0.0), fov=40, width=8, height=8) for x in (0.1, -0.1)]
+    points, within = seen_points(Sphere(radius=RADIUS), [(camera, None) for camera in few])
+    # A pixel at the nearest point and at the rim, twice, of 40° / 8: the diagonal of a place is longer than the shift
+    # between the two pictures, so that most of their pixels share one.
+    nearest, rim = DISTANCE - RADIUS, math.sqrt(DISTANCE**2 - RADIUS**2)
+    pixel = 2 * 2 * math.tan(math.radians(20)) / 8
+    assert pixel * nearest < within < 1.1 * pixel * rim
+    assert len(points) > 8
+
+
 def test_masks_say_what_of_it_is_the_object() -> None:
     eyes = [(0.02, 0.0, DISTANCE), (-0.02, 0.0, DISTANCE)]
     _, points = share_seen([photograph(eye, masked=True) for eye in eyes])
