@@ -26,6 +26,7 @@ from .checkpoint import (
 )
 from .color import ColorSiren, TextureField
 from .cones import cone_starts
+from .encoded import EncodedField
 from .errors import InputError
 from .evolution import Law, curvature, key_loss, law_loss, mean_curvature, morph, near_surface, normal_speed, transport
 from .field import Field, Jet, OneLevelField, SecondJet
@@ -55,6 +56,7 @@ __all__ = [
     "ColorSiren",
     "Deviation",
     "Difference",
+    "EncodedField",
     "Field",
     "FieldLike",
     "FixedShapes",

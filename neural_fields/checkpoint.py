@@ -21,6 +21,7 @@ from .algebra import Bounded, Combined, Difference, Intersection, Offset, Placed
 from .analytic import Box, Capsule, Plane, Sphere, Torus
 from .baselines import NeusSDF
 from .color import ColorSiren, TextureField
+from .encoded import EncodedField
 from .errors import InputError
 from .field import Field, plain
 from .files import write_whole
@@ -220,13 +221,18 @@ def radiance_bytes(radiance: Radiance, geometry: Field, *, metadata: Mapping[str
         metadata: JSON values to keep with it.
     """
     color, outside = radiance.color, radiance.outside
-    of_color = {name: getattr(color, name) for name in COLOR_SIZES}
-    of_outside = None if outside is None else {name: getattr(outside, name) for name in OUTSIDE_SIZES}
+    of_color, of_outside = (
+        None
+        if network is None
+        else {name: getattr(network, name) for name in sizes}
+        | {"grid": None if network.grid is None else _grid_of(network.grid)}
+        for network, sizes in ((color, COLOR_SIZES), (outside, OUTSIDE_SIZES))
+    )
     header = {
         "format": RADIANCE_FORMAT,
         "version": VERSION,
-        "color": of_color | {"grid": _grid_of(color.grid)},
-        "outside": None if of_outside is None or outside is None else of_outside | {"grid": _grid_of(outside.grid)},
+        "color": of_color,
+        "outside": of_outside,
         "inv_std": float(radiance.inv_std),
         "geometry": {"digest": _digest(geometry)},
         "metadata": dict(metadata or {}),
@@ -263,10 +269,8 @@ def load_radiance(path: str | os.PathLike[str], geometry: Field) -> tuple[Radian
         return Radiance(color, outside, tensors["background"], inv_std), metadata
 
 
-def _grid_of(grid: HashEncoding | None) -> dict[str, Any] | None:
-    """What `_radiant` needs to construct one again."""
-    if grid is None:
-        return None
+def _grid_of(grid: HashEncoding) -> dict[str, Any]:
+    """What `_made_grid` needs to construct one again."""
     return {
         "levels": len(grid.resolutions),
         "table_size": grid.table_size,
@@ -285,15 +289,18 @@ def _radiant(
     sizes = dict(header[name])
     grid = sizes.pop("grid")
     _check_size(sizes, own)
-    if grid is not None:
-        _check_size({"levels": grid["levels"], "features": grid["features"]}, own)
-        resolutions = grid_resolutions(grid["levels"], grid["coarsest"], grid["finest"])
-        entries = sum(min((cells + 1) ** 3, grid["table_size"]) for cells in resolutions)
-        _check_size({"entries": entries}, own)
-        grid = HashEncoding(**grid)
-    network = kind(**sizes, grid=grid)
+    network = kind(**sizes, grid=None if grid is None else _made_grid(grid, own))
     _restore(path, network, own, "run `mplicits reconstruct` again")
     return network.to(tensors["background"].device).requires_grad_(False)
+
+
+def _made_grid(described: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> HashEncoding:
+    """An untrained one, unless it has more numbers than the file."""
+    _check_size({"levels": described["levels"], "features": described["features"]}, tensors)
+    resolutions = grid_resolutions(described["levels"], described["coarsest"], described["finest"])
+    entries = sum(min((cells + 1) ** 3, described["table_size"]) for cells in resolutions)
+    _check_size({"entries": entries}, tensors)
+    return HashEncoding(**described)
 
 
 def _digest(field: Field) -> str:
@@ -386,6 +393,9 @@ def _describe(field: Field) -> dict[str, Any]:
         return {"type": "MultiscaleSDF", "taper": field.taper, "levels": levels}
     if isinstance(field, SpaceTimeSDF):
         return {"type": "SpaceTimeSDF", "sdf": _describe(field.sdf)}
+    if isinstance(field, EncodedField):
+        grid = _grid_of(field.grid)
+        return {"type": "EncodedField", "field": _describe(field.field), "grid": grid, "gain": field.gain}
     name = type(field).__name__
     if type(field) is CLOSED.get(name):
         return {"type": name, **plain(field.definition())}
@@ -395,8 +405,8 @@ def _describe(field: Field) -> dict[str, Any]:
             definition["similarity"] = dataclasses.asdict(field.similarity)
         return {"type": name, "parts": [_describe(part) for part in field.fields], **definition}
     raise TypeError(
-        f"a {name} cannot be saved; expected a Siren, a MultiscaleSDF of Sirens, a SpaceTimeSDF, a closed form, or a "
-        "combination of these; a mesh of it can be (extract_mesh)"
+        f"a {name} cannot be saved; expected a Siren, a MultiscaleSDF of Sirens, a SpaceTimeSDF, one of them encoded, "
+        "a closed form, or a combination of these; a mesh of it can be (extract_mesh)"
     )
 
 
@@ -438,6 +448,9 @@ def _build(description: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> Fie
         if not isinstance(sdf, MultiscaleSDF):
             raise ValueError(f"a SpaceTimeSDF of a {type(sdf).__name__}")
         return SpaceTimeSDF(sdf)
+    if description["type"] == "EncodedField":
+        grid = _made_grid(arguments["grid"], tensors)
+        return EncodedField(_build(arguments["field"], tensors), grid, gain=arguments["gain"])
     if description["type"] in CLOSED:
         return CLOSED[description["type"]](
             **{key: tuple(value) if isinstance(value, list) else value for key, value in arguments.items()}

@@ -10,6 +10,7 @@ from mplicits.neural_fields import (
     Capsule,
     CarriedKeyframes,
     Difference,
+    EncodedField,
     Field,
     FunctionField,
     Intersection,
@@ -34,6 +35,7 @@ from mplicits.neural_fields import (
     VelocitySiren,
 )
 from mplicits.neural_fields.baselines import BaconSDF, BandLimited, BanfSDF, HashGridSDF, NeusSDF
+from mplicits.neural_fields.hash_encoding import HashEncoding
 from torch import Tensor
 
 
@@ -71,6 +73,13 @@ def small_hash_grid() -> HashGridSDF:
     field = HashGridSDF(levels=2, table_size=512, coarsest=4, finest=16, width=16, radius=0.5)
     for table in field.tables:
         torch.nn.init.uniform_(table, -0.2, 0.2)
+    return field
+
+
+def small_encoded() -> EncodedField:
+    """Features of a network, and of a dense and a hashed grid whose entries are large enough to show."""
+    field = EncodedField(small_multiscale(0.4), HashEncoding(levels=2, table_size=512, coarsest=4, finest=16), gain=2.0)
+    torch.nn.init.uniform_(field.grid.table, -0.2, 0.2)
     return field
 
 
@@ -150,6 +159,7 @@ FIELDS: dict[str, Callable[[], Field]] = {
     "multiscale": small_multiscale,
     "multiscale-tapered": lambda: small_multiscale(0.4),
     "multiscale-over-sphere": two_levels,
+    "encoded": small_encoded,
     "spacetime": small_spacetime,
     "spacetime-tapered": lambda: small_spacetime(0.4),
     "slice": lambda: TimeSlice(small_spacetime(0.4), 0.3),

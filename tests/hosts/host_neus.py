@@ -14,6 +14,7 @@ import trimesh
 from host_common import EVERY, LOOKS, MORE_STEPS, RAYS, RESOLUTION, applied, changes, in_ball, now, surface
 
 DEEPER = "[(128, 2), (256, 3)]", "[(128, 4), (256, 5)]"  # what `ours, deeper` changes: the paper's networks for images
+ENCODED = "ours, 256 features"  # the other such rows have as many without an encoding
 
 
 def set_up(args: argparse.Namespace, clone: Path, scene: Path, row: str, folder: Path) -> None:
@@ -27,8 +28,9 @@ def set_up(args: argparse.Namespace, clone: Path, scene: Path, row: str, folder:
         if path == conf and row != "ours":
             continue
         path.write_text(applied(path.read_text(), diff))
-    if row.startswith("ours, "):
-        text = runner.read_text().replace("num_features=32", "num_features=256")
+    if row.startswith("ours, "):  # beside 24 features of the encoding, or alone
+        text = runner.read_text().replace("num_features=8", f"num_features={232 if row == ENCODED else 256}")
+        text = text if row == ENCODED else text.replace("EncodedField(sdf)", "sdf")
         runner.write_text(text.replace(*DEEPER) if row == "ours, deeper" else text)
     if not torch.cuda.is_available():
         for path in folder.rglob("*.py"):

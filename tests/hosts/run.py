@@ -3,10 +3,10 @@
     python tests/hosts/run.py --neus path/to/NeuS --data path/to/dtu_scan24 --steps 240 --rays 64 --seeds 0 1 2
 
 The clone and the data stay as they are: what is run is a copy in a temporary folder, in which the document's lines are
-changed (``ours``), its other colour network is not (``ours, 256 features``; ``ours, deeper`` with the paper's deeper
-levels), or nothing is (``host``), and ``cuda`` is ``cpu`` where there is no GPU. The host's own packages have to be
-there: ``pip install pyhocon icecream tqdm PyMCubes`` for NeuS, ``pip install omegaconf matplotlib PyMCubes`` for
-instant-nsr-pl (``--nsr``), whose others have stand-ins.
+changed (``ours``), its other colour network is not (``ours, 256 features``; ``ours, no encoding`` with all of them the
+field's own, ``ours, deeper`` with the paper's deeper levels too), or nothing is (``host``), and ``cuda`` is ``cpu``
+where there is no GPU. The host's own packages have to be there: ``pip install pyhocon icecream tqdm PyMCubes`` for
+NeuS, ``pip install omegaconf matplotlib PyMCubes`` for instant-nsr-pl (``--nsr``), whose others have stand-ins.
 
 Every eighth view is kept from the training, and colours are measured there, on the same rays for all. Where the data
 has a ``surface.ply`` (``mplicits scene``), the mesh is measured against it. With ``--keep FILE`` rows are written to a
@@ -23,7 +23,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-ROWS = {"neus": ("host", "ours", "ours, 256 features", "ours, deeper"), "nsr": ("host", "ours")}
+ROWS = {"neus": ("host", "ours", "ours, 256 features", "ours, no encoding", "ours, deeper"), "nsr": ("host", "ours")}
 
 
 def module(host: str) -> Any:
