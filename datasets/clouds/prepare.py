@@ -14,7 +14,7 @@ from .judging import layer_level, neighborly, worse_normals
 from .meshes import weld
 from .noise import noise_deviation, noise_level, smooth_along_normals
 from .orientation import estimate_normals, nearest, openness, orient_normals, outwardness
-from .outliers import inspect_points
+from .outliers import agreement, inspect_points
 from .point_cloud import PointCloud, centred, middle_of, unit_rows, usable_rows
 from .reading import MIN_POINTS
 from .reestimate import denoise, refit_normals
@@ -23,6 +23,10 @@ from .winding import orient_by_winding
 __all__ = ["CleaningReport", "OrientedCloud", "prepare_cloud"]
 
 Float64 = NDArray[np.float64]
+
+# Least share of neighbours that support a point (see `agreement`) once noise is smoothed off points whose normals were
+# estimated: fewer support those that were moved along another layer's normal, and to the wrong place.
+SUPPORTED = 0.3
 
 
 @dataclass(frozen=True)
@@ -169,7 +173,8 @@ def prepare_cloud(
         isolation: points whose eighth neighbour is this many times further away than the median point's are dropped:
             a single stray point of a scan would get a bubble of surface to itself, and set the scale. Those that
             neighbours about as sparse support (see `inspect_points`) stay: they are a sparser part. None keeps all.
-        drop_outliers: whether other points that belong to no surface are dropped (see `inspect_points`).
+        drop_outliers: whether other points that belong to no surface are dropped (see `inspect_points`); and after
+            noise was smoothed along estimated normals, those that few of their neighbours support (`SUPPORTED`).
         turn_normals: whether single normals of the file that point the other way than their neighbours' are turned
             round; with ``normals="file"`` none is.
         smooth_noise: whether points are moved along their normals to where their neighbours agree, if the noise is
@@ -226,7 +231,7 @@ def prepare_cloud(
     points = similarity.to_unit(places[sound])
 
     source: Literal["file", "mesh", "estimated"] = cloud.normals_source
-    flipped, pieces, oriented_by = False, 0, None
+    flipped, pieces, oriented_by, strays = False, 0, None, int(found.outliers.sum())
     if unit is not None:
         unit = np.where(found.flipped[:, None], -unit, unit)[sound]
         flipped = normals == "auto" and _plainly_inward(points, unit)
@@ -239,13 +244,18 @@ def prepare_cloud(
             points, unit, noise = denoise(noisy, unit)
             deviation = noise_deviation(noisy, unit, thick=0.0) * similarity.scale if noise else 0.0
             noise *= similarity.scale
+            if noise and drop_outliers:
+                supported = agreement(points, unit, np.arange(len(points)))[0] >= SUPPORTED
+                points, unit, kept = points[supported], unit[supported], kept[supported]
+                _check_enough(len(kept), cloud, "are left after dropping outliers; keep them with --no-drop-outliers")
+                strays += int((~supported).sum())
     report = CleaningReport(
         read=len(cloud),
         kept=len(kept),
         dropped_nan=len(cloud) - len(finite),
         dropped_duplicates=len(finite) - len(distinct),
         dropped_isolated=int(found.isolated.sum()),
-        dropped_outliers=int(found.outliers.sum()),
+        dropped_outliers=strays,
         repaired_normals=repaired,
         dropped_normals=dropped_normals,
         turned_normals=int(found.flipped.sum()),

@@ -33,8 +33,13 @@ BLOCK = 1 << 13  # points fitted at once, to bound memory
 NEIGHBORS = 64
 ALIKE = 0.3  # smallest cosine between normals that count
 ROUNDS = 2
-REACH = 3.0  # of the neighbours that a plane is fitted to, in standard deviations of the noise
-ALIKE_AT_EDGES = 0.9  # smallest cosine between normals of points that move each other, once normals are filtered
+# Of the neighbours that a plane is fitted to, in standard deviations of the noise. A plane that reaches less far than
+# nine is tilted by noise more than bends tilt it; where points are sparser than that, the number of them is the limit.
+REACH = 9.0
+# Where there are edges, smallest cosines between normals: of neighbours that the first planes are fitted to, before a
+# filter has told faces apart; of points that move each other, once it has; of those that planes are then fitted to.
+ALIKE_AT_FIRST, ALIKE_MOVED, ALIKE_AFTER = 0.6, 0.9, 0.8
+EDGE_ROUNDS = 3
 TURN = 0.2  # radians, about: normals this much apart count e^(-1/2) of equal ones in a filter
 FILTERED, PASSES = 32, 3  # neighbours that a filter averages, and how often
 # Angles to the next eight normals, in the mean, that nine tenths of the points are below, over their median: 2.3 on
@@ -53,7 +58,7 @@ def denoise(points: Float64, normals: Float64, *, rounds: int = ROUNDS) -> tuple
     Args:
         points: ``(N, 3)``, around the origin.
         normals: ``(N, 3)`` unit normals of the noisy points, on the right side for the most part.
-        rounds: how often normals are fitted and points are moved, and once more as often where there are edges (see
+        rounds: how often normals are fitted and points are moved; `EDGE_ROUNDS` times more where there are edges (see
             `has_edges`), with filtered normals.
 
     Returns:
@@ -73,12 +78,13 @@ def denoise(points: Float64, normals: Float64, *, rounds: int = ROUNDS) -> tuple
     fitted = refit_normals(moved, normals, reach, tree=tree)
     if not has_edges(moved, fitted, tree=tree):
         return moved, fitted, level
-    for _ in range(rounds):
+    fitted = refit_normals(moved, fitted, reach, alike=ALIKE_AT_FIRST, tree=tree)
+    for _ in range(EDGE_ROUNDS):
         normals = filter_normals(moved, fitted, tree=tree)
         level = noise_level(points, normals, thick=thick) or level
-        moved = smooth_along_normals(points, normals, level, alike=ALIKE_AT_EDGES)
+        moved = smooth_along_normals(points, normals, level, alike=ALIKE_MOVED)
         tree = KDTree(moved)
-        fitted = refit_normals(moved, normals, reach, tree=tree)
+        fitted = refit_normals(moved, normals, reach, alike=ALIKE_AFTER, tree=tree)
     return moved, filter_normals(moved, fitted, tree=tree), level
 
 
@@ -167,6 +173,7 @@ def refit_normals(
     reach: float,
     *,
     neighbors: int = NEIGHBORS,
+    alike: float = ALIKE,
     rows: Rows | None = None,
     among: Rows | None = None,
     tree: KDTree | None = None,
@@ -182,6 +189,7 @@ def refit_normals(
         normals: ``(N, 3)`` unit normals, whose signs the new ones keep.
         reach: in the units of the points.
         neighbors: nearest points that are asked.
+        alike: c₀, smallest cosine between normals that count.
         rows: ``(m,)`` points whose normals are wanted; None for all.
         among: ``(n,)`` points that planes are fitted to; None for all. A point without a like one keeps its normal.
         tree: of the points that planes are fitted to; None to build it.
@@ -199,8 +207,8 @@ def refit_normals(
         distance, near = np.asarray(found[0]), others[np.asarray(found[1])]
         radius = np.clip(reach, distance[:, min(16, count - 1)], distance[:, -1] * 1.001)[:, None]
         cosine = np.einsum("md,mkd->mk", normals[here], normals[near])
-        alike = ((cosine - ALIKE) / (1 - ALIKE)).clip(min=0)
-        weight = (1 - (distance / radius) ** 2).clip(min=0) ** 2 * alike**2
+        likeness = ((cosine - alike) / (1 - alike)).clip(min=0)
+        weight = (1 - (distance / radius) ** 2).clip(min=0) ** 2 * likeness**2
         offset = points[near] - points[here][:, None]
         total = weight.sum(axis=1)[:, None]
         offset -= (np.einsum("mk,mkd->md", weight, offset) / np.maximum(total, 1e-300))[:, None]

@@ -50,6 +50,9 @@ RIM, ROW = 0.03, 2
 # All in units of the distance to the fourth nearest point: how much patches may differ at a new point, how far one may
 # be beyond another's plane, and how near two must pass to a point of an edge.
 SPREAD, BEYOND, THROUGH = 0.05, 0.03, 0.1
+# In those units, how far a new point may be from the weighted mean of the points around it. On the rim of a half-plane
+# that is 1/√π = 0.56, and beyond it more.
+ONE_SIDED = 0.7
 LARGEST_AREA = 100.0  # that a point stands for, over the median
 
 
@@ -99,20 +102,24 @@ def dense_distance(
     index = CloudDistance(points, normals, **about)
     if index.spacing * omega <= TURN or count <= len(points):
         return index
-    found = densified(index.points, index.normals, count - len(points), seed=seed)
+    found = densified(index.points, index.normals, count - len(points), guessed=guessed, seed=seed)
     new_points, new_normals = (torch.from_numpy(a.astype(np.float32)) for a in (found.points, found.new_normals))
     own_normals = torch.from_numpy(found.normals.astype(np.float32))
     dense = torch.cat((points.cpu(), new_points)), torch.cat((own_normals, new_normals))
     return CloudDistance(*dense, **about, given=len(points), gap=index.spacing, repaired=found.repaired)
 
 
-def densified(points: NDArray[np.floating], normals: NDArray[np.floating], count: int, *, seed: int = 0) -> Densified:
+def densified(
+    points: NDArray[np.floating], normals: NDArray[np.floating], count: int, *, guessed: bool = False, seed: int = 0
+) -> Densified:
     """Find points of the surface between those of a cloud.
 
     Args:
         points: ``(N, 3)``, around the origin.
         normals: ``(N, 3)`` unit normals.
         count: how many places are tried, uniform by area; most of them become points where the cloud is sound.
+        guessed: whether the normals were estimated from noisy points: those beyond an edge may then not contradict
+            what runs on beyond it, and new points must have points on all sides.
         seed: of the places.
     """
     if len(points) <= NEIGHBORS:  # too few for a neighbourhood that is not the whole
@@ -126,7 +133,7 @@ def densified(points: NDArray[np.floating], normals: NDArray[np.floating], count
         area = np.minimum(patches.reach**2, LARGEST_AREA * np.median(patches.reach) ** 2)[able]
         parents = np.sort(random.choice(able, count, p=area / area.sum()))  # in order: neighbours are near in memory
         for start in range(0, count, BLOCK):
-            found.append(_placed(patches, parents[start : start + BLOCK], random))
+            found.append(_placed(patches, parents[start : start + BLOCK], random, guessed=guessed))
     new = [np.concatenate(columns) for columns in zip(*found, strict=True)]
     return Densified(fixed, repaired, new[0], new[1])
 
@@ -227,7 +234,7 @@ def _repaired(patches: _Patches) -> tuple[Float64, int]:
     return fixed, int(torn.sum())
 
 
-def _placed(patches: _Patches, parents: Rows, random: np.random.Generator) -> tuple[Float64, Float64]:
+def _placed(patches: _Patches, parents: Rows, random: np.random.Generator, *, guessed: bool) -> tuple[Float64, Float64]:
     """New points and their normals, at most one beside each of ``parents``."""
     normal = patches.normals[parents]
     step = random.normal(size=(len(parents), 3))
@@ -237,12 +244,12 @@ def _placed(patches: _Patches, parents: Rows, random: np.random.Generator) -> tu
     x = patches.points[parents] + step - 0.5 * (bent * step).sum(axis=1, keepdims=True) * normal
     normal, good = _unit(normal + bent), np.ones(len(parents), bool)
     for _ in range(2):  # patches are flat across a spacing: the second move is a hundredth of the first
-        moved, normal, good = _blended(patches, x, normal)
+        moved, normal, good = _blended(patches, x, normal, ONE_SIDED if guessed else np.inf)
         x = x + moved
     return x[good], normal[good]
 
 
-def _blended(patches: _Patches, x: Float64, normal: Float64) -> tuple[Float64, Float64, Mask]:
+def _blended(patches: _Patches, x: Float64, normal: Float64, one_sided: float) -> tuple[Float64, Float64, Mask]:
     """What moves places ``(m, 3)`` onto the blend of patches with their normals; normals there; which are good."""
     distance, found, offset, value, theirs = patches.at(x, BLENDED)
     scale, sound = distance[:, 3:4], patches.sound[found]
@@ -257,7 +264,9 @@ def _blended(patches: _Patches, x: Float64, normal: Float64) -> tuple[Float64, F
     above, below = -(offset * blend[:, None]).sum(axis=2), (offset * patches.normals[found]).sum(axis=2)
     beyond = sound & (cosine < AGREED) & (above * below < 0)
     beyond &= np.minimum(np.abs(above), np.abs(below)) > BEYOND * scale
-    good = (total[:, 0] > ENOUGH) & (spread < SPREAD * scale)[:, 0] & ~beyond.any(axis=1)
+    middle = np.linalg.norm(np.einsum("mk,mkd->md", weight, offset), axis=1, keepdims=True)
+    good = (total > ENOUGH) & (spread < SPREAD * scale) & ~beyond.any(axis=1, keepdims=True)
+    good = (good & (middle < one_sided * scale))[:, 0]
     return -mean * blend, blend, good
 
 

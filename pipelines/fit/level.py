@@ -17,20 +17,42 @@ from ..run.trainer import Group, Objective, seeded, warm_cosine
 from .heldout import LOOKS, Judge, Verdict
 from .samples import Source
 
-__all__ = ["RESIDUAL_GAIN", "LevelObjective", "new_level"]
+__all__ = ["RESIDUAL_GAIN", "LevelObjective", "calm_omega", "new_level"]
 
 # A residual starts at a tenth of the usual output scale, close to the level before it.
 RESIDUAL_GAIN = 0.1
+# Largest frequency of a residual, in units of 1 / the standard deviation of noise that was smoothed off along estimated
+# normals: of waves shorter than 2π/0.4 of those, smoothing leaves nothing in the points but noise. Where a cloud is
+# filled in between its points, that smooths them once more, and edges need the higher ones.
+CALM = 0.4
 BEST = "best."  # before the names of the weights that did best
 
 
 def new_level(
-    config: FitConfig | EvolveConfig, level: int, *, residual: bool, in_dim: int = 3, gain: float = RESIDUAL_GAIN
+    config: FitConfig | EvolveConfig,
+    level: int,
+    *,
+    residual: bool,
+    in_dim: int = 3,
+    gain: float = RESIDUAL_GAIN,
+    omega: float | None = None,
 ) -> Siren:
-    """The untrained SIREN of a level, whose weights follow from the seed; small by ``gain`` where it is a residual."""
-    width, depth, omega = config.widths[level], config.depths[level], config.omegas[level]
+    """The untrained SIREN of a level, whose weights follow from the seed; small by ``gain`` where it is a residual.
+
+    Its frequency is the configuration's, or ``omega``.
+    """
+    width, depth, omega = config.widths[level], config.depths[level], omega or config.omegas[level]
     with seeded(config.seed * 1009 + level):
         return Siren(width, depth, omega=omega, in_dim=in_dim, output_gain=gain if residual else 1.0)
+
+
+def calm_omega(config: FitConfig, level: int, noise: float) -> float:
+    """The frequency of a level of a cloud whose normals were estimated from points with ``noise``, 0 for none.
+
+    That of the configuration, but no more than `CALM` / noise, which is no less than that of level 0.
+    """
+    omega = config.omegas[level]
+    return min(omega, max(config.omegas[0], CALM / noise)) if noise else omega
 
 
 class LevelObjective(Objective):

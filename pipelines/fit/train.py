@@ -39,7 +39,7 @@ from ..surface.trim import thinned
 from .between import dense_distance
 from .cloud import CloudDistance, load_cloud
 from .heldout import FEWEST, Judge, held_out
-from .level import RESIDUAL_GAIN, LevelObjective, new_level
+from .level import RESIDUAL_GAIN, LevelObjective, calm_omega, new_level
 from .plan import Share
 from .review import Review, review_points
 from .samples import Band, Source, band_of, banded_sources, first_sources
@@ -306,7 +306,9 @@ class _Fitting:
         delta = None if band is None else band.delta
         index = self.indexed(level)
         gain = SMALL_GAIN if index.filled and config.robust_normals else RESIDUAL_GAIN
-        siren = new_level(config, level, residual=level > 0, gain=gain).to(self.device)
+        noisy = self.cloud.guessed and not index.filled
+        omega = calm_omega(config, level, self.cloud.noise if noisy else 0.0)
+        siren = new_level(config, level, residual=level > 0, gain=gain, omega=omega).to(self.device)
         work.indexed()
         index.watch = work.points
         if self.frozen is None or delta is None:
@@ -354,6 +356,7 @@ class _Fitting:
             {
                 "level": level,
                 "parameters": parameter_count(siren),
+                "omega": siren.omega,
                 "delta": delta,
                 "band": None if band is None else dataclasses.asdict(band),
                 "between": len(index.points) - index.given,
@@ -465,7 +468,8 @@ class _Fitting:
         signs = progress.get("signs")
         if signs is not None:
             self.take_signs(Signs(tensors["signs.turned"].numpy(), signs["slope"], signs["witness"]))
-        levels = [new_level(self.config, level, residual=False) for level in range(len(self.stages))]
+        omegas = [stage.get("omega") for stage in self.stages]  # older runs have the configuration's
+        levels = [new_level(self.config, level, residual=False, omega=omega) for level, omega in enumerate(omegas)]
         if levels:
             empty = MultiscaleSDF(levels[0], levels[1:], [1.0] * (len(levels) - 1)).to(self.device)
             self.frozen = restore_frozen(empty, tensors)

@@ -166,3 +166,27 @@ def test_uneven_density_is_not_isolation():
     half = dense.points[:, 2] > 0
     points = np.concatenate((dense.points[half], sparse.points[sparse.points[:, 2] <= 0]))
     assert prepare_cloud(PointCloud(points, normals=points.astype(np.float32))).report.dropped_isolated == 0
+
+
+def test_points_that_smoothing_took_to_the_wrong_place_are_dropped():
+    """Of a plate three deviations of the noise thick, points are counted to the wrong side, and moved away from it."""
+    half = np.array([0.6, 0.5, 0.03])
+    plate = sample_surface(Box(half_size=tuple(half)), 12_000, shell=0.001, seed=1)
+    noisy = plate.points + np.random.default_rng(2).normal(0, 0.02, (12_000, 3))
+    colors = np.random.default_rng(3).uniform(size=(12_000, 3)).astype(np.float32)
+    every, sound = (
+        prepare_cloud(PointCloud(noisy, None, colors), smooth_noise=True, isolation=None, drop_outliers=drop)
+        for drop in (False, True)
+    )
+    assert every.noise > 0
+
+    def off(points):
+        offset = np.abs(every.similarity.to_input(points)) - half
+        return np.abs(np.linalg.norm(offset.clip(min=0), axis=1) + offset.max(axis=1).clip(max=0))
+
+    row = {tuple(color): index for index, color in enumerate(every.colors)}  # colours tell which points are left
+    left = np.array([row[tuple(color)] for color in sound.colors])
+    gone = np.setdiff1d(np.arange(len(every)), left)
+    assert len(gone) == sound.report.dropped_outliers > 0
+    assert len(sound) == sound.report.kept == len(every) - len(gone)
+    assert np.square(off(every.points[gone])).mean() > 2 * np.square(off(every.points[left])).mean()

@@ -49,6 +49,18 @@ def test_an_edge_stays_sharp():
     assert np.quantile(after, 0.9) < 1
 
 
+def test_only_as_alike_normals_as_are_asked_for_count():
+    """Two planes at sixty degrees: cosine ½ counts when 0.3 is asked for, and not when 0.6 is."""
+    flat = np.column_stack((RNG.uniform(-1, 1, 4000), RNG.uniform(0, 1, 4000), np.zeros(4000)))
+    cosine, sine = 0.5, 0.75**0.5
+    turn = np.array([[1, 0, 0], [0, -cosine, sine], [0, sine, cosine]])  # y to the other side, and up by sixty degrees
+    points = np.concatenate((flat[:2000], flat[2000:] @ turn.T))
+    exact = np.repeat([[0.0, 0.0, 1.0], [0.0, sine, cosine]], 2000, axis=0)
+    loose, strict = (refit_normals(points, exact, 0.2, alike=alike) for alike in (0.3, 0.6))
+    assert np.abs(strict - exact).max() < 100 * DOUBLE
+    assert angles(loose, exact).max() > 5
+
+
 def box_with_normals(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points of a box, the exact normals of their faces, and these turned by five degrees or so."""
     half = np.array([0.6, 0.5, 0.4])

@@ -8,10 +8,11 @@ import torch
 from mplicits.datasets import PointCloud
 from mplicits.datasets.synthetic.samples import sample_sphere, sample_torus
 from mplicits.neural_fields import Torus
-from mplicits.pipelines.fit.between import TURN, dense_distance, densified
+from mplicits.pipelines.fit.between import ONE_SIDED, TURN, dense_distance, densified
 from mplicits.pipelines.fit.cloud import CloudDistance
 from mplicits.pipelines.fit.train import fit
 from mplicits.pipelines.run.settings import FitConfig
+from scipy.spatial import KDTree
 
 Float64 = np.ndarray
 
@@ -137,6 +138,20 @@ def test_the_same_seed_finds_the_same_points() -> None:
     first, again, other = (densified(points, normals, 500, seed=seed).points for seed in (1, 1, 2))
     assert np.array_equal(first, again)
     assert len(first) != len(other) or not np.array_equal(first, other)
+
+
+def test_guessed_normals_are_not_followed_beyond_the_rim_of_a_strip() -> None:
+    """All its points are as far away as the rim at least, and so is their mean: that bounds how far new ones go."""
+    random = np.random.default_rng(0)
+    points = random.uniform(-1, 1, (2000, 3)) * [1, 0.1, 0]
+    normals = np.tile([0.0, 0.0, 1.0], (2000, 1))
+    tree = KDTree(points)
+    believed, guessed = (densified(points, normals, 20_000, guessed=guess).points for guess in (False, True))
+    for found, bounded in ((believed, False), (guessed, True)):
+        beyond = np.linalg.norm((np.abs(found[:, :2]) - [1, 0.1]).clip(min=0), axis=1)
+        fourth = np.asarray(tree.query(found, k=4)[0])[:, 3]
+        assert bool((beyond < ONE_SIDED * fourth).all()) == bounded
+    assert len(guessed) > 0.7 * len(believed)
 
 
 def test_dense_clouds_are_left_as_they_are() -> None:

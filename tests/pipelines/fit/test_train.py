@@ -15,6 +15,7 @@ from mplicits.neural_fields import InputError, load_field
 from mplicits.neural_fields.meshing import extract_mesh
 from mplicits.pipelines.cli.info import describe
 from mplicits.pipelines.fit.heldout import FEWEST
+from mplicits.pipelines.fit.level import CALM, calm_omega
 from mplicits.pipelines.fit.train import fit
 from mplicits.pipelines.run.folder import read_record
 from mplicits.pipelines.run.machine import choose_device
@@ -103,6 +104,38 @@ def test_an_interrupted_run_resumes_to_the_same_result(
     assert not (tmp_path / "resume.safetensors").exists()
     resumed, whole = (load_field(d / "field.safetensors").field.state_dict() for d in (tmp_path, fitted))
     assert all(torch.equal(resumed[name], whole[name]) for name in whole)
+
+
+def test_frequencies_of_residuals_follow_the_noise_where_normals_are_guesses(fitted: Path, tmp_path: Path) -> None:
+    """Waves of the noise's size are its own; a resumed run has the same."""
+    clean = json.loads((fitted / "run.json").read_text())
+    assert [stage["omega"] for stage in clean["stages"]] == [10.0, 15.0]
+    ball = sphere_cloud()
+    noisy = ball.points + np.random.default_rng(1).normal(0, 0.35, ball.points.shape)  # a twentieth of the radius
+    small = {"widths": (16, 16, 16), "depths": (1, 1, 1), "omegas": (5.0, 8.0, 90.0), "steps": (40, 40, 40)}
+    config = replace(SMALL, **small, learning_rates=(3e-3,) * 3, samples=6000, between=False)
+    whole = fit(PointCloud(noisy), config, out=tmp_path / "whole")
+    stages, noise = whole.record["stages"], whole.record["cleaning"]["smoothed_noise"]
+    cap = CALM * whole.record["similarity"]["scale"] / noise
+    assert 5 < cap < 90
+    assert [stage["omega"] for stage in stages] == pytest.approx([5.0, min(8.0, cap), cap])
+
+    def interrupt(progress: Progress) -> None:
+        if progress.stage == "level 2" and progress.step == 20:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    with pytest.raises(Interrupted):
+        fit(PointCloud(noisy), config, out=tmp_path / "part", progress=interrupt)
+    run = fit(PointCloud(noisy), out=tmp_path / "part", resume=True)
+    for resumed, level in zip(run.field.levels, whole.field.levels, strict=True):
+        assert resumed.omega == level.omega
+        assert all(torch.equal(a, b) for a, b in zip(resumed.parameters(), level.parameters(), strict=True))
+
+
+def test_frequencies_fall_no_lower_than_that_of_level_0() -> None:
+    config = replace(SMALL, omegas=(10.0, 40.0))
+    assert [calm_omega(config, 1, noise) for noise in (0.0, CALM / 50, CALM / 20, CALM / 5)] == [40, 40, 20, 10]
+    assert calm_omega(config, 0, CALM / 5) == 10
 
 
 def test_a_level_that_is_worse_than_none_adds_nothing(fitted: Path, tmp_path: Path) -> None:
