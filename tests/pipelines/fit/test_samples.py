@@ -9,6 +9,8 @@ from mplicits.pipelines.fit.samples import (
     LEAST,
     LEFT,
     SQUARES,
+    SURE,
+    SURE_GUESSED,
     Samples,
     Weights,
     band_of,
@@ -223,6 +225,21 @@ def with_hole() -> CloudDistance:
     points, normals = sphere_points(20_000)
     seen = normals[:, 2] < 0.8
     return CloudDistance(points[seen], normals[seen])
+
+
+def test_places_in_less_doubt_are_empty_where_normals_are_guesses() -> None:
+    """In the mouth of a bowl the winding number is between; guesses are believed from 0.2 and 0.8 on."""
+    points, normals = sphere_points(20_000)
+    seen = normals[:, 2] < 0.3
+    level, found = Sphere(radius=RADIUS), {}
+    for guessed in (False, True):
+        bowl = CloudDistance(points[seen], normals[seen], guessed=guessed)
+        found[guessed] = remote_samples(bowl, level, 0.05, 40_000, generator=generator(), device=CPU)
+        for places, sure in ((found[guessed].empty, True), (found[guessed].unseen, False)):
+            depth = np.abs(bowl.winding_number(places.points.numpy(), cell=bowl.cell / 2) - 0.5)
+            assert ((depth > (SURE_GUESSED if guessed else SURE)) == sure).all()
+    assert len(found[True].empty) > len(found[False].empty)
+    assert len(found[True].unseen) < len(found[False].unseen)
 
 
 def test_a_hole_of_a_scan_is_no_empty_place() -> None:
