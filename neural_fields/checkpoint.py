@@ -7,7 +7,7 @@ import hashlib
 import json
 import math
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -221,18 +221,11 @@ def radiance_bytes(radiance: Radiance, geometry: Field, *, metadata: Mapping[str
         metadata: JSON values to keep with it.
     """
     color, outside = radiance.color, radiance.outside
-    of_color, of_outside = (
-        None
-        if network is None
-        else {name: getattr(network, name) for name in sizes}
-        | {"grid": None if network.grid is None else _grid_of(network.grid)}
-        for network, sizes in ((color, COLOR_SIZES), (outside, OUTSIDE_SIZES))
-    )
     header = {
         "format": RADIANCE_FORMAT,
         "version": VERSION,
-        "color": of_color,
-        "outside": of_outside,
+        "color": _radiant_of(color, COLOR_SIZES),
+        "outside": None if outside is None else _radiant_of(outside, OUTSIDE_SIZES),
         "inv_std": float(radiance.inv_std),
         "geometry": {"digest": _digest(geometry)},
         "metadata": dict(metadata or {}),
@@ -267,6 +260,12 @@ def load_radiance(path: str | os.PathLike[str], geometry: Field) -> tuple[Radian
         if not isinstance(metadata, dict):
             raise TypeError(f"metadata is a {type(metadata).__name__}")
         return Radiance(color, outside, tensors["background"], inv_std), metadata
+
+
+def _radiant_of(network: ViewColor | Outside, sizes: Sequence[str]) -> dict[str, Any]:
+    """What `_radiant` needs to construct one again."""
+    grid = None if network.grid is None else _grid_of(network.grid)
+    return {name: getattr(network, name) for name in sizes} | {"grid": grid}
 
 
 def _grid_of(grid: HashEncoding) -> dict[str, Any]:

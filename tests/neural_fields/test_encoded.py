@@ -30,12 +30,14 @@ def test_geometry_is_the_fields_own_bit_for_bit() -> None:
 
 def test_features_are_the_fields_and_then_the_encodings() -> None:
     field, x = small_encoded(), points()
-    own, encoded = field.field.jet(x).features, 2.0 * field.grid(x)
-    for features in (field.jet(x).features, field.value_features(x)[1], field.second_jet(x).features):
+    inner, encoded = field.field, 2.0 * field.grid(x)
+    for features, own in (
+        (field.jet(x).features, inner.jet(x).features),
+        (field.value_features(x)[1], inner.value_features(x)[1]),
+        (field.second_jet(x).features, inner.second_jet(x).features),
+    ):
         assert features.shape == (200, 2 + field.grid.size)
-        # The field's own may be a rounding apart between a value and a jet; the encoding is the same everywhere.
-        assert torch.equal(features[:, 2:], encoded)
-        assert torch.allclose(features[:, :2], own, rtol=1e-4, atol=1e-5)
+        assert torch.equal(features, torch.cat((own, encoded), dim=-1))
     assert EncodedField(Siren(8, 1)).jet(x).features.shape == (200, 24)
 
 
