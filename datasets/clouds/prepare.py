@@ -141,11 +141,6 @@ class OrientedCloud:
         """Whether normals, all or some, were estimated from the points: at sharp edges each is one side's by chance."""
         return self.report.normals_source == "estimated" or self.report.reestimated_normals > 0
 
-    @property
-    def guessed(self) -> bool:
-        """Whether the normals were estimated from noisy points."""
-        return self.estimated and self.report.smoothed_noise > 0
-
 
 def prepare_cloud(
     cloud: PointCloud,

@@ -23,7 +23,15 @@ from .noise import noise_level
 from .orientation import fit_planes, openness
 from .point_cloud import centred, spread
 
-__all__ = ["WindingNormals", "disc_areas", "layer_thickness", "misfit", "orient_by_winding", "winding_normals"]
+__all__ = [
+    "MUCH_LESS",
+    "WindingNormals",
+    "disc_areas",
+    "layer_thickness",
+    "misfit",
+    "orient_by_winding",
+    "winding_normals",
+]
 
 Float64 = NDArray[np.float64]
 Index = NDArray[np.int64]

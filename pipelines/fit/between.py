@@ -102,7 +102,7 @@ def dense_distance(
     index = CloudDistance(points, normals, **about)
     if index.spacing * omega <= TURN or count <= len(points):
         return index
-    found = densified(index.points, index.normals, count - len(points), guessed=guessed, seed=seed)
+    found = densified(index.points, index.normals, count - len(points), guessed=guessed and noise > 0, seed=seed)
     new_points, new_normals = (torch.from_numpy(a.astype(np.float32)) for a in (found.points, found.new_normals))
     own_normals = torch.from_numpy(found.normals.astype(np.float32))
     dense = torch.cat((points.cpu(), new_points)), torch.cat((own_normals, new_normals))

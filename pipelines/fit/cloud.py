@@ -2,10 +2,9 @@
 
 No mesh is needed for these. Magnitude: each point stands for a disc in its tangent plane, as wide as its neighbourhood
 is spaced; the distance to the nearest of a few discs has neither the bias of the distance to the nearest point
-(√(d² + h²) instead of d) nor the reach of an infinite tangent plane. Sign: away from the surface by the generalised
-winding number of the cloud, which closes the holes that scans have; close to it by the side of the nearest discs.
-Beside the edge of a blade, where all discs are seen edge-on, what smoothing has left of noise would decide: of a cloud
-that was noisy, the winding number is asked down to half the width of the noise.
+(√(d² + h²) instead of d) nor the reach of an infinite tangent plane. Sign: by the generalised winding number of the
+cloud, which closes the holes that scans have, and weighs all normals against each other where some are wrong; within a
+fourth of a spacing of the discs, where a sum over single points says little, by the side of the nearest ones.
 """
 
 from __future__ import annotations
@@ -25,6 +24,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from ...datasets import PointCloud, read_cloud
+from ...datasets.clouds.dipoles import DipoleField
 from ...datasets.clouds.large import Merging, merge_cloud
 from ...datasets.clouds.reading import check_cloud, open_stream
 from ...datasets.clouds.stream import MemoryStream
@@ -42,6 +42,19 @@ VERSION = 1
 LARGEST_AREA = 100.0
 # Queries at a time: between two of them a progress display is told.
 ROWS = 1 << 15
+# Winding numbers at a time: of more places, groups of neighbouring ones are smaller, and fewer points are near them.
+PLACES = 1 << 18
+# Neighbours that share the disc out to the last of them, and among how many nearest ones they are looked for.
+SHARING, ASKED = 8, 16
+# Points in each other's tangent plane, to within this part of their distance, lie beside each other on one side. A
+# normal that so many times as many of those contradict as confirm has the wrong sign.
+BESIDE_ANOTHER, ODD = 0.25, 2.0
+# Dipoles are softened by this part of the radius of their discs, or of the noise that was smoothed off, whichever is
+# more: close to the surface, between two of them, the winding number would waver. Of wider ones the sides of a thin bar
+# cancel.
+SOFT = 0.3
+# Nearer to the discs than this many spacings, sides of discs are right more often than winding numbers.
+BESIDE = 0.25
 
 
 def load_cloud(
@@ -125,10 +138,8 @@ class CloudDistance:
         points: ``(N, 3)`` points.
         normals: ``(N, 3)`` outward unit normals.
         neighbors: how many discs are compared at each query.
-        cell: edge of the cells in which points are merged into dipoles for the winding number; dipoles
-            are used only further than ``2 · cell`` from the surface, where their error is below 0.05.
         noise: standard deviation of the noise that was smoothed off the points.
-        guessed: whether the normals were estimated from those noisy points.
+        guessed: whether the normals were estimated from the points, noisy or not.
         given: how many of the points are the cloud's own, the first ones; None for all. The others fill it in.
         gap: the spacing of those; None for that of all.
         repaired: how many normals of points on edges were replaced by one side's.
@@ -143,7 +154,6 @@ class CloudDistance:
         normals: Tensor,
         *,
         neighbors: int = 6,
-        cell: float = 0.05,
         noise: float = 0.0,
         guessed: bool = False,
         given: int | None = None,
@@ -155,17 +165,13 @@ class CloudDistance:
         self.normals: Float32 = normals.cpu().numpy()
         self.tree = KDTree(self.points, compact_nodes=False, balanced_tree=False)
         self.noise, self.guessed = noise, guessed
-        self.neighbors, self.cell = min(neighbors, len(points)), cell
-        count = min(8, len(points) - 1)
-        reach = np.asarray(self.tree.query(self.points, k=count + 1, workers=-1)[0])[:, -1]
-        # `count` neighbours share the disc of radius `reach`: each of them has this much area to itself.
-        areas = math.pi * reach**2 / count
-        # A few points on their own have nobody near, but no surface of that size either.
-        self.areas: Float32 = np.minimum(areas, LARGEST_AREA * np.median(areas)).astype(np.float32)
+        self.neighbors = min(neighbors, len(points))
+        self.areas: Float32 = self._areas()
         self.radii: Float32 = np.sqrt(self.areas / math.pi)
         self.spacing = float(np.median(np.sqrt(self.areas)))
         self.given, self.repaired = len(points) if given is None else given, repaired
         self.gap = self.spacing if gap is None else gap
+        self._dipoles = self._softened(SOFT)
 
     @property
     def filled(self) -> bool:
@@ -176,8 +182,13 @@ class CloudDistance:
         """Distance from each of ``(M, 3)`` to the nearest point of the cloud → ``(M,)``."""
         return np.concatenate([self._query(x[start : start + ROWS], 1)[0] for start in _starts(len(x))])
 
-    def signed(self, x: Tensor) -> Tensor:
-        """Signed distance of ``(M, 3)`` points → ``(M,)`` on the CPU, negative inside."""
+    def signed(self, x: Tensor, *, soft: float = SOFT) -> Tensor:
+        """Signed distance of ``(M, 3)`` points → ``(M,)`` on the CPU, negative inside.
+
+        Args:
+            x: the points.
+            soft: softening of the dipoles that the signs are asked of, in standard deviations of the noise.
+        """
         query = x.cpu().numpy()
         parts = [self._query(query[start : start + ROWS], self.neighbors) for start in _starts(len(query))]
         distance, index = (np.concatenate(part) for part in zip(*parts, strict=True))
@@ -188,11 +199,10 @@ class CloudDistance:
         magnitude = discs.min(axis=1)
         # Each disc votes with its side, the nearer and the more face-on the louder.
         side = np.sum(along / (distance**3 + 1e-12), axis=1)
-        far = distance[:, 0] > 2 * self.cell
-        near = ~far & (distance[:, 0] > 0.5 * self.noise) if self.noise else np.zeros_like(far)
-        for some, cell in ((far, self.cell), (near, self.cell / 2)):
-            if some.any():
-                side[some] = 0.5 - self.winding_number(query[some], cell=cell)
+        some = magnitude > BESIDE * self.spacing
+        if self.guessed and self.noise:  # sides of discs are chance where normals follow noise
+            some[:] = True
+        side[some] = 0.5 - self._winding(self._dipoles if soft == SOFT else self._softened(soft), query[some])
         return torch.from_numpy(np.where(side < 0, -magnitude, magnitude).astype(np.float32))
 
     def _query(self, x: NDArray[np.floating], k: int) -> tuple[NDArray[np.float64], NDArray[np.integer]]:
@@ -201,38 +211,46 @@ class CloudDistance:
         self.watch(queries(len(x), len(self.points)))
         return np.asarray(distance), np.asarray(index)
 
-    def winding_number(self, x: Float32, *, cell: float | None = None, chunk: int = 1024) -> NDArray[np.float64]:
+    def winding_number(self, x: Float32) -> NDArray[np.float64]:
         """Generalised winding number at ``(M, 3)`` points: about 1 inside, 0 outside, in between near holes.
 
-        ``w(x) = Σ_i a_i ⟨p_i − x, n_i⟩ / (4π |p_i − x|³)`` over dipoles (Barill et al. 2018, first order).
-
-        Args:
-            x: the points.
-            cell: edge of the cells of one dipole each; None for that of the index.
-            chunk: points at a time.
+        ``w(x) = Σ_i a_i ⟨p_i − x, n_i⟩ / 4π (|p_i − x|² + ε_i²)^(3/2)`` (Barill et al. 2018), see `DipoleField`.
         """
-        centers, moments = self._dipoles(cell or self.cell)
-        offset = (centers * moments).sum(dim=1)
-        squares = (centers**2).sum(dim=1)
-        query = torch.from_numpy(np.ascontiguousarray(x, np.float32))
-        result = torch.empty(len(query))
-        for start in range(0, len(query), chunk):
-            part = query[start : start + chunk]
-            flux = torch.addmm(offset, part, moments.t(), alpha=-1)
-            d2 = torch.addmm(squares, part, centers.t(), alpha=-2).add_((part**2).sum(dim=1)[:, None])
-            inverse = d2.clamp_(min=1e-8).rsqrt_()
-            result[start : start + chunk] = flux.mul_(inverse).mul_(inverse).mul_(inverse).sum(dim=1)
-            self.watch(windings(len(part), len(centers)))
-        return (result / (4 * math.pi)).double().numpy()
+        return self._winding(self._dipoles, x)
 
-    def _dipoles(self, cell: float) -> tuple[Tensor, Tensor]:
-        """Area-weighted centres and area-weighted normal sums of the cloud's occupied cells."""
-        cells = np.floor(self.points / cell).astype(np.int64)
-        _, owner = np.unique(cells @ np.array([1 << 40, 1 << 20, 1]), return_inverse=True)
-        area = np.bincount(owner, self.areas)
-        center = np.stack([np.bincount(owner, self.areas * self.points[:, i]) for i in range(3)], 1) / area[:, None]
-        moment = np.stack([np.bincount(owner, self.areas * self.normals[:, i]) for i in range(3)], 1)
-        return torch.from_numpy(center.astype(np.float32)), torch.from_numpy(moment.astype(np.float32))
+    def _winding(self, dipoles: DipoleField, x: Float32) -> NDArray[np.float64]:
+        def watch(pairs: int) -> None:
+            self.watch(windings(pairs, 1))
+
+        starts = range(0, max(len(x), 1), PLACES)
+        return np.concatenate([dipoles.winding(x[start : start + PLACES], watch=watch) for start in starts])
+
+    def _softened(self, soft: float) -> DipoleField:
+        """The points as dipoles, softened by so many standard deviations of the noise, or `SOFT` of their discs."""
+        softening = np.maximum(SOFT * self.radii, soft * self.noise)
+        return DipoleField(self.points, self.normals * self.areas[:, None], softening)
+
+    def _areas(self) -> Float32:
+        """The area that each point has to itself ``(N,)``: the disc out to neighbours whose normals face its own way.
+
+        Those of the far side of a thin part do not share it: with them a bar would have half of its surface, and
+        winding numbers of one half inside. Where most of those beside a point face the other way, its own normal is
+        wrong, and all of them share the disc.
+        """
+        count, asked = (min(number, len(self.points) - 1) for number in (SHARING, ASKED))
+        found = self.tree.query(self.points, k=asked + 1, workers=-1)
+        reach, near = np.asarray(found[0])[:, 1:], np.asarray(found[1])[:, 1:]
+        cosine = np.einsum("nd,nkd->nk", self.normals, self.normals[near])
+        alike = (cosine > 0).cumsum(axis=1)
+        last = (alike < count).sum(axis=1).clip(max=asked - 1)
+        sharing = alike[:, -1].clip(1, count)
+        height = np.einsum("nd,nkd->nk", self.normals, self.points[near] - self.points[:, None])
+        beside = np.abs(height) < BESIDE_ANOTHER * reach
+        odd = (beside & (cosine < 0)).sum(axis=1) > ODD * (beside & (cosine > 0)).sum(axis=1)
+        last, sharing = np.where(odd, count - 1, last), np.where(odd, count, sharing)
+        areas = math.pi * reach[np.arange(len(reach)), last] ** 2 / sharing
+        # A few points on their own have nobody near, but no surface of that size either.
+        return np.minimum(areas, LARGEST_AREA * np.median(areas)).astype(np.float32)
 
 
 def _starts(count: int) -> range:

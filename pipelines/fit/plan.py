@@ -15,8 +15,8 @@ from .unoriented import BATCH, SAMPLES, STAGES, STEPS
 
 __all__ = ["FEWEST_SAMPLES", "FEWEST_STEPS", "FitPlan", "Share"]
 
-# Cells of 0.05 that the surface of a shape in the unit sphere goes through: dipoles of the winding number.
-DIPOLES = 4000
+# Dipoles that a winding number is the sum of: a leaf of the cloud each, and the single points of those near by.
+DIPOLES = 3000
 # Queries of a residual level are near the surface, where a few points are looked at; so many of a far one, per sample.
 NEAR = 0.25
 IN_BAND = 0.5  # of the points at which a level is asked, those that the next one is
@@ -63,8 +63,7 @@ class FitPlan:
         backward = 2  # times the work of a value
         points = (1 + backward) * values(STEPS * BATCH, self.nets[:1])
         seconds = self.speed.networks(points, steps=STEPS)
-        # Of cells half as wide there are four times as many on a surface.
-        places = self.speed.points(queries(SAMPLES, self.points) + windings(SAMPLES, 4 * DIPOLES))
+        places = self.speed.points(queries(SAMPLES, self.points) + windings(SAMPLES, DIPOLES))
         first, second = STAGES
         return [Stage(first, "steps", places + seconds), Stage(second, "steps", seconds)]
 
@@ -91,7 +90,7 @@ class FitPlan:
         filled = max(self.points, count) if self.config.between else self.points  # of a sparse cloud, at most
         if level:
             return self.speed.points(queries(NEAR * count, filled)) + self.looking_seconds(level, filled + 3 * count)
-        points = queries(count, filled) + windings(count / 2, DIPOLES)
+        points = queries(count, filled) + windings(count, DIPOLES)
         return self.speed.points(points + self._index(filled))
 
     def index_seconds(self, samples: int) -> float:

@@ -56,12 +56,15 @@ STRAY = 4.0
 TAIL = 20.0
 # How far a winding number must be from one half to say in or out: it is off by less than 0.05 where it is asked.
 SURE = 0.4
-# The same where normals were estimated from noisy points, which are wrong at thin parts: in the arches of a tower, far
+# The same where normals were estimated from the points, which are wrong at thin parts: in the arches of a tower, far
 # from its bars, the number is 0.11 to 0.32. In the holes of scans of solid parts it is nearer to one half.
 SURE_GUESSED = 0.3
-# Normals estimated from noisy points are wrong by tens of degrees where parts are as thin as the noise, and there no
-# field of slope 1 is near the points either. Weights of both terms, in units of those of the settings.
+# Normals estimated from the points are wrong by tens of degrees where parts are as thin as a neighbourhood, or as the
+# noise, and there no field of slope 1 is near the points either. Weights of both terms, in units of the settings'.
 GUESSED_NORMAL, GUESSED_SLOPE = 0.1, 0.2
+# Dipoles of such normals are softened by so many standard deviations of the noise where levels ask for signs: what is
+# left of it moves the sides of a thin part into each other. It is as wide as those that gave the normals their signs.
+SOFT_GUESSED = 2.0
 # Of noise without normals, smoothing leaves this much: 0.3 to 0.7 of it in the root mean square on six shapes with 0.5
 # and 1 %, 0.4 in the median. Distances are that good.
 LEFT = 0.4
@@ -401,7 +404,7 @@ def remote_samples(
         distance = cloud.nearest(points)
         # Between its points a surface is about a spacing away from them.
         far = np.flatnonzero(distance - samples.value.abs().cpu().numpy() > max(delta, 4 * cloud.gap))
-        depth = cloud.winding_number(points[far], cell=cloud.cell / 2) - 0.5
+        depth = cloud.winding_number(points[far]) - 0.5
         sure = np.abs(depth) > (SURE_GUESSED if cloud.guessed else SURE)
         empty, unseen = (samples.take(torch.from_numpy(far[some]).to(device)) for some in (sure, ~sure))
         length = np.minimum(distance[far[sure]], 2 * delta)
@@ -478,7 +481,7 @@ def near_samples(cloud: CloudDistance, delta: float, count: int, *, generator: t
     Their signs are those of winding numbers, which weigh all normals against each other; nothing is known of gradients.
     """
     points = band_samples(cloud, delta / 2, count, generator=generator).points
-    return Samples(points, distance=cloud.signed(points))
+    return Samples(points, distance=cloud.signed(points, soft=SOFT_GUESSED))
 
 
 def band_samples(cloud: CloudDistance, delta: float, count: int, *, generator: torch.Generator) -> Samples:

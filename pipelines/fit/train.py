@@ -306,7 +306,7 @@ class _Fitting:
         delta = None if band is None else band.delta
         index = self.indexed(level)
         gain = SMALL_GAIN if index.filled and config.robust_normals else RESIDUAL_GAIN
-        noisy = self.cloud.guessed and not index.filled
+        noisy = self.cloud.estimated and not index.filled
         omega = calm_omega(config, level, self.cloud.noise if noisy else 0.0)
         siren = new_level(config, level, residual=level > 0, gain=gain, omega=omega).to(self.device)
         work.indexed()
@@ -383,7 +383,7 @@ class _Fitting:
         Nobody judges level 0, so it learns from all of them: a voxel may be all that there is of a small face.
         """
         config, all_points = self.config, self.points.numpy()
-        noise, guessed = self.cloud.noise, self.cloud.guessed
+        noise, guessed = self.cloud.noise, self.cloud.estimated
         self.spacing = spacing_of(all_points.astype(np.float64))
         share = config.hold_out if level else 0.0
         self.held = torch.from_numpy(held_out(all_points, self.spacing, share, seed=config.seed))

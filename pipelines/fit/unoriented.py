@@ -33,7 +33,7 @@ from ...datasets.clouds.noise import noise_deviation
 from ...datasets.clouds.orientation import mean_agreement, settle_signs
 from ...datasets.clouds.point_cloud import spread
 from ...datasets.clouds.reestimate import denoise
-from ...datasets.clouds.winding import misfit
+from ...datasets.clouds.winding import MUCH_LESS, misfit
 from ...neural_fields import Siren
 from ...neural_fields.devices import upload
 from ..run.settings import FitConfig
@@ -51,6 +51,7 @@ CLEAR = 0.1  # mean slope of the field into a region, from which on that has a s
 FAINT = 0.15  # mean slope at the points, below which it says nothing: that of an open sheet
 CONTRADICTED = 0.01  # share of the places
 ASKED = 16_000  # points at which winding numbers are looked at
+FAR = 0.05  # from the points, where wrong signs of a few of them no longer decide a winding number
 STAGE = "level 0: signs"
 STAGES = tuple(f"{STAGE} ({number} of 2)" for number in (1, 2))  # one for each witness
 
@@ -100,8 +101,8 @@ class Places(NamedTuple):
         points = spread_points(index, SAMPLES, torch.Generator().manual_seed(seed))
         distance = torch.from_numpy(index.nearest(points.numpy())).float().clamp(min=1e-6)
         region = torch.from_numpy(Exterior(index.points.astype(np.float64)).regions(points.double().numpy()))
-        depth = torch.from_numpy(index.winding_number(points.numpy(), cell=index.cell / 2)).float() - 0.5
-        sure = (depth.abs() > SURE) & (distance > index.cell)
+        depth = torch.from_numpy(index.winding_number(points.numpy())).float() - 0.5
+        sure = (depth.abs() > SURE) & (distance > FAR)
         return cls(points, distance, region, torch.where(sure, -depth.sign(), 0.0))
 
     @property
@@ -159,9 +160,10 @@ def give_signs(
 
 
 def fits_better(cloud: OrientedCloud, signs: Signs) -> bool:
-    """Whether these signs fit the cloud better than those that it has, by neighbours or by winding numbers.
+    """Whether these signs fit the cloud better than those that it has, by neighbours or, much better, by winding numbers.
 
-    See `mean_agreement` and `misfit`. Where both are worse, signs have been spoilt.
+    See `mean_agreement` and `misfit`. Where neighbours agree less and the misfit is not less by far, signs have been
+    spoilt: of bars as thin as a spacing, a misfit wide enough to average hardly knows.
 
     Args:
         cloud: as it was prepared.
@@ -172,7 +174,8 @@ def fits_better(cloud: OrientedCloud, signs: Signs) -> bool:
     if mean_agreement(points, after) > mean_agreement(points, before):
         return True
     some, soft = spread(points, ASKED), 2 * cloud.noise
-    return misfit(points[some], after[some], softening=soft) < misfit(points[some], before[some], softening=soft)
+    less = MUCH_LESS * misfit(points[some], before[some], softening=soft)
+    return misfit(points[some], after[some], softening=soft) < less
 
 
 def signed(cloud: OrientedCloud, signs: Signs, *, smooth: bool) -> OrientedCloud:

@@ -62,7 +62,7 @@ class Base:
     def index(self) -> CloudDistance:
         """Distances to the cloud."""
         points, normals = torch.from_numpy(self.cloud.points), torch.from_numpy(self.cloud.normals)
-        return CloudDistance(points, normals, noise=self.cloud.noise, guessed=self.cloud.guessed)
+        return CloudDistance(points, normals, noise=self.cloud.noise, guessed=self.cloud.estimated)
 
 
 def base_cell(cell: PaperCell, overrides: tuple[tuple[str, Any], ...] = ()) -> PaperCell:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 from bounds import unit_roundoff
-from mplicits.datasets.clouds.dipoles import LEAF, DipoleSums
+from mplicits.datasets.clouds.dipoles import LEAF, MOST_LEAVES, DipoleField, DipoleSums
 
 SOFTENING = 0.05
 # A leaf of 48 points seen as one dipole from beyond its near leaves; see `mplicits.datasets.clouds.dipoles.NEAR`.
@@ -82,3 +82,51 @@ def test_leaf_means_count_no_point_twice():
     means = sums.leaf_means(torch.ones(1000))
     assert len(means) == 32
     assert torch.equal(means, torch.ones(32))
+
+
+@pytest.mark.parametrize(("count", "relative"), [(1, FAR), (LEAF, 0.0), (3000, FAR)])
+def test_a_field_of_dipoles_is_the_sum_over_all_of_them(count, relative):
+    points, dipoles = sphere(count)
+    places = np.random.default_rng(1).uniform(-1, 1, (2000, 3))
+    softening = np.random.default_rng(2).uniform(SOFTENING, 2 * SOFTENING, count)
+    offset = points[None] - places[:, None]
+    squares = (offset**2).sum(axis=2) + softening**2
+    exact = (np.einsum("ijd,jd->ij", offset, dipoles) * squares**-1.5).sum(axis=1) / (4 * np.pi)
+    found = DipoleField(points, dipoles, softening).winding(places)
+    rounding = 16 * unit_roundoff(torch.float32) / SOFTENING**2
+    # A sum over all is of order 1; a single dipole is as large as its area over the square of its softening.
+    assert np.abs(found - exact).max() < (relative + rounding) * max(1.0, np.abs(exact).max())
+
+
+def test_winding_numbers_are_whole_close_to_the_sides_of_a_plate():
+    """A plate a tenth as thick as a leaf is wide: its sides, merged by leaves, would cancel."""
+    side = np.linspace(-0.5, 0.5, 60)
+    x, y = (axis.ravel() for axis in np.meshgrid(side, side))
+    top = np.stack((x, y, np.full_like(x, 0.01)), axis=1)
+    points = np.concatenate((top, top * (1, 1, -1)))
+    normals = np.zeros_like(points)
+    normals[:, 2] = np.sign(points[:, 2])
+    spacing, softening = side[1] - side[0], 0.003
+    field = DipoleField(points, spacing**2 * normals, np.full(len(points), softening))
+    # Of an infinite plate the number is 1 halfway through and 0 above it. What the rim leaves out is its solid angle;
+    # dipoles on a square lattice waver by 4 e^(−2πz/h) of their own at the height z, and softened ones see less.
+    rim, waver, soft = 2 * 0.01 / 0.3, 4 * np.exp(-2 * np.pi * 0.01 / spacing), 1 - 0.01 / np.hypot(0.01, softening)
+    inner = np.random.default_rng(0).uniform(-0.2, 0.2, (500, 2))
+    halfway, above = (np.column_stack((inner, np.full(500, z))) for z in (0.0, 0.03))
+    assert rim + waver + soft + FAR < 0.3  # of 0.5, at which a side is taken for the other
+    assert (np.abs(field.winding(halfway) - 1) < rim + waver + soft + FAR).all()
+    assert (np.abs(field.winding(above)) < rim + waver + soft + FAR).all()
+
+
+def test_no_place_has_no_winding_number_and_pairs_are_counted():
+    field = DipoleField(*sphere(200), np.full(200, SOFTENING))
+    assert field.winding(np.empty((0, 3))).shape == (0,)
+    pairs: list[int] = []
+    field.winding(np.zeros((7, 3)), watch=pairs.append)
+    assert sum(pairs) >= 7 * 200 / LEAF  # each place asks for every dipole, or for its leaf
+
+
+def test_leaves_of_a_large_cloud_are_no_more_than_so_many():
+    points, dipoles = sphere(2 * LEAF * MOST_LEAVES)
+    found = DipoleField(points, dipoles, np.full(len(points), SOFTENING)).winding(np.array([[0.0, 0, 0], [0, 0, 0.95]]))
+    assert np.abs(found - (1, 0)).max() < FAR
