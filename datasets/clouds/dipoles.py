@@ -169,8 +169,8 @@ class DipoleField:
         >>> sphere = sample_sphere(2000)  # of radius 0.5
         >>> area = np.pi / 2000
         >>> field = DipoleField(sphere.points, area * sphere.normals, np.full(2000, 0.01))
-        >>> field.winding(np.array([[0.0, 0.0, 0.0], [0.9, 0.0, 0.0]])).round(2).tolist()
-        [1.0, 0.0]
+        >>> (field.winding(np.array([[0.0, 0.0, 0.0], [0.9, 0.0, 0.0]])) > 0.5).tolist()
+        [True, False]
     """
 
     def __init__(

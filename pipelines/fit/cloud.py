@@ -53,6 +53,8 @@ BESIDE_ANOTHER, ODD = 0.25, 2.0
 # more: close to the surface, between two of them, the winding number would waver. Of wider ones the sides of a thin bar
 # cancel.
 SOFT = 0.3
+# Sides of a square bar: of all neighbours of a point on it at least one in so many is on its own side.
+SIDES = 4.0
 # Nearer to the discs than this many spacings, sides of discs are right more often than winding numbers.
 BESIDE = 0.25
 
@@ -249,6 +251,8 @@ class CloudDistance:
         odd = (beside & (cosine < 0)).sum(axis=1) > ODD * (beside & (cosine > 0)).sum(axis=1)
         last, sharing = np.where(odd, count - 1, last), np.where(odd, count, sharing)
         areas = math.pi * reach[np.arange(len(reach)), last] ** 2 / sharing
+        # A normal that hardly any neighbour shares is more likely wrong than its point is alone.
+        areas = np.minimum(areas, SIDES * math.pi * reach[:, count - 1] ** 2 / count)
         # A few points on their own have nobody near, but no surface of that size either.
         return np.minimum(areas, LARGEST_AREA * np.median(areas)).astype(np.float32)
 

@@ -160,7 +160,7 @@ def give_signs(
 
 
 def fits_better(cloud: OrientedCloud, signs: Signs) -> bool:
-    """Whether these signs fit the cloud better than those that it has, by neighbours or, much better, by winding numbers.
+    """Whether these signs fit the cloud better than its own, by neighbours or, by far, by winding numbers.
 
     See `mean_agreement` and `misfit`. Where neighbours agree less and the misfit is not less by far, signs have been
     spoilt: of bars as thin as a spacing, a misfit wide enough to average hardly knows.
