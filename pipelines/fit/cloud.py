@@ -57,6 +57,9 @@ SOFT = 0.3
 SIDES = 4.0
 # Nearer to the discs than this many spacings, sides of discs are right more often than winding numbers.
 BESIDE = 0.25
+# So near to one half a winding number says little: in the holes of scans. Up to this far from their rims the discs
+# there, which go on where the surface ends, say more.
+DOUBT, RIM = 0.25, 0.1
 
 
 def load_cloud(
@@ -200,11 +203,16 @@ class CloudDistance:
         discs = np.hypot(along, np.maximum(across - self.radii[index], 0))
         magnitude = discs.min(axis=1)
         # Each disc votes with its side, the nearer and the more face-on the louder.
-        side = np.sum(along / (distance**3 + 1e-12), axis=1)
+        disc = np.sum(along / (distance**3 + 1e-12), axis=1)
+        side = disc.copy()
         some = magnitude > BESIDE * self.spacing
-        if self.guessed and self.noise:  # sides of discs are chance where normals follow noise
+        chance = self.guessed and self.noise > 0  # what sides of discs are where normals follow noise
+        if chance:
             some[:] = True
         side[some] = 0.5 - self._winding(self._dipoles if soft == SOFT else self._softened(soft), query[some])
+        doubtful = (np.abs(side) < DOUBT) & (distance[:, 0] < RIM)
+        if not chance:  # where the disc's side has been taken already, this changes nothing
+            side[doubtful] = disc[doubtful]
         return torch.from_numpy(np.where(side < 0, -magnitude, magnitude).astype(np.float32))
 
     def _query(self, x: NDArray[np.floating], k: int) -> tuple[NDArray[np.float64], NDArray[np.integer]]:
