@@ -203,16 +203,15 @@ class CloudDistance:
         discs = np.hypot(along, np.maximum(across - self.radii[index], 0))
         magnitude = discs.min(axis=1)
         # Each disc votes with its side, the nearer and the more face-on the louder.
-        disc = np.sum(along / (distance**3 + 1e-12), axis=1)
-        side = disc.copy()
-        some = magnitude > BESIDE * self.spacing
-        chance = self.guessed and self.noise > 0  # what sides of discs are where normals follow noise
-        if chance:
-            some[:] = True
-        side[some] = 0.5 - self._winding(self._dipoles if soft == SOFT else self._softened(soft), query[some])
-        doubtful = (np.abs(side) < DOUBT) & (distance[:, 0] < RIM)
-        if not chance:  # where the disc's side has been taken already, this changes nothing
-            side[doubtful] = disc[doubtful]
+        side = np.sum(along / (distance**3 + 1e-12), axis=1)
+        dipoles = self._dipoles if soft == SOFT else self._softened(soft)
+        if self.guessed and self.noise:  # sides of discs are chance where normals follow noise
+            side = 0.5 - self._winding(dipoles, query)
+        else:
+            asked = np.flatnonzero(magnitude > BESIDE * self.spacing)
+            number = 0.5 - self._winding(dipoles, query[asked])
+            sure = (np.abs(number) >= DOUBT) | (distance[asked, 0] >= RIM)
+            side[asked[sure]] = number[sure]
         return torch.from_numpy(np.where(side < 0, -magnitude, magnitude).astype(np.float32))
 
     def _query(self, x: NDArray[np.floating], k: int) -> tuple[NDArray[np.float64], NDArray[np.integer]]:
