@@ -159,9 +159,13 @@ class Client:
         if self._gone.is_set() or not self._controls.is_traced:
             return
         self._last = frame
-        self._send(frame)
-        self._say_size()
-        self._controls.play_on()
+        try:
+            self._send(frame)
+            self._say_size()
+            self._controls.play_on()
+        except Exception:  # what is on its way to a browser that has just left cannot be sent, and is no failure
+            if self.connection is None or not self.connection.has_left:
+                raise
 
     def fail(self, error: Exception) -> None:
         """Say that an image could not be drawn; called by the scheduler."""

@@ -194,11 +194,17 @@ def _guarded_connection() -> Any:
     """A connection of websockets that hands on only what fits."""
     import msgspec
     from websockets.asyncio.server import ServerConnection
+    from websockets.protocol import State
 
     class Guarded(ServerConnection):
         def __init__(self, *arguments: Any, **options: Any) -> None:
             super().__init__(*arguments, **options)
             self._meter, self._clicks = Meter(RATE, BURST), Meter(CLICK_RATE, CLICK_BURST)
+
+        @property
+        def has_left(self) -> bool:
+            """Whether the browser has gone, or is being cut off; viser hears of it a little later."""
+            return self.state is not State.OPEN
 
         @contextmanager
         def awaiting_picture(self) -> Iterator[None]:

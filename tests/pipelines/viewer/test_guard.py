@@ -3,13 +3,14 @@
 import asyncio
 import contextlib
 import random
+import threading
 import time
 import urllib.error
 import urllib.request
 
 import pytest
 from mplicits.neural_fields import Siren
-from mplicits.pipelines.viewer.client import OneAtATime
+from mplicits.pipelines.viewer.client import Client, OneAtATime
 from mplicits.pipelines.viewer.guard import BURST, LARGEST, Meter, fits
 
 pytest.importorskip("viser")
@@ -161,6 +162,33 @@ def test_the_hostile_are_disconnected_and_the_others_served(viewer, capfd):
         assert time.monotonic() < deadline, "waited in vain"
         time.sleep(0.02)
     assert capfd.readouterr().err == ""
+
+
+def test_an_image_on_its_way_to_a_browser_that_has_just_left_is_no_failure(viewer, monkeypatch):
+    """viser refuses what is sent to a closed connection some time before it says that the browser has left."""
+
+    def refuse(_frame) -> None:
+        raise UserWarning("never delivered")
+
+    async def come_and_go() -> Client:
+        async with connect(viewer.url.replace("http", "ws"), subprotocols=PROTOCOL, max_size=None) as socket:
+            await socket.send(hello())
+            async with asyncio.timeout(20):
+                while not (clients := list(viewer._clients.values())) or clients[0]._last is None:
+                    await asyncio.sleep(0.02)
+            (client,) = clients
+            monkeypatch.setattr(client, "_send", refuse)
+            with pytest.raises(UserWarning, match="never delivered"):  # while it is there, an error is one
+                client.show(client._last)
+        return client
+
+    client = asyncio.run(come_and_go())
+    deadline = time.monotonic() + 20
+    while viewer.num_clients:
+        assert time.monotonic() < deadline, "waited in vain"
+        time.sleep(0.02)
+    monkeypatch.setattr(client, "_gone", threading.Event())  # as before it was said
+    client.show(client._last)
 
 
 def unpacked(raw: bytes | str) -> bytes:
