@@ -3,8 +3,9 @@
 No mesh is needed for these. Magnitude: each point stands for a disc in its tangent plane, as wide as its neighbourhood
 is spaced; the distance to the nearest of a few discs has neither the bias of the distance to the nearest point
 (√(d² + h²) instead of d) nor the reach of an infinite tangent plane. Sign: by the generalised winding number of the
-cloud, which closes the holes that scans have, and weighs all normals against each other where some are wrong; within a
-fourth of a spacing of the discs, where a sum over single points says little, by the side of the nearest ones.
+cloud, which closes the holes that scans have, and weighs all normals against each other where some are wrong. Within a
+fourth of a spacing of the discs, where a sum over single points says little, and beside the rims of holes, where it is
+in doubt, the side of the nearest discs says more; but not where normals were estimated from noise.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import json
 import math
 import zipfile
 from collections.abc import Callable
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -176,7 +178,6 @@ class CloudDistance:
         self.spacing = float(np.median(np.sqrt(self.areas)))
         self.given, self.repaired = len(points) if given is None else given, repaired
         self.gap = self.spacing if gap is None else gap
-        self._dipoles = self._softened(SOFT)
 
     @property
     def filled(self) -> bool:
@@ -202,12 +203,12 @@ class CloudDistance:
         across = np.sqrt(np.maximum(distance**2 - along**2, 0))
         discs = np.hypot(along, np.maximum(across - self.radii[index], 0))
         magnitude = discs.min(axis=1)
-        # Each disc votes with its side, the nearer and the more face-on the louder.
-        side = np.sum(along / (distance**3 + 1e-12), axis=1)
         dipoles = self._dipoles if soft == SOFT else self._softened(soft)
         if self.guessed and self.noise:  # sides of discs are chance where normals follow noise
             side = 0.5 - self._winding(dipoles, query)
         else:
+            # Each disc votes with its side, the nearer and the more face-on the louder.
+            side = np.sum(along / (distance**3 + 1e-12), axis=1)
             asked = np.flatnonzero(magnitude > BESIDE * self.spacing)
             number = 0.5 - self._winding(dipoles, query[asked])
             sure = (np.abs(number) >= DOUBT) | (distance[asked, 0] >= RIM)
@@ -233,6 +234,10 @@ class CloudDistance:
 
         starts = range(0, max(len(x), 1), PLACES)
         return np.concatenate([dipoles.winding(x[start : start + PLACES], watch=watch) for start in starts])
+
+    @cached_property
+    def _dipoles(self) -> DipoleField:
+        return self._softened(SOFT)
 
     def _softened(self, soft: float) -> DipoleField:
         """The points as dipoles, softened by so many standard deviations of the noise, or `SOFT` of their discs."""
