@@ -62,6 +62,7 @@ BESIDE = 0.25
 # So near to one half a winding number says little: in the holes of scans. Up to this far from their rims the discs
 # there, which go on where the surface ends, say more.
 DOUBT, RIM = 0.25, 0.1
+CHANCE = 3.0  # standard deviations of the noise
 
 
 def load_cloud(
@@ -204,15 +205,14 @@ class CloudDistance:
         discs = np.hypot(along, np.maximum(across - self.radii[index], 0))
         magnitude = discs.min(axis=1)
         dipoles = self._dipoles if soft == SOFT else self._softened(soft)
-        if self.guessed and self.noise:  # sides of discs are chance where normals follow noise
-            side = 0.5 - self._winding(dipoles, query)
-        else:
-            # Each disc votes with its side, the nearer and the more face-on the louder.
-            side = np.sum(along / (distance**3 + 1e-12), axis=1)
-            asked = np.flatnonzero(magnitude > BESIDE * self.spacing)
-            number = 0.5 - self._winding(dipoles, query[asked])
-            sure = (np.abs(number) >= DOUBT) | (distance[asked, 0] >= RIM)
-            side[asked[sure]] = number[sure]
+        # Each disc votes with its side, the nearer and the more face-on the louder.
+        side = np.sum(along / (distance**3 + 1e-12), axis=1)
+        # Where normals follow noise, sides of discs as near as that are chance.
+        chance = distance[:, 0] < (CHANCE * self.noise if self.guessed else 0.0)
+        asked = np.flatnonzero(chance | (magnitude > BESIDE * self.spacing))
+        number = 0.5 - self._winding(dipoles, query[asked])
+        sure = chance[asked] | (np.abs(number) >= DOUBT) | (distance[asked, 0] >= RIM)
+        side[asked[sure]] = number[sure]
         return torch.from_numpy(np.where(side < 0, -magnitude, magnitude).astype(np.float32))
 
     def _query(self, x: NDArray[np.floating], k: int) -> tuple[NDArray[np.float64], NDArray[np.integer]]:
