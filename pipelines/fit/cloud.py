@@ -5,7 +5,7 @@ is spaced; the distance to the nearest of a few discs has neither the bias of th
 (√(d² + h²) instead of d) nor the reach of an infinite tangent plane. Sign: by the generalised winding number of the
 cloud, which closes the holes that scans have, and weighs all normals against each other where some are wrong. Within a
 fourth of a spacing of the discs, where a sum over single points says little, and beside the rims of holes, where it is
-in doubt, the side of the nearest discs says more; but not where normals were estimated from noise.
+in doubt and the nearest discs agree, their side says more; but not where normals were estimated from noise.
 """
 
 from __future__ import annotations
@@ -60,8 +60,9 @@ SIDES = 4.0
 # Nearer to the discs than this many spacings, sides of discs are right more often than winding numbers.
 BESIDE = 0.25
 # So near to one half a winding number says little: in the holes of scans. Up to this far from their rims the discs
-# there, which go on where the surface ends, say more.
-DOUBT, RIM = 0.25, 0.1
+# there, which go on where the surface ends, say more; if a place is on one side of all, by this sine or more. Elsewhere
+# winding numbers are in doubt too, beside bars and in the folds of coarse meshes, and discs say nothing there.
+DOUBT, RIM, FACE_ON = 0.25, 0.1, 0.2
 CHANCE = 3.0  # standard deviations of the noise
 
 
@@ -211,7 +212,9 @@ class CloudDistance:
         chance = distance[:, 0] < (CHANCE * self.noise if self.guessed else 0.0)
         asked = np.flatnonzero(chance | (magnitude > BESIDE * self.spacing))
         number = 0.5 - self._winding(dipoles, query[asked])
-        sure = chance[asked] | (np.abs(number) >= DOUBT) | (distance[asked, 0] >= RIM)
+        sine = along[asked] / np.maximum(distance[asked], 1e-12)
+        one_side = np.maximum(sine.min(axis=1), -sine.max(axis=1)) >= FACE_ON
+        sure = chance[asked] | (np.abs(number) >= DOUBT) | (distance[asked, 0] >= RIM) | ~one_side
         side[asked[sure]] = number[sure]
         return torch.from_numpy(np.where(side < 0, -magnitude, magnitude).astype(np.float32))
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 from mplicits.neural_fields import MultiscaleSDF, Siren, Sphere, Torus, Union
-from mplicits.pipelines.fit.cloud import CloudDistance
+from mplicits.pipelines.fit.cloud import DOUBT, CloudDistance
 from mplicits.pipelines.fit.samples import (
     LEAST,
     LEFT,
@@ -78,6 +78,24 @@ def test_winding_number_tells_inside_from_outside_through_a_hole() -> None:
     assert (winding[[0, 1, 4]] > 0.5).all()
     assert (winding[[2, 3]] < 0.5).all()
     assert torch.equal(cloud.signed(x) < 0, torch.tensor([True, True, False, False, True]))
+
+
+def test_beside_the_rim_of_a_hole_discs_that_agree_go_on_where_the_surface_ends() -> None:
+    """A bowl: in its opening winding numbers are one half, whatever is beside the rim."""
+    points, normals = sphere_points(40_000)
+    below = points[:, 2] < 0
+    bowl = CloudDistance(points[below], normals[below])
+    beside = torch.tensor([[0.95, 0.0, 0.03], [0.0, 0.95, 0.03], [-0.92, 0.0, 0.05]]) * RADIUS  # within the sphere
+    winding = bowl.winding_number(beside.numpy())
+    assert (winding < 0.5).all()
+    assert (winding > 0.5 - DOUBT).all()
+    assert (bowl.signed(beside) < 0).all()
+    # Beyond the rim's reach, and where its discs are seen edge-on, nothing is better than winding numbers.
+    remote = torch.tensor([[0.1, 0.0, 0.05], [0.0, 0.5, -0.05]]) * RADIUS
+    turn = torch.linspace(0, 2 * np.pi, 50)
+    edge_on = RADIUS * torch.stack((0.99 * turn.cos(), 0.99 * turn.sin(), 0.08 + 0 * turn), dim=1)
+    for places in (remote, edge_on):
+        assert torch.equal(bowl.signed(places) < 0, torch.from_numpy(bowl.winding_number(places.numpy())) > 0.5)
 
 
 def test_delta_is_equation_5() -> None:
