@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 
 from ..run.config import given_flags, input_error
-from .common import Command, add_flags, check_output, whole
+from .common import Command, add_flags, check_output, training, whole
 
 __all__ = ["WEB"]
 
@@ -22,6 +22,8 @@ def _web_arguments(parser: argparse.ArgumentParser) -> None:
     add_flags(parser, "--out", help=f"{', '.join(PAGES)}, or a folder: field, module and page")
     add("--levels", type=whole(1), metavar="N", help="only the N coarsest levels (default: all)")
     add("--no-colors", dest="colors", action="store_false", help="leave out the colours of the run's texture")
+    what = "leave out how they change with the direction of view, which a reconstruction's do (takes up to a minute)"
+    add("--no-highlights", dest="highlights", action="store_false", help=what)
     add("--float32", action="store_true", help="keep the weights as they are (default: 13 bits each)")
     add_flags(parser, "--up")
     add("--title", metavar="TEXT", help="of the page (default: the name of the run)")
@@ -53,9 +55,12 @@ def _web(arguments: argparse.Namespace) -> int:
     from ..web.export import WebOptions, web_run
 
     started = time.monotonic()
-    done = web_run(arguments.run, out, WebOptions(**given_flags(arguments, WebOptions)), say=print)
+    with training("nothing was written", at_any_time=True) as progress:
+        options = WebOptions(**given_flags(arguments, WebOptions))
+        done = web_run(arguments.run, out, options, say=print, progress=progress)
     levels = f"{done.levels} level{'s' if done.levels > 1 else ''}"
-    levels += " with colours" if done.colored else ""
+    by_direction = done.highlights is not None and done.highlights.worth_it
+    levels += f" with colours{' by direction' * by_direction}" if done.colored else ""
     seconds = time.monotonic() - started
     print(f"{out}: {done.size / 1024:,.0f} KiB, {levels}, {done.triangles:,} triangles around them, in {seconds:.1f} s")
     return 0

@@ -222,9 +222,9 @@ class _Reconstruction:
         if texture is not None:
             self.folder.keep(TEXTURE_FILE, texture_bytes(texture, metadata={"texture": record["texture"]}))
         about = {name: getattr(self.config, name) for name in ("uniform", "importance", "march_grid")}
-        self.folder.keep(
-            RADIANCE_FILE, radiance_bytes(self.model.radiance(), self.model.geometry, metadata={"sampling": about})
-        )
+        eyes = [camera.eye.double().numpy().round(5).tolist() for camera, _ in views]
+        metadata = {"sampling": about, "eyes": eyes}
+        self.folder.keep(RADIANCE_FILE, radiance_bytes(self.model.radiance(), self.model.geometry, metadata=metadata))
         if pairs:
             self.folder.keep(HELD_OUT_FILE, picture_bytes(self._sheet(pairs[:SHEET_VIEWS])))
         record = self.folder.finish(self.model.geometry, self.images.similarity, record, gone=(PREVIEW_FILE,))

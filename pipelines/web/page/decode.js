@@ -68,6 +68,9 @@ function numbersOf(bytes, kind, count, start) {
   return numbers;
 }
 
+// The networks of a field, as they are counted: its levels, then its colours, then what these gain by direction.
+const networksOf = ({ levels, colors, highlights }) => [...levels, ...(colors ? [colors] : []), ...(highlights ? [highlights] : [])];
+
 // The layers of a network: weights row by row, out x in.
 function layersOf(arrays, { name, depth }) {
   const layers = [];

@@ -12,7 +12,7 @@ export interface Camera {
   height: number;
 }
 
-/** Evaluations of each network (the colours' last), passes of the adapter, and bytes read back. */
+/** Evaluations of each network (those of colours last), passes of the adapter, and bytes read back. */
 export interface Counts {
   values: number[];
   jets: number[];
@@ -37,6 +37,8 @@ export interface Wanted {
   normalLevel?: number;
   precision?: number | null;
   colored?: boolean;
+  /** Colours as they are seen from there, where the field has them. */
+  directed?: boolean;
 }
 
 /** One ray of the last picture. */

@@ -100,6 +100,7 @@ class Networks {
       triple: compile(gl, parts, 'plane', 'triple'),
     };
     this.nets = layersOfAll.map((layers) => this.upload(layers));
+    if (this.nets.some((net) => net.directed)) this.programs.directedSine = compile(gl, parts, 'plane', 'layer', ['FIRST', 'DIRECTED']);
     const quads = Math.max(...this.nets.map((net) => net.quads));
     const phases = Math.max(...this.nets.map((net) => net.depth));
     this.work = [activations(gl, quads), activations(gl, quads)];
@@ -114,15 +115,16 @@ class Networks {
     const { gl } = this;
     const width = layers[0].bias.length, padded = 4 * Math.ceil(width / 4), depth = layers.length - 1;
     const { weight: last, bias: lastBias } = layers[depth];
-    const net = { width, depth, quads: padded / 4, sines: [] };
+    // Of six inputs, the last three are a direction; such a network has no sweep back.
+    const net = { width, depth, quads: padded / 4, sines: [], directed: layers[0].weight.length === 6 * width };
     layers.slice(0, depth).forEach(({ weight, bias }, index) => {
-      const inputs = index ? width : 3;
+      const inputs = weight.length / width;
       const forward = (row, column) => (column < inputs ? weight[row * inputs + column] : 0);
       net.sines.push({
-        forward: matrixTexture(gl, width, index ? padded : 3, forward),
+        forward: matrixTexture(gl, width, index ? padded : inputs, forward),
         back: index
           ? matrixTexture(gl, width, padded, (row, column) => (column < width ? weight[column * width + row] : 0))
-          : rowsTexture(gl, 3, width, (row, column) => weight[3 * column + row]),
+          : rowsTexture(gl, inputs, width, (row, column) => weight[inputs * column + row]),
         bias: rowsTexture(gl, 1, width, (_, column) => bias[column]),
       });
     });
@@ -144,7 +146,7 @@ class Networks {
       gl.deleteTexture(held.texture);
       gl.deleteFramebuffer(held.buffer);
     }
-    gl.deleteTexture(this.points);
+    for (const texture of [this.points, this.ways]) gl.deleteTexture(texture);
   }
 
   // The moment, of a field that moves: b + t w, the weights of time folded into the first biases.
@@ -170,25 +172,28 @@ class Networks {
         gl.deleteFramebuffer(held.buffer);
       }
     }
-    if (this.points) gl.deleteTexture(this.points);
+    for (const texture of [this.points, this.ways]) if (texture) gl.deleteTexture(texture);
     this.rows = 4 * Math.ceil(rows / 4);
     this.points = texture2d(gl, ROW, this.rows);
+    this.ways = this.nets.some((net) => net.directed) ? texture2d(gl, ROW, this.rows) : null;
     this.values = target2d(gl, ROW, this.rows / 4);
     this.triples = target2d(gl, ROW, this.rows);
     this.staged = new Float32Array(4 * ROW * this.rows);
   }
 
-  // Points (x, y, z for each) as the shaders want them.
-  load(points, count) {
+  // Points (x, y, z for each) as the shaders want them, and directions.
+  load(points, count, ways = null) {
     const { gl } = this;
     const rows = Math.ceil(count / ROW);
     this.reserve(rows);
-    for (let i = 0; i < count; i++) {
-      for (let c = 0; c < 3; c++) this.staged[4 * i + c] = points[3 * i + c];
+    for (const [into, numbers] of [[this.points, points], ...(ways ? [[this.ways, ways]] : [])]) {
+      for (let i = 0; i < count; i++) {
+        for (let c = 0; c < 3; c++) this.staged[4 * i + c] = numbers[3 * i + c];
+      }
+      gl.activeTexture(gl.TEXTURE0);
+      gl.bindTexture(gl.TEXTURE_2D, into);
+      gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, ROW, rows, gl.RGBA, gl.FLOAT, this.staged.subarray(0, 4 * ROW * rows));
     }
-    gl.activeTexture(gl.TEXTURE0);
-    gl.bindTexture(gl.TEXTURE_2D, this.points);
-    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, ROW, rows, gl.RGBA, gl.FLOAT, this.staged.subarray(0, 4 * ROW * rows));
   }
 
   bind(place, unit, name, texture, kind) {
@@ -219,10 +224,11 @@ class Networks {
       const first = index === 0;
       const free = this.work.find((one) => one !== held);
       const into = keep ? this.phases[index] : free;
-      const program = this.programs[(first ? 'first' : '') + (keep ? (first ? 'Phase' : 'phase') : first ? 'Sine' : 'sine')];
+      const begun = net.directed ? 'directed' : 'first';
+      const program = this.programs[first ? `${begun}${keep ? 'Phase' : 'Sine'}` : keep ? 'phase' : 'sine'];
       this.pass(program, into.buffer, [0, 0, wide, net.quads], {
         arrays: first ? {} : { source: held.texture },
-        planes: { weights: layer.forward, bias: layer.bias, ...(first ? { points: this.points } : {}) },
+        planes: { weights: layer.forward, bias: layer.bias, ...(first ? { points: this.points } : {}), ...(first && net.directed ? { ways: this.ways } : {}) },
         whole: first ? { base } : { quads: net.quads },
       });
       if (keep) this.pass(this.programs.bend, free.buffer, [0, 0, wide, net.quads], { arrays: { phases: into.texture } });
@@ -284,11 +290,11 @@ class Networks {
     return this.read(this.values, count, 1);
   }
 
-  // Three outputs of a network, as r, g, b and 1.
-  color(index, points, count) {
+  // Three outputs of a network, as r, g, b and 1; of one of six inputs, directions as well.
+  color(index, points, count, ways = null) {
     if (!count) return new Float32Array(0);
     const net = this.nets[index];
-    this.load(points, count);
+    this.load(points, count, ways);
     this.each(count, (base, here, wide) => this.addTriples(net, this.sweep(net, base, wide, false), net.output, net.outputBias, base, here));
     this.counts.values[index] += count;
     return this.read(this.triples, count, 4);

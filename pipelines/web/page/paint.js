@@ -74,7 +74,7 @@ class Paint {
       gl.uniform1i(shade.at(name), unit);
     });
     gl.uniform1i(shade.at('ready'), this.ready);
-    gl.uniform1i(shade.at('shading'), shading);
+    gl.uniform1i(shade.at('shading'), Math.min(shading, 4)); // colours as they are seen have their light in them
     gl.uniform1i(shade.at('occluded'), occlusion);
     gl.uniform2f(shade.at('size'), camera.width, camera.height);
     gl.uniformMatrix3fv(shade.at('axes'), false, [...camera.right, ...camera.down, ...camera.forward]);

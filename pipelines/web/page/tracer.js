@@ -106,14 +106,15 @@ class Field {
 }
 
 // Display colours around a surface: those of a network at points in the band of a level, the others first moved onto the
-// surface by x - f g / |g|^2; what does not arrive there has the colour of what lies outside.
+// surface by x - f g / |g|^2; what does not arrive there has the colour of what lies outside. Where directions are
+// given, a second network says what colours gain by them.
 class Colors {
-  // `source` answers value(points, count, level), jet(…) and color(points, count), or promises to.
+  // `source` answers value(points, count, level), jet(…), color(points, count) and color(points, count, ways), or promises to.
   constructor(source, { level, delta, outside }) {
     Object.assign(this, { source, level, delta, outside });
   }
 
-  async at(points, count) {
+  async at(points, count, ways = null) {
     const { source, delta } = this;
     const moved = points.slice(0, 3 * count);
     const reached = (await source.value(moved, count, this.level)).map((f) => Number(Math.abs(f) < delta));
@@ -132,9 +133,13 @@ class Colors {
       });
     }
     const found = await source.color(moved, count);
+    const gained = ways && (await source.color(moved, count, ways));
     const colors = new Float32Array(3 * count);
     for (let i = 0; i < count; i++) {
-      for (let c = 0; c < 3; c++) colors[3 * i + c] = reached[i] ? Math.min(1, Math.max(0, found[4 * i + c])) : this.outside[c];
+      for (let c = 0; c < 3; c++) {
+        const own = found[4 * i + c] + (gained ? gained[4 * i + c] : 0);
+        colors[3 * i + c] = reached[i] ? Math.min(1, Math.max(0, own)) : this.outside[c];
+      }
     }
     return colors;
   }
@@ -218,13 +223,12 @@ class Hull {
 class Tracer {
   constructor(gl, parts, { header, arrays }) {
     this.header = header;
-    const saved = header.colors ? [...header.levels, header.colors] : header.levels;
-    this.networks = new Networks(gl, parts, saved.map((network) => layersOf(arrays, network)));
+    this.networks = new Networks(gl, parts, networksOf(header).map((network) => layersOf(arrays, network)));
     this.field = new Field(this.networks, header);
     this.colors = header.colors && new Colors({
       value: (...asked) => this.field.value(...asked),
       jet: (...asked) => this.field.jet(...asked),
-      color: (points, count) => this.networks.color(header.levels.length, points, count),
+      color: (points, count, ways) => this.networks.color(header.levels.length + Number(Boolean(ways)), points, count, ways),
     }, header.colors);
     this.hull = new Hull(gl, parts, arrays, header);
   }
@@ -261,9 +265,9 @@ class Tracer {
   }
 
   // What rows [first, first + rows) of a camera's picture see: normal and depth of each pixel, depth 0 for nothing; and
-  // where it is `colored`, the surface's own colours.
+  // where it is `colored`, the surface's own colours; `directed`, as they are seen from there.
   // Depths are known to a tenth of a pixel, or to `precision` in units of the field.
-  async trace(camera, { level, normalLevel = level, first = 0, rows = camera.height, precision = null, colored = false, clip = null }) {
+  async trace(camera, { level, normalLevel = level, first = 0, rows = camera.height, precision = null, colored = false, directed = false, clip = null }) {
     const { size, tolerance, resolution } = ruleOf(camera, this.header.radius, precision);
     const seen = new Float32Array(4 * camera.width * rows);
     const rays = this.begin(camera, first, rows, clip);
@@ -286,7 +290,8 @@ class Tracer {
       for (let c = 0; c < 3; c++) points[3 * i + c] = camera.eye[c] + depth * rays.direction[3 * ray + c];
     });
     if (colored) {
-      const colors = await this.colors.at(points, hits.length);
+      const ways = directed ? Float32Array.from([...hits].flatMap((ray) => [...rays.direction.subarray(3 * ray, 3 * ray + 3)])) : null;
+      const colors = await this.colors.at(points, hits.length, ways);
       hits.forEach((ray, i) => color.set(colors.subarray(3 * i, 3 * i + 3), 4 * rays.pixel[ray]));
     }
     return { seen, color };

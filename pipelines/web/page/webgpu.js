@@ -24,7 +24,7 @@ async function gpuDevice() {
 class GpuTracer {
   constructor(device, parts, { header, arrays }) {
     Object.assign(this, { device, parts, header });
-    const saved = header.colors ? [...header.levels, header.colors] : header.levels;
+    const saved = networksOf(header);
     this.nets = saved.map((network) => packNetwork(layersOf(arrays, network)));
     this.shell = shellArrays(header, arrays);
     this.counts = { values: saved.map(() => 0), jets: saved.map(() => 0), passes: 0, read: 0 };
@@ -35,8 +35,8 @@ class GpuTracer {
 
   // A tracer, or null where there is no adapter that can hold this field.
   static async open(parts, saved) {
-    const { levels, colors } = saved.header;
-    if (levels.length > MOST_LEVELS || [...levels, ...(colors ? [colors] : [])].some((net) => scratchOf(net) > MOST_SCRATCH)) return null;
+    const { header } = saved;
+    if (header.levels.length > MOST_LEVELS || networksOf(header).some((net) => scratchOf(net) > MOST_SCRATCH)) return null;
     const device = await gpuDevice();
     if (!device) return null;
     device.pushErrorScope('validation');
@@ -165,7 +165,7 @@ class GpuTracer {
     const slot = (buffer) => ({ buffer, size: 2 * KIND });
     const whole = (buffer) => ({ buffer });
     const levels = this.header.levels.length;
-    // The groups of level j's network; level 0's and the colours' read from `list` and its slots.
+    // The groups of network j; level 0's and those of colours read from `list` and its slots.
     const asked = (j, list, slots) => {
       const last = j >= levels - 1;
       const next = last ? [this.lists.at(-1), this.slots.finer[0]] : [this.lists[2 + j], this.slots.finer[j + 1]];
@@ -176,7 +176,7 @@ class GpuTracer {
       first: [asked(0, this.lists[0], even), asked(0, this.lists[1], odd)],
       finer: this.nets.map((_, j) => (j && j < levels ? asked(j, this.lists[1 + j], this.slots.finer[j]) : null)),
       host: asked(0, this.identity, this.slots.asked),
-      colors: this.nets.length > levels ? asked(levels, this.identity, this.slots.asked) : null,
+      colors: this.nets.slice(levels).map((_, k) => asked(levels + k, this.identity, this.slots.asked)),
     };
     const marched = (here, there) => this.group(
       this.layouts.march, whole(this.frame), whole(this.rays), whole(this.places), whole(this.lists[here]),
@@ -195,7 +195,7 @@ class GpuTracer {
       new Uint32Array(numbers, 16, 2).set([this.room, j]);
       this.device.queue.writeBuffer(this.gates[j], 0, numbers);
     });
-    if (this.header.colors) this.device.queue.writeBuffer(this.gates.at(-1), 16, Uint32Array.from([this.room, 0]));
+    for (const gate of this.gates.slice(levels.length)) this.device.queue.writeBuffer(gate, 16, Uint32Array.from([this.room, 0]));
   }
 
   // The networks up to `level`, of a step, for at most so many rays: values (kind 0) or jets (1).
@@ -233,8 +233,8 @@ class GpuTracer {
     return bytes;
   }
 
-  // What networks say at a list of points: gradient and value of each, or its colour.
-  async ask(points, count, level, kind) {
+  // What networks say at a list of points: gradient and value of each, or its colour, or what that gains by direction.
+  async ask(points, count, level, kind, ways = null) {
     const found = new Float32Array(4 * count);
     for (let first = 0; first < count; first += MOST_RAYS) {
       const many = Math.min(MOST_RAYS, count - first);
@@ -242,16 +242,18 @@ class GpuTracer {
       this.setGates(level, this.header.deltas);
       const staged = new Float32Array(8 * many);
       for (let i = 0; i < many; i++) for (let c = 0; c < 3; c++) staged[8 * i + c] = points[3 * (first + i) + c];
+      // A direction stands where the answer will.
+      if (ways) for (let i = 0; i < many; i++) for (let c = 0; c < 3; c++) staged[8 * i + 4 + c] = ways[3 * (first + i) + c];
       const { queue } = this.device;
       queue.writeBuffer(this.places, 0, staged);
-      const net = kind === 'color' ? this.nets.length - 1 : 0, jet = kind === 'jet' ? 1 : 0;
+      const net = kind === 'color' ? this.header.levels.length + Number(Boolean(ways)) : 0, jet = kind === 'jet' ? 1 : 0;
       queue.writeBuffer(this.slots.asked, jet * KIND, Uint32Array.from([many]));
       const encoder = this.device.createCommandEncoder();
       this.clear(encoder);
       const pass = encoder.beginComputePass();
       if (kind === 'color') {
         pass.setPipeline(this.kernels[net][0]);
-        pass.setBindGroup(0, this.asks.colors, [0, 0]);
+        pass.setBindGroup(0, this.asks.colors[Number(Boolean(ways))], [0, 0]);
         pass.dispatchWorkgroups(this.crew(net, many));
         this.counts.passes++;
       } else {
@@ -280,12 +282,12 @@ class GpuTracer {
     return { value: Float32Array.from({ length: count }, (_, i) => found[4 * i + 3]), gradient };
   }
 
-  color(points, count) {
-    return this.ask(points, count, 0, 'color');
+  color(points, count, ways) {
+    return this.ask(points, count, 0, 'color', ways);
   }
 
   // See Tracer.trace.
-  async trace(camera, { level, normalLevel = level, first = 0, rows = camera.height, precision = null, colored = false, clip = null }) {
+  async trace(camera, { level, normalLevel = level, first = 0, rows = camera.height, precision = null, colored = false, directed = false, clip = null }) {
     const { width } = camera;
     const seen = new Float32Array(4 * width * rows);
     const strip = Math.max(1, Math.floor(MOST_RAYS / width));
@@ -306,7 +308,11 @@ class GpuTracer {
       }
       if (colored) {
         color = new Float32Array(seen.length);
-        const colors = await this.colors.at(points, pixels.length);
+        const ways = directed ? Float32Array.from(pixels.flatMap((pixel, i) => {
+          const way = [0, 1, 2].map((c) => points[3 * i + c] - camera.eye[c]), length = Math.hypot(...way);
+          return way.map((part) => part / length);
+        })) : null;
+        const colors = await this.colors.at(points, pixels.length, ways);
         pixels.forEach((pixel, i) => color.set(colors.subarray(3 * i, 3 * i + 3), 4 * pixel));
       }
     }
