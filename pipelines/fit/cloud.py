@@ -61,7 +61,8 @@ SIDES = 4.0
 BESIDE = 0.25
 # So near to one half a winding number says little: in the holes of scans. Up to this far from their rims the discs
 # there, which go on where the surface ends, say more; if a place is on one side of all, by this sine or more. Elsewhere
-# winding numbers are in doubt too, beside bars and in the folds of coarse meshes, and discs say nothing there.
+# winding numbers are in doubt too, beside bars and in the folds of coarse meshes, and discs say nothing there. Nor do
+# those of points that fill a sparse cloud in: at a sharp corner they may go on where there is nothing.
 DOUBT, RIM, FACE_ON = 0.25, 0.1, 0.2
 CHANCE = 3.0  # standard deviations of the noise
 
@@ -215,7 +216,7 @@ class CloudDistance:
         sine = along[asked] / np.maximum(distance[asked], 1e-12)
         one_side = np.maximum(sine.min(axis=1), -sine.max(axis=1)) >= FACE_ON
         sure = chance[asked] | (np.abs(number) >= DOUBT) | (distance[asked, 0] >= RIM) | ~one_side
-        side[asked[sure]] = number[sure]
+        side[asked[sure | self.filled]] = number[sure | self.filled]
         return torch.from_numpy(np.where(side < 0, -magnitude, magnitude).astype(np.float32))
 
     def _query(self, x: NDArray[np.floating], k: int) -> tuple[NDArray[np.float64], NDArray[np.integer]]:
