@@ -215,8 +215,8 @@ class CloudDistance:
         number = 0.5 - self._winding(dipoles, query[asked])
         sine = along[asked] / np.maximum(distance[asked], 1e-12)
         one_side = np.maximum(sine.min(axis=1), -sine.max(axis=1)) >= FACE_ON
-        sure = chance[asked] | (np.abs(number) >= DOUBT) | (distance[asked, 0] >= RIM) | ~one_side
-        side[asked[sure | self.filled]] = number[sure | self.filled]
+        rim = (np.abs(number) < DOUBT) & (distance[asked, 0] < RIM) & one_side & ~chance[asked] & (not self.filled)
+        side[asked] = np.where(rim, side[asked], number)
         return torch.from_numpy(np.where(side < 0, -magnitude, magnitude).astype(np.float32))
 
     def _query(self, x: NDArray[np.floating], k: int) -> tuple[NDArray[np.float64], NDArray[np.integer]]:

@@ -17,7 +17,6 @@ from ...neural_fields import (
     InputError,
     MultiscaleSDF,
     SavedField,
-    Similarity,
     Siren,
     TextureField,
     extract_mesh,
@@ -165,16 +164,14 @@ def pack_run(run: str | Path, options: WebOptions | None = None, *, progress: Re
     """
     options = options or WebOptions()
     file = find_field(run)
-    shown, similarity, metadata = _shown(file, options.time)
+    saved = _shown(file, options.time)
+    shown = saved.field
     still = shown.in_dim == 3 and options.time is None
     texture = texture_of(file, shown) if options.colors and still else None
-    highlights = None
-    if texture is not None and options.highlights:
-        highlights = _highlights(file, texture, metadata.get("run", {}), progress)
     if options.levels is not None:
         chosen_level(shown, file, options.levels - 1, flag="--levels")
         shown = _coarse(shown, options.levels)
-    return _content(shown, texture, highlights, similarity, options.title or _name_of(file), file, options)
+    return _content(shown, texture, saved, file, options, progress)
 
 
 def _highlights(
@@ -230,11 +227,10 @@ def _name_of(file: Path) -> str:
 def _content(
     shown: Field,
     texture: TextureField | None,
-    highlights: Highlights | None,
-    similarity: Similarity,
-    name: str,
+    saved: SavedField,
     file: Path,
     options: WebOptions,
+    progress: Report | None,
 ) -> Packed:
     moving = shown if isinstance(shown, SpaceTimeSDF) else None
     stills: list[Field] = [shown] if moving is None else [moving.at(float(t)) for t in MOMENTS]
@@ -246,6 +242,10 @@ def _content(
     except NoSurfaceError as error:
         raise InputError(f"{file}: no surface to show ({error})") from error
     outline = np.concatenate([points for _, points in outlines])
+    # What takes a while comes after all that may be refused.
+    highlights = None
+    if texture is not None and options.highlights:
+        highlights = _highlights(file, texture, saved.metadata.get("run", {}), progress)
     bits = None if options.float32 else BITS
     rounding = [] if bits is None else _rounding(outlines, bits)
     payload = Payload()
@@ -267,7 +267,7 @@ def _content(
     header = {
         "format": "mplicits-web",
         "version": VERSION,
-        "title": name,
+        "title": options.title or _name_of(file),
         "moves": moving is not None,
         "levels": levels,
         "colors": colors,
@@ -279,8 +279,8 @@ def _content(
         "radius": BOUNDING_RADIUS,
         "shell": {"low": low.tolist(), "high": high.tolist(), "grid": GRID, "triangles": len(shell.faces)},
         "view": _view(outline, options.up),
-        "unit": similarity.scale,
-        "center": list(similarity.center),
+        "unit": saved.similarity.scale,
+        "center": list(saved.similarity.center),
         "bits": bits,
         "rounding": [dataclasses.asdict(part) for part in rounding],
         **described,

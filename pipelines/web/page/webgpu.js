@@ -246,14 +246,15 @@ class GpuTracer {
       if (ways) for (let i = 0; i < many; i++) for (let c = 0; c < 3; c++) staged[8 * i + 4 + c] = ways[3 * (first + i) + c];
       const { queue } = this.device;
       queue.writeBuffer(this.places, 0, staged);
-      const net = kind === 'color' ? this.header.levels.length + Number(Boolean(ways)) : 0, jet = kind === 'jet' ? 1 : 0;
+      const coloring = Number(Boolean(ways)); // the texture, or what it gains by direction
+      const net = kind === 'color' ? this.header.levels.length + coloring : 0, jet = kind === 'jet' ? 1 : 0;
       queue.writeBuffer(this.slots.asked, jet * KIND, Uint32Array.from([many]));
       const encoder = this.device.createCommandEncoder();
       this.clear(encoder);
       const pass = encoder.beginComputePass();
       if (kind === 'color') {
         pass.setPipeline(this.kernels[net][0]);
-        pass.setBindGroup(0, this.asks.colors[Number(Boolean(ways))], [0, 0]);
+        pass.setBindGroup(0, this.asks.colors[coloring], [0, 0]);
         pass.dispatchWorkgroups(this.crew(net, many));
         this.counts.passes++;
       } else {

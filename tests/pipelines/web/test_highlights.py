@@ -129,6 +129,9 @@ def test_what_a_page_says_and_leaves_out(tmp_path, monkeypatch):
         header = pack_run(folder, options).header
         assert header["highlights"] is None
         assert "highlights" not in json.dumps(header["blocks"])
+    with pytest.raises(export.InputError, match="--levels"):
+        pack_run(folder, WebOptions(levels=9))
+    assert not asked  # what cannot be shown is refused before anything is learnt
     (folder / "radiance.safetensors").unlink()
     assert pack_run(folder).header["highlights"] is None
     assert not asked
