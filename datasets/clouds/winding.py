@@ -51,6 +51,8 @@ STILL = 0.002
 # winding numbers give leave much less; and so do all that are open even with those (see `openness`).
 FITS, MUCH_LESS, OPEN = 0.25, 0.75, 0.2
 HARDLY_FITS = 0.33
+# Where normals do not fit, parts may be thin: softenings go on, of so many points at most, down to this many spacings.
+NARROWEST, LIMIT_OF_THIN = 0.2, 24_000
 SCALES = (0.6, 1.0)
 ASKED = 2000  # points that the thickness of the cloud is measured at, with neighbourhoods of so many
 SIZES = (16, 32, 64, 128, 256)
@@ -73,16 +75,32 @@ def orient_by_winding(points: Float64, normals: Float64, *, limit: int = 16_000)
     some = spread(points, limit)
     # Noise hides single wrong signs from the misfit, and propagation from one noisy normal to the next has many.
     noise = noise_level(centred(points), normals)
-    before = misfit(points[some], normals[some], softening=2 * noise)
+
+    def judged(signed: Float64, softening: float, least: float | None = None) -> float:
+        return misfit(points[some], signed[some], softening=softening, least=least)
+
+    before = judged(normals, 2 * noise)
     if before < FITS and not noise:
         return None
     found = winding_normals(points, limit=limit)
-    theirs = found.normals[KDTree(points[found.rows]).query(points, workers=-1)[1]]
-    oriented = np.where((normals * theirs).sum(axis=1, keepdims=True) < 0, -normals, normals)
-    after = misfit(points[some], oriented[some], softening=2 * noise)
+    oriented = _turned(points, normals, found)
+    after = judged(oriented, 2 * noise)
+    if after >= FITS:
+        thin = narrower_normals(points, normals, found, limit=LIMIT_OF_THIN)
+        signed = _turned(points, normals, thin)
+        least = thin.softening
+        now, since = (judged(n, 2 * thin.noise, least) for n in (signed, normals))
+        if now < judged(oriented, 2 * thin.noise, least):
+            oriented, before, after = signed, since, now
     if openness(points, oriented) > OPEN:
         return None
     return oriented if after < max(FITS, min(HARDLY_FITS, MUCH_LESS * before)) else None
+
+
+def _turned(points: Float64, normals: Float64, found: WindingNormals) -> Float64:
+    """The normals ``(N, 3)`` with the signs of those that were found nearest to each."""
+    theirs = found.normals[KDTree(points[found.rows]).query(points, workers=-1)[1]]
+    return np.where((normals * theirs).sum(axis=1, keepdims=True) < 0, -normals, normals)
 
 
 class WindingNormals(NamedTuple):
@@ -108,9 +126,7 @@ def winding_normals(points: Float64, *, limit: int = 16_000) -> WindingNormals:
         points: ``(N, 3)``, finite, at least two places among them.
         limit: how many points are asked, at most; time grows as its power of 1.5.
     """
-    middle = (points.max(axis=0) + points.min(axis=0)) / 2
-    radius = float(np.linalg.norm(points - middle, axis=1).max())
-    unit = (points - middle) / radius
+    unit, radius = _in_unit_ball(points)
     area = float(disc_areas(unit[spread(unit, 4000)]).sum())
     thickness = layer_thickness(unit)
     limit = min(limit, len(unit))
@@ -119,7 +135,8 @@ def winding_normals(points: Float64, *, limit: int = 16_000) -> WindingNormals:
         wanted = int(np.clip(count * area / softening**2, min(FEWEST, limit), limit))
         asked = spread(unit, wanted)
         before = normals[KDTree(unit[rows]).query(unit[asked])[1]]
-        return asked, _consistent(unit[asked], before * area / len(asked), softening)
+        most = MOST_ROUNDS if len(asked) <= MANY else MOST_ROUNDS_OF_MANY
+        return asked, _consistent(unit[asked], before * area / len(asked), softening, most)
 
     softening = WIDEST
     rows, normals = widened(np.zeros(1, np.int64), np.zeros((1, 3)), softening, COUNT)
@@ -134,12 +151,51 @@ def winding_normals(points: Float64, *, limit: int = 16_000) -> WindingNormals:
     return WindingNormals(rows, normals, softening * radius, noise * radius)
 
 
-def _consistent(points: Float64, dipoles: Float64, softening: float) -> Float64:
-    """Unit normals ``(n, 3)``, from dipoles ``(n, 3)`` to begin with, which may be zero."""
+def narrower_normals(points: Float64, normals: Float64, found: WindingNormals, *, limit: int) -> WindingNormals:
+    """The normals of `winding_normals` worked out again, for parts that are as thin as the points lie close.
+
+    The two sides of such a part cancel in dipoles that are wider than it is, and nothing says which is which. So these
+    are narrowed to a fraction of a spacing; and where a wrong patch begins to turn, that is waited for. As long as the
+    sides are mixed up, their distance looks like noise, and noise is what stops narrower dipoles: it is measured again
+    when they are told apart, and if there still is some they stop there after all.
+
+    Args:
+        points: ``(N, 3)``, finite.
+        normals: ``(N, 3)`` unit normals with any signs.
+        found: what `winding_normals` made of the points.
+        limit: how many points are asked, at most.
+    """
+    unit, radius = _in_unit_ball(points)
+    rows = spread(unit, limit)
+    areas = disc_areas(unit[rows])
+    start = found.normals[KDTree(unit[found.rows]).query(unit[rows])[1]]
+    narrowest = NARROWEST * float(np.sqrt(np.median(areas)))
+
+    def narrowed(noise: float) -> WindingNormals:
+        now, softening = start, found.softening / radius
+        while softening > narrowest and softening / NARROWING > NOISE_WIDTHS * noise:
+            softening /= NARROWING
+            now = _consistent(unit[rows], now * areas[:, None], softening, MOST_ROUNDS)
+        return WindingNormals(rows, now, softening * radius, noise * radius)
+
+    clean = narrowed(0.0)
+    noise = noise_level(unit, _turned(points, normals, clean))
+    return narrowed(noise) if NOISE_WIDTHS * noise * radius > clean.softening else clean
+
+
+def _in_unit_ball(points: Float64) -> tuple[Float64, float]:
+    """The points round the middle of their box, over the largest distance from it; and that distance."""
+    moved = points - (points.max(axis=0) + points.min(axis=0)) / 2
+    radius = float(np.linalg.norm(moved, axis=1).max())
+    return moved / radius, radius
+
+
+def _consistent(points: Float64, dipoles: Float64, softening: float, most: int) -> Float64:
+    """Unit normals ``(n, 3)``, from dipoles ``(n, 3)`` to begin with, which may be zero, in so many rounds at most."""
     sums = DipoleSums(points, softening)
     mu = torch.from_numpy(dipoles.astype(np.float32))
     normals = torch.nn.functional.normalize(mu)
-    for done in range(1, 1 + (MOST_ROUNDS if len(points) <= MANY else MOST_ROUNDS_OF_MANY)):
+    for done in range(1, 1 + most):
         step = sums.adjoint(0.5 - sums.winding(mu))
         change = sums.winding(step)
         mu = mu + step * ((step**2).sum() / (change**2).sum().clamp(min=1e-30))
@@ -152,7 +208,7 @@ def _consistent(points: Float64, dipoles: Float64, softening: float) -> Float64:
     return normals.double().numpy()
 
 
-def misfit(points: Float64, normals: Float64, *, softening: float = 0.0) -> float:
+def misfit(points: Float64, normals: Float64, *, softening: float = 0.0, least: float | None = None) -> float:
     """How far the winding number at points ``(N, 3)`` with unit normals ``(N, 3)`` is from ½, in the root mean square.
 
     It is averaged over leaves of some 48 neighbours first, so that noise counts little: 0 for a closed surface with
@@ -161,13 +217,13 @@ def misfit(points: Float64, normals: Float64, *, softening: float = 0.0) -> floa
     Args:
         points: ``(N, 3)``.
         normals: ``(N, 3)``.
-        softening: of the dipoles, which are 1.5 spacings wide at least: twice the noise's standard deviation.
+        softening: of the dipoles: twice the noise's standard deviation.
+        least: how wide they are in any case; None for 1.5 spacings, in which sides of thinner parts cancel.
     """
-    middle = (points.max(axis=0) + points.min(axis=0)) / 2
-    radius = np.linalg.norm(points - middle, axis=1).max()
-    unit = (points - middle) / radius
+    unit, radius = _in_unit_ball(points)
     areas = disc_areas(unit)
-    sums = DipoleSums(unit, max(softening / radius, 1.5 * float(np.sqrt(np.median(areas)))))
+    narrowest = 1.5 * float(np.sqrt(np.median(areas))) if least is None else least / radius
+    sums = DipoleSums(unit, max(softening / radius, narrowest))
     mean = sums.leaf_means(sums.winding(torch.from_numpy((normals * areas[:, None]).astype(np.float32))))
     if (
         softening

@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from ...neural_fields import InputError, MultiscaleSDF, Similarity, SpaceTimeSDF
+from ..fit.band import delta_of
 from ..fit.level import new_level
-from ..fit.samples import delta_of
 from ..run.folder import RunFolder, digest_of
 from ..run.machine import choose_device, environment, speed
 from ..run.motion import VELOCITY_FILE, load_motion

@@ -24,17 +24,14 @@ from .cloud import CloudDistance
 
 __all__ = [
     "SQUARES",
-    "Band",
     "Remote",
     "Rows",
     "Samples",
     "Source",
     "Usual",
     "Weights",
-    "band_of",
     "band_samples",
     "banded_sources",
-    "delta_of",
     "distance_samples",
     "first_sources",
     "free_lengths",
@@ -49,11 +46,6 @@ __all__ = [
 
 # Half-edge of the cube in which level 0 learns distances: the mesher's box is [-1, 1]³, and a little more.
 DOMAIN = 1.05
-# Largest error over its 99th percentile: 1.0 for uniform noise, 1.6 for Gaussian, 2 to 3 for what a coarse level
-# misses of the fine parts of a clean cloud.
-STRAY = 4.0
-# The same over the 90th percentile, generous: a level may miss a thin part as a whole.
-TAIL = 20.0
 # How far a winding number must be from one half to say in or out: it is off by less than 0.05 where it is asked.
 SURE = 0.4
 # The same where normals were estimated from the points, which are wrong at thin parts: in the arches of a tower, far
@@ -273,68 +265,6 @@ def usual_errors(surface: Samples, band: Samples) -> Usual:
         eikonal_loss(band.gradient),
     )
     return Usual(*(max(float(loss.quantile(0.5)), least) for loss, least in zip(losses, LEAST, strict=True)))
-
-
-@dataclass(frozen=True)
-class Band:
-    """The band around a level.
-
-    Attributes:
-        delta: its half-width.
-        rule: "quantile" where one was asked for, "maximum" over all points, or "maximum but for strays"; or "no wider
-            than the band before", see `within`.
-        outside: input points that it does not hold.
-    """
-
-    delta: float
-    rule: str
-    outside: int
-
-    def within(self, before: float | None, errors: Tensor) -> Band:
-        """This band, or where the one ``before`` it is narrower, that: bands nest.
-
-        Args:
-            before: half-width of the band around the level before; None if there is none.
-            errors: ``(n,)`` values at the input points.
-        """
-        if before is None or self.delta <= before:
-            return self
-        return Band(before, "no wider than the band before", int((errors.abs() >= before).sum()))
-
-
-def band_of(errors: Tensor, *, epsilon: float, quantile: float | None) -> Band:
-    """The band of `delta_of`, and what chose it.
-
-    Args:
-        errors: ``(n,)`` values f(x_j) at the input points.
-        epsilon: the ε of Eq. 5.
-        quantile: q in (0, 1], or None.
-    """
-    # A level that met every point exactly would leave its successor no band at all.
-    delta = max(delta_of(errors, epsilon=epsilon, quantile=quantile), 1e-6)
-    strays = float(errors.abs().max()) * (1 + epsilon) > delta
-    rule = "quantile" if quantile is not None else "maximum but for strays" if strays else "maximum"
-    return Band(delta, rule, int((errors.abs() >= delta).sum()))
-
-
-def delta_of(errors: Tensor, *, epsilon: float, quantile: float | None) -> float:
-    """The half-width of a band, ``δ = (1 + ε) · Q_q(|f(x_j)|)``; the paper's Eq. 5 at ``quantile = 1``.
-
-    The maximum of Eq. 5 is fragile: one stray point far from the surface widens the band to half the domain. With
-    ``quantile=None`` it is taken over the points with no more than ``STRAY`` times the 99th percentile and ``TAIL``
-    times the 90th, which all points of a sound cloud are: their errors have a bounded distribution, strays do not.
-    The second bound holds where more than one point in a hundred is a stray.
-
-    Args:
-        errors: ``(n,)`` values f(x_j) at the input points.
-        epsilon: the ε of Eq. 5.
-        quantile: q in (0, 1], or None.
-    """
-    ordered = errors.abs().flatten().sort().values
-    if quantile is None:
-        usual = min(q * ordered[math.ceil(share * len(ordered)) - 1] for q, share in ((STRAY, 0.99), (TAIL, 0.9)))
-        return (1 + epsilon) * float(ordered[ordered <= usual][-1])
-    return (1 + epsilon) * float(ordered[max(0, math.ceil(quantile * len(ordered)) - 1)])
 
 
 def surface_samples(index: CloudDistance) -> Samples:

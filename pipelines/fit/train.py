@@ -36,13 +36,14 @@ from ..run.trainer import (
     without_prefix,
 )
 from ..surface.trim import thinned
+from .band import Band, band_of, with_wrong_sides
 from .between import dense_distance
 from .cloud import CloudDistance, load_cloud
 from .heldout import FEWEST, Judge, held_out
 from .level import RESIDUAL_GAIN, LevelObjective, calm_omega, new_level
 from .plan import Share
 from .review import Review, review_points
-from .samples import Band, Source, band_of, banded_sources, first_sources
+from .samples import Source, banded_sources, first_sources
 from .timing import Timing
 from .unoriented import Places, Signs, fits_better, give_signs, signed
 
@@ -397,7 +398,12 @@ class _Fitting:
 
     def next_band(self) -> Band:
         """The band around the last frozen level (Eq. 5), inside the one before: under noise it could be wider."""
-        band = band_of(self.errors, epsilon=self.config.epsilon, quantile=self.config.quantile)
+        config, level = self.config, len(self.stages)
+        assert self.frozen is not None
+        band = band_of(self.errors, epsilon=config.epsilon, quantile=config.quantile)
+        if level == 1 and config.quantile is None:
+            asked = {"epsilon": config.epsilon, "count": config.samples, "seed": config.seed, "device": self.device}
+            band = with_wrong_sides(band, self.indexed(level), self.frozen, **asked)
         return band.within(self.stages[-1]["delta"], self.errors)
 
     def judge(self, delta: float, surface: Source) -> Judge | None:

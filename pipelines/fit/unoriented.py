@@ -13,8 +13,8 @@ field that has the steeper slope along the normals is kept: where it crosses a w
 where both sides of the wall got the same sign. Where the slope is faint, signs come from the neighbours.
 
 Of bars that are thin for the network the field is faint all over, and its signs are worse than what came before: they
-change from point to point, and winding numbers fit them less. Neither need be so of good ones alone. A filled hollow
-has as few contradictions as an empty one, and winding numbers see no walls of two spacings.
+change from point to point, and winding numbers fit them less where they were changed. So changes are taken
+only if winding numbers fit them better there, by far.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ from torch import Tensor
 from ...datasets import OrientedCloud
 from ...datasets.clouds.exterior import OUTSIDE, Exterior
 from ...datasets.clouds.noise import noise_deviation
-from ...datasets.clouds.orientation import mean_agreement, settle_signs
+from ...datasets.clouds.orientation import settle_signs
 from ...datasets.clouds.point_cloud import spread
 from ...datasets.clouds.reestimate import denoise
-from ...datasets.clouds.winding import MUCH_LESS, misfit
+from ...datasets.clouds.winding import MUCH_LESS
 from ...neural_fields import Siren
 from ...neural_fields.devices import upload
 from ..run.settings import FitConfig
@@ -43,6 +43,8 @@ from .level import new_level
 from .samples import SURE, spread_points
 
 __all__ = ["BATCH", "SAMPLES", "STAGE", "STAGES", "STEPS", "Places", "Signs", "fits_better", "give_signs", "signed"]
+
+Float32 = NDArray[np.float32]
 
 STEPS, BATCH, SAMPLES, RATE = 300, 4096, 50_000, 2e-3
 POINTS = 2.0  # weight of f = 0 at the points, in units of that of known distances
@@ -160,22 +162,28 @@ def give_signs(
 
 
 def fits_better(cloud: OrientedCloud, signs: Signs) -> bool:
-    """Whether these signs fit the cloud better than its own, by neighbours or, by far, by winding numbers.
+    """Whether these signs fit the cloud better than its own, by far.
 
-    See `mean_agreement` and `misfit`. Where neighbours agree less and the misfit is not less by far, signs have been
-    spoilt: of bars as thin as a spacing, a misfit wide enough to average hardly knows.
+    Winding numbers are ½ at points whose normals are right. They are asked where normals were turned and nowhere else,
+    for of a small patch that is wrong the rest of a large cloud hardly knows. Where the misfit is not less by far,
+    signs have been spoilt.
 
     Args:
         cloud: as it was prepared.
         signs: of its normals.
     """
-    points, before = cloud.points.astype(np.float64), cloud.normals.astype(np.float64)
-    after = np.where(signs.turned[:, None], -before, before)
-    if mean_agreement(points, after) > mean_agreement(points, before):
-        return True
-    some, soft = spread(points, ASKED), 2 * cloud.noise
-    less = MUCH_LESS * misfit(points[some], before[some], softening=soft)
-    return misfit(points[some], after[some], softening=soft) < less
+    turned = cloud.points[signs.turned]
+    if not len(turned):
+        return False
+    turned = turned[spread(turned.astype(np.float64), ASKED)]
+    after = np.where(signs.turned[:, None], -cloud.normals, cloud.normals)
+    return _misfit(cloud.points, after, turned) < MUCH_LESS * _misfit(cloud.points, cloud.normals, turned)
+
+
+def _misfit(points: Float32, normals: Float32, at: Float32) -> float:
+    """How far winding numbers are from ½ at some of the points, in the root mean square."""
+    index = CloudDistance(torch.from_numpy(points), torch.from_numpy(normals))
+    return float(np.sqrt(np.square(index.winding_number(at) - 0.5).mean()))
 
 
 def signed(cloud: OrientedCloud, signs: Signs, *, smooth: bool) -> OrientedCloud:

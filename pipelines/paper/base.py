@@ -17,9 +17,10 @@ import torch
 from ...datasets import OrientedCloud
 from ...neural_fields import Field, MultiscaleSDF, Similarity, Siren, load_field
 from ..bench.cells import Workplace
+from ..fit.band import band_of
 from ..fit.cloud import CloudDistance
 from ..fit.level import LevelObjective, new_level
-from ..fit.samples import Source, Weights, band_of, distance_samples, surface_samples, with_previous
+from ..fit.samples import Source, Weights, distance_samples, surface_samples, with_previous
 from ..fit.train import prepare, review_points
 from ..run.folder import find_field
 from ..run.settings import FitConfig

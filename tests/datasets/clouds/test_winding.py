@@ -111,6 +111,25 @@ def test_thin_parts_as_noisy_as_they_are_thick_keep_their_sides(shape):
     assert wrong(found.normals, side[found.rows]) < 0.05
 
 
+@pytest.mark.parametrize("thickness", [0.4, 1.0])
+def test_a_blade_as_thin_as_a_part_of_a_spacing_gets_its_sides(thickness):
+    """Wider dipoles of its two sides cancel: only narrow ones tell them apart."""
+    size = (0.8, 0.16)
+    spacing = 0.01
+    flat = np.stack(np.meshgrid(*(np.arange(-half, half, spacing) for half in size)), axis=-1).reshape(-1, 2)
+    half = thickness * spacing / 2
+    shift = np.random.default_rng(4).uniform(-spacing / 3, spacing / 3, (2, len(flat), 2))
+    points = np.concatenate(
+        [np.column_stack((flat + s, np.full(len(flat), z))) for s, z in zip(shift, (half, -half), strict=True)]
+    )
+    exact = np.repeat([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]], len(flat), axis=0)
+    up = np.tile([0.0, 0.0, 1.0], (len(points), 1))
+    assert wrong(up, exact) == 0.5
+    oriented = orient_by_winding(points, up)
+    assert oriented is not None
+    assert wrong(oriented, exact) < 0.01
+
+
 def test_what_propagation_got_wrong_is_turned():
     points, exact = legs()
     half = np.where(points[:, :1] > 0.1, -exact, exact)

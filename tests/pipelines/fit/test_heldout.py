@@ -10,6 +10,7 @@ from mplicits.datasets import PointCloud
 from mplicits.datasets.synthetic.samples import sample_sphere
 from mplicits.neural_fields import Siren, Sphere
 from mplicits.pipelines.cli.info import describe
+from mplicits.pipelines.fit.band import Band
 from mplicits.pipelines.fit.heldout import (
     FEWEST,
     LEARNT,
@@ -24,7 +25,7 @@ from mplicits.pipelines.fit.heldout import (
     voxels_of,
 )
 from mplicits.pipelines.fit.level import LevelObjective
-from mplicits.pipelines.fit.samples import Band, Samples, Source, Usual, with_previous
+from mplicits.pipelines.fit.samples import Samples, Source, Usual, with_previous
 from mplicits.pipelines.fit.train import fit
 from mplicits.pipelines.run.settings import FitConfig
 from mplicits.pipelines.run.trainer import Trainer

@@ -13,10 +13,8 @@ from mplicits.pipelines.fit.samples import (
     SURE_GUESSED,
     Samples,
     Weights,
-    band_of,
     band_samples,
     banded_sources,
-    delta_of,
     distance_samples,
     free_lengths,
     near_samples,
@@ -99,34 +97,6 @@ def test_beside_the_rim_of_a_hole_discs_that_agree_go_on_where_the_surface_ends(
     edge_on = RADIUS * torch.stack((0.99 * turn.cos(), 0.99 * turn.sin(), 0.08 + 0 * turn), dim=1)
     for places in (remote, edge_on):
         assert torch.equal(bowl.signed(places) < 0, torch.from_numpy(bowl.winding_number(places.numpy())) > 0.5)
-
-
-def test_delta_is_equation_5() -> None:
-    errors = torch.tensor([0.01, -0.02, 0.005, 0.0])
-    assert delta_of(errors, epsilon=0.3, quantile=1.0) == pytest.approx(1.3 * 0.02)
-    assert delta_of(errors, epsilon=0.3, quantile=0.75) == pytest.approx(1.3 * 0.01)
-    stray = torch.cat((torch.full((9999,), 0.01), torch.tensor([1.0])))
-    assert delta_of(stray, epsilon=0.3, quantile=1.0) == pytest.approx(1.3)
-    for quantile in (0.999, None):
-        assert delta_of(stray, epsilon=0.3, quantile=quantile) == pytest.approx(1.3 * 0.01)
-    normal = torch.randn(50_000, generator=generator())
-    assert delta_of(normal, epsilon=0.3, quantile=None) == pytest.approx(1.3 * float(normal.abs().max()))
-
-
-def test_many_strays_do_not_widen_a_band() -> None:
-    """More than one in a hundred: the 99th percentile is itself a stray's."""
-    strays = torch.cat((torch.linspace(0, 0.01, 9500), torch.linspace(0.4, 1, 500)))
-    band = band_of(strays, epsilon=0.3, quantile=None)
-    assert band.delta == pytest.approx(1.3 * 0.01)
-    assert (band.rule, band.outside) == ("maximum but for strays", 500)
-
-
-def test_bands_say_what_chose_them() -> None:
-    errors = torch.tensor([0.01, -0.02, 0.005, 0.0])
-    assert band_of(errors, epsilon=0.3, quantile=None).rule == "maximum"
-    by_quantile = band_of(errors, epsilon=0.3, quantile=0.75)
-    assert (by_quantile.rule, by_quantile.outside) == ("quantile", 1)
-    assert band_of(torch.zeros(5), epsilon=0.3, quantile=None).delta == 1e-6
 
 
 def test_distance_samples_cover_the_domain_and_the_surface(cloud: CloudDistance) -> None:

@@ -77,7 +77,7 @@ def test_the_hollow_of_a_thick_wall_is_outside_though_normals_filled_it() -> Non
     assert found.turned[5000:].mean() > 1 - FEW
 
 
-def test_signs_are_taken_where_neighbours_or_winding_numbers_fit_better_with_them() -> None:
+def test_signs_are_taken_where_winding_numbers_fit_better_with_them() -> None:
     points, normals = joined(ball(2500, 0.8), ball(1500, 0.6, inward=True))
     cloud = prepare_cloud(PointCloud(points.double().numpy(), normals.numpy(), None, "shell"), normals="file")
     inner = np.arange(len(cloud)) >= 2500
@@ -88,7 +88,18 @@ def test_signs_are_taken_where_neighbours_or_winding_numbers_fit_better_with_the
     assert not fits_better(cloud, Signs(some, 1.0, "winding"))
     spotted = replace(cloud, normals=np.where(some[:, None], -cloud.normals, cloud.normals))
     assert fits_better(spotted, Signs(some, 1.0, "winding"))
-    assert fits_better(spotted, Signs(some != inner, 1.0, "winding"))  # neighbours cannot tell which side is out
+    assert not fits_better(spotted, Signs(some != inner, 1.0, "winding"))  # a filled hollow costs more than spots
+    assert not fits_better(cloud, Signs(np.zeros(len(cloud), bool), 1.0, "winding"))
+
+
+def test_a_small_patch_is_turned_though_the_rest_of_a_large_cloud_hardly_knows() -> None:
+    points, normals = ball(20_000, 0.8)
+    cloud = prepare_cloud(PointCloud(points.double().numpy(), normals.numpy(), None, "ball"), normals="file")
+    patch = cloud.points[:, 2] > 0.995 * cloud.points[:, 2].max()
+    assert 0 < patch.mean() < 0.005
+    wrong = replace(cloud, normals=np.where(patch[:, None], -cloud.normals, cloud.normals))
+    assert fits_better(wrong, Signs(patch, 1.0, "winding"))
+    assert not fits_better(cloud, Signs(patch, 1.0, "winding"))
 
 
 def test_a_ball_leaves_nothing_in_doubt() -> None:
