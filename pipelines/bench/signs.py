@@ -18,6 +18,7 @@ from ...neural_fields import InputError
 from ..fit.cloud import CloudDistance
 from ..fit.train import prepare
 from ..fit.unoriented import Places, fits_better, give_signs
+from ..run.machine import choose_device
 from ..run.settings import FitConfig
 from ..surface.surface import read_reference
 from .benchmark import Benchmark, Part
@@ -105,7 +106,7 @@ class SignsBench(Benchmark[SignsRow]):
         started = time.perf_counter()
         points, normals = torch.from_numpy(cloud.points), torch.from_numpy(cloud.normals)
         places = Places.around(CloudDistance(points, normals), seed=seed)
-        device = torch.device(self.device)
+        device = choose_device(self.device)
         signs = give_signs(points, normals, config, device=device, places=places, report=work.stage(path.stem))
         assert signs is not None  # nobody asks it to stop
         against = (cloud.normals * exact).sum(axis=1) < 0

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from .cloud import CloudDistance
+from .cloud import SOFT_GUESSED, CloudDistance
 
 __all__ = ["Densified", "dense_distance", "densified"]
 
@@ -54,7 +54,11 @@ SPREAD, BEYOND, THROUGH = 0.05, 0.03, 0.1
 # that is 1/√π = 0.56, and beyond it more.
 ONE_SIDED = 0.7
 LARGEST_AREA = 100.0  # that a point stands for, over the median
-
+# Least part of the sphere of directions that a solid, or the space around it, fills at a new point: half of it on a
+# smooth surface, a fourth on the edge of a cube, and next to nothing where guessed normals have led beyond an edge.
+SOLID_ANGLE = 0.2
+# That is asked only where so many of the cloud's own points meet it: an open sheet sees nothing of itself.
+CLOSED, ASKED = 0.95, 4000
 
 # Radians that the finest level's frequency may turn through between two points. Where four points lie on a wave they
 # hold it down, and nothing is filled in: patches are less exact than the points themselves.
@@ -102,11 +106,20 @@ def dense_distance(
     index = CloudDistance(points, normals, **about)
     if index.spacing * omega <= TURN or count <= len(points):
         return index
-    found = densified(index.points, index.normals, count - len(points), guessed=guessed and noise > 0, seed=seed)
+    noisy = guessed and noise > 0
+    found = densified(index.points, index.normals, count - len(points), guessed=noisy, seed=seed)
     new_points, new_normals = (torch.from_numpy(a.astype(np.float32)) for a in (found.points, found.new_normals))
+    if noisy and _on_solid(index, index.points[:: 1 + len(points) // ASKED]).mean() > CLOSED:
+        kept = torch.from_numpy(_on_solid(index, new_points.numpy()))
+        new_points, new_normals = new_points[kept], new_normals[kept]
     own_normals = torch.from_numpy(found.normals.astype(np.float32))
     dense = torch.cat((points.cpu(), new_points)), torch.cat((own_normals, new_normals))
     return CloudDistance(*dense, **about, given=len(points), gap=index.spacing, repaired=found.repaired)
+
+
+def _on_solid(index: CloudDistance, x: NDArray[np.float32]) -> Mask:
+    """Whether both sides of each of ``(M, 3)`` points of a surface have `SOLID_ANGLE`, by winding numbers."""
+    return np.abs(index.winding_number(x, soft=SOFT_GUESSED) - 0.5) < 0.5 - SOLID_ANGLE
 
 
 def densified(

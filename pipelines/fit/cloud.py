@@ -55,6 +55,9 @@ BESIDE_ANOTHER, ODD = 0.25, 2.0
 # more: close to the surface, between two of them, the winding number would waver. Of wider ones the sides of a thin bar
 # cancel.
 SOFT = 0.3
+# Where normals were estimated from noisy points, dipoles of so many standard deviations of the noise are asked: what is
+# left of it moves the sides of a thin part into each other. It is as wide as those that gave the normals their signs.
+SOFT_GUESSED = 2.0
 # Sides of a square bar: of all neighbours of a point on it at least one in so many is on its own side.
 SIDES = 4.0
 # Nearer to the discs than this many spacings, sides of discs are right more often than winding numbers.
@@ -206,13 +209,12 @@ class CloudDistance:
         across = np.sqrt(np.maximum(distance**2 - along**2, 0))
         discs = np.hypot(along, np.maximum(across - self.radii[index], 0))
         magnitude = discs.min(axis=1)
-        dipoles = self._dipoles if soft == SOFT else self._softened(soft)
         # Each disc votes with its side, the nearer and the more face-on the louder.
         side = np.sum(along / (distance**3 + 1e-12), axis=1)
         # Where normals follow noise, sides of discs as near as that are chance.
         chance = distance[:, 0] < (CHANCE * self.noise if self.guessed else 0.0)
         asked = np.flatnonzero(chance | (magnitude > BESIDE * self.spacing))
-        number = 0.5 - self._winding(dipoles, query[asked])
+        number = 0.5 - self.winding_number(query[asked], soft=soft)
         sine = along[asked] / np.maximum(distance[asked], 1e-12)
         one_side = np.maximum(sine.min(axis=1), -sine.max(axis=1)) >= FACE_ON
         rim = (np.abs(number) < DOUBT) & (distance[asked, 0] < RIM) & one_side & ~chance[asked] & (not self.filled)
@@ -225,14 +227,17 @@ class CloudDistance:
         self.watch(queries(len(x), len(self.points)))
         return np.asarray(distance), np.asarray(index)
 
-    def winding_number(self, x: Float32) -> NDArray[np.float64]:
+    def winding_number(self, x: Float32, *, soft: float = SOFT) -> NDArray[np.float64]:
         """Generalised winding number at ``(M, 3)`` points: about 1 inside, 0 outside, in between near holes.
 
         ``w(x) = Σ_i a_i ⟨p_i − x, n_i⟩ / 4π (|p_i − x|² + ε_i²)^(3/2)`` (Barill et al. 2018), see `DipoleField`.
-        """
-        return self._winding(self._dipoles, x)
 
-    def _winding(self, dipoles: DipoleField, x: Float32) -> NDArray[np.float64]:
+        Args:
+            x: the points.
+            soft: softening of the dipoles, in standard deviations of the noise.
+        """
+        dipoles = self._dipoles if soft == SOFT else self._softened(soft)
+
         def watch(pairs: int) -> None:
             self.watch(windings(pairs, 1))
 

@@ -20,7 +20,7 @@ from torch import Tensor
 from ...neural_fields import Field, InputError, Jet
 from ...neural_fields.losses import data_loss, eikonal_loss, normal_loss
 from ..run.settings import FitConfig
-from .cloud import CloudDistance
+from .cloud import SOFT_GUESSED, CloudDistance
 
 __all__ = [
     "SQUARES",
@@ -54,9 +54,6 @@ SURE_GUESSED = 0.3
 # Normals estimated from the points are wrong by tens of degrees where parts are as thin as a neighbourhood, or as the
 # noise, and there no field of slope 1 is near the points either. Weights of both terms, in units of the settings'.
 GUESSED_NORMAL, GUESSED_SLOPE = 0.1, 0.2
-# Dipoles of such normals are softened by so many standard deviations of the noise where levels ask for signs: what is
-# left of it moves the sides of a thin part into each other. It is as wide as those that gave the normals their signs.
-SOFT_GUESSED = 2.0
 # Of noise without normals, smoothing leaves this much: 0.3 to 0.7 of it in the root mean square on six shapes with 0.5
 # and 1 %, 0.4 in the median. Distances are that good.
 LEFT = 0.4

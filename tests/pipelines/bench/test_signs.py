@@ -27,7 +27,7 @@ def ball(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.mark.parametrize(("noise", "points"), [(0.0, None), (0.005, 2000)])
 def test_a_ball_has_no_wrong_signs(ball: Path, tmp_path: Path, noise: float, points: int | None) -> None:
-    bench = SignsBench(shapes=[ball], config=CONFIG, noise=noise, isotropic=noise > 0, points=points)
+    bench = SignsBench(shapes=[ball], config=CONFIG, noise=noise, isotropic=noise > 0, points=points, device="auto")
     (row,) = bench.rows(tmp_path / "out")
     assert row.before == row.after == 0.0
     assert not row.asked

@@ -8,7 +8,8 @@ import torch
 from mplicits.datasets import PointCloud
 from mplicits.datasets.synthetic.samples import sample_sphere, sample_torus
 from mplicits.neural_fields import Torus
-from mplicits.pipelines.fit.between import ONE_SIDED, TURN, dense_distance, densified
+from mplicits.pipelines.fit import between
+from mplicits.pipelines.fit.between import ONE_SIDED, TURN, Densified, dense_distance, densified
 from mplicits.pipelines.fit.cloud import CloudDistance
 from mplicits.pipelines.fit.train import fit
 from mplicits.pipelines.run.settings import FitConfig
@@ -152,6 +153,28 @@ def test_guessed_normals_are_not_followed_beyond_the_rim_of_a_strip() -> None:
         fourth = np.asarray(tree.query(found, k=4)[0])[:, 3]
         assert bool((beyond < ONE_SIDED * fourth).all()) == bounded
     assert len(guessed) > 0.7 * len(believed)
+
+
+def noisy_filling(points: Float64, normals: Float64) -> Float64:
+    """The points that fill in a cloud with noise and estimated normals."""
+    given = (torch.from_numpy(a.astype(np.float32)) for a in (points, normals))
+    index = dense_distance(*given, omega=1000.0, count=6000, noise=0.001, guessed=True)
+    return index.points[index.given :].astype(np.float64)
+
+
+def test_guessed_normals_do_not_lead_beyond_a_corner(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a solid nothing fills the sky over its corners, and winding numbers know that; an open sheet they do not."""
+    found = Densified(np.empty((0, 3)), 0, np.empty((0, 3)), np.empty((0, 3)))
+    points, normals = box(2000)
+    on_face, beyond = np.array([[0.1, 0.2, 0.5]]), np.array([[0.56, 0.56, 0.56]])
+    places = np.concatenate((on_face, beyond))
+    up = np.tile([0.0, 0.0, 1.0], (2, 1))
+    monkeypatch.setattr(
+        between, "densified", lambda p, n, *_, **__: found._replace(normals=n, points=places, new_normals=up)
+    )
+    assert np.allclose(noisy_filling(points, normals), on_face)
+    sheet = points * [1, 1, 0]
+    assert np.allclose(noisy_filling(sheet, np.tile([0.0, 0.0, 1.0], (len(sheet), 1))), places)
 
 
 def test_dense_clouds_are_left_as_they_are() -> None:
