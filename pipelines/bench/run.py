@@ -10,8 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-import torch
-
 from ..run.jobs import Outcome, check_jobs, run_jobs
 from ..run.machine import choose_device, environment
 from ..run.trainer import Interrupted, Report
@@ -74,7 +72,7 @@ def run_cell(
         "deltas": list(findings.deltas),
         "details": dict(findings.details),
         "seconds": round(time.perf_counter() - started, 3),
-        "environment": environment(torch.device(device)),
+        "environment": environment(choose_device(device)),
     }
     write_record(out, key, record)
     return json.loads(json.dumps(record))  # as it will be read next time: tuples are lists
