@@ -29,6 +29,9 @@ from .tables import Column, Figure, Table, tabulated
 __all__ = ["SignsBench", "SignsRow"]
 
 
+NEAREST = 64  # of the noisy points, among which a smoothed one is looked for
+
+
 @dataclass(frozen=True)
 class SignsRow:
     """One cloud.
@@ -146,9 +149,19 @@ class SignsBench(Benchmark[SignsRow]):
 def _exact_normals(
     clean: PointCloud, noisy: PointCloud, cloud: OrientedCloud, config: FitConfig
 ) -> NDArray[np.float32]:
-    """The exact normal of each point that is left of a noisy cloud, ``(N, 3)``."""
+    """The exact normal of each point that is left of a noisy cloud, ``(N, 3)``.
+
+    Smoothing has moved the points, and dropped k of them; the others keep their order, so that the i-th that is left
+    was one of those from the i-th to the (i + k)-th: of these it is the one that is nearest.
+    """
     still = cloud if not cloud.noise else prepare(noisy, dataclasses.replace(config, smooth_noise=False))
-    assert len(still) == len(cloud)
     assert clean.normals is not None
     unit = cloud.similarity.to_unit(noisy.points)
-    return clean.normals[np.asarray(KDTree(unit).query(still.points)[1])]
+    exact = clean.normals[np.asarray(KDTree(unit).query(still.points)[1])]
+    dropped = len(still) - len(cloud)
+    if not dropped:
+        return exact
+    near = np.asarray(KDTree(still.points).query(cloud.points, k=min(NEAREST, len(still)))[1])
+    skipped = near - np.arange(len(cloud))[:, None]
+    possible = (skipped >= 0) & (skipped <= dropped)
+    return exact[near[np.arange(len(near)), possible.argmax(axis=1)]]

@@ -48,6 +48,22 @@ def test_normals_that_point_inward_are_counted(ball: Path, tmp_path: Path, monke
     assert row.after == 0.0
 
 
+def test_points_that_smoothing_drops_do_not_mix_up_the_others(ball: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every point has another normal here, so that one that is taken for its neighbour shows."""
+    points = np.random.default_rng(0).normal(size=(500, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    clean = PointCloud(points, points.astype(np.float32), None, "ball")
+    still = prepare(clean, CONFIG)
+    left = np.arange(500) % 50 > 0
+    moved = (still.points + 0.01 * np.random.default_rng(1).normal(size=(500, 3))).astype(np.float32)[left]
+    smoothed = replace(
+        still, points=moved, normals=still.normals[left], report=replace(still.report, smoothed_noise=1.0)
+    )
+    monkeypatch.setattr(module, "prepare", lambda *_: still)
+    exact = module._exact_normals(clean, clean, smoothed, CONFIG)
+    assert (exact == clean.normals[left]).mean() > 0.99  # but for two that lie closer together than they were moved
+
+
 def test_a_cloud_is_no_shape(ball: Path, tmp_path: Path) -> None:
     (tmp_path / "cloud.xyz").write_text("\n".join(f"{i} {i % 7} {i % 5}" for i in range(100)), encoding="utf-8")
     with pytest.raises(InputError, match=r"cloud\.xyz"):
