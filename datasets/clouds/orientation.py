@@ -18,7 +18,6 @@ __all__ = [
     "estimate_normals",
     "fibonacci_directions",
     "fit_planes",
-    "mean_agreement",
     "nearest",
     "openness",
     "orient_normals",
@@ -168,23 +167,8 @@ def fibonacci_directions(count: int) -> Float64:
     return np.stack((ring * np.cos(angle), ring * np.sin(angle), z), axis=1)
 
 
-def mean_agreement(points: Float64, normals: Float64, *, neighbors: int = 8) -> float:
-    """How well the signs of normals go from point to point: 1 if all neighbours agree, −1 if none do.
-
-    The mean over neighbours i and j of what `orient_normals` passes signs on by, ⟨n_i, n_j⟩ − 2⟨e, n_i⟩⟨e, n_j⟩/|e|²
-    along the edge e between them.
-
-    Args:
-        points: ``(N, 3)``, finite.
-        normals: ``(N, 3)`` unit normals.
-        neighbors: of each point.
-    """
-    near = nearest(points, min(neighbors + 1, len(points)))
-    rows, columns = np.repeat(np.arange(len(points)), near.shape[1] - 1), near[:, 1:].ravel()
-    return float(_agreement(points, normals, np.zeros(len(points)), rows, columns).mean())
-
-
 def _agreement(points: Float64, normals: Float64, spread: Float64, i: Index, j: Index) -> Float64:
+    """⟨n_i, n_j⟩ − 2⟨e, n_i⟩⟨e, n_j⟩/|e|² of pairs of neighbours: 1 if their signs agree on any arc, −1 if not."""
     edge = points[j] - points[i]
     width = _NOISE_WIDTHS * np.maximum(spread[i], spread[j])
     squared = np.maximum((edge**2).sum(axis=1), 1e-300)

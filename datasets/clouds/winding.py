@@ -168,19 +168,18 @@ def narrower_normals(points: Float64, normals: Float64, found: WindingNormals, *
     unit, radius = _in_unit_ball(points)
     rows = spread(unit, limit)
     areas = disc_areas(unit[rows])
-    start = found.normals[KDTree(unit[found.rows]).query(unit[rows])[1]]
     narrowest = NARROWEST * float(np.sqrt(np.median(areas)))
-
-    def narrowed(noise: float) -> WindingNormals:
-        now, softening = start, found.softening / radius
-        while softening > narrowest and softening / NARROWING > NOISE_WIDTHS * noise:
-            softening /= NARROWING
-            now = _consistent(unit[rows], now * areas[:, None], softening, MOST_ROUNDS)
-        return WindingNormals(rows, now, softening * radius, noise * radius)
-
-    clean = narrowed(0.0)
-    noise = noise_level(unit, _turned(points, normals, clean))
-    return narrowed(noise) if NOISE_WIDTHS * noise * radius > clean.softening else clean
+    softenings = [found.softening / radius]
+    steps = [found.normals[KDTree(unit[found.rows]).query(unit[rows])[1]]]
+    while softenings[-1] > narrowest:
+        softenings.append(softenings[-1] / NARROWING)
+        steps.append(_consistent(unit[rows], steps[-1] * areas[:, None], softenings[-1], MOST_ROUNDS))
+    last = WindingNormals(rows, steps[-1], softenings[-1] * radius, 0.0)
+    noise = noise_level(unit, _turned(points, normals, last))
+    if NOISE_WIDTHS * noise <= softenings[-1]:
+        return last
+    allowed = max(1, sum(softening > NOISE_WIDTHS * noise for softening in softenings)) - 1
+    return WindingNormals(rows, steps[allowed], softenings[allowed] * radius, noise * radius)
 
 
 def _in_unit_ball(points: Float64) -> tuple[Float64, float]:

@@ -28,7 +28,6 @@ from .tables import Column, Figure, Table, tabulated
 
 __all__ = ["SignsBench", "SignsRow"]
 
-
 NEAREST = 64  # of the noisy points, among which a smoothed one is looked for
 
 

@@ -8,7 +8,6 @@ the places too of which winding numbers say for sure that they are on the other 
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from dataclasses import dataclass
 
@@ -18,7 +17,7 @@ from torch import Tensor
 
 from ...neural_fields import Field
 from .cloud import CloudDistance
-from .samples import SURE, spread_points
+from .samples import CLEAR, SURE, spread_points
 
 __all__ = ["Band", "band_of", "delta_of", "with_wrong_sides"]
 
@@ -29,8 +28,6 @@ STRAY = 4.0
 TAIL = 20.0
 # Places on the wrong side widen a band to so many times its width at most: a level that is lost would have no band.
 WIDEST = 2.0
-# Spacings from all points, below which a winding number says nothing for sure.
-CLEAR = 4.0
 # Of the places this part is asked first: most levels have none on the wrong side, and winding numbers take time.
 FIRST = 4
 
@@ -41,14 +38,19 @@ class Band:
 
     Attributes:
         delta: its half-width.
-        rule: "quantile" where one was asked for, "maximum" over all points, or "maximum but for strays"; or "no wider
-            than the band before", see `within`.
+        rule: "quantile" where one was asked for, "maximum" over all points, or "maximum but for strays"; "places on the
+            wrong side", see `with_wrong_sides`; or "no wider than the band before", see `within`.
         outside: input points that it does not hold.
     """
 
     delta: float
     rule: str
     outside: int
+
+    @classmethod
+    def of(cls, delta: float, rule: str, errors: Tensor) -> Band:
+        """The band of half-width ``delta``, with the count of the ``errors`` ``(n,)`` at the input points beyond it."""
+        return cls(delta, rule, int((errors.abs() >= delta).sum()))
 
     def within(self, before: float | None, errors: Tensor) -> Band:
         """This band, or where the one ``before`` it is narrower, that: bands nest.
@@ -59,7 +61,7 @@ class Band:
         """
         if before is None or self.delta <= before:
             return self
-        return Band(before, "no wider than the band before", int((errors.abs() >= before).sum()))
+        return Band.of(before, "no wider than the band before", errors)
 
 
 def band_of(errors: Tensor, *, epsilon: float, quantile: float | None) -> Band:
@@ -74,7 +76,7 @@ def band_of(errors: Tensor, *, epsilon: float, quantile: float | None) -> Band:
     delta = max(delta_of(errors, epsilon=epsilon, quantile=quantile), 1e-6)
     strays = float(errors.abs().max()) * (1 + epsilon) > delta
     rule = "quantile" if quantile is not None else "maximum but for strays" if strays else "maximum"
-    return Band(delta, rule, int((errors.abs() >= delta).sum()))
+    return Band.of(delta, rule, errors)
 
 
 def delta_of(errors: Tensor, *, epsilon: float, quantile: float | None) -> float:
@@ -99,7 +101,15 @@ def delta_of(errors: Tensor, *, epsilon: float, quantile: float | None) -> float
 
 @torch.no_grad()
 def with_wrong_sides(
-    band: Band, cloud: CloudDistance, field: Field, *, epsilon: float, count: int, seed: int, device: torch.device
+    band: Band,
+    errors: Tensor,
+    cloud: CloudDistance,
+    field: Field,
+    *,
+    epsilon: float,
+    count: int,
+    seed: int,
+    device: torch.device,
 ) -> Band:
     """This band, or a wider one that also holds the places which ``field`` puts on the wrong side.
 
@@ -108,6 +118,7 @@ def with_wrong_sides(
 
     Args:
         band: see `band_of`.
+        errors: ``(n,)`` values at the input points.
         cloud: the points.
         field: the frozen levels.
         epsilon: the ε of Eq. 5.
@@ -125,7 +136,7 @@ def with_wrong_sides(
     more = _wrong_sides(band.delta, cloud, field, spread_points(cloud, count, generator), device)
     widest = float(torch.cat((wrong, more)).abs().max())
     delta = min((1 + epsilon) * widest, WIDEST * band.delta)
-    return dataclasses.replace(band, delta=delta, rule="places on the wrong side")
+    return Band.of(delta, "places on the wrong side", errors)
 
 
 def _wrong_sides(delta: float, cloud: CloudDistance, field: Field, places: Tensor, device: torch.device) -> Tensor:

@@ -15,7 +15,6 @@ import json
 import math
 import zipfile
 from collections.abc import Callable
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -179,6 +178,7 @@ class CloudDistance:
         self.tree = KDTree(self.points, compact_nodes=False, balanced_tree=False)
         self.noise, self.guessed = noise, guessed
         self.neighbors = min(neighbors, len(points))
+        self._dipoles: dict[float, DipoleField] = {}  # by how much they are softened
         self.areas: Float32 = self._areas()
         self.radii: Float32 = np.sqrt(self.areas / math.pi)
         self.spacing = float(np.median(np.sqrt(self.areas)))
@@ -236,7 +236,7 @@ class CloudDistance:
             x: the points.
             soft: softening of the dipoles, in standard deviations of the noise.
         """
-        dipoles = self._dipoles if soft == SOFT else self._softened(soft)
+        dipoles = self._softened(soft)
 
         def watch(pairs: int) -> None:
             self.watch(windings(pairs, 1))
@@ -244,14 +244,12 @@ class CloudDistance:
         starts = range(0, max(len(x), 1), PLACES)
         return np.concatenate([dipoles.winding(x[start : start + PLACES], watch=watch) for start in starts])
 
-    @cached_property
-    def _dipoles(self) -> DipoleField:
-        return self._softened(SOFT)
-
     def _softened(self, soft: float) -> DipoleField:
         """The points as dipoles, softened by so many standard deviations of the noise, or `SOFT` of their discs."""
-        softening = np.maximum(SOFT * self.radii, soft * self.noise)
-        return DipoleField(self.points, self.normals * self.areas[:, None], softening)
+        if soft not in self._dipoles:
+            softening = np.maximum(SOFT * self.radii, soft * self.noise)
+            self._dipoles[soft] = DipoleField(self.points, self.normals * self.areas[:, None], softening)
+        return self._dipoles[soft]
 
     def _areas(self) -> Float32:
         """The area that each point has to itself ``(N,)``: the disc out to neighbours whose normals face its own way.

@@ -57,6 +57,8 @@ GUESSED_NORMAL, GUESSED_SLOPE = 0.1, 0.2
 # Of noise without normals, smoothing leaves this much: 0.3 to 0.7 of it in the root mean square on six shapes with 0.5
 # and 1 %, 0.4 in the median. Distances are that good.
 LEFT = 0.4
+# Spacings from all points, from which on a place is no longer between them: there a surface is about one away.
+CLEAR = 4.0
 # So few places that the level before gets wrong far from the cloud are not worth a share of the batch.
 FEWEST = 32
 
@@ -329,8 +331,7 @@ def remote_samples(
         points = samples.points.cpu().numpy()
         assert samples.value is not None
         distance = cloud.nearest(points)
-        # Between its points a surface is about a spacing away from them.
-        far = np.flatnonzero(distance - samples.value.abs().cpu().numpy() > max(delta, 4 * cloud.gap))
+        far = np.flatnonzero(distance - samples.value.abs().cpu().numpy() > max(delta, CLEAR * cloud.gap))
         depth = cloud.winding_number(points[far]) - 0.5
         sure = np.abs(depth) > (SURE_GUESSED if cloud.guessed else SURE)
         empty, unseen = (samples.take(torch.from_numpy(far[some]).to(device)) for some in (sure, ~sure))

@@ -403,7 +403,7 @@ class _Fitting:
         band = band_of(self.errors, epsilon=config.epsilon, quantile=config.quantile)
         if level == 1 and config.quantile is None:
             asked = {"epsilon": config.epsilon, "count": config.samples, "seed": config.seed, "device": self.device}
-            band = with_wrong_sides(band, self.indexed(level), self.frozen, **asked)
+            band = with_wrong_sides(band, self.errors, self.indexed(level), self.frozen, **asked)
         return band.within(self.stages[-1]["delta"], self.errors)
 
     def judge(self, delta: float, surface: Source) -> Judge | None:

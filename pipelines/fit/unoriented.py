@@ -13,8 +13,8 @@ field that has the steeper slope along the normals is kept: where it crosses a w
 where both sides of the wall got the same sign. Where the slope is faint, signs come from the neighbours.
 
 Of bars that are thin for the network the field is faint all over, and its signs are worse than what came before: they
-change from point to point, and winding numbers fit them less where they were changed. So changes are taken
-only if winding numbers fit them better there, by far.
+change from point to point, and winding numbers fit them less where they were changed. So changes are taken only if
+winding numbers fit them better there, by far.
 """
 
 from __future__ import annotations

@@ -42,7 +42,7 @@ def widened(field: Field, delta: float) -> Band:
     assert sphere.normals is not None
     cloud = CloudDistance(torch.from_numpy(sphere.points).float(), torch.from_numpy(sphere.normals).float())
     where = {"count": 400_000, "seed": 0, "device": torch.device("cpu")}
-    return with_wrong_sides(Band(delta, "maximum", 0), cloud, field, epsilon=0.05, **where)
+    return with_wrong_sides(Band(delta, "maximum", 1), torch.tensor([delta]), cloud, field, epsilon=0.05, **where)
 
 
 def test_a_level_that_is_right_keeps_the_band_of_its_points() -> None:
@@ -56,6 +56,7 @@ def test_a_band_holds_what_a_level_puts_on_the_wrong_side(delta: float, expected
     band = widened(Union(Sphere(radius=0.5), Sphere(radius=0.2, center=(0.8, 0.0, 0.0))), delta)
     assert 0.8 * expected < band.delta <= expected * (1 + 1e-6)
     assert (band.rule == "places on the wrong side") == (delta < 0.2)
+    assert band.outside == (delta > 0.2)  # the one input point is at δ: a wider band holds it
 
 
 def test_a_hollow_that_a_level_invents_is_on_the_wrong_side_too() -> None:
