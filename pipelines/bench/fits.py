@@ -27,12 +27,13 @@ from ..fit.cloud import load_cloud
 from ..fit.train import Run, fit, prepare
 from ..render.picture import contact_sheet, write_picture
 from ..render.rasterise import picture_of
-from ..run.folder import STATE_FILE, find_field, is_fitted, read_record
+from ..run.folder import FIELD_FILE, STATE_FILE, find_field, is_fitted, read_record
 from ..run.machine import peak_memory
 from ..run.settings import FitConfig
 from ..run.trainer import Report
 from ..surface.measure import Metrics, evaluate_surfaces
 from ..surface.surface import Surface, face_normals, from_cloud, from_mesh, read_reference, read_surface, sample_points
+from ..surface.trim import drop_unsupported, read_support
 from .benchmark import Benchmark, Part, plain
 from .cells import Workplace, key_of
 from .tables import Column, Figure, Table, tabulated
@@ -296,12 +297,21 @@ def clouds_of(
 
 
 def timed_mesh(run: Run, resolution: int, level: int = -1) -> tuple[Mesh | None, float]:
-    """The mesh of a level in unit-sphere coordinates, if it has a surface, and the seconds of its extraction."""
+    """The mesh of a level as `mplicits mesh` makes it, without blobs, but in unit-sphere coordinates; and its seconds.
+
+    A level without a surface has none. Of a run that no folder holds, nothing says what supports it, and blobs stay.
+    """
     started = time.perf_counter()
+    level %= run.field.num_levels
     try:
         mesh = extract_mesh(run.field, resolution=resolution, level=level)
     except NoSurfaceError:
         mesh = None
+    home, support = run.directory, None
+    if home is not None:
+        support = read_support(home / FIELD_FILE, read_record(home), level)
+    if mesh is not None and support is not None:
+        mesh = drop_unsupported(mesh, support.points, radius=support.radius).mesh
     return mesh, time.perf_counter() - started
 
 

@@ -212,6 +212,7 @@ class Judge:
         data: weight of f(x)².
         normal: weight of 1 − cos(∇f, N).
         usual: the scales of `pseudo_huber` around them.
+        guessed: whether the normals were estimated from the points.
     """
 
     def __init__(
@@ -225,10 +226,12 @@ class Judge:
         data: float,
         normal: float,
         usual: Usual = SQUARES,
+        guessed: bool = False,
     ) -> None:
         samples = Samples(points, distance=torch.zeros(len(points)), normal=normals)
         self.samples = with_previous(samples, previous, delta, device=previous.like.device)
         self.data, self.normal, self.usual, self.count = data, normal, usual, len(self.samples)
+        self.guessed = guessed
         self.voxels = torch.from_numpy(voxels_of(self.samples.points.cpu().numpy(), spacing))
         assert self.samples.value is not None
         assert self.samples.gradient is not None
@@ -252,7 +255,7 @@ class Judge:
         """On a level with these errors; see `Verdict`."""
         pairs = zip(self.without[1:], each[1:], strict=True)
         fall = Fall(*(standard_errors(before - after, self.voxels) for before, after in pairs))
-        return Verdict(self.count, self.before, each.mean(), at, fall)
+        return Verdict(self.count, self.before, each.mean(), at, fall, guessed=self.guessed)
 
     def _errors(self, value: Tensor, gradient: Tensor) -> Each:
         distance, normal = self.samples.distance, self.samples.normal

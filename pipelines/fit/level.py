@@ -128,7 +128,8 @@ class LevelObjective(Objective):
         """Look once more, and go back to the best weights if they are surely better → what was found; None without.
 
         The rates have fallen to nothing at the end, and with them the waves that the batches left; a few hundred points
-        hardly see those. So the last weights stay, unless they are worse by more than chance, or worse than none.
+        hardly see those. So the last weights stay, unless they are worse by more than chance, or no better than none:
+        neither is their loss less, nor would the level be kept for its distances and angles.
         """
         if self.judge is None:
             return None
@@ -136,10 +137,11 @@ class LevelObjective(Objective):
         last = self.judge.errors(self.siren)
         self.look(1.0)
         self.siren.load_state_dict({name: self.kept[BEST + name] for name in weights})
-        best = self.judge.errors(self.siren)
-        if last.mean().loss < self.judge.before.loss and not self.judge.surely_less(best, last):
+        best, verdict = self.judge.errors(self.siren), self.judge.verdict(last, 1.0)
+        some_use = verdict.after.loss < verdict.before.loss or verdict.better
+        if some_use and not self.judge.surely_less(best, last):
             self.siren.load_state_dict(weights)
-            return self.judge.verdict(last, 1.0)
+            return verdict
         return self.judge.verdict(best, float(self.kept["at"]))
 
     def _draw(self, source: Source) -> Tensor:

@@ -347,7 +347,7 @@ class _Fitting:
         if verdict is not None:
             seen = ~self.held
             learnt = _rms(self.errors[seen]) / max(_rms(before[seen]), 1e-30)
-            verdict = verdict._replace(learnt=learnt, guessed=self.cloud.estimated)
+            verdict = verdict._replace(learnt=learnt)
             silenced |= not verdict.better
         if silenced:
             nn.init.zeros_(siren.output.weight)
@@ -413,7 +413,8 @@ class _Fitting:
         assert self.frozen is not None
         points, normals = self.points[self.held], self.normals[self.held]
         terms = {"data": surface.data, "normal": surface.normal, "usual": surface.usual}
-        judge = Judge(points, normals, self.frozen, delta, spacing=self.spacing, **terms)
+        about = {"spacing": self.spacing, "guessed": self.cloud.estimated}
+        judge = Judge(points, normals, self.frozen, delta, **about, **terms)
         return judge if judge.count >= FEWEST / 2 else None
 
     def review(self) -> dict[str, Any]:

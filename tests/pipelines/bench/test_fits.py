@@ -9,13 +9,13 @@ import pytest
 import torch
 from mplicits.datasets import add_isotropic_noise, read_cloud
 from mplicits.datasets.synthetic.prisms import PRISMS
-from mplicits.neural_fields import InputError, Similarity, Sphere, extract_mesh
+from mplicits.neural_fields import InputError, Mesh, MultiscaleSDF, Similarity, Sphere, Union, extract_mesh
 from mplicits.pipelines.bench import fits as module
 from mplicits.pipelines.bench.fits import STEEPEST, FitBench, facing_camera
 from mplicits.pipelines.bench.report import as_text
 from mplicits.pipelines.mesh.files import write_mesh
 from mplicits.pipelines.run.settings import FitConfig
-from mplicits.pipelines.surface.surface import Surface, face_normals
+from mplicits.pipelines.surface.surface import Surface, components, face_normals, from_mesh
 
 SMALL = FitConfig(
     widths=(32, 32),
@@ -55,6 +55,20 @@ def test_rows_picture_and_table(ball: Path, tmp_path: Path, monkeypatch: pytest.
     assert finest.chamfer_floor is not None
     assert f"{finest.chamfer:.2e}" in table
     assert f"{finest.chamfer - finest.chamfer_floor:.2e}" in table
+
+
+def test_blobs_go_as_mplicits_mesh_drops_them(ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = module.kept_fit(tmp_path / "run", read_cloud(ball), SMALL)
+    blob = Sphere(radius=0.08, center=(0.85, 0.85, 0.85))  # far from all points
+
+    def with_blob(field: MultiscaleSDF, *, resolution: int, level: int) -> Mesh:
+        return extract_mesh(Union(field.levels[level], blob), resolution=resolution)
+
+    monkeypatch.setattr(module, "extract_mesh", with_blob)
+    for kept, parts in ((replace(run, directory=None), 2), (run, 1)):
+        mesh, _ = module.timed_mesh(kept, 64, level=0)
+        assert mesh is not None
+        assert components(from_mesh(mesh)) == parts
 
 
 def test_noise_reaches_the_fit(ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -39,10 +39,10 @@ def points(count: int) -> torch.Tensor:
     return torch.from_numpy(sample_sphere(count, radius=RADIUS).points).float()
 
 
-def judge_of(sphere: float, *, data: float = 100.0, normal: float = 3.0) -> Judge:
+def judge_of(sphere: float, *, data: float = 100.0, normal: float = 3.0, guessed: bool = False) -> Judge:
     """Of a sphere's points, by a frozen sphere of another radius."""
-    x = points(1000)
-    return Judge(x, x / RADIUS, Sphere(radius=sphere), 0.1, spacing=SPACING, data=data, normal=normal)
+    x, about = points(1000), {"spacing": SPACING, "data": data, "normal": normal}
+    return Judge(x, x / RADIUS, Sphere(radius=sphere), 0.1, **about, guessed=guessed)
 
 
 def zero_siren(bias: float) -> Siren:
@@ -197,6 +197,31 @@ def test_a_level_goes_back_to_what_was_surely_better() -> None:
     assert verdict.at == 0.5
     assert float(level.siren.output.bias.detach()) == pytest.approx(-0.99 * OFF, rel=1e-6)
     assert verdict.after.distance == pytest.approx(0.01 * OFF, rel=1e-3)
+
+
+@pytest.mark.parametrize("guessed", [True, False])
+def test_a_few_far_points_send_no_level_back(guessed: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Of a thousand points 998 come to be exact, and two so far off that the mean square is above that at the start.
+    level = objective(judge_of(RADIUS - OFF, guessed=guessed), 0.0)
+    judge = level.judge
+    assert judge is not None
+    few = torch.where(torch.arange(1000) < 2, 30 * OFF, 0.0)
+    angle = judge.without.angle + 0.1  # normals that were estimated may be wrong
+    distances = {-0.5: 0.98 * judge.without.distance, -1.0: few}
+
+    def errors(siren: Siren) -> Each:
+        distance = distances[float(siren.output.bias.detach())]
+        return Each(judge.data * distance.square(), distance, angle)
+
+    monkeypatch.setattr(judge, "errors", errors)
+    for bias, done in ((-0.5, 0.5), (-1.0, 1.0)):
+        torch.nn.init.constant_(level.siren.output.bias, bias)
+        level.look(done)
+    assert not judge.surely_less(errors(level.siren)._replace(loss=judge.without.loss), errors(level.siren))
+    verdict = level.take_best()
+    assert verdict is not None
+    assert verdict.at == (1.0 if guessed else 0.5)
+    assert verdict.better == guessed
 
 
 def verdict_of(distance: float, angle: float, at: float = 1.0) -> Verdict:
