@@ -15,7 +15,7 @@ from ._lattice import Bounds
 from .field import Jet
 from .function import FieldLike, as_field
 from .mesh import Mesh
-from .rates import HOST_RATE, parameter_groups, share_rate
+from .rates import HOST_RATE, Pace, parameter_groups, share_rate
 from .similarity import Similarity
 from .world import WorldField
 
@@ -35,13 +35,21 @@ class Hosted(nn.Module):
             the box from −half to half on each axis.
         half: of that box, in the host's units.
         learning_rate: see `share_rate`; None leaves the parameters in their own units.
+        pace: share of the rates that suit the field; see `Pace`.
 
     Raises:
         ValueError: a number is not positive, or the bounds are none.
     """
 
     def __init__(
-        self, field: FieldLike, *, scale: float | None, bounds: Box | None, half: float, learning_rate: float | None
+        self,
+        field: FieldLike,
+        *,
+        scale: float | None,
+        bounds: Box | None,
+        half: float,
+        learning_rate: float | None,
+        pace: Pace = 1.0,
     ) -> None:
         super().__init__()
         box = _cube(half) if bounds is None else as_bounds(bounds)
@@ -50,8 +58,9 @@ class Hosted(nn.Module):
             scale = 1.0 if bounds is None else 1 / math.hypot(*corner)
         positive(scale=scale)
         self.field, self.scale, self.bounds = as_field(field), float(scale), box
+        self.pace = pace
         if learning_rate is not None:
-            share_rate(self.field, learning_rate)
+            share_rate(self.field, learning_rate, pace=pace)
 
     @property
     def world(self) -> WorldField:
@@ -76,7 +85,7 @@ class Hosted(nn.Module):
 
     def parameter_groups(self, lr: float = HOST_RATE) -> list[dict[str, Any]]:
         """Groups for the host's optimiser, with a rate for each layer of the field; see `rates.parameter_groups`."""
-        return parameter_groups(self.field, lr)
+        return parameter_groups(self.field, lr, pace=self.pace)
 
     @torch.no_grad()
     def follow(self, inv_s: Tensor | float, *, band: float = 4.0, least: float = 0.02, most: float = 0.3) -> None:

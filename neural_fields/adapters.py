@@ -16,7 +16,7 @@ from ._checks import positive
 from ._hosted import Box, Hosted, joined, mark
 from ._point_memo import PointMemo
 from .function import FieldLike
-from .rates import HOST_RATE
+from .rates import HOST_RATE, Pace
 from .volume import neus_alpha
 
 __all__ = ["Deviation", "InstantNSRGeometry", "NerfstudioField", "NeuSGeometry"]
@@ -35,6 +35,7 @@ class NeuSGeometry(Hosted):
         bounds: box of the mesh, ``(2, 3)``; from -1.01 to 1.01 by default, as in NeuS.
         learning_rate: at which NeuS trains all its networks alike; the parameters of the field are then kept in units
             in which this rate suits them (`share_rate`). None leaves them alone.
+        pace: share of the rates that suit the field, one for all levels or one for each; see `Pace`.
 
     Raises:
         ValueError: a number is not positive, or the bounds are none.
@@ -55,8 +56,9 @@ class NeuSGeometry(Hosted):
         scale: float | None = None,
         bounds: Box | None = None,
         learning_rate: float | None = None,
+        pace: Pace = 1.0,
     ) -> None:
-        super().__init__(field, scale=scale, bounds=bounds, half=1.01, learning_rate=learning_rate)
+        super().__init__(field, scale=scale, bounds=bounds, half=1.01, learning_rate=learning_rate, pace=pace)
         self._memo = PointMemo()
 
     def forward(self, x: Tensor) -> Tensor:
@@ -93,6 +95,7 @@ class InstantNSRGeometry(Hosted):
             of the host's cube outside the field's unit sphere; 1 / (√3 radius) takes them in.
         resolution: cells along each axis of the mesh that ``isosurface`` extracts.
         learning_rate: of the host's group ``geometry``; see `NeuSGeometry`.
+        pace: see `NeuSGeometry`.
 
     Raises:
         ValueError: a number is not positive.
@@ -114,10 +117,11 @@ class InstantNSRGeometry(Hosted):
         scale: float | None = None,
         resolution: int = 512,
         learning_rate: float | None = None,
+        pace: Pace = 1.0,
     ) -> None:
         positive(radius=radius)
         scale = 1 / radius if scale is None else scale
-        super().__init__(field, scale=scale, bounds=None, half=radius, learning_rate=learning_rate)
+        super().__init__(field, scale=scale, bounds=None, half=radius, learning_rate=learning_rate, pace=pace)
         self.radius, self.resolution = float(radius), resolution
 
     def forward(
@@ -211,6 +215,7 @@ class NerfstudioField(Hosted):
         bounds: the host's ``scene_box.aabb`` ``(2, 3)``, box of the mesh too; from -1 to 1 by default.
         deviation: initial value of the deviation network, the host's ``beta_init``.
         learning_rate: of the host's group ``fields``; see `NeuSGeometry`. It is the geometry alone that changes units.
+        pace: see `NeuSGeometry`.
 
     Raises:
         ValueError: a number is not positive, or the bounds are none.
@@ -226,8 +231,9 @@ class NerfstudioField(Hosted):
         bounds: Box | None = None,
         deviation: float = 0.3,
         learning_rate: float | None = None,
+        pace: Pace = 1.0,
     ) -> None:
-        super().__init__(field, scale=scale, bounds=bounds, half=1.0, learning_rate=learning_rate)
+        super().__init__(field, scale=scale, bounds=bounds, half=1.0, learning_rate=learning_rate, pace=pace)
         self.color, self.heads = color, heads
         self.deviation_network = Deviation(deviation)
         self.cos_anneal_ratio = 1.0

@@ -17,9 +17,14 @@ from torch import nn
 
 from ._checks import positive
 from .field import Field
+from .multiscale import MultiscaleSDF
 from .siren import Siren
 
-__all__ = ["HOST_RATE", "parameter_groups", "share_rate"]
+__all__ = ["HOST_RATE", "Pace", "parameter_groups", "share_rate"]
+
+# Shares of the rates below at which levels learn, the coarsest first; the last is for all that are finer, and one
+# number for all. Where colours do not need the geometry's own features, half of the rates leaves fewer waves.
+Pace = float | Sequence[float]
 
 # Adam's rate for the softplus networks of NeuS, sdfstudio and nerfstudio, beside which the two below were found.
 HOST_RATE = 5e-4
@@ -27,18 +32,19 @@ SINE_RATE = 3e-3  # of sine layers, over ω₀
 OUTPUT_RATE = 1e-4  # of their outputs, which ω₀ is no part of
 
 
-def parameter_groups(field: Field, lr: float = HOST_RATE) -> list[dict[str, Any]]:
+def parameter_groups(field: Field, lr: float = HOST_RATE, *, pace: Pace = 1.0) -> list[dict[str, Any]]:
     """The parameters of a field as groups for an optimiser, each with the rate that suits it.
 
     Args:
         field: SIRENs anywhere in it get rates of their own; all else gets ``lr``.
         lr: at which the host trains its own geometry; all rates are in proportion to it.
+        pace: share of these rates at which SIRENs learn; see `Pace`.
 
     Returns:
         Dicts with ``params`` and ``lr``.
 
     Raises:
-        ValueError: the rate is not positive.
+        ValueError: a rate or a pace is not positive.
 
     Example:
         >>> from mplicits.neural_fields import MultiscaleSDF, parameter_groups
@@ -48,15 +54,15 @@ def parameter_groups(field: Field, lr: float = HOST_RATE) -> list[dict[str, Any]
     """
     positive(lr=lr)
     groups, taken = [], set()
-    for siren in _sirens(field):
-        for params, wanted, unit in zip(_parts(siren), _wanted(siren), siren.units, strict=True):
+    for siren, rates in _wanted(field, pace):
+        for params, wanted, unit in zip(_parts(siren), rates, siren.units, strict=True):
             groups.append({"params": params, "lr": lr / HOST_RATE * wanted / unit})
             taken.update(map(id, params))
     rest = [parameter for parameter in field.parameters() if id(parameter) not in taken]
     return [*groups, {"params": rest, "lr": lr}] if rest else groups
 
 
-def share_rate(field: Field, lr: float = HOST_RATE) -> None:
+def share_rate(field: Field, lr: float = HOST_RATE, *, pace: Pace = 1.0) -> None:
     """Keep a field's parameters in units in which one rate serves all of them; the field stays the same function.
 
     The units are powers of two (`Siren.set_units`), so that values and jets stay the same bit for bit; the steps are
@@ -65,9 +71,10 @@ def share_rate(field: Field, lr: float = HOST_RATE) -> None:
     Args:
         field: changed in place; before an optimiser has seen it.
         lr: at which the host will train it, at the peak of its schedule.
+        pace: see `Pace`.
 
     Raises:
-        ValueError: the rate is not positive.
+        ValueError: a rate or a pace is not positive.
 
     Example:
         >>> import torch
@@ -79,15 +86,9 @@ def share_rate(field: Field, lr: float = HOST_RATE) -> None:
         ((0.25, 0.25), True)
     """
     positive(lr=lr)
-    for siren in _sirens(field):
-        sines, output = (2.0 ** round(math.log2(wanted / lr)) for wanted in _wanted(siren))
+    for siren, rates in _wanted(field, pace):
+        sines, output = (2.0 ** round(math.log2(wanted / lr)) for wanted in rates)
         siren.set_units(sines, output)
-
-
-def _sirens(field: Field) -> Iterator[Siren]:
-    for module in field.modules():
-        if isinstance(module, Siren):
-            yield module
 
 
 def _parts(siren: Siren) -> tuple[Sequence[nn.Parameter], Sequence[nn.Parameter]]:
@@ -95,6 +96,21 @@ def _parts(siren: Siren) -> tuple[Sequence[nn.Parameter], Sequence[nn.Parameter]
     return list(siren.layers.parameters()), list(siren.output.parameters())
 
 
-def _wanted(siren: Siren) -> tuple[float, float]:
-    """Adam's rates for weights and biases of the sine layers, and for those of the output."""
-    return SINE_RATE / siren.omega, OUTPUT_RATE
+def _wanted(field: Field, pace: Pace) -> Iterator[tuple[Siren, tuple[float, float]]]:
+    """Each SIREN with Adam's rates for weights and biases of its sine layers, and for those of its output."""
+    paces = [pace] if isinstance(pace, float | int) else list(pace)
+    for share in paces:
+        positive(pace=share)
+    if not paces:
+        raise ValueError("pace: there is none")
+    level = {
+        id(part): number
+        for module in field.modules()
+        if isinstance(module, MultiscaleSDF)
+        for number, siren in enumerate(module.levels)
+        for part in siren.modules()
+    }
+    for module in field.modules():
+        if isinstance(module, Siren):
+            share = paces[min(level.get(id(module), 0), len(paces) - 1)]
+            yield module, (share * SINE_RATE / module.omega, share * OUTPUT_RATE)

@@ -14,6 +14,7 @@ import trimesh
 from host_common import EVERY, LOOKS, MORE_STEPS, RAYS, RESOLUTION, applied, changes, in_ball, now, surface
 
 DEEPER = "[(128, 2), (256, 3)]", "[(128, 4), (256, 5)]"  # what `ours, deeper` changes: the paper's networks for images
+SHORT = "Short trainings in NeuS"  # the section whose lines `--short` adds, the host's own row's too
 ENCODED = "ours, 256 features"  # the other such rows have as many without an encoding
 
 
@@ -21,8 +22,9 @@ def set_up(args: argparse.Namespace, clone: Path, scene: Path, row: str, folder:
     """A copy of the host in ``folder``, changed for one row, with the schedule squeezed into so many steps."""
     shutil.copytree(clone, folder, dirs_exist_ok=True, ignore=shutil.ignore_patterns("exp", ".git"))
     runner, conf = folder / "exp_runner.py", folder / "confs" / "wmask.conf"
-    for file, diff in changes("NeuS"):
-        if row == "host" and "weights_only" not in diff:
+    sharper = changes(SHORT) if args.short else []
+    for file, diff in [*changes("NeuS"), *sharper]:
+        if row == "host" and "weights_only" not in diff and (file, diff) not in sharper:
             continue
         path = conf if file.endswith(".conf") else folder / file
         if path == conf and row != "ours":

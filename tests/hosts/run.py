@@ -56,6 +56,7 @@ def main() -> None:
     parser.add_argument("--warm-up", type=float, default=5000 / 300_000, help="share of the steps; NeuS's by default")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--rows", nargs="+", choices=ROWS["neus"])
+    parser.add_argument("--short", action="store_true", help="NeuS: all rows with the lines for short trainings")
     parser.add_argument("--keep", type=Path, help="file of the rows, to go on from")
     parser.add_argument("--work", type=int, help=argparse.SUPPRESS)
     args = parser.parse_args()
@@ -67,6 +68,7 @@ def main() -> None:
     rows = {tuple(key): found for key, found in map(json.loads, kept)}
     for seed, scene, row in product(args.seeds, args.data, args.rows or ROWS[host]):
         key = (host, scene.resolve().name, row, seed, args.steps, args.rays, args.samples, args.warm_up)
+        key += ("short",) * args.short
         if key not in rows:
             rows[key] = run(args, host, scene, row, seed)
             if args.keep:

@@ -4,7 +4,16 @@ import copy
 
 import pytest
 import torch
-from mplicits.neural_fields import MultiscaleSDF, Siren, SpaceTimeSDF, Sphere, Union, parameter_groups, share_rate
+from mplicits.neural_fields import (
+    MultiscaleSDF,
+    NeuSGeometry,
+    Siren,
+    SpaceTimeSDF,
+    Sphere,
+    Union,
+    parameter_groups,
+    share_rate,
+)
 from mplicits.neural_fields.rates import OUTPUT_RATE, SINE_RATE
 from torch import Tensor, nn
 
@@ -83,6 +92,33 @@ def test_one_rate_takes_the_steps_of_the_groups() -> None:
             assert near <= rate * 2**0.5 + 1e-6
 
 
+@pytest.mark.parametrize(("pace", "shares"), [(0.5, (0.5, 0.5)), ((0.5, 0.25), (0.5, 0.25)), ((2.0,), (2.0, 2.0))])
+def test_levels_learn_at_their_pace(pace: float | tuple[float, ...], shares: tuple[float, float]) -> None:
+    field = tapered()
+    plain, slow = (parameter_groups(field, 1e-3, pace=each) for each in (1.0, pace))
+    of_group = [share for share in shares for _ in range(2)]  # sine layers and output
+    for one, other, share in zip(plain, slow, of_group, strict=True):
+        assert other["lr"] == pytest.approx(share * one["lr"], rel=1e-12)
+    share_rate(field, 5e-4)
+    units = [unit for siren in field.levels for unit in siren.units]  # pyright: ignore[reportAttributeAccessIssue]
+    shell = NeuSGeometry(field, learning_rate=5e-4, pace=pace)
+    found = [unit for siren in field.levels for unit in siren.units]  # pyright: ignore[reportAttributeAccessIssue]
+    assert found == [share * unit for share, unit in zip(of_group, units, strict=True)]
+    for one, other, unit in zip(slow, shell.parameter_groups(1e-3), found, strict=True):
+        assert other["lr"] * unit == pytest.approx(one["lr"], rel=1e-12)
+
+
+def test_levels_of_all_parts_have_their_pace() -> None:
+    field = Union(tapered(), Siren(8, 1), tapered())
+    rates = [group["lr"] for group in parameter_groups(field, 5e-4, pace=(1.0, 0.5))]
+    coarse, fine, alone = (
+        [SINE_RATE / 10, OUTPUT_RATE],
+        [SINE_RATE / 60, OUTPUT_RATE / 2],
+        [SINE_RATE / 30, OUTPUT_RATE],
+    )
+    assert rates == pytest.approx([*coarse, *fine, *alone, *coarse, *fine], rel=1e-12)
+
+
 def test_groups_in_units_are_in_the_same_proportion() -> None:
     field = tapered()
     plain = parameter_groups(field, 1e-3)
@@ -113,6 +149,9 @@ def test_rates_are_positive() -> None:
     for function in (parameter_groups, share_rate):
         with pytest.raises(ValueError, match="lr=0"):
             function(Siren(8, 1), 0)
+        for pace, message in ((-1.0, "pace=-1"), ((1.0, 0.0), "pace=0"), ((), "pace: there is none")):
+            with pytest.raises(ValueError, match=message):
+                function(Siren(8, 1), pace=pace)
 
 
 def test_lifted_into_space_time_and_sliced_it_stays_the_same() -> None:
