@@ -49,7 +49,7 @@ class Hosted(nn.Module):
         bounds: Box | None,
         half: float,
         learning_rate: float | None,
-        pace: Pace = 1.0,
+        pace: Pace,
     ) -> None:
         super().__init__()
         box = _cube(half) if bounds is None else as_bounds(bounds)

@@ -104,7 +104,7 @@ def _wanted(field: Field, pace: Pace) -> Iterator[tuple[Siren, tuple[float, floa
     if not paces:
         raise ValueError("pace: there is none")
     level = {
-        id(part): number
+        part: number
         for module in field.modules()
         if isinstance(module, MultiscaleSDF)
         for number, siren in enumerate(module.levels)
@@ -112,5 +112,5 @@ def _wanted(field: Field, pace: Pace) -> Iterator[tuple[Siren, tuple[float, floa
     }
     for module in field.modules():
         if isinstance(module, Siren):
-            share = paces[min(level.get(id(module), 0), len(paces) - 1)]
+            share = paces[min(level.get(module, 0), len(paces) - 1)]
             yield module, (share * SINE_RATE / module.omega, share * OUTPUT_RATE)

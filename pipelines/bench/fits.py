@@ -27,7 +27,7 @@ from ..fit.cloud import load_cloud
 from ..fit.train import Run, fit, prepare
 from ..render.picture import contact_sheet, write_picture
 from ..render.rasterise import picture_of
-from ..run.folder import FIELD_FILE, STATE_FILE, find_field, is_fitted, read_record
+from ..run.folder import STATE_FILE, find_field, is_fitted, read_record
 from ..run.machine import peak_memory
 from ..run.settings import FitConfig
 from ..run.trainer import Report
@@ -301,15 +301,13 @@ def timed_mesh(run: Run, resolution: int, level: int = -1) -> tuple[Mesh | None,
 
     A level without a surface has none. Of a run that no folder holds, nothing says what supports it, and blobs stay.
     """
+    level, home = run.field.resolve_level(level), run.directory
+    support = None if home is None else read_support(find_field(home), read_record(home), level)
     started = time.perf_counter()
-    level %= run.field.num_levels
     try:
         mesh = extract_mesh(run.field, resolution=resolution, level=level)
     except NoSurfaceError:
         mesh = None
-    home, support = run.directory, None
-    if home is not None:
-        support = read_support(home / FIELD_FILE, read_record(home), level)
     if mesh is not None and support is not None:
         mesh = drop_unsupported(mesh, support.points, radius=support.radius).mesh
     return mesh, time.perf_counter() - started

@@ -413,8 +413,8 @@ class _Fitting:
         assert self.frozen is not None
         points, normals = self.points[self.held], self.normals[self.held]
         terms = {"data": surface.data, "normal": surface.normal, "usual": surface.usual}
-        about = {"spacing": self.spacing, "guessed": self.cloud.estimated}
-        judge = Judge(points, normals, self.frozen, delta, **about, **terms)
+        guessed = self.cloud.estimated
+        judge = Judge(points, normals, self.frozen, delta, spacing=self.spacing, guessed=guessed, **terms)
         return judge if judge.count >= FEWEST / 2 else None
 
     def review(self) -> dict[str, Any]:

@@ -22,10 +22,8 @@ def set_up(args: argparse.Namespace, clone: Path, scene: Path, row: str, folder:
     """A copy of the host in ``folder``, changed for one row, with the schedule squeezed into so many steps."""
     shutil.copytree(clone, folder, dirs_exist_ok=True, ignore=shutil.ignore_patterns("exp", ".git"))
     runner, conf = folder / "exp_runner.py", folder / "confs" / "wmask.conf"
-    sharper = changes(SHORT) if args.short else []
-    for file, diff in [*changes("NeuS"), *sharper]:
-        if row == "host" and "weights_only" not in diff and (file, diff) not in sharper:
-            continue
+    wanted = [change for change in changes("NeuS") if row != "host" or "weights_only" in change[1]]
+    for file, diff in [*wanted, *(changes(SHORT) if args.short else [])]:
         path = conf if file.endswith(".conf") else folder / file
         if path == conf and row != "ours":
             continue

@@ -5,8 +5,9 @@
 The clone and the data stay as they are: what is run is a copy in a temporary folder, in which the document's lines are
 changed (``ours``), its other colour network is not (``ours, 256 features``; ``ours, no encoding`` with all of them the
 field's own, ``ours, deeper`` with the paper's deeper levels too), or nothing is (``host``), and ``cuda`` is ``cpu``
-where there is no GPU. The host's own packages have to be there: ``pip install pyhocon icecream tqdm PyMCubes`` for
-NeuS, ``pip install omegaconf matplotlib PyMCubes`` for instant-nsr-pl (``--nsr``), whose others have stand-ins.
+where there is no GPU. ``--short`` adds NeuS's lines for short trainings to all rows, ``host`` too. The host's own
+packages have to be there: ``pip install pyhocon icecream tqdm PyMCubes`` for NeuS, ``pip install omegaconf matplotlib
+PyMCubes`` for instant-nsr-pl (``--nsr``), whose others have stand-ins.
 
 Every eighth view is kept from the training, and colours are measured there, on the same rays for all. Where the data
 has a ``surface.ply`` (``mplicits scene``), the mesh is measured against it. With ``--keep FILE`` rows are written to a
@@ -61,6 +62,8 @@ def main() -> None:
     parser.add_argument("--work", type=int, help=argparse.SUPPRESS)
     args = parser.parse_args()
     host = "neus" if args.neus else "nsr"
+    if args.short and host == "nsr":
+        parser.error("--short goes with --neus")
     if args.work is not None:
         print("\n" + json.dumps(module(host).work(args.data[0], args.work)))
         return

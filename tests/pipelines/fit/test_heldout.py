@@ -41,8 +41,8 @@ def points(count: int) -> torch.Tensor:
 
 def judge_of(sphere: float, *, data: float = 100.0, normal: float = 3.0, guessed: bool = False) -> Judge:
     """Of a sphere's points, by a frozen sphere of another radius."""
-    x, about = points(1000), {"spacing": SPACING, "data": data, "normal": normal}
-    return Judge(x, x / RADIUS, Sphere(radius=sphere), 0.1, **about, guessed=guessed)
+    x, frozen = points(1000), Sphere(radius=sphere)
+    return Judge(x, x / RADIUS, frozen, 0.1, spacing=SPACING, data=data, normal=normal, guessed=guessed)
 
 
 def zero_siren(bias: float) -> Siren:
