@@ -124,7 +124,8 @@ def meshes(path: Path) -> None:
 
 
 def views(path: Path, *, form: str = "transforms", count: int = 4) -> None:
-    quietly("scene", "painted-sphere", "-o", path, "--format", form, "--views", count, "--size", 16, "--samples", 1)
+    small = ("--views", count, "--size", 16, "--samples", 1, "--depths")
+    quietly("scene", "painted-sphere", "-o", path, "--format", form, *small)
 
 
 def cameras(path: Path) -> None:

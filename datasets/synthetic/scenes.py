@@ -6,7 +6,7 @@ function that vanishes exactly on the surface), the colour is a function of the 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -21,11 +21,21 @@ from ..cameras import UP_AXES, Camera, look_at
 from ..clouds.orientation import fibonacci_directions
 from ..clouds.point_cloud import PointCloud
 from ..color_space import linear_to_srgb, srgb_to_linear
+from ..views.depth_maps import DepthMap
 from ..views.images import PosedImage, PosedImages
 from .samples import sample_surface
 from .statue import Statue
 
-__all__ = ["SCENES", "Scene", "render_scene", "render_view", "sample_scene", "scene_cameras", "scene_mesh"]
+__all__ = [
+    "SCENES",
+    "Scene",
+    "render_scene",
+    "render_view",
+    "sample_scene",
+    "scene_cameras",
+    "scene_depths",
+    "scene_mesh",
+]
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -37,6 +47,7 @@ GLOSS, SHARPNESS = 0.6, 40  # light in the middle of a lamp's reflection, and ho
 DISTANCE = 4.0  # of the eyes from the middle, in radii of the shape
 MARGIN = 1.1  # radius of the ball that just fills the images, in radii of the shape
 RAYS_AT_ONCE = 1 << 17
+VISIBLE = 1e-3  # how far before a point of the surface a ray may meet it that sees the point
 SPARSE_POINTS = 1000  # as many as structure from motion would give, more or less
 
 
@@ -96,9 +107,10 @@ def render_scene(
     samples: int = 3,
     shaded: bool = False,
     glossy: bool = False,
+    depths: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> PosedImages:
-    """Posed images of a scene, with exact poses, colours and masks, and a few points of its surface.
+    """Posed images of a scene, with exact poses, colours and masks, and a few points of its surface with who sees them.
 
     Args:
         scene: what to draw.
@@ -108,6 +120,7 @@ def render_scene(
         samples: rays per pixel and direction.
         shaded: whether a fixed lamp lights the shape; without, the images show the paint itself.
         glossy: whether the lamp is reflected, in a highlight that moves with the eye.
+        depths: whether each image has the depths of its pixels' centres.
         progress: called with ``(done, total)`` after every image.
 
     Raises:
@@ -116,11 +129,39 @@ def render_scene(
     images = []
     for index, camera in enumerate(scene_cameras(scene, views=views, size=size, seed=seed)):
         color, mask = render_view(scene, camera, samples=samples, shaded=shaded, glossy=glossy)
-        images.append(PosedImage(f"{index:03d}.png", camera, color, mask))
+        depth = scene_depths(scene, camera) if depths else None
+        images.append(PosedImage(f"{index:03d}.png", camera, color, mask, depth))
         if progress is not None:
             progress(index + 1, views)
     points = sample_surface(scene.field, SPARSE_POINTS, seed=seed).points
-    return PosedImages(tuple(images), Similarity.identity(), "the unit sphere", points, Path(scene.name))
+    seen = _observations(scene, points, [view.camera for view in images])
+    return PosedImages(tuple(images), Similarity.identity(), "the unit sphere", points, Path(scene.name), seen)
+
+
+def scene_depths(scene: Scene, camera: Camera) -> DepthMap:
+    """The depths ``(H, W)`` along the axis of view of what a camera's pixels see in their middle; NaN of what misses.
+
+    Args:
+        scene: what is seen.
+        camera: in the scene's coordinates.
+    """
+    eye, directions = camera.rays(dtype=torch.float64)
+    hits = sphere_trace(scene.field, eye, directions, tolerance=1e-9, lipschitz=scene.lipschitz)
+    ahead = (hits.position - eye) @ camera.forward
+    numbers = torch.where(hits.mask, ahead, torch.nan).float().numpy()
+    return DepthMap(numbers, camera, "metric", Path(scene.name))
+
+
+def _observations(scene: Scene, points: Float64, cameras: Sequence[Camera]) -> NDArray[np.int64]:
+    """``(K, 2)`` which camera sees which of the points ``(P, 3)``: in its picture, with nothing before them."""
+    eyes = torch.stack([camera.eye for camera in cameras])
+    away = torch.from_numpy(points) - eyes[:, None]  # (V, P, 3)
+    length = away.norm(dim=-1)
+    directions = away / length[..., None]
+    hits = sphere_trace(scene.field, eyes[:, None].expand_as(directions), directions, lipschitz=scene.lipschitz)
+    free = (hits.mask & (hits.depth > length - VISIBLE)).numpy()
+    framed = np.stack([camera.in_view(points)[2] for camera in cameras])
+    return np.argwhere(free & framed)
 
 
 def render_view(

@@ -7,7 +7,7 @@ OpenCV's; pixels count from the image's corner, so half a pixel is taken off.
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence, Sized
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,6 +23,7 @@ from .shots import IMAGE_SUFFIXES, Shot
 __all__ = ["find_model", "read_colmap", "read_colmap_points"]
 
 Float64 = NDArray[np.float64]
+Int64 = NDArray[np.int64]
 
 MODELS = {  # name: number of parameters; the order is that of the binary files' numbers
     "SIMPLE_PINHOLE": 3,
@@ -53,6 +54,7 @@ class _Lens:
 
 @dataclass(frozen=True)
 class _Pose:
+    number: int
     name: str
     quaternion: tuple[float, ...]  # w, x, y, z
     shift: tuple[float, ...]
@@ -78,15 +80,13 @@ def read_colmap(model: Path) -> list[Shot]:
     """
     cameras, images = _part(model, "cameras"), _part(model, "images")
     lenses = _binary_lenses(cameras) if cameras.suffix == ".bin" else _text_lenses(cameras)
-    poses = _binary_poses(images) if images.suffix == ".bin" else _text_poses(images)
-    if not poses:
-        raise InputError(f"{images}: no images; expected at least one that COLMAP registered")
+    poses = _poses(images)
     folder = _beside(model, IMAGE_FOLDERS)
     if folder is None:
         folder = (model.parent.parent if model.parent.name == "sparse" else model.parent) / IMAGE_FOLDERS[0]
     masks = _beside(model, MASK_FOLDERS)
     shots = []
-    for pose in sorted(poses, key=lambda pose: pose.name):
+    for pose in poses:
         named = f"{images}: {pose.name}"
         if pose.lens not in lenses:
             raise InputError(f"{named}: its camera {pose.lens} is not in {cameras.name}; export both again")
@@ -97,8 +97,12 @@ def read_colmap(model: Path) -> list[Shot]:
     return shots
 
 
-def read_colmap_points(model: Path) -> Float64 | None:
-    """The sparse points ``(P, 3)`` of a model in world coordinates; None where it has none.
+def read_colmap_points(model: Path) -> tuple[Float64, Int64] | None:
+    """The sparse points of a model, and which images they were seen in; None where it has none.
+
+    Returns:
+        Points ``(P, 3)`` in world coordinates; and of each time that an image saw one the number of the image, in the
+        order of `read_colmap`, and that of the point ``(K, 2)``.
 
     Raises:
         InputError: the file is damaged.
@@ -107,10 +111,16 @@ def read_colmap_points(model: Path) -> Float64 | None:
     if not binary.is_file() and not text.is_file():
         return None
     path = binary if binary.is_file() else text
-    points = _binary_points(path) if path is binary else _text_points(path)
+    points, seen = _binary_points(path) if path is binary else _text_points(path)
     if not np.isfinite(points).all():
         raise InputError(f"{path}: holds a number that is not finite; export it again")
-    return points if len(points) else None
+    if not len(points):
+        return None
+    # Files number images as they like, and may list some that are not there any more.
+    numbers = np.array([pose.number for pose in _poses(_part(model, "images"))])
+    order = np.argsort(numbers)
+    at = order[np.searchsorted(numbers, seen[:, 0], sorter=order).clip(max=len(order) - 1)]
+    return points, np.column_stack((at, seen[:, 1]))[numbers[at] == seen[:, 0]]
 
 
 def _part(model: Path, kind: str) -> Path:
@@ -118,6 +128,14 @@ def _part(model: Path, kind: str) -> Path:
         if (model / f"{kind}{suffix}").is_file():
             return model / f"{kind}{suffix}"
     raise InputError(f"{model}: neither {kind}.bin nor {kind}.txt in it; export the model again")
+
+
+def _poses(images: Path) -> list[_Pose]:
+    """Of the images, in the order of their names."""
+    poses = _binary_poses(images) if images.suffix == ".bin" else _text_poses(images)
+    if not poses:
+        raise InputError(f"{images}: no images; expected at least one that COLMAP registered")
+    return sorted(poses, key=lambda pose: pose.name)
 
 
 def _beside(model: Path, names: tuple[str, ...]) -> Path | None:
@@ -178,11 +196,11 @@ def _text_poses(path: Path) -> list[_Pose]:
         if not line.strip():
             continue
         try:
-            _, *numbers, lens, name = line.split(maxsplit=9)
+            number, *numbers, lens, name = line.split(maxsplit=9)
             values = tuple(map(float, numbers))
             if len(values) != 7:
                 raise ValueError(f"{len(values)} numbers")
-            poses.append(_Pose(name.strip(), values[:4], values[4:], int(lens)))
+            poses.append(_Pose(int(number), name.strip(), values[:4], values[4:], int(lens)))
         except ValueError as error:
             expected = "expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
             raise InputError(f"{path}: {line[:60]!r}: {expected}; export it again") from error
@@ -190,12 +208,20 @@ def _text_poses(path: Path) -> list[_Pose]:
     return poses
 
 
-def _text_points(path: Path) -> Float64:
-    rows = [line.split(maxsplit=4)[1:4] for line in _lines(path) if line.strip()]
+def _text_points(path: Path) -> tuple[Float64, Int64]:
+    rows = [line.split() for line in _lines(path) if line.strip()]
+    tracks = [words[8::2] for words in rows]  # after the error: pairs of image and place in it
     try:
-        return np.array(rows, np.float64).reshape(-1, 3)
-    except ValueError as error:
+        points = np.array([words[1:4] for words in rows], np.float64).reshape(-1, 3)
+        images = np.array([image for track in tracks for image in track], np.int64)
+    except (ValueError, OverflowError) as error:
         raise InputError(f"{path}: expected POINT3D_ID X Y Z and more on each line; export it again") from error
+    return points, _observations(images, tracks)
+
+
+def _observations(images: Int64, tracks: Sequence[Sized]) -> Int64:
+    """``(K, 2)``: images that saw a point, one point after the other, and the numbers of the points."""
+    return np.column_stack((images, np.repeat(np.arange(len(tracks)), [len(track) for track in tracks])))
 
 
 class _Records:
@@ -211,6 +237,12 @@ class _Records:
         start = self.place
         self.skip(struct.calcsize("<" + form))
         return struct.unpack_from("<" + form, self.data, start)
+
+    def array(self, form: str, count: int) -> Int64:
+        """So many numbers of one kind."""
+        start, kind = self.place, np.dtype(form)
+        self.skip(count * kind.itemsize)
+        return np.frombuffer(self.data, kind, count, start).astype(np.int64)
 
     def text(self) -> str:
         """The text up to the next zero."""
@@ -243,17 +275,18 @@ def _binary_lenses(path: Path) -> dict[int, _Lens]:
 def _binary_poses(path: Path) -> list[_Pose]:
     records, poses = _Records(path), []
     for _ in range(int(records.take("Q")[0])):
-        _, *numbers, lens = records.take("I7di")
+        number, *numbers, lens = records.take("I7di")
         name = records.text()
         records.skip(24 * int(records.take("Q")[0]))  # what the image saw of the points
-        poses.append(_Pose(name, tuple(numbers[:4]), tuple(numbers[4:]), int(lens)))
+        poses.append(_Pose(int(number), name, tuple(numbers[:4]), tuple(numbers[4:]), int(lens)))
     return poses
 
 
-def _binary_points(path: Path) -> Float64:
-    records, places = _Records(path), []
+def _binary_points(path: Path) -> tuple[Float64, Int64]:
+    records, places, tracks = _Records(path), [], []
     for _ in range(int(records.take("Q")[0])):
         *place, seen = records.take("8x3d11xQ")  # its number before, its colour and error after
         places.append(place)
-        records.skip(8 * int(seen))  # which views saw it
-    return np.array(places, np.float64).reshape(-1, 3)
+        tracks.append(records.array("<u4", 2 * int(seen))[::2])  # pairs of image and place in it
+    images = np.concatenate([np.empty(0, np.int64), *tracks])
+    return np.array(places, np.float64).reshape(-1, 3), _observations(images, tracks)

@@ -14,6 +14,7 @@ from ...neural_fields import InputError, Similarity
 from ..cameras import Camera
 from ..files import readable
 from .colmap import read_colmap_points
+from .depth_maps import DepthMap, DepthSource, find_depth_maps, read_depth_map
 from .neus import read_neus_sphere
 from .pictures import read_mask, read_picture, resample, shrink, undistort, undistorted_camera
 from .reading import find_source, read_shots
@@ -36,12 +37,14 @@ class PosedImage:
         camera: a pinhole of the picture's size.
         color: ``(H, W, 3)`` display RGB in [0, 1]; not multiplied by the mask.
         mask: ``(H, W)`` how much of the pixel is object, in [0, 1]; None where nobody said.
+        depth: the depths that it shows, in pixels of their own; None where nobody measured.
     """
 
     name: str
     camera: Camera
     color: NDArray[np.float32]
     mask: NDArray[np.float32] | None
+    depth: DepthMap | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +57,7 @@ class PosedImages:
         region: where that came from, in words.
         points: ``(P, 3)`` sparse points of the surface in world coordinates, or None.
         source: the file that the cameras were read from; for COLMAP the folder of the model.
+        observations: ``(K, 2)`` which view saw which point: their numbers; None where nobody said.
     """
 
     views: tuple[PosedImage, ...]
@@ -61,10 +65,17 @@ class PosedImages:
     region: str
     points: NDArray[np.float64] | None
     source: Path
+    observations: NDArray[np.int64] | None = None
 
 
-def read_posed_images(path: str | Path, *, width: int | None = None, region: Similarity | None = None) -> PosedImages:
-    """Read photographs, their cameras and masks, and find out where the object is.
+def read_posed_images(
+    path: str | Path,
+    *,
+    width: int | None = None,
+    region: Similarity | None = None,
+    depths: DepthSource | None = None,
+) -> PosedImages:
+    """Read photographs, their cameras, masks and depth maps, and find out where the object is.
 
     Lens distortion is taken out of the pictures, and the cameras are those of the new pictures. Where a picture is
     larger or smaller than its file of cameras says, both sides by one factor, the camera follows. A picture's mask is
@@ -76,10 +87,12 @@ def read_posed_images(path: str | Path, *, width: int | None = None, region: Sim
         width: pictures that are wider are shrunk to this, in pixels, in linear light; none is enlarged.
         region: the sphere around the object. By default that of ``scale_mat_i``, of the masks' visual hull, of the
             sparse points, or that which the cameras look at: the first that there is.
+        depths: where depth maps are, and what they hold; by default those that a transforms.json names
+            (``depth_file_path``, ``depth_path``), in the units of the cameras.
 
     Raises:
-        InputError: a file is missing or damaged, a picture and its camera or mask do not go together, a lens cannot
-            be undistorted, or nothing says where the object is.
+        InputError: a file is missing or damaged, a picture and its camera, mask or depth map do not go together, a
+            lens cannot be undistorted, or nothing says where the object is.
         ValueError: ``width`` is not positive.
 
     Example:
@@ -92,16 +105,18 @@ def read_posed_images(path: str | Path, *, width: int | None = None, region: Sim
         raise ValueError(f"width={width}: expected at least one pixel")
     source = find_source(path)
     with readable(source):
-        return _posed(source, width, region)
+        return _posed(source, width, region, depths or DepthSource())
 
 
-def _posed(source: Path, width: int | None, region: Similarity | None) -> PosedImages:
+def _posed(source: Path, width: int | None, region: Similarity | None, depths: DepthSource) -> PosedImages:
     shots = read_shots(source)
     neus = source.suffix.lower() == ".npz"
     sphere = read_neus_sphere(source) if neus else None
-    points = read_colmap_points(source) if source.is_dir() else None
+    points, observations = (read_colmap_points(source) if source.is_dir() else None) or (None, None)
+    maps = find_depth_maps(shots, depths)
+    shots = [replace(shot, depth=path) for shot, path in zip(shots, maps, strict=True)]
     _check_files(shots)
-    views = tuple(_view(shot, width) for shot in shots)
+    views = tuple(_view(shot, width, depths) for shot in shots)
     if all(view.mask is None or view.mask.min() > OPAQUE for view in views):
         views = tuple(replace(view, mask=None) for view in views)  # white masks in all views say nothing
     if region is not None:
@@ -110,12 +125,13 @@ def _posed(source: Path, width: int | None, region: Similarity | None) -> PosedI
         similarity, words = sphere, f"scale_mat_i of {source.name}"
     else:
         similarity, words = _find_region(views, points, source)
-    return PosedImages(views, similarity, words, points, source)
+    return PosedImages(views, similarity, words, points, source, observations)
 
 
 def _check_files(shots: Sequence[Shot]) -> None:
     """Say before any long work what is missing."""
-    for kind, fix in (("image", "add it, or leave that camera out"), ("mask", "add it, or leave all masks out")):
+    fixes = {"image": "add it, or leave that camera out", "mask": "add it, or leave all masks out"}
+    for kind, fix in {**fixes, "depth": "add it, or leave all depth maps out"}.items():
         files = [(shot, file) for shot in shots if (file := getattr(shot, kind)) is not None]
         missing = [(shot, file) for shot, file in files if not file.is_file()]
         if missing:
@@ -124,7 +140,7 @@ def _check_files(shots: Sequence[Shot]) -> None:
             raise InputError(f"{shot.named}: no {kind} {file}{more}; {fix}")
 
 
-def _view(shot: Shot, width: int | None) -> PosedImage:
+def _view(shot: Shot, width: int | None, depths: DepthSource) -> PosedImage:
     color, mask = read_picture(shot.image)
     see_through = mask is not None  # then what is not object has no colour of its own
     camera = _fitted(shot, color.shape[1], color.shape[0])
@@ -148,7 +164,9 @@ def _view(shot: Shot, width: int | None) -> PosedImage:
             color, mask = resample(color, mask, step)
         else:
             color, mask = resample(color, None, step)[0], mask if mask is None else step(mask)
-    return PosedImage(shot.name, pinhole, color, mask)
+    return PosedImage(
+        shot.name, pinhole, color, mask, None if shot.depth is None else read_depth_map(shot.depth, shot, depths)
+    )
 
 
 def _fitted(shot: Shot, width: int, height: int) -> Camera:

@@ -24,6 +24,8 @@ class Shot:
         image: where the photograph should be.
         mask: where its mask should be, or None.
         named: file and record, as the beginning of a message.
+        depth: where its depth map should be, or None.
+        depth_scale: steps per unit of that, if it has integers and the file says so; see `read_depth`.
     """
 
     name: str
@@ -31,6 +33,8 @@ class Shot:
     image: Path
     mask: Path | None
     named: str
+    depth: Path | None = None
+    depth_scale: float | None = None
 
 
 def find_image(folder: Path, name: str) -> Path:

@@ -86,12 +86,17 @@ def _shot(frame: _Frame) -> Shot:
         raise InputError(f"{frame.named('file_path')}: None; expected the name of the image")
     folder = frame.path.parent
     image = find_image(folder, name)
+    # nerfstudio's name of the key, and instant-ngp's, which says how much a step of an integer is.
+    depth = _file_name(frame, "depth_file_path") or _file_name(frame, "depth_path")
+    step = frame.positive("integer_depth_scale")
     return Shot(
         name,
         _camera(frame, image),
         image,
         None if mask is None else folder / mask,
         f"{frame.path}: frames[{frame.index}]",
+        None if depth is None else folder / depth,
+        None if step is None else 1 / step,
     )
 
 

@@ -1,7 +1,7 @@
 """Posed images out, in the layouts that NeuS, nerfstudio and COLMAP read: the inverses of our readers.
 
 Images are PNG files of 8 bits, numbered from 000 in the order of the views. A folder appears under its name only
-when it is complete.
+when it is complete. Depth maps become NPY files in ``depths/``, in all layouts.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,7 @@ from .images import PosedImage, PosedImages
 __all__ = ["check_new_folder", "write_colmap", "write_neus", "write_transforms"]
 
 Float64 = NDArray[np.float64]
+Int64 = NDArray[np.int64]
 
 PINHOLE = 1  # COLMAP's number for the model with fx, fy, cx, cy
 GREY = 128  # the colour of sparse points, of which only the place is known
@@ -58,7 +59,7 @@ def write_neus(folder: str | Path, images: PosedImages) -> None:
     Raises:
         InputError: the folder is not new, or cannot be written.
     """
-    with _new_folder(folder) as partial:
+    with _new_folder(folder, images) as partial:
         scale = np.diag([images.similarity.scale] * 3 + [1.0])
         scale[:3, 3] = images.similarity.center
         matrices: dict[str, Any] = {}
@@ -75,13 +76,13 @@ def write_transforms(folder: str | Path, images: PosedImages) -> None:
     """Write ``transforms.json`` and ``images/``, as nerfstudio and instant-ngp read them.
 
     Poses are in OpenGL's convention and ``cx``, ``cy`` count from the image's corner. Masks become the alpha channel
-    (straight). Every frame has its own intrinsics; ``camera_angle_x`` of the first stands at the top, for readers of
-    Blender's dialect.
+    (straight). Every frame has its own intrinsics; ``camera_angle_x`` of the first
+    stands at the top, for readers of Blender's dialect.
 
     Raises:
         InputError: the folder is not new, or cannot be written.
     """
-    with _new_folder(folder) as partial:
+    with _new_folder(folder, images) as partial:
         frames = []
         for name, view in _numbered(images):
             _write_png(partial / "images" / name, _with_alpha(view))
@@ -89,7 +90,10 @@ def write_transforms(folder: str | Path, images: PosedImages) -> None:
             size = {"w": view.camera.width, "h": view.camera.height}
             lens = {"fl_x": fx, "fl_y": fy, "cx": cx + 0.5, "cy": cy + 0.5}
             pose = (view.camera.world_from_camera.numpy() @ OPENGL).tolist()
-            frames.append({"file_path": f"images/{name}", **size, **lens, "transform_matrix": pose})
+            frame: dict[str, Any] = {"file_path": f"images/{name}", **size, **lens, "transform_matrix": pose}
+            if view.depth is not None:
+                frame["depth_file_path"] = _depth_file(name).as_posix()
+            frames.append(frame)
         angle = 2 * math.atan(frames[0]["w"] / 2 / frames[0]["fl_x"])
         content = {"camera_model": "PINHOLE", "camera_angle_x": angle, "frames": frames}
         (partial / "transforms.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
@@ -98,13 +102,13 @@ def write_transforms(folder: str | Path, images: PosedImages) -> None:
 def write_colmap(folder: str | Path, images: PosedImages, *, form: Literal["text", "binary"] = "binary") -> None:
     """Write ``images/`` and a sparse model in ``sparse/0``, as COLMAP writes them.
 
-    Cameras are PINHOLE, one for each distinct lens. Masks become the alpha channel (straight). The sparse points have
-    no observations, because which views see them is not known.
+    Cameras are PINHOLE, one for each distinct lens. Masks become the alpha channel (straight). Which views saw a sparse
+    point is written where it is known, and as the place in the image that to which the point projects.
 
     Raises:
         InputError: the folder is not new, or cannot be written.
     """
-    with _new_folder(folder) as partial:
+    with _new_folder(folder, images) as partial:
         named = list(_numbered(images))
         for name, view in named:
             _write_png(partial / "images" / name, _with_alpha(view))
@@ -114,18 +118,65 @@ def write_colmap(folder: str | Path, images: PosedImages, *, form: Literal["text
         points = np.empty((0, 3)) if images.points is None else images.points
         model = partial / "sparse" / "0"
         model.mkdir(parents=True)
-        {"text": _write_text, "binary": _write_binary}[form](model, lenses, places, points)
+        {"text": _write_text, "binary": _write_binary}[form](model, lenses, places, points, _observations(images))
 
 
 _Lens = tuple[int, int, float, float, float, float]
 _Place = tuple[str, int, list[float], list[float]]
 
 
-def _write_text(model: Path, lenses: list[_Lens], places: list[_Place], points: Float64) -> None:
+class _Observations(NamedTuple):
+    """Which view saw which sparse point, and where; ``(K,)`` each, view by view.
+
+    Attributes:
+        view: number from 0.
+        point: number from 0.
+        pixel: ``(K, 2)`` in the view's image, from its corner.
+        order: number from 0 among those of the view.
+    """
+
+    view: Int64
+    point: Int64
+    pixel: Float64
+    order: Int64
+
+    def of_view(self, view: int) -> list[tuple[float, float, int]]:
+        """Its places x, y in the image, each with the number of the point, from 1."""
+        rows = self.view == view
+        return [
+            (*pixel, point + 1)
+            for pixel, point in zip(self.pixel[rows].tolist(), self.point[rows].tolist(), strict=True)
+        ]
+
+    def tracks(self, points: int) -> list[list[int]]:
+        """Of each point the views that saw it, from 1, each followed by the order there."""
+        found: list[list[int]] = [[] for _ in range(points)]
+        for view, point, order in zip(self.view.tolist(), self.point.tolist(), self.order.tolist(), strict=True):
+            found[point] += [view + 1, order]
+        return found
+
+
+def _observations(images: PosedImages) -> _Observations:
+    seen = np.empty((0, 2), np.int64) if images.observations is None else images.observations
+    view, point = seen[np.argsort(seen[:, 0], kind="stable")].T
+    pixel = np.empty((len(view), 2))
+    for number in np.unique(view):
+        rows = view == number
+        assert images.points is not None
+        pixel[rows] = images.views[number].camera.in_view(images.points[point[rows]])[0] + 0.5
+    return _Observations(view, point, pixel, np.arange(len(view)) - np.searchsorted(view, view))
+
+
+def _write_text(model: Path, lenses: list[_Lens], places: list[_Place], points: Float64, seen: _Observations) -> None:
     cameras = [f"{k} PINHOLE {w} {h} {_words(lens)}" for k, (w, h, *lens) in enumerate(lenses, 1)]
-    # The second line of each image lists its observations: none.
-    images = [f"{k} {_words(q)} {_words(t)} {lens} {name}\n" for k, (name, lens, q, t) in enumerate(places, 1)]
-    cloud = [f"{k} {_words(point)} {GREY} {GREY} {GREY} 0" for k, point in enumerate(points.tolist(), 1)]
+    images = []
+    for k, (name, lens, q, t) in enumerate(places, 1):
+        marks = " ".join(f"{x!r} {y!r} {point}" for x, y, point in seen.of_view(k - 1))
+        images.append(f"{k} {_words(q)} {_words(t)} {lens} {name}\n{marks}")
+    cloud = [
+        " ".join((f"{k} {_words(point)} {GREY} {GREY} {GREY} 0", *map(str, track)))
+        for k, (point, track) in enumerate(zip(points.tolist(), seen.tracks(len(points)), strict=True), 1)
+    ]
     heads = {
         "cameras": "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]",
         "images": "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then a line of POINTS2D[] (X Y POINT3D_ID)",
@@ -136,19 +187,21 @@ def _write_text(model: Path, lenses: list[_Lens], places: list[_Place], points: 
         (model / f"{name}.txt").write_text(text, encoding="utf-8")
 
 
-def _write_binary(model: Path, lenses: list[_Lens], places: list[_Place], points: Float64) -> None:
+def _write_binary(model: Path, lenses: list[_Lens], places: list[_Place], points: Float64, seen: _Observations) -> None:
     count = struct.Struct("<Q").pack
     cameras = [struct.pack("<iiQQ4d", k, PINHOLE, *lens) for k, lens in enumerate(lenses, 1)]
-    images = [
-        struct.pack("<i7di", k, *q, *t, lens) + name.encode() + b"\0" + count(0)
-        for k, (name, lens, q, t) in enumerate(places, 1)
+    images = []
+    for k, (name, lens, q, t) in enumerate(places, 1):
+        marks = [struct.pack("<ddq", *mark) for mark in seen.of_view(k - 1)]
+        head = struct.pack("<i7di", k, *q, *t, lens) + name.encode() + b"\0"
+        images.append(head + count(len(marks)) + b"".join(marks))
+    cloud = [
+        struct.pack("<Q3d3BdQ", k, *point, GREY, GREY, GREY, 0.0, len(track) // 2)
+        + struct.pack(f"<{len(track)}I", *track)
+        for k, (point, track) in enumerate(zip(points.tolist(), seen.tracks(len(points)), strict=True), 1)
     ]
-    row = [("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("track", "<u8")]
-    cloud = np.zeros(len(points), row)
-    cloud["id"], cloud["xyz"], cloud["rgb"] = np.arange(1, len(points) + 1), points, GREY
-    (model / "cameras.bin").write_bytes(count(len(cameras)) + b"".join(cameras))
-    (model / "images.bin").write_bytes(count(len(images)) + b"".join(images))
-    (model / "points3D.bin").write_bytes(count(len(cloud)) + cloud.tobytes())
+    for name, records in (("cameras", cameras), ("images", images), ("points3D", cloud)):
+        (model / f"{name}.bin").write_bytes(count(len(records)) + b"".join(records))
 
 
 def _lens(camera: Camera) -> _Lens:
@@ -196,13 +249,22 @@ def _write_png(path: Path, pixels: NDArray[np.uint8]) -> None:
     iio.imwrite(path, pixels)
 
 
+def _depth_file(name: str) -> Path:
+    """Of the depth map of the image with that name, in the folder of the data set."""
+    return Path("depths", name).with_suffix(".npy")
+
+
 @contextmanager
-def _new_folder(folder: str | Path) -> Iterator[Path]:
-    """A folder beside the target that takes its name when all is written."""
+def _new_folder(folder: str | Path, images: PosedImages) -> Iterator[Path]:
+    """A folder beside the target that takes its name when all is written; depth maps are in it."""
     folder = check_new_folder(folder)
     partial = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
     try:
         partial.mkdir(parents=True)
+        for name, view in _numbered(images):
+            if view.depth is not None:
+                (partial / _depth_file(name)).parent.mkdir(exist_ok=True)
+                np.save(partial / _depth_file(name), view.depth.numbers)
         yield partial
         if folder.is_dir():
             folder.rmdir()

@@ -113,6 +113,8 @@ def _scene_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--shaded", action="store_true", help=what)
     what = "let the shape reflect the lamp, in a highlight that moves with the eye"
     parser.add_argument("--glossy", action="store_true", help=what)
+    what = "write depth maps too, in depths/: what the pixels' centres see, in the units of the cameras"
+    parser.add_argument("--depths", action="store_true", help=what)
     what = "what is wrong with them, to see what is said of it and survived: " + ", ".join(FAULTS)
     parser.add_argument("--fault", choices=FAULTS, metavar="FAULT", help=what)
     add_flags(parser, "--seed", help="of the cameras (0)")
@@ -138,6 +140,7 @@ def _scene(arguments: argparse.Namespace) -> int:
             samples=arguments.samples,
             shaded=arguments.shaded,
             glossy=arguments.glossy,
+            depths=arguments.depths,
             progress=progress,
         )
     if arguments.fault:
@@ -159,6 +162,7 @@ SCENE = Command(
     """  mplicits scene painted-sphere -o sphere
   mplicits scene figure -o figure --format transforms --views 40 --size 200
   mplicits scene statue -o statue --format colmap --shaded
+  mplicits scene figure -o measured --format transforms --depths
   mplicits scene figure -o unsharp --fault poses""",
     _scene_arguments,
     _scene,

@@ -1,4 +1,4 @@
-"""The visual hull of masks, as a start of the geometry: what all pictures take for object, carved out of a grid."""
+"""A start of the geometry, carved out of a grid: what all masks take for object, and no measured ray passes."""
 
 from __future__ import annotations
 
@@ -16,6 +16,8 @@ from ...neural_fields.losses import data_loss, eikonal_loss
 from ...neural_fields.value_grid import ValueGrid
 from ..run.settings import ReconstructConfig
 from ..run.trainer import seeded
+from .free_space import seen_through
+from .measured import MeasuredDepths
 from .model import SceneModel
 from .silhouettes import grid_in_ball, silhouettes
 
@@ -25,11 +27,18 @@ RESOLUTION = 48  # cells along the grid that is carved
 AGREE = 0.95  # share of the views that must take a point for object: one wrong picture of twenty takes nothing away
 SEEING = 0.25  # of all views that must see it
 LEAST, MOST = 1e-3, 0.5  # shares of the unit ball that a hull fills; others are no start
+MOST_UNSEEN = 0.9  # the same of what no measured ray passes: of a scene that is seen from one side, much is not seen
 STEPS, BATCH, RATE = 250, 1024, 2e-3
 DATA_WEIGHT, EIKONAL_WEIGHT = 100.0, 0.1
 
 
-def begin(model: SceneModel, views: Sequence[PosedImage], images: PosedImages, config: ReconstructConfig) -> str:
+def begin(
+    model: SceneModel,
+    views: Sequence[PosedImage],
+    images: PosedImages,
+    config: ReconstructConfig,
+    measured: MeasuredDepths | None = None,
+) -> str:
     """Give an untrained scene the start that its settings ask for; it is a sphere already.
 
     Args:
@@ -37,43 +46,56 @@ def begin(model: SceneModel, views: Sequence[PosedImage], images: PosedImages, c
         views: those that are trained on.
         images: of which these are a part; for the coordinates and the name.
         config: ``start``, ``geometry`` and ``seed`` are used.
+        measured: depths of these views, if there are any.
 
     Returns:
-        What it is now, "hull" or "sphere".
+        What it is now: "hull", "depths" (what no measured ray passes) or "sphere". A hull is carved by measured rays
+        too, unless it was asked for by name.
 
     Raises:
-        InputError: a hull was asked for, but there is none.
+        InputError: a start was asked for that there is not.
     """
     base = model.geometry.base if isinstance(model.geometry, MultiscaleSDF) else None
-    if config.start != "sphere" and isinstance(base, Siren) and all(view.mask is not None for view in views):
-        distances = carve(views, images.similarity)
+    masked = all(view.mask is not None for view in views) and config.start != "depths"
+    empty = None if measured is None or config.start == "hull" else seen_through(measured, RESOLUTION).numpy()
+    if config.start != "sphere" and isinstance(base, Siren) and (masked or empty is not None):
+        distances = carve(views if masked else (), images.similarity, empty=empty)
         if distances is not None:
             start_at_hull(base, distances, seed=config.seed)
-            return "hull"
-    if config.start == "hull":
+            return "hull" if masked else "depths"
+    if config.start in ("hull", "depths"):
+        wants = {
+            "hull": "visual hull to begin with, which wants masks on all pictures that leave a part of the region",
+            "depths": "start by measured depths, which wants depth maps in the cameras' units or COLMAP's points",
+        }
         raise InputError(
-            f"{images.source}: no visual hull to begin with, which wants masks on all pictures that leave a part of "
-            "the region, and --geometry multiscale; see `mplicits check-cameras`, or take --start sphere"
+            f"{images.source}: no {wants[config.start]}, and --geometry multiscale; see `mplicits check-cameras`, or "
+            "take --start sphere"
         )
     return "sphere"
 
 
 def carve(
-    views: Sequence[PosedImage], similarity: Similarity, *, resolution: int = RESOLUTION
+    views: Sequence[PosedImage],
+    similarity: Similarity,
+    *,
+    resolution: int = RESOLUTION,
+    empty: NDArray[np.bool_] | None = None,
 ) -> NDArray[np.float64] | None:
-    """Signed distances to the visual hull at the vertices of a grid over [−1, 1]³, negative inside.
+    """Signed distances to what is left of the unit ball at the vertices of a grid over [−1, 1]³, negative inside.
 
     A vertex of the unit ball is inside where AGREE of the views that see it find object within half a cell around it.
     So the hull is up to a cell too large, and thin parts stay.
 
     Args:
-        views: pictures with masks.
+        views: pictures with masks; none leaves all that is not empty.
         similarity: from world to unit-sphere coordinates.
         resolution: cells along an edge.
+        empty: ``(resolution + 1,) * 3`` vertices that are known to be outside.
 
     Returns:
-        ``(resolution + 1,) * 3`` distances by x, y and z, exact to about a cell; or None where the masks leave less
-        than LEAST or more than MOST of the ball, as empty and full ones do.
+        ``(resolution + 1,) * 3`` distances by x, y and z, exact to about a cell; or None where less than LEAST or more
+        than MOST of the ball is left, as by empty and full masks.
     """
     count, edge = resolution + 1, 2 / resolution
     points, in_ball = grid_in_ball(resolution)
@@ -81,8 +103,10 @@ def carve(
     for sees, objects in silhouettes([view for view in views if view.mask is not None], similarity, points, edge):
         seen += sees
         object_in += objects
-    kept = (seen >= max(1.0, SEEING * len(views))) & (object_in >= AGREE * seen)
-    if not LEAST < float(kept.double().mean()) < MOST:
+    kept = (seen >= max(1.0, SEEING * len(views))) & (object_in >= AGREE * seen) if views else torch.ones_like(seen) > 0
+    if empty is not None:
+        kept &= ~torch.from_numpy(empty.reshape(-1))[in_ball]
+    if not LEAST < float(kept.double().mean()) < (MOST if views else MOST_UNSEEN):
         return None
     solid = np.zeros(count**3, dtype=bool)
     solid[in_ball[kept].numpy()] = True

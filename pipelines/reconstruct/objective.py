@@ -15,6 +15,7 @@ from ..run.focus import Focus
 from ..run.settings import ReconstructConfig
 from ..run.team import gathered, mean_of_all, own_generator, whole_batch
 from ..run.trainer import Group, Objective, Trainer, warm_cosine
+from .measured import MeasuredDepths, depth_loss
 from .model import RayPool, SceneModel
 
 # Steps between two looks at the surface's surroundings, at least and at most.
@@ -26,6 +27,10 @@ WHOLE_EVERY, WHOLE_LATER, EARLY = 8, 64, 0.125
 MOVED, KNOWN, FURTHEST = 0.125, 8.0, 0.15
 LEAST_SHARE = 0.25  # of the rays of a step, however many sections they have
 POSES_FROM = 0.1  # share of the training after which cameras are moved
+DEPTH_RAYS = 256  # measured ones of a step
+# Steps between two fits of maps whose scale is not known to the surface; and the share of the training after which
+# depths that were estimated from single pictures, which are wrong in their details, do not count any more.
+SETTLE_EVERY, FADED = 64, 0.5
 
 __all__ = ["SceneObjective", "scene_trainer"]
 
@@ -37,9 +42,12 @@ class SceneObjective(Objective):
         model: what is trained, on the pool's device.
         pool: the pixels.
         config: settings.
+        measured: depths of the same pictures, if there are any.
     """
 
-    def __init__(self, model: SceneModel, pool: RayPool, config: ReconstructConfig) -> None:
+    def __init__(
+        self, model: SceneModel, pool: RayPool, config: ReconstructConfig, measured: MeasuredDepths | None = None
+    ) -> None:
         rate = warm_cosine(config.learning_rate)
         parts = [part for part in (model.color, model.outside, model.exposures) if part is not None]
         grid, colors = tables_apart(*parts)
@@ -62,6 +70,9 @@ class SceneObjective(Objective):
         self.grid = ValueGrid(config.march_grid, pool.device) if config.march_grid else None
         if self.grid is not None:
             self.kept |= {"march": self.grid.kept, "moved": self.grid.moved, "looks": torch.tensor([0, NEAR_EVERY, 0])}
+        self.measured = measured if config.depth_weight else None
+        if self.measured is not None:
+            self.kept["affine"] = self.measured.affine
 
     def level_at(self, done: float) -> int:
         """The finest level that is switched on when a fraction of the schedule is done."""
@@ -153,16 +164,40 @@ class SceneObjective(Objective):
             mask = torch.nn.functional.binary_cross_entropy(opacity, rays.mask)
             terms["mask"] = mask
             total = total + config.mask_weight * mask
+        if self.measured is not None and (done < FADED or self.measured.is_exact):
+            depth = self.depth_term(self.measured, step, done)
+            terms["depth"] = depth
+            total = total + config.depth_weight * depth
         terms["uncertainty"] = 1 / self.model.inv_std
         return terms, total
 
+    def depth_term(self, measured: MeasuredDepths, step: int, done: float) -> Tensor:
+        """How far the surface is from what was measured: the mean of `depth_loss` over rays at random."""
+        measured.affine = self.kept["affine"]  # that of a run which is resumed
+        if measured.is_loose and done < FADED and step % SETTLE_EVERY == 0:
+            measured.settle(self.grid or (lambda x: self.model.geometry.value(x, level=0)))
+            self.kept["affine"] = measured.affine
+        rays = measured.draw(whole_batch(DEPTH_RAYS), self.generator)
+        if self.model.poses is not None:
+            origins, along = self.model.poses.moved(rays.origins, rays.along, rays.view)
+            rays = rays._replace(origins=origins, along=along)
+        missed = depth_loss(
+            self.model.geometry, rays, level=self.level_at(done), generator=own_generator(self.generator)
+        )
+        return torch.where(rays.exact, missed, max(1 - done / FADED, 0.0) * missed).mean()
+
 
 def scene_trainer(
-    model: SceneModel, pool: RayPool, config: ReconstructConfig, *, seconds: float | None = None
+    model: SceneModel,
+    pool: RayPool,
+    config: ReconstructConfig,
+    *,
+    measured: MeasuredDepths | None = None,
+    seconds: float | None = None,
 ) -> Trainer[SceneObjective]:
     """The training of a scene; see `SceneObjective` and `Trainer`."""
     return Trainer(
-        SceneObjective(model, pool, config),
+        SceneObjective(model, pool, config, measured),
         stage="reconstruct",
         steps=config.steps,
         seconds=seconds,

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from ...datasets import PointCloud
+from ...datasets.views.depth_maps import DepthSource
 from ...datasets.views.images import PosedImage, PosedImages, read_posed_images
 from ...neural_fields import InputError, Jet, NoSurfaceError, TextureField, extract_mesh
 from ...neural_fields.checkpoint import radiance_bytes, texture_bytes
@@ -33,6 +34,7 @@ from ..surface.surface import from_mesh, sample_points
 from ..surface.trim import in_region, thinned
 from ..texture.train import FittedTexture, fit_texture
 from .hull import begin
+from .measured import MeasuredDepths
 from .model import RayPool, SceneModel, build_scene
 from .objective import scene_trainer
 from .plan import SEEING, SPHERE, WITNESSES, ReconstructPlan, level_stage
@@ -122,7 +124,9 @@ def reconstruct(
     machine = speed(device)
     schedule.plan(usual_stages(config, machine), budget=config.time_budget)
     schedule(Progress(READING, 0, 0, 0.0, {}))
-    images = data if isinstance(data, PosedImages) else read_posed_images(data, width=config.width)
+    maps = None if config.depth_maps is None else Path(config.depth_maps)
+    depths = DepthSource(maps, config.depth_kind, config.depth_scale)
+    images = data if isinstance(data, PosedImages) else read_posed_images(data, width=config.width, depths=depths)
     schedule(Progress(READING, 0, 0, 1.0, {}))
     load_compiler()
     training = _Reconstruction(
@@ -166,11 +170,15 @@ class _Reconstruction:
         has_masks = all(view.mask is not None for view in self.train_views)
         self.model = build_scene(config, has_masks=has_masks, views=len(self.train_views)).to(device)
         pool = RayPool(self.train_views, images.similarity, device, whole=self.model.outside is not None)
-        self.start = "sphere" if resume else begin(self.model, self.train_views, images, config)
+        measured = MeasuredDepths(self.train_views, images, device, seed=config.seed) if config.depth_weight else ()
+        self.measured = measured or None
+        self.start = "sphere" if resume else begin(self.model, self.train_views, images, config, self.measured)
         schedule(Progress(SPHERE, 0, 0, 1.0, {}))
-        self.trainer = scene_trainer(self.model, pool, config, seconds=self.training_seconds())
-        # Of the training pixels, their masks and the cameras.
-        seen = (pool.colors, pool.eyes, pool.axes, pool.lens, *([] if pool.masks is None else [pool.masks]))
+        self.trainer = scene_trainer(self.model, pool, config, measured=self.measured, seconds=self.training_seconds())
+        # Of the training pixels, their masks, the cameras and what was measured.
+        seen = [pool.colors, pool.eyes, pool.axes, pool.lens, *([] if pool.masks is None else [pool.masks])]
+        if self.measured is not None:
+            seen += [self.measured.along, self.measured.numbers]
         self.fingerprint = digest_of(tensor.cpu().numpy() for tensor in seen)
         self.shown = 0
 
@@ -337,6 +345,7 @@ class _Reconstruction:
             "parameters": {name: parameter_count(part) for name, part in parts.items()},
             "deltas": model.geometry.deltas.tolist(),
             **({} if model.exposures is None else {"exposures": self._by_view(("gain", "offset"), model.exposures())}),
+            **({} if self.measured is None else {"measured_depths": len(self.measured)}),
             **({} if model.poses is None else {"poses": self._by_view(("turn", "shift"), model.poses())}),
             "inv_std": float(model.inv_std.detach()),
             "steps": trainer.step,

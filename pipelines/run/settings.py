@@ -161,8 +161,10 @@ class ReconstructConfig(Settings):
     taper: float = setting(0.3, "share of a band over which the next level fades out", at_least=0, at_most=1)
     band: float = setting(4.0, "half-width of the bands in units of the surface's uncertainty 1/s", above=0)
     least_delta: float = setting(0.02, "half-width that a band keeps, in units of the region's radius", above=0)
-    start: Literal["auto", "hull", "sphere"] = setting(
-        "auto", "what the geometry begins as: hull (of the masks) or sphere; auto is hull where masks give one"
+    start: Literal["auto", "hull", "depths", "sphere"] = setting(
+        "auto",
+        "what the geometry begins as: hull (of the masks), depths (what no measured ray passes) or sphere; auto is the "
+        "first of them that there is",
     )
     radius: float = setting(0.5, "of the sphere that the geometry begins as, in units of the region's radius", above=0)
     color_width: int = setting(128, "neurons per layer of the colour network", above=0)
@@ -173,6 +175,17 @@ class ReconstructConfig(Settings):
     )
     background: Literal["auto", "black", "white", "outside"] = setting(
         "auto", "what is behind the object: black, white, or a learnt outside; auto is white with masks, else outside"
+    )
+    depth_maps: str | None = setting(
+        None, "folder with a depth map for each photograph; by default those that the data set names, if it does"
+    )
+    depth_kind: Literal["metric", "relative", "disparity"] = setting(
+        "metric",
+        "what depth maps hold: depths in the units of the cameras; relative ones, of unknown scale and shift; or "
+        "inverse ones of that kind, as networks give for one picture",
+    )
+    depth_scale: float | None = setting(
+        None, "numbers of the depth maps per unit of the cameras; by default 1000 for integers, else 1", above=0
     )
     exposure: Literal["off", "affine"] = setting(
         "off", "affine: each photograph has a gain and an offset for each colour, as automatic exposure makes them"
@@ -202,6 +215,11 @@ class ReconstructConfig(Settings):
     sharpening: float = setting(8.0, "learning rate of the surface's uncertainty, in units of the others'", above=0)
     eikonal_weight: float = setting(0.05, "weight of (|grad f| - 1)^2", at_least=0)
     mask_weight: float = setting(0.1, "weight of the masks' cross-entropy, where there are masks", at_least=0)
+    depth_weight: float = setting(
+        0.5,
+        "weight of measured depths (depth maps, COLMAP's points), where there are any; 0 leaves them out",
+        at_least=0,
+    )
     anneal: float = setting(
         0.2, "share of the training in which slopes are annealed (cos_anneal)", at_least=0, at_most=1
     )

@@ -98,7 +98,26 @@ def test_every_model_gives_its_cameras_in_the_order_of_names(model, write, tmp_p
 
 @pytest.mark.parametrize("write", WRITERS)
 def test_points_keep_all_their_digits(write, tmp_path):
-    np.testing.assert_array_equal(read_colmap_points(write(tmp_path)), POINTS)
+    found = read_colmap_points(write(tmp_path))
+    assert found is not None
+    np.testing.assert_array_equal(found[0], POINTS)
+
+
+@pytest.mark.parametrize("write", WRITERS)
+def test_points_say_which_images_saw_them(write, tmp_path):
+    found = read_colmap_points(write(tmp_path))
+    assert found is not None
+    # Images 5, 6 and 7 are b, a and c, whose order by name is a, b, c. The text says 5 and 6 of every point, the binary
+    # file 5 of the second and twice of the third.
+    expected = [[1, 0], [0, 0], [1, 1], [0, 1], [1, 2], [0, 2]] if write is write_text else [[1, 1], [1, 2], [1, 2]]
+    assert found[1].tolist() == expected
+
+
+def test_images_that_are_not_in_the_model_saw_nothing(tmp_path):
+    rows = "1 0 0 0 9 9 9 0.5 4 0 6 1 99 3\n2 1 0 0 9 9 9 0.5\n"
+    found = read_colmap_points(write_text(tmp_path, points3D=rows))
+    assert found is not None
+    assert found[1].tolist() == [[0, 0]]
 
 
 def test_a_model_without_points_has_none(tmp_path):
@@ -151,6 +170,8 @@ def test_images_and_masks_are_found_beside_the_model(place, tmp_path):
         ({"images": "5 1 0 0 0 0 inf 1 3 a.jpg\n\n"}, r"images\.txt: a\.jpg: its pose is zero or not finite"),
         ({"points3D": "1 0 0\n"}, r"points3D\.txt: expected POINT3D_ID X Y Z"),
         ({"points3D": "1 0 0 x 9 9 9 0.5\n"}, r"points3D\.txt: expected POINT3D_ID X Y Z"),
+        ({"points3D": "1 0 0 0 9 9 9 0.5 x 0\n"}, r"points3D\.txt: expected POINT3D_ID X Y Z"),
+        ({"points3D": f"1 0 0 0 9 9 9 0.5 {10**30} 0\n"}, r"points3D\.txt: expected POINT3D_ID X Y Z"),
         ({"points3D": "1 0 0 nan 9 9 9 0.5\n"}, r"points3D\.txt: holds a number that is not finite"),
     ],
 )

@@ -3,6 +3,7 @@
 import json
 import math
 import struct
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -12,6 +13,7 @@ import pytest
 import torch
 from mplicits.datasets.cameras import Camera, look_at
 from mplicits.datasets.synthetic.scenes import SCENES, render_scene
+from mplicits.datasets.views.depth_maps import DepthSource
 from mplicits.datasets.views.images import PosedImage, PosedImages, read_posed_images
 from mplicits.datasets.views.reading import read_cameras
 from mplicits.datasets.views.writing import check_new_folder, write_colmap, write_neus, write_transforms
@@ -103,7 +105,7 @@ def colmap_text(model: Path):
 
     cameras = {int(row[0]): (row[1], *map(int, row[2:4]), *map(float, row[4:])) for row in rows("cameras.txt")}
     lines = rows("images.txt")
-    assert not any(lines[1::2])  # no observations
+    assert not any(lines[1::2])  # no observations of these
     images = [(list(map(float, row[1:5])), list(map(float, row[5:8])), int(row[8]), row[9]) for row in lines[::2]]
     points = np.array([list(map(float, row[1:4])) for row in rows("points3D.txt")])
     return cameras, images, points
@@ -186,6 +188,43 @@ def test_the_object_is_found_again(tmp_path, name):
     assert np.linalg.norm(center) < 0.1
     assert radius >= scene.radius + np.linalg.norm(center)  # all of it is in the region
     assert radius == (1.0 if name == "neus" else pytest.approx(0.85, abs=0.2))
+
+
+@pytest.mark.parametrize("form", ["text", "binary"])
+def test_colmap_says_which_views_saw_a_point_and_where(tmp_path, form):
+    images = render_scene(SCENES["painted-sphere"](), 5, 16, samples=1)
+    images = replace(images, observations=images.observations[::7])
+    write_colmap(tmp_path / "colmap", images, form=form)
+    read = read_posed_images(tmp_path / "colmap")
+    order = np.lexsort(read.observations.T)
+    expected = images.observations[np.lexsort(images.observations.T)]
+    assert np.array_equal(read.observations[order], expected)
+    if form == "text":
+        lines = (tmp_path / "colmap" / "sparse" / "0" / "images.txt").read_text().splitlines()[1:]
+        cloud = (tmp_path / "colmap" / "sparse" / "0" / "points3D.txt").read_text().splitlines()[1:]
+        for number, view in enumerate(images.views):
+            marks = np.array(lines[2 * number + 1].split(), float).reshape(-1, 3)
+            seen = images.observations[images.observations[:, 0] == number, 1]
+            assert np.array_equal(marks[:, 2], seen + 1)
+            pixels, _ = view.camera.project(torch.from_numpy(images.points[seen]))
+            assert np.abs(marks[:, :2] - 0.5 - pixels.numpy()).max() < 1e-9
+            for place, point in enumerate(seen):  # and each point leads back to its place
+                track = np.array(cloud[point].split()[8:], int).reshape(-1, 2).tolist()
+                assert [number + 1, place] in track
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_depth_maps_are_beside_the_images(tmp_path, name):
+    images = render_scene(SCENES["painted-sphere"](), 3, 16, samples=1, depths=True)
+    WRITERS[name](tmp_path / "data", images)
+    named = read_posed_images(tmp_path / "data")
+    assert (named.views[0].depth is not None) == (name == "transforms")
+    read = read_posed_images(tmp_path / "data", depths=DepthSource(tmp_path / "data" / "depths"))
+    for view, written in zip(read.views, images.views, strict=True):
+        # At the rim, where pixels mix near and far, nothing is known any more.
+        known = np.isfinite(view.depth.numbers)
+        assert known.sum() > 30
+        assert np.array_equal(view.depth.numbers[known], written.depth.numbers[known])
 
 
 def test_pictures_without_masks_have_no_alpha(tmp_path, photographs):

@@ -12,6 +12,7 @@ from mplicits.neural_fields import InputError, Siren
 from mplicits.pipelines.reconstruct import hull
 from mplicits.pipelines.reconstruct import model as scene_model
 from mplicits.pipelines.reconstruct.hull import begin, carve, start_at_hull
+from mplicits.pipelines.reconstruct.measured import MeasuredDepths
 from mplicits.pipelines.reconstruct.model import build_scene
 from mplicits.pipelines.run.settings import ReconstructConfig
 
@@ -115,7 +116,29 @@ def test_settings_say_what_it_begins_as(
     assert begin(build_scene(neus, has_masks=masks), some.views, some, neus) == "sphere"
 
 
-def test_a_hull_that_is_not_there_is_refused() -> None:
+def test_a_start_that_is_not_there_is_refused() -> None:
     model = build_scene(SMALL, has_masks=True)
     with pytest.raises(InputError, match="no visual hull to begin with"):
         begin(model, filled(0.0).views, filled(0.0), replace(SMALL, start="hull"))
+    with pytest.raises(InputError, match="no start by measured depths, which wants depth maps"):
+        begin(model, images().views, images(), replace(SMALL, start="depths"))
+
+
+def test_what_no_measured_ray_passes_is_a_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    started: list[np.ndarray] = []
+    monkeypatch.setattr(hull, "start_at_hull", lambda _, distances, **__: started.append(distances))
+    scene = render_scene(SCENES["painted-sphere"](), views=12, size=24, samples=1, depths=True)
+    bare = replace(scene, views=tuple(replace(view, mask=None) for view in scene.views))
+    for some, start, expected in ((bare, "auto", "depths"), (scene, "auto", "hull"), (scene, "depths", "depths")):
+        measured = MeasuredDepths(some.views, some, torch.device("cpu"))
+        model = build_scene(SMALL, has_masks=some is scene)
+        assert begin(model, some.views, some, replace(SMALL, start=start), measured) == expected
+    length, cell = lengths(hull.RESOLUTION + 1), 2 / hull.RESOLUTION
+    # Vertices half a diagonal inside are never passed, and those beyond what the rays see are solid; the distances
+    # are those of a grid, to a cell.
+    for distances in started:
+        assert bool((distances[length < RADIUS - 2 * cell] < 0).all())
+    by_masks = carve(scene.views, scene.similarity)
+    assert by_masks is not None
+    assert bool((started[1] >= by_masks - 2 * cell).all())  # carved further
+    assert int((started[1] > 0).sum()) > int((by_masks > 0).sum())

@@ -1,5 +1,6 @@
 """Training of a scene on a few rays of a painted sphere: schedule, interruption, time."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
@@ -12,6 +13,8 @@ from mplicits.neural_fields.losses import eikonal_loss
 from mplicits.neural_fields.sphere_start import fit_sphere
 from mplicits.neural_fields.volume import sphere_span
 from mplicits.pipelines.reconstruct import model as scene_model
+from mplicits.pipelines.reconstruct import objective
+from mplicits.pipelines.reconstruct.measured import MeasuredDepths
 from mplicits.pipelines.reconstruct.model import RayPool, build_scene
 from mplicits.pipelines.reconstruct.objective import SceneObjective, scene_trainer
 from mplicits.pipelines.run.settings import ReconstructConfig
@@ -188,6 +191,74 @@ def test_a_stopped_training_continues_to_the_same_bits(images: PosedImages, stop
     expected = weights(whole)
     assert all(torch.equal(tensor, expected[name]) for name, tensor in weights(second).items())
     assert second.losses == whole.losses
+
+
+@pytest.fixture(scope="module")
+def relative(images: PosedImages) -> PosedImages:
+    """With depth maps of unknown scale and shift, and without sparse points that would say them."""
+    scene = render_scene(SCENES["painted-sphere"](), views=4, size=16, samples=1, depths=True)
+    views = []
+    for view in scene.views:
+        assert view.depth is not None
+        views.append(replace(view, depth=replace(view.depth, numbers=2 * view.depth.numbers - 1, kind="relative")))
+    return replace(scene, views=tuple(views), points=None, observations=None)
+
+
+def with_depths(images: PosedImages, config: ReconstructConfig) -> Trainer[SceneObjective]:
+    pool = RayPool(images.views, images.similarity, torch.device("cpu"))
+    measured = MeasuredDepths(images.views, images, pool.device)
+    scene = build_scene(config, has_masks=True, views=len(images.views))
+    return scene_trainer(scene, pool, config, measured=measured)
+
+
+def test_measured_depths_bring_the_surface_nearer() -> None:
+    scene = render_scene(SCENES["painted-sphere"](), views=4, size=16, samples=1, depths=True)
+    config = replace(TINY, steps=30, radius=0.4)
+    off = []
+    for weight in (0.0, 10.0):
+        trainer = with_depths(scene, replace(config, depth_weight=weight))
+        assert (trainer.objective.measured is not None) == (weight > 0)
+        train(trainer)
+        assert ("depth" in trainer.losses) == (weight > 0)
+        points = torch.from_numpy(scene.points).float()
+        off.append(float(trainer.objective.model.geometry.value(points).detach().abs().mean()))
+    assert off[1] < 0.5 * off[0]
+
+
+def test_maps_without_a_scale_are_fitted_to_the_surface_and_fade(
+    relative: PosedImages, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    trainer = with_depths(relative, replace(TINY, steps=8, depth_weight=1.0))
+    fitted: list[int] = []
+    settle = MeasuredDepths.settle
+
+    def counted(self: MeasuredDepths, distance: Callable[[Tensor], Tensor]) -> None:
+        fitted.append(trainer.step)
+        settle(self, distance)
+
+    monkeypatch.setattr(MeasuredDepths, "settle", counted)
+    monkeypatch.setattr(objective, "SETTLE_EVERY", 2)
+    train(trainer)
+    assert fitted == [0, 2]  # not in the second half, where they do not count
+    assert bool((trainer.objective.kept["affine"][:, 0] > 0).any())
+    measured = trainer.objective.measured
+    assert measured is not None
+    terms = [float(trainer.objective.depth_term(measured, 1, done).detach()) for done in (0.0, 0.4, 0.5, 1.0)]
+    assert terms[0] > 0
+    assert terms[1] < 0.5 * terms[0]  # a fifth, but of other rays
+    assert terms[2:] == [0.0, 0.0]
+
+
+def test_a_training_on_depths_continues_to_the_same_bits(relative: PosedImages) -> None:
+    config = replace(TINY, cameras="refined")
+    whole = with_depths(relative, config)
+    train(whole)
+    first, second = with_depths(relative, config), with_depths(relative, config)
+    train(first, until=3)
+    second.restore(first.state())
+    train(second)
+    for name, tensor in weights(whole).items():
+        assert torch.equal(tensor, weights(second)[name]), name
 
 
 def test_the_seed_decides(images: PosedImages) -> None:

@@ -235,6 +235,32 @@ def test_pictures_without_masks_have_an_outside(data: Path, tmp_path: Path) -> N
     assert "psnr_object" not in run.record["held_out"]
 
 
+def test_measured_depths_are_used_as_soon_as_there_are_any(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    images = moved(render_scene(SCENES["painted-sphere"](), views=5, size=12, samples=1, depths=True), WORLD)
+    views = tuple(
+        replace(view, depth=replace(view.depth, numbers=view.depth.numbers * np.float32(WORLD.scale)))
+        for view in images.views
+        if view.depth is not None
+    )
+    write_neus(tmp_path / "data", replace(images, views=views))
+    command = (
+        f"reconstruct {tmp_path / 'data'} -o {tmp_path / 'run'} {FLAGS} --depth-maps {tmp_path / 'data' / 'depths'}"
+    )
+    assert main(command.split()) == 0
+    record = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert record["measured_depths"] > 50
+    assert record["config"]["depth_maps"] == str(tmp_path / "data" / "depths")
+    assert "depth" in record["losses"]
+    # In other units than the cameras they are refused before anything is trained.
+    capsys.readouterr()
+    message = fails(capsys, f"{command} --force --depth-scale 1000")
+    assert "0.0% of the depths in all maps end in the region of interest; give --depth-scale" in message
+    assert json.loads((tmp_path / "run" / "run.json").read_text()) == record
+    assert main(f"{command} --force --depth-scale 1000 --depth-kind relative".split()) == 0
+    assert main(f"{command} --force --depth-weight 0".split()) == 0
+    assert "measured_depths" not in json.loads((tmp_path / "run" / "run.json").read_text())
+
+
 def test_pictures_on_the_way(data: Path, tmp_path: Path) -> None:
     def report(progress: Progress) -> None:
         if progress.stage == "held-out views":

@@ -1,0 +1,342 @@
+"""Depths that were measured along rays of the photographs: of depth maps and sparse points, for start and training.
+
+A measurement says two things: where the ray meets the surface, and that nothing is on the way there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ...datasets.views.depth_maps import DepthMap
+from ...datasets.views.images import PosedImage, PosedImages
+from ...neural_fields import Field, InputError
+from ...neural_fields.devices import upload
+from ...neural_fields.volume import sphere_span
+from ..run.team import my_share
+
+__all__ = ["DepthRays", "MeasuredDepths", "depth_loss", "fit_scale_shift"]
+
+Float64 = NDArray[np.float64]
+
+LIMIT = 1 << 21  # readings that are kept, of all maps together
+OBJECT = 0.5  # a pixel with a larger share of object counts as one
+FEWEST = 16  # readings that say scale and shift of a map
+# Of the fit that does not follow outliers: how often it is weighted again, the relative error below which all count
+# alike, and how far numbers differ at least, as a share of their mean.
+ROUNDS, LEAST_RESIDUAL, ALL_ALIKE = 10, 1e-3, 1e-6
+TINY = 1e-300
+ASKED, ALONG = 256, 64  # rays of each map that are held against the surface, and places along each
+INSIDE = 0.01  # of the readings of maps in the cameras' units, at least, end in the region
+ALIKE = 1.2  # factor between the depths of such maps and of sparse points, at most
+AS_IT_IS, RELATIVE, DISPARITY = 0, 1, 2  # how a number becomes a depth
+
+
+class DepthRays(NamedTuple):
+    """Measured rays in unit-sphere coordinates: they meet the surface at ``origins + depths · along``.
+
+    Attributes:
+        origins: ``(B, 3)``.
+        along: ``(B, 3)`` directions whose part along the axis of view is 1.
+        depths: ``(B,)`` along that axis, in radii of the region; not positive where it is not known yet.
+        exact: ``(B,)`` whether it was measured, by a sensor or by triangulation, and not estimated from one picture.
+        view: ``(B,)`` number of the picture.
+    """
+
+    origins: Tensor
+    along: Tensor
+    depths: Tensor
+    exact: Tensor
+    view: Tensor
+
+
+@dataclass(frozen=True)
+class _Part:
+    """Measurements of one view.
+
+    Attributes:
+        lines: ``(N, 3)`` lines of sight in camera coordinates, z = 1.
+        numbers: ``(N,)`` depths in radii of the region, or numbers of a map.
+        form: how those become depths.
+        exact: see `DepthRays`.
+        view: number of the picture.
+    """
+
+    lines: Float64
+    numbers: Float64
+    form: int
+    exact: bool
+    view: int
+
+
+class MeasuredDepths:
+    """The measurements of all views that are trained on.
+
+    Numbers of a map that is not in the cameras' units become depths by a scale and a shift of its own. The sparse
+    points that the view saw say which, if there are sixteen; else `settle` fits them to the surface as it is.
+
+    Args:
+        views: those that are trained on.
+        images: of which these are a part; for the coordinates, the sparse points and the name.
+        device: where the rays are wanted.
+        seed: of the choice where there are more than can be kept.
+
+    Attributes:
+        affine: ``(V, 2)`` scale and shift of each view's map; 0 until they are known.
+        is_loose: whether there are maps for `settle`.
+        is_exact: whether anything was measured in the cameras' units.
+
+    Raises:
+        InputError: maps in the cameras' units are not: hardly a reading ends in the region, or sparse points are at
+            other depths.
+    """
+
+    def __init__(
+        self, views: Sequence[PosedImage], images: PosedImages, device: torch.device, *, seed: int = 0
+    ) -> None:
+        self.device = device
+        parts = _gathered(views, images, np.random.default_rng(seed))
+        cameras = [view.camera.moved(images.similarity) for view in views]
+        axes = [camera.world_from_camera[:3, :3].numpy() for camera in cameras]
+        self.eyes = torch.stack([camera.eye for camera in cameras]).float().to(device)
+        counts = [len(part.numbers) for part in parts]
+
+        def joined(arrays: Sequence[NDArray[np.generic]], empty: NDArray[np.generic]) -> Tensor:
+            return torch.from_numpy(np.concatenate([empty, *arrays])).to(device)
+
+        along = [part.lines @ axes[part.view].T for part in parts]
+        self.along = joined([lines.astype(np.float32) for lines in along], np.empty((0, 3), np.float32))
+        numbers = [part.numbers.astype(np.float32) for part in parts]
+        self.numbers = joined(numbers, np.empty(0, np.float32))
+        forms, views_of, exact = (
+            np.repeat(np.array([getattr(part, name) for part in parts], kind), counts)
+            for name, kind in (("form", np.uint8), ("view", np.int16), ("exact", np.bool_))
+        )
+        self.forms, self.views, self.exact = (torch.from_numpy(array).to(device) for array in (forms, views_of, exact))
+        self.affine = torch.zeros(len(views), 2, device=device)
+        self.is_loose, self.is_exact = bool((self.forms != AS_IT_IS).any()), bool(self.exact.any())
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    def at(self, rows: Tensor) -> DepthRays:
+        """The measurements with these numbers ``(B,)``."""
+        view, numbers, form = self.views[rows].long(), self.numbers[rows], self.forms[rows]
+        scale, shift = self.affine[view].unbind(dim=1)
+        mapped = scale * numbers + shift
+        depths = torch.where(form == RELATIVE, mapped, torch.where(form == AS_IT_IS, numbers, _inverse(mapped)))
+        return DepthRays(self.eyes[view], self.along[rows], depths, self.exact[rows], view)
+
+    def draw(self, count: int, generator: torch.Generator) -> DepthRays:
+        """``count`` measurements at random, with replacement, or a team's share of them."""
+        rows = torch.randint(len(self), (count,), generator=generator)
+        return self.at(upload(my_share(rows), self.device))
+
+    @torch.no_grad()
+    def settle(self, distance: Callable[[Tensor], Tensor]) -> None:
+        """Fit scale and shift of the maps that have none of their own to a surface as it is.
+
+        Args:
+            distance: ``(N, 3)`` → ``(N,)`` signed distances in unit-sphere coordinates.
+        """
+        loose = self.forms != AS_IT_IS
+        # Of each view's readings, evenly; they lie one after the other.
+        count = torch.bincount(self.views[loose].long(), minlength=len(self.eyes))
+        owned = count.nonzero()[:, 0]
+        steps = (torch.arange(ASKED, device=self.device) + 0.5) / ASKED
+        first = count.cumsum(0) - count
+        rows = loose.nonzero()[:, 0][(first[owned, None] + steps * count[owned, None]).long().reshape(-1)]
+        view, along = self.views[rows].long(), self.along[rows]
+        length = along.norm(dim=1)
+        depths = first_hits(self.eyes[view], along / length[:, None], distance) / length
+        hit = depths > 0
+        wanted = torch.where(self.forms[rows] == RELATIVE, depths, _inverse(depths))
+        found = fit_scale_shift(self.numbers[rows][hit], wanted[hit], view[hit], len(self.eyes))
+        self.affine[owned] = found[owned].to(self.affine)
+
+
+def _inverse(numbers: Tensor) -> Tensor:
+    """1 / x of what is positive, else 0."""
+    return torch.where(numbers > 0, 1 / numbers.clamp_min(1e-12), 0.0)
+
+
+def first_hits(origins: Tensor, directions: Tensor, distance: Callable[[Tensor], Tensor]) -> Tensor:
+    """Where rays first go from outside to inside a surface ``(N,)``; 0 for those that do not, or begin inside.
+
+    Found between `ALONG` places within the unit sphere, by linear interpolation.
+    """
+    near, far = sphere_span(origins, directions)
+    depths = near[:, None] + (far - near)[:, None] * torch.linspace(0, 1, ALONG, device=near.device)
+    values = distance((origins[:, None] + depths[..., None] * directions[:, None]).reshape(-1, 3)).reshape(depths.shape)
+    enters = (values[:, :-1] > 0) & (values[:, 1:] <= 0)
+    at = enters.float().argmax(dim=1, keepdim=True)
+    before, after = values.gather(1, at), values.gather(1, at + 1)
+    share = before / (before - after).clamp_min(1e-12)
+    place = torch.lerp(depths.gather(1, at), depths.gather(1, at + 1), share)[:, 0]
+    return torch.where(enters.any(dim=1), place, 0.0)
+
+
+def fit_scale_shift(numbers: Tensor, wanted: Tensor, group: Tensor, groups: int) -> Tensor:
+    """Scale a and shift b of each group that minimise Σ |a m + b − z| of its numbers m, ``(groups, 2)`` float64.
+
+    By least squares that are weighted again with 1 / |residual|, so that outliers do not count as squares. 0 for groups
+    with fewer than sixteen numbers, with numbers that are all alike, or whose scale would not be positive.
+
+    Args:
+        numbers: ``(N,)``, m.
+        wanted: ``(N,)``, z.
+        group: ``(N,)`` of each.
+        groups: how many there are.
+    """
+    m, z = numbers.double(), wanted.double()
+    count = torch.bincount(group, minlength=groups)
+
+    def summed(what: Tensor) -> Tensor:
+        return torch.zeros(groups, dtype=torch.float64, device=m.device).index_add(0, group, what)
+
+    def line(weight: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Scale, shift, and whether the numbers differ."""
+        total = summed(weight).clamp_min(TINY)
+        middle_m, middle_z = summed(weight * m) / total, summed(weight * z) / total
+        off_m, off_z = m - middle_m[group], z - middle_z[group]
+        spread = summed(weight * off_m.square()) / total
+        scale = summed(weight * off_m * off_z) / total / spread.clamp_min(TINY)
+        return scale, middle_z - scale * middle_m, spread > (ALL_ALIKE * middle_m).square()
+
+    scale, shift, differ = line(torch.ones_like(m))
+    for _ in range(ROUNDS):
+        away = (scale[group] * m + shift[group] - z).abs() + LEAST_RESIDUAL * z.abs()
+        scale, shift, differ = line(1 / away.clamp_min(TINY))
+    usable = (count >= FEWEST) & (scale > 0) & differ
+    return torch.where(usable[:, None], torch.stack((scale, shift), dim=1), 0.0)
+
+
+def depth_loss(field: Field, rays: DepthRays, *, level: int = -1, generator: torch.Generator | None = None) -> Tensor:
+    """How far a field is from what was measured ``(B,)``: |f(p)| + max(−f(x), 0) + max(f(x) − |p − x|, 0).
+
+    p is where the ray meets the surface, x a place at random on the way there, nearer to p more often. A distance is 0
+    at p; at x it is not negative, and not more than what is left of the way. What lies outside the unit sphere is not
+    asked, and measurements that are not known yet count 0.
+
+    Args:
+        field: f, in unit-sphere coordinates.
+        rays: the measurements.
+        level: of the field.
+        generator: of the places, on the CPU; without, they are in the middle of the way.
+    """
+    length = rays.along.norm(dim=1)
+    directions, reach = rays.along / length[:, None], rays.depths * length
+    near, far = sphere_span(rays.origins, directions)
+    on_surface = (reach > near) & (reach < far)
+    end = torch.minimum(reach, far)
+    seen_through = end > near
+    part = torch.rand(len(reach), generator=generator) if generator else torch.full((len(reach),), 0.5)
+    at = end - (end - near) * upload(part, end.device).square()
+    places = rays.origins + torch.stack((reach, at))[..., None] * directions  # (2, B, 3)
+    values = reach.new_zeros(places.shape[:2])
+    asked = torch.stack((on_surface, seen_through))
+    values[asked] = field.value(places[asked], level=level)
+    missed, free = values[0].abs(), (-values[1]).clamp_min(0) + (values[1] - (reach - at)).clamp_min(0)
+    return torch.where(on_surface, missed, 0.0) + torch.where(seen_through, free, 0.0)
+
+
+def _gathered(views: Sequence[PosedImage], images: PosedImages, random: np.random.Generator) -> list[_Part]:
+    """All measurements, view by view."""
+    parts, in_region, ratios, source = [], [], [], images.source
+    place = {id(view): number for number, view in enumerate(images.views)}
+    for index, view in enumerate(views):
+        camera = view.camera.moved(images.similarity)
+        eye, axes = camera.eye.numpy(), camera.world_from_camera[:3, :3].numpy()
+        seen = (_observed(images, place[id(view)]) - eye) @ axes
+        seen = seen[seen[:, 2] > 0]
+        points = _Part(seen / seen[:, 2:], seen[:, 2], AS_IT_IS, exact=True, view=index)
+        parts.append(_on_object(view, points))
+        if view.depth is None:
+            continue
+        part = _of_map(view.depth, points, images, random, LIMIT // len(views))
+        parts.append(_on_object(view, part))
+        if view.depth.kind == "metric":
+            ends = eye + part.numbers[:, None] * (part.lines @ axes.T)
+            in_region.append(float((np.linalg.norm(ends, axis=1) < 1).mean()) if len(ends) else 0.0)
+            here, there = _numbers_at(view.depth, points)
+            ratios.append(here / images.similarity.scale / there)
+            source = view.depth.source
+    if in_region:
+        _check_units(source, in_region, ratios)
+    return [part for part in parts if len(part.numbers)]
+
+
+def _observed(images: PosedImages, view: int) -> Float64:
+    """The sparse points ``(N, 3)`` that a view saw, in unit-sphere coordinates."""
+    if images.points is None or images.observations is None:
+        return np.empty((0, 3))
+    return images.similarity.to_unit(images.points[images.observations[images.observations[:, 0] == view, 1]])
+
+
+def _of_map(depth: DepthMap, points: _Part, images: PosedImages, random: np.random.Generator, most: int) -> _Part:
+    """The readings of a depth map; as depths, if the view's sparse points say which they are."""
+    lines, numbers = depth.camera.sight_lines().numpy().reshape(-1, 3), depth.numbers.reshape(-1).astype(np.float64)
+    rows = np.flatnonzero(np.isfinite(numbers))
+    if len(rows) > most:
+        rows = np.sort(random.choice(rows, most, replace=False))
+    lines, numbers = lines[rows], numbers[rows]
+    if depth.kind == "metric":
+        return _Part(lines, numbers / images.similarity.scale, AS_IT_IS, exact=True, view=points.view)
+    form = RELATIVE if depth.kind == "relative" else DISPARITY
+    here, at_points = _numbers_at(depth, points)
+    wanted = torch.from_numpy(at_points if form == RELATIVE else 1 / at_points)
+    group = torch.zeros(len(wanted), dtype=torch.int64)
+    scale, shift = fit_scale_shift(torch.from_numpy(here), wanted, group, 1)[0].tolist()
+    if not scale:
+        return _Part(lines, numbers, form, exact=False, view=points.view)
+    mapped = scale * numbers + shift
+    ahead = mapped > 0
+    mapped = mapped[ahead] if form == RELATIVE else 1 / mapped[ahead]
+    return _Part(lines[ahead], mapped, AS_IT_IS, exact=False, view=points.view)
+
+
+def _numbers_at(depth: DepthMap, points: _Part) -> tuple[Float64, Float64]:
+    """A map's numbers where its view saw sparse points ``(N,)``, and the depths of these ``(N,)`` in radii."""
+    height, width = depth.numbers.shape
+    pixels = np.rint(depth.camera.pixels_at(points.lines[:, :2])).astype(np.int64)
+    inside = ((pixels >= 0) & (pixels < (width, height))).all(axis=1)
+    numbers = depth.numbers[pixels[inside, 1], pixels[inside, 0]].astype(np.float64)
+    known = np.isfinite(numbers)
+    return numbers[known], points.numbers[inside][known]
+
+
+def _on_object(view: PosedImage, part: _Part) -> _Part:
+    """Those that the view's mask, if it has one, takes for object: what is behind is not there for the training."""
+    if view.mask is None or not len(part.numbers):
+        return part
+    height, width = view.mask.shape
+    pixels = np.rint(view.camera.pixels_at(part.lines[:, :2])).astype(np.int64)
+    inside = ((pixels >= 0) & (pixels < (width, height))).all(axis=1)
+    column, row = pixels.clip(0, (width - 1, height - 1)).T
+    kept = inside & (view.mask[row, column] > OBJECT)
+    return _Part(part.lines[kept], part.numbers[kept], part.form, part.exact, part.view)
+
+
+def _check_units(source: Path, in_region: Sequence[float], ratios: Sequence[Float64]) -> None:
+    """Whether maps that are said to be in the cameras' units can be.
+
+    Args:
+        source: one of the files.
+        in_region: share of each map's readings that end in the region.
+        ratios: of depths in each map to those of sparse points there.
+    """
+    fix = "give --depth-scale (numbers per unit of the cameras), or --depth-kind relative"
+    if np.mean(in_region) < INSIDE:
+        share = f"{np.mean(in_region):.1%} of the depths in all maps end in the region of interest"
+        raise InputError(f"{source}: {share}; {fix}")
+    together = np.concatenate(ratios)
+    if len(together) >= FEWEST and not 1 / ALIKE < np.median(together) < ALIKE:
+        times = f"depths in all maps are {np.median(together):.3g} times those of the sparse points"
+        raise InputError(f"{source}: {times}; {fix}")
