@@ -26,7 +26,8 @@ WHOLE_EVERY, WHOLE_LATER, EARLY = 8, 64, 0.125
 # further off), in units of its uncertainty 1/s; the latter in radii of the region, at most.
 MOVED, KNOWN, FURTHEST = 0.125, 8.0, 0.15
 LEAST_SHARE = 0.25  # of the rays of a step, however many sections they have
-POSES_FROM = 0.1  # share of the training after which cameras are moved
+# The share of the training after which cameras are moved, and their rate in units of the geometry's.
+POSES_FROM, POSE_RATE = 0.1, 3.0
 DEPTH_RAYS = 256  # measured ones of a step
 # Steps between two fits of maps whose scale is not known to the surface; and the share of the training after which
 # depths that were estimated from single pictures, which are wrong in their details, do not count any more.
@@ -59,7 +60,8 @@ class SceneObjective(Objective):
         if grid:
             groups.append(Group(grid, lambda done: config.grid_rate * config.color_rate * rate(done)))
         if model.poses is not None:  # not before there is something to be compared with
-            groups.append(Group(list(model.poses.parameters()), lambda done: rate(done) if done > POSES_FROM else 0.0))
+            moved = list(model.poses.parameters())
+            groups.append(Group(moved, lambda done: POSE_RATE * rate(done) if done > POSES_FROM else 0.0))
         super().__init__(model, groups, torch.Generator().manual_seed(config.seed))
         self.model, self.pool, self.config = model, pool, config
         self.sampling = Sampling(uniform=config.uniform, importance=config.importance)

@@ -209,10 +209,10 @@ class ReconstructConfig(Settings):
     texture_steps: int = setting(
         500, "training steps of the texture of the finished surface; 0 leaves it uncoloured", at_least=0
     )
-    learning_rate: float = setting(3e-4, "peak learning rate of the geometry", above=0)
-    color_rate: float = setting(12.0, "learning rate of the colours, in units of the geometry's", above=0)
+    learning_rate: float = setting(1e-4, "peak learning rate of the geometry", above=0)
+    color_rate: float = setting(36.0, "learning rate of the colours, in units of the geometry's", above=0)
     grid_rate: float = setting(2.5, "learning rate of the hash encoding, in units of the colours'", above=0)
-    sharpening: float = setting(8.0, "learning rate of the surface's uncertainty, in units of the others'", above=0)
+    sharpening: float = setting(24.0, "learning rate of the surface's uncertainty, in units of the others'", above=0)
     eikonal_weight: float = setting(0.05, "weight of (|grad f| - 1)^2", at_least=0)
     mask_weight: float = setting(0.1, "weight of the masks' cross-entropy, where there are masks", at_least=0)
     depth_weight: float = setting(

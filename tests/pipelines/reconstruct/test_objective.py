@@ -37,6 +37,8 @@ TINY = ReconstructConfig(
     importance=4,
     march_grid=8,
     learning_rate=2e-3,
+    color_rate=12.0,
+    sharpening=8.0,
 )
 
 
