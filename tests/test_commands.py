@@ -189,6 +189,7 @@ STAND_INS: dict[str, Callable[[Path], None]] = {
     "photos": functools.partial(views, count=12),  # three of which are apart by so much that no two share a place
     "srb": scans_with_truth,
     "lego": views,
+    "project": functools.partial(views, form="colmap", count=6),
     "dtu_*": functools.partial(views, form="neus"),
     "transforms.json": cameras,
     "photos/transforms.json": lambda path: views(path.parent),
@@ -263,7 +264,7 @@ def reason_to_skip(line: str) -> str | None:
     for begin, reason in elsewhere.items():
         if line.startswith(f"{begin} "):
             return reason
-    if line.startswith("mplicits find-cameras ") or "--poses colmap" in line:
+    if line.startswith(("mplicits find-cameras ", "mplicits find-points ")) or "--poses colmap" in line:
         return "COLMAP finds nothing in pictures so small; tests/datasets/views/test_find_cameras.py has larger ones"
     needs = {"view": "websockets", "poisson": "pymeshlab", "--texture": "xatlas"}
     for word, module in needs.items():

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
 import itertools
-import json
-import multiprocessing
-import os
 import shutil
-import signal
-import sqlite3
-from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Literal
@@ -21,21 +16,28 @@ import cv2
 import numpy as np
 
 from ...neural_fields import InputError
-from ...neural_fields.files import check_place
+from .colmap_process import (
+    DATABASE_FILE,
+    FEATURES,
+    LARGEST_SIDE,
+    MATCHING,
+    OVERLAP,
+    Report,
+    begun,
+    check_colmap,
+    film_pairs,
+    fingerprint,
+    solve,
+    write_record,
+)
 from .shots import IMAGE_SUFFIXES, image_size, list_images
 
-__all__ = ["FILM_SUFFIXES", "FoundCameras", "check_colmap", "find_cameras"]
+__all__ = ["FILM_SUFFIXES", "PLACING", "FoundCameras", "find_cameras"]
 
 FILM_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
-RECORD_FILE, DATABASE_FILE, LOG_FILE = "cameras.json", "database.db", "colmap.log"
 LEAST = 3  # photographs; two say little of a surface
-LARGEST_SIDE = 1600  # pixels in which features are looked for
-OVERLAP = 10  # frames of a film after each that it is matched with; and the 2^n-th ones after it
 SHARPNESS_WIDTH = 480  # pixels across, in which the sharpness of frames is compared
-POLL_SECONDS = 0.3
-FEATURES, MATCHING, PLACING = "finding features", "matching", "placing cameras"
-
-Report = Callable[[str, int, int], None]
+PLACING = "placing cameras"
 
 
 @dataclass(frozen=True)
@@ -55,18 +57,6 @@ class FoundCameras:
     left_out: tuple[str, ...]
     points: int
     error: float
-
-
-def check_colmap() -> None:
-    """Ask, before any long work, whether the extra ``mplicits[poses]`` is installed.
-
-    Raises:
-        InputError: it is not.
-    """
-    try:
-        import pycolmap  # noqa: F401
-    except ImportError as error:
-        raise InputError("finding cameras needs pycolmap; pip install 'mplicits[poses]'") from error
 
 
 def find_cameras(
@@ -96,8 +86,10 @@ def find_cameras(
     source, project = Path(source), Path(project)
     check_colmap()
     photographs = _photographs(source)
-    asked = {"source": str(source.resolve()), "frames": frames, "lens": lens, "content": _fingerprint(photographs)}
-    found = _begun(project, asked)
+    asked = {"source": str(source.resolve()), "frames": frames, "lens": lens, "content": fingerprint(photographs)}
+    found = begun(
+        project, asked, lambda was: FoundCameras(**{**was, "project": project, "left_out": tuple(was["left_out"])})
+    )
     if found is not None:
         return found
     report = report or (lambda stage, done, total: None)
@@ -108,10 +100,12 @@ def find_cameras(
         _sharpest(source, images, frames, report)
     names = [file.name for file in list_images(images)]
     one = len({image_size(images / name) for name in names}) == 1 if lens == "auto" else lens == "one"
-    made = _solve(project, len(names), one=one, film=not source.is_dir(), report=report)
+    film, count = not source.is_dir(), len(names)
+    pairs = film_pairs(count) if film else count * (count - 1) // 2
+    made = solve(project, partial(_reconstructed, one=one, film=film), photographs=count, pairs=pairs, report=report)
     placed = set(made.pop("names"))
     found = FoundCameras(project, len(names), tuple(name for name in names if name not in placed), **made)
-    _write_record(project, asked | {"found": asdict(found) | {"project": ""}})
+    write_record(project, asked | {"found": asdict(found) | {"project": ""}})
     return found
 
 
@@ -129,48 +123,6 @@ def _photographs(source: Path) -> list[Path]:
     if source.suffix.lower() not in FILM_SUFFIXES:
         raise InputError(f"{source}: neither a folder of photographs nor a film ({', '.join(FILM_SUFFIXES)})")
     return [source]
-
-
-def _fingerprint(files: list[Path]) -> str:
-    """Of names, sizes and times of change; contents would be read for minutes."""
-    digest = hashlib.sha256()
-    for file in files:
-        digest.update(f"{file.name} {file.stat().st_size} {file.stat().st_mtime_ns}\n".encode())
-    return digest.hexdigest()
-
-
-def _begun(project: Path, asked: dict[str, Any]) -> FoundCameras | None:
-    """What was found in the project before; None where there is more to do. The project is then begun."""
-    record_file = project / RECORD_FILE
-    if project.exists() and not project.is_dir():
-        raise InputError(f"{project}: is a file; name a folder")
-    if not record_file.is_file():
-        if project.is_dir() and any(project.iterdir()):
-            raise InputError(f"{project}: is not empty, and not a project of ours; name another folder")
-        check_place(project)
-        project.mkdir(parents=True, exist_ok=True)
-        _write_record(project, asked)
-        return None
-    try:
-        record = json.loads(record_file.read_text(encoding="utf-8"))
-        found = record.pop("found", None)
-        same = record == asked
-        if same and found is not None:
-            return FoundCameras(**{**found, "project": project, "left_out": tuple(found["left_out"])})
-    except (ValueError, TypeError, KeyError, AttributeError) as error:
-        raise InputError(f"{record_file}: damaged ({error}); remove the folder, or name another") from error
-    if not same:
-        raise InputError(
-            f"{project}: holds the cameras of other photographs ({record.get('source')}), or of other settings; "
-            "name another folder, or remove this one"
-        )
-    return None
-
-
-def _write_record(project: Path, record: dict[str, Any]) -> None:
-    half = project / f".{RECORD_FILE}"
-    half.write_text(json.dumps(record, indent=1), encoding="utf-8")
-    half.replace(project / RECORD_FILE)
 
 
 def _link(photographs: list[Path], images: Path) -> None:
@@ -227,73 +179,8 @@ def _opened(film: Path) -> Iterator[tuple[cv2.VideoCapture, int]]:
         capture.release()
 
 
-def _solve(project: Path, count: int, *, one: bool, film: bool, report: Report) -> dict[str, Any]:
-    """COLMAP in a process of its own: it can be ended at any time, and what it prints goes into a file."""
-    context = multiprocessing.get_context("spawn")
-    ours, theirs = context.Pipe(duplex=False)
-    process = context.Process(target=_work, args=(str(project), one, film, theirs), daemon=True)
-    process.start()
-    theirs.close()
-    stage, placed = FEATURES, 0
-    try:
-        while True:
-            if ours.poll(POLL_SECONDS):
-                kind, said = ours.recv()
-                if kind == "done":
-                    return said
-                if kind == "failed":
-                    raise InputError(f"{project}: {said}")
-                stage, placed = said
-            report(stage, *_progress(project / DATABASE_FILE, stage, count, placed, film=film))
-    except EOFError as error:
-        raise InputError(f"{project}: COLMAP ended while {stage}; see {project / LOG_FILE}") from error
-    finally:
-        process.terminate()
-        process.join()
-        ours.close()
-
-
-def _progress(database: Path, stage: str, count: int, placed: int, *, film: bool) -> tuple[int, int]:
-    """How much of a stage is done: for the first two that is what the database holds."""
-    if stage == FEATURES:
-        return min(_rows(database, "keypoints"), count), count
-    if stage == MATCHING:
-        pairs = _film_pairs(count) if film else count * (count - 1) // 2
-        return min(_rows(database, "two_view_geometries"), pairs), pairs
-    return min(placed, count), count
-
-
-def _film_pairs(count: int) -> int:
-    """Frames that are matched with one another: the next ones, and those that 2, 4, 8, … come later."""
-    steps = {*range(1, OVERLAP + 1), *(2**power for power in range(OVERLAP))}
-    return sum(max(count - step, 0) for step in steps)
-
-
-def _rows(database: Path, table: str) -> int:
-    """How many rows are in COLMAP's database, but for the last few megabytes that it has written.
-
-    Read as immutable, no lock is taken. COLMAP does not wait for one: it would end, if it opened the file meanwhile.
-    """
-    try:
-        with closing(sqlite3.connect(f"{database.resolve().as_uri()}?immutable=1", uri=True)) as opened:
-            return int(opened.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0])
-    except sqlite3.Error:  # not there yet, or being written
-        return 0
-
-
-def _work(project: str, one: bool, film: bool, told: Connection) -> None:
-    """What the other process does."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends Ctrl-C to both; the first one ends this one
-    log = os.open(Path(project) / LOG_FILE, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
-    for stream in (1, 2):
-        os.dup2(log, stream)
-    try:
-        told.send(("done", _reconstructed(Path(project), one, film, told)))
-    except InputError as error:
-        told.send(("failed", str(error)))
-
-
-def _reconstructed(project: Path, one: bool, film: bool, told: Connection) -> dict[str, Any]:
+def _reconstructed(project: Path, told: Connection, *, one: bool, film: bool) -> dict[str, Any]:
+    """What the other process does; see `solve`."""
     import pycolmap
 
     database, images = project / DATABASE_FILE, project / "images"

@@ -21,7 +21,7 @@ from .fit import FIT
 from .mesh import EVALUATE, MESH
 from .solids import BOOLEAN, OFFSET
 from .train import EVOLVE, RECONSTRUCT, TEXTURE
-from .views import CHECK_CAMERAS, FIND_CAMERAS, SCENE
+from .views import CHECK_CAMERAS, FIND_CAMERAS, FIND_POINTS, SCENE
 from .web import WEB
 
 __all__ = ["COMMANDS"]
@@ -152,6 +152,7 @@ COMMANDS: Mapping[str, Command] = MappingProxyType(
         "view": VIEW,
         "web": WEB,
         "find-cameras": FIND_CAMERAS,
+        "find-points": FIND_POINTS,
         "check-cameras": CHECK_CAMERAS,
         "evaluate": EVALUATE,
         "info": Command(

@@ -1,4 +1,4 @@
-"""Posed photographs: ``mplicits find-cameras``, ``check-cameras``, and ``scene``, exact ones to try things on."""
+"""Posed photographs: ``find-cameras``, ``find-points``, ``check-cameras``, and ``scene`` to try things on."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from ..run.config import input_error
 from .common import Command, add_flags, check_output, training, whole, write_json
 
-__all__ = ["CHECK_CAMERAS", "FIND_CAMERAS", "SCENE", "tell_found"]
+__all__ = ["CHECK_CAMERAS", "FIND_CAMERAS", "FIND_POINTS", "SCENE", "tell_found"]
 
 if TYPE_CHECKING:
     from ...datasets.views.find_cameras import FoundCameras
@@ -42,7 +42,10 @@ def tell_found(found: FoundCameras) -> None:
     """Print what `find_cameras` has found, and warn on stderr."""
     from ..reconstruct.posing import said_of
 
-    line, warnings = said_of(found)
+    _tell(*said_of(found))
+
+
+def _tell(line: str, warnings: list[str]) -> None:
     print(line)
     for warning in warnings:
         print(f"warning: {warning}", file=sys.stderr)
@@ -57,6 +60,37 @@ FIND_CAMERAS = Command(
     "Find where photographs were taken, and with which lens, by structure from motion: COLMAP's, through pycolmap "
     "(pip install 'mplicits[poses]'). The project is read by all commands that take posed photographs; `mplicits "
     "reconstruct --poses colmap` does both.",
+)
+
+
+def _points_arguments(parser: argparse.ArgumentParser) -> None:
+    what = "photographs with cameras: NeuS's, nerfstudio's, Blender's or COLMAP's folder or file"
+    parser.add_argument("data", metavar="DATA", help=what)
+    add_flags(parser, "--out", metavar="PROJECT", help="folder of the COLMAP project; an interrupted one is continued")
+    add_flags(parser, "--json", "--quiet")
+
+
+def _find_points(arguments: argparse.Namespace) -> int:
+    from ..reconstruct.posing import find_points_timed, said_of_points
+
+    out = arguments.out
+    with training("the same command continues", quiet=arguments.quiet, at_any_time=True) as report:
+        found = find_points_timed(arguments.data, out, progress=report)
+    _tell(*said_of_points(found))
+    print(f"next: mplicits reconstruct {out} -o RUN")
+    write_json(arguments.json, asdict(found) | {"project": str(out)})
+    return 0
+
+
+FIND_POINTS = Command(
+    "triangulate sparse points of photographs whose cameras are known, with COLMAP",
+    """  mplicits find-points data/dtu_scan24 -o project
+  mplicits reconstruct project -o runs/scan24""",
+    _points_arguments,
+    _find_points,
+    "Find points of the surface that several photographs show, with the cameras as they are: COLMAP's, through "
+    "pycolmap (pip install 'mplicits[poses]'). The project has the photographs without lens distortion, the cameras and the "
+    "points, which `mplicits reconstruct` then holds on to.",
 )
 
 

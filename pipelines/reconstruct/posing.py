@@ -1,4 +1,4 @@
-"""Cameras for photographs that have none, with progress: `find_cameras` as a stage of longer work."""
+"""Cameras and sparse points of photographs, with progress: `find_cameras` and `find_points` as stages."""
 
 from __future__ import annotations
 
@@ -7,14 +7,18 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
-from ...datasets.views.find_cameras import FEATURES, MATCHING, PLACING, FoundCameras, find_cameras
+from ...datasets.views.colmap_process import FEATURES, MATCHING
+from ...datasets.views.find_cameras import PLACING, FoundCameras, find_cameras
+from ...datasets.views.find_points import NEAREST, TRIANGULATING, FoundPoints, find_points
+from ...datasets.views.reading import find_source, read_shots
 from ...datasets.views.shots import list_images
 from ..run.schedule import Progress, Report, Schedule, Stage
 
-__all__ = ["find_cameras_timed", "said_of"]
+__all__ = ["find_cameras_timed", "find_points_timed", "said_of", "said_of_points"]
 
-# Seconds of a core for the features of a photograph and for matching two, and of the whole for placing one.
-FEATURE_SECONDS, PAIR_SECONDS, PLACE_SECONDS = 1.5, 0.05, 0.5
+# Seconds of a core for the features of a photograph and for matching two, and of the whole for placing one, or for its
+# points where its place is known.
+FEATURE_SECONDS, PAIR_SECONDS, PLACE_SECONDS, POINTS_SECONDS = 1.5, 0.05, 0.5, 0.1
 FEW_POINTS = 100
 
 
@@ -52,6 +56,40 @@ def find_cameras_timed(
         schedule(Progress(stage, done, total, done / max(total, 1), {}))
 
     return find_cameras(source, project, frames=frames, lens=lens, report=report)
+
+
+def find_points_timed(source: str | Path, project: str | Path, *, progress: Report | None = None) -> FoundPoints:
+    """`find_points`, that says how far it is and how long it will take.
+
+    Args:
+        source: see `find_points`.
+        project: the same.
+        progress: told of every stage.
+    """
+    schedule = Schedule.of(progress)
+    count, cores = len(read_shots(find_source(source))), os.cpu_count() or 1
+    schedule.plan(
+        [
+            Stage(FEATURES, "features", FEATURE_SECONDS * count / cores),
+            Stage(MATCHING, "matching", PAIR_SECONDS * count * min(NEAREST, count - 1) / cores),
+            Stage(TRIANGULATING, "placing", POINTS_SECONDS * count),
+        ]
+    )
+
+    def report(stage: str, done: int, total: int) -> None:
+        schedule(Progress(stage, done, total, done / max(total, 1), {}))
+
+    return find_points(source, project, report=report)
+
+
+def said_of_points(found: FoundPoints) -> tuple[str, list[str]]:
+    """What was found, in a line, and what is to be warned of."""
+    line = (
+        f"{found.project}: {found.points:,} points that {found.photographs} photographs show, seen {found.error:.2f} "
+        "pixels off"
+    )
+    few = f"{found.points} points are few: cameras may be wrong; see `mplicits check-cameras`"
+    return line, [few] if found.points < FEW_POINTS else []
 
 
 def said_of(found: FoundCameras) -> tuple[str, list[str]]:

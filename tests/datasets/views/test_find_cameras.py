@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from mplicits.datasets import look_at, read_cameras
 from mplicits.datasets.synthetic.scenes import Scene, render_view
+from mplicits.datasets.views import colmap_process
 from mplicits.datasets.views import find_cameras as module
 from mplicits.datasets.views.find_cameras import FoundCameras, find_cameras
 from mplicits.neural_fields import InputError, Sphere
@@ -51,12 +52,12 @@ def solved(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
     """COLMAP's place is taken by somebody who places all but the last photograph, and notes what was asked."""
     asked: list[dict[str, Any]] = []
 
-    def solve(project: Path, count: int, **options: Any) -> dict[str, Any]:
-        asked.append({"project": project, "count": count, **options})
+    def solve(project: Path, job: Any, *, photographs: int, pairs: int, report: Any) -> dict[str, Any]:
+        asked.append({"project": project, "count": photographs, "pairs": pairs, **job.keywords})
         names = sorted(file.name for file in (project / "images").iterdir())
         return {"names": names[:-1], "points": 7, "error": 0.25}
 
-    monkeypatch.setattr(module, "_solve", solve)
+    monkeypatch.setattr(module, "solve", solve)
     monkeypatch.setattr(module, "check_colmap", lambda: None)
     return asked
 
@@ -67,7 +68,7 @@ def test_found_cameras_stand_where_the_pictures_were_drawn_from(photographs: Pat
     found = find_cameras(photographs, tmp_path / "project", report=lambda *said: stages.append(said))
     assert (found.photographs, found.left_out) == (VIEWS, ())
     assert found.error < 1  # half a pixel's rounding in each direction is 0.4 in the mean
-    assert {stage for stage, _, _ in stages} <= {module.FEATURES, module.MATCHING, module.PLACING}
+    assert {stage for stage, _, _ in stages} <= {colmap_process.FEATURES, colmap_process.MATCHING, module.PLACING}
     assert all(0 <= done <= total for _, done, total in stages)
     cameras = dict(read_cameras(tmp_path / "project"))
     ours = np.array([cameras[f"{number}.png"].eye.numpy() for number in range(VIEWS)])
@@ -106,7 +107,7 @@ def test_an_interrupted_search_goes_on(
     photographs: Path, tmp_path: Path, solved: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patch:
-        patch.setattr(module, "_solve", interrupted)
+        patch.setattr(module, "solve", interrupted)
         with pytest.raises(KeyboardInterrupt):
             find_cameras(photographs, tmp_path / "project")
     assert find_cameras(photographs, tmp_path / "project").photographs == VIEWS
@@ -194,18 +195,18 @@ def test_without_pycolmap_the_extra_is_named(
 def test_progress_is_read_without_a_lock(tmp_path: Path) -> None:
     """As long as somebody writes exclusively, nobody else may open the database: COLMAP would find it locked."""
     database = tmp_path / "a b?.db"
-    assert module._rows(database, "keypoints") == 0
+    assert colmap_process._rows(database, "keypoints") == 0
     with closing(sqlite3.connect(database, isolation_level=None)) as theirs:
         theirs.execute("CREATE TABLE keypoints (image INTEGER)")
         theirs.executemany("INSERT INTO keypoints VALUES (?)", [(1,), (2,)])
         theirs.execute("BEGIN EXCLUSIVE")
-        assert module._rows(database, "keypoints") == 2
+        assert colmap_process._rows(database, "keypoints") == 2
         theirs.execute("ROLLBACK")
-        assert module._rows(database, "matches") == 0
+        assert colmap_process._rows(database, "matches") == 0
     assert [file.name for file in tmp_path.iterdir()] == ["a b?.db"]
 
 
 @pytest.mark.parametrize("count", [3, 11, 40])
 def test_how_many_frames_of_a_film_are_matched(count: int) -> None:
     near = {*range(1, 11), *(2**power for power in range(10))}
-    assert module._film_pairs(count) == sum(b - a in near for a, b in combinations(range(count), 2))
+    assert colmap_process.film_pairs(count) == sum(b - a in near for a, b in combinations(range(count), 2))

@@ -8,7 +8,9 @@ import cv2
 import numpy as np
 import pytest
 from mplicits.datasets.synthetic.scenes import SCENES, render_scene
-from mplicits.datasets.views.find_cameras import FEATURES, FoundCameras
+from mplicits.datasets.views.colmap_process import FEATURES
+from mplicits.datasets.views.find_cameras import FoundCameras
+from mplicits.datasets.views.find_points import FoundPoints
 from mplicits.datasets.views.writing import write_colmap
 from mplicits.neural_fields import InputError
 from mplicits.pipelines.cli import main
@@ -49,6 +51,25 @@ def test_cameras_are_found_and_what_is_doubtful_is_said(
     assert "40 points are few" in err
     assert (finder[0]["frames"], finder[0]["lens"]) == (7, "each")
     assert json.loads(said.read_text())["left_out"] == ["4.png"]
+
+
+def test_points_are_found_and_few_are_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def find(source: Path, project: Path, *, report: Any) -> FoundPoints:
+        report(FEATURES, 1, 4)
+        return FoundPoints(Path(project), 4, 40, 0.5)
+
+    monkeypatch.setattr(posing, "find_points", find)
+    photos, project, said = tmp_path / "photos", tmp_path / "project", tmp_path / "said.json"
+    write_colmap(photos, render_scene(SCENES["painted-sphere"](), views=4, size=16, samples=1))
+    assert main(["find-points", str(photos), "-o", str(project), "--json", str(said), "--quiet"]) == 0
+    out, err = capsys.readouterr()
+    assert f"{project}: 40 points that 4 photographs show, seen 0.50 pixels off" in out
+    assert "40 points are few" in err
+    assert json.loads(said.read_text()) == {"project": str(project), "photographs": 4, "points": 40, "error": 0.5}
+    assert main(["find-points", str(tmp_path / "none"), "-o", str(project), "--quiet"]) == 2
+    assert "none: no such file; check the path" in capsys.readouterr().err
 
 
 def test_a_reconstruction_begins_with_its_cameras(
