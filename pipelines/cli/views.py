@@ -89,8 +89,8 @@ FIND_POINTS = Command(
     _points_arguments,
     _find_points,
     "Find points of the surface that several photographs show, with the cameras as they are: COLMAP's, through "
-    "pycolmap (pip install 'mplicits[poses]'). The project has the photographs without lens distortion, the cameras and the "
-    "points, which `mplicits reconstruct` then holds on to.",
+    "pycolmap (pip install 'mplicits[poses]'). The project has the photographs without lens distortion, the cameras "
+    "and the points, which `mplicits reconstruct` then holds on to.",
 )
 
 

@@ -155,7 +155,7 @@ class MeasuredDepths:
         rows = loose.nonzero()[:, 0][(first[owned, None] + steps * count[owned, None]).long().reshape(-1)]
         view, along = self.views[rows].long(), self.along[rows]
         length = along.norm(dim=1)
-        depths = first_hits(self.eyes[view], along / length[:, None], distance) / length
+        depths = _first_hits(self.eyes[view], along / length[:, None], distance) / length
         hit = depths > 0
         wanted = torch.where(self.forms[rows] == RELATIVE, depths, _inverse(depths))
         found = fit_scale_shift(self.numbers[rows][hit], wanted[hit], view[hit], len(self.eyes))
@@ -167,7 +167,7 @@ def _inverse(numbers: Tensor) -> Tensor:
     return torch.where(numbers > 0, 1 / numbers.clamp_min(1e-12), 0.0)
 
 
-def first_hits(origins: Tensor, directions: Tensor, distance: Callable[[Tensor], Tensor]) -> Tensor:
+def _first_hits(origins: Tensor, directions: Tensor, distance: Callable[[Tensor], Tensor]) -> Tensor:
     """Where rays first go from outside to inside a surface ``(N,)``; 0 for those that do not, or begin inside.
 
     Found between `ALONG` places within the unit sphere, by linear interpolation.
@@ -222,8 +222,8 @@ def depth_loss(field: Field, rays: DepthRays, *, level: int = -1, generator: tor
     """How far a field is from what was measured ``(B,)``: |f(p)| + max(−f(x), 0) + max(f(x) − |p − x|, 0).
 
     p is where the ray meets the surface, x a place at random on the way there, nearer to p more often. A distance is 0
-    at p; at x it is not negative, and not more than what is left of the way. What lies outside the unit sphere is not
-    asked, and measurements that are not known yet count 0.
+    at p; at x it is not negative, and not more than what is left of the way. What lies outside the unit sphere, and
+    measurements that are not known yet, count 0.
 
     Args:
         field: f, in unit-sphere coordinates.
@@ -240,10 +240,9 @@ def depth_loss(field: Field, rays: DepthRays, *, level: int = -1, generator: tor
     part = torch.rand(len(reach), generator=generator) if generator else torch.full((len(reach),), 0.5)
     at = end - (end - near) * upload(part, end.device).square()
     places = rays.origins + torch.stack((reach, at))[..., None] * directions  # (2, B, 3)
-    values = reach.new_zeros(places.shape[:2])
-    asked = torch.stack((on_surface, seen_through))
-    values[asked] = field.value(places[asked], level=level)
-    missed, free = values[0].abs(), (-values[1]).clamp_min(0) + (values[1] - (reach - at)).clamp_min(0)
+    # Those that do not count are evaluated too: a GPU would be waited for until it says which they are.
+    on, before = field.value(places, level=level)
+    missed, free = on.abs(), (-before).clamp_min(0) + (before - (reach - at)).clamp_min(0)
     return torch.where(on_surface, missed, 0.0) + torch.where(seen_through, free, 0.0)
 
 
