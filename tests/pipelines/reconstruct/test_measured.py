@@ -10,7 +10,6 @@ from mplicits.datasets.synthetic.scenes import SCENES, render_scene
 from mplicits.datasets.views.depth_maps import DepthKind
 from mplicits.datasets.views.images import PosedImages
 from mplicits.neural_fields import InputError, Similarity, Sphere
-from mplicits.pipelines.reconstruct.free_space import seen_through
 from mplicits.pipelines.reconstruct.measured import (
     FEWEST,
     DepthRays,
@@ -167,29 +166,6 @@ def test_what_ends_outside_the_region_says_that_the_way_is_free() -> None:
     # In the middle of the way by its square: at depth 4 - 0.25 * 2, which is 0.5 from the middle of the sphere.
     assert float(depth_loss(Sphere(radius=0.8), rays)) == pytest.approx(0.3, abs=1e-6)
     assert float(depth_loss(Sphere(radius=0.3), rays)) == 0
-
-
-@pytest.mark.parametrize("kind", ["maps", "points"])
-def test_rays_carve_what_is_outside_and_nothing_inside(images: PosedImages, kind: str) -> None:
-    resolution = 24
-    empty = seen_through(measured_of(images if kind == "maps" else only_points(images)), resolution)
-    axis = torch.linspace(-1, 1, resolution + 1)
-    length = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij")).norm(dim=0)
-    cell = 2 / resolution
-    # Places of a ray, which is outside, are rounded to the next vertex: half a diagonal away at most.
-    assert not bool(empty[length < RADIUS - 0.5 * 3**0.5 * cell].any())
-    beyond = (length > RADIUS + 3 * cell) & (length < 0.95)
-    assert float(empty[beyond].float().mean()) > (0.5 if kind == "maps" else 0.15)
-
-
-def test_one_wrong_measurement_carves_no_hole(images: PosedImages) -> None:
-    measured = measured_of(images)
-    measured.numbers[0] *= 2  # through the sphere and far behind it
-    right, wrong = seen_through(measured_of(images), 24), seen_through(measured, 24)
-    axis = torch.linspace(-1, 1, 25)
-    inside = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij")).norm(dim=0) < RADIUS - 0.08
-    assert not bool((wrong & inside).any())
-    assert int((wrong != right).sum()) < 25
 
 
 def scaled(images: PosedImages, factor: float) -> PosedImages:
