@@ -85,7 +85,7 @@ def _find_points(arguments: argparse.Namespace) -> int:
 FIND_POINTS = Command(
     "triangulate sparse points of photographs whose cameras are known, with COLMAP",
     """  mplicits find-points data/dtu_scan24 -o project
-  mplicits reconstruct project -o runs/scan24""",
+  mplicits find-points lego/transforms_train.json -o project --quiet""",
     _points_arguments,
     _find_points,
     "Find points of the surface that several photographs show, with the cameras as they are: COLMAP's, through "
