@@ -224,6 +224,10 @@ class Camera:
         matrix[1, 2] -= first
         return replace(self, intrinsics=matrix, height=rows)
 
+    def fits(self, width: int, height: int) -> bool:
+        """Whether an image of that size may show the same view: both sides by one factor, but for rounding."""
+        return abs(self.height * width / self.width - height) < 1
+
     def resized(self, width: int, height: int) -> Camera:
         """The same view in other pixels; where the aspect ratio changes, they are no longer square.
 

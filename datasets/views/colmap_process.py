@@ -6,10 +6,11 @@ import hashlib
 import json
 import multiprocessing
 import os
+import shutil
 import signal
 import sqlite3
-from collections.abc import Callable
-from contextlib import closing
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
@@ -20,16 +21,18 @@ from ...neural_fields.files import check_place
 __all__ = [
     "DATABASE_FILE",
     "FEATURES",
-    "LARGEST_SIDE",
     "MATCHING",
     "OVERLAP",
     "Job",
     "Report",
     "begun",
     "check_colmap",
+    "extract_features",
     "film_pairs",
     "fingerprint",
+    "new_model",
     "solve",
+    "verification_options",
     "write_record",
 ]
 
@@ -197,3 +200,34 @@ def _work(project: str, job: Job, told: Connection) -> None:
         told.send(("done", job(Path(project), told)))
     except InputError as error:
         told.send(("failed", str(error)))
+
+
+def extract_features(project: Path, told: Connection, *, one: bool) -> None:
+    """The first stage of a job: features of all photographs, taken with ``one`` lens or one each."""
+    import pycolmap
+
+    told.send(("stage", (FEATURES, 0)))
+    mode = pycolmap.CameraMode.SINGLE if one else pycolmap.CameraMode.PER_IMAGE
+    options = pycolmap.FeatureExtractionOptions()
+    options.max_image_size = LARGEST_SIDE
+    pycolmap.extract_features(project / DATABASE_FILE, project / "images", camera_mode=mode, extraction_options=options)
+
+
+def verification_options() -> Any:
+    """How matches of two photographs are held against a camera's motion: as in every other run."""
+    import pycolmap
+
+    options = pycolmap.TwoViewGeometryOptions()
+    options.ransac.random_seed = 0  # else every run has matches of its own
+    return options
+
+
+@contextmanager
+def new_model(project: Path) -> Iterator[Path]:
+    """A folder for a model, which becomes the project's ``sparse/0`` when the block ends without an error."""
+    half = project / ".sparse"
+    shutil.rmtree(half, ignore_errors=True)
+    (half / "0").mkdir(parents=True)
+    yield half / "0"
+    shutil.rmtree(project / "sparse", ignore_errors=True)
+    half.replace(project / "sparse")

@@ -97,11 +97,11 @@ def read_depth_map(path: Path, shot: Shot, source: DepthSource) -> DepthMap:
     """
     depth = read_depth(path, scale=source.scale, integer_scale=shot.depth_scale)
     height, width = depth.shape
-    whole = shot.camera
-    if abs(whole.height * width / whole.width - height) >= 1:  # a pixel, because sizes are rounded
-        sizes = f"{width} × {height} pixels, but the camera of {shot.name} has {whole.width} × {whole.height}"
+    if not shot.camera.fits(width, height):
+        size = f"{shot.camera.width} × {shot.camera.height}"
+        sizes = f"{width} × {height} pixels, but the camera of {shot.name} has {size}"
         raise InputError(f"{path}: {sizes}; export it in the view of the photograph (registered)")
-    camera = whole.resized(width, height)
+    camera = shot.camera.resized(width, height)
     if source.kind == "metric":
         edges = edge_pixels(depth, pixel_angle=1 / camera.fx_fy_cx_cy[0], jump=JUMP)
         depth = np.where(edges, np.nan, depth)

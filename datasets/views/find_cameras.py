@@ -18,16 +18,17 @@ import numpy as np
 from ...neural_fields import InputError
 from .colmap_process import (
     DATABASE_FILE,
-    FEATURES,
-    LARGEST_SIDE,
     MATCHING,
     OVERLAP,
     Report,
     begun,
     check_colmap,
+    extract_features,
     film_pairs,
     fingerprint,
+    new_model,
     solve,
+    verification_options,
     write_record,
 )
 from .shots import IMAGE_SUFFIXES, image_size, list_images
@@ -184,14 +185,9 @@ def _reconstructed(project: Path, told: Connection, *, one: bool, film: bool) ->
     import pycolmap
 
     database, images = project / DATABASE_FILE, project / "images"
-    told.send(("stage", (FEATURES, 0)))
-    mode = pycolmap.CameraMode.SINGLE if one else pycolmap.CameraMode.PER_IMAGE
-    extraction = pycolmap.FeatureExtractionOptions()
-    extraction.max_image_size = LARGEST_SIDE
-    pycolmap.extract_features(database, images, camera_mode=mode, extraction_options=extraction)
+    extract_features(project, told, one=one)
     told.send(("stage", (MATCHING, 0)))
-    verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = 0  # else every run has matches of its own
+    verification = verification_options()
     if film:
         pairing = pycolmap.SequentialPairingOptions()
         pairing.overlap, pairing.quadratic_overlap = OVERLAP, True
@@ -216,12 +212,8 @@ def _reconstructed(project: Path, told: Connection, *, one: bool, film: bool) ->
             "another, of something with texture, and keep the lens"
         )
     model = max(models.values(), key=lambda model: model.num_reg_images())
-    half = project / ".sparse"
-    shutil.rmtree(half, ignore_errors=True)
-    (half / "0").mkdir(parents=True)
-    model.write(half / "0")
-    shutil.rmtree(project / "sparse", ignore_errors=True)
-    half.replace(project / "sparse")
+    with new_model(project) as folder:
+        model.write(folder)
     return {
         "names": sorted(image.name for image in model.images.values() if image.has_pose),
         "points": model.num_points3D(),

@@ -13,16 +13,18 @@ import torch
 from numpy.typing import NDArray
 
 from ...neural_fields import InputError
+from ...neural_fields.files import files_in
 from .colmap_process import (
     DATABASE_FILE,
-    FEATURES,
-    LARGEST_SIDE,
     MATCHING,
     Report,
     begun,
     check_colmap,
+    extract_features,
     fingerprint,
+    new_model,
     solve,
+    verification_options,
     write_record,
 )
 from .images import read_posed_images
@@ -33,7 +35,7 @@ __all__ = ["TRIANGULATING", "FoundPoints", "find_points", "neighbours"]
 
 TRIANGULATING = "triangulating"
 NEAREST = 20  # views that each is matched with: those that look at the region from most nearly the same side
-GIVEN = "given"  # the model that COLMAP is given: cameras and no points
+GIVEN, PAIRS_FILE = "given", "pairs.txt"  # what COLMAP is given: a model with cameras and no points, and who is matched
 
 
 @dataclass(frozen=True)
@@ -71,7 +73,9 @@ def find_points(source: str | Path, project: str | Path, *, report: Report | Non
     """
     check_colmap()
     source, project = find_source(source), Path(project)
-    files = [shot.image for shot in read_shots(source)]
+    shots = read_shots(source)
+    files = [file for shot in shots for file in (shot.image, shot.mask, shot.depth) if file is not None]
+    files += [source] if source.is_file() else files_in(source, (".bin", ".txt"))
     asked = {"source": str(source.resolve()), "content": fingerprint([file for file in files if file.is_file()])}
     found = begun(project, asked, lambda was: FoundPoints(**{**was, "project": project}))
     if found is not None:
@@ -79,10 +83,9 @@ def find_points(source: str | Path, project: str | Path, *, report: Report | Non
     report = report or (lambda stage, done, total: None)
     if not (project / GIVEN).is_dir():
         _write_given(source, project)
-    views = len(read_shots(project / GIVEN))
-    pairs = (project / "pairs.txt").read_text(encoding="utf-8").count("\n")
-    made = solve(project, _triangulated, photographs=views, pairs=pairs, report=report)
-    found = FoundPoints(project, views, **made)
+    pairs = (project / PAIRS_FILE).read_text(encoding="utf-8").count("\n")
+    made = solve(project, _triangulated, photographs=len(shots), pairs=pairs, report=report)
+    found = FoundPoints(project, len(shots), **made)
     write_record(project, asked | {"found": asdict(found) | {"project": ""}})
     return found
 
@@ -97,7 +100,7 @@ def _write_given(source: Path, project: Path) -> None:
     eyes = torch.stack([view.camera.eye for view in images.views]).numpy()
     pairs = neighbours(eyes - np.array(images.similarity.center))
     lines = "".join(f"{names[a]} {names[b]}\n" for a, b in pairs)
-    (project / "pairs.txt").write_text(lines, encoding="utf-8")
+    (project / PAIRS_FILE).write_text(lines, encoding="utf-8")
     for name in ("images", "depths"):
         if (half / name).is_dir():
             shutil.rmtree(project / name, ignore_errors=True)
@@ -130,32 +133,22 @@ def _triangulated(project: Path, told: Connection) -> dict[str, Any]:
     import pycolmap
 
     database, images = project / DATABASE_FILE, project / "images"
-    told.send(("stage", (FEATURES, 0)))
-    extraction = pycolmap.FeatureExtractionOptions()
-    extraction.max_image_size = LARGEST_SIDE
-    mode = pycolmap.CameraMode.PER_IMAGE
-    pycolmap.extract_features(database, images, camera_mode=mode, extraction_options=extraction)
+    extract_features(project, told, one=False)
     told.send(("stage", (MATCHING, 0)))
-    verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = 0  # else every run has matches of its own
     pairing = pycolmap.ImportedPairingOptions()
-    pairing.match_list_path = project / "pairs.txt"
-    pycolmap.match_image_pairs(database, pairing_options=pairing, verification_options=verification)
+    pairing.match_list_path = project / PAIRS_FILE
+    pycolmap.match_image_pairs(database, pairing_options=pairing, verification_options=verification_options())
     told.send(("stage", (TRIANGULATING, 0)))
     model = _with_numbers_of(database, pycolmap.Reconstruction(project / GIVEN))
-    half = project / ".sparse"
-    shutil.rmtree(half, ignore_errors=True)
-    (half / "0").mkdir(parents=True)
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = 0
-    model = pycolmap.triangulate_points(model, database, images, half / "0", options=options)
-    if not model.num_points3D():
-        raise InputError(
-            "no two photographs show the same thing in the same place: the cameras may be wrong (see `mplicits "
-            "check-cameras`), or there is nothing with texture"
-        )
-    shutil.rmtree(project / "sparse", ignore_errors=True)
-    half.replace(project / "sparse")
+    with new_model(project) as folder:
+        model = pycolmap.triangulate_points(model, database, images, folder, options=options)
+        if not model.num_points3D():
+            raise InputError(
+                "no two photographs show the same thing in the same place: the cameras may be wrong (see `mplicits "
+                "check-cameras`), or there is nothing with texture"
+            )
     return {"points": model.num_points3D(), "error": model.compute_mean_reprojection_error()}
 
 

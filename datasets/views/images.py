@@ -130,8 +130,12 @@ def _posed(source: Path, width: int | None, region: Similarity | None, depths: D
 
 def _check_files(shots: Sequence[Shot]) -> None:
     """Say before any long work what is missing."""
-    fixes = {"image": "add it, or leave that camera out", "mask": "add it, or leave all masks out"}
-    for kind, fix in {**fixes, "depth": "add it, or leave all depth maps out"}.items():
+    fixes = {
+        "image": "add it, or leave that camera out",
+        "mask": "add it, or leave all masks out",
+        "depth": "add it, or leave all depth maps out",
+    }
+    for kind, fix in fixes.items():
         files = [(shot, file) for shot in shots if (file := getattr(shot, kind)) is not None]
         missing = [(shot, file) for shot, file in files if not file.is_file()]
         if missing:
@@ -164,15 +168,14 @@ def _view(shot: Shot, width: int | None, depths: DepthSource) -> PosedImage:
             color, mask = resample(color, mask, step)
         else:
             color, mask = resample(color, None, step)[0], mask if mask is None else step(mask)
-    return PosedImage(
-        shot.name, pinhole, color, mask, None if shot.depth is None else read_depth_map(shot.depth, shot, depths)
-    )
+    depth = None if shot.depth is None else read_depth_map(shot.depth, shot, depths)
+    return PosedImage(shot.name, pinhole, color, mask, depth)
 
 
 def _fitted(shot: Shot, width: int, height: int) -> Camera:
     """The camera for the picture that is there: files often keep the size of the original photographs."""
     camera = shot.camera
-    if abs(camera.height * width / camera.width - height) >= 1:  # a pixel, because sizes are rounded
+    if not camera.fits(width, height):
         sizes = f"{width} × {height} pixels, but its camera has {camera.width} × {camera.height}"
         raise InputError(f"{shot.named}: {shot.image} has {sizes}; turn, crop or export it as it was")
     same = (camera.width, camera.height) == (width, height)

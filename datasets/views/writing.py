@@ -76,8 +76,8 @@ def write_transforms(folder: str | Path, images: PosedImages) -> None:
     """Write ``transforms.json`` and ``images/``, as nerfstudio and instant-ngp read them.
 
     Poses are in OpenGL's convention and ``cx``, ``cy`` count from the image's corner. Masks become the alpha channel
-    (straight). Every frame has its own intrinsics; ``camera_angle_x`` of the first
-    stands at the top, for readers of Blender's dialect.
+    (straight). Every frame has its own intrinsics; ``camera_angle_x`` of the first stands at the top, for readers of
+    Blender's dialect.
 
     Raises:
         InputError: the folder is not new, or cannot be written.
@@ -103,7 +103,7 @@ def write_colmap(folder: str | Path, images: PosedImages, *, form: Literal["text
     """Write ``images/`` and a sparse model in ``sparse/0``, as COLMAP writes them.
 
     Cameras are PINHOLE, one for each distinct lens. Masks become the alpha channel (straight). Which views saw a sparse
-    point is written where it is known, and as the place in the image that to which the point projects.
+    point is written where it is known, with the place in the image to which the point projects.
 
     Raises:
         InputError: the folder is not new, or cannot be written.

@@ -31,21 +31,19 @@ def seen_through(measured: MeasuredDepths, resolution: int) -> Tensor:
     rows = torch.arange(len(measured), device=measured.device)[:: max(1, len(measured) // LIMIT)]
     steps = torch.arange(round(2 / edge) * 2, device=measured.device) * (edge / 2)
     for part in rows.split(CHUNK):
-        rays = measured.at(part)
-        length = rays.along.norm(dim=1)
-        directions, reach = rays.along / length[:, None], rays.depths * length
-        near, far = sphere_span(rays.origins, directions)
+        origins, directions, reach = measured.at(part)[:3]
+        near, far = sphere_span(origins, directions)
         depths = near[:, None] + steps
         # Not the last cell and a half: that is where the surface is, as well as it was measured.
         kept = depths < torch.minimum(reach - 1.5 * edge, far)[:, None]
-        places = rays.origins[:, None] + depths[..., None] * directions[:, None]
+        places = origins[:, None] + depths[..., None] * directions[:, None]
         cells = _cell(places, resolution)
         # Half-cell steps meet a cell more than once; a ray counts once.
         first = torch.ones_like(kept)
         first[:, 1:] = cells[:, 1:] != cells[:, :-1]
         passed += torch.bincount(cells[kept & first], minlength=count**3)
         inside = (reach > near) & (reach < far)
-        ends = _cell(rays.origins + reach[:, None] * directions, resolution)
+        ends = _cell(origins + reach[:, None] * directions, resolution)
         ended += torch.bincount(ends[inside], minlength=count**3)
     return ((passed >= CROSSED) & (passed >= ended)).reshape(count, count, count).cpu()
 

@@ -57,8 +57,9 @@ def begin(
     """
     base = model.geometry.base if isinstance(model.geometry, MultiscaleSDF) else None
     masked = all(view.mask is not None for view in views) and config.start != "depths"
-    empty = None if measured is None or config.start == "hull" else seen_through(measured, RESOLUTION).numpy()
-    if config.start != "sphere" and isinstance(base, Siren) and (masked or empty is not None):
+    carving = None if config.start == "hull" else measured
+    if config.start != "sphere" and isinstance(base, Siren) and (masked or carving is not None):
+        empty = None if carving is None else seen_through(carving, RESOLUTION).numpy()
         distances = carve(views if masked else (), images.similarity, empty=empty)
         if distances is not None:
             start_at_hull(base, distances, seed=config.seed)
@@ -103,7 +104,9 @@ def carve(
     for sees, objects in silhouettes([view for view in views if view.mask is not None], similarity, points, edge):
         seen += sees
         object_in += objects
-    kept = (seen >= max(1.0, SEEING * len(views))) & (object_in >= AGREE * seen) if views else torch.ones_like(seen) > 0
+    kept = object_in >= AGREE * seen
+    if views:
+        kept &= seen >= max(1.0, SEEING * len(views))
     if empty is not None:
         kept &= ~torch.from_numpy(empty.reshape(-1))[in_ball]
     if not LEAST < float(kept.double().mean()) < (MOST if views else MOST_UNSEEN):

@@ -5,8 +5,8 @@ A measurement says two things: where the ray meets the surface, and that nothing
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,44 +15,47 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ...datasets.cameras import Camera
 from ...datasets.views.depth_maps import DepthMap
 from ...datasets.views.images import PosedImage, PosedImages
-from ...neural_fields import Field, InputError
+from ...neural_fields import Field, InputError, sphere_trace
 from ...neural_fields.devices import upload
+from ...neural_fields.function import FieldLike
 from ...neural_fields.volume import sphere_span
 from ..run.team import my_share
+from .silhouettes import OBJECT
 
 __all__ = ["DepthRays", "MeasuredDepths", "depth_loss", "fit_scale_shift"]
 
 Float64 = NDArray[np.float64]
+Int64 = NDArray[np.int64]
 
 LIMIT = 1 << 21  # readings that are kept, of all maps together
-OBJECT = 0.5  # a pixel with a larger share of object counts as one
 FEWEST = 16  # readings that say scale and shift of a map
 # Of the fit that does not follow outliers: how often it is weighted again, the relative error below which all count
 # alike, and how far numbers differ at least, as a share of their mean.
 ROUNDS, LEAST_RESIDUAL, ALL_ALIKE = 10, 1e-3, 1e-6
 TINY = 1e-300
-ASKED, ALONG = 256, 64  # rays of each map that are held against the surface, and places along each
+ASKED, TOLERANCE = 256, 1e-3  # rays of each map that are held against the surface, and how exactly they are traced
 INSIDE = 0.01  # of the readings of maps in the cameras' units, at least, end in the region
 ALIKE = 1.2  # factor between the depths of such maps and of sparse points, at most
 AS_IT_IS, RELATIVE, DISPARITY = 0, 1, 2  # how a number becomes a depth
 
 
 class DepthRays(NamedTuple):
-    """Measured rays in unit-sphere coordinates: they meet the surface at ``origins + depths · along``.
+    """Measured rays in unit-sphere coordinates: they meet the surface at ``origins + reach · directions``.
 
     Attributes:
         origins: ``(B, 3)``.
-        along: ``(B, 3)`` directions whose part along the axis of view is 1.
-        depths: ``(B,)`` along that axis, in radii of the region; not positive where it is not known yet.
+        directions: ``(B, 3)`` unit vectors.
+        reach: ``(B,)`` in radii of the region; not positive where it is not known yet.
         exact: ``(B,)`` whether it was measured, by a sensor or by triangulation, and not estimated from one picture.
         view: ``(B,)`` number of the picture.
     """
 
     origins: Tensor
-    along: Tensor
-    depths: Tensor
+    directions: Tensor
+    reach: Tensor
     exact: Tensor
     view: Tensor
 
@@ -132,7 +135,9 @@ class MeasuredDepths:
         scale, shift = self.affine[view].unbind(dim=1)
         mapped = scale * numbers + shift
         depths = torch.where(form == RELATIVE, mapped, torch.where(form == AS_IT_IS, numbers, _inverse(mapped)))
-        return DepthRays(self.eyes[view], self.along[rows], depths, self.exact[rows], view)
+        along = self.along[rows]  # their part along the axis of view is 1
+        length = along.norm(dim=1)
+        return DepthRays(self.eyes[view], along / length[:, None], depths * length, self.exact[rows], view)
 
     def draw(self, count: int, generator: torch.Generator) -> DepthRays:
         """``count`` measurements at random, with replacement, or a team's share of them."""
@@ -140,11 +145,11 @@ class MeasuredDepths:
         return self.at(upload(my_share(rows), self.device))
 
     @torch.no_grad()
-    def settle(self, distance: Callable[[Tensor], Tensor]) -> None:
+    def settle(self, distance: FieldLike) -> None:
         """Fit scale and shift of the maps that have none of their own to a surface as it is.
 
         Args:
-            distance: ``(N, 3)`` → ``(N,)`` signed distances in unit-sphere coordinates.
+            distance: a field, or a function of points, in unit-sphere coordinates.
         """
         loose = self.forms != AS_IT_IS
         # Of each view's readings, evenly; they lie one after the other.
@@ -155,8 +160,15 @@ class MeasuredDepths:
         rows = loose.nonzero()[:, 0][(first[owned, None] + steps * count[owned, None]).long().reshape(-1)]
         view, along = self.views[rows].long(), self.along[rows]
         length = along.norm(dim=1)
-        depths = _first_hits(self.eyes[view], along / length[:, None], distance) / length
-        hit = depths > 0
+        hits = sphere_trace(
+            distance,
+            self.eyes[view],
+            along / length[:, None],
+            tolerance=TOLERANCE,
+            resolution=TOLERANCE,
+            radius=1.0,
+        )
+        hit, depths = hits.mask, hits.depth / length
         wanted = torch.where(self.forms[rows] == RELATIVE, depths, _inverse(depths))
         found = fit_scale_shift(self.numbers[rows][hit], wanted[hit], view[hit], len(self.eyes))
         self.affine[owned] = found[owned].to(self.affine)
@@ -165,22 +177,6 @@ class MeasuredDepths:
 def _inverse(numbers: Tensor) -> Tensor:
     """1 / x of what is positive, else 0."""
     return torch.where(numbers > 0, 1 / numbers.clamp_min(1e-12), 0.0)
-
-
-def _first_hits(origins: Tensor, directions: Tensor, distance: Callable[[Tensor], Tensor]) -> Tensor:
-    """Where rays first go from outside to inside a surface ``(N,)``; 0 for those that do not, or begin inside.
-
-    Found between `ALONG` places within the unit sphere, by linear interpolation.
-    """
-    near, far = sphere_span(origins, directions)
-    depths = near[:, None] + (far - near)[:, None] * torch.linspace(0, 1, ALONG, device=near.device)
-    values = distance((origins[:, None] + depths[..., None] * directions[:, None]).reshape(-1, 3)).reshape(depths.shape)
-    enters = (values[:, :-1] > 0) & (values[:, 1:] <= 0)
-    at = enters.float().argmax(dim=1, keepdim=True)
-    before, after = values.gather(1, at), values.gather(1, at + 1)
-    share = before / (before - after).clamp_min(1e-12)
-    place = torch.lerp(depths.gather(1, at), depths.gather(1, at + 1), share)[:, 0]
-    return torch.where(enters.any(dim=1), place, 0.0)
 
 
 def fit_scale_shift(numbers: Tensor, wanted: Tensor, group: Tensor, groups: int) -> Tensor:
@@ -231,15 +227,14 @@ def depth_loss(field: Field, rays: DepthRays, *, level: int = -1, generator: tor
         level: of the field.
         generator: of the places, on the CPU; without, they are in the middle of the way.
     """
-    length = rays.along.norm(dim=1)
-    directions, reach = rays.along / length[:, None], rays.depths * length
-    near, far = sphere_span(rays.origins, directions)
+    origins, directions, reach = rays[:3]
+    near, far = sphere_span(origins, directions)
     on_surface = (reach > near) & (reach < far)
     end = torch.minimum(reach, far)
     seen_through = end > near
     part = torch.rand(len(reach), generator=generator) if generator else torch.full((len(reach),), 0.5)
     at = end - (end - near) * upload(part, end.device).square()
-    places = rays.origins + torch.stack((reach, at))[..., None] * directions  # (2, B, 3)
+    places = origins + torch.stack((reach, at))[..., None] * directions  # (2, B, 3)
     # Those that do not count are evaluated too: a GPU would be waited for until it says which they are.
     on, before = field.value(places, level=level)
     missed, free = on.abs(), (-before).clamp_min(0) + (before - (reach - at)).clamp_min(0)
@@ -303,24 +298,26 @@ def _of_map(depth: DepthMap, points: _Part, images: PosedImages, random: np.rand
 
 def _numbers_at(depth: DepthMap, points: _Part) -> tuple[Float64, Float64]:
     """A map's numbers where its view saw sparse points ``(N,)``, and the depths of these ``(N,)`` in radii."""
-    height, width = depth.numbers.shape
-    pixels = np.rint(depth.camera.pixels_at(points.lines[:, :2])).astype(np.int64)
-    inside = ((pixels >= 0) & (pixels < (width, height))).all(axis=1)
-    numbers = depth.numbers[pixels[inside, 1], pixels[inside, 0]].astype(np.float64)
-    known = np.isfinite(numbers)
-    return numbers[known], points.numbers[inside][known]
+    row, column, inside = _pixels(depth.camera, points.lines)
+    numbers = depth.numbers[row, column].astype(np.float64)
+    known = inside & np.isfinite(numbers)
+    return numbers[known], points.numbers[known]
 
 
 def _on_object(view: PosedImage, part: _Part) -> _Part:
     """Those that the view's mask, if it has one, takes for object: what is behind is not there for the training."""
     if view.mask is None or not len(part.numbers):
         return part
-    height, width = view.mask.shape
-    pixels = np.rint(view.camera.pixels_at(part.lines[:, :2])).astype(np.int64)
-    inside = ((pixels >= 0) & (pixels < (width, height))).all(axis=1)
-    column, row = pixels.clip(0, (width - 1, height - 1)).T
+    row, column, inside = _pixels(view.camera, part.lines)
     kept = inside & (view.mask[row, column] > OBJECT)
-    return _Part(part.lines[kept], part.numbers[kept], part.form, part.exact, part.view)
+    return replace(part, lines=part.lines[kept], numbers=part.numbers[kept])
+
+
+def _pixels(camera: Camera, lines: Float64) -> tuple[Int64, Int64, NDArray[np.bool_]]:
+    """Rows and columns of the pixels that lines of sight ``(N, 3)`` pass, the nearest ones of those that pass none."""
+    pixels = np.rint(camera.pixels_at(lines[:, :2])).astype(np.int64)
+    nearest = pixels.clip(0, (camera.width - 1, camera.height - 1))
+    return nearest[:, 1], nearest[:, 0], (nearest == pixels).all(axis=1)
 
 
 def _check_units(source: Path, in_region: Sequence[float], ratios: Sequence[Float64]) -> None:

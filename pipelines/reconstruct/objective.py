@@ -181,8 +181,8 @@ class SceneObjective(Objective):
             self.kept["affine"] = measured.affine
         rays = measured.draw(whole_batch(DEPTH_RAYS), self.generator)
         if self.model.poses is not None:
-            origins, along = self.model.poses.moved(rays.origins, rays.along, rays.view)
-            rays = rays._replace(origins=origins, along=along)
+            origins, directions = self.model.poses.moved(rays.origins, rays.directions, rays.view)
+            rays = rays._replace(origins=origins, directions=directions)
         missed = depth_loss(
             self.model.geometry, rays, level=self.level_at(done), generator=own_generator(self.generator)
         )

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 from ...datasets.views.colmap_process import FEATURES, MATCHING
+from ...datasets.views.colmap_process import Report as ColmapReport
 from ...datasets.views.find_cameras import PLACING, FoundCameras, find_cameras
 from ...datasets.views.find_points import NEAREST, TRIANGULATING, FoundPoints, find_points
 from ...datasets.views.reading import find_source, read_shots
@@ -52,10 +53,7 @@ def find_cameras_timed(
         ]
     )
 
-    def report(stage: str, done: int, total: int) -> None:
-        schedule(Progress(stage, done, total, done / max(total, 1), {}))
-
-    return find_cameras(source, project, frames=frames, lens=lens, report=report)
+    return find_cameras(source, project, frames=frames, lens=lens, report=_to(schedule))
 
 
 def find_points_timed(source: str | Path, project: str | Path, *, progress: Report | None = None) -> FoundPoints:
@@ -76,10 +74,16 @@ def find_points_timed(source: str | Path, project: str | Path, *, progress: Repo
         ]
     )
 
+    return find_points(source, project, report=_to(schedule))
+
+
+def _to(schedule: Schedule) -> ColmapReport:
+    """What tells a schedule how far COLMAP is."""
+
     def report(stage: str, done: int, total: int) -> None:
         schedule(Progress(stage, done, total, done / max(total, 1), {}))
 
-    return find_points(source, project, report=report)
+    return report
 
 
 def said_of_points(found: FoundPoints) -> tuple[str, list[str]]:
@@ -88,8 +92,13 @@ def said_of_points(found: FoundPoints) -> tuple[str, list[str]]:
         f"{found.project}: {found.points:,} points that {found.photographs} photographs show, seen {found.error:.2f} "
         "pixels off"
     )
-    few = f"{found.points} points are few: cameras may be wrong; see `mplicits check-cameras`"
-    return line, [few] if found.points < FEW_POINTS else []
+    return line, _few(found.points)
+
+
+def _few(points: int) -> list[str]:
+    """What is to be warned of, if so many points are few."""
+    warning = f"{points} points are few: cameras may be wrong; see `mplicits check-cameras`"
+    return [warning] if points < FEW_POINTS else []
 
 
 def said_of(found: FoundCameras) -> tuple[str, list[str]]:
@@ -103,6 +112,4 @@ def said_of(found: FoundCameras) -> tuple[str, list[str]]:
     if found.left_out:
         names = ", ".join(found.left_out[:3]) + (", …" if len(found.left_out) > 3 else "")
         warnings.append(f"not placed: {names}; too little in them is in others too, or they are blurred")
-    if found.points < FEW_POINTS:
-        warnings.append(f"{found.points} points are few: cameras may be wrong; see `mplicits check-cameras`")
-    return line, warnings
+    return line, warnings + _few(found.points)

@@ -13,7 +13,7 @@ from torch import Tensor
 from ...datasets.cameras import Camera
 from ...datasets.views.pictures import shrink
 from ...neural_fields import Field, sphere_trace
-from .views import OBJECT
+from .silhouettes import OBJECT
 
 __all__ = ["SeenFrom", "seen_points"]
 

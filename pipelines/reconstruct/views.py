@@ -21,6 +21,7 @@ from ...neural_fields.volume import sphere_span
 from ...neural_fields.volume_renderer import Sampling
 from ..render.picture import Image, stacked
 from .model import SceneModel, camera_rays
+from .silhouettes import OBJECT
 
 __all__ = [
     "ViewImage",
@@ -40,7 +41,6 @@ Float32 = NDArray[np.float32]
 RAYS = 4096  # rendered at a time
 SSIM_WINDOW = 11
 GOLDEN = (5**0.5 - 1) / 2
-OBJECT = 0.5  # a pixel with a larger share of object counts as one
 
 
 @dataclass(frozen=True)

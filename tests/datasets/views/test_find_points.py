@@ -1,6 +1,7 @@
 """Points triangulated by COLMAP lie on the sphere that was drawn; which views are matched; what is kept and refused."""
 
 import math
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -96,6 +97,12 @@ def test_an_interrupted_search_goes_on_and_a_finished_one_is_kept(
     assert asked == 2 * [(VIEWS, VIEWS * (VIEWS - 1) // 2)]
     with pytest.raises(InputError, match="holds the cameras of other photographs"):
         find_points(tmp_path / "project" / "given", tmp_path / "project")
+    # Other cameras for the same photographs are another question, too.
+    changed = shutil.copytree(photographs, tmp_path / "changed")
+    find_points(changed, tmp_path / "again")
+    (changed / "transforms.json").write_text((changed / "transforms.json").read_text() + "\n")
+    with pytest.raises(InputError, match="holds the cameras of other photographs"):
+        find_points(changed, tmp_path / "again")
 
 
 def test_views_are_paired_with_those_that_look_from_the_same_side() -> None:

@@ -51,7 +51,7 @@ def told_as(images: PosedImages, kind: DepthKind, scales: np.ndarray, shifts: np
 
 def ends(measured: MeasuredDepths) -> Tensor:
     rays = measured.at(torch.arange(len(measured)))
-    return rays.origins + rays.depths[:, None] * rays.along
+    return rays.origins + rays.reach[:, None] * rays.directions
 
 
 def measured_of(images: PosedImages) -> MeasuredDepths:
