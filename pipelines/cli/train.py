@@ -198,7 +198,7 @@ def _reconstruct_here(arguments: argparse.Namespace, config: ReconstructConfig |
     )
     if held_out:
         print(
-            f"{views['held_out']} held-out views: PSNR {held_out['psnr']:.2f} dB, SSIM {held_out['ssim']:.3f} "
+            f"{len(held_out['views'])} held-out views: PSNR {held_out['psnr']:.2f} dB, SSIM {held_out['ssim']:.3f} "
             f"({directory / HELD_OUT_FILE})"
         )
     print(f"{directory / MESH_FILE}: {len(mesh.vertices):,} vertices, {len(mesh.faces):,} faces")
