@@ -17,14 +17,14 @@ from numpy.typing import NDArray
 
 from ...neural_fields import Box, Capsule, Field, Similarity, Sphere, Torus, Union, sphere_trace
 from ...neural_fields.meshing import Mesh, extract_mesh
-from ..cameras import UP_AXES, Camera, look_at
-from ..clouds.orientation import fibonacci_directions
+from ..cameras import Camera
 from ..clouds.point_cloud import PointCloud
-from ..color_space import linear_to_srgb, srgb_to_linear
+from ..color_space import srgb_to_linear
 from ..views.depth_maps import DepthMap
 from ..views.images import PosedImage, PosedImages
 from .samples import sample_surface
 from .statue import Statue
+from .studio import cameras_around, developed, lit
 
 __all__ = [
     "SCENES",
@@ -41,11 +41,6 @@ Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Rgb = tuple[float, float, float]
 
-LAMP = (0.4, 0.7, 0.6)  # towards the lamp, for shaded scenes
-AMBIENT = 0.35  # share of the light that comes from everywhere
-GLOSS, SHARPNESS = 0.6, 40  # light in the middle of a lamp's reflection, and how narrow it is (Blinn 1977)
-DISTANCE = 4.0  # of the eyes from the middle, in radii of the shape
-MARGIN = 1.1  # radius of the ball that just fills the images, in radii of the shape
 RAYS_AT_ONCE = 1 << 17
 VISIBLE = 1e-3  # how far before a point of the surface a ray may meet it that sees the point
 SPARSE_POINTS = 1000  # as many as structure from motion would give, more or less
@@ -75,8 +70,6 @@ class Scene:
 def scene_cameras(scene: Scene, *, views: int = 24, size: int = 64, seed: int = 0) -> list[Camera]:
     """Cameras spread evenly over a sphere around a scene, upright, with all of the shape in view.
 
-    They stand on a Fibonacci lattice that is turned at random, so that another seed gives views to hold out.
-
     Args:
         scene: what they look at.
         views: how many.
@@ -86,16 +79,7 @@ def scene_cameras(scene: Scene, *, views: int = 24, size: int = 64, seed: int = 
     Raises:
         ValueError: ``views`` or ``size`` is not positive.
     """
-    for name, number in (("views", views), ("size", size)):
-        if number < 1:
-            raise ValueError(f"{name}={number}: expected at least one")
-    # The orthogonal factor of a Gaussian matrix is an evenly distributed rotation (or reflection, which is as good).
-    turn = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))[0]
-    eyes = DISTANCE * scene.radius * fibonacci_directions(views) @ turn.T
-    # A ball of radius r at distance d is seen within asin(r / d) of its middle.
-    fov = 2 * float(np.degrees(np.arcsin(MARGIN / DISTANCE)))
-    up = UP_AXES[scene.up]
-    return [look_at(torch.from_numpy(eye), (0, 0, 0), up=up, fov=fov, width=size, height=size) for eye in eyes]
+    return cameras_around(scene.radius, up=scene.up, views=views, size=size, seed=seed)
 
 
 def render_scene(
@@ -192,21 +176,18 @@ def render_view(
         _strip(scene, camera.strip(first, min(rows, camera.height - first)), samples, shaded, glossy)
         for first in range(0, camera.height, rows)
     ]
-    light, hits = (np.concatenate(part) for part in zip(*strips, strict=True))
-    mean = light / np.maximum(hits, 1)[..., None]
-    return linear_to_srgb(mean).clip(0, 1).astype(np.float32), (hits / samples**2).astype(np.float32)
+    color, mask = (np.concatenate(part) for part in zip(*strips, strict=True))
+    return color, mask
 
 
-def _strip(scene: Scene, camera: Camera, samples: int, shaded: bool, glossy: bool) -> tuple[Float64, NDArray[np.int64]]:
-    """Sum of the light ``(H, W, 3)`` of the rays of each pixel that hit, and their number ``(H, W)``."""
+def _strip(scene: Scene, camera: Camera, samples: int, shaded: bool, glossy: bool) -> tuple[Float32, Float32]:
     fine = camera.resized(samples * camera.width, samples * camera.height)
     eye, directions = fine.rays(dtype=torch.float64)
     hits = sphere_trace(scene.field, eye, directions, tolerance=1e-9, lipschitz=scene.lipschitz)
     mask, position = hits.mask.numpy(), hits.position.numpy()
     light = np.zeros((*mask.shape, 3))
     light[mask] = _light(scene, position[mask], directions.numpy()[mask], shaded, glossy)
-    tiles = (camera.height, samples, camera.width, samples)
-    return light.reshape(*tiles, 3).sum(axis=(1, 3)), mask.reshape(tiles).sum(axis=(1, 3))
+    return developed(light, mask, samples)
 
 
 def _light(scene: Scene, points: Float64, directions: Float64, shaded: bool, glossy: bool) -> Float64:
@@ -217,16 +198,7 @@ def _light(scene: Scene, points: Float64, directions: Float64, shaded: bool, glo
     with torch.inference_mode():
         gradient = scene.field.jet(torch.from_numpy(points)).gradient.numpy()
     normals = gradient / np.maximum(np.linalg.norm(gradient, axis=1, keepdims=True), 1e-12)
-    towards = np.array(LAMP) / np.linalg.norm(LAMP)
-    cosine = normals @ towards
-    if shaded:
-        light = light * (AMBIENT + (1 - AMBIENT) * np.maximum(cosine, 0))[:, None]
-    if glossy:
-        halfway = towards - directions
-        halfway /= np.maximum(np.linalg.norm(halfway, axis=1, keepdims=True), 1e-12)
-        aligned = np.maximum((normals * halfway).sum(axis=1), 0)
-        light = light + (GLOSS * np.where(cosine > 0, aligned**SHARPNESS, 0.0))[:, None]
-    return light
+    return lit(light, normals, directions, shaded=shaded, glossy=glossy)
 
 
 def scene_mesh(scene: Scene, *, resolution: int = 256) -> Mesh:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from dataclasses import asdict
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..run.config import input_error
@@ -136,7 +137,8 @@ TRUTH = "surface.ply"
 
 
 def _scene_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("name", metavar="NAME", choices=SCENE_NAMES, help=", ".join(SCENE_NAMES))
+    what = f"{', '.join(SCENE_NAMES)}; or a mesh, with its texture if an OBJ or glTF file has one"
+    parser.add_argument("name", metavar="NAME|MESH", help=what)
     add_flags(parser, "--out", metavar="DIR", help="a folder that is not there yet")
     what = "neus (cameras_sphere.npz), transforms (.json of nerfstudio), colmap or colmap-text (neus)"
     parser.add_argument("--format", choices=FORMATS, default="neus", metavar="FORMAT", help=what)
@@ -152,6 +154,7 @@ def _scene_arguments(parser: argparse.ArgumentParser) -> None:
     what = "what is wrong with them, to see what is said of it and survived: " + ", ".join(FAULTS)
     parser.add_argument("--fault", choices=FAULTS, metavar="FAULT", help=what)
     add_flags(parser, "--seed", help="of the cameras (0)")
+    parser.add_argument("--up", choices=("y", "z"), metavar="{y,z}", help="the axis of a mesh that points up (y)")
 
 
 def _scene(arguments: argparse.Namespace) -> int:
@@ -159,24 +162,26 @@ def _scene(arguments: argparse.Namespace) -> int:
     from ...datasets.synthetic.view_faults import with_fault
     from ...datasets.views.writing import check_new_folder, write_colmap, write_neus, write_transforms
     from ..mesh.files import write_mesh
+    from ..render.studio import photograph_mesh, true_mesh
     from ..run.progress import counter_bar
 
     folder = check_new_folder(arguments.out)
     if arguments.fault and arguments.views < 3:
         raise input_error("--fault: one of three views at least has it; --views 3 or more")
-    scene = SCENES[arguments.name]()
+    name, exact = arguments.name, arguments.name in SCENES
+    if not exact and not Path(name).exists():
+        raise input_error(f"{name}: neither a mesh file nor one of the scenes {', '.join(SCENE_NAMES)}; check the name")
+    if exact and arguments.up:
+        raise input_error(f"--up: goes with a mesh; {name} stands as it is, so leave it out")
+    given = {flag: getattr(arguments, flag) for flag in ("seed", "samples", "shaded", "glossy", "depths")}
+    truth = scene_mesh(SCENES[name]()) if exact else true_mesh(name)
     with counter_bar("render") as progress:
-        images = render_scene(
-            scene,
-            arguments.views,
-            arguments.size,
-            seed=arguments.seed,
-            samples=arguments.samples,
-            shaded=arguments.shaded,
-            glossy=arguments.glossy,
-            depths=arguments.depths,
-            progress=progress,
-        )
+        if exact:
+            scene = SCENES[name]()
+            images = render_scene(scene, arguments.views, arguments.size, progress=progress, **given)
+        else:
+            up = arguments.up or "y"
+            images = photograph_mesh(name, arguments.views, arguments.size, up=up, progress=progress, **given)
     if arguments.fault:
         images = with_fault(images, arguments.fault, arguments.seed)
     if arguments.format == "neus":
@@ -185,21 +190,23 @@ def _scene(arguments: argparse.Namespace) -> int:
         write_transforms(folder, images)
     else:
         write_colmap(folder, images, form="text" if arguments.format == "colmap-text" else "binary")
-    write_mesh(folder / TRUTH, scene_mesh(scene))
+    write_mesh(folder / TRUTH, truth)
     print(f"{folder}: {arguments.views} views of {arguments.size} × {arguments.size} pixels; the truth is {TRUTH}")
     print(f"next: mplicits check-cameras {folder} -o cameras.glb")
     return 0
 
 
 SCENE = Command(
-    "write posed images of an exact synthetic scene",
+    "write posed images of an exact synthetic scene, or of a mesh",
     """  mplicits scene painted-sphere -o sphere
   mplicits scene figure -o figure --format transforms --views 40 --size 200
   mplicits scene statue -o statue --format colmap --shaded
   mplicits scene figure -o measured --format transforms --depths
-  mplicits scene figure -o unsharp --fault poses""",
+  mplicits scene figure -o unsharp --fault poses
+  mplicits scene spot.obj -o spot --format transforms --views 40 --shaded""",
     _scene_arguments,
     _scene,
-    "Draw a shape whose surface and colours are known in closed form from cameras all around it, and write images, "
-    "masks and cameras as a data set, with the true surface beside them.",
+    "Draw a shape whose surface and colours are known in closed form, or a mesh of your own, from cameras all around "
+    "it, and write images, masks and cameras as a data set, with the true surface beside them. A mesh without colours "
+    "is lit clay.",
 )

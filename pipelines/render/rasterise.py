@@ -6,29 +6,52 @@ its own colour there, as a trace of a field gives it (`Seen`); `shade` makes pic
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from ...datasets.cameras import Camera
 from ...datasets.clouds.meshes import vertex_normals
-from ...datasets.textured.reading import TexturedMesh, colors_at
+from ...datasets.textured.reading import TexturedMesh, colors_at, read_textured
+from ...neural_fields import InputError
 from ..surface.raster import clip, cover
-from ..surface.surface import Surface
+from ..surface.surface import Surface, read_surface
 from .picture import Image
 from .shade import ShadeOptions, compose, default_shading, downsample, shade
 from .trace import Seen
 
-__all__ = ["cloud_view", "mesh_view", "picture_of"]
+__all__ = ["Painted", "cloud_view", "mesh_view", "picture_of", "read_painted"]
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
+Painted = Surface | TexturedMesh
 
 SUPERSAMPLING = 2
 NEAR = 1e-4  # what is nearer than this share of the furthest depth is not drawn: it would fill the image
 
 
-def mesh_view(mesh: Surface | TexturedMesh, camera: Camera) -> Seen:
+def read_painted(path: str | Path) -> Painted:
+    """Read a mesh or a cloud to be drawn: with the image over it, where an OBJ or glTF file has one.
+
+    An OBJ whose materials or images are missing is read without them.
+
+    Raises:
+        InputError: see `read_surface`.
+    """
+    path = Path(path)
+    if path.suffix.lower() in (".obj", ".glb", ".gltf"):
+        try:
+            mesh = read_textured(path)
+        except InputError:
+            return read_surface(path)  # which says what is wrong, if more than the colours are
+        if mesh.image is not None:
+            return mesh
+    return read_surface(path)
+
+
+def mesh_view(mesh: Painted, camera: Camera) -> Seen:
     """What the pixels see of a mesh; the part of it behind the camera is cut away.
 
     Normals are those of the vertices, interpolated in space (not on the screen) and made unit again; they point where

@@ -14,6 +14,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from ...datasets.cameras import Camera, turntable
+from ...datasets.textured.mesh import TexturedMesh
 from ...datasets.views.reading import read_cameras
 from ...neural_fields import Field, InputError, Similarity
 from ...neural_fields.meshing import NoSurfaceError, extract_mesh
@@ -22,7 +23,7 @@ from ..fit.cloud import CloudDistance
 from ..run.folder import chosen_level, find_field, fitted_cloud, is_field, load_still
 from ..surface.surface import read_surface, sample_points
 from ..texture.riding import Colors, colors_of_run
-from .rasterise import cloud_view, mesh_view
+from .rasterise import cloud_view, mesh_view, read_painted
 from .trace import Seen, trace_view
 
 __all__ = [
@@ -200,18 +201,18 @@ def traced_part(points: Float64) -> Float64:
 
 
 def _surface_subject(file: Path) -> Subject:
-    surface = read_surface(file)
-    used = surface.used_vertices()
+    surface = read_painted(file)
+    solid = bool(len(surface.faces))
+    used = surface.vertices[np.unique(surface.faces)] if solid else surface.vertices
     try:
         similarity = Similarity.to_unit_sphere(used)
     except ValueError as error:
         raise InputError(f"{file}: {error}") from error
-    moved = surface.moved(similarity)
-    solid = bool(len(surface.faces))
+    moved = dataclasses.replace(surface, vertices=similarity.to_unit(surface.vertices))
     spacing = 0.0 if solid else _spacing(moved.vertices)
 
     def view(camera: Camera, _panel: Panel) -> Seen:
-        if solid:
+        if isinstance(moved, TexturedMesh) or solid:
             return mesh_view(moved, camera)
         distance = max(float(camera.eye.norm()), 1e-3)
         size = DISC * spacing * float(camera.intrinsics[1, 1]) / distance
@@ -222,8 +223,8 @@ def _surface_subject(file: Path) -> Subject:
         similarity=similarity,
         panels=(Panel("mesh" if solid else "cloud"),),
         field=None,
-        colored=surface.colors is not None,
-        oriented=solid or surface.normals is not None,
+        colored=isinstance(surface, TexturedMesh) or surface.colors is not None,
+        oriented=isinstance(surface, TexturedMesh) or solid or surface.normals is not None,
         fitted_to=None,
         outline=lambda: similarity.to_unit(used),
         view=view,

@@ -8,11 +8,7 @@ import torch
 from mplicits.datasets.cameras import look_at
 from mplicits.datasets.color_space import linear_to_srgb, srgb_to_linear
 from mplicits.datasets.synthetic.scenes import (
-    AMBIENT,
-    GLOSS,
-    LAMP,
     SCENES,
-    SHARPNESS,
     Scene,
     render_scene,
     render_view,
@@ -20,6 +16,7 @@ from mplicits.datasets.synthetic.scenes import (
     scene_cameras,
     scene_mesh,
 )
+from mplicits.datasets.synthetic.studio import AMBIENT, GLOSS, LAMP, SHARPNESS
 from mplicits.neural_fields import Box, Similarity, Sphere
 
 CHEAP = [name for name in SCENES if name != "statue"]

@@ -7,14 +7,17 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import trimesh
 from mplicits.datasets.synthetic.scenes import SCENES, render_scene
 from mplicits.datasets.views.colmap_process import FEATURES
 from mplicits.datasets.views.find_cameras import FoundCameras
 from mplicits.datasets.views.find_points import FoundPoints
+from mplicits.datasets.views.images import read_posed_images
 from mplicits.datasets.views.writing import write_colmap
 from mplicits.neural_fields import InputError
 from mplicits.pipelines.cli import main
 from mplicits.pipelines.reconstruct import posing
+from mplicits.pipelines.surface.surface import read_surface
 
 TINY = (
     "--widths 8 8 --depths 1 1 --color-width 8 --color-depth 1 --color-grid 8 --steps 3 --rays 8 --uniform 8"
@@ -119,3 +122,31 @@ def test_a_scene_has_the_fault_that_is_asked_for(tmp_path: Path, capsys: pytest.
     few = ["--views", "2", "--fault", "image"]
     assert main(["scene", "figure", "-o", str(tmp_path / "few"), *few]) == 2
     assert "--views 3 or more" in capsys.readouterr().err
+
+
+def test_a_mesh_is_photographed_where_it_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    ball, small = tmp_path / "ball.obj", ["--views", "3", "--size", "16", "--samples", "1"]
+    trimesh.creation.icosphere(3, radius=2.0).apply_translation((10, 20, 30)).export(ball)
+    assert main(["scene", str(ball), "-o", str(tmp_path / "photos"), *small, "--up", "z", "--depths"]) == 0
+    images = read_posed_images(tmp_path / "photos")
+    # A ball through the vertices of a box around an icosphere is that through its vertices.
+    assert images.similarity.center == pytest.approx((10, 20, 30), abs=1e-6)
+    assert images.similarity.scale == pytest.approx(2.1, rel=1e-2)
+    truth = read_surface(tmp_path / "photos" / "surface.ply")
+    assert np.abs(np.linalg.norm(truth.vertices - (10, 20, 30), axis=1) - 2).max() < 1e-5
+    assert (tmp_path / "photos" / "depths" / "000.npy").is_file()
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (["nothing"], "nothing: neither a mesh file nor one of the scenes painted-sphere"),
+        (["figure", "--up", "z"], "--up: goes with a mesh; figure stands as it is, so leave it out"),
+    ],
+)
+def test_what_cannot_be_photographed_is_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], line: str
+) -> None:
+    assert main(["scene", *words, "-o", str(tmp_path / "photos")]) == 2
+    assert line in capsys.readouterr().err
+    assert not (tmp_path / "photos").exists()

@@ -1,0 +1,169 @@
+"""Posed photographs of a mesh from a file, in the studio of the exact scenes: to reconstruct what is known."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ...datasets.cameras import Camera
+from ...datasets.clouds.meshes import vertex_normals
+from ...datasets.color_space import srgb_to_linear
+from ...datasets.synthetic.studio import cameras_around, developed, lit
+from ...datasets.textured.mesh import TexturedMesh
+from ...datasets.views.depth_maps import DepthMap
+from ...datasets.views.images import PosedImage, PosedImages
+from ...neural_fields import InputError, Mesh, Similarity
+from ..surface.surface import Surface, read_reference, sample_points
+from .rasterise import Painted, mesh_view, read_painted
+from .trace import Seen, strips
+
+__all__ = ["photograph_mesh", "true_mesh"]
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+
+PIXELS = 1 << 21  # that are drawn at once, before they are averaged
+CLAY = 0.7  # display grey of a mesh without colours
+REGION = 1.05  # radius of the region of interest, in radii of the mesh
+SPARSE_POINTS = 1000  # as many as structure from motion would give, more or less
+# Pixels from a point that is seen to the tangent plane of what the middle of its pixel sees, and to that place itself,
+# at most: on a slope the latter is further.
+FLAT, NEAR = 1.0, 10.0
+
+
+def photograph_mesh(
+    path: str | Path,
+    views: int = 24,
+    size: int = 64,
+    *,
+    seed: int = 0,
+    samples: int = 3,
+    up: str = "y",
+    shaded: bool = False,
+    glossy: bool = False,
+    depths: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> PosedImages:
+    """Posed images of a mesh, as `render_scene` makes them of exact scenes, in the coordinates of its file.
+
+    What has no colours is grey clay, and always lit: bare, it would be a silhouette.
+
+    Args:
+        path: a file that `read_painted` knows.
+        views: how many images.
+        size: width and height of the images, in pixels.
+        seed: of the cameras and the sparse points.
+        samples: rays per pixel and direction.
+        up: "y" or "z", the axis that points up.
+        shaded: whether a fixed lamp lights the mesh; without, the images show its colours themselves.
+        glossy: whether the lamp is reflected, in a highlight that moves with the eye.
+        depths: whether each image has the depths of its pixels' centres.
+        progress: called with ``(done, total)`` after every image.
+
+    Raises:
+        InputError: the mesh cannot be read, or has no faces.
+        ValueError: ``views``, ``size`` or ``samples`` is not positive.
+    """
+    if samples < 1:
+        raise ValueError(f"samples={samples}: expected at least one")
+    mesh = read_painted(path)
+    if not len(mesh.faces):
+        raise InputError(f"{path}: has no faces, so there is no surface to photograph; give a mesh")
+    ball = Similarity.to_unit_sphere(mesh.vertices[np.unique(mesh.faces)])
+    mesh = dataclasses.replace(mesh, vertices=ball.to_unit(mesh.vertices))
+    light = _Light(shaded=shaded or not _has_colors(mesh), glossy=glossy)
+    points, _ = sample_points(Surface(mesh.vertices, mesh.faces), SPARSE_POINTS, np.random.default_rng(seed))
+    images: list[PosedImage] = []
+    observed: list[NDArray[np.bool_]] = []
+    placed = cameras_around(ball.scale, up=up, views=views, size=size, seed=seed, middle=ball.center)
+    for index, camera in enumerate(placed):
+        near = camera.moved(ball)
+        color, mask = _photograph(mesh, near, samples, light)
+        middles = mesh_view(mesh, near)
+        observed.append(_sees(near, middles, points))
+        depth = DepthMap(ball.scale * _depths(near, middles), camera, "metric", Path(path)) if depths else None
+        images.append(PosedImage(f"{index:03d}.png", camera, color, mask, depth))
+        if progress is not None:
+            progress(index + 1, views)
+    region = Similarity(ball.center, REGION * ball.scale)
+    seen = np.argwhere(np.stack(observed))
+    return PosedImages(tuple(images), region, "around the mesh", ball.to_input(points), Path(path), seen)
+
+
+def true_mesh(path: str | Path) -> Mesh:
+    """What was photographed, with the colours of its vertices, as a mesh to hold reconstructions against.
+
+    Args:
+        path: a mesh file.
+
+    Raises:
+        InputError: it cannot be read, or has no faces.
+    """
+    surface = read_reference(path)
+    colors = None if surface.colors is None else surface.colors.astype(np.float32)
+    normals = vertex_normals(surface.vertices, surface.faces)
+    return Mesh(surface.vertices, surface.faces.astype(np.int32), normals, colors)
+
+
+class _Light(NamedTuple):
+    """How the studio's lamp is used; see `lit`."""
+
+    shaded: bool
+    glossy: bool
+
+
+def _has_colors(mesh: Painted) -> bool:
+    return mesh.has_colors if isinstance(mesh, TexturedMesh) else mesh.colors is not None
+
+
+def _photograph(mesh: Painted, camera: Camera, samples: int, light: _Light) -> tuple[Float32, Float32]:
+    """Display RGB ``(H, W, 3)`` with straight alpha, and the mask ``(H, W)``."""
+    parts = [_strip(mesh, strip, samples, light) for _, strip in strips(camera, lambda: PIXELS // samples**2)]
+    color, mask = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return color, mask
+
+
+def _strip(mesh: Painted, camera: Camera, samples: int, light: _Light) -> tuple[Float32, Float32]:
+    fine = camera.resized(samples * camera.width, samples * camera.height)
+    seen = mesh_view(mesh, fine)
+    own = np.full((len(seen.pixel), 3), CLAY) if seen.color is None else seen.color.double().numpy()
+    sent, mask = np.zeros((fine.height * fine.width, 3)), np.zeros(fine.height * fine.width, bool)
+    normals, directions = seen.normal.double().numpy(), seen.direction.double().numpy()
+    sent[seen.pixel] = lit(srgb_to_linear(own), normals, directions, shaded=light.shaded, glossy=light.glossy)
+    mask[seen.pixel] = True
+    return developed(sent.reshape(fine.height, fine.width, 3), mask.reshape(fine.height, fine.width), samples)
+
+
+def _depths(camera: Camera, seen: Seen) -> Float32:
+    """Depths ``(H, W)`` along the axis of view; NaN of what misses."""
+    depths = torch.full((camera.height * camera.width,), torch.nan, dtype=torch.float64)
+    depths[seen.pixel] = (seen.position.double() - camera.eye) @ camera.forward
+    return depths.reshape(camera.height, camera.width).float().numpy()
+
+
+def _sees(camera: Camera, seen: Seen, points: Float64) -> NDArray[np.bool_]:
+    """Which of the points ``(P, 3)`` a camera sees: those in its picture that are where the surface in their pixel is.
+
+    Args:
+        camera: in the coordinates of the points.
+        seen: what its pixels see.
+        points: of the surface.
+    """
+    pixels, depths, found = camera.in_view(points)
+    if not len(seen.pixel):
+        return np.zeros_like(found)
+    rows = np.full(camera.height * camera.width, -1)
+    rows[seen.pixel] = np.arange(len(seen.pixel))
+    column, row = np.rint(pixels[found]).astype(np.int64).T
+    met = rows[row * camera.width + column]
+    offset = points[found] - seen.position.double().numpy()[met]
+    from_plane = np.abs((offset * seen.normal.double().numpy()[met]).sum(axis=1))
+    pixel = depths[found] / float(camera.intrinsics[0, 0])
+    found[found] = (met >= 0) & (from_plane < FLAT * pixel) & (np.linalg.norm(offset, axis=1) < NEAR * pixel)
+    return found
