@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..run.config import input_error
-from .common import Command, add_flags, check_output, training, whole, write_json
+from .common import Command, add_flags, check_output, positive, training, whole, write_json
 
 __all__ = ["CHECK_CAMERAS", "FIND_CAMERAS", "FIND_POINTS", "SCENE", "tell_found"]
 
@@ -101,14 +101,20 @@ def _check_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("data", metavar="DATA", help=what)
     add_flags(parser, "--out", required=False, help=".glb or .ply: the cameras, to look at")
+    what = "folder with a depth map for each photograph; by default those that the data set names"
+    parser.add_argument("--depth-maps", type=Path, metavar="FOLDER", help=what)
+    what = "numbers of the depth maps per unit of the cameras (1000 for integers, else 1)"
+    parser.add_argument("--depth-scale", type=positive, metavar="X", help=what)
     add_flags(parser, "--json")
 
 
 def _check_cameras(arguments: argparse.Namespace) -> int:
     check_output(arguments.out, (".glb", ".ply"))
+    from ...datasets.views.depth_maps import DepthSource
     from ..reconstruct.check import check_files
 
-    _, check, text = check_files(arguments.data, arguments.out)
+    depths = DepthSource(arguments.depth_maps, "metric", arguments.depth_scale)
+    _, check, text = check_files(arguments.data, arguments.out, depths)
     print(text)
     if arguments.out is not None:
         print(f"{arguments.out}: frustums from violet (first) to yellow (last), the region's sphere, the world's axes")
@@ -122,7 +128,8 @@ CHECK_CAMERAS = Command(
     "look at the cameras of posed photographs, and check them",
     """  mplicits check-cameras photos
   mplicits check-cameras photos/transforms.json -o cameras.glb
-  mplicits check-cameras dtu_scan24 -o cameras.ply --json cameras.json""",
+  mplicits check-cameras dtu_scan24 -o cameras.ply --json cameras.json
+  mplicits check-cameras photos --depth-maps photos/depths""",
     _check_arguments,
     _check_cameras,
     "Print where the cameras of a data set stand and what they see of the region of interest, warn of what is usually "

@@ -19,9 +19,11 @@ from numpy.typing import NDArray
 from ...datasets import read_cameras, srgb_to_linear
 from ...datasets.cameras import Camera
 from ...datasets.clouds.orientation import fibonacci_directions
+from ...datasets.views.depth_maps import DepthSource
 from ...datasets.views.images import PosedImage, PosedImages, read_posed_images
 from ...neural_fields import InputError, Similarity
 from ..mesh.files import write_mesh
+from .depth_check import DepthCheck, check_depths
 from .frustums import camera_mesh
 from .silhouettes import contradictions, how_turned
 
@@ -53,6 +55,7 @@ class CameraCheck:
         in_view: ``(V,)`` share of the region's sphere that falls into the image.
         points_inside: share of the sparse points that lie in the region; None without points.
         mask_inside: share of the object's pixels whose rays meet the region, in the median view; None without masks.
+        depths: what is known of the depth maps; None without any.
         warnings: one line each.
     """
 
@@ -61,6 +64,7 @@ class CameraCheck:
     in_view: Float64
     points_inside: float | None
     mask_inside: float | None
+    depths: DepthCheck | None
     warnings: tuple[str, ...]
 
     def record(self) -> dict[str, Any]:
@@ -71,16 +75,20 @@ class CameraCheck:
             "share_of_sphere_in_view": self.in_view.tolist(),
             "share_of_sparse_points_inside": self.points_inside,
             "share_of_masks_inside": self.mask_inside,
+            "depth_maps": None if self.depths is None else self.depths.record(),
             "warnings": list(self.warnings),
         }
 
 
-def check_files(path: str | Path, out: Path | None = None) -> tuple[PosedImages, CameraCheck, str]:
+def check_files(
+    path: str | Path, out: Path | None = None, depths: DepthSource | None = None
+) -> tuple[PosedImages, CameraCheck, str]:
     """Check a data set, and write what it looks like.
 
     Args:
         path: as for `read_posed_images`.
         out: ``.glb`` or ``.ply`` file for `camera_mesh`, in world coordinates.
+        depths: as for `read_posed_images`.
 
     Returns:
         The images (made small), the figures, and both in words.
@@ -89,7 +97,7 @@ def check_files(path: str | Path, out: Path | None = None) -> tuple[PosedImages,
         InputError: the data set cannot be read, or the file not be written.
     """
     cameras = [camera for _, camera in read_cameras(path)]
-    images, trouble = _read(path, cameras)
+    images, trouble = _read(path, cameras, depths)
     check = check_cameras(images)
     check = replace(check, warnings=(*check.warnings, *trouble))
     sizes = [(camera.width, camera.height) for camera in cameras]
@@ -98,13 +106,15 @@ def check_files(path: str | Path, out: Path | None = None) -> tuple[PosedImages,
     return images, check, format_check(images, check, sizes)
 
 
-def _read(path: str | Path, cameras: Sequence[Camera]) -> tuple[PosedImages, tuple[str, ...]]:
+def _read(
+    path: str | Path, cameras: Sequence[Camera], depths: DepthSource | None
+) -> tuple[PosedImages, tuple[str, ...]]:
     """The images, around a guessed region where none can be found: that is when cameras most need to be looked at."""
     try:
-        return read_posed_images(path, width=WIDTH), ()
+        return read_posed_images(path, width=WIDTH, depths=depths), ()
     except InputError as error:
         try:
-            images = read_posed_images(path, width=WIDTH, region=_guess(cameras))
+            images = read_posed_images(path, width=WIDTH, region=_guess(cameras), depths=depths)
         except InputError:
             raise error from None  # it was not the region, then
         return replace(images, region="a guess"), (f"there is no region of interest but a guess: {error}",)
@@ -137,10 +147,12 @@ def check_cameras(images: PosedImages) -> CameraCheck:
     points = None if images.points is None else images.similarity.to_unit(images.points)
     mask_inside = _mask_inside(images.views, cameras)
     warnings = list(_placement(eyes, forward, middle))
-    # Where the cameras are wrong, what the masks see of the region says nothing.
+    depths = check_depths(images)
+    # Where the cameras are wrong, what the masks and depth maps see of the region says nothing.
     warnings += [
         *_masks(images.views, None if warnings else mask_inside),
         *([] if warnings else _silhouettes(images)),
+        *([] if warnings or depths is None else depths.warnings),
         *_exposure(images.views),
     ]
     return CameraCheck(
@@ -149,6 +161,7 @@ def check_cameras(images: PosedImages) -> CameraCheck:
         in_view,
         None if points is None or not len(points) else float((np.linalg.norm(points, axis=1) <= 1).mean()),
         mask_inside,
+        depths,
         tuple(warnings),
     )
 
@@ -178,6 +191,8 @@ def format_check(images: PosedImages, check: CameraCheck, sizes: Sequence[tuple[
         lines.append(f"sparse points: {len(images.points):,}, {100 * check.points_inside:.0f} % of them in the region")
     if check.mask_inside is not None:
         lines.append(f"masks: {100 * check.mask_inside:.1f} % of the object's pixels see into the region")
+    if check.depths is not None:
+        lines.append(check.depths.in_words(len(images.views)))
     return "\n".join(lines)
 
 
