@@ -132,7 +132,7 @@ class ReconstructBench(Benchmark[ReconstructRow]):
         """The settings of a row; all of them see the same rays."""
         if kind != NEUS:
             return dataclasses.replace(self.config, geometry="multiscale", **ALIKE)
-        rates = {"learning_rate": self.neus_learning_rate, "color_rate": 1.0, "sharpening": 8.0}
+        rates = {"learning_rate": self.neus_learning_rate, "color_rate": 1.0, "sharpening": 8.0, "smooth_weight": 0.0}
         colors = {"color_width": 256, "color_depth": 4, "color_frequencies": 0, "color_grid": 0}
         return dataclasses.replace(self.config, geometry="neus", **ALIKE, **colors, **rates)
 

@@ -24,6 +24,7 @@ from ..run.focus import Focus
 from ..run.settings import ReconstructConfig
 from ..run.team import my_share
 from ..run.trainer import seeded
+from .smoothness import flatness
 
 __all__ = ["Exposures", "PoseCorrections", "RayPool", "Rays", "SceneModel", "build_scene", "camera_rays"]
 
@@ -233,6 +234,7 @@ class Rays(NamedTuple):
         mask: ``(R,)`` how much of the pixel is object; 1 everywhere if nobody said.
         view: ``(R,)`` number of the picture.
         row: ``(R,)`` number of the pixel in the pool.
+        flat: ``(R,)`` how little the picture shows there, see `flatness`.
     """
 
     origins: Tensor
@@ -241,6 +243,7 @@ class Rays(NamedTuple):
     mask: Tensor
     view: Tensor
     row: Tensor
+    flat: Tensor
 
 
 def camera_rays(camera: Camera) -> tuple[Tensor, Tensor]:
@@ -274,7 +277,7 @@ class RayPool:
         lens = [camera.intrinsics[[0, 1, 0, 1], [0, 1, 2, 2]] for camera in cameras]
         self.lens = torch.stack(lens).float().to(device)  # (V, 4): fx, fy, cx, cy
         self.widths = torch.tensor([camera.width for camera in cameras], device=device)
-        colors, masks, pixels, owners, hits = [], [], [], [], 0
+        colors, masks, flats, pixels, owners, hits = [], [], [], [], [], 0
         for index, (view, camera) in enumerate(zip(views, cameras, strict=True)):
             near, far = sphere_span(*camera_rays(camera))
             hit = far > near
@@ -284,10 +287,12 @@ class RayPool:
             owners.append(torch.full_like(kept, index, dtype=torch.int16))
             # Eight bits hold what pictures hold; a pool of float32 would be four times as large.
             colors.append(_bytes(view.color.reshape(-1, 3))[kept])
+            flats.append(_bytes(flatness(view.color, view.mask).reshape(-1))[kept])
             if self.has_masks and view.mask is not None:
                 masks.append(_bytes(view.mask.reshape(-1))[kept])
         self.colors, self.pixels = torch.cat(colors).to(device), torch.cat(pixels).to(device)
         self.owners = torch.cat(owners).to(device)
+        self.flats = torch.cat(flats).to(device)
         self.masks = torch.cat(masks).to(device) if masks else None
         if not hits:
             raise InputError("no pixel of any picture sees the region of interest; see `mplicits check-cameras`")
@@ -307,7 +312,7 @@ class RayPool:
         seen = torch.stack(((x - cx) / fx, (y - cy) / fy, torch.ones_like(fx)), dim=1)
         directions = torch.nn.functional.normalize(torch.einsum("rij,rj->ri", self.axes[view], seen), dim=1)
         mask = torch.ones(len(rows), device=self.device) if self.masks is None else self.masks[rows] / 255
-        return Rays(self.eyes[view], directions, self.colors[rows] / 255, mask, view, rows)
+        return Rays(self.eyes[view], directions, self.colors[rows] / 255, mask, view, rows, self.flats[rows] / 255)
 
 
 def _bytes(numbers: np.ndarray) -> Tensor:

@@ -6,17 +6,19 @@ import math
 
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from ...neural_fields.hash_encoding import tables_apart
 from ...neural_fields.losses import eikonal_loss
 from ...neural_fields.value_grid import ValueGrid
-from ...neural_fields.volume_renderer import Sampling
+from ...neural_fields.volume_renderer import Rendered, Sampling
 from ..run.focus import Focus
 from ..run.settings import ReconstructConfig
 from ..run.team import gathered, mean_of_all, own_generator, whole_batch
 from ..run.trainer import Group, Objective, Trainer, warm_cosine
 from .measured import MeasuredDepths, depth_loss
 from .model import RayPool, SceneModel
+from .smoothness import tangents, unevenness
 
 # Steps between two looks at the surface's surroundings, at least and at most.
 NEAR_EVERY, NEAR_REST = 16, 128
@@ -28,6 +30,8 @@ MOVED, KNOWN, FURTHEST = 0.125, 8.0, 0.15
 LEAST_SHARE = 0.25  # of the rays of a step, however many sections they have
 # The share of the training after which cameras are moved, and their rate in units of the geometry's.
 POSES_FROM, POSE_RATE = 0.1, 3.0
+# Rays of a step whose ends are held to be smooth, and the opacity of those that end on something.
+SMOOTH_RAYS, SOLID = 96, 0.9
 DEPTH_RAYS = 256  # measured ones of a step
 # Steps between two fits of maps whose scale is not known to the surface; and the share of the training after which
 # depths that were estimated from single pictures, which are wrong in their details, do not count any more.
@@ -166,12 +170,30 @@ class SceneObjective(Objective):
             mask = torch.nn.functional.binary_cross_entropy(opacity, rays.mask)
             terms["mask"] = mask
             total = total + config.mask_weight * mask
+        if config.smooth_weight:
+            smooth = self.smooth_term(origins, directions, rays.flat, seen, self.level_at(done))
+            terms["smooth"] = smooth
+            total = total + config.smooth_weight * smooth
         if self.measured is not None and (done < FADED or self.measured.is_exact):
             depth = self.depth_term(self.measured, step, done)
             terms["depth"] = depth
             total = total + config.depth_weight * depth
         terms["uncertainty"] = 1 / self.model.inv_std
         return terms, total
+
+    def smooth_term(self, origins: Tensor, directions: Tensor, flat: Tensor, seen: Rendered, level: int) -> Tensor:
+        """How unevenly normals turn where rays end whose pixels are like those around; of the first rays of a step.
+
+        Where the rays end is taken as it is: only how the surface lies there is taught.
+        """
+        first = slice(SMOOTH_RAYS)
+        with torch.no_grad():
+            opacity = seen.opacity[first]
+            depth = seen.depth[first] / opacity.clamp_min(SOLID)
+            ends = origins[first] + depth[:, None] * directions[first]
+            along = tangents(normalize(seen.normal[first], dim=1))
+            weight = torch.where(opacity > SOLID, flat[first], 0.0)
+        return (weight * unevenness(self.model.geometry, ends, along, level=level)).mean()
 
     def depth_term(self, measured: MeasuredDepths, step: int, done: float) -> Tensor:
         """How far the surface is from what was measured: the mean of `depth_loss` over rays at random."""

@@ -214,6 +214,9 @@ class ReconstructConfig(Settings):
     grid_rate: float = setting(2.5, "learning rate of the hash encoding, in units of the colours'", above=0)
     sharpening: float = setting(24.0, "learning rate of the surface's uncertainty, in units of the others'", above=0)
     eikonal_weight: float = setting(0.05, "weight of (|grad f| - 1)^2", at_least=0)
+    smooth_weight: float = setting(
+        1.0, "weight of how unevenly normals turn where the photographs show no detail; 0 leaves it out", at_least=0
+    )
     mask_weight: float = setting(0.1, "weight of the masks' cross-entropy, where there are masks", at_least=0)
     depth_weight: float = setting(
         0.5,

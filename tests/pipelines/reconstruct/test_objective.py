@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
+import numpy as np
 import pytest
 import torch
 from mplicits.datasets.synthetic.scenes import SCENES, render_scene
@@ -101,7 +102,7 @@ def test_some_steps_lower_the_errors(images: PosedImages) -> None:
     assert after[1] < 0.5 * opacity
     assert trainer.step == 60
     assert trainer.fraction == 1
-    assert set(trainer.losses) == {"color", "eikonal", "mask", "uncertainty"}
+    assert set(trainer.losses) == {"color", "eikonal", "mask", "smooth", "uncertainty"}
 
 
 def test_a_step_has_fewer_rays_while_each_has_many_sections(images: PosedImages) -> None:
@@ -211,6 +212,24 @@ def with_depths(images: PosedImages, config: ReconstructConfig) -> Trainer[Scene
     measured = MeasuredDepths(images.views, images, pool.device)
     scene = build_scene(config, has_masks=True, views=len(images.views))
     return scene_trainer(scene, pool, config, measured=measured)
+
+
+def test_normals_should_turn_evenly_where_photographs_are_flat(images: PosedImages) -> None:
+    random, found = np.random.default_rng(0), {}
+    shown = {
+        "grey": [np.full_like(view.color, 0.5) for view in images.views],
+        "noise": [random.random(view.color.shape, np.float32) for view in images.views],
+    }
+    for name, colors in shown.items():
+        views = [replace(view, color=color) for view, color in zip(images.views, colors, strict=True)]
+        objective = make(replace(images, views=tuple(views)), TINY).objective
+        objective.model.variance.data.fill_(0.5)  # s = 150: rays end on a surface
+        found[name] = float(objective.losses(0, 0.5)[0]["smooth"].detach())
+    assert found["grey"] > 0
+    assert found["noise"] < 0.01 * found["grey"]  # all edges
+    terms, total = make(images, replace(TINY, smooth_weight=0.0)).objective.losses(0, 0.5)
+    assert "smooth" not in terms
+    assert total.isfinite()
 
 
 def test_measured_depths_bring_the_surface_nearer() -> None:
