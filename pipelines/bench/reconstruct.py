@@ -132,7 +132,7 @@ class ReconstructBench(Benchmark[ReconstructRow]):
         """The settings of a row; all of them see the same rays."""
         if kind != NEUS:
             return dataclasses.replace(self.config, geometry="multiscale", **ALIKE)
-        rates = {"learning_rate": self.neus_learning_rate, "color_rate": 1.0, "sharpening": 8.0, "smooth_weight": 0.0}
+        rates = {"learning_rate": self.neus_learning_rate, "color_rate": 1.0, "sharpening": 8.0}
         colors = {"color_width": 256, "color_depth": 4, "color_frequencies": 0, "color_grid": 0}
         return dataclasses.replace(self.config, geometry="neus", **ALIKE, **colors, **rates)
 
@@ -188,7 +188,8 @@ class ReconstructBench(Benchmark[ReconstructRow]):
         report(Progress(stage, 0, config.steps, 0.0, {}))
         started, has_masks = time.perf_counter(), all(view.mask is not None for view in train)
         model = self.build(config, has_masks=has_masks, views=len(train)).to(device)
-        pool = RayPool(train, similarity, device, whole=model.outside is not None)
+        whole, flat = model.outside is not None, config.smooth_weight > 0
+        pool = RayPool(train, similarity, device, whole=whole, flat=flat)
         start_seconds = time.perf_counter() - started
 
         def told(progress: Progress) -> None:

@@ -234,7 +234,7 @@ class Rays(NamedTuple):
         mask: ``(R,)`` how much of the pixel is object; 1 everywhere if nobody said.
         view: ``(R,)`` number of the picture.
         row: ``(R,)`` number of the pixel in the pool.
-        flat: ``(R,)`` how little the picture shows there, see `flatness`.
+        flat: ``(R,)`` how little the picture shows there, see `flatness`; 1 everywhere if nobody asked.
     """
 
     origins: Tensor
@@ -262,13 +262,20 @@ class RayPool:
         similarity: from world to unit-sphere coordinates.
         device: where the rays are wanted.
         whole: keep the pixels that do not see the region, too.
+        flat: keep how little the pictures show at each pixel.
 
     Raises:
         InputError: no ray of any picture meets the region of interest.
     """
 
     def __init__(
-        self, views: Sequence[PosedImage], similarity: Similarity, device: torch.device, *, whole: bool = False
+        self,
+        views: Sequence[PosedImage],
+        similarity: Similarity,
+        device: torch.device,
+        *,
+        whole: bool = False,
+        flat: bool = False,
     ) -> None:
         self.device, self.has_masks = device, all(view.mask is not None for view in views)
         cameras = [view.camera.moved(similarity) for view in views]
@@ -287,12 +294,13 @@ class RayPool:
             owners.append(torch.full_like(kept, index, dtype=torch.int16))
             # Eight bits hold what pictures hold; a pool of float32 would be four times as large.
             colors.append(_bytes(view.color.reshape(-1, 3))[kept])
-            flats.append(_bytes(flatness(view.color, view.mask).reshape(-1))[kept])
+            if flat:
+                flats.append(_bytes(flatness(view.color, view.mask).reshape(-1))[kept])
             if self.has_masks and view.mask is not None:
                 masks.append(_bytes(view.mask.reshape(-1))[kept])
         self.colors, self.pixels = torch.cat(colors).to(device), torch.cat(pixels).to(device)
         self.owners = torch.cat(owners).to(device)
-        self.flats = torch.cat(flats).to(device)
+        self.flats = torch.cat(flats).to(device) if flats else None
         self.masks = torch.cat(masks).to(device) if masks else None
         if not hits:
             raise InputError("no pixel of any picture sees the region of interest; see `mplicits check-cameras`")
@@ -311,8 +319,11 @@ class RayPool:
         x, y = pixel % self.widths[view], pixel // self.widths[view]
         seen = torch.stack(((x - cx) / fx, (y - cy) / fy, torch.ones_like(fx)), dim=1)
         directions = torch.nn.functional.normalize(torch.einsum("rij,rj->ri", self.axes[view], seen), dim=1)
-        mask = torch.ones(len(rows), device=self.device) if self.masks is None else self.masks[rows] / 255
-        return Rays(self.eyes[view], directions, self.colors[rows] / 255, mask, view, rows, self.flats[rows] / 255)
+        mask, flat = (
+            torch.ones(len(rows), device=self.device) if known is None else known[rows] / 255
+            for known in (self.masks, self.flats)
+        )
+        return Rays(self.eyes[view], directions, self.colors[rows] / 255, mask, view, rows, flat)
 
 
 def _bytes(numbers: np.ndarray) -> Tensor:

@@ -10,7 +10,7 @@ from ..run.schedule import Stage
 from ..run.settings import ReconstructConfig, TextureConfig
 from ..texture.train import texture_stages
 from .hull import STEPS as HULL_STEPS
-from .objective import EARLY, NEAR_EVERY, WHOLE_EVERY, WHOLE_LATER
+from .objective import EARLY, NEAR_EVERY, SMOOTH_RAYS, WHOLE_EVERY, WHOLE_LATER
 from .seen import RAYS as SEEN_RAYS
 
 __all__ = ["SEEING", "SPHERE", "WITNESSES", "ReconstructPlan", "level_stage"]
@@ -107,6 +107,8 @@ class ReconstructPlan:
         evaluated = EVALUATED * samples if config.skip else samples
         # Those that get a colour are half of all samples at most.
         coloured = COLOURED * min(evaluated, samples / 2)
+        if config.smooth_weight:
+            evaluated += 3 * min(SMOOTH_RAYS, config.rays)
         trained = training(1, evaluated, self._on(level)) + training(1, coloured, [self._color()])
         return self.speed.networks(MET * (looked + trained), steps=2)
 

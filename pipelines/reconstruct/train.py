@@ -169,7 +169,8 @@ class _Reconstruction:
         schedule(Progress(SPHERE, 0, 0, 0.0, {}))
         has_masks = all(view.mask is not None for view in self.train_views)
         self.model = build_scene(config, has_masks=has_masks, views=len(self.train_views)).to(device)
-        pool = RayPool(self.train_views, images.similarity, device, whole=self.model.outside is not None)
+        whole, flat = self.model.outside is not None, config.smooth_weight > 0
+        pool = RayPool(self.train_views, images.similarity, device, whole=whole, flat=flat)
         measured = MeasuredDepths(self.train_views, images, device, seed=config.seed) if config.depth_weight else None
         self.measured = measured or None
         self.start = "sphere" if resume else begin(self.model, self.train_views, images, config, self.measured)

@@ -215,7 +215,9 @@ class ReconstructConfig(Settings):
     sharpening: float = setting(24.0, "learning rate of the surface's uncertainty, in units of the others'", above=0)
     eikonal_weight: float = setting(0.05, "weight of (|grad f| - 1)^2", at_least=0)
     smooth_weight: float = setting(
-        1.0, "weight of how unevenly normals turn where the photographs show no detail; 0 leaves it out", at_least=0
+        0.0,
+        "weight of how unevenly normals turn where the photographs show no detail; 1 is for things of plain colours",
+        at_least=0,
     )
     mask_weight: float = setting(0.1, "weight of the masks' cross-entropy, where there are masks", at_least=0)
     depth_weight: float = setting(
