@@ -103,6 +103,9 @@ def _check_arguments(parser: argparse.ArgumentParser) -> None:
     add_flags(parser, "--out", required=False, help=".glb or .ply: the cameras, to look at")
     what = "folder with a depth map for each photograph; by default those that the data set names"
     parser.add_argument("--depth-maps", type=Path, metavar="FOLDER", help=what)
+    what = "what they hold, as for reconstruct; only metric ones are held against each other (metric)"
+    kinds = ("metric", "relative", "disparity")
+    parser.add_argument("--depth-kind", choices=kinds, default="metric", metavar="KIND", help=what)
     what = "numbers of the depth maps per unit of the cameras (1000 for integers, else 1)"
     parser.add_argument("--depth-scale", type=positive, metavar="X", help=what)
     add_flags(parser, "--json")
@@ -113,7 +116,7 @@ def _check_cameras(arguments: argparse.Namespace) -> int:
     from ...datasets.views.depth_maps import DepthSource
     from ..reconstruct.check import check_files
 
-    depths = DepthSource(arguments.depth_maps, "metric", arguments.depth_scale)
+    depths = DepthSource(arguments.depth_maps, arguments.depth_kind, arguments.depth_scale)
     _, check, text = check_files(arguments.data, arguments.out, depths)
     print(text)
     if arguments.out is not None:

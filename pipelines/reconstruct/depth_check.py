@@ -6,7 +6,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,6 +16,7 @@ from .measured import INSIDE
 __all__ = ["DepthCheck", "check_depths"]
 
 Float64 = NDArray[np.float64]
+Int64 = NDArray[np.int64]
 
 READINGS = 2000  # of each map that are looked at
 PARTNERS = 4  # views that each is held against
@@ -107,25 +107,27 @@ def _seen_through(index: int, places: Float64, views: Sequence[PosedImage], near
 def _known(places: Float64, view: PosedImage) -> tuple[Float64, Float64]:
     """Depths ``(K,)`` of the places that a view can tell something of, and how far it sees there ``(K,)``.
 
-    Of its pixel and the eight around it the smallest depth counts; where all of them are background, it sees through.
+    Of its pixel and the eight around it the smallest depth counts, and none where one of them has none, as at rims;
+    where all of them are background, it sees through.
     """
     assert view.depth is not None
     pixels, z, framed = view.depth.camera.in_view(places)
     column, row = np.rint(pixels[framed]).astype(np.int64).T
-    there, z = _nearest(view.depth.numbers)[row, column], z[framed]
+    there, z = _around(view.depth.numbers, row, column).astype(np.float64).min(axis=0), z[framed]
     if view.mask is not None:
         pixels, _, inside = view.camera.in_view(places[framed])
         column, row = np.rint(pixels[inside]).astype(np.int64).T
-        background = cv2.dilate(view.mask, np.ones((3, 3), np.uint8))[row, column] < BACKGROUND
+        background = _around(view.mask, row, column).max(axis=0) < BACKGROUND
         there[np.flatnonzero(inside)[background]] = np.inf
     known = ~np.isnan(there)
     return z[known], there[known]
 
 
-def _nearest(numbers: NDArray[np.floating]) -> Float64:
-    """The smallest depth of each pixel and its eight neighbours; NaN where one of them has none, as at rims."""
-    wide = np.pad(numbers.astype(np.float64), 1, constant_values=np.nan)
-    return np.lib.stride_tricks.sliding_window_view(wide, (3, 3)).min(axis=(2, 3))
+def _around(image: NDArray[np.float32], row: Int64, column: Int64) -> NDArray[np.float32]:
+    """The numbers ``(9, K)`` of an image in pixels ``(K,)`` and those around them; at its border those repeat."""
+    height, width = image.shape
+    down, across = (step.reshape(-1, 1) for step in np.mgrid[-1:2, -1:2])
+    return image[(row + down).clip(0, height - 1), (column + across).clip(0, width - 1)]
 
 
 def _warnings(views: Sequence[PosedImage], shares: Float64, usual: float, inside: float) -> Iterator[str]:

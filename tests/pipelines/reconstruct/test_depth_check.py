@@ -107,6 +107,16 @@ def test_the_command_says_so(tmp_path: Path, scene: PosedImages, capsys: pytest.
     assert "warning: the depth maps contradict each other" in capsys.readouterr().err
 
 
+def test_the_command_believes_what_kind_they_are(
+    tmp_path: Path, scene: PosedImages, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_transforms(tmp_path / "photos", changed(scene, lambda index, maps: 0.5 * maps[index] + 1))
+    assert main(["check-cameras", str(tmp_path / "photos"), "--depth-kind", "relative"]) == 0
+    said = capsys.readouterr()
+    assert f"depth maps: {VIEWS} of {VIEWS} photographs have one\n" in said.out
+    assert "depth" not in said.err
+
+
 def test_wrong_cameras_are_said_alone(scene: PosedImages) -> None:
     turned = [replace(view, camera=scene.views[0].camera) for view in scene.views]
     check = check_cameras(replace(scene, views=tuple(turned)))
