@@ -6,9 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mplicits.datasets.synthetic.scenes import SCENES, render_scene
-from mplicits.datasets.views.images import PosedImages
+from mplicits.datasets.synthetic.scenes import SCENES, scene_cameras, scene_depths
+from mplicits.datasets.views.images import PosedImage, PosedImages
 from mplicits.datasets.views.writing import write_transforms
+from mplicits.neural_fields import Similarity
 from mplicits.pipelines.cli import main
 from mplicits.pipelines.reconstruct.check import check_cameras
 from mplicits.pipelines.reconstruct.depth_check import DepthCheck, check_depths
@@ -19,7 +20,13 @@ Numbers = np.ndarray
 
 @pytest.fixture(scope="module")
 def scene() -> PosedImages:
-    return render_scene(SCENES["figure"](), views=VIEWS, size=48, samples=1, depths=True)
+    """The depths of the figure, and photographs in which it is black."""
+    figure, views = SCENES["figure"](), []
+    for index, camera in enumerate(scene_cameras(figure, views=VIEWS, size=48)):
+        depth = scene_depths(figure, camera)
+        mask = np.isfinite(depth.numbers).astype(np.float32)
+        views.append(PosedImage(f"{index:03d}.png", camera, np.zeros((48, 48, 3), np.float32), mask, depth))
+    return PosedImages(tuple(views), Similarity.identity(), "the unit sphere", None, Path("figure"))
 
 
 def changed(images: PosedImages, change: Callable[[int, list[Numbers]], Numbers]) -> PosedImages:

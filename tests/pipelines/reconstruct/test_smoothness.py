@@ -89,7 +89,7 @@ def test_a_crease_costs_a_bounded_amount() -> None:
 
 
 def test_ripples_are_learnt_away() -> None:
-    points, normals = on_sphere(300)
+    points, normals = on_sphere(100)
     torch.manual_seed(0)
     field = Siren(32, 2, omega=30.0).double()
     fit_sphere(field, 0.375, steps=20, batch=256)
