@@ -181,6 +181,7 @@ def render_view(
 
 
 def _strip(scene: Scene, camera: Camera, samples: int, shaded: bool, glossy: bool) -> tuple[Float32, Float32]:
+    """Colours and mask of some rows of `render_view`."""
     fine = camera.resized(samples * camera.width, samples * camera.height)
     eye, directions = fine.rays(dtype=torch.float64)
     hits = sphere_trace(scene.field, eye, directions, tolerance=1e-9, lipschitz=scene.lipschitz)

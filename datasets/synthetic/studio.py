@@ -15,7 +15,7 @@ from ..cameras import UP_AXES, Camera, look_at
 from ..clouds.orientation import fibonacci_directions
 from ..color_space import linear_to_srgb
 
-__all__ = ["MARGIN", "cameras_around", "developed", "lit"]
+__all__ = ["cameras_around", "developed", "lit"]
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]

@@ -184,10 +184,10 @@ def _scene(arguments: argparse.Namespace) -> int:
     if exact and arguments.up:
         raise input_error(f"--up: goes with a mesh; {name} stands as it is, so leave it out")
     given = {flag: getattr(arguments, flag) for flag in ("seed", "samples", "shaded", "glossy", "depths")}
-    truth = scene_mesh(SCENES[name]()) if exact else true_mesh(name)
+    scene = SCENES[name]() if exact else None
+    truth = true_mesh(name) if scene is None else scene_mesh(scene)
     with counter_bar("render") as progress:
-        if exact:
-            scene = SCENES[name]()
+        if scene is not None:
             images = render_scene(scene, arguments.views, arguments.size, progress=progress, **given)
         else:
             up = arguments.up or "y"

@@ -25,7 +25,7 @@ from ...neural_fields import InputError, Similarity
 from ..mesh.files import write_mesh
 from .depth_check import DepthCheck, check_depths
 from .frustums import camera_mesh
-from .silhouettes import contradictions, how_turned
+from .silhouettes import contradictions, how_turned, named
 
 __all__ = ["CameraCheck", "check_cameras", "check_files", "format_check"]
 
@@ -42,7 +42,6 @@ APART = 0.5  # median distance of the axes from where they meet best, as a share
 EMPTY, FULL = 1e-3, 0.999  # shares of a mask
 PAST_REGION = 0.05  # share of the object's pixels that may see past the region
 EXPOSURE = 4.0  # times brighter or darker than the median of the views: two stops
-NAMED = 3  # views that a warning names
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,9 +261,9 @@ def _masks(views: Sequence[PosedImage], inside: float | None) -> Iterator[str]:
     empty = [name for name, share in shares.items() if share < EMPTY]
     full = [name for name, share in shares.items() if share > FULL]
     if empty:
-        yield f"{len(empty)} of {len(shares)} masks are empty: {_named(empty)}"
+        yield f"{len(empty)} of {len(shares)} masks are empty: {named(empty)}"
     if full:
-        yield f"{len(full)} of {len(shares)} masks are full: {_named(full)}; they tell nothing from its background"
+        yield f"{len(full)} of {len(shares)} masks are full: {named(full)}; they tell nothing from its background"
     if inside is not None and inside < 1 - PAST_REGION and len(full) < len(shares):
         past = 100 * (1 - inside)
         yield f"{past:.0f} % of the object's pixels see past the region of interest, which cuts it; enlarge it"
@@ -281,7 +280,7 @@ def _silhouettes(images: PosedImages) -> Iterator[str]:
     elif turned := how_turned(views, images.similarity):
         yield f"the silhouettes contradict each other, and would not if the pictures were not {turned}"
     elif odd:
-        names = _named([view.name for view in odd])
+        names = named([view.name for view in odd])
         yield (
             f"{len(odd)} of {len(views)} silhouettes contradict the others: {names}; is that the right picture, the "
             "right way round, and its pose and mask right?"
@@ -314,7 +313,7 @@ def _exposure(views: Sequence[PosedImage]) -> Iterator[str]:
         if level > EXPOSURE * usual or EXPOSURE * level < usual
     ]
     if odd:
-        yield f"{len(odd)} of {len(views)} images are two stops or more off the others' brightness: {_named(odd)}"
+        yield f"{len(odd)} of {len(views)} images are two stops or more off the others' brightness: {named(odd)}"
 
 
 def _brightness(view: PosedImage) -> float:
@@ -322,8 +321,3 @@ def _brightness(view: PosedImage) -> float:
     light = srgb_to_linear(view.color).mean(axis=-1)
     weight = np.ones_like(light) if view.mask is None or not view.mask.any() else view.mask
     return float((light * weight).sum() / weight.sum())
-
-
-def _named(names: Sequence[str]) -> str:
-    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
-    return ", ".join(names[:NAMED]) + more

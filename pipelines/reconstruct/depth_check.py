@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from ...datasets.views.depth_maps import DepthMap
 from ...datasets.views.images import PosedImage, PosedImages
-from .measured import INSIDE
+from .measured import UNITS, said_outside
+from .silhouettes import named
 
 __all__ = ["DepthCheck", "check_depths"]
 
@@ -26,7 +27,6 @@ NEARER, NOISE = 0.02, 0.01
 CONTRADICTED = 0.08  # share of the readings of the median view that others see through
 ODD, TIMES = 0.15, 5.0  # the same share of one view that is named, and how many times that of the median one
 BACKGROUND = 0.01  # of a mask, at most
-NAMED = 3  # views that a warning names
 FEWEST = 50  # readings that another view can tell something of
 
 
@@ -131,16 +131,14 @@ def _around(image: NDArray[np.float32], row: Int64, column: Int64) -> NDArray[np
 
 
 def _warnings(views: Sequence[PosedImage], shares: Float64, usual: float, inside: float) -> Iterator[str]:
-    units = "are they in the units of the cameras? (--depth-scale, or --depth-kind relative)"
-    if inside < INSIDE:
-        yield f"{inside:.1%} of the depths in all maps end in the region of interest; {units}"
+    if outside := said_outside(inside):
+        yield outside
     elif usual > CONTRADICTED:
         yield (
             f"the depth maps contradict each other: of the median one others see through {usual:.0%} of the readings; "
-            f"are they of these photographs, along the axis of view, and {units.removeprefix('are they ')}"
+            f"are they of these photographs, and along the axis of view? If in other units, {UNITS}"
         )
     elif odd := [view.name for view, share in zip(views, shares, strict=True) if share > max(ODD, TIMES * usual)]:
         yield (
-            f"{len(odd)} of {len(views)} depth maps contradict the others: {', '.join(odd[:NAMED])}"
-            f"{f' and {len(odd) - NAMED} more' if len(odd) > NAMED else ''}; are they of those photographs?"
+            f"{len(odd)} of {len(views)} depth maps contradict the others: {named(odd)}; are they of those photographs?"
         )

@@ -25,7 +25,7 @@ from ...neural_fields.volume import sphere_span
 from ..run.team import my_share
 from .silhouettes import OBJECT
 
-__all__ = ["DepthRays", "MeasuredDepths", "depth_loss", "fit_scale_shift"]
+__all__ = ["DepthRays", "MeasuredDepths", "depth_loss", "fit_scale_shift", "said_outside"]
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
@@ -37,6 +37,7 @@ FEWEST = 16  # readings that say scale and shift of a map
 ROUNDS, LEAST_RESIDUAL, ALL_ALIKE = 10, 1e-3, 1e-6
 TINY = 1e-300
 ASKED, TOLERANCE = 256, 1e-3  # rays of each map that are held against the surface, and how exactly they are traced
+UNITS = "give --depth-scale (numbers per unit of the cameras), or --depth-kind relative"  # if they are others
 INSIDE = 0.01  # of the readings of maps in the cameras' units, at least, end in the region
 ALIKE = 1.2  # factor between the depths of such maps and of sparse points, at most
 AS_IT_IS, RELATIVE, DISPARITY = 0, 1, 2  # how a number becomes a depth
@@ -320,6 +321,17 @@ def _pixels(camera: Camera, lines: Float64) -> tuple[Int64, Int64, NDArray[np.bo
     return nearest[:, 1], nearest[:, 0], (nearest == pixels).all(axis=1)
 
 
+def said_outside(share: float) -> str | None:
+    """What is said if hardly a depth of maps in the cameras' units ends in the region; None if enough of them do.
+
+    Args:
+        share: of the readings of all maps, that do.
+    """
+    if share >= INSIDE:
+        return None
+    return f"{share:.1%} of the depths in all maps end in the region of interest; {UNITS}"
+
+
 def _check_units(source: Path, in_region: Sequence[float], ratios: Sequence[Float64]) -> None:
     """Whether maps that are said to be in the cameras' units can be.
 
@@ -328,11 +340,9 @@ def _check_units(source: Path, in_region: Sequence[float], ratios: Sequence[Floa
         in_region: share of each map's readings that end in the region.
         ratios: of depths in each map to those of sparse points there.
     """
-    fix = "give --depth-scale (numbers per unit of the cameras), or --depth-kind relative"
-    if np.mean(in_region) < INSIDE:
-        share = f"{np.mean(in_region):.1%} of the depths in all maps end in the region of interest"
-        raise InputError(f"{source}: {share}; {fix}")
+    if outside := said_outside(float(np.mean(in_region))):
+        raise InputError(f"{source}: {outside}")
     together = np.concatenate(ratios)
     if len(together) >= FEWEST and not 1 / ALIKE < np.median(together) < ALIKE:
         times = f"depths in all maps are {np.median(together):.3g} times those of the sparse points"
-        raise InputError(f"{source}: {times}; {fix}")
+        raise InputError(f"{source}: {times}; {UNITS}")

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from ...datasets.views.images import PosedImage
 from ...neural_fields import Similarity
 
-__all__ = ["OBJECT", "contradictions", "grid_in_ball", "how_turned", "silhouettes"]
+__all__ = ["OBJECT", "contradictions", "grid_in_ball", "how_turned", "named", "silhouettes"]
 
 OBJECT = 0.5  # a pixel with a larger share of object counts as one
 COARSE = 32  # cells along the grid on which silhouettes are compared
@@ -35,6 +35,7 @@ TURNS = {  # what is said, and which of a mask's axes are reversed
 }
 # Masks are inverted if the border of the usual picture is object, and its middle is not.
 BORDER, MIDDLE = 0.5, 0.25
+NAMED = 3  # views that a warning names
 
 
 def grid_in_ball(resolution: int) -> tuple[Tensor, Tensor]:
@@ -155,3 +156,9 @@ def _looks_inverted(views: Sequence[PosedImage]) -> tuple[bool, bool]:
         borders.append(np.concatenate([*view.mask[[0, -1]], *view.mask[:, [0, -1]].T]).mean())
         middles.append(view.mask[height // 3 : -(height // 3) or None, width // 3 : -(width // 3) or None].mean())
     return bool(np.median(borders) > BORDER), bool(np.median(middles) < MIDDLE * np.median(borders))
+
+
+def named(names: Sequence[str]) -> str:
+    """The first of the views that a warning is about, and how many more there are."""
+    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+    return ", ".join(names[:NAMED]) + more

@@ -21,7 +21,7 @@ from ...datasets.views.images import PosedImage, PosedImages
 from ...neural_fields import InputError, Mesh, Similarity
 from ..surface.surface import Surface, read_reference, sample_points
 from .rasterise import Painted, mesh_view, read_painted
-from .trace import Seen, strips
+from .trace import Seen, fine_strips
 
 __all__ = ["photograph_mesh", "true_mesh"]
 
@@ -124,13 +124,13 @@ def _has_colors(mesh: Painted) -> bool:
 
 def _photograph(mesh: Painted, camera: Camera, samples: int, light: _Light) -> tuple[Float32, Float32]:
     """Display RGB ``(H, W, 3)`` with straight alpha, and the mask ``(H, W)``."""
-    parts = [_strip(mesh, strip, samples, light) for _, strip in strips(camera, lambda: PIXELS // samples**2)]
+    parts = [_strip(mesh, fine, samples, light) for fine in fine_strips(camera, samples, pixels=PIXELS)]
     color, mask = (np.concatenate(part) for part in zip(*parts, strict=True))
     return color, mask
 
 
-def _strip(mesh: Painted, camera: Camera, samples: int, light: _Light) -> tuple[Float32, Float32]:
-    fine = camera.resized(samples * camera.width, samples * camera.height)
+def _strip(mesh: Painted, fine: Camera, samples: int, light: _Light) -> tuple[Float32, Float32]:
+    """The same, of a strip whose camera has ``samples`` pixels per pixel and direction."""
     seen = mesh_view(mesh, fine)
     own = np.full((len(seen.pixel), 3), CLAY) if seen.color is None else seen.color.double().numpy()
     sent, mask = np.zeros((fine.height * fine.width, 3)), np.zeros(fine.height * fine.width, bool)
