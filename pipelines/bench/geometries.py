@@ -133,6 +133,7 @@ class GeometryBench(Benchmark[GeometryRow]):
         rates: peak learning rates of the geometry; those of colours and uncertainty stay ``color_rate · learning_rate``
             and ``sharpening · learning_rate`` of the config.
         seeds: 0, 1, … below it, two at least.
+        geometries: those of `GEOMETRIES` that are trained.
         test_views: at most so many of the held-out views are measured, evenly chosen.
         resolution: of the marching cubes, of the exact surface as well.
         samples: points on each surface for Chamfer distances.
@@ -141,11 +142,12 @@ class GeometryBench(Benchmark[GeometryRow]):
     name = "geometries"
     source = "geometries from photographs, with the same colour network"
     row = GeometryRow
-    apart = ("scenes", "config", "rates", "seeds")
+    apart = ("scenes", "config", "rates", "seeds", "geometries")
     scenes: Sequence[BenchScene]
     config: ReconstructConfig
     rates: tuple[float, ...] = (3e-4,)
     seeds: int = 3
+    geometries: tuple[str, ...] = GEOMETRIES
     test_views: int = 8
     resolution: int = 256
     samples: int = 500_000
@@ -155,7 +157,7 @@ class GeometryBench(Benchmark[GeometryRow]):
         one_of_each([scene.name for scene in self.scenes], "scenes")
         for scene in self.scenes:
             self._training(scene, MULTISCALE, self.rates[0], 0).views(scene)
-        every = [(scene, rate, kind) for scene in self.scenes for rate in self.rates for kind in GEOMETRIES]
+        every = [(scene, rate, kind) for scene in self.scenes for rate in self.rates for kind in self.geometries]
         return [self.part(scene, kind, rate, seed) for seed in range(self.seeds) for scene, rate, kind in every]
 
     def part(self, scene: BenchScene, geometry: str, rate: float, seed: int) -> Part:

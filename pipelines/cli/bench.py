@@ -25,6 +25,7 @@ __all__ = ["BENCH_COMMANDS"]
 
 # The names of `bench.model.DEVICES`, which help must not load torch for.
 MODELLED = ("h100", "a100", "4090", "m2")
+GEOMETRIES = ("multiscale", "neus", "single")  # those of `bench.geometries`
 
 
 def _run(arguments: argparse.Namespace, benches: Sequence[Benchmark[Any]], *, out: Path | None) -> int:
@@ -373,6 +374,8 @@ def _reconstruct_arguments(parser: argparse.ArgumentParser) -> None:
     _number(alone, "--seeds", whole(2, 100), 3, "trainings of each geometry with each rate")
     about = "peak rates that every geometry is trained with; its best one counts (--learning-rate)"
     alone.add_argument("--rates", nargs="+", type=positive, metavar="RATE", help=about)
+    about = "which of them (all): multiscale, neus, single"
+    alone.add_argument("--geometries", nargs="+", choices=GEOMETRIES, metavar="NAME", help=about)
     add_flags(parser, "--json")
     add_settings(parser, ReconstructConfig, about="of all rows; the geometry is chosen by the benchmark")
 
@@ -385,6 +388,8 @@ def _reconstruct(arguments: argparse.Namespace) -> int:
             raise input_error(f"--{name}: rows see the same rays, as many in every step; leave it out")
     if arguments.rates and not arguments.geometry_only:
         raise input_error("--rates: only --geometry-only tries several; add it, or give --learning-rate")
+    if arguments.geometries and not arguments.geometry_only:
+        raise input_error("--geometries: without --geometry-only all rows are trained; add it")
     if arguments.geometry_only and arguments.neus_learning_rate is not None:
         raise input_error("--neus-learning-rate: --geometry-only tries the same rates for all; give --rates")
     config = read_settings(arguments, ReconstructConfig)
@@ -404,8 +409,10 @@ def _reconstruct(arguments: argparse.Namespace) -> int:
     if arguments.geometry_only:
         from ..bench.geometries import GeometryBench
 
-        rates = tuple(dict.fromkeys(arguments.rates or (config.learning_rate,)))
-        alone = GeometryBench(scenes=scenes, config=config, rates=rates, seeds=arguments.seeds, **options)
+        options["rates"] = tuple(dict.fromkeys(arguments.rates or (config.learning_rate,)))
+        if arguments.geometries:
+            options["geometries"] = tuple(dict.fromkeys(arguments.geometries))
+        alone = GeometryBench(scenes=scenes, config=config, seeds=arguments.seeds, **options)
         return _run(arguments, [alone], out=arguments.out)
     options["equal_time"] = arguments.equal_time
     if arguments.neus_learning_rate is not None:

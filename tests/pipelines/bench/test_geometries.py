@@ -6,7 +6,7 @@ import statistics
 import pytest
 import torch
 from mplicits.neural_fields.baselines import NeusSDF
-from mplicits.pipelines.bench.cells import Workplace
+from mplicits.pipelines.bench.cells import Catalogue, Workplace
 from mplicits.pipelines.bench.geometries import (
     GEOMETRIES,
     SINGLE,
@@ -18,6 +18,7 @@ from mplicits.pipelines.bench.geometries import (
 )
 from mplicits.pipelines.bench.reconstruct import read_scene
 from mplicits.pipelines.bench.reconstruct_rows import MULTISCALE, NEUS, SurfaceFigures
+from mplicits.pipelines.cli.bench import GEOMETRIES as OFFERED
 from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.reconstruct import model as module
 from mplicits.pipelines.reconstruct.model import build_scene
@@ -66,6 +67,17 @@ def test_colours_begin_alike_and_learn_at_one_rate(bench, monkeypatch):
             assert len(model.geometry.deltas) == (geometry == MULTISCALE)
     assert all(torch.equal(weights[0], other) for other in weights)
     assert rates == {round(TINY.learning_rate * factor, 12) for factor in (TINY.color_rate, TINY.sharpening)}
+
+
+def test_only_those_that_are_asked_for_are_trained(bench, capsys):
+    assert set(OFFERED) == set(GEOMETRIES)
+    some = dataclasses.replace(bench, geometries=(NEUS, MULTISCALE))
+    chosen = [cell for cell in bench.cells() if cell.parameters["geometry"] != SINGLE]
+    # What is done stays done: asking for others does not change a training's key.
+    keys, before = ({Catalogue([one]).key(cell) for cell in chosen} for one in (some, bench))
+    assert {Catalogue([some]).key(cell) for cell in some.cells()} == keys == before
+    assert main(["bench", "reconstruct", "figure", "--geometries", "neus"]) == 2
+    assert "--geometries: without --geometry-only all rows are trained; add it" in capsys.readouterr().err
 
 
 def test_the_interval_is_students():
