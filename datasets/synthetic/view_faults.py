@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from ..cameras import Camera
 from ..color_space import linear_to_srgb, srgb_to_linear
+from ..views.depth_maps import DepthMap
 from ..views.images import PosedImage, PosedImages
 
 __all__ = ["VIEW_FAULTS", "with_fault"]
@@ -28,7 +28,7 @@ def with_fault(images: PosedImages, fault: str, seed: int = 0) -> PosedImages:
     the region's radius along each; ``pose``: one camera looks 30° past the object; ``image``: one photograph is that of
     another camera; ``mirrored``: all pictures are, left to right; ``masks``: object and background have changed places;
     ``exposure``: every other photograph has half of the light. What concerns one picture concerns the third, which is
-    not held out.
+    not held out. Depth maps go with their pictures and their cameras.
 
     Args:
         images: of one size, three at least.
@@ -47,38 +47,45 @@ def with_fault(images: PosedImages, fault: str, seed: int = 0) -> PosedImages:
 
 def _poses(images: PosedImages, random: np.random.Generator) -> list[PosedImage]:
     radius = images.similarity.scale
-    return [
-        replace(view, camera=_turned(view.camera, random.normal(0, TURN, 3), random.normal(0, SHIFT * radius, 3)))
-        for view in images.views
-    ]
+    return [_turned(view, random.normal(0, TURN, 3), random.normal(0, SHIFT * radius, 3)) for view in images.views]
 
 
 def _pose(images: PosedImages, _: np.random.Generator) -> list[PosedImage]:
     views = list(images.views)
-    views[2] = replace(views[2], camera=_turned(views[2].camera, np.array([0, LOST, 0]), np.zeros(3)))
+    views[2] = _turned(views[2], np.array([0, LOST, 0]), np.zeros(3))
     return views
 
 
-def _turned(camera: Camera, degrees: np.ndarray, shift: np.ndarray) -> Camera:
-    """Turned about its eye, in its own axes, and moved in the world's."""
-    pose = camera.world_from_camera.clone()
+def _turned(view: PosedImage, degrees: np.ndarray, shift: np.ndarray) -> PosedImage:
+    """Its camera turned about its eye, in its own axes, and moved in the world's."""
+    pose = view.camera.world_from_camera.clone()
     turn = torch.from_numpy(Rotation.from_rotvec(degrees, degrees=True).as_matrix()).to(pose)
     pose[:3, :3] = pose[:3, :3] @ turn
     pose[:3, 3] += torch.from_numpy(shift).to(pose)
-    return replace(camera, world_from_camera=pose)
+    depth = None if view.depth is None else _placed(view.depth, pose)
+    return replace(view, camera=replace(view.camera, world_from_camera=pose), depth=depth)
+
+
+def _placed(depth: DepthMap, pose: torch.Tensor) -> DepthMap:
+    """As if it had been taken there."""
+    return replace(depth, camera=replace(depth.camera, world_from_camera=pose))
 
 
 def _image(images: PosedImages, _: np.random.Generator) -> list[PosedImage]:
     views = list(images.views)
-    views[2] = replace(views[2], color=views[1].color, mask=views[1].mask)
+    there, shown = views[2], views[1]
+    depth = None if shown.depth is None else _placed(shown.depth, there.camera.world_from_camera)
+    views[2] = replace(there, color=shown.color, mask=shown.mask, depth=depth)
     return views
 
 
 def _mirrored(images: PosedImages, _: np.random.Generator) -> list[PosedImage]:
-    return [
-        replace(view, color=view.color[:, ::-1], mask=None if view.mask is None else view.mask[:, ::-1])
-        for view in images.views
-    ]
+    def mirrored(view: PosedImage) -> PosedImage:
+        mask = None if view.mask is None else view.mask[:, ::-1]
+        depth = None if view.depth is None else replace(view.depth, numbers=view.depth.numbers[:, ::-1])
+        return replace(view, color=view.color[:, ::-1], mask=mask, depth=depth)
+
+    return [mirrored(view) for view in images.views]
 
 
 def _masks(images: PosedImages, _: np.random.Generator) -> list[PosedImage]:

@@ -69,6 +69,17 @@ def test_mirrored_twice_is_as_before(images: PosedImages) -> None:
     assert all(np.array_equal(a.mask, b.mask) for a, b in zip(again.views, images.views, strict=True))
 
 
+@pytest.mark.parametrize("fault", sorted(VIEW_FAULTS))
+def test_depth_maps_go_with_their_pictures_and_cameras(fault: str) -> None:
+    figure = render_scene(SCENES["figure"](), views=4, size=16, samples=1, depths=True)
+    for view in with_fault(figure, fault).views:
+        assert view.depth is not None
+        assert torch.equal(view.depth.camera.world_from_camera, view.camera.world_from_camera)
+        assert view.mask is not None
+        inside = view.mask > 0.5  # one sample in the middle of each pixel: a depth is where the mask is
+        assert np.array_equal(np.isfinite(view.depth.numbers), ~inside if fault == "masks" else inside)
+
+
 def test_masks_are_inverted(images: PosedImages) -> None:
     for old, new in zip(images.views, with_fault(images, "masks").views, strict=True):
         assert old.mask is not None
