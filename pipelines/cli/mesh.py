@@ -79,6 +79,8 @@ MESH = Command(
 def _evaluate_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("mesh", metavar="MESH", help="the mesh to judge")
     parser.add_argument("reference", metavar="REFERENCE", help="the true mesh, or a point cloud")
+    about = "posed photographs: say, too, how near the mesh is where so many of them see the reference"
+    parser.add_argument("--photos", metavar="DATA", help=about)
     add_flags(parser, "--samples", type=whole(1), default=500_000, help="on each surface (500000)")
     add_flags(parser, "--seed", help="of the samples (0)")
     add_flags(parser, "--json")
@@ -87,7 +89,18 @@ def _evaluate_arguments(parser: argparse.ArgumentParser) -> None:
 def _evaluate(arguments: argparse.Namespace) -> int:
     from ..surface.measure import evaluate_files, format_metrics, write_metrics
 
-    metrics = evaluate_files(arguments.mesh, arguments.reference, samples=arguments.samples, seed=arguments.seed)
+    options = {name: getattr(arguments, name) for name in ("samples", "seed")}
+    if arguments.photos is None:
+        metrics = evaluate_files(arguments.mesh, arguments.reference, **options)
+    else:
+        from ...datasets.views.images import read_posed_images
+        from ..reconstruct.witnesses import witnesses_of
+        from ..run.progress import counter_bar
+
+        cameras = [view.camera for view in read_posed_images(arguments.photos).views]
+        with counter_bar("photographs") as progress:
+            witnesses = witnesses_of(cameras, progress=progress)
+            metrics = evaluate_files(arguments.mesh, arguments.reference, witnesses=witnesses, **options)
     print(format_metrics(metrics))
     if arguments.json:
         write_metrics(arguments.json, metrics)
@@ -97,7 +110,8 @@ def _evaluate(arguments: argparse.Namespace) -> int:
 EVALUATE = Command(
     "measure a mesh against a reference",
     """  mplicits evaluate scan.ply truth.ply
-  mplicits evaluate scan.ply points.xyz --samples 100000 --json figures.json""",
+  mplicits evaluate scan.ply points.xyz --samples 100000 --json figures.json
+  mplicits evaluate runs/statue/mesh.ply photos/surface.ply --photos photos""",
     _evaluate_arguments,
     _evaluate,
     "Measure a mesh against a mesh or a cloud. Lengths are in units of the reference's bounding sphere.",

@@ -23,7 +23,7 @@ from ..surface.surface import Surface, read_reference, sample_points
 from .rasterise import Painted, mesh_view, read_painted
 from .trace import Seen, fine_strips
 
-__all__ = ["photograph_mesh", "true_mesh"]
+__all__ = ["photograph_mesh", "sees", "true_mesh"]
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -86,7 +86,7 @@ def photograph_mesh(
         near = camera.moved(ball)
         color, mask = _photograph(mesh, near, samples, light)
         middles = mesh_view(mesh, near)
-        observed.append(_sees(near, middles, points))
+        observed.append(sees(near, middles, points))
         depth = DepthMap(ball.scale * _depths(near, middles), camera, "metric", Path(path)) if depths else None
         images.append(PosedImage(f"{index:03d}.png", camera, color, mask, depth))
         if progress is not None:
@@ -109,6 +109,28 @@ def true_mesh(path: str | Path) -> Mesh:
     colors = None if surface.colors is None else surface.colors.astype(np.float32)
     normals = vertex_normals(surface.vertices, surface.faces)
     return Mesh(surface.vertices, surface.faces.astype(np.int32), normals, colors)
+
+
+def sees(camera: Camera, seen: Seen, points: Float64) -> NDArray[np.bool_]:
+    """Which of the points ``(P, 3)`` a camera sees: those in its picture that are where the surface in their pixel is.
+
+    Args:
+        camera: in the coordinates of the points.
+        seen: what its pixels see.
+        points: of the surface.
+    """
+    pixels, depths, found = camera.in_view(points)
+    if not len(seen.pixel):
+        return np.zeros_like(found)
+    rows = np.full(camera.height * camera.width, -1)
+    rows[seen.pixel] = np.arange(len(seen.pixel))
+    column, row = np.rint(pixels[found]).astype(np.int64).T
+    met = rows[row * camera.width + column]
+    offset = points[found] - seen.position.double().numpy()[met]
+    from_plane = np.abs((offset * seen.normal.double().numpy()[met]).sum(axis=1))
+    pixel = depths[found] / float(camera.intrinsics[0, 0])
+    found[found] = (met >= 0) & (from_plane < FLAT * pixel) & (np.linalg.norm(offset, axis=1) < NEAR * pixel)
+    return found
 
 
 class _Light(NamedTuple):
@@ -145,25 +167,3 @@ def _depths(camera: Camera, seen: Seen) -> Float32:
     depths = torch.full((camera.height * camera.width,), torch.nan, dtype=torch.float64)
     depths[seen.pixel] = (seen.position.double() - camera.eye) @ camera.forward
     return depths.reshape(camera.height, camera.width).float().numpy()
-
-
-def _sees(camera: Camera, seen: Seen, points: Float64) -> NDArray[np.bool_]:
-    """Which of the points ``(P, 3)`` a camera sees: those in its picture that are where the surface in their pixel is.
-
-    Args:
-        camera: in the coordinates of the points.
-        seen: what its pixels see.
-        points: of the surface.
-    """
-    pixels, depths, found = camera.in_view(points)
-    if not len(seen.pixel):
-        return np.zeros_like(found)
-    rows = np.full(camera.height * camera.width, -1)
-    rows[seen.pixel] = np.arange(len(seen.pixel))
-    column, row = np.rint(pixels[found]).astype(np.int64).T
-    met = rows[row * camera.width + column]
-    offset = points[found] - seen.position.double().numpy()[met]
-    from_plane = np.abs((offset * seen.normal.double().numpy()[met]).sum(axis=1))
-    pixel = depths[found] / float(camera.intrinsics[0, 0])
-    found[found] = (met >= 0) & (from_plane < FLAT * pixel) & (np.linalg.norm(offset, axis=1) < NEAR * pixel)
-    return found

@@ -9,6 +9,7 @@ exact, and only the choice of columns is a discretisation.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -22,6 +23,7 @@ from ...neural_fields.files import write_json
 from .raster import cover
 from .roughness import feet_among, roughness
 from .surface import Surface, components, is_closed, read_surface, sample_points
+from .witnessed import Seen, Ways, Witnesses, seen_figures, seen_lines
 
 __all__ = [
     "Metrics",
@@ -80,6 +82,7 @@ class Metrics:
         edge_angle: the median near the reference's sharp edges. None where there are none.
         edge_angle_90: what nine tenths of those are below.
         ripple: the residual noise: median height of the waves on flat places.
+        seen: the same distances by how many photographs see the place; None if nobody asked.
     """
 
     chamfer: float
@@ -108,18 +111,38 @@ class Metrics:
     edge_angle: float | None = None
     edge_angle_90: float | None = None
     ripple: float | None = None
+    seen: Seen | None = None
 
 
-def evaluate_files(mesh: str | Path, reference: str | Path, *, samples: int = 500_000, seed: int = 0) -> Metrics:
+def evaluate_files(
+    mesh: str | Path,
+    reference: str | Path,
+    *,
+    samples: int = 500_000,
+    seed: int = 0,
+    witnesses: Callable[[Surface], Witnesses] | None = None,
+) -> Metrics:
     """``evaluate_surfaces`` on two files; the reference may be a point cloud.
 
+    Args:
+        mesh: the file to judge.
+        reference: that of the truth.
+        samples: see `evaluate_surfaces`.
+        seed: of the samples.
+        witnesses: gives the argument of that name of the reference that was read.
+
     Raises:
-        InputError: a file cannot be read, or the first one holds no faces.
+        InputError: a file cannot be read, or the first one holds no faces; or the second, where there are witnesses.
     """
     surface = read_surface(mesh)
     if not len(surface.faces):
         raise InputError(f"{mesh}: holds points but no faces, so it is no mesh to evaluate; give the mesh first")
-    return evaluate_surfaces(surface, read_surface(reference), samples=samples, seed=seed)
+    truth = read_surface(reference)
+    if witnesses is None:
+        return evaluate_surfaces(surface, truth, samples=samples, seed=seed)
+    if not len(truth.faces):
+        raise InputError(f"{reference}: points hide nothing, so nobody knows what photographs see of them; give a mesh")
+    return evaluate_surfaces(surface, truth, samples=samples, seed=seed, witnesses=witnesses(truth))
 
 
 def evaluate_surfaces(
@@ -131,6 +154,7 @@ def evaluate_surfaces(
     threshold: float = 0.01,
     voxel: float = 0.01,
     columns: int = 512,
+    witnesses: Witnesses | None = None,
 ) -> Metrics:
     """Compare a mesh with a reference surface or cloud, both in the same coordinates.
 
@@ -142,13 +166,16 @@ def evaluate_surfaces(
         threshold: for the F-score, in units of the reference's bounding sphere.
         voxel: for the shell IoU (0.01 in the paper's code), same units.
         columns: for the volumetric IoU, columns along the longest side.
+        witnesses: who says how many photographs see points of the reference, which then has faces; None asks nobody.
 
     Raises:
-        ValueError: ``samples`` is not positive.
+        ValueError: ``samples`` is not positive, or there are witnesses of a cloud.
     """
     if samples < 1:
         raise ValueError(f"samples={samples}: expected > 0")
     is_cloud = not len(reference.faces)
+    if is_cloud and witnesses is not None:
+        raise ValueError("witnesses: points hide nothing; expected a reference with faces")
     similarity = Similarity.to_unit_sphere(reference.used_vertices())
     mesh, reference = mesh.moved(similarity), reference.moved(similarity)
     of_mesh, of_reference, of_floor = np.random.default_rng(seed).spawn(3)
@@ -166,11 +193,15 @@ def evaluate_surfaces(
         consistency = float(there + back) / 2
 
     notes, closed = [], is_closed(mesh)
-    floor = iou = rough = None
+    floor = iou = rough = seen = None
     if is_cloud:
         notes.append("the reference is a point cloud: distances are to its points; no floor, no iou, no roughness")
     else:
-        floor = sum(chamfer(target, sample_points(reference, samples, of_floor)[0]))
+        again = _ways(sample_points(reference, samples, of_floor)[0], target)
+        floor = float(again.there.mean() + again.back.mean())
+        if witnesses is not None:
+            counts = witnesses(similarity.to_input(target))
+            seen = seen_figures(counts, Ways(forward**2, np.asarray(nearest), backward**2), again)
         iou, iou_notes = _iou(mesh, reference, columns, closed=closed)
         notes.extend(iou_notes)
         if normals is not None and target_normals is not None:
@@ -199,6 +230,7 @@ def evaluate_surfaces(
         samples=samples,
         seed=seed,
         notes=tuple(notes),
+        seen=seen,
         **({} if rough is None else rough._asdict()),
     )
 
@@ -208,9 +240,15 @@ def chamfer(a: Float64, b: Float64) -> tuple[float, float]:
 
     ``mean_a min_b |a − b|²`` and ``mean_b min_a |a − b|²``; the tables give their sum.
     """
-    forward, _ = KDTree(b, balanced_tree=False).query(a, workers=-1)
+    ways = _ways(a, b)
+    return float(ways.there.mean()), float(ways.back.mean())
+
+
+def _ways(a: Float64, b: Float64) -> Ways:
+    """From samples of a surface ``(N, 3)`` to those of the reference ``(M, 3)``, and back."""
+    forward, nearest = KDTree(b, balanced_tree=False).query(a, workers=-1)
     backward, _ = KDTree(a, balanced_tree=False).query(b, workers=-1)
-    return float((forward**2).mean()), float((backward**2).mean())
+    return Ways(np.asarray(forward) ** 2, np.asarray(nearest), np.asarray(backward) ** 2)
 
 
 def shell_iou(a: Float64, b: Float64, *, voxel: float = 0.01) -> float:
@@ -263,6 +301,7 @@ def format_metrics(metrics: Metrics) -> str:
         ("shell_iou", f"{m.shell_iou:.4f}", f"of surface voxels of {m.voxel:g}"),
         ("components", f"{m.components}", "closed" if m.closed else "with open edges"),
         ("vertices, faces", f"{m.vertices:,}", f"{m.faces:,}"),
+        *(() if m.seen is None else seen_lines(m.seen)),
         ("mean distance, input units", f"{m.mean_distance:.4g}", f"1 unit above = {m.scale:.6g} input units"),
     ]
     rows = [f"{name:<32} {value:>10}  {remark}".rstrip() for name, value, remark in lines]
