@@ -374,7 +374,7 @@ def _reconstruct_arguments(parser: argparse.ArgumentParser) -> None:
     _number(alone, "--seeds", whole(2, 100), 3, "trainings of each geometry with each rate")
     about = "peak rates that every geometry is trained with; its best one counts (--learning-rate)"
     alone.add_argument("--rates", nargs="+", type=positive, metavar="RATE", help=about)
-    about = "which of them (all): multiscale, neus, single"
+    about = f"which of them (all): {', '.join(GEOMETRIES)}"
     alone.add_argument("--geometries", nargs="+", choices=GEOMETRIES, metavar="NAME", help=about)
     add_flags(parser, "--json")
     add_settings(parser, ReconstructConfig, about="of all rows; the geometry is chosen by the benchmark")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import functools
 import time
 
 from ..run.config import given_flags
@@ -93,13 +94,13 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     if arguments.photos is None:
         metrics = evaluate_files(arguments.mesh, arguments.reference, **options)
     else:
-        from ...datasets.views.images import read_posed_images
-        from ..reconstruct.witnesses import witnesses_of
+        from ...datasets.views.reading import read_cameras
+        from ..reconstruct.witnesses import count_witnesses
         from ..run.progress import counter_bar
 
-        cameras = [view.camera for view in read_posed_images(arguments.photos).views]
+        cameras = [camera for _, camera in read_cameras(arguments.photos)]
         with counter_bar("photographs") as progress:
-            witnesses = witnesses_of(cameras, progress=progress)
+            witnesses = functools.partial(count_witnesses, cameras, progress=progress)
             metrics = evaluate_files(arguments.mesh, arguments.reference, witnesses=witnesses, **options)
     print(format_metrics(metrics))
     if arguments.json:

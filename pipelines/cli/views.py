@@ -6,9 +6,10 @@ import argparse
 import sys
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_args, get_type_hints
 
 from ..run.config import input_error
+from ..run.settings import ReconstructConfig
 from .common import Command, add_flags, check_output, positive, training, whole, write_json
 
 __all__ = ["CHECK_CAMERAS", "FIND_CAMERAS", "FIND_POINTS", "SCENE", "tell_found"]
@@ -104,7 +105,7 @@ def _check_arguments(parser: argparse.ArgumentParser) -> None:
     what = "folder with a depth map for each photograph; by default those that the data set names"
     parser.add_argument("--depth-maps", type=Path, metavar="FOLDER", help=what)
     what = "what they hold, as for reconstruct; only metric ones are held against each other (metric)"
-    kinds = ("metric", "relative", "disparity")
+    kinds: tuple[str, ...] = get_args(get_type_hints(ReconstructConfig)["depth_kind"])
     parser.add_argument("--depth-kind", choices=kinds, default="metric", metavar="KIND", help=what)
     what = "numbers of the depth maps per unit of the cameras (1000 for integers, else 1)"
     parser.add_argument("--depth-scale", type=positive, metavar="X", help=what)

@@ -9,7 +9,6 @@ exact, and only the choice of columns is a discretisation.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -120,7 +119,7 @@ def evaluate_files(
     *,
     samples: int = 500_000,
     seed: int = 0,
-    witnesses: Callable[[Surface], Witnesses] | None = None,
+    witnesses: Witnesses | None = None,
 ) -> Metrics:
     """``evaluate_surfaces`` on two files; the reference may be a point cloud.
 
@@ -129,7 +128,7 @@ def evaluate_files(
         reference: that of the truth.
         samples: see `evaluate_surfaces`.
         seed: of the samples.
-        witnesses: gives the argument of that name of the reference that was read.
+        witnesses: see `evaluate_surfaces`.
 
     Raises:
         InputError: a file cannot be read, or the first one holds no faces; or the second, where there are witnesses.
@@ -138,11 +137,9 @@ def evaluate_files(
     if not len(surface.faces):
         raise InputError(f"{mesh}: holds points but no faces, so it is no mesh to evaluate; give the mesh first")
     truth = read_surface(reference)
-    if witnesses is None:
-        return evaluate_surfaces(surface, truth, samples=samples, seed=seed)
-    if not len(truth.faces):
+    if witnesses is not None and not len(truth.faces):
         raise InputError(f"{reference}: points hide nothing, so nobody knows what photographs see of them; give a mesh")
-    return evaluate_surfaces(surface, truth, samples=samples, seed=seed, witnesses=witnesses(truth))
+    return evaluate_surfaces(surface, truth, samples=samples, seed=seed, witnesses=witnesses)
 
 
 def evaluate_surfaces(
@@ -176,7 +173,7 @@ def evaluate_surfaces(
     is_cloud = not len(reference.faces)
     if is_cloud and witnesses is not None:
         raise ValueError("witnesses: points hide nothing; expected a reference with faces")
-    similarity = Similarity.to_unit_sphere(reference.used_vertices())
+    given, similarity = reference, Similarity.to_unit_sphere(reference.used_vertices())
     mesh, reference = mesh.moved(similarity), reference.moved(similarity)
     of_mesh, of_reference, of_floor = np.random.default_rng(seed).spawn(3)
     points, normals = sample_points(mesh, samples, of_mesh)
@@ -200,7 +197,7 @@ def evaluate_surfaces(
         again = _ways(sample_points(reference, samples, of_floor)[0], target)
         floor = float(again.there.mean() + again.back.mean())
         if witnesses is not None:
-            counts = witnesses(similarity.to_input(target))
+            counts = witnesses(given, similarity.to_input(target))
             seen = seen_figures(counts, Ways(forward**2, np.asarray(nearest), backward**2), again)
         iou, iou_notes = _iou(mesh, reference, columns, closed=closed)
         notes.extend(iou_notes)

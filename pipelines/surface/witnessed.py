@@ -9,13 +9,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from .surface import Surface
+
 __all__ = ["LEAST", "WITNESSED", "Seen", "SeenBy", "Ways", "Witnesses", "seen_figures", "seen_lines"]
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 
-Witnesses = Callable[[Float64], Int64]
-"""How many photographs see points ``(N, 3)`` of the reference, which is given in its own coordinates; ``(N,)``."""
+Witnesses = Callable[[Surface, Float64], Int64]
+"""How many photographs see points ``(N, 3)`` of the reference, both in its own coordinates; ``(N,)``."""
 
 LEAST = 2  # photographs that must see a place to measure it
 WITNESSED = ((0, 0), (1, 1), (2, 3), (4, 7), (8, None))  # from how many to how many

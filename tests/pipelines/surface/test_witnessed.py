@@ -33,13 +33,13 @@ def test_every_number_of_photographs_has_one_part() -> None:
 
 def test_what_no_photograph_sees_does_not_count() -> None:
     """Half of a square is missing, and nobody has seen that half."""
-    asked = []
+    truth, asked = square(3.0), []
 
-    def witnesses(points: np.ndarray) -> np.ndarray:
+    def witnesses(surface: Surface, points: np.ndarray) -> np.ndarray:
+        assert surface is truth
         asked.append(points)
         return np.where(points[:, 0] < 0.49, 5, 0)
 
-    truth = square(3.0)
     metrics = evaluate_surfaces(square(3.0, side=0.5), truth, samples=4000, witnesses=witnesses)
     assert np.allclose(asked[0][:, 2], 3.0)  # in the reference's own coordinates
     assert metrics.seen is not None
@@ -55,4 +55,4 @@ def test_what_no_photograph_sees_does_not_count() -> None:
 def test_a_cloud_has_no_witnesses() -> None:
     cloud = Surface(np.random.default_rng(0).normal(size=(10, 3)), np.zeros((0, 3), np.int64))
     with pytest.raises(ValueError, match="points hide nothing"):
-        evaluate_surfaces(square(0.0), cloud, samples=10, witnesses=lambda points: np.zeros(len(points), np.int64))
+        evaluate_surfaces(square(0.0), cloud, samples=10, witnesses=lambda _, points: np.zeros(len(points), np.int64))
