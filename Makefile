@@ -7,6 +7,8 @@ OUT ?= demo
 MINUTES ?= 30
 N ?= 200
 # Errors only; and Python compiles what is imported when it is, which is a tenth of what pip would compile for a minute.
+# It has to keep that, or each process would compile all of PyTorch anew: four seconds, of which a test run has hundreds.
+export PYTHONDONTWRITEBYTECODE :=
 PIP := $(BIN)/python -m pip install --quiet --quiet --no-compile --disable-pip-version-check -c constraints.txt
 
 .PHONY: demo test test-all fuzz kills clients lint docs clean

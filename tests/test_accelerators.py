@@ -51,8 +51,8 @@ from mplicits.pipelines.run.config import load_config
 from mplicits.pipelines.run.settings import FitConfig
 from mplicits.pipelines.viewer.frames import Look
 from mplicits.pipelines.viewer.paint import Painter
+from reconstructions import small_reconstructions
 from test_commands import EVOLVE, FIT, RECONSTRUCT, TEXTURE
-from textures import small_textures
 from torch import Tensor, nn
 
 Result = Sequence[Tensor | np.ndarray]
@@ -279,7 +279,7 @@ PICTURES = ("lambert.png", "color.png", "error.png", "photographed/held_out.png"
 
 def test_commands(accelerator: torch.device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     few_points(monkeypatch)
-    small_textures(monkeypatch)
+    small_reconstructions(monkeypatch)
     cloud = sample_torus(400)
     scene = render_scene(SCENES["painted-sphere"](), views=6, size=12, samples=2)
 

@@ -35,7 +35,7 @@ from mplicits.pipelines.render import subject
 from mplicits.pipelines.run.settings import TextureConfig
 from mplicits.pipelines.texture import riding
 from mplicits.pipelines.web import export
-from textures import small_textures
+from reconstructions import small_reconstructions
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -72,7 +72,7 @@ SMALLEST = {  # by what a line begins with, or holds
     "mplicits scene *": "--views 3 --size 16 --samples 1",
     "mplicits bench reconstruct *": f"{RECONSTRUCT} --views 4 --size 16 --test-every 2 --test-views 1 --no-equal-time"
     " --resolution 16 --eval-samples 500",
-    "mplicits bench reconstruct * --geometry-only *": "--rates 1e-3 --seeds 2",
+    "mplicits bench reconstruct * --geometry-only *": "--rates 1e-3 --seeds 2 --geometries multiscale neus",
     "mplicits bench paper *": "--preset smoke --table comparison --methods ours --jobs 1",
     "mplicits bench srb *": f"{FIT} --resolution 16 --eval-samples 500",
 }
@@ -232,7 +232,7 @@ def stand_in(tmp_path_factory: pytest.TempPathFactory) -> Maker:
 def _small(monkeypatch: pytest.MonkeyPatch) -> None:
     """What has no flag: the bundled scan, checks, texture and mesh of ``fit --mesh``; and Ctrl-C ends ``view``."""
     few_points(monkeypatch)
-    small_textures(monkeypatch)
+    small_reconstructions(monkeypatch)
     scan = functools.partial(simulate_scan, Sphere(radius=0.7), scanners=3, resolution=24, colors=np.abs)
     monkeypatch.setattr(datasets, "statue_scan", scan)
     monkeypatch.setitem(scene_mesh.__kwdefaults__, "resolution", 48)

@@ -7,7 +7,7 @@ import standin
 import torch
 import waits
 from mplicits.neural_fields import Sphere, cone_starts
-from textures import small_textures
+from reconstructions import small_reconstructions
 from waits import Row
 
 
@@ -47,7 +47,7 @@ def test_fixed_shapes_need_no_wait(name: str) -> None:
 
 def test_training_steps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    small_textures(monkeypatch)
+    small_reconstructions(monkeypatch)
     limits = {"`fit`": 0, "`reconstruct`, reconstruct": 3, "`reconstruct`, texture": 0}
     seen = set()
     for row in waits.trainings():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import importlib.metadata
 import os
 import platform
@@ -54,8 +55,14 @@ def sgemm_rate(width: int = 512, *, rows: int = 2048, device: torch.device | str
 
 
 def speed(device: torch.device | str = "cpu") -> Speed:
-    """How fast this machine is, measured in a tenth of a second: what predictions of times begin with."""
-    device = torch.device(device)
+    """How fast this machine is, measured in a tenth of a second, once: what predictions of times begin with."""
+    return _speed(torch.device(device), torch.get_num_threads())
+
+
+@functools.cache
+def _speed(device: torch.device, threads: int) -> Speed:
+    """See `speed`; ``threads`` are those of the calling process, and say of which measurement this is."""
+    del threads
     cpu = sgemm_rate(repeats=3)
     if device.type == "cpu":
         return Speed(cpu, cpu, LEAST_STEP["cpu"])
@@ -107,11 +114,17 @@ def choose_device(name: str) -> torch.device:
     return device
 
 
+@functools.cache
+def _versions() -> tuple[tuple[str, str], ...]:
+    """Names and versions of the packages on which figures depend; they are read from files, and stay as they are."""
+    names = ("mplicits", "torch", "numpy", "scipy", "safetensors")
+    return tuple((name, importlib.metadata.version(name)) for name in names)
+
+
 def environment(device: torch.device) -> dict[str, Any]:
     """What the figures of a run depend on: versions, threads, machine."""
-    names = ("mplicits", "torch", "numpy", "scipy", "safetensors")
     return {
-        "versions": {name: importlib.metadata.version(name) for name in names},
+        "versions": dict(_versions()),
         "python": platform.python_version(),
         "machine": f"{platform.system()} {platform.machine()}",
         "cpu_count": os.cpu_count(),

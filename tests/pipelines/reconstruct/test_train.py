@@ -36,7 +36,7 @@ from mplicits.pipelines.run.folder import load_state, state_bytes
 from mplicits.pipelines.run.settings import ReconstructConfig
 from mplicits.pipelines.run.trainer import Interrupted, Progress
 from mplicits.pipelines.surface.measure import chamfer
-from textures import small_textures
+from reconstructions import small_reconstructions
 from torch import Tensor
 
 WORLD = Similarity(center=(120.0, -30.0, 8.0), scale=5.0)
@@ -67,8 +67,8 @@ FLAGS += " --march-grid 8 --start sphere"
 
 
 @pytest.fixture(autouse=True)
-def _small_textures(monkeypatch: pytest.MonkeyPatch) -> None:
-    small_textures(monkeypatch)
+def _small_reconstructions(monkeypatch: pytest.MonkeyPatch) -> None:
+    small_reconstructions(monkeypatch)
 
 
 def moved(images: PosedImages, similarity: Similarity) -> PosedImages:
@@ -94,7 +94,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def finished(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     directory = tmp_path_factory.mktemp("runs") / "whole"
     with pytest.MonkeyPatch.context() as patch:
-        small_textures(patch)
+        small_reconstructions(patch)
         reconstruct(data, TINY, out=directory)
     return directory
 

@@ -1,0 +1,24 @@
+"""What tests of reconstructions share: starts and textures that take no time."""
+
+import inspect
+from functools import partial
+
+import pytest
+from mplicits.neural_fields import solve_sphere
+from mplicits.pipelines.reconstruct import hull
+from mplicits.pipelines.reconstruct import model as scene_model
+from mplicits.pipelines.reconstruct import train as reconstruct_texture
+from mplicits.pipelines.run.settings import TextureConfig
+
+
+def small_reconstructions(patch: pytest.MonkeyPatch) -> None:
+    """Begin by one linear solve or a short fit, and colour few points by a small network.
+
+    How good starts and textures are is tested elsewhere.
+    """
+    patch.setattr(scene_model, "fit_sphere", solve_sphere)
+    patch.setitem(inspect.unwrap(hull.start_at_hull).__kwdefaults__, "steps", 50)
+    patch.setattr(reconstruct_texture, "TEXTURE_SAMPLES", 2000)
+    patch.setattr(reconstruct_texture, "TEXTURE_RESOLUTION", 32)
+    small = partial(TextureConfig, samples=2000, width=16, depth=1, batch=256, band_batch=256)
+    patch.setattr(reconstruct_texture, "TextureConfig", small)
