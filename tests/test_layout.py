@@ -210,6 +210,17 @@ def test_the_demo_installs_nothing_but_the_package() -> None:
         assert all(" -c constraints.txt " in line for line in installed)
 
 
+def test_make_keeps_what_python_compiles(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing is compiled at the installation: where nobody kept it, each process would compile PyTorch anew."""
+    make = shutil.which("make")
+    if make is None:
+        pytest.skip("there is no make")
+    monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "1")
+    rule = f"kept:;@'{sys.executable}' -c 'import sys; print(sys.dont_write_bytecode)'"
+    words = [make, "--silent", "--eval", rule, "kept"]
+    assert subprocess.run(words, check=True, cwd=ROOT, capture_output=True, text=True).stdout == "False\n"
+
+
 @pytest.mark.slow
 def test_the_wheel_alone_holds_every_module(tmp_path: Path) -> None:
     """Built, installed into an environment of its own (what it depends on is borrowed), every module imported."""
