@@ -24,12 +24,18 @@ from mplicits.pipelines.reconstruct import model as module
 from mplicits.pipelines.reconstruct.model import build_scene
 from mplicits.pipelines.run.settings import ReconstructConfig
 from mplicits.pipelines.run.trainer import parameter_count
+from reconstructions import small_reconstructions
 
 TINY = ReconstructConfig(
     widths=(16, 24), depths=(1, 1), omegas=(5.0, 10.0), features=4, color_width=16, color_depth=1, color_grid=8,
     steps=2, rays=8,
     uniform=4, importance=4, march_grid=4, test_every=3, start="sphere", device="cpu",
 )  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def _small_reconstructions(monkeypatch: pytest.MonkeyPatch) -> None:
+    small_reconstructions(monkeypatch)
 
 
 @pytest.fixture(scope="module")

@@ -31,6 +31,7 @@ from mplicits.pipelines.run.settings import ReconstructConfig
 from mplicits.pipelines.run.trainer import StopFlag
 from mplicits.pipelines.surface.surface import from_mesh
 from mplicits.pipelines.surface.trim import in_region
+from reconstructions import small_reconstructions
 
 TINY = ReconstructConfig(
     widths=(16, 24),
@@ -67,6 +68,11 @@ FLAGS += [
 ]
 FLAGS += ["--uniform", "4", "--importance", "4", "--march-grid", "4", "--test-every", "3", "--device", "cpu"]
 FLAGS += ["--views", "6", "--size", "8", "--resolution", "16", "--eval-samples", "2000"]
+
+
+@pytest.fixture(autouse=True)
+def _small_reconstructions(monkeypatch: pytest.MonkeyPatch) -> None:
+    small_reconstructions(monkeypatch)
 
 
 @pytest.fixture(scope="module")

@@ -15,6 +15,7 @@ from mplicits.pipelines.reconstruct.objective import SceneObjective
 from mplicits.pipelines.reconstruct.train import reconstruct
 from mplicits.pipelines.reconstruct.views import ViewImage, exposed_as, measure, render_image
 from mplicits.pipelines.run.settings import ReconstructConfig
+from reconstructions import small_reconstructions
 from torch import Tensor, nn
 
 TINY = ReconstructConfig(
@@ -30,6 +31,11 @@ class Paint(nn.Module):
 
     def forward(self, x: Tensor, direction: Tensor, jet: Jet) -> Tensor:
         return torch.from_numpy(SCENES["painted-sphere"]().color(x.double().numpy())).float()
+
+
+@pytest.fixture(autouse=True)
+def _small_reconstructions(monkeypatch: pytest.MonkeyPatch) -> None:
+    small_reconstructions(monkeypatch)
 
 
 @pytest.fixture(scope="module")
