@@ -27,8 +27,13 @@ Result = TypeVar("Result")
 
 # How long workers may take to write their checkpoints after Ctrl-C.
 GRACE_SECONDS = 60.0
-# Read by Ray when it is imported: no usage reports, and devices stay visible to tasks that ask for none.
-RAY_ENVIRONMENT = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0"}
+# Read by Ray when it is imported: no usage reports, devices stay visible to tasks that ask for none, and workers do not
+# give way to whatever else runs: they are what was asked for, and their seconds are measured.
+RAY_ENVIRONMENT = {
+    "RAY_USAGE_STATS_ENABLED": "0",
+    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
+    "RAY_worker_niceness": "0",
+}
 
 
 @dataclass(frozen=True)
