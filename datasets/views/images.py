@@ -200,4 +200,6 @@ def _find_region(
             return attempt(), "; ".join((words, *(f"not {reason}" for reason in refused)))
         except ValueError as error:
             refused.append(str(error))
-    raise InputError(f"{source}: region: not found ({'; '.join(refused)}); give its center and scale")
+    reasons = "; ".join(dict.fromkeys(refused))
+    fix = "take more views, from other sides, or give it: scale_mat_i of NeuS's files, or region= in Python"
+    raise InputError(f"{source}: region: not found ({reasons}); {fix}")
