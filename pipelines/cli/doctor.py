@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import importlib.metadata
+import importlib.util
 import os
 import platform
 import re
+import shlex
 import subprocess
 import sys
 import tempfile
@@ -51,6 +53,7 @@ def examine(folder: Path | None = None) -> list[Finding]:
     """
     return [
         _python(),
+        _start(),
         *(_requirement(line) for line in importlib.metadata.requires(PACKAGE) or [] if _is_asked_of_users(line)),
         _cv2(),
         *_torchvision(),
@@ -76,6 +79,16 @@ def format_findings(findings: list[Finding]) -> str:
 
 def _python() -> Finding:
     return Finding("ok", "Python", f"{platform.python_version()} on {platform.system()} {platform.machine()}")
+
+
+def _start() -> Finding:
+    """Whether Python has kept what it compiled of PyTorch; containers often forbid it, and each start then does it."""
+    kept = Path(importlib.util.cache_from_source(torch.__file__))
+    if kept.exists():
+        return Finding("ok", "start", "PyTorch is compiled to bytecode")
+    folder = shlex.quote(str(Path(torch.__file__).parent))
+    fix = f"python -m compileall -q {folder}, and every command starts seconds sooner"
+    return Finding("warning", "start", f"Python compiles PyTorch anew each time ({kept.parent} is missing); {fix}")
 
 
 def _installed(name: str) -> str | None:

@@ -1,7 +1,9 @@
 """The command line as a user meets it: output, exit codes, and one line for each mistake."""
 
+import importlib.util
 import json
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -432,6 +434,23 @@ def test_doctor_finds_nothing_wrong_here(capsys):
     assert "GFLOP/s" in text
     assert re.search(r"ok +torch +\d", text)
     assert "error" not in text.replace("errors", "")
+
+
+def test_doctor_says_that_nothing_is_kept_of_what_python_compiles(monkeypatch, tmp_path):
+    monkeypatch.setattr(torch, "__file__", str(tmp_path / "it's" / "torch" / "__init__.py"))
+    kept = Path(importlib.util.cache_from_source(torch.__file__))
+    (start,) = [finding for finding in doctor.examine(tmp_path) if finding.topic == "start"]
+    assert start.level == "warning"
+    assert str(kept.parent) in start.text
+    kept.parent.mkdir(parents=True)
+    Path(torch.__file__).touch()
+    (line,) = [part for part in start.text.split("; ") if part.startswith("python ")]
+    words = shlex.split(line.partition(", and")[0])
+    assert words[0] == "python"
+    subprocess.run([sys.executable, *words[1:]], check=True)
+    assert kept.exists()
+    (start,) = [finding for finding in doctor.examine(tmp_path) if finding.topic == "start"]
+    assert start.level == "ok"
 
 
 def test_doctor_says_who_evaluates(monkeypatch, tmp_path):
