@@ -198,10 +198,15 @@ def test_dependencies_are_those_that_are_imported() -> None:
     assert recorded <= needed, f"the record of a run asks for versions of {sorted(recorded - needed)}"
 
 
-def test_the_demo_installs_nothing_but_the_package() -> None:
-    make = shutil.which("make")
-    if make is None:
+@pytest.fixture
+def make() -> str:
+    found = shutil.which("make")
+    if found is None:
         pytest.skip("there is no make")
+    return found
+
+
+def test_the_demo_installs_nothing_but_the_package(make: str) -> None:
     for target, expected in (("demo", ["-e ."]), ("lint", ["-e .", "-e '.[dev]'"])):
         words = [make, "-n", target, "VENV=none"]
         lines = subprocess.run(words, check=True, cwd=ROOT, capture_output=True, text=True).stdout.splitlines()
@@ -210,11 +215,8 @@ def test_the_demo_installs_nothing_but_the_package() -> None:
         assert all(" -c constraints.txt " in line for line in installed)
 
 
-def test_make_keeps_what_python_compiles(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_make_keeps_what_python_compiles(make: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing is compiled at the installation: where nobody kept it, each process would compile PyTorch anew."""
-    make = shutil.which("make")
-    if make is None:
-        pytest.skip("there is no make")
     monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "1")
     rule = f"kept:\n\t@'{sys.executable}' -c 'import sys; print(sys.dont_write_bytecode)'\n"
     words = [make, "-f", "Makefile", "-f", "-", "kept"]

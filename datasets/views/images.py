@@ -199,7 +199,7 @@ def _find_region(
         try:
             return attempt(), "; ".join((words, *(f"not {reason}" for reason in refused)))
         except ValueError as error:
-            refused.append(str(error))
-    reasons = "; ".join(dict.fromkeys(refused))
+            if str(error) not in refused:  # the others may begin with the last one
+                refused.append(str(error))
     fix = "take more views, from other sides, or give it: scale_mat_i of NeuS's files, or region= in Python"
-    raise InputError(f"{source}: region: not found ({reasons}); {fix}")
+    raise InputError(f"{source}: region: not found ({'; '.join(refused)}); {fix}")

@@ -86,9 +86,9 @@ def _start() -> Finding:
     kept = Path(importlib.util.cache_from_source(torch.__file__))
     if kept.exists():
         return Finding("ok", "start", "PyTorch is compiled to bytecode")
-    folder = shlex.quote(str(Path(torch.__file__).parent))
-    fix = f"python -m compileall -q {folder}, and every command starts seconds sooner"
-    return Finding("warning", "start", f"Python compiles PyTorch anew each time ({kept.parent} is missing); {fix}")
+    command = shlex.join([sys.executable, "-m", "compileall", "-q", str(Path(torch.__file__).parent)])
+    fix = f"{command}, and every command starts seconds sooner"
+    return Finding("warning", "start", f"Python compiles PyTorch anew each time ({kept} is missing); {fix}")
 
 
 def _installed(name: str) -> str | None:

@@ -26,6 +26,8 @@ STATUS = Path("/proc/self/status")
 # Seconds of the smallest training step: on a CPU the calls from Python, on a GPU those and the launches of kernels.
 LEAST_STEP = {"cpu": 1.5e-3, "cuda": 3e-3}
 
+_version = functools.cache(importlib.metadata.version)  # it reads files, and every record of a run asks
+
 
 def best_seconds(work: Callable[[], object], *, repeats: int = 5, median: bool = False) -> float:
     """Least wall-clock seconds of ``repeats`` calls after one warm-up call.
@@ -114,17 +116,11 @@ def choose_device(name: str) -> torch.device:
     return device
 
 
-@functools.cache
-def _versions() -> tuple[tuple[str, str], ...]:
-    """Names and versions of the packages on which figures depend; they are read from files, and stay as they are."""
-    names = ("mplicits", "torch", "numpy", "scipy", "safetensors")
-    return tuple((name, importlib.metadata.version(name)) for name in names)
-
-
 def environment(device: torch.device) -> dict[str, Any]:
     """What the figures of a run depend on: versions, threads, machine."""
+    names = ("mplicits", "torch", "numpy", "scipy", "safetensors")
     return {
-        "versions": dict(_versions()),
+        "versions": {name: _version(name) for name in names},
         "python": platform.python_version(),
         "machine": f"{platform.system()} {platform.machine()}",
         "cpu_count": os.cpu_count(),

@@ -20,7 +20,6 @@ from mplicits.pipelines.bench.reconstruct import read_scene
 from mplicits.pipelines.bench.reconstruct_rows import MULTISCALE, NEUS, SurfaceFigures
 from mplicits.pipelines.cli.bench import GEOMETRIES as OFFERED
 from mplicits.pipelines.cli.entry import main
-from mplicits.pipelines.reconstruct import model as module
 from mplicits.pipelines.reconstruct.model import build_scene
 from mplicits.pipelines.run.settings import ReconstructConfig
 from mplicits.pipelines.run.trainer import parameter_count
@@ -45,8 +44,7 @@ def bench() -> GeometryBench:
 
 
 @pytest.mark.parametrize(("widths", "depths"), [((128, 256), (4, 5)), ((32, 48), (2, 2)), ((16, 24), (1, 1))])
-def test_one_siren_is_as_large_as_all_levels(monkeypatch, widths, depths):
-    monkeypatch.setattr(module, "fit_sphere", lambda *_: None)
+def test_one_siren_is_as_large_as_all_levels(widths, depths):
     config = dataclasses.replace(ReconstructConfig(), widths=widths, depths=depths)
     single = single_siren(config)
     levels, one, wider = (
@@ -58,8 +56,7 @@ def test_one_siren_is_as_large_as_all_levels(monkeypatch, widths, depths):
     assert single.omegas == (config.omegas[-1],)
 
 
-def test_colours_begin_alike_and_learn_at_one_rate(bench, monkeypatch):
-    monkeypatch.setattr(module, "fit_sphere", lambda *_: None)
+def test_colours_begin_alike_and_learn_at_one_rate(bench):
     weights, rates = [], set()
     for geometry in GEOMETRIES:
         for rate in bench.rates:
@@ -95,7 +92,6 @@ def test_the_interval_is_students():
 
 
 def test_the_best_rate_of_each_counts_and_gains_are_paired(bench, tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "fit_sphere", lambda *_: None)
     first = bench.run(bench.cells()[0], Workplace(tmp_path, "one"))
     row = bench.read([{"outputs": list(first.outputs)}])[0]
     assert (row.geometry, row.rate, row.seed, row.result.steps) == (MULTISCALE, 3e-4, 0, 2)

@@ -441,13 +441,12 @@ def test_doctor_says_that_nothing_is_kept_of_what_python_compiles(monkeypatch, t
     kept = Path(importlib.util.cache_from_source(torch.__file__))
     (start,) = [finding for finding in doctor.examine(tmp_path) if finding.topic == "start"]
     assert start.level == "warning"
-    assert str(kept.parent) in start.text
+    assert str(kept) in start.text
     kept.parent.mkdir(parents=True)
     Path(torch.__file__).touch()
-    (line,) = [part for part in start.text.split("; ") if part.startswith("python ")]
-    words = shlex.split(line.partition(", and")[0])
-    assert words[0] == "python"
-    subprocess.run([sys.executable, *words[1:]], check=True)
+    words = shlex.split(start.text.partition("; ")[2].partition(", and")[0])
+    assert words[0] == sys.executable  # another Python keeps other files
+    subprocess.run(words, check=True)
     assert kept.exists()
     (start,) = [finding for finding in doctor.examine(tmp_path) if finding.topic == "start"]
     assert start.level == "ok"
