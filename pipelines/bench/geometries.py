@@ -16,7 +16,7 @@ from ..reconstruct.model import SceneModel, build_scene
 from ..run.settings import ReconstructConfig
 from ..run.trainer import seeded
 from .benchmark import Benchmark, Part, one_of_each, plain
-from .cells import Workplace
+from .cells import Workplace, read_record
 from .reconstruct import ALIKE, UNUSED, BenchScene, ReconstructBench
 from .reconstruct_rows import MULTISCALE, NEUS, ReconstructRow
 from .tables import Column, Figure, Table, tabulated
@@ -124,8 +124,9 @@ class GeometryBench(Benchmark[GeometryRow]):
     """The multiscale geometry, NeuS's network, and one SIREN of as many parameters as the multiscale one.
 
     Colour network and its first weights, encodings of position and direction, features that it gets, rays, samples,
-    schedules, and rates of all that is not geometry are the same for all three. Every geometry is trained with each
-    of the rates; of these the one of the best mean PSNR is its own, a choice that favours each of them alike.
+    schedules, and rates of all that is not geometry are the same for all three. With the first seed every geometry is
+    trained with each of the rates; the one of the best PSNR is its own, a choice that favours each of them alike, and
+    with the other seeds it is trained with that rate alone.
 
     Attributes:
         scenes: of different names.
@@ -153,17 +154,22 @@ class GeometryBench(Benchmark[GeometryRow]):
     samples: int = 500_000
 
     def cells(self) -> list[Part]:
-        """One for each training, all of a seed before the next; see `Benchmark.cells`."""
+        """One for each training, all of a seed before the next; see `Benchmark.cells`.
+
+        Those of the first seed have a rate each; the others find theirs when those are done.
+        """
         one_of_each([scene.name for scene in self.scenes], "scenes")
         for scene in self.scenes:
             self._training(scene, MULTISCALE, self.rates[0], 0).views(scene)
-        every = [(scene, rate, kind) for scene in self.scenes for rate in self.rates for kind in self.geometries]
-        return [self.part(scene, kind, rate, seed) for seed in range(self.seeds) for scene, rate, kind in every]
+        first = [self.part(s, kind, r, 0) for s in self.scenes for r in self.rates for kind in self.geometries]
+        some, others = [(scene, kind) for scene in self.scenes for kind in self.geometries], range(1, self.seeds)
+        return first + [self.part(scene, kind, self.rates, seed) for seed in others for scene, kind in some]
 
-    def part(self, scene: BenchScene, geometry: str, rate: float, seed: int) -> Part:
-        """The cell of a training."""
+    def part(self, scene: BenchScene, geometry: str, rate: float | tuple[float, ...], seed: int) -> Part:
+        """The cell of a training, with a rate, or with that of several which is the best one of the first seed."""
         what = (("scene", scene.name), ("pictures", scene.digest), ("geometry", geometry), ("rate", rate))
-        return Part(self.name, f"{scene.name}, {geometry}, {rate:g}, seed {seed}", options=(*what, ("seed", seed)))
+        rates = "its rate" if isinstance(rate, tuple) else f"{rate:g}"
+        return Part(self.name, f"{scene.name}, {geometry}, {rates}, seed {seed}", options=(*what, ("seed", seed)))
 
     def settings(self, cell: Part) -> Mapping[str, Any]:
         """See `Benchmark.settings`; with the rate of the colours, which the cell's own does not change."""
@@ -183,12 +189,24 @@ class GeometryBench(Benchmark[GeometryRow]):
         """See `Benchmark.measure`; a training that is interrupted begins anew."""
         of = cell.parameters
         scene = next(scene for scene in self.scenes if scene.name == of["scene"])
-        training = self._training(scene, of["geometry"], of["rate"], of["seed"])
-        row = training.trained(scene, of["geometry"], None, work)
-        return [GeometryRow(of["geometry"], of["rate"], of["seed"], row)]
+        kind, rate, seed = of["geometry"], of["rate"], of["seed"]
+        if isinstance(rate, tuple):
+            tried = [row for one in rate for row in self._kept(self.part(scene, kind, one, 0), work)]
+            # Under a cell of its own, the training is still there when other rates are tried.
+            return self._kept(self.part(scene, kind, best_rate(tried), seed), work)
+        row = self._training(scene, kind, rate, seed).trained(scene, kind, None, work)
+        return [GeometryRow(kind, rate, seed, row)]
+
+    def _kept(self, cell: Part, work: Workplace) -> list[GeometryRow]:
+        """The rows of another cell, which is done first, unless it has been done."""
+        assert work.first is not None
+        where = work.first(cell)
+        record = read_record(where.out, where.key)
+        assert record is not None
+        return self.read([record])
 
     def tables(self, rows: Sequence[GeometryRow], *, sgemm: float) -> tuple[Table, ...]:
-        """Each geometry with its best rate, and what the multiscale one gains seed by seed."""
+        """Each geometry with its own rate, and what the multiscale one gains seed by seed."""
         best = best_trainings(rows)
         table, gains = _of_geometries(self.name, best), _gains(best)
         return (table, _of_gains(f"{self.name}-gains", gains)) if gains else (table,)
@@ -197,17 +215,19 @@ class GeometryBench(Benchmark[GeometryRow]):
 Best = Mapping[tuple[str, str], Sequence[GeometryRow]]
 
 
+def best_rate(rows: Sequence[GeometryRow]) -> float:
+    """The rate of the best PSNR among trainings of a geometry that have one seed."""
+    return max(rows, key=lambda row: row.result.psnr).rate
+
+
 def best_trainings(rows: Sequence[GeometryRow]) -> Best:
-    """Of every scene and geometry the trainings with the rate of the best mean PSNR, by their seeds."""
+    """Of every scene and geometry the trainings with the best rate of the first seed, by their seeds."""
     best: dict[tuple[str, str], list[GeometryRow]] = {}
     for scene in dict.fromkeys(row.result.scene for row in rows):
         for geometry in GEOMETRIES:
             mine = [row for row in rows if (row.result.scene, row.geometry) == (scene, geometry)]
-            tried = [[row for row in mine if row.rate == rate] for rate in dict.fromkeys(row.rate for row in mine)]
-            # A rate that has fewer trainings so far is not compared with others.
-            whole = [some for some in tried if len(some) == max(map(len, tried))]
-            if whole:
-                chosen = max(whole, key=lambda some: statistics.fmean(row.result.psnr for row in some))
+            if first := [row for row in mine if row.seed == 0]:
+                chosen = [row for row in mine if row.rate == best_rate(first)]
                 best[scene, geometry] = sorted(chosen, key=lambda row: row.seed)
     return best
 
@@ -243,8 +263,9 @@ def _of_geometries(name: str, best: Best) -> Table:
         (Column("colour", ",d"), lambda rows: rows[0].result.color_parameters),
     ]
     notes = (
-        "±: half of Student's 95 % interval over the seeds. Each geometry has that of the rates with which its mean "
-        "PSNR is best. normals: the angle whose cosine is the mean |n·n'|. Chamfer: of the largest component.",
+        "±: half of Student's 95 % interval over the seeds. Each geometry has that of the rates with which its PSNR "
+        "is best with the first seed. normals: the angle whose cosine is the mean |n·n'|. Chamfer: of the largest "
+        "component.",
     )
     items = [(f"{scene} {rows[0].result.network}", rows) for (scene, _), rows in best.items()]
     return tabulated(name, "Geometries with the same colours", "scene, geometry", figures, items, notes=notes)

@@ -371,8 +371,8 @@ def _reconstruct_arguments(parser: argparse.ArgumentParser) -> None:
     alone = parser.add_argument_group("the geometry alone")
     about = "the same colour network, encodings and rates for the multiscale geometry, NeuS's and one SIREN of its size"
     alone.add_argument("--geometry-only", action="store_true", help=about)
-    _number(alone, "--seeds", whole(2, 100), 3, "trainings of each geometry with each rate")
-    about = "peak rates that every geometry is trained with; its best one counts (--learning-rate)"
+    _number(alone, "--seeds", whole(2, 100), 3, "trainings of each geometry with its rate")
+    about = "peak rates, all tried with the first seed; each geometry keeps its best one (--learning-rate)"
     alone.add_argument("--rates", nargs="+", type=positive, metavar="RATE", help=about)
     about = f"which of them (all): {', '.join(GEOMETRIES)}"
     alone.add_argument("--geometries", nargs="+", choices=GEOMETRIES, metavar="NAME", help=about)

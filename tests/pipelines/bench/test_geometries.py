@@ -12,6 +12,7 @@ from mplicits.pipelines.bench.geometries import (
     SINGLE,
     GeometryBench,
     GeometryRow,
+    _Training,
     best_trainings,
     interval,
     single_siren,
@@ -102,10 +103,9 @@ def test_the_best_rate_of_each_counts_and_gains_are_paired(bench, tmp_path, monk
         return GeometryRow(geometry, rate, seed, result)
 
     rows = [scored(MULTISCALE, rate, seed, 20 + seed) for rate in (3e-4,) for seed in (0, 1)]
-    rows += [scored(NEUS, 3e-4, seed, 10) for seed in (0, 1)]
-    rows += [scored(NEUS, 1e-3, seed, 18 + seed) for seed in (0, 1)]
+    rows += [scored(NEUS, 3e-4, 0, 10), scored(NEUS, 1e-3, 0, 18), scored(NEUS, 1e-3, 1, 19)]
     rows += [scored(SINGLE, 3e-4, seed, 19 + 3 * seed) for seed in (0, 1)]
-    rows += [scored(SINGLE, 1e-3, 0, 40)]  # not as often as the other rate so far
+    rows += [scored(SINGLE, 1e-3, 0, 18.9), scored(SINGLE, 1e-3, 1, 40)]  # the first seed chooses, not the best of all
     best = best_trainings(rows)
     assert [best["painted-sphere", geometry][0].rate for geometry in GEOMETRIES] == [3e-4, 1e-3, 3e-4]
     table, gains = bench.tables(rows, sgemm=1.0)
@@ -116,9 +116,29 @@ def test_the_best_rate_of_each_counts_and_gains_are_paired(bench, tmp_path, monk
 
 def test_cells_are_whole_seeds_first(bench):
     cells = [cell.parameters for cell in bench.cells()]
-    assert len(cells) == 2 * 2 * 3
-    assert [one["seed"] for one in cells] == 6 * [0] + 6 * [1]
-    assert {one["geometry"] for one in cells[:3]} == set(GEOMETRIES)
+    assert len(cells) == 2 * 3 + 3
+    assert [one["seed"] for one in cells] == 6 * [0] + 3 * [1]
+    assert {one["geometry"] for one in cells[:3]} == {one["geometry"] for one in cells[6:]} == set(GEOMETRIES)
+
+
+def test_other_seeds_have_the_rate_of_the_first(bench, tmp_path, monkeypatch):
+    trained: list[tuple[float, int]] = []
+    real = _Training.trained
+
+    def watched(self, *arguments):
+        trained.append((self.config.learning_rate, self.config.seed))
+        row = real(self, *arguments)
+        return dataclasses.replace(row, psnr={3e-4: 20.0, 1e-3: 21.0, 3e-3: 19.0}[self.config.learning_rate])
+
+    monkeypatch.setattr(_Training, "trained", watched)
+    some = dataclasses.replace(bench, geometries=(MULTISCALE,))
+    rows = some.rows(tmp_path)
+    assert trained == [(3e-4, 0), (1e-3, 0), (1e-3, 1)] == [(row.rate, row.seed) for row in rows]
+    assert [row.rate for row in best_trainings(rows)["painted-sphere", MULTISCALE]] == [1e-3, 1e-3]
+    # With one more rate, that alone is trained, and the same one is still the best.
+    more = dataclasses.replace(some, rates=(*some.rates, 3e-3)).rows(tmp_path)
+    assert trained[3:] == [(3e-3, 0)]
+    assert [(row.rate, row.seed) for row in more] == [(3e-4, 0), (1e-3, 0), (3e-3, 0), (1e-3, 1)]
 
 
 def test_rates_without_the_geometry_alone_are_refused(capsys):
