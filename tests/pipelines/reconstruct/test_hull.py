@@ -11,9 +11,18 @@ from mplicits.datasets.views.images import PosedImages
 from mplicits.neural_fields import InputError, Siren
 from mplicits.pipelines.reconstruct import hull
 from mplicits.pipelines.reconstruct import model as scene_model
-from mplicits.pipelines.reconstruct.hull import begin, carve, start_at_hull
+from mplicits.pipelines.reconstruct.hull import (
+    COARSEST,
+    FINEST,
+    PIXELS,
+    begin,
+    carve,
+    fitting_resolution,
+    start_at_hull,
+)
 from mplicits.pipelines.reconstruct.measured import MeasuredDepths
 from mplicits.pipelines.reconstruct.model import build_scene
+from mplicits.pipelines.reconstruct.silhouettes import trusted
 from mplicits.pipelines.run.settings import ReconstructConfig
 
 SMALL = ReconstructConfig(
@@ -77,13 +86,60 @@ def test_a_sphere_is_carved_out() -> None:
     assert float(distances[resolution // 2, resolution // 2, resolution // 2]) < -RADIUS + cell
 
 
-def test_one_wrong_mask_in_thirty_takes_nothing_away() -> None:
+def test_coarse_grids_decide_nothing_that_the_fine_one_would_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = render_scene(SCENES["striped-torus"](), views=12, size=24, samples=1)
+    carved = carve(scene.views, scene.similarity, resolution=64)
+    monkeypatch.setattr(hull, "COARSEST", 64)
+    at_once = carve(scene.views, scene.similarity, resolution=64)
+    assert carved is not None
+    assert at_once is not None
+    assert np.array_equal(carved, at_once)
+    assert carved[32, 32, 32] > 0  # there is a hole
+
+
+def test_a_gap_that_one_camera_of_many_sees_is_carved() -> None:
     views = list(images().views) * 3
+    mask = np.array(views[7].mask)
+    mask[11:14, 11:14] = 0  # of which a pixel is left, as far as a cell is from others
+    views[7] = replace(views[7], mask=mask)
+    assert len(trusted(views, images().similarity)) == len(views)
+    distances = carve(views, images().similarity, resolution=32)
+    assert distances is not None
+    assert distances[16, 16, 16] > 0  # in the middle of the hole, and of the ball
+
+
+def test_masks_that_are_wrong_do_not_carve() -> None:
+    views, similarity = list(images().views) * 3, images().similarity
+    assert trusted(views, similarity) == views
     views[0] = inverted().views[0]
-    right, wrong = (carve(some, images().similarity, resolution=16) for some in (images().views, views))
-    assert right is not None
-    assert wrong is not None
-    assert bool(((wrong < 0) | (right > 0)).all())
+    mask = np.array(views[1].mask)
+    mask[8:16, 8:16] = 0
+    views[1] = replace(views[1], mask=mask)
+    assert [id(view) for view in trusted(views, similarity)] == [id(view) for view in views[2:]]
+    # Where all are inverted, nothing tells which to trust; of three views each may cut a third.
+    turned = inverted().views
+    assert trusted(turned, similarity) is turned
+    assert trusted(views[2:5], similarity) == views[2:5]
+
+
+@pytest.mark.parametrize(("size", "expected"), [(12, 32), (48, 64), (400, 128)])
+def test_cells_are_as_large_as_pixels(size: int, expected: int) -> None:
+    # A pixel of the 24 sees |eye| / f of a plane through the middle; one of them is 24 / size as large.
+    views = [replace(view, camera=view.camera.resized(size, size)) for view in images().views]
+    resolution = fitting_resolution(views, images().similarity)
+    camera = views[0].camera
+    pixel = float(camera.eye.norm() / camera.intrinsics[0, 0])
+    assert resolution == expected
+    assert 2 / resolution <= PIXELS * pixel or resolution == FINEST
+    assert 4 / resolution > PIXELS * pixel or resolution == COARSEST
+
+
+def test_a_finer_grid_is_empty_between_empty_vertices() -> None:
+    empty = np.zeros((4, 4, 4), dtype=bool)
+    empty[1:3] = True
+    fine = hull._all_around(empty, 6)
+    assert [bool(fine[i].all()) for i in range(7)] == [False, False, True, True, True, False, False]
+    assert np.array_equal(hull._all_around(empty, 3), empty)
 
 
 def test_masks_that_leave_nothing_are_no_start() -> None:
@@ -133,11 +189,11 @@ def test_what_no_measured_ray_passes_is_a_start(monkeypatch: pytest.MonkeyPatch)
         measured = MeasuredDepths(some.views, some, torch.device("cpu"))
         model = build_scene(SMALL, has_masks=some is scene)
         assert begin(model, some.views, some, replace(SMALL, start=start), measured) == expected
-    length, cell = lengths(hull.RESOLUTION + 1), 2 / hull.RESOLUTION
     # Vertices half a diagonal inside are never passed, and those beyond what the rays see are solid; the distances
     # are those of a grid, to a cell.
+    cell = 2 / hull.RESOLUTION
     for distances in started:
-        assert bool((distances[length < RADIUS - 2 * cell] < 0).all())
+        assert bool((distances[lengths(len(distances)) < RADIUS - 2 * cell] < 0).all())
     by_masks = carve(scene.views, scene.similarity)
     assert by_masks is not None
     assert bool((started[1] >= by_masks - 2 * cell).all())  # carved further
