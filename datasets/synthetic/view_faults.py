@@ -19,6 +19,8 @@ TURN = 0.5  # degrees, standard deviation of an inexact pose about each axis
 SHIFT = 0.005  # the same of its eye along each axis, in radii of the region
 LOST = 30.0  # degrees that one camera looks past the object
 DARKER = 0.5  # light of every other photograph
+# Of the masks that have a hole: the first, how many further on the next one is, and its radius as a share of the width.
+TORN, HOLE = slice(2, None, 12), 0.1
 
 
 def with_fault(images: PosedImages, fault: str, seed: int = 0) -> PosedImages:
@@ -27,8 +29,9 @@ def with_fault(images: PosedImages, fault: str, seed: int = 0) -> PosedImages:
     ``poses``: each camera is turned about its eye, by 0.5° (standard deviation) about each axis, and moved by 0.5 % of
     the region's radius along each; ``pose``: one camera looks 30° past the object; ``image``: one photograph is that of
     another camera; ``mirrored``: all pictures are, left to right; ``masks``: object and background have changed places;
-    ``exposure``: every other photograph has half of the light. What concerns one picture concerns the third, which is
-    not held out. Depth maps go with their pictures and their cameras.
+    ``holes``: every twelfth mask has a hole in the middle of the object, a fifth of the picture wide; ``exposure``:
+    every other photograph has half of the light. What concerns one picture concerns the third, which is not held out,
+    and holes begin with it. Depth maps go with their pictures and their cameras.
 
     Args:
         images: of one size, three at least.
@@ -92,6 +95,21 @@ def _masks(images: PosedImages, _: np.random.Generator) -> list[PosedImage]:
     return [replace(view, mask=None if view.mask is None else 1 - view.mask) for view in images.views]
 
 
+def _holes(images: PosedImages, _: np.random.Generator) -> list[PosedImage]:
+    views = list(images.views)
+    views[TORN] = [_torn(view) for view in views[TORN]]
+    return views
+
+
+def _torn(view: PosedImage) -> PosedImage:
+    if view.mask is None or not view.mask.any():
+        return view
+    y, x = np.indices(view.mask.shape)
+    down, across = (np.average(axis, weights=view.mask) for axis in (y, x))
+    hole = (y - down) ** 2 + (x - across) ** 2 < (HOLE * view.mask.shape[1]) ** 2
+    return replace(view, mask=np.where(hole, 0, view.mask).astype(view.mask.dtype))
+
+
 def _exposure(images: PosedImages, _: np.random.Generator) -> list[PosedImage]:
     return [
         replace(view, color=linear_to_srgb(DARKER * srgb_to_linear(view.color)).astype(np.float32)) if odd % 2 else view
@@ -105,5 +123,6 @@ VIEW_FAULTS: dict[str, Callable[[PosedImages, np.random.Generator], list[PosedIm
     "image": _image,
     "mirrored": _mirrored,
     "masks": _masks,
+    "holes": _holes,
     "exposure": _exposure,
 }

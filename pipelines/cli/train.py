@@ -167,6 +167,7 @@ def _reconstruct_here(arguments: argparse.Namespace, config: ReconstructConfig |
     from ..mesh.extract import mesh_run
     from ..mesh.plan import mesh_stage, meshing
     from ..reconstruct.posing import find_cameras_timed
+    from ..reconstruct.silhouettes import named
     from ..reconstruct.train import HELD_OUT_FILE, MESH_FILE, reconstruct, usual_stages
     from ..run.costs import Net
     from ..run.folder import check_new_run, read_record
@@ -191,6 +192,11 @@ def _reconstruct_here(arguments: argparse.Namespace, config: ReconstructConfig |
             lines: list[str] = []
             mesh = mesh_run(directory, directory / MESH_FILE, say=lines.append)
     tell_budget(run.record)
+    if torn := run.record.get("mask_holes"):
+        print(
+            f"warning: {len(torn)} masks have holes where all others see object; left out: {named([*torn])}",
+            file=sys.stderr,
+        )
     views, held_out = run.record["views"], run.record["held_out"]
     print(
         f"{run.record['data']}: {views['trained']} views, {run.record['steps']:,} steps in "

@@ -142,7 +142,7 @@ CHECK_CAMERAS = Command(
 
 
 SCENE_NAMES = ("painted-sphere", "striped-torus", "figure", "statue")
-FAULTS = ("poses", "pose", "image", "mirrored", "masks", "exposure")
+FAULTS = ("poses", "pose", "image", "mirrored", "masks", "holes", "exposure")
 FORMATS = ("neus", "transforms", "colmap", "colmap-text")
 TRUTH = "surface.ply"
 

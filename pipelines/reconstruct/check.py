@@ -25,7 +25,7 @@ from ...neural_fields import InputError, Similarity
 from ..mesh.files import write_mesh
 from .depth_check import DepthCheck, check_depths
 from .frustums import camera_mesh
-from .silhouettes import contradictions, how_turned, named
+from .silhouettes import contradictions, holes, how_turned, named
 
 __all__ = ["CameraCheck", "check_cameras", "check_files", "format_check"]
 
@@ -279,12 +279,16 @@ def _silhouettes(images: PosedImages) -> Iterator[str]:
         yield "the masks cover the borders of the pictures and not their middles: they look inverted; white is object"
     elif turned := how_turned(views, images.similarity):
         yield f"the silhouettes contradict each other, and would not if the pictures were not {turned}"
-    elif odd:
-        names = named([view.name for view in odd])
-        yield (
-            f"{len(odd)} of {len(views)} silhouettes contradict the others: {names}; is that the right picture, the "
-            "right way round, and its pose and mask right?"
-        )
+    else:
+        if odd:
+            names = named([view.name for view in odd])
+            yield (
+                f"{len(odd)} of {len(views)} silhouettes contradict the others: {names}; is that the right picture, "
+                "the right way round, and its pose and mask right?"
+            )
+        if torn := holes(views, images.similarity):
+            names = named([views[index].name for index in torn])
+            yield f"{len(torn)} of {len(views)} masks have a hole where all others see object: {names}; fill it"
 
 
 def _mask_inside(views: Sequence[PosedImage], cameras: Sequence[Camera]) -> float | None:

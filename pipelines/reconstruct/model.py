@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -263,6 +263,7 @@ class RayPool:
         device: where the rays are wanted.
         whole: keep the pixels that do not see the region, too.
         flat: keep how little the pictures show at each pixel.
+        left_out: by the number of a view, pixels of it that are not kept ``(H, W)``.
 
     Raises:
         InputError: no ray of any picture meets the region of interest.
@@ -276,6 +277,7 @@ class RayPool:
         *,
         whole: bool = False,
         flat: bool = False,
+        left_out: Mapping[int, np.ndarray] | None = None,
     ) -> None:
         self.device, self.has_masks = device, all(view.mask is not None for view in views)
         cameras = [view.camera.moved(similarity) for view in views]
@@ -289,7 +291,10 @@ class RayPool:
             near, far = sphere_span(*camera_rays(camera))
             hit = far > near
             hits += int(hit.sum())
-            kept = torch.arange(len(hit)) if whole else hit.nonzero()[:, 0]
+            wanted = torch.ones_like(hit) if whole else hit
+            if left_out and index in left_out:
+                wanted = wanted & ~torch.from_numpy(left_out[index].reshape(-1))
+            kept = wanted.nonzero()[:, 0]
             pixels.append(kept.int())
             owners.append(torch.full_like(kept, index, dtype=torch.int16))
             # Eight bits hold what pictures hold; a pool of float32 would be four times as large.

@@ -15,7 +15,7 @@ from torch import Tensor
 from ...datasets.views.images import PosedImage
 from ...neural_fields import Similarity
 
-__all__ = ["OBJECT", "contradictions", "grid_in_ball", "how_turned", "named", "silhouettes", "trusted"]
+__all__ = ["OBJECT", "contradictions", "grid_in_ball", "holes", "how_turned", "named", "silhouettes", "trusted"]
 
 OBJECT = 0.5  # a pixel with a larger share of object counts as one
 COARSE = 32  # cells along the grid on which silhouettes are compared
@@ -26,9 +26,9 @@ ODD = 0.4
 # Or one that alone cuts so much from what all others leave, and so many times as much as the next one does; of few
 # views each cuts much, by right.
 ALONE, OF_FEW, TIMES = 0.1, 2.0, 5.0
-# A view that alone cuts more than that, or than its share of few views, does not carve. Of some four hundred right ones
-# of nine things three did, which the others make up for; and all that had a hole a sixth of the picture wide.
-LONE = 0.02
+# A view is not trusted that alone cuts more than this of what all others leave. Of right ones, three of three hundred
+# do; of masks with a hole a sixth of the picture wide, all. Of few views each may cut much, by right.
+LONE, FEW = 0.02, 20
 # Pictures are turned if more than this share of their object is where no hull is (of right ones, whatever was tried,
 # 0.001 at most), and a quarter of that once they are turned back.
 NO_HULL, TURNED_BACK = 0.005, 0.25
@@ -68,7 +68,7 @@ def silhouettes(
         reach = math.ceil(0.5 * edge * float(camera.intrinsics[0, 0]) / float(camera.eye.norm().clamp(min=edge)))
         mask = view.mask > OBJECT
         cut = bool(mask[[0, -1]].any() or mask[:, [0, -1]].any())
-        mask = _widened(mask, reach)
+        mask = torch.from_numpy(_widened(mask, reach))
         pixels, depth = camera.project(points)
         column, row = pixels.round().long().unbind(dim=1)
         inside = (depth > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
@@ -79,10 +79,10 @@ def silhouettes(
         )
 
 
-def _widened(mask: NDArray[np.bool_], reach: int) -> Tensor:
+def _widened(mask: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
     """What is within so many pixels of something, in either direction ``(H, W)``."""
     window = cv2.getStructuringElement(cv2.MORPH_RECT, (2 * reach + 1, 2 * reach + 1))
-    return torch.from_numpy(cv2.dilate(mask.astype(np.uint8), window) > 0)
+    return np.asarray(cv2.dilate(mask.astype(np.uint8), window)) > 0
 
 
 def contradictions(views: Sequence[PosedImage], similarity: Similarity) -> tuple[bool, list[PosedImage]]:
@@ -105,9 +105,6 @@ def contradictions(views: Sequence[PosedImage], similarity: Similarity) -> tuple
 def trusted(views: Sequence[PosedImage], similarity: Similarity) -> Sequence[PosedImage]:
     """Views that may carve a visual hull: all but those that contradict the others, or cut much that no other does.
 
-    A hole in a mask cuts a tunnel through the hull, and so does a gap that only one camera looks through; but that one
-    is small.
-
     Args:
         views: pictures, all with masks.
         similarity: from world to unit-sphere coordinates.
@@ -115,8 +112,44 @@ def trusted(views: Sequence[PosedImage], similarity: Similarity) -> Sequence[Pos
     if all(_looks_inverted(views)):
         return views
     seen, against = _told(views, similarity)
-    wrong = _odd(seen, against) | (_lone_cuts(seen, against) > max(LONE, 1 / len(views)))
+    wrong = _odd(seen, against) | _cuts_alone(seen, against)
     return [view for view, is_wrong in zip(views, wrong.tolist(), strict=True) if not is_wrong]
+
+
+def holes(views: Sequence[PosedImage], similarity: Similarity) -> dict[int, NDArray[np.bool_]]:
+    """Holes in masks: background with object all around it, where all other views take for object what is behind.
+
+    A hole in a mask cuts a tunnel through the visual hull that no other silhouette does. So does a gap through which
+    only one camera looks, but of many views that one is small, and views that alone cut little are not asked. Nor are
+    those that contradict the others in everything (`contradictions`), nor any where there are few.
+
+    Args:
+        views: pictures, all with masks.
+        similarity: from world to unit-sphere coordinates.
+
+    Returns:
+        By the number of the view, for those that have any, pixels ``(H, W)``.
+    """
+    if all(_looks_inverted(views)):
+        return {}
+    seen, against = _told(views, similarity)
+    alone = against & (against.sum(dim=0) == 1)
+    points, found = grid_in_ball(COARSE)[0], {}
+    for index in (_cuts_alone(seen, against) & ~_odd(seen, against)).nonzero()[:, 0].tolist():
+        mask = views[index].mask
+        assert mask is not None
+        behind = _shadow(views[index], similarity, points[alone[index]], 2 / COARSE)
+        hole = behind & _enclosed(mask <= OBJECT)
+        if hole.any():
+            found[index] = hole
+    return found
+
+
+def _enclosed(background: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The parts of it that reach no border of the picture ``(H, W)``."""
+    labels = np.asarray(cv2.connectedComponents(background.astype(np.uint8), connectivity=4)[1])
+    outer = np.unique(np.concatenate([*labels[[0, -1]], *labels[:, [0, -1]].T]))
+    return background & ~np.isin(labels, outer)
 
 
 def _told(views: Sequence[PosedImage], similarity: Similarity) -> tuple[Tensor, Tensor]:
@@ -131,6 +164,11 @@ def _lone_cuts(seen: Tensor, against: Tensor) -> Tensor:
     """What each view contradicts alone, as a share of what none does ``(V,)``."""
     times = against.sum(dim=0)
     return (against & (times == 1)).sum(dim=1) / ((times == 0) & seen.any(dim=0)).sum().clamp(min=1)
+
+
+def _cuts_alone(seen: Tensor, against: Tensor) -> Tensor:
+    """Which views of many cut much that no other one does ``(V,)``."""
+    return (_lone_cuts(seen, against) > LONE) & (len(seen) >= FEW)
 
 
 def _odd(seen: Tensor, against: Tensor) -> Tensor:
@@ -177,17 +215,21 @@ def _without_hull(views: Sequence[PosedImage], similarity: Similarity) -> float:
     shares = []
     for view in views:
         assert view.mask is not None
-        camera = view.camera.moved(similarity)
-        reach = math.ceil(edge * float(camera.intrinsics[0, 0]) / float(camera.eye.norm().clamp(min=edge)))
-        pixels, depth = camera.project(hull)
-        column, row = pixels.round().long().unbind(dim=1)
-        inside = (depth > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-        there = np.zeros((camera.height, camera.width), dtype=bool)
-        there[row[inside].numpy(), column[inside].numpy()] = True
-        there = _widened(there, reach)
-        mask = torch.from_numpy(view.mask > OBJECT)
-        shares.append(float((mask & ~there).sum() / mask.sum().clamp(min=1)))
+        mask = view.mask > OBJECT
+        shares.append((mask & ~_shadow(view, similarity, hull, edge)).sum() / max(mask.sum(), 1))
     return float(np.median(shares))
+
+
+def _shadow(view: PosedImage, similarity: Similarity, points: Tensor, edge: float) -> NDArray[np.bool_]:
+    """Where a view sees points ``(N, 3)``, and all within a cell of them ``(H, W)``."""
+    camera = view.camera.moved(similarity)
+    reach = math.ceil(edge * float(camera.intrinsics[0, 0]) / float(camera.eye.norm().clamp(min=edge)))
+    pixels, depth = camera.project(points)
+    column, row = pixels.round().long().unbind(dim=1)
+    inside = (depth > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    there = np.zeros((camera.height, camera.width), dtype=bool)
+    there[row[inside].numpy(), column[inside].numpy()] = True
+    return _widened(there, reach)
 
 
 def _looks_inverted(views: Sequence[PosedImage]) -> tuple[bool, bool]:

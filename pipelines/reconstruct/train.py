@@ -39,6 +39,7 @@ from .model import RayPool, SceneModel, build_scene
 from .objective import scene_trainer
 from .plan import SEEING, SPHERE, WITNESSES, ReconstructPlan, level_stage
 from .seen import seen_points
+from .silhouettes import holes
 from .views import ViewImage, comparison_sheet, exposed_as, held_out, measure, reduced, render_image, spread
 
 __all__ = [
@@ -170,7 +171,8 @@ class _Reconstruction:
         has_masks = all(view.mask is not None for view in self.train_views)
         self.model = build_scene(config, has_masks=has_masks, views=len(self.train_views)).to(device)
         whole, flat = self.model.outside is not None, config.smooth_weight > 0
-        pool = RayPool(self.train_views, images.similarity, device, whole=whole, flat=flat)
+        self.holes = holes(self.train_views, images.similarity) if has_masks else {}
+        pool = RayPool(self.train_views, images.similarity, device, whole=whole, flat=flat, left_out=self.holes)
         measured = MeasuredDepths(self.train_views, images, device, seed=config.seed) if config.depth_weight else None
         self.measured = measured or None
         self.start = "sphere" if resume else begin(self.model, self.train_views, images, config, self.measured)
@@ -279,6 +281,10 @@ class _Reconstruction:
             self.schedule(Progress("held-out views", index + 1, count, (index + 1) / count, {}))
         return pairs
 
+    def _torn(self) -> dict[str, int]:
+        """How many pixels are left out of each picture whose mask has a hole."""
+        return {self.train_views[index].name: int(hole.sum()) for index, hole in self.holes.items()}
+
     def _figures(self, pairs: Sequence[tuple[PosedImage, ViewImage]]) -> dict[str, Any] | None:
         """Means over the held-out views, and each one's figures; None without such views."""
         if not pairs:
@@ -346,6 +352,7 @@ class _Reconstruction:
             "parameters": {name: parameter_count(part) for name, part in parts.items()},
             "deltas": model.geometry.deltas.tolist(),
             **({} if model.exposures is None else {"exposures": self._by_view(("gain", "offset"), model.exposures())}),
+            **({"mask_holes": self._torn()} if self.holes else {}),
             **({} if self.measured is None else {"measured_depths": len(self.measured)}),
             **({} if model.poses is None else {"poses": self._by_view(("turn", "shift"), model.poses())}),
             "inv_std": float(model.inv_std.detach()),

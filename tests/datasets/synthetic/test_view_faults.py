@@ -72,11 +72,13 @@ def test_mirrored_twice_is_as_before(images: PosedImages) -> None:
 @pytest.mark.parametrize("fault", sorted(VIEW_FAULTS))
 def test_depth_maps_go_with_their_pictures_and_cameras(fault: str) -> None:
     figure = render_scene(SCENES["figure"](), views=4, size=16, samples=1, depths=True)
-    for view in with_fault(figure, fault).views:
+    for view, right in zip(with_fault(figure, fault).views, figure.views, strict=True):
         assert view.depth is not None
         assert torch.equal(view.depth.camera.world_from_camera, view.camera.world_from_camera)
         assert view.mask is not None
-        inside = view.mask > 0.5  # one sample in the middle of each pixel: a depth is where the mask is
+        # One sample in the middle of each pixel: a depth is where the mask is, or was before it had a hole.
+        assert right.mask is not None
+        inside = (right.mask if fault == "holes" else view.mask) > 0.5
         assert np.array_equal(np.isfinite(view.depth.numbers), ~inside if fault == "masks" else inside)
 
 
@@ -85,6 +87,17 @@ def test_masks_are_inverted(images: PosedImages) -> None:
         assert old.mask is not None
         assert new.mask is not None
         assert np.allclose(old.mask + new.mask, 1)
+
+
+def test_every_twelfth_mask_has_a_hole_in_its_middle() -> None:
+    images = render_scene(SCENES["painted-sphere"](), views=15, size=30, samples=1)
+    made = with_fault(images, "holes")
+    cut = [a.mask != b.mask for a, b in zip(images.views, made.views, strict=True)]
+    assert [index for index, hole in enumerate(cut) if hole.any()] == [2, 14]
+    # The sphere is in the middle: a disc of radius 3 around it.
+    y, x = np.indices((30, 30)) - 14.5
+    assert all(np.array_equal(cut[index], x**2 + y**2 < 9) for index in (2, 14))
+    assert all(a.color is b.color for a, b in zip(images.views, made.views, strict=True))
 
 
 def test_every_other_photograph_has_half_of_the_light(images: PosedImages) -> None:

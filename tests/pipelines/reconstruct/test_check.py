@@ -18,7 +18,7 @@ from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.cli.views import SCENE_NAMES
 from mplicits.pipelines.reconstruct.check import check_cameras, check_files
 from mplicits.pipelines.reconstruct.frustums import camera_mesh, frustum_size
-from mplicits.pipelines.reconstruct.silhouettes import contradictions
+from mplicits.pipelines.reconstruct.silhouettes import contradictions, holes
 from mplicits.pipelines.surface.surface import read_surface
 
 WRITERS = {"neus": write_neus, "transforms": write_transforms, "colmap": write_colmap}
@@ -200,6 +200,25 @@ def test_a_picture_of_something_else(torus):
 @pytest.fixture(scope="module")
 def figure():
     return render_scene(SCENES["figure"](), 24, 64, samples=1)
+
+
+def test_masks_with_holes(figure):
+    assert holes(figure.views, figure.similarity) == {}
+    torn = with_fault(figure, "holes")
+    assert the_warning(torn) == "2 of 24 masks have a hole where all others see object: 002.png, 014.png; fill it"
+    found = holes(torn.views, torn.similarity)
+    for index, hole in found.items():
+        missing = (figure.views[index].mask > 0.5) & (torn.views[index].mask <= 0.5)
+        # All of it, and nothing else but gaps that are no wider than a cell away from it.
+        assert hole[missing].all()
+        assert not hole[torn.views[index].mask > 0.5].any()
+        assert (hole & ~missing).sum() < 0.2 * missing.sum()
+    few = dataclasses.replace(torn, views=torn.views[:12])  # of which each may cut much
+    assert holes(few.views, few.similarity) == {}
+    notch = np.array(figure.views[2].mask)
+    notch[20:44, :32] = 0  # open to the border: it may be the outline
+    cut = with_views(figure, lambda k, v: dataclasses.replace(v, mask=notch) if k == 2 else v)
+    assert holes(cut.views, cut.similarity) == {}
 
 
 @pytest.mark.parametrize(

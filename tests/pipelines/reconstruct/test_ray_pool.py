@@ -77,6 +77,16 @@ def test_pixels_that_miss_the_sphere_are_never_drawn_and_all_others_are() -> Non
     assert set(places(pool)[0]) == expected
 
 
+@pytest.mark.parametrize("whole", [False, True])
+def test_pixels_that_are_left_out_are_never_drawn(whole: bool) -> None:
+    pictures = views()
+    hole = np.zeros(pictures[1].color.shape[:2], dtype=bool)
+    hole[3:9, 2:6] = True
+    everything, rest = (places(RayPool(pictures, WORLD, CPU, whole=whole, left_out=out))[0] for out in ({}, {1: hole}))
+    assert set(rest) == {(number, y, x) for number, y, x in everything if number != 1 or not hole[y, x]}
+    assert len(set(rest)) < len(set(everything))
+
+
 def test_all_pixels_are_drawn_where_the_outside_is_learnt() -> None:
     pictures = views()
     pool = RayPool(pictures, WORLD, CPU, whole=True)

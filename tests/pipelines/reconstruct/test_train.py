@@ -15,6 +15,7 @@ import torch
 from mplicits.datasets import read_cloud
 from mplicits.datasets.clouds.orientation import fibonacci_directions
 from mplicits.datasets.synthetic.scenes import SCENES, render_scene, sample_scene
+from mplicits.datasets.synthetic.view_faults import with_fault
 from mplicits.datasets.views.images import PosedImages
 from mplicits.datasets.views.writing import write_neus, write_transforms
 from mplicits.neural_fields import (
@@ -29,6 +30,7 @@ from mplicits.neural_fields import (
 )
 from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.mesh.extract import MeshOptions, mesh_run
+from mplicits.pipelines.reconstruct import silhouettes
 from mplicits.pipelines.reconstruct.model import SceneModel
 from mplicits.pipelines.reconstruct.train import Reconstruction, reconstruct, surface_colors
 from mplicits.pipelines.run.config import load_config
@@ -381,6 +383,18 @@ def test_the_command_leaves_a_coloured_mesh(data: Path, tmp_path: Path, capsys: 
         "support.safetensors",
     ]
     assert "is finished, so there is nothing to resume" in fails(capsys, f"reconstruct {data} -o {run} --resume")
+
+
+def test_what_is_behind_holes_of_masks_is_not_learnt(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(silhouettes, "FEW", 4)
+    torn = with_fault(render_scene(SCENES["painted-sphere"](), views=6, size=24, samples=1), "holes")
+    write_neus(tmp_path / "torn", torn)
+    assert main(f"reconstruct {tmp_path / 'torn'} -o {tmp_path / 'run'} {FLAGS} --texture-steps 0".split()) == 0
+    assert "1 masks have holes where all others see object; left out: image/002.png" in capsys.readouterr().err
+    missing = (torn.views[3].mask > 0.5) & (torn.views[2].mask <= 0.5)
+    assert json.loads((tmp_path / "run" / "run.json").read_text())["mask_holes"] == {"image/002.png": missing.sum()}
 
 
 def test_the_command_says_how_to_go_on(
