@@ -167,7 +167,6 @@ def _reconstruct_here(arguments: argparse.Namespace, config: ReconstructConfig |
     from ..mesh.extract import mesh_run
     from ..mesh.plan import mesh_stage, meshing
     from ..reconstruct.posing import find_cameras_timed
-    from ..reconstruct.silhouettes import named
     from ..reconstruct.train import HELD_OUT_FILE, MESH_FILE, reconstruct, usual_stages
     from ..run.costs import Net
     from ..run.folder import check_new_run, read_record
@@ -192,11 +191,7 @@ def _reconstruct_here(arguments: argparse.Namespace, config: ReconstructConfig |
             lines: list[str] = []
             mesh = mesh_run(directory, directory / MESH_FILE, say=lines.append)
     tell_budget(run.record)
-    if torn := run.record.get("mask_holes"):
-        print(
-            f"warning: {len(torn)} masks have holes where all others see object; left out: {named([*torn])}",
-            file=sys.stderr,
-        )
+    _tell_left_out(run.record)
     views, held_out = run.record["views"], run.record["held_out"]
     print(
         f"{run.record['data']}: {views['trained']} views, {run.record['steps']:,} steps in "
@@ -212,6 +207,20 @@ def _reconstruct_here(arguments: argparse.Namespace, config: ReconstructConfig |
         print(f"  {line}")
     print(f"next: mplicits view {directory}")
     return 0
+
+
+def _tell_left_out(record: dict[str, Any]) -> None:
+    """Warn, on stderr, of photographs, and parts of them, that were not trained on."""
+    from ..reconstruct.silhouettes import named
+
+    odd, torn = record.get("left_out", []), record.get("mask_holes", {})
+    trained = record["views"]["trained"]
+    if odd:
+        count = f"{len(odd)} of {trained + len(odd)}"
+        print(f"warning: {count} silhouettes contradict the others; left out: {named(odd)}", file=sys.stderr)
+    if torn:
+        what = f"{len(torn)} of {trained} masks have a hole where all others see object"
+        print(f"warning: {what}; its pixels are left out: {named([*torn])}", file=sys.stderr)
 
 
 RECONSTRUCT = Command(

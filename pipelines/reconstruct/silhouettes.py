@@ -15,7 +15,17 @@ from torch import Tensor
 from ...datasets.views.images import PosedImage
 from ...neural_fields import Similarity
 
-__all__ = ["OBJECT", "contradictions", "grid_in_ball", "holes", "how_turned", "named", "silhouettes", "trusted"]
+__all__ = [
+    "OBJECT",
+    "contradictions",
+    "grid_in_ball",
+    "holes",
+    "how_turned",
+    "named",
+    "outliers",
+    "silhouettes",
+    "trusted",
+]
 
 OBJECT = 0.5  # a pixel with a larger share of object counts as one
 COARSE = 32  # cells along the grid on which silhouettes are compared
@@ -29,6 +39,7 @@ ALONE, OF_FEW, TIMES = 0.1, 2.0, 5.0
 # A view is not trusted that alone cuts more than this of what all others leave. Of right ones, three of three hundred
 # do; of masks with a hole a sixth of the picture wide, all. Of few views each may cut much, by right.
 LONE, FEW = 0.02, 20
+MOST_ODD = 0.1  # share of the views that may be left out because the others contradict them
 # Pictures are turned if more than this share of their object is where no hull is (of right ones, whatever was tried,
 # 0.001 at most), and a quarter of that once they are turned back.
 NO_HULL, TURNED_BACK = 0.005, 0.25
@@ -100,6 +111,19 @@ def contradictions(views: Sequence[PosedImage], similarity: Similarity) -> tuple
         return True, []
     odd = _odd(*_told(views, similarity))
     return False, [view for view, is_odd in zip(views, odd.tolist(), strict=True) if is_odd]
+
+
+def outliers(views: Sequence[PosedImage], similarity: Similarity) -> list[PosedImage]:
+    """Views that teach nothing right: those of `contradictions`, if they are a tenth of all at most.
+
+    Of more than that nobody knows whether they are wrong, or the others are.
+
+    Args:
+        views: pictures, all with masks.
+        similarity: from world to unit-sphere coordinates.
+    """
+    odd = contradictions(views, similarity)[1]
+    return odd if len(odd) <= MOST_ODD * len(views) else []
 
 
 def trusted(views: Sequence[PosedImage], similarity: Similarity) -> Sequence[PosedImage]:

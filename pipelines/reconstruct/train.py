@@ -39,7 +39,7 @@ from .model import RayPool, SceneModel, build_scene
 from .objective import scene_trainer
 from .plan import SEEING, SPHERE, WITNESSES, ReconstructPlan, level_stage
 from .seen import seen_points
-from .silhouettes import holes
+from .silhouettes import holes, outliers
 from .views import ViewImage, comparison_sheet, exposed_as, held_out, measure, reduced, render_image, spread
 
 __all__ = [
@@ -164,11 +164,14 @@ class _Reconstruction:
         self.folder, self.schedule, self.started = folder, schedule, started
         self.notes: list[str] = []  # what the time budget changed
         self.train_views, self.test_views = held_out(images.views, config.test_every)
+        has_masks = all(view.mask is not None for view in self.train_views)
+        self.odd = outliers(self.train_views, images.similarity) if has_masks else []
+        wrong = {id(view) for view in self.odd}
+        self.train_views = [view for view in self.train_views if id(view) not in wrong]
         pixels = round(np.mean([view.color.shape[0] * view.color.shape[1] for view in images.views]))
         self.plan = ReconstructPlan(config, machine, pixels, len(self.test_views), texture_settings(config))
         schedule.plan([*self.plan.before(), *self.plan.levels(), *self.plan.after()], budget=self.left())
         schedule(Progress(SPHERE, 0, 0, 0.0, {}))
-        has_masks = all(view.mask is not None for view in self.train_views)
         self.model = build_scene(config, has_masks=has_masks, views=len(self.train_views)).to(device)
         whole, flat = self.model.outside is not None, config.smooth_weight > 0
         self.holes = holes(self.train_views, images.similarity) if has_masks else {}
@@ -352,6 +355,7 @@ class _Reconstruction:
             "parameters": {name: parameter_count(part) for name, part in parts.items()},
             "deltas": model.geometry.deltas.tolist(),
             **({} if model.exposures is None else {"exposures": self._by_view(("gain", "offset"), model.exposures())}),
+            **({"left_out": [view.name for view in self.odd]} if self.odd else {}),
             **({"mask_holes": self._torn()} if self.holes else {}),
             **({} if self.measured is None else {"measured_depths": len(self.measured)}),
             **({} if model.poses is None else {"poses": self._by_view(("turn", "shift"), model.poses())}),

@@ -18,7 +18,7 @@ from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.cli.views import SCENE_NAMES
 from mplicits.pipelines.reconstruct.check import check_cameras, check_files
 from mplicits.pipelines.reconstruct.frustums import camera_mesh, frustum_size
-from mplicits.pipelines.reconstruct.silhouettes import contradictions, holes
+from mplicits.pipelines.reconstruct.silhouettes import contradictions, holes, outliers
 from mplicits.pipelines.surface.surface import read_surface
 
 WRITERS = {"neus": write_neus, "transforms": write_transforms, "colmap": write_colmap}
@@ -174,6 +174,17 @@ def test_masks_that_are_inverted(good, torus):
         one = with_views(images, lambda k, v: dataclasses.replace(v, mask=1 - v.mask) if k == 3 else v)
         assert "1 of" in (line := next(line for line in check_cameras(one).warnings if "contradict" in line))
         assert images.views[3].name in line
+
+
+def test_a_tenth_of_the_pictures_may_be_outliers(figure):
+    def inverted(*which):
+        return with_views(figure, lambda k, v: dataclasses.replace(v, mask=1 - v.mask) if k in which else v)
+
+    some, many = inverted(3, 11), inverted(3, 11, 17)
+    assert outliers(figure.views, figure.similarity) == []
+    assert [view.name for view in outliers(some.views, some.similarity)] == ["003.png", "011.png"]
+    assert len(contradictions(many.views, many.similarity)[1]) == 3
+    assert outliers(many.views, many.similarity) == []
 
 
 def test_a_picture_of_something_else(torus):

@@ -385,6 +385,20 @@ def test_the_command_leaves_a_coloured_mesh(data: Path, tmp_path: Path, capsys: 
     assert "is finished, so there is nothing to resume" in fails(capsys, f"reconstruct {data} -o {run} --resume")
 
 
+def test_a_picture_that_the_others_contradict_is_not_learnt_from(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    images = render_scene(SCENES["painted-sphere"](), views=12, size=12, samples=1)
+    views = list(images.views)
+    views[2] = replace(views[2], mask=np.zeros_like(views[2].mask))
+    write_neus(tmp_path / "odd", replace(images, views=tuple(views)))
+    assert main(f"reconstruct {tmp_path / 'odd'} -o {tmp_path / 'run'} {FLAGS} --texture-steps 0".split()) == 0
+    assert "warning: 1 of 10 silhouettes contradict the others; left out: image/002.png\n" in capsys.readouterr().err
+    record = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert record["left_out"] == ["image/002.png"]
+    assert record["views"] == {"trained": 9, "held_out": 2}
+
+
 def test_what_is_behind_holes_of_masks_is_not_learnt(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -392,7 +406,10 @@ def test_what_is_behind_holes_of_masks_is_not_learnt(
     torn = with_fault(render_scene(SCENES["painted-sphere"](), views=6, size=24, samples=1), "holes")
     write_neus(tmp_path / "torn", torn)
     assert main(f"reconstruct {tmp_path / 'torn'} -o {tmp_path / 'run'} {FLAGS} --texture-steps 0".split()) == 0
-    assert "1 masks have holes where all others see object; left out: image/002.png" in capsys.readouterr().err
+    assert (
+        "1 of 5 masks have a hole where all others see object; its pixels are left out: image/002.png"
+        in capsys.readouterr().err
+    )
     missing = (torn.views[3].mask > 0.5) & (torn.views[2].mask <= 0.5)
     assert json.loads((tmp_path / "run" / "run.json").read_text())["mask_holes"] == {"image/002.png": missing.sum()}
 
