@@ -20,6 +20,8 @@ PARALLEL = 1e-6  # squared sine between axes of view below which they meet nowhe
 CLEAR = 0.9  # of the distance to the nearest camera, that the sphere may reach to
 MARGIN = 1.05  # by how much the sphere is larger than what it is put around
 CELLS = 64  # of the grid of the visual hull, along each side
+# One view in so many may take for background what is in the hull; of so few views, one if else there were none.
+ONE_IN, FEW = 20, 4
 FEWEST = 8  # points or grid points that say where something is
 TAIL = 0.02  # share of the sparse points on either side that are not trusted
 
@@ -84,11 +86,12 @@ def region_from_points(points: Float64, cameras: Sequence[Camera]) -> Similarity
 
 
 def region_from_masks(cameras: Sequence[Camera], masks: Sequence[NDArray[np.floating]]) -> Similarity:
-    """The sphere around the visual hull: the points that are object in every view that has them in the picture.
+    """The sphere around the visual hull: the points that are object in the views that have them in the picture.
 
-    Points of a grid of 64³ are tried, first in the cube around twice the sphere of `region_from_cameras`, then in the
-    box of those that are left. At least half of the views must have a point in the picture. The sphere is centred on
-    the box of the hull, and reaches a step of the grid and 5 % beyond it.
+    One view in twenty may differ, since the hull of all would lack what one mask lacks; of four views or more one, if
+    else there were no hull. Points of a grid of 64³ are tried, first in the cube around twice the sphere of
+    `region_from_cameras`, then in the box of those that are left. At least half of the views must have a point in the
+    picture. The sphere is centred on the box of the hull, and reaches a step of the grid and 5 % beyond it.
 
     Args:
         cameras: V of them.
@@ -102,32 +105,40 @@ def region_from_masks(cameras: Sequence[Camera], masks: Sequence[NDArray[np.floa
         raise ValueError("masks: show no background")
     start = region_from_cameras(cameras)
     low, high = (np.array(start.center) + side * 2 * start.scale for side in (-1, 1))
-    hull, step = _hull(low, high, cameras, solid)
+    may_differ = len(masks) // ONE_IN
+    try:
+        hull, step = _hull(low, high, cameras, solid, may_differ)
+    except ValueError:
+        if len(masks) < FEW:
+            raise
+        may_differ += 1
+        hull, step = _hull(low, high, cameras, solid, may_differ)
     low, high = hull.min(axis=0) - step, hull.max(axis=0) + step
-    hull, step = _hull(low, high, cameras, solid)
+    hull, step = _hull(low, high, cameras, solid, may_differ)
     center = (hull.min(axis=0) + hull.max(axis=0)) / 2
     reach = np.linalg.norm(np.abs(hull - center) + step, axis=1).max()
     return _sphere(center, MARGIN * float(reach))
 
 
 def _hull(
-    low: Float64, high: Float64, cameras: Sequence[Camera], solid: Sequence[NDArray[np.bool_]]
+    low: Float64, high: Float64, cameras: Sequence[Camera], solid: Sequence[NDArray[np.bool_]], may_differ: int
 ) -> tuple[Float64, Float64]:
-    """The points of the grid between two corners that are object ``(N, 3)``, and its steps ``(3,)``."""
+    """Points of the grid between two corners, object but in so many views ``(N, 3)``, and its steps ``(3,)``."""
     lines = [np.linspace(low[axis], high[axis], CELLS) for axis in range(3)]
     points = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, 3)
-    views = np.zeros(len(points), np.int64)
+    views, against = np.zeros((2, len(points)), np.int64)
     for camera, mask in zip(cameras, solid, strict=True):
         pixels, _, inside = camera.in_view(points)
         hit = np.zeros(len(points), np.bool_)
         column, row = np.rint(pixels[inside]).astype(np.int64).T
         hit[inside] = mask[row.clip(0, camera.height - 1), column.clip(0, camera.width - 1)]
         views += inside
-        kept = hit | ~inside
-        points, views = points[kept], views[kept]
+        against += inside & ~hit
+        kept = against <= may_differ
+        points, views, against = points[kept], views[kept], against[kept]
     hull = points[views * 2 >= len(cameras)]
     if len(hull) < FEWEST:
-        raise ValueError("masks: no part of space is object in all of them")
+        raise ValueError("masks: no part of space is object in enough of them")
     return hull, (high - low) / (CELLS - 1)
 
 

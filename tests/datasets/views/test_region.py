@@ -123,6 +123,21 @@ def test_masks_that_say_nothing_or_contradict_each_other_are_refused():
     with pytest.raises(ValueError, match="show no background"):
         region_from_masks(cameras, [np.ones((32, 48), np.float32)] * len(cameras))
     masks = silhouettes(cameras, CENTER, 0.5)
-    masks[3] = 1 - silhouettes(cameras, CENTER, 1.5)[3]
-    with pytest.raises(ValueError, match="no part of space is object in all of them"):
+    for wrong in (3, 4):
+        masks[wrong] = 1 - silhouettes(cameras, CENTER, 1.5)[wrong]
+    with pytest.raises(ValueError, match="no part of space is object in enough of them"):
         region_from_masks(cameras, masks)
+
+
+@pytest.mark.parametrize("count", [4, 12, 40])
+def test_one_wrong_mask_does_not_cut_the_region(count):
+    cameras = around(count, size=(96, 64))
+    masks = silhouettes(cameras, CENTER, 0.9)
+    right = region_from_masks(cameras, masks)
+    masks[1] = 0 * masks[1]
+    assert region_from_masks(cameras, masks).scale == pytest.approx(right.scale, rel=0.35 if count == 4 else 0.1)
+    if count == 40:  # half of the ball is missing in two
+        for wrong in (1, 7):
+            masks[wrong] = silhouettes(cameras, CENTER, 0.9)[wrong]
+            masks[wrong][:, :48] = 0
+        assert region_from_masks(cameras, masks).scale == pytest.approx(right.scale, rel=0.1)
