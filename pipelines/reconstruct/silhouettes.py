@@ -36,6 +36,9 @@ ODD = 0.4
 # Or one that alone cuts so much from what all others leave, and so many times as much as the next one does; of few
 # views each cuts much, by right.
 ALONE, OF_FEW, TIMES = 0.1, 2.0, 5.0
+# Or one with so much of its object where the others see none, and so many times (TIMES) as much as most have. Right
+# ones have 0.018 at most, of what is thinner than a cell, or lies outside the region or the others' pictures.
+SPILT, MOST = 0.03, 0.8
 # A view is not trusted that alone cuts more than this of what all others leave. Of right ones, three of three hundred
 # do; of masks with a hole a sixth of the picture wide, all. Of few views each may cut much, by right.
 LONE, FEW = 0.02, 20
@@ -101,7 +104,8 @@ def contradictions(views: Sequence[PosedImage], similarity: Similarity) -> tuple
 
     A view contradicts a point that it sees, and takes for background. Of the points that three quarters of the views
     take for object, a wrong view contradicts far more than a right one; and no right one alone cuts much from what all
-    others leave. A wrong picture of a thing that looks much the same from there cannot be told by masks.
+    others leave. Nor is its object anywhere but where the others leave something. A wrong picture of a thing that looks
+    much the same from there cannot be told by masks.
 
     Args:
         views: pictures, all with masks that are neither empty nor full.
@@ -109,7 +113,7 @@ def contradictions(views: Sequence[PosedImage], similarity: Similarity) -> tuple
     """
     if all(_looks_inverted(views)):
         return True, []
-    odd = _odd(*_told(views, similarity))
+    odd = _odd(views, similarity, *_told(views, similarity))
     return False, [view for view, is_odd in zip(views, odd.tolist(), strict=True) if is_odd]
 
 
@@ -136,7 +140,7 @@ def trusted(views: Sequence[PosedImage], similarity: Similarity) -> Sequence[Pos
     if all(_looks_inverted(views)):
         return views
     seen, against = _told(views, similarity)
-    wrong = _odd(seen, against) | _cuts_alone(seen, against)
+    wrong = _odd(views, similarity, seen, against) | _cuts_alone(seen, against)
     return [view for view, is_wrong in zip(views, wrong.tolist(), strict=True) if not is_wrong]
 
 
@@ -159,7 +163,8 @@ def holes(views: Sequence[PosedImage], similarity: Similarity) -> dict[int, NDAr
     seen, against = _told(views, similarity)
     alone = against & (against.sum(dim=0) == 1)
     points, found = grid_in_ball(COARSE)[0], {}
-    for index in (_cuts_alone(seen, against) & ~_odd(seen, against)).nonzero()[:, 0].tolist():
+    torn = _cuts_alone(seen, against) & ~_odd(views, similarity, seen, against)
+    for index in torn.nonzero()[:, 0].tolist():
         mask = views[index].mask
         assert mask is not None
         behind = _shadow(views[index], similarity, points[alone[index]], 2 / COARSE)
@@ -195,14 +200,18 @@ def _cuts_alone(seen: Tensor, against: Tensor) -> Tensor:
     return (_lone_cuts(seen, against) > LONE) & (len(seen) >= FEW)
 
 
-def _odd(seen: Tensor, against: Tensor) -> Tensor:
+def _odd(views: Sequence[PosedImage], similarity: Similarity, seen: Tensor, against: Tensor) -> Tensor:
     """Which views contradict too much ``(V,)``."""
-    views, times, count = len(seen), against.sum(dim=0), seen.sum(dim=0)
-    agreed = (count >= max(1.0, MAY_DIFFER * views)) & (times <= MAY_DIFFER * count)
+    times, count = against.sum(dim=0), seen.sum(dim=0)
+    agreed = (count >= max(1.0, MAY_DIFFER * len(views))) & (times <= MAY_DIFFER * count)
     shares = (against & agreed).sum(dim=1) / (seen & agreed).sum(dim=1).clamp(min=1)
     alone = _lone_cuts(seen, against)
-    next_one = alone.sort().values[-2] if views > 1 else torch.tensor(math.inf)
-    return (shares > ODD) | ((alone > max(ALONE, OF_FEW / views)) & (alone > TIMES * next_one))
+    next_one = alone.sort().values[-2] if len(views) > 1 else torch.tensor(math.inf)
+    cuts = (alone > max(ALONE, OF_FEW / len(views))) & (alone > TIMES * next_one)
+    # One wrong view of few may not take the hull from the others.
+    spilt = _without_hull(views, similarity, seen, against, (SURE * count).clamp(min=1))
+    spills = (spilt > SPILT) & (spilt > TIMES * np.quantile(spilt, MOST))
+    return (shares > ODD) | cuts | torch.from_numpy(spills)
 
 
 def how_turned(views: Sequence[PosedImage], similarity: Similarity) -> str | None:
@@ -216,10 +225,11 @@ def how_turned(views: Sequence[PosedImage], similarity: Similarity) -> str | Non
         views: pictures, all with masks that are neither empty nor full.
         similarity: from world to unit-sphere coordinates.
     """
-    as_given = _without_hull(views, similarity)
+    as_given = _usually_without(views, similarity)
     if as_given <= NO_HULL:
         return None
-    turned = {said: _without_hull([_flipped(view, axes) for view in views], similarity) for said, axes in TURNS.items()}
+    flipped = {said: [_flipped(view, axes) for view in views] for said, axes in TURNS.items()}
+    turned = {said: _usually_without(some, similarity) for said, some in flipped.items()}
     best = min(turned, key=lambda said: turned[said])
     return best if turned[best] < TURNED_BACK * as_given else None
 
@@ -229,19 +239,26 @@ def _flipped(view: PosedImage, axes: tuple[int, ...]) -> PosedImage:
     return replace(view, mask=np.ascontiguousarray(np.flip(view.mask, axes)))
 
 
-def _without_hull(views: Sequence[PosedImage], similarity: Similarity) -> float:
+def _usually_without(views: Sequence[PosedImage], similarity: Similarity) -> float:
     """Share of the object's pixels with no visual hull behind them, to a cell of it; of the median view."""
-    edge = 2 / COARSE
-    points, _ = grid_in_ball(COARSE)
-    seen, objects = (torch.stack(parts) for parts in zip(*silhouettes(views, similarity, points, edge), strict=True))
-    count = seen.sum(dim=0)
-    hull = points[(count >= max(1.0, MAY_DIFFER * len(views))) & ((seen & ~objects).sum(dim=0) <= SURE * count)]
-    shares = []
+    seen, against = _told(views, similarity)
+    return float(np.median(_without_hull(views, similarity, seen, against, SURE * seen.sum(dim=0))))
+
+
+def _without_hull(
+    views: Sequence[PosedImage], similarity: Similarity, seen: Tensor, against: Tensor, may_differ: Tensor
+) -> NDArray[np.float64]:
+    """Of each view, the share of the object's pixels with no visual hull behind them, to a cell of it ``(V,)``.
+
+    The hull is of the points ``(N,)`` that no more views contradict than ``may_differ``.
+    """
+    hull = (seen.sum(dim=0) >= max(1.0, MAY_DIFFER * len(views))) & (against.sum(dim=0) <= may_differ)
+    points, shares = grid_in_ball(COARSE)[0][hull], []
     for view in views:
         assert view.mask is not None
         mask = view.mask > OBJECT
-        shares.append((mask & ~_shadow(view, similarity, hull, edge)).sum() / max(mask.sum(), 1))
-    return float(np.median(shares))
+        shares.append((mask & ~_shadow(view, similarity, points, 2 / COARSE)).sum() / max(mask.sum(), 1))
+    return np.array(shares)
 
 
 def _shadow(view: PosedImage, similarity: Similarity, points: Tensor, edge: float) -> NDArray[np.bool_]:
