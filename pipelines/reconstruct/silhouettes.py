@@ -113,20 +113,25 @@ def contradictions(views: Sequence[PosedImage], similarity: Similarity) -> tuple
     """
     if all(_looks_inverted(views)):
         return True, []
-    odd = _odd(views, similarity, *_told(views, similarity))
+    seen, against = _told(views, similarity)
+    odd = _wrong(views, similarity, seen, against) | _cuts_most(seen, against)
     return False, [view for view, is_odd in zip(views, odd.tolist(), strict=True) if is_odd]
 
 
 def outliers(views: Sequence[PosedImage], similarity: Similarity) -> list[PosedImage]:
-    """Views that teach nothing right: those of `contradictions`, if they are a tenth of all at most.
+    """Views that teach nothing right, if they are a tenth of all at most.
 
-    Of more than that nobody knows whether they are wrong, or the others are.
+    Of more than that nobody knows whether they are wrong, or the others are. Those of `contradictions` that only cut
+    much alone are not among them: so does a single look from above, by right.
 
     Args:
         views: pictures, all with masks.
         similarity: from world to unit-sphere coordinates.
     """
-    odd = contradictions(views, similarity)[1]
+    if all(_looks_inverted(views)):
+        return []
+    wrong = _wrong(views, similarity, *_told(views, similarity))
+    odd = [view for view, is_wrong in zip(views, wrong.tolist(), strict=True) if is_wrong]
     return odd if len(odd) <= MOST_ODD * len(views) else []
 
 
@@ -140,7 +145,7 @@ def trusted(views: Sequence[PosedImage], similarity: Similarity) -> Sequence[Pos
     if all(_looks_inverted(views)):
         return views
     seen, against = _told(views, similarity)
-    wrong = _odd(views, similarity, seen, against) | _cuts_alone(seen, against)
+    wrong = _wrong(views, similarity, seen, against) | _cuts_most(seen, against) | _cuts_much(seen, against)
     return [view for view, is_wrong in zip(views, wrong.tolist(), strict=True) if not is_wrong]
 
 
@@ -149,7 +154,7 @@ def holes(views: Sequence[PosedImage], similarity: Similarity) -> dict[int, NDAr
 
     A hole in a mask cuts a tunnel through the visual hull that no other silhouette does. So does a gap through which
     only one camera looks, but of many views that one is small, and views that alone cut little are not asked. Nor are
-    those that contradict the others in everything (`contradictions`), nor any where there are few.
+    those that are wrong in everything (`outliers`), nor any where there are few.
 
     Args:
         views: pictures, all with masks.
@@ -163,7 +168,7 @@ def holes(views: Sequence[PosedImage], similarity: Similarity) -> dict[int, NDAr
     seen, against = _told(views, similarity)
     alone = against & (against.sum(dim=0) == 1)
     points, found = grid_in_ball(COARSE)[0], {}
-    torn = _cuts_alone(seen, against) & ~_odd(views, similarity, seen, against)
+    torn = _cuts_much(seen, against) & ~_wrong(views, similarity, seen, against)
     for index in torn.nonzero()[:, 0].tolist():
         mask = views[index].mask
         assert mask is not None
@@ -195,23 +200,27 @@ def _lone_cuts(seen: Tensor, against: Tensor) -> Tensor:
     return (against & (times == 1)).sum(dim=1) / ((times == 0) & seen.any(dim=0)).sum().clamp(min=1)
 
 
-def _cuts_alone(seen: Tensor, against: Tensor) -> Tensor:
+def _cuts_much(seen: Tensor, against: Tensor) -> Tensor:
     """Which views of many cut much that no other one does ``(V,)``."""
     return (_lone_cuts(seen, against) > LONE) & (len(seen) >= FEW)
 
 
-def _odd(views: Sequence[PosedImage], similarity: Similarity, seen: Tensor, against: Tensor) -> Tensor:
-    """Which views contradict too much ``(V,)``."""
+def _cuts_most(seen: Tensor, against: Tensor) -> Tensor:
+    """Which one cuts far more than all others do alone ``(V,)``."""
+    alone = _lone_cuts(seen, against)
+    next_one = alone.sort().values[-2] if len(seen) > 1 else torch.tensor(math.inf)
+    return (alone > max(ALONE, OF_FEW / len(seen))) & (alone > TIMES * next_one)
+
+
+def _wrong(views: Sequence[PosedImage], similarity: Similarity, seen: Tensor, against: Tensor) -> Tensor:
+    """Which views contradict most of what the others agree on, or have object where they leave none ``(V,)``."""
     times, count = against.sum(dim=0), seen.sum(dim=0)
     agreed = (count >= max(1.0, MAY_DIFFER * len(views))) & (times <= MAY_DIFFER * count)
     shares = (against & agreed).sum(dim=1) / (seen & agreed).sum(dim=1).clamp(min=1)
-    alone = _lone_cuts(seen, against)
-    next_one = alone.sort().values[-2] if len(views) > 1 else torch.tensor(math.inf)
-    cuts = (alone > max(ALONE, OF_FEW / len(views))) & (alone > TIMES * next_one)
     # One wrong view of few may not take the hull from the others.
     spilt = _without_hull(views, similarity, seen, against, (SURE * count).clamp(min=1))
     spills = (spilt > SPILT) & (spilt > TIMES * np.quantile(spilt, MOST))
-    return (shares > ODD) | cuts | torch.from_numpy(spills)
+    return (shares > ODD) | torch.from_numpy(spills)
 
 
 def how_turned(views: Sequence[PosedImage], similarity: Similarity) -> str | None:

@@ -189,6 +189,13 @@ def test_a_tenth_of_the_pictures_may_be_outliers(figure):
     assert outliers(many.views, many.similarity) == []
 
 
+def test_a_single_look_from_above_is_no_outlier(torus, figure):
+    for images in (torus, figure):
+        by_height = sorted(images.views, key=lambda view: abs(float(view.camera.eye[2])))
+        some = (*by_height[: len(by_height) // 2], by_height[-1])
+        assert outliers(some, images.similarity) == []
+
+
 def test_a_picture_of_something_else(torus):
     """In the place of a picture that sees the ring from its side, one that sees it from above."""
     height = [abs(float(view.camera.eye[2])) for view in torus.views]
@@ -238,6 +245,7 @@ def test_masks_with_holes(figure):
         assert hole[missing].all()
         assert not hole[torn.views[index].mask > 0.5].any()
         assert (hole & ~missing).sum() < 0.2 * missing.sum()
+    assert outliers(torn.views, torn.similarity) == []  # the rest of those pictures is right
     few = dataclasses.replace(torn, views=torn.views[:12])  # of which each may cut much
     assert holes(few.views, few.similarity) == {}
     notch = np.array(figure.views[2].mask)
