@@ -25,7 +25,7 @@ from ...neural_fields import InputError, Similarity
 from ..mesh.files import write_mesh
 from .depth_check import DepthCheck, check_depths
 from .frustums import camera_mesh
-from .silhouettes import contradictions, holes, how_turned, named
+from .silhouettes import Agreement, named
 
 __all__ = ["CameraCheck", "check_cameras", "check_files", "format_check"]
 
@@ -274,10 +274,11 @@ def _silhouettes(images: PosedImages) -> Iterator[str]:
     views = [view for view in images.views if view.mask is not None and EMPTY <= view.mask.mean() <= FULL]
     if not views:
         return
-    inverted, odd = contradictions(views, images.similarity)
+    agreement = Agreement.of(views, images.similarity)
+    inverted, odd = agreement.contradictions()
     if inverted:
         yield "the masks cover the borders of the pictures and not their middles: they look inverted; white is object"
-    elif turned := how_turned(views, images.similarity):
+    elif turned := agreement.how_turned():
         yield f"the silhouettes contradict each other, and would not if the pictures were not {turned}"
     else:
         if odd:
@@ -286,7 +287,7 @@ def _silhouettes(images: PosedImages) -> Iterator[str]:
                 f"{len(odd)} of {len(views)} silhouettes contradict the others: {names}; is that the right picture, "
                 "the right way round, and its pose and mask right?"
             )
-        if torn := holes(views, images.similarity):
+        if torn := agreement.holes():
             names = named([views[index].name for index in torn])
             yield f"{len(torn)} of {len(views)} masks have a hole where all others see object: {names}; fill it"
 

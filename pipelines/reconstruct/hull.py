@@ -19,7 +19,7 @@ from ..run.trainer import seeded
 from .free_space import seen_through
 from .measured import MeasuredDepths
 from .model import SceneModel
-from .silhouettes import grid_in_ball, silhouettes, trusted
+from .silhouettes import Agreement, grid_in_ball, silhouettes
 
 __all__ = ["begin", "carve", "fitting_resolution", "start_at_hull"]
 
@@ -42,6 +42,7 @@ def begin(
     images: PosedImages,
     config: ReconstructConfig,
     measured: MeasuredDepths | None = None,
+    agreement: Agreement | None = None,
 ) -> str:
     """Give an untrained scene the start that its settings ask for; it is a sphere already.
 
@@ -51,6 +52,7 @@ def begin(
         images: of which these are a part; for the coordinates and the name.
         config: ``start``, ``geometry`` and ``seed`` are used.
         measured: depths of these views, if there are any.
+        agreement: of these views, if it is known.
 
     Returns:
         What it is now: "hull", "depths" (what no measured ray passes) or "sphere". A hull is carved by measured rays
@@ -64,7 +66,8 @@ def begin(
     carving = None if config.start == "hull" else measured
     if config.start != "sphere" and isinstance(base, Siren) and (masked or carving is not None):
         empty = None if carving is None else seen_through(carving, RESOLUTION).numpy()
-        distances = carve(trusted(views, images.similarity) if masked else (), images.similarity, empty=empty)
+        carved = (agreement or Agreement.of(views, images.similarity)).trusted() if masked else ()
+        distances = carve(carved, images.similarity, empty=empty)
         if distances is not None:
             start_at_hull(base, distances, seed=config.seed)
             return "hull" if masked else "depths"
@@ -105,11 +108,10 @@ def carve(
     """
     if resolution is None:
         resolution = fitting_resolution(views, similarity) if views or empty is None else len(empty) - 1
-    solid = _object_vertices(views, similarity, resolution)
+    solid, ball = _object_vertices(views, similarity, resolution)
     if empty is not None:
         solid &= ~_all_around(empty, resolution)
-    share = solid.sum() / len(grid_in_ball(resolution)[1])
-    if not LEAST < share < (MOST if views else MOST_UNSEEN):
+    if not LEAST < solid.sum() / ball < (MOST if views else MOST_UNSEEN):
         return None
     # The surface lies half a cell from the outermost vertices inside.
     outer, inner = (np.asarray(distance_transform_edt(part), dtype=np.float64) for part in (~solid, solid))
@@ -126,15 +128,21 @@ def fitting_resolution(views: Sequence[PosedImage], similarity: Similarity) -> i
     return resolution
 
 
-def _object_vertices(views: Sequence[PosedImage], similarity: Similarity, resolution: int) -> NDArray[np.bool_]:
-    """Vertices of the unit ball that AGREE of the views that see them take for object ``(resolution + 1,) * 3``."""
-    sizes = [resolution]
+def _object_vertices(
+    views: Sequence[PosedImage], similarity: Similarity, resolution: int
+) -> tuple[NDArray[np.bool_], int]:
+    """Vertices that AGREE of the views that see them take for object ``(resolution + 1,) * 3``, and how many are asked.
+
+    Those in the unit ball are; without views all of them are object.
+    """
+    ball, sizes = 0, [resolution]
     while views and sizes[0] > COARSEST and sizes[0] % 2 == 0:
         sizes.insert(0, sizes[0] // 2)
     solid = np.ones(3 * (sizes[0] + 1,), dtype=bool)
     for size in sizes:
         count = size + 1
         points, places = grid_in_ball(size)
+        ball = len(places)
         if count > len(solid):
             # Beside a vertex that is object there is one of the coarser grid that is, with room to spare.
             near = binary_dilation(solid, np.ones((3, 3, 3)))
@@ -142,20 +150,21 @@ def _object_vertices(views: Sequence[PosedImage], similarity: Similarity, resolu
                 near = near.repeat(2, axis=axis)
             among = torch.from_numpy(near[:count, :count, :count].reshape(-1))[places]
             points, places = points[among], places[among]
-        kept = _agreed(views, similarity, points, 2 / size * (1 if size == resolution else ROOM))
+        if views:
+            places = places[_agreed(views, similarity, points, 2 / size * (1 if size == resolution else ROOM))]
         solid = np.zeros(count**3, dtype=bool)
-        solid[places[kept].numpy()] = True
+        solid[places.numpy()] = True
         solid = solid.reshape(count, count, count)
-    return solid
+    return solid, ball
 
 
 def _agreed(views: Sequence[PosedImage], similarity: Similarity, points: Tensor, edge: float) -> Tensor:
-    """Which points ``(N, 3)`` are object for AGREE of the views that see them, if enough do ``(N,)``; all, of none."""
+    """Which points ``(N, 3)`` are object for AGREE of the views that see them, if enough do ``(N,)``."""
     seen, object_in = torch.zeros(len(points)), torch.zeros(len(points))
     for sees, objects in silhouettes([view for view in views if view.mask is not None], similarity, points, edge):
         seen += sees
         object_in += objects
-    return (object_in >= AGREE * seen) & (seen >= max(1.0, SEEING * len(views)) * bool(views))
+    return (object_in >= AGREE * seen) & (seen >= max(1.0, SEEING * len(views)))
 
 
 def _all_around(empty: NDArray[np.bool_], resolution: int) -> NDArray[np.bool_]:

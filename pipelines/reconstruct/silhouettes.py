@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -15,17 +16,7 @@ from torch import Tensor
 from ...datasets.views.images import PosedImage
 from ...neural_fields import Similarity
 
-__all__ = [
-    "OBJECT",
-    "contradictions",
-    "grid_in_ball",
-    "holes",
-    "how_turned",
-    "named",
-    "outliers",
-    "silhouettes",
-    "trusted",
-]
+__all__ = ["OBJECT", "Agreement", "grid_in_ball", "named", "silhouettes"]
 
 OBJECT = 0.5  # a pixel with a larger share of object counts as one
 COARSE = 32  # cells along the grid on which silhouettes are compared
@@ -77,10 +68,9 @@ def silhouettes(
         edge: a point is object where there is object within half of it.
     """
     for view in views:
-        assert view.mask is not None
         camera = view.camera.moved(similarity)
         reach = math.ceil(0.5 * edge * float(camera.intrinsics[0, 0]) / float(camera.eye.norm().clamp(min=edge)))
-        mask = view.mask > OBJECT
+        mask = _object_in(view)
         cut = bool(mask[[0, -1]].any() or mask[:, [0, -1]].any())
         mask = torch.from_numpy(_widened(mask, reach))
         pixels, depth = camera.project(points)
@@ -99,84 +89,171 @@ def _widened(mask: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
     return np.asarray(cv2.dilate(mask.astype(np.uint8), window)) > 0
 
 
-def contradictions(views: Sequence[PosedImage], similarity: Similarity) -> tuple[bool, list[PosedImage]]:
-    """Whether masks are inverted, and the views whose silhouettes the others contradict.
+@dataclass(frozen=True, eq=False)
+class Agreement:
+    """What silhouettes say of the same points, and which of them the others contradict.
 
     A view contradicts a point that it sees, and takes for background. Of the points that three quarters of the views
-    take for object, a wrong view contradicts far more than a right one; and no right one alone cuts much from what all
-    others leave. Nor is its object anywhere but where the others leave something. A wrong picture of a thing that looks
-    much the same from there cannot be told by masks.
+    take for object, a wrong view contradicts far more than a right one; and no right one of many alone cuts much from
+    what all others leave. Nor is its object anywhere but where the others leave something. A wrong picture of a thing
+    that looks much the same from there cannot be told by masks.
 
-    Args:
-        views: pictures, all with masks that are neither empty nor full.
-        similarity: from world to unit-sphere coordinates.
-    """
-    if all(_looks_inverted(views)):
-        return True, []
-    seen, against = _told(views, similarity)
-    odd = _wrong(views, similarity, seen, against) | _cuts_most(seen, against)
-    return False, [view for view, is_odd in zip(views, odd.tolist(), strict=True) if is_odd]
-
-
-def outliers(views: Sequence[PosedImage], similarity: Similarity) -> list[PosedImage]:
-    """Views that teach nothing right, if they are a tenth of all at most.
-
-    Of more than that nobody knows whether they are wrong, or the others are. Those of `contradictions` that only cut
-    much alone are not among them: so does a single look from above, by right.
-
-    Args:
+    Attributes:
         views: pictures, all with masks.
         similarity: from world to unit-sphere coordinates.
+        seen: which points of a grid in the unit ball each view sees ``(V, N)``.
+        against: which of them it contradicts ``(V, N)``.
     """
-    if all(_looks_inverted(views)):
-        return []
-    wrong = _wrong(views, similarity, *_told(views, similarity))
-    odd = [view for view, is_wrong in zip(views, wrong.tolist(), strict=True) if is_wrong]
-    return odd if len(odd) <= MOST_ODD * len(views) else []
+
+    views: Sequence[PosedImage]
+    similarity: Similarity
+    seen: Tensor
+    against: Tensor
+
+    @classmethod
+    def of(cls, views: Sequence[PosedImage], similarity: Similarity) -> Agreement:
+        """Ask each view for each point of the grid."""
+        told = list(silhouettes(views, similarity, grid_in_ball(COARSE)[0], 2 / COARSE))
+        seen, objects = (torch.stack(parts) for parts in zip(*told, strict=True))
+        return cls(views, similarity, seen, seen & ~objects)
+
+    def without(self, some: Sequence[PosedImage]) -> Agreement:
+        """That of the other views."""
+        if not some:
+            return self
+        left_out = {id(view) for view in some}
+        rows = [row for row, view in enumerate(self.views) if id(view) not in left_out]
+        views = [self.views[row] for row in rows]
+        return Agreement(views, self.similarity, self.seen[rows], self.against[rows])
+
+    def contradictions(self) -> tuple[bool, list[PosedImage]]:
+        """Whether the masks are inverted, and if they are not, the views that the others contradict."""
+        return self.is_inverted, self._those(self._wrong | self._cuts_most)
+
+    def outliers(self) -> list[PosedImage]:
+        """Views that teach nothing right, if they are a tenth of all at most.
+
+        Of more than that nobody knows whether they are wrong, or the others are. Those of `contradictions` that only
+        cut much alone are not among them: so does a single look from above, by right.
+        """
+        odd = self._those(self._wrong)
+        return odd if len(odd) <= MOST_ODD * len(self.views) else []
+
+    def trusted(self) -> Sequence[PosedImage]:
+        """Views that may carve a visual hull: all but those of `contradictions`, and those that alone cut much."""
+        return self.without(self._those(self._wrong | self._cuts_most | self._cuts_much)).views
+
+    def holes(self) -> dict[int, NDArray[np.bool_]]:
+        """Holes in masks: background with object all around it, where all other views take for object what is behind.
+
+        A hole in a mask cuts a tunnel through the visual hull that no other silhouette does. So does a gap through
+        which only one camera looks, but of many views that one is small, and views that alone cut little are not
+        asked. Nor are those that are wrong in everything (`outliers`), nor any where there are few.
+
+        Returns:
+            By the number of the view, for those that have any, pixels ``(H, W)``.
+        """
+        alone = self.against & (self.against.sum(dim=0) == 1)
+        points, found = grid_in_ball(COARSE)[0], {}
+        torn = self._cuts_much & ~self._wrong & (not self.is_inverted)
+        for index in torn.nonzero()[:, 0].tolist():
+            view = self.views[index]
+            behind = _shadow(view, self.similarity, points[alone[index]], 2 / COARSE)
+            hole = behind & _enclosed(~_object_in(view))
+            if hole.any():
+                found[index] = hole
+        return found
+
+    def how_turned(self) -> str | None:
+        """One of `TURNS`, if the pictures look so; None if they look right, or wrong in another way.
+
+        The visual hull is behind all object in right silhouettes, and less so in those of mirrored pictures. It is
+        carved anew from masks that are turned back, and if they fit it that much better, that is what is wrong. Of a
+        thing and cameras that mirrored look the same nothing is said, nor need be.
+        """
+        as_given = self._usually_without_hull()
+        if as_given <= NO_HULL:
+            return None
+        flipped = {said: [_flipped(view, axes) for view in self.views] for said, axes in TURNS.items()}
+        turned = {said: Agreement.of(views, self.similarity)._usually_without_hull() for said, views in flipped.items()}
+        best = min(turned, key=lambda said: turned[said])
+        return best if turned[best] < TURNED_BACK * as_given else None
+
+    @cached_property
+    def is_inverted(self) -> bool:
+        """Whether the border of the usual mask is object, and its middle is background."""
+        borders, middles = [], []
+        for view in self.views:
+            mask = _mask(view)
+            height, width = mask.shape
+            borders.append(np.concatenate([*mask[[0, -1]], *mask[:, [0, -1]].T]).mean())
+            middles.append(mask[height // 3 : -(height // 3) or None, width // 3 : -(width // 3) or None].mean())
+        border = np.median(borders)
+        return bool(border > BORDER and np.median(middles) < MIDDLE * border)
+
+    @cached_property
+    def _wrong(self) -> Tensor:
+        """Which contradict most of what the others agree on, or have object where they leave none ``(V,)``."""
+        times, count = self.against.sum(dim=0), self.seen.sum(dim=0)
+        agreed = self._seen_by_enough & (times <= MAY_DIFFER * count)
+        shares = (self.against & agreed).sum(dim=1) / (self.seen & agreed).sum(dim=1).clamp(min=1)
+        # One wrong view of few may not take the hull from the others.
+        spilt = self._without_hull((SURE * count).clamp(min=1))
+        spills = (spilt > SPILT) & (spilt > TIMES * np.quantile(spilt, MOST))
+        return (shares > ODD) | torch.from_numpy(spills)
+
+    @cached_property
+    def _lone_cuts(self) -> Tensor:
+        """What each view contradicts alone, as a share of what none does ``(V,)``."""
+        times = self.against.sum(dim=0)
+        return (self.against & (times == 1)).sum(dim=1) / ((times == 0) & self.seen.any(dim=0)).sum().clamp(min=1)
+
+    @property
+    def _cuts_much(self) -> Tensor:
+        """Which of many cut much that no other one does ``(V,)``."""
+        return (self._lone_cuts > LONE) & (len(self.views) >= FEW)
+
+    @property
+    def _cuts_most(self) -> Tensor:
+        """Which one cuts far more than all others do alone ``(V,)``."""
+        alone, count = self._lone_cuts, len(self.views)
+        next_one = alone.sort().values[-2] if count > 1 else torch.tensor(math.inf)
+        return (alone > max(ALONE, OF_FEW / count)) & (alone > TIMES * next_one)
+
+    @property
+    def _seen_by_enough(self) -> Tensor:
+        return self.seen.sum(dim=0) >= max(1.0, MAY_DIFFER * len(self.views))
+
+    def _those(self, which: Tensor) -> list[PosedImage]:
+        """The views that are meant; none where all masks are inverted, which contradict each other by right."""
+        if self.is_inverted:
+            return []
+        return [view for view, is_meant in zip(self.views, which.tolist(), strict=True) if is_meant]
+
+    def _usually_without_hull(self) -> float:
+        return float(np.median(self._without_hull(SURE * self.seen.sum(dim=0))))
+
+    def _without_hull(self, may_differ: Tensor) -> NDArray[np.float64]:
+        """Of each view, the share of the object's pixels with no visual hull behind them, to a cell of it ``(V,)``.
+
+        The hull is of the points ``(N,)`` that no more views contradict than ``may_differ``.
+        """
+        hull = grid_in_ball(COARSE)[0][self._seen_by_enough & (self.against.sum(dim=0) <= may_differ)]
+        shares = []
+        for view in self.views:
+            mask = _object_in(view)
+            bare = mask & ~_shadow(view, self.similarity, hull, 2 / COARSE)
+            shares.append(bare.sum() / max(mask.sum(), 1))
+        return np.array(shares)
 
 
-def trusted(views: Sequence[PosedImage], similarity: Similarity) -> Sequence[PosedImage]:
-    """Views that may carve a visual hull: all but those that contradict the others, or cut much that no other does.
-
-    Args:
-        views: pictures, all with masks.
-        similarity: from world to unit-sphere coordinates.
-    """
-    if all(_looks_inverted(views)):
-        return views
-    seen, against = _told(views, similarity)
-    wrong = _wrong(views, similarity, seen, against) | _cuts_most(seen, against) | _cuts_much(seen, against)
-    return [view for view, is_wrong in zip(views, wrong.tolist(), strict=True) if not is_wrong]
+def _mask(view: PosedImage) -> NDArray[np.float32]:
+    assert view.mask is not None
+    return view.mask
 
 
-def holes(views: Sequence[PosedImage], similarity: Similarity) -> dict[int, NDArray[np.bool_]]:
-    """Holes in masks: background with object all around it, where all other views take for object what is behind.
-
-    A hole in a mask cuts a tunnel through the visual hull that no other silhouette does. So does a gap through which
-    only one camera looks, but of many views that one is small, and views that alone cut little are not asked. Nor are
-    those that are wrong in everything (`outliers`), nor any where there are few.
-
-    Args:
-        views: pictures, all with masks.
-        similarity: from world to unit-sphere coordinates.
-
-    Returns:
-        By the number of the view, for those that have any, pixels ``(H, W)``.
-    """
-    if all(_looks_inverted(views)):
-        return {}
-    seen, against = _told(views, similarity)
-    alone = against & (against.sum(dim=0) == 1)
-    points, found = grid_in_ball(COARSE)[0], {}
-    torn = _cuts_much(seen, against) & ~_wrong(views, similarity, seen, against)
-    for index in torn.nonzero()[:, 0].tolist():
-        mask = views[index].mask
-        assert mask is not None
-        behind = _shadow(views[index], similarity, points[alone[index]], 2 / COARSE)
-        hole = behind & _enclosed(mask <= OBJECT)
-        if hole.any():
-            found[index] = hole
-    return found
+def _object_in(view: PosedImage) -> NDArray[np.bool_]:
+    return _mask(view) > OBJECT
 
 
 def _enclosed(background: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -186,88 +263,8 @@ def _enclosed(background: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return background & ~np.isin(labels, outer)
 
 
-def _told(views: Sequence[PosedImage], similarity: Similarity) -> tuple[Tensor, Tensor]:
-    """Of each view, which points of a grid in the unit ball it sees, and which of them it contradicts ``(V, N)``."""
-    points, _ = grid_in_ball(COARSE)
-    told = list(silhouettes(views, similarity, points, 2 / COARSE))
-    seen, objects = (torch.stack(parts) for parts in zip(*told, strict=True))
-    return seen, seen & ~objects
-
-
-def _lone_cuts(seen: Tensor, against: Tensor) -> Tensor:
-    """What each view contradicts alone, as a share of what none does ``(V,)``."""
-    times = against.sum(dim=0)
-    return (against & (times == 1)).sum(dim=1) / ((times == 0) & seen.any(dim=0)).sum().clamp(min=1)
-
-
-def _cuts_much(seen: Tensor, against: Tensor) -> Tensor:
-    """Which views of many cut much that no other one does ``(V,)``."""
-    return (_lone_cuts(seen, against) > LONE) & (len(seen) >= FEW)
-
-
-def _cuts_most(seen: Tensor, against: Tensor) -> Tensor:
-    """Which one cuts far more than all others do alone ``(V,)``."""
-    alone = _lone_cuts(seen, against)
-    next_one = alone.sort().values[-2] if len(seen) > 1 else torch.tensor(math.inf)
-    return (alone > max(ALONE, OF_FEW / len(seen))) & (alone > TIMES * next_one)
-
-
-def _wrong(views: Sequence[PosedImage], similarity: Similarity, seen: Tensor, against: Tensor) -> Tensor:
-    """Which views contradict most of what the others agree on, or have object where they leave none ``(V,)``."""
-    times, count = against.sum(dim=0), seen.sum(dim=0)
-    agreed = (count >= max(1.0, MAY_DIFFER * len(views))) & (times <= MAY_DIFFER * count)
-    shares = (against & agreed).sum(dim=1) / (seen & agreed).sum(dim=1).clamp(min=1)
-    # One wrong view of few may not take the hull from the others.
-    spilt = _without_hull(views, similarity, seen, against, (SURE * count).clamp(min=1))
-    spills = (spilt > SPILT) & (spilt > TIMES * np.quantile(spilt, MOST))
-    return (shares > ODD) | torch.from_numpy(spills)
-
-
-def how_turned(views: Sequence[PosedImage], similarity: Similarity) -> str | None:
-    """One of `TURNS`, if the pictures look so; None if they look right, or wrong in another way.
-
-    The visual hull is behind all object in right silhouettes, and less so in those of mirrored pictures. It is carved
-    anew from masks that are turned back, and if they fit it that much better, that is what is wrong. Of a thing and
-    cameras that mirrored look the same nothing is said, nor need be.
-
-    Args:
-        views: pictures, all with masks that are neither empty nor full.
-        similarity: from world to unit-sphere coordinates.
-    """
-    as_given = _usually_without(views, similarity)
-    if as_given <= NO_HULL:
-        return None
-    flipped = {said: [_flipped(view, axes) for view in views] for said, axes in TURNS.items()}
-    turned = {said: _usually_without(some, similarity) for said, some in flipped.items()}
-    best = min(turned, key=lambda said: turned[said])
-    return best if turned[best] < TURNED_BACK * as_given else None
-
-
 def _flipped(view: PosedImage, axes: tuple[int, ...]) -> PosedImage:
-    assert view.mask is not None
-    return replace(view, mask=np.ascontiguousarray(np.flip(view.mask, axes)))
-
-
-def _usually_without(views: Sequence[PosedImage], similarity: Similarity) -> float:
-    """Share of the object's pixels with no visual hull behind them, to a cell of it; of the median view."""
-    seen, against = _told(views, similarity)
-    return float(np.median(_without_hull(views, similarity, seen, against, SURE * seen.sum(dim=0))))
-
-
-def _without_hull(
-    views: Sequence[PosedImage], similarity: Similarity, seen: Tensor, against: Tensor, may_differ: Tensor
-) -> NDArray[np.float64]:
-    """Of each view, the share of the object's pixels with no visual hull behind them, to a cell of it ``(V,)``.
-
-    The hull is of the points ``(N,)`` that no more views contradict than ``may_differ``.
-    """
-    hull = (seen.sum(dim=0) >= max(1.0, MAY_DIFFER * len(views))) & (against.sum(dim=0) <= may_differ)
-    points, shares = grid_in_ball(COARSE)[0][hull], []
-    for view in views:
-        assert view.mask is not None
-        mask = view.mask > OBJECT
-        shares.append((mask & ~_shadow(view, similarity, points, 2 / COARSE)).sum() / max(mask.sum(), 1))
-    return np.array(shares)
+    return replace(view, mask=np.ascontiguousarray(np.flip(_mask(view), axes)))
 
 
 def _shadow(view: PosedImage, similarity: Similarity, points: Tensor, edge: float) -> NDArray[np.bool_]:
@@ -280,17 +277,6 @@ def _shadow(view: PosedImage, similarity: Similarity, points: Tensor, edge: floa
     there = np.zeros((camera.height, camera.width), dtype=bool)
     there[row[inside].numpy(), column[inside].numpy()] = True
     return _widened(there, reach)
-
-
-def _looks_inverted(views: Sequence[PosedImage]) -> tuple[bool, bool]:
-    """Whether the border of the usual mask is object, and whether its middle is background."""
-    borders, middles = [], []
-    for view in views:
-        assert view.mask is not None
-        height, width = view.mask.shape
-        borders.append(np.concatenate([*view.mask[[0, -1]], *view.mask[:, [0, -1]].T]).mean())
-        middles.append(view.mask[height // 3 : -(height // 3) or None, width // 3 : -(width // 3) or None].mean())
-    return bool(np.median(borders) > BORDER), bool(np.median(middles) < MIDDLE * np.median(borders))
 
 
 def named(names: Sequence[str]) -> str:

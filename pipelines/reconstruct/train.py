@@ -39,7 +39,7 @@ from .model import RayPool, SceneModel, build_scene
 from .objective import scene_trainer
 from .plan import SEEING, SPHERE, WITNESSES, ReconstructPlan, level_stage
 from .seen import seen_points
-from .silhouettes import holes, outliers
+from .silhouettes import Agreement
 from .views import ViewImage, comparison_sheet, exposed_as, held_out, measure, reduced, render_image, spread
 
 __all__ = [
@@ -165,20 +165,24 @@ class _Reconstruction:
         self.notes: list[str] = []  # what the time budget changed
         self.train_views, self.test_views = held_out(images.views, config.test_every)
         has_masks = all(view.mask is not None for view in self.train_views)
-        self.odd = outliers(self.train_views, images.similarity) if has_masks else []
-        wrong = {id(view) for view in self.odd}
-        self.train_views = [view for view in self.train_views if id(view) not in wrong]
+        agreement = Agreement.of(self.train_views, images.similarity) if has_masks else None
+        self.odd = agreement.outliers() if agreement else []
+        if agreement:
+            agreement = agreement.without(self.odd)
+            self.train_views = [*agreement.views]
         pixels = round(np.mean([view.color.shape[0] * view.color.shape[1] for view in images.views]))
         self.plan = ReconstructPlan(config, machine, pixels, len(self.test_views), texture_settings(config))
         schedule.plan([*self.plan.before(), *self.plan.levels(), *self.plan.after()], budget=self.left())
         schedule(Progress(SPHERE, 0, 0, 0.0, {}))
         self.model = build_scene(config, has_masks=has_masks, views=len(self.train_views)).to(device)
         whole, flat = self.model.outside is not None, config.smooth_weight > 0
-        self.holes = holes(self.train_views, images.similarity) if has_masks else {}
+        self.holes = agreement.holes() if agreement else {}
         pool = RayPool(self.train_views, images.similarity, device, whole=whole, flat=flat, left_out=self.holes)
         measured = MeasuredDepths(self.train_views, images, device, seed=config.seed) if config.depth_weight else None
         self.measured = measured or None
-        self.start = "sphere" if resume else begin(self.model, self.train_views, images, config, self.measured)
+        self.start = (
+            "sphere" if resume else begin(self.model, self.train_views, images, config, self.measured, agreement)
+        )
         schedule(Progress(SPHERE, 0, 0, 1.0, {}))
         self.trainer = scene_trainer(self.model, pool, config, measured=self.measured, seconds=self.training_seconds())
         # Of the training pixels, their masks, the cameras and what was measured.

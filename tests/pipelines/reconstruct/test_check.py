@@ -18,7 +18,7 @@ from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.cli.views import SCENE_NAMES
 from mplicits.pipelines.reconstruct.check import check_cameras, check_files
 from mplicits.pipelines.reconstruct.frustums import camera_mesh, frustum_size
-from mplicits.pipelines.reconstruct.silhouettes import contradictions, holes, outliers
+from mplicits.pipelines.reconstruct.silhouettes import Agreement
 from mplicits.pipelines.surface.surface import read_surface
 
 WRITERS = {"neus": write_neus, "transforms": write_transforms, "colmap": write_colmap}
@@ -183,17 +183,17 @@ def test_a_tenth_of_the_pictures_may_be_outliers(figure):
         return with_views(figure, lambda k, v: dataclasses.replace(v, mask=1 - v.mask) if k in which else v)
 
     some, many = inverted(3, 11), inverted(3, 11, 17)
-    assert outliers(figure.views, figure.similarity) == []
-    assert [view.name for view in outliers(some.views, some.similarity)] == ["003.png", "011.png"]
-    assert len(contradictions(many.views, many.similarity)[1]) == 3
-    assert outliers(many.views, many.similarity) == []
+    assert Agreement.of(figure.views, figure.similarity).outliers() == []
+    assert [view.name for view in Agreement.of(some.views, some.similarity).outliers()] == ["003.png", "011.png"]
+    assert len(Agreement.of(many.views, many.similarity).contradictions()[1]) == 3
+    assert Agreement.of(many.views, many.similarity).outliers() == []
 
 
 def test_a_single_look_from_above_is_no_outlier(torus, figure):
     for images in (torus, figure):
         by_height = sorted(images.views, key=lambda view: abs(float(view.camera.eye[2])))
         some = (*by_height[: len(by_height) // 2], by_height[-1])
-        assert outliers(some, images.similarity) == []
+        assert Agreement.of(some, images.similarity).outliers() == []
 
 
 def test_a_picture_of_something_else(torus):
@@ -204,7 +204,7 @@ def test_a_picture_of_something_else(torus):
     wrong = with_views(
         torus, lambda k, v: dataclasses.replace(v, color=other.color, mask=other.mask) if k == side else v
     )
-    assert contradictions(wrong.views, torus.similarity) == (False, [wrong.views[side]])
+    assert Agreement.of(wrong.views, torus.similarity).contradictions() == (False, [wrong.views[side]])
     other = torus.views[side]
     wrong = with_views(
         torus, lambda k, v: dataclasses.replace(v, color=other.color, mask=other.mask) if k == above else v
@@ -231,27 +231,27 @@ def test_a_mask_with_more_than_the_object(figure):
 
     for rows in (slice(None), slice(-12, None)):  # all of the picture, and the ground
         wrong = with_more(rows)
-        assert contradictions(wrong.views, wrong.similarity) == (False, [wrong.views[5]])
+        assert Agreement.of(wrong.views, wrong.similarity).contradictions() == (False, [wrong.views[5]])
 
 
 def test_masks_with_holes(figure):
-    assert holes(figure.views, figure.similarity) == {}
+    assert Agreement.of(figure.views, figure.similarity).holes() == {}
     torn = with_fault(figure, "holes")
     assert the_warning(torn) == "2 of 24 masks have a hole where all others see object: 002.png, 014.png; fill it"
-    found = holes(torn.views, torn.similarity)
+    found = Agreement.of(torn.views, torn.similarity).holes()
     for index, hole in found.items():
         missing = (figure.views[index].mask > 0.5) & (torn.views[index].mask <= 0.5)
         # All of it, and nothing else but gaps that are no wider than a cell away from it.
         assert hole[missing].all()
         assert not hole[torn.views[index].mask > 0.5].any()
         assert (hole & ~missing).sum() < 0.2 * missing.sum()
-    assert outliers(torn.views, torn.similarity) == []  # the rest of those pictures is right
+    assert Agreement.of(torn.views, torn.similarity).outliers() == []  # the rest of those pictures is right
     few = dataclasses.replace(torn, views=torn.views[:12])  # of which each may cut much
-    assert holes(few.views, few.similarity) == {}
+    assert Agreement.of(few.views, few.similarity).holes() == {}
     notch = np.array(figure.views[2].mask)
     notch[20:44, :32] = 0  # open to the border: it may be the outline
     cut = with_views(figure, lambda k, v: dataclasses.replace(v, mask=notch) if k == 2 else v)
-    assert holes(cut.views, cut.similarity) == {}
+    assert Agreement.of(cut.views, cut.similarity).holes() == {}
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,7 @@ from mplicits.pipelines.reconstruct.hull import (
 )
 from mplicits.pipelines.reconstruct.measured import MeasuredDepths
 from mplicits.pipelines.reconstruct.model import build_scene
-from mplicits.pipelines.reconstruct.silhouettes import trusted
+from mplicits.pipelines.reconstruct.silhouettes import Agreement
 from mplicits.pipelines.run.settings import ReconstructConfig
 
 SMALL = ReconstructConfig(
@@ -102,7 +102,7 @@ def test_a_gap_that_one_camera_of_many_sees_is_carved() -> None:
     mask = np.array(views[7].mask)
     mask[11:14, 11:14] = 0  # of which a pixel is left, as far as a cell is from others
     views[7] = replace(views[7], mask=mask)
-    assert len(trusted(views, images().similarity)) == len(views)
+    assert len(Agreement.of(views, images().similarity).trusted()) == len(views)
     distances = carve(views, images().similarity, resolution=32)
     assert distances is not None
     assert distances[16, 16, 16] > 0  # in the middle of the hole, and of the ball
@@ -110,16 +110,16 @@ def test_a_gap_that_one_camera_of_many_sees_is_carved() -> None:
 
 def test_masks_that_are_wrong_do_not_carve() -> None:
     views, similarity = list(images().views) * 3, images().similarity
-    assert trusted(views, similarity) == views
+    assert Agreement.of(views, similarity).trusted() == views
     views[0] = inverted().views[0]
     mask = np.array(views[1].mask)
     mask[8:16, 8:16] = 0
     views[1] = replace(views[1], mask=mask)
-    assert [id(view) for view in trusted(views, similarity)] == [id(view) for view in views[2:]]
+    assert [id(view) for view in Agreement.of(views, similarity).trusted()] == [id(view) for view in views[2:]]
     # Where all are inverted, nothing tells which to trust; of three views each may cut a third.
     turned = inverted().views
-    assert trusted(turned, similarity) is turned
-    assert trusted(views[2:5], similarity) == views[2:5]
+    assert Agreement.of(turned, similarity).trusted() is turned
+    assert Agreement.of(views[2:5], similarity).trusted() == views[2:5]
 
 
 @pytest.mark.parametrize(("size", "expected"), [(12, 32), (48, 64), (400, 128)])
