@@ -116,7 +116,15 @@ class HashEncoding(nn.Module):
         return len(self.resolutions) * self.table.shape[1]
 
     def forward(self, x: Tensor) -> Tensor:
-        """Features ``(..., L F)`` of positions ``(..., 3)``; differentiable by the table and by ``x``."""
+        """Features ``(..., L F)`` of positions ``(..., 3)``; differentiable by the table and by ``x``.
+
+        In the precision of the table, under ``autocast`` too: half of it has no digits left for where in a cell of a
+        fine grid a position is.
+        """
+        with torch.autocast(x.device.type, enabled=False):
+            return self._looked_up(x.to(self.table.dtype))
+
+    def _looked_up(self, x: Tensor) -> Tensor:
         rows = x.reshape(-1, 1, 3)
         cells = self.cells[:, None]
         at = (rows.clamp(-self.extent, self.extent) + self.extent) * (0.5 / self.extent) * cells  # (N, L, 3)

@@ -31,6 +31,8 @@ __all__ = ["Exposures", "PoseCorrections", "RayPool", "Rays", "SceneModel", "bui
 # s = exp(10 v): one learning rate serves this number and the networks (NeuS begins at v = 0.3, s = 20).
 SHARPENING = 10.0
 FIRST_VARIANCE = 0.3
+# Kinds of devices on which matrix products of colours are in bfloat16.
+HALF_PRECISION = ("cuda",)
 
 
 class Exposures(nn.Module):
@@ -161,7 +163,7 @@ class SceneModel(nn.Module):
         """`render_volume` of this scene, with colours in half precision on a GPU."""
 
         def color(x: Tensor, direction: Tensor, jet: Jet) -> Tensor:
-            with torch.autocast(x.device.type, torch.bfloat16, enabled=x.device.type == "cuda"):
+            with torch.autocast(x.device.type, torch.bfloat16, enabled=x.device.type in HALF_PRECISION):
                 return self.color(x, direction, jet).float()
 
         return render_volume(

@@ -88,6 +88,17 @@ def test_any_leading_shape_and_any_device(device: torch.device) -> None:
     assert moved(x[:0].to(device)).shape == (0, encoding.size)
 
 
+def test_under_autocast_features_are_those_of_full_precision() -> None:
+    encoding, x = small().float(), in_cube(24).float()
+    expected = encoding(x)
+    (slope,) = torch.autograd.grad(expected.square().sum(), encoding.table)
+    with torch.autocast("cpu", torch.bfloat16):
+        found, of_half = encoding(x), encoding(x.bfloat16())
+    assert torch.equal(found, expected)
+    assert of_half.dtype == torch.float32
+    assert torch.equal(torch.autograd.grad(found.square().sum(), encoding.table)[0], slope)
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

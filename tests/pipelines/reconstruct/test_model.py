@@ -132,7 +132,10 @@ def test_a_seed_decides_the_start_and_leaves_the_global_random_state() -> None:
 
 
 @pytest.mark.usefixtures("no_start")
-def test_everything_is_trained_by_one_picture() -> None:
+@pytest.mark.parametrize("half", [False, True])
+def test_everything_is_trained_by_one_picture(half: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    # On a GPU products of colours are in half precision, which the CPU has too.
+    monkeypatch.setattr(scene_model, "HALF_PRECISION", ("cpu",) if half else ())
     model = build_scene(replace(SMALL, background="outside"), has_masks=False)
     origins = torch.nn.functional.normalize(torch.randn(64, 3), dim=1) * 2
     directions = torch.nn.functional.normalize(0.5 * (torch.rand(64, 3) - 0.5) - origins, dim=1)
