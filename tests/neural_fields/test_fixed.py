@@ -112,6 +112,7 @@ def test_first_rows_are_those_of_nonzero(count: int) -> None:
     assert torch.equal(first_rows(mask[:0], count), torch.zeros(count, dtype=torch.int64))
 
 
+@standin.needed
 @pytest.mark.parametrize("capacity", [None, [50, 20]])
 def test_nobody_waits_and_the_kernels_are_the_same_for_any_points(capacity: list[int] | None) -> None:
     field = copy.deepcopy(sdf()).to(standin.NAME)
@@ -135,6 +136,7 @@ def composed(name: str) -> Field:
 
 
 @pytest.mark.parametrize("capacity", [None, [60, 20]])
+@standin.needed
 @pytest.mark.parametrize("name", ["union", "slice"])
 def test_fields_of_fields_need_no_wait_either(name: str, capacity: list[int] | None) -> None:
     field, x = composed(name), points()

@@ -49,6 +49,7 @@ def test_every_row_is_in_one_block(rows: int, size: int, threads: int) -> None:
     assert len(names) <= max(1, threads)
 
 
+@standin.needed
 def test_an_accelerator_is_given_as_much_as_it_may_have_at_once() -> None:
     """A CPU gets a block for each of its cores; elsewhere each block would be launches of its own."""
     rows = 20 * LEAST_ROWS

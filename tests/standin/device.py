@@ -287,10 +287,11 @@ def _register() -> tuple[torch.library.Library, ...]:
         packet, _, overload = name.partition(".")
         func: Callable[..., Any] = getattr(getattr(torch.ops.aten, packet), overload or "default")
         some.impl(name, functools.partial(_run, func), "PrivateUse1")
-    if not torch.cuda.is_available():  # which pins memory itself
-        some.impl("_pin_memory", _pin, "CPU")
-        some.impl("is_pinned", _is_pinned, "CPU")
+    some.impl("_pin_memory", _pin, "CPU")
+    some.impl("is_pinned", _is_pinned, "CPU")
     return everything, some
 
 
-_LIBRARIES = _register()  # they last as long as someone holds them
+# Not beside CUDA: PyTorch asks the backend of a process for streams and pinned memory, and there can be one of them.
+AVAILABLE = not torch.cuda.is_available()
+_LIBRARIES = _register() if AVAILABLE else ()  # they last as long as someone holds them
