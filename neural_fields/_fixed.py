@@ -8,14 +8,16 @@ places; places that are left over are computed and thrown away.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from contextvars import ContextVar
+from types import MappingProxyType
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-__all__ = ["FixedShapes", "current_shapes", "first_rows", "fixed_shapes", "one_evaluation"]
+__all__ = ["FixedShapes", "Rows", "chosen", "current_shapes", "first_rows", "fixed_shapes", "one_evaluation"]
 
 
 class FixedShapes:
@@ -27,11 +29,19 @@ class FixedShapes:
         demand: for each residual level that was evaluated, the most points that were in its band, 0-dimensional int64.
         lost: ``(N,)`` bool of the last evaluation, the points that found no room in a band: they have the value of a
             coarser level. None where there was room for all. Of a field of fields (`Union`, …), in a band of any part.
+        rooms: how many rows each choice by `chosen` has room for; those without a name here for all.
+        asked: by the same names, how many rows were to be chosen, 0-dimensional int64.
     """
 
-    def __init__(self, capacity: Sequence[int] | None = None, wanted: Tensor | None = None) -> None:
-        self.capacity, self.wanted = capacity, wanted
+    def __init__(
+        self,
+        capacity: Sequence[int] | None = None,
+        wanted: Tensor | None = None,
+        rooms: Mapping[str, int] = MappingProxyType({}),
+    ) -> None:
+        self.capacity, self.wanted, self.rooms = capacity, wanted, rooms
         self.demand: list[Tensor] = []
+        self.asked: dict[str, Tensor] = {}
         self.lost: Tensor | None = None
         self._under_way = False
 
@@ -75,11 +85,70 @@ class FixedShapes:
         return admitted, first_rows(admitted, room)
 
 
+class Rows(NamedTuple):
+    """Some rows of tensors ``(N, …)``, and the way to them and back.
+
+    Attributes:
+        places: ``(K,)`` their numbers; places that are left over have N.
+        total: N.
+        full: whether none can be left over.
+    """
+
+    places: Tensor
+    total: int
+    full: bool
+
+    def of(self, tensor: Tensor) -> Tensor:
+        """``(N, …)`` → ``(K, …)``; places that are left over get the last row, and whatever they find is lost."""
+        return tensor[self.places] if self.full else tensor.index_select(0, self.places.clamp(max=self.total - 1))
+
+    def back(self, found: Tensor) -> Tensor:
+        """``(K, …)`` → ``(N, …)``, 0 in rows that were not chosen."""
+        blank = found.new_zeros(self.total if self.full else self.total + 1, *found.shape[1:])
+        filled = blank.index_copy(0, self.places, found)
+        return filled if self.full else filled[: self.total]
+
+    @property
+    def used(self) -> Tensor:
+        """``(K,)`` bool, False for places that are left over."""
+        return self.places < self.total
+
+    @contextmanager
+    def wanted(self) -> Iterator[None]:
+        """Inside this, fields let none of the places that are left over into a band."""
+        shapes = current_shapes()
+        if shapes is None or self.full:
+            yield
+            return
+        before, shapes.wanted = shapes.wanted, self.used
+        try:
+            yield
+        finally:
+            shapes.wanted = before
+
+
+def chosen(name: str, mask: Tensor) -> Rows:
+    """The rows of ``mask`` ``(N,)`` that are True; with a given room inside `fixed_shapes`.
+
+    Args:
+        name: of the choice, for `FixedShapes.rooms`.
+        mask: bool, N ≥ 1.
+    """
+    shapes = current_shapes()
+    if shapes is None:
+        return Rows(mask.nonzero()[:, 0], len(mask), full=True)
+    shapes.asked[name] = mask.sum()
+    room = min(shapes.rooms.get(name, len(mask)), len(mask))
+    return Rows(first_rows(mask, room), len(mask), full=False)
+
+
 _shapes: ContextVar[FixedShapes | None] = ContextVar("shapes", default=None)
 
 
 @contextmanager
-def fixed_shapes(capacity: Sequence[int] | None = None) -> Iterator[FixedShapes]:
+def fixed_shapes(
+    capacity: Sequence[int] | None = None, *, rooms: Mapping[str, int] = MappingProxyType({})
+) -> Iterator[FixedShapes]:
     """Inside this, a `MultiscaleSDF` never makes the host wait, and launches the same kernels for any points.
 
     Without a ``capacity`` every level is evaluated at every point, and used where it lies in the band: as many more
@@ -88,6 +157,7 @@ def fixed_shapes(capacity: Sequence[int] | None = None) -> Iterator[FixedShapes]
 
     Args:
         capacity: see `FixedShapes`.
+        rooms: likewise.
 
     Example:
         >>> import torch
@@ -99,7 +169,7 @@ def fixed_shapes(capacity: Sequence[int] | None = None) -> Iterator[FixedShapes]
         >>> bool((value - sdf.value(x)).abs().max() < 1e-6)
         True
     """
-    shapes = FixedShapes(capacity)
+    shapes = FixedShapes(capacity, rooms=rooms)
     token = _shapes.set(shapes)
     try:
         yield shapes

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 
 import torch
 from torch import Tensor
 
-__all__ = ["few_numbers", "makes_wait", "precise", "upload"]
+__all__ = ["Supply", "few_numbers", "handed", "is_supplied", "makes_wait", "precise", "upload"]
 
 
 def makes_wait(device: torch.device) -> bool:
@@ -24,6 +26,101 @@ def upload(tensor: Tensor, device: torch.device | str) -> Tensor:
     if device.type in ("cpu", "mps"):  # these share the host's memory
         return tensor.to(device)
     return tensor.pin_memory().to(device, non_blocking=True)
+
+
+class Supply:
+    """What the host makes for a work of a device that is done again and again, with the same operations each time.
+
+    The first time, inside `noting`, it goes to the device as it is asked for, and how it was made is noted down. From
+    then on, inside `supplied`, the work finds it in memory of the device that stays where it is, as a CUDA graph wants
+    it; `renew` makes all of it once more, in the same order, and sends it in one copy for each precision.
+
+    Args:
+        device: where the work is done.
+    """
+
+    def __init__(self, device: torch.device) -> None:
+        self.device = device
+        self._makers: list[Callable[[], Tensor]] = []
+        self._shapes: list[tuple[torch.dtype, torch.Size]] = []
+        self._stores: dict[torch.dtype, Tensor] = {}
+        self._places: list[Tensor] = []
+        self._next: int | None = None
+
+    @contextmanager
+    def noting(self) -> Iterator[None]:
+        """The work is done as if there were no supply; `handed` notes down."""
+        self._makers.clear()
+        self._shapes.clear()
+        token = _supply.set(self)
+        try:
+            yield
+        finally:
+            _supply.reset(token)
+
+    @contextmanager
+    def supplied(self) -> Iterator[None]:
+        """`handed` gives what `renew` has put there, and makes nothing."""
+        if not self._places:
+            self._lay_out()
+        self._next = 0
+        token = _supply.set(self)
+        try:
+            yield
+        finally:
+            _supply.reset(token)
+            self._next = None
+
+    def renew(self) -> None:
+        """Make all of it anew, for the next time."""
+        if not self._places:
+            self._lay_out()
+        made = [make() for make in self._makers]
+        for dtype, store in self._stores.items():
+            flat = torch.cat([one.reshape(-1) for one in made if one.dtype == dtype])
+            store.copy_(upload(flat, self.device), non_blocking=True)
+
+    def _lay_out(self) -> None:
+        """Memory for all that was noted down, and the place of each part in it."""
+        sizes: dict[torch.dtype, int] = {}
+        starts = []
+        for dtype, shape in self._shapes:
+            starts.append(sizes.get(dtype, 0))
+            sizes[dtype] = starts[-1] + shape.numel()
+        self._stores = {dtype: torch.zeros(size, dtype=dtype, device=self.device) for dtype, size in sizes.items()}
+        self._places = [
+            self._stores[dtype][start : start + shape.numel()].view(shape)
+            for start, (dtype, shape) in zip(starts, self._shapes, strict=True)
+        ]
+
+    def give(self, make: Callable[[], Tensor]) -> Tensor:
+        """See `handed`."""
+        if self._next is not None:
+            self._next += 1
+            return self._places[self._next - 1]
+        made = make()
+        self._makers.append(make)
+        self._shapes.append((made.dtype, made.shape))
+        return upload(made, self.device)
+
+
+_supply: ContextVar[Supply | None] = ContextVar("supply", default=None)
+
+
+def handed(make: Callable[[], Tensor], device: torch.device) -> Tensor:
+    """What the host makes, on ``device``; anew each time, where a work is done again by a `Supply`.
+
+    Args:
+        make: draws random numbers, or tells what the host knows by now; its shape is the same each time.
+        device: of the work.
+    """
+    supply = _supply.get()
+    return upload(make(), device) if supply is None else supply.give(make)
+
+
+def is_supplied() -> bool:
+    """Whether this work will be done again by a `Supply`, so that numbers of the host must go through `handed`."""
+    return _supply.get() is not None
 
 
 def few_numbers(numbers: Sequence[float], like: Tensor) -> Tensor:

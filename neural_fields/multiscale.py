@@ -329,7 +329,8 @@ def _walk_on(
             )
         else:
             taken = rows.clamp(max=count - 1)  # places that are left over get the last point, and
-            joined = join(tuple(part[taken] for part in parts), evaluate(level, points[taken]), delta)
+            some = tuple(part.index_select(0, taken) for part in parts)
+            joined = join(some, evaluate(level, points.index_select(0, taken)), delta)
             parts = tuple(
                 torch.cat((part, part[:1])).index_copy(0, rows, new)[:count]  # what they find goes behind it
                 for part, new in zip(parts, joined, strict=True)

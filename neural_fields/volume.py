@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import softplus
 
-from .devices import upload
+from .devices import handed
 
 __all__ = [
     "ball_chord",
@@ -53,7 +53,7 @@ class Weights(NamedTuple):
 
 
 def neus_optical_depth(
-    value: Tensor, slope: Tensor, interval: Tensor, inv_std: Tensor | float, *, cos_anneal: float = 1.0
+    value: Tensor, slope: Tensor, interval: Tensor, inv_std: Tensor | float, *, cos_anneal: Tensor | float = 1.0
 ) -> Tensor:
     """Optical depth τ ≥ 0 of sections, from the field at their middles (NeuS, Eq. 13, in logarithms).
 
@@ -65,7 +65,7 @@ def neus_optical_depth(
         slope: ``(...,)`` c = ⟨∇f, v⟩ there, for unit directions v.
         interval: ``(...,)`` length Δ of each section.
         inv_std: s, a number or 0-d tensor; 1/s is the width of the surface's uncertainty.
-        cos_anneal: a in [0, 1]: 0 at the start of training, 1 is the true slope.
+        cos_anneal: a in [0, 1], a number or 0-d tensor: 0 at the start of training, 1 is the true slope.
 
     Example:
         >>> import torch
@@ -74,14 +74,14 @@ def neus_optical_depth(
         1.0
     """
     falling = -torch.relu(-slope)
-    if cos_anneal < 1:
+    if isinstance(cos_anneal, Tensor) or cos_anneal < 1:  # of a tensor the host does not know
         falling = cos_anneal * falling - (1 - cos_anneal) * torch.relu(0.5 - 0.5 * slope)
     half = 0.5 * interval * falling
     return softplus(-inv_std * (value + half)) - softplus(-inv_std * (value - half))
 
 
 def neus_alpha(
-    value: Tensor, slope: Tensor, interval: Tensor, inv_std: Tensor | float, *, cos_anneal: float = 1.0
+    value: Tensor, slope: Tensor, interval: Tensor, inv_std: Tensor | float, *, cos_anneal: Tensor | float = 1.0
 ) -> Tensor:
     """Opacity α = 1 − e^{−τ} in [0, 1) of sections; the arguments are those of `neus_optical_depth`."""
     return -torch.expm1(-neus_optical_depth(value, slope, interval, inv_std, cos_anneal=cos_anneal))
@@ -149,12 +149,16 @@ def stratified_depths(near: Tensor, far: Tensor, count: int, *, generator: torch
     With a generator the depths of a ray are shifted together by a random part of a stratum; without, they are
     the middles of the strata.
     """
-    shift = torch.rand(len(near), 1, generator=generator) if generator else torch.full((1, 1), 0.5)
-    strata = (torch.arange(count) + shift) / count
-    return near[:, None] + (far - near)[:, None] * upload(strata, near.device).to(near.dtype)
+    shift, rays = 0.5, len(near)
+    if generator:
+        shift = handed(lambda: torch.rand(rays, 1, generator=generator), near.device)
+    strata = (torch.arange(count, device=near.device) + shift) / count
+    return near[:, None] + (far - near)[:, None] * strata.to(near.dtype)
 
 
-def secant_weights(depths: Tensor, values: Tensor, inv_std: Tensor | float, *, cos_anneal: float = 1.0) -> Tensor:
+def secant_weights(
+    depths: Tensor, values: Tensor, inv_std: Tensor | float, *, cos_anneal: Tensor | float = 1.0
+) -> Tensor:
     """Weights ``(R, S − 1)`` of the sections between depths, from the field's values at their ends alone.
 
     The slope is the lesser (steeper) one of the section's own secant and the one before, so that a section which the
@@ -195,7 +199,8 @@ def importance_depths(
     cumulative = cumulative / cumulative[:, -1:]
     quantiles = stratified_depths(torch.zeros_like(depths[:, 0]), torch.ones_like(depths[:, 0]), count)
     if generator:
-        shifts = upload(torch.rand(quantiles.shape, generator=generator), quantiles.device).to(quantiles.dtype)
+        shape = quantiles.shape
+        shifts = handed(lambda: torch.rand(shape, generator=generator), depths.device).to(depths.dtype)
         quantiles = quantiles + (shifts - 0.5) / count
     right = torch.searchsorted(cumulative, quantiles.contiguous()).clamp(1, depths.shape[1] - 1)
     low, high = cumulative.gather(1, right - 1), cumulative.gather(1, right)

@@ -8,6 +8,7 @@ that contribute to their pixel, and jets, if wanted, only where the values of th
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple, Protocol
@@ -16,7 +17,8 @@ import torch
 from torch import Tensor
 
 from ._checks import at_least, positive
-from .devices import precise, upload
+from ._fixed import chosen
+from .devices import handed, precise
 from .field import Field, Jet
 from .function import FieldLike, as_field
 from .volume import (
@@ -112,7 +114,7 @@ def render_volume(
     *,
     inv_std: Tensor | float,
     sampling: Sampling | None = None,
-    cos_anneal: float = 1.0,
+    cos_anneal: Tensor | float = 1.0,
     level: int = -1,
     background: Tensor | None = None,
     outside: RayOutside | None = None,
@@ -123,6 +125,9 @@ def render_volume(
     generator: torch.Generator | None = None,
 ) -> Rendered:
     """Render rays through the unit sphere; differentiable in the rays and all parameters, ``inv_std`` too.
+
+    Inside `fixed_shapes` the sections, colours and rays that are chosen have the ``rooms`` "sections", "colors" and
+    "outside", as bands have theirs, and the host never waits.
 
     Args:
         field: the geometry, in unit-sphere coordinates; or any function of points ``(..., 3)`` → ``(...,)``.
@@ -175,40 +180,43 @@ def render_volume(
     depths = edges[:, :-1] + 0.5 * interval
     # Sections of a ray that misses the sphere have no length, and stand for nothing.
     counts, rows = (far > near).to(depths)[:, None].expand_as(depths), None
-    if skip > 0:
+    if skip > 0 and counts.numel():
         with torch.no_grad():  # an estimate chooses sections and teaches nobody
             values = _march(field, guide)(ray_points(origins, directions, edges))
             estimated = secant_weights(edges, values, _estimate_sharpness(field, level, inv_std), cos_anneal=cos_anneal)
             counts = counts * _counts(estimated, values, skip, skip_share, generator)
-        rows = counts.flatten().nonzero()[:, 0]
+        rows = chosen("sections", counts.flatten() > 0)
 
     def of_sections(tensor: Tensor) -> Tensor:
         """``(R, S, …)`` → ``(K, …)``, those that are evaluated."""
         flat = tensor.flatten(0, 1)
-        return flat if rows is None else flat[rows]
+        return flat if rows is None else rows.of(flat)
 
     def in_place(found: Tensor) -> Tensor:
         """The way back; 0 in sections that were skipped."""
         shape = (*depths.shape, *found.shape[1:])
-        if rows is None:
-            return found.reshape(shape)
-        return found.new_zeros(depths.numel(), *found.shape[1:]).index_copy(0, rows, found).reshape(shape)
+        return (found if rows is None else rows.back(found)).reshape(shape)
 
     points = of_sections(ray_points(origins, directions, depths))  # (K, 3)
     along = of_sections(directions[:, None].expand(-1, depths.shape[1], -1))
-    found = field.jet(points, level=level)
+    with nullcontext() if rows is None else rows.wanted():
+        found = field.jet(points, level=level)
     slope = (found.gradient * along).sum(dim=-1)
     optical = neus_optical_depth(found.value, slope, of_sections(interval), inv_std, cos_anneal=cos_anneal)
     weights, remaining = transmittance_weights(in_place(optical))
-    seen = in_place(_colors(color, points, along, found, of_sections(weights), least_weight))
+    matter = None
+    if least_weight > 0:
+        matter = of_sections(weights.detach()) > least_weight
+        matter = matter if rows is None or rows.full else matter & rows.used
+    seen = in_place(_colors(color, points, along, found, matter))
     mixed = composite(weights, seen)
     if outside is not None:
         # As for colours: where next to no light gets there, nobody asks what is there.
-        through = (remaining.detach() > least_weight).nonzero()[:, 0]
-        eyes, along, ends = origins[through], directions[through], far[through]
-        last = background if background is None or background.ndim == 1 else background[through]
+        through = chosen("outside", remaining.detach() > least_weight)
+        eyes, along, ends, light = (through.of(tensor) for tensor in (origins, directions, far, remaining))
+        last = background if background is None or background.ndim == 1 else through.of(background)
         behind = _behind(outside, eyes, along, ends, sampling, last, generator)
-        mixed = mixed.index_add(0, through, remaining[through, None] * behind)
+        mixed = mixed + through.back(light[:, None] * behind)
     elif background is not None:
         mixed = mixed + remaining[:, None] * background
     jet = Jet(*(in_place(part) for part in found))
@@ -283,18 +291,18 @@ def _counts(estimated: Tensor, values: Tensor, skip: float, share: float, genera
     smallest = (values[:, 1:] + values[:, :-1]).argmin(dim=1, keepdim=True)
     counts = (around >= skip).to(estimated).scatter(1, smallest, 1.0)
     if share and generator is not None:
-        chance = upload(torch.rand(estimated.shape, generator=generator) < share, estimated.device)
+        shape = estimated.shape
+        chance = handed(lambda: torch.rand(shape, generator=generator), estimated.device) < share
         counts = torch.where((counts == 0) & chance, 1 / share, counts)
     return counts
 
 
-def _colors(color: RayColor, points: Tensor, along: Tensor, jet: Jet, weights: Tensor, least_weight: float) -> Tensor:
-    """Colours ``(K, 3)`` of the samples that matter, 0 for the others."""
-    if least_weight <= 0:
+def _colors(color: RayColor, points: Tensor, along: Tensor, jet: Jet, matter: Tensor | None) -> Tensor:
+    """Colours ``(K, 3)`` of the samples that matter ``(K,)``, 0 for the others; of all for None."""
+    if matter is None or not len(points):
         return color(points, along, jet)
-    rows = (weights.detach() > least_weight).nonzero()[:, 0]
-    found = color(points[rows], along[rows], Jet(*(part[rows] for part in jet)))
-    return points.new_zeros(points.shape).index_copy(0, rows, found)
+    rows = chosen("colors", matter)
+    return rows.back(color(rows.of(points), rows.of(along), Jet(*(rows.of(part) for part in jet))))
 
 
 def _behind(

@@ -29,7 +29,8 @@ from torch.utils.flop_counter import FlopCounterMode
 from ...neural_fields import Field, Jet, levels_of
 from ...neural_fields.radiance import Outside, ViewColor
 from ..reconstruct.model import RayPool, SceneModel
-from ..reconstruct.objective import SceneObjective, scene_trainer
+from ..reconstruct.objective import SceneObjective
+from ..reconstruct.replayed import scene_trainer
 from ..run.settings import ReconstructConfig
 from ..run.trainer import Progress, StopFlag, Trainer
 from .reconstruct_rows import StepParts
@@ -111,6 +112,8 @@ def train_watched(
 ) -> Watched:
     """Train to the end of the schedule, or until ``flag`` asks to stop.
 
+    Steps are not replayed on a GPU: what is counted is what each of them asks for.
+
     Args:
         model: on the pool's device.
         pool: the pixels.
@@ -126,6 +129,7 @@ def train_watched(
     colors, outsides = _RowCounter(model.color), _RowCounter(model.outside)
     if seconds is not None:
         config = replace(config, steps=ENDLESS)
+    config = replace(config, graphs=False)
     trainer = scene_trainer(model, pool, config, seconds=seconds)
     clocks = None
     if pool.device.type == "cpu":

@@ -48,7 +48,7 @@ __all__ = ["BenchScene", "ReconstructBench", "common_sheet", "read_scene", "row_
 
 SHEET_VIEWS = 4  # rows of a sheet of held-out views
 COMMON_VIEWS = 2  # on the sheet of all rows
-UNUSED = ("texture_steps", "time_budget", "device", "width")  # settings that change no row of one data set
+UNUSED = ("texture_steps", "time_budget", "device", "width", "graphs")  # settings that change no row of one data set
 ALIKE: Mapping[str, Any] = {"jets": 0, "focus": 0.0}  # or each network would have rays of its own
 
 

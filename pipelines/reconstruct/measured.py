@@ -19,7 +19,7 @@ from ...datasets.cameras import Camera
 from ...datasets.views.depth_maps import DepthMap
 from ...datasets.views.images import PosedImage, PosedImages
 from ...neural_fields import Field, InputError, sphere_trace
-from ...neural_fields.devices import upload
+from ...neural_fields.devices import handed
 from ...neural_fields.function import FieldLike
 from ...neural_fields.volume import sphere_span
 from ..run.team import my_share
@@ -142,8 +142,7 @@ class MeasuredDepths:
 
     def draw(self, count: int, generator: torch.Generator) -> DepthRays:
         """``count`` measurements at random, with replacement, or a team's share of them."""
-        rows = torch.randint(len(self), (count,), generator=generator)
-        return self.at(upload(my_share(rows), self.device))
+        return self.at(handed(lambda: my_share(torch.randint(len(self), (count,), generator=generator)), self.device))
 
     @torch.no_grad()
     def settle(self, distance: FieldLike) -> None:
@@ -233,8 +232,10 @@ def depth_loss(field: Field, rays: DepthRays, *, level: int = -1, generator: tor
     on_surface = (reach > near) & (reach < far)
     end = torch.minimum(reach, far)
     seen_through = end > near
-    part = torch.rand(len(reach), generator=generator) if generator else torch.full((len(reach),), 0.5)
-    at = end - (end - near) * upload(part, end.device).square()
+    part, count = torch.full_like(reach, 0.5), len(reach)
+    if generator:
+        part = handed(lambda: torch.rand(count, generator=generator), end.device)
+    at = end - (end - near) * part.square()
     places = origins + torch.stack((reach, at))[..., None] * directions  # (2, B, 3)
     # Those that do not count are evaluated too: a GPU would be waited for until it says which they are.
     on, before = field.value(places, level=level)

@@ -14,7 +14,7 @@ from ...datasets.cameras import Camera
 from ...datasets.views.images import PosedImage
 from ...neural_fields import Field, InputError, Jet, MultiscaleSDF, Similarity, Siren
 from ...neural_fields.baselines import NeusSDF
-from ...neural_fields.devices import precise, upload
+from ...neural_fields.devices import handed, precise
 from ...neural_fields.hash_encoding import HashEncoding
 from ...neural_fields.radiance import Outside, Radiance, ViewColor
 from ...neural_fields.sphere_start import fit_sphere
@@ -31,6 +31,7 @@ __all__ = ["Exposures", "PoseCorrections", "RayPool", "Rays", "SceneModel", "bui
 # s = exp(10 v): one learning rate serves this number and the networks (NeuS begins at v = 0.3, s = 20).
 SHARPENING = 10.0
 FIRST_VARIANCE = 0.3
+TINY_ANGLE = 1e-10  # in radians
 # Kinds of devices on which matrix products of colours are in bfloat16.
 HALF_PRECISION = ("cuda",)
 
@@ -74,11 +75,16 @@ class PoseCorrections(nn.Module):
     def moved(self, origins: Tensor, directions: Tensor, view: Tensor) -> tuple[Tensor, Tensor]:
         """Origins and directions ``(R, 3)`` of rays of the cameras with the numbers ``view`` ``(R,)``, corrected."""
         turns, shifts = self()
-        x, y, z = turns.unbind(dim=1)
-        none = torch.zeros_like(x)
-        cross = torch.stack((none, -z, y, z, none, -x, -y, x, none), dim=1).reshape(-1, 3, 3)
-        turned = torch.linalg.matrix_exp(cross)[view] @ directions[:, :, None]
-        return origins + shifts[view], turned[:, :, 0]
+        # Rodrigues: v cos θ + (ω × v) sin θ / θ + ω ⟨ω, v⟩ (1 − cos θ) / θ², the last factor as half a sinc squared.
+        # (PyTorch's exponential of matrices would make a GPU wait.) The root has a slope at 0, too.
+        angle = (turns.square().sum(dim=1, keepdim=True) + TINY_ANGLE**2).sqrt()
+        first, second = torch.sinc(angle / math.pi), 0.5 * torch.sinc(0.5 * angle / math.pi).square()
+        turn, cosine, first, second, shift = (
+            part.index_select(0, view) for part in (turns, angle.cos(), first, second, shifts)
+        )
+        along = (turn * directions).sum(dim=1, keepdim=True)
+        turned = cosine * directions + first * torch.linalg.cross(turn, directions) + second * along * turn
+        return origins + shift, turned
 
 
 class SceneModel(nn.Module):
@@ -140,7 +146,7 @@ class SceneModel(nn.Module):
         """
         if self.exposures is None:
             return seen.color
-        gain, offset = (part[view] for part in self.exposures())
+        gain, offset = (part.index_select(0, view) for part in self.exposures())
         if self.outside is not None:
             return gain * seen.color + offset
         behind = (1 - seen.opacity)[:, None] * self.background
@@ -152,7 +158,7 @@ class SceneModel(nn.Module):
         directions: Tensor,
         sampling: Sampling,
         *,
-        cos_anneal: float = 1.0,
+        cos_anneal: Tensor | float = 1.0,
         level: int = -1,
         least_weight: float = 0.0,
         skip: float = 0.0,
@@ -317,10 +323,13 @@ class RayPool:
 
     def draw(self, count: int, generator: torch.Generator, focus: Focus | None = None) -> Rays:
         """``count`` rays at random, with replacement, or a team's share of them; ``focus`` says where."""
-        rows = (
-            torch.randint(len(self), (count,), generator=generator) if focus is None else focus.rows(count, generator)
-        )
-        rows = upload(my_share(rows), self.device)
+
+        def draw() -> Tensor:
+            if focus is None:
+                return my_share(torch.randint(len(self), (count,), generator=generator))
+            return my_share(focus.rows(count, generator))
+
+        rows = handed(draw, self.device)
         view, pixel = self.owners[rows].long(), self.pixels[rows].long()
         fx, fy, cx, cy = self.lens[view].unbind(dim=1)
         x, y = pixel % self.widths[view], pixel // self.widths[view]

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from ...neural_fields.devices import handed, is_supplied
 from ...neural_fields.hash_encoding import tables_apart
 from ...neural_fields.losses import eikonal_loss
 from ...neural_fields.value_grid import ValueGrid
@@ -15,7 +18,7 @@ from ...neural_fields.volume_renderer import Rendered, Sampling
 from ..run.focus import Focus
 from ..run.settings import ReconstructConfig
 from ..run.team import gathered, mean_of_all, own_generator, whole_batch
-from ..run.trainer import Group, Objective, Trainer, warm_cosine
+from ..run.trainer import Group, Objective, warm_cosine
 from .measured import MeasuredDepths, depth_loss
 from .model import RayPool, SceneModel
 from .smoothness import tangents, unevenness
@@ -37,7 +40,37 @@ DEPTH_RAYS = 256  # measured ones of a step
 # depths that were estimated from single pictures, which are wrong in their details, do not count any more.
 SETTLE_EVERY, FADED = 64, 0.5
 
-__all__ = ["SceneObjective", "scene_trainer"]
+__all__ = ["Kind", "Outcome", "SceneObjective"]
+
+
+class Kind(NamedTuple):
+    """Of which kind a step is: those of one kind do the same operations.
+
+    Attributes:
+        rays: how many there are.
+        level: the finest that is switched on.
+        annealing: whether slopes are still annealed.
+        measured: whether measured depths count.
+    """
+
+    rays: int
+    level: int
+    annealing: bool
+    measured: bool
+
+
+class Outcome(NamedTuple):
+    """What a step is descended by.
+
+    Attributes:
+        terms: of the loss, unweighted.
+        total: their weighted sum.
+        sections: that are evaluated per ray, 0-d.
+    """
+
+    terms: dict[str, Tensor]
+    total: Tensor
+    sections: Tensor
 
 
 class SceneObjective(Objective):
@@ -76,6 +109,7 @@ class SceneObjective(Objective):
         self.grid = ValueGrid(config.march_grid, pool.device) if config.march_grid else None
         if self.grid is not None:
             self.kept |= {"march": self.grid.kept, "moved": self.grid.moved, "looks": torch.tensor([0, NEAR_EVERY, 0])}
+        self.done = 0.0  # of the schedule, at the step under way
         self.measured = measured if config.depth_weight else None
         if self.measured is not None:
             self.kept["affine"] = self.measured.affine
@@ -85,13 +119,13 @@ class SceneObjective(Objective):
         started = sum(start <= done for start in self.config.starts)
         return min(started, self.model.geometry.num_levels) - 1
 
-    def look(self, step: int, done: float) -> ValueGrid | None:
-        """The grid that rays march on, brought up to date: its near part often, all of it now and then.
+    def look(self, step: int, done: float) -> None:
+        """Bring the grid that rays march on up to date: its near part often, all of it now and then.
 
         While the surface moves, often is every `NEAR_EVERY` steps; the less it moved, the longer it is left alone.
         """
         if self.grid is None:
-            return None
+            return
         self.grid.kept = self.kept["march"]  # that of a run which is resumed
         looked, pause, looks = self.kept["looks"].tolist()
         if step >= looked + pause or not looks:
@@ -101,7 +135,6 @@ class SceneObjective(Objective):
             whole = looks % (WHOLE_EVERY if done < EARLY else WHOLE_LATER) == 0
             self.grid.refresh(self.model.geometry, whole=whole)
             self.kept |= {"moved": self.grid.moved, "looks": torch.tensor([step, pause, looks + 1])}
-        return self.grid
 
     def remember(self, step: int, sections: Tensor) -> None:
         """Fetch what the next steps depend on, all at once: a GPU is waited for.
@@ -133,9 +166,44 @@ class SceneObjective(Objective):
 
     def losses(self, step: int, done: float) -> tuple[dict[str, Tensor], Tensor]:
         """See `Objective.losses`."""
-        config = self.config
+        kind = self.ahead(step, done)
+        outcome = self.evaluate(kind)
+        self.behind(step, outcome.sections)
+        return outcome.terms, outcome.total
+
+    def ahead(self, step: int, done: float) -> Kind:
+        """What has to be done on the host before a step, and of which kind the step is."""
+        self.done = done
+        self.focus.watched(step, self.kept)
+        self.look(step, done)
+        measured = self.measured
+        if measured is not None:
+            measured.affine = self.kept["affine"]  # that of a run which is resumed
+            if measured.is_loose and done < FADED and step % SETTLE_EVERY == 0:
+                measured.settle(self.grid or (lambda x: self.model.geometry.value(x, level=0)))
+                self.kept["affine"] = measured.affine
+        return Kind(
+            rays=whole_batch(self.batch()),
+            level=self.level_at(done),
+            annealing=done < self.config.anneal,
+            measured=measured is not None and (done < FADED or measured.is_exact),
+        )
+
+    def behind(self, step: int, sections: Tensor) -> None:
+        """What has to be done on the host after a step, of which a ray had so many sections, 0-d."""
+        if (step + 1) % NEAR_EVERY == 0:
+            self.remember(step, sections)
+
+    def by_time(self, number: Callable[[float], float]) -> Tensor | float:
+        """A number that follows from the share of the schedule that is done; a tensor where the step is replayed."""
+        device = self.pool.device
+        return handed(lambda: torch.tensor(number(self.done)), device) if is_supplied() else number(self.done)
+
+    def evaluate(self, kind: Kind) -> Outcome:
+        """The losses of a fresh batch; nothing of it depends on the step but by what it is `handed`."""
+        config, pool = self.config, self.pool
         self.model.widen(config.band, config.least_delta)
-        rays = self.pool.draw(whole_batch(self.batch()), self.generator, self.focus.watched(step, self.kept))
+        rays = pool.draw(kind.rays, self.generator, self.focus)
         generator = own_generator(self.generator)
         origins, directions = rays.origins, rays.directions
         if self.model.poses is not None:
@@ -144,18 +212,17 @@ class SceneObjective(Objective):
             origins,
             directions,
             self.sampling,
-            cos_anneal=min(1.0, done / config.anneal) if config.anneal else 1.0,
-            level=self.level_at(done),
+            cos_anneal=self.by_time(lambda done: done / config.anneal) if kind.annealing else 1.0,
+            level=kind.level,
             least_weight=config.least_weight,
             skip=config.skip,
             skip_share=config.skip_share,
-            guide=self.look(step, done),
+            guide=self.grid,
             generator=generator,
         )
-        if (step + 1) % NEAR_EVERY == 0:
-            self.remember(step, mean_of_all((seen.counts > 0).sum() / len(origins)))
+        sections = mean_of_all((seen.counts > 0).sum() / len(origins))
         target = rays.color
-        if self.pool.has_masks:
+        if pool.has_masks:
             target = torch.lerp(self.model.background.expand_as(target), target, rays.mask[:, None])
         wrong = (self.model.photographed(seen, rays.view) - target).abs().mean(dim=1)
         self.focus.learn(gathered(rays.row), gathered(wrong.detach()))
@@ -165,21 +232,21 @@ class SceneObjective(Objective):
         eikonal = (seen.counts * eikonal_loss(seen.jet.gradient)).sum() / within
         terms = {"color": color, "eikonal": eikonal}
         total = color + config.eikonal_weight * eikonal
-        if self.pool.has_masks and config.mask_weight:
+        if pool.has_masks and config.mask_weight:
             opacity = seen.opacity.clamp(1e-3, 1 - 1e-3)
             mask = torch.nn.functional.binary_cross_entropy(opacity, rays.mask)
             terms["mask"] = mask
             total = total + config.mask_weight * mask
         if config.smooth_weight:
-            smooth = self.smooth_term(origins, directions, rays.flat, seen, self.level_at(done))
+            smooth = self.smooth_term(origins, directions, rays.flat, seen, kind.level)
             terms["smooth"] = smooth
             total = total + config.smooth_weight * smooth
-        if self.measured is not None and (done < FADED or self.measured.is_exact):
-            depth = self.depth_term(self.measured, step, done)
+        if self.measured is not None and kind.measured:
+            depth = self.depth_term(self.measured, kind.level)
             terms["depth"] = depth
             total = total + config.depth_weight * depth
         terms["uncertainty"] = 1 / self.model.inv_std
-        return terms, total
+        return Outcome(terms, total, sections)
 
     def smooth_term(self, origins: Tensor, directions: Tensor, flat: Tensor, seen: Rendered, level: int) -> Tensor:
         """How unevenly normals turn where rays end whose pixels are like those around; of the first rays of a step.
@@ -195,35 +262,12 @@ class SceneObjective(Objective):
             weight = torch.where(opacity > SOLID, flat[first], 0.0)
         return (weight * unevenness(self.model.geometry, ends, along, level=level)).mean()
 
-    def depth_term(self, measured: MeasuredDepths, step: int, done: float) -> Tensor:
+    def depth_term(self, measured: MeasuredDepths, level: int) -> Tensor:
         """How far the surface is from what was measured: the mean of `depth_loss` over rays at random."""
-        measured.affine = self.kept["affine"]  # that of a run which is resumed
-        if measured.is_loose and done < FADED and step % SETTLE_EVERY == 0:
-            measured.settle(self.grid or (lambda x: self.model.geometry.value(x, level=0)))
-            self.kept["affine"] = measured.affine
         rays = measured.draw(whole_batch(DEPTH_RAYS), self.generator)
         if self.model.poses is not None:
             origins, directions = self.model.poses.moved(rays.origins, rays.directions, rays.view)
             rays = rays._replace(origins=origins, directions=directions)
-        missed = depth_loss(
-            self.model.geometry, rays, level=self.level_at(done), generator=own_generator(self.generator)
-        )
-        return torch.where(rays.exact, missed, max(1 - done / FADED, 0.0) * missed).mean()
-
-
-def scene_trainer(
-    model: SceneModel,
-    pool: RayPool,
-    config: ReconstructConfig,
-    *,
-    measured: MeasuredDepths | None = None,
-    seconds: float | None = None,
-) -> Trainer[SceneObjective]:
-    """The training of a scene; see `SceneObjective` and `Trainer`."""
-    return Trainer(
-        SceneObjective(model, pool, config, measured),
-        stage="reconstruct",
-        steps=config.steps,
-        seconds=seconds,
-        network_name="model",
-    )
+        missed = depth_loss(self.model.geometry, rays, level=level, generator=own_generator(self.generator))
+        left = self.by_time(lambda done: max(1 - done / FADED, 0.0))
+        return torch.where(rays.exact, missed, left * missed).mean()

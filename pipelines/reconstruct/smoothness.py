@@ -42,7 +42,7 @@ def tangents(normals: Tensor) -> Tensor:
     From row to row it turns by the golden angle, so that any rows after one another have all directions, and no random
     numbers are needed where the rows come at random.
     """
-    axis = torch.eye(3).to(normals)[normals.abs().argmin(dim=1)]
+    axis = torch.eye(3, dtype=normals.dtype, device=normals.device)[normals.abs().argmin(dim=1)]
     across = normalize(torch.linalg.cross(normals, axis), dim=1)
     angle = GOLDEN * torch.arange(len(normals), device=normals.device)[:, None].to(normals)
     return angle.cos() * across + angle.sin() * torch.linalg.cross(normals, across)

@@ -36,8 +36,8 @@ from ..texture.train import FittedTexture, fit_texture
 from .hull import begin
 from .measured import MeasuredDepths
 from .model import RayPool, SceneModel, build_scene
-from .objective import scene_trainer
 from .plan import SEEING, SPHERE, WITNESSES, ReconstructPlan, level_stage
+from .replayed import scene_trainer
 from .seen import seen_points
 from .silhouettes import Agreement
 from .views import ViewImage, comparison_sheet, exposed_as, held_out, measure, reduced, render_image, spread

@@ -241,6 +241,7 @@ class ReconstructConfig(Settings):
     march_grid: int = setting(
         64, "cells along the grid of coarse values by which samples are placed; 0 asks the network", at_least=0
     )
+    graphs: bool = setting(True, "on a GPU, record each kind of step once, and replay it as one CUDA graph")
     width: int | None = setting(None, "shrink the pictures to this many pixels across before training", above=0)
     test_every: int = setting(8, "every n-th picture is held out and measured; 0 trains on all", at_least=0)
     time_budget: float | None = setting(None, "end training after about this many seconds", above=0)

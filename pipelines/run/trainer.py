@@ -269,14 +269,18 @@ class Trainer(Generic[O]):
         for group, (_, rate) in zip(self.adam.param_groups, self.objective.groups, strict=True):
             group["lr"] = rate(done)
         terms, total = self.objective.losses(self.step, done)
+        self.descend(total)
+        self.step += 1
+        return {name: term.detach() for name, term in terms.items()}
+
+    def descend(self, total: Tensor) -> None:
+        """One step of Adam down the gradient of ``total``."""
         self.adam.zero_grad(set_to_none=True)
         total.backward()
         average_gradients(self.trained)
         if self.clip is not None:
             nn.utils.clip_grad_norm_(self.trained, self.clip)
         self.adam.step()
-        self.step += 1
-        return {name: term.detach() for name, term in terms.items()}
 
     def state(self) -> dict[str, Tensor]:
         """All that `restore` needs to continue as if nothing had happened."""

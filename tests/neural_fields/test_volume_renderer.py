@@ -14,9 +14,11 @@ from mplicits.neural_fields import (
     Siren,
     Sphere,
     ViewColor,
+    fixed_shapes,
     render_volume,
 )
 from mplicits.neural_fields.function import as_field
+from mplicits.neural_fields.radiance import Outside
 from mplicits.neural_fields.value_grid import ValueGrid
 from mplicits.neural_fields.volume import sphere_span
 from mplicits.neural_fields.volume_renderer import sample_depths
@@ -94,6 +96,44 @@ def test_every_field_renders_and_trains(name: str) -> None:
     for parameter in trained:
         assert parameter.grad is not None
         assert bool(parameter.grad.isfinite().all())
+
+
+@pytest.mark.parametrize("spare", [None, 0, 7, -1])
+def test_in_fixed_shapes_rays_see_the_same_if_there_is_room(spare: int | None) -> None:
+    torch.manual_seed(0)
+    field = MultiscaleSDF.from_widths([(16, 1), (16, 1)], omegas=[4, 8], deltas=[0.02], taper=0.5, num_features=3)
+    color, around = ViewColor(3, width=8, depth=1), Outside(width=8, depth=1)
+    field, color, around = field.double(), color.double(), around.double()
+    parameters = [*field.parameters(), *color.parameters(), *around.parameters()]
+    origins, directions = (part.double() for part in rays(40))
+
+    def render() -> list[Tensor]:
+        seen = render_volume(
+            field, color, origins, directions, inv_std=300.0, sampling=Sampling(12, 8, 2), outside=around,
+            least_weight=0.05, skip=0.05,
+        )  # fmt: skip
+        loss = seen.color.square().sum() + (seen.counts * seen.jet.gradient.square().sum(dim=-1)).sum()
+        grown = torch.autograd.grad(loss, parameters, allow_unused=True, materialize_grads=True)
+        return [seen.color, seen.counts, seen.opacity, seen.depth, seen.normal, seen.weights, *seen.jet, *grown]
+
+    usual = render()
+    with fixed_shapes() as shapes:
+        fixed = render()
+    asked = {name: int(number) for name, number in shapes.asked.items()}
+    assert asked["sections"] == int((usual[1] > 0).sum()) < usual[1].numel()
+    assert 0 < asked["colors"] < asked["sections"]
+    assert 0 < asked["outside"] < 40
+    (band,) = (int(number) for number in shapes.demand)
+    assert 0 < band < asked["sections"]
+    if spare is not None:
+        with fixed_shapes([band + spare], rooms={name: room + spare for name, room in asked.items()}) as shapes:
+            fixed = render()
+        if spare < 0:  # they are told, and one has nothing in a section in which others have
+            assert int(shapes.asked["sections"]) == asked["sections"]
+            assert not torch.equal(fixed[0], usual[0])
+            return
+    for one, same in zip(usual, fixed, strict=True):
+        torch.testing.assert_close(same, one, rtol=1e-10, atol=1e-10)  # float64 sums of some hundred numbers
 
 
 def test_no_rays_are_legal() -> None:

@@ -26,7 +26,7 @@ from mplicits.pipelines.bench.reconstruct_rows import EQUAL_TIME, MULTISCALE, NE
 from mplicits.pipelines.bench.report import as_text
 from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.reconstruct.model import RayPool, build_scene
-from mplicits.pipelines.reconstruct.objective import scene_trainer
+from mplicits.pipelines.reconstruct.replayed import scene_trainer
 from mplicits.pipelines.run.settings import ReconstructConfig
 from mplicits.pipelines.run.trainer import StopFlag
 from mplicits.pipelines.surface.surface import from_mesh

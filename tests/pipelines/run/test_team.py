@@ -17,7 +17,7 @@ from mplicits.pipelines.fit.samples import Samples, Source
 from mplicits.pipelines.reconstruct import model as scene_model
 from mplicits.pipelines.reconstruct import objective as scene_objective
 from mplicits.pipelines.reconstruct.model import RayPool, build_scene
-from mplicits.pipelines.reconstruct.objective import scene_trainer
+from mplicits.pipelines.reconstruct.replayed import scene_trainer
 from mplicits.pipelines.run.settings import ReconstructConfig
 from mplicits.pipelines.run.team import (
     agreed,

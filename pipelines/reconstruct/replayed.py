@@ -1,0 +1,156 @@
+"""The training of a scene on a GPU: each kind of step is recorded once, in fixed shapes, and then replayed."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from ...neural_fields import fixed_shapes
+from ...neural_fields._fixed import FixedShapes
+from ...neural_fields.devices import handed
+from ..run.replay import CudaGraphs, Recorder, Replays
+from ..run.settings import ReconstructConfig
+from ..run.team import is_alone
+from ..run.trainer import Trainer
+from .measured import MeasuredDepths
+from .model import RayPool, SceneModel
+from .objective import NEAR_EVERY, Kind, SceneObjective
+
+__all__ = ["ReplayedTrainer", "Rooms", "scene_trainer"]
+
+# Room for so many times what was asked for of late, and for some more, in whole steps. There is no new room as long as
+# what was asked for lies between these shares of the old one.
+SPARE, MORE, STEP = 1.25, 64, 256
+FULL, EMPTY = 0.95, 0.5
+# Numbers of rays are multiples of this share of the most, or there would be as many kinds of steps as numbers.
+PART = 8
+CHOICES = ("sections", "colors", "outside")
+
+
+class Rooms(NamedTuple):
+    """How many rows each choice of a step has room for; None for all.
+
+    Attributes:
+        chosen: of `CHOICES`.
+        bands: of the residual levels.
+    """
+
+    chosen: tuple[int | None, ...]
+    bands: tuple[int | None, ...]
+
+    @property
+    def all(self) -> tuple[int | None, ...]:
+        """Those of the choices, then those of the bands."""
+        return (*self.chosen, *self.bands)
+
+
+class ReplayedTrainer(Trainer[SceneObjective]):
+    """A `Trainer` of a scene whose steps are replayed.
+
+    How many sections of rays are evaluated, lie in bands, and get colours differs from step to step, and a recorded
+    step has room for given numbers. They follow, every sixteen steps, from the most that was asked for in the last
+    sixteen. A step in which a room was too small is not taken: its gradient would leave something out.
+
+    Args:
+        objective: of a scene.
+        recorder: how steps are recorded; None for CUDA's graphs.
+        others: of `Trainer`.
+    """
+
+    def __init__(self, objective: SceneObjective, *, recorder: Recorder | None = None, **others: Any) -> None:
+        super().__init__(objective, **others)
+        device = self.trained[0].device
+        self.replays = Replays(device, recorder or CudaGraphs())
+        for group in self.adam.param_groups:
+            group["capturable"] = device.type == "cuda"
+        # What rows were asked for, of CHOICES and residual levels, the most of late; and steps that were not taken.
+        self.peaks = torch.zeros(len(CHOICES) + len(objective.model.geometry.deltas) + 1, device=device)
+        self.rooms: dict[Kind, Rooms] = {}
+        self.asked: dict[int, list[float]] = {}  # by the level that is on: what a ray asked for, at most
+        self.left_out = 0
+        self._rates: list[float] = []
+
+    def _step(self) -> dict[str, Tensor]:
+        done = self.fraction
+        kind = self.objective.ahead(self.step, done)
+        part = math.ceil(self.objective.config.rays / PART)
+        kind = kind._replace(rays=math.ceil(kind.rays / part) * part)
+        rooms = self._rooms(kind)
+        self._rates = [rate(done) for _, rate in self.objective.groups]
+        found = dict(self.replays.do((kind, rooms), lambda: self._work(kind, rooms)))
+        sections = found.pop("sections")
+        self.objective.behind(self.step, sections)
+        self.step += 1
+        if self.step % NEAR_EVERY == 0:
+            self._learn(kind)
+        return found
+
+    def _work(self, kind: Kind, rooms: Rooms) -> dict[str, Tensor]:
+        """A step as the device does it."""
+        rates = handed(lambda: torch.tensor(self._rates), self.trained[0].device)
+        for group, rate in zip(self.adam.param_groups, rates.unbind(), strict=True):
+            group["lr"] = rate
+        named = {name: room for name, room in zip(CHOICES, rooms.chosen, strict=True) if room is not None}
+        # A band without a number has room for all, as has what comes after it.
+        bands = [room for room in rooms.bands if room is not None]
+        with fixed_shapes(bands, rooms=named) as shapes:
+            outcome = self.objective.evaluate(kind)
+        with torch.no_grad():
+            asked = self._asked(shapes)
+            over = [asked[row] > room for row, room in enumerate(rooms.all) if room is not None]
+            lost = torch.stack(over).any().float() if over else asked.new_zeros(())
+            self.peaks[: len(asked)] = torch.maximum(self.peaks[: len(asked)], asked)
+            self.peaks[-1] += lost
+        self.adam.found_inf = lost  # pyright: ignore[reportAttributeAccessIssue]  of a step that is not taken it is 1
+        self.descend(outcome.total)
+        terms = {name: term.detach() for name, term in outcome.terms.items()}
+        return terms | {"sections": outcome.sections}
+
+    def _asked(self, shapes: FixedShapes) -> Tensor:
+        """How many rows were to be chosen, of `CHOICES` and in each band."""
+        none = self.peaks.new_zeros(())
+        bands = [*shapes.demand, *[none] * (len(self.peaks) - 1 - len(CHOICES) - len(shapes.demand))]
+        return torch.stack([part.to(none) for part in [shapes.asked.get(name, none) for name in CHOICES] + bands])
+
+    def _rooms(self, kind: Kind) -> Rooms:
+        """The rooms of a kind of step: those that it has, as long as they suit what was asked for."""
+        wanted = [kind.rays * each for each in self.asked.get(kind.level, [])]
+        old = self.rooms.get(kind)
+        if old is not None and all(_suits(room, need) for room, need in zip(old.all, wanted, strict=False)):
+            return old
+        rooms = [_room(need) for need in wanted] or [None] * (len(self.peaks) - 1)
+        self.rooms[kind] = Rooms(tuple(rooms[: len(CHOICES)]), tuple(rooms[len(CHOICES) :]))
+        return self.rooms[kind]
+
+    def _learn(self, kind: Kind) -> None:
+        """Look at what was asked for in the last steps."""
+        *peaks, lost = self.peaks.tolist()
+        self.asked[kind.level] = [peak / kind.rays for peak in peaks]
+        self.left_out += int(lost)
+        self.peaks.zero_()
+
+
+def _room(need: float) -> int:
+    return STEP * math.ceil((SPARE * need + MORE) / STEP)
+
+
+def _suits(room: int | None, need: float) -> bool:
+    """Whether a room that was given is neither too small for what is asked for now, nor much too large."""
+    return room is not None and need <= FULL * room and _room(need) >= EMPTY * room
+
+
+def scene_trainer(
+    model: SceneModel,
+    pool: RayPool,
+    config: ReconstructConfig,
+    *,
+    measured: MeasuredDepths | None = None,
+    seconds: float | None = None,
+) -> Trainer[SceneObjective]:
+    """The training of a scene; see `SceneObjective` and `Trainer`. Alone on a GPU, it is replayed."""
+    objective = SceneObjective(model, pool, config, measured)
+    kind = ReplayedTrainer if config.graphs and pool.device.type == "cuda" and is_alone() else Trainer
+    return kind(objective, stage="reconstruct", steps=config.steps, seconds=seconds, network_name="model")
