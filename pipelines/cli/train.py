@@ -192,6 +192,8 @@ def _reconstruct_here(arguments: argparse.Namespace, config: ReconstructConfig |
             mesh = mesh_run(directory, directory / MESH_FILE, say=lines.append)
     tell_budget(run.record)
     _tell_left_out(run.record)
+    if refused := run.record.get("replayed", {}).get("refused"):
+        print(f"warning: steps were done one operation at a time, for want of CUDA graphs ({refused})", file=sys.stderr)
     views, held_out = run.record["views"], run.record["held_out"]
     print(
         f"{run.record['data']}: {views['trained']} views, {run.record['steps']:,} steps in "

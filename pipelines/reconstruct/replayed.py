@@ -73,6 +73,11 @@ class ReplayedTrainer(Trainer[SceneObjective]):
         self.left_out = 0
         self._rates: list[float] = []
 
+    def facts(self) -> dict[str, Any]:
+        """Kinds of steps that were recorded, steps that were not taken, and why nothing is recorded, if so."""
+        refused = {"refused": self.replays.refused} if self.replays.refused else {}
+        return {"recorded": self.replays.recorded, "not_taken": self.left_out, **refused}
+
     def _step(self) -> dict[str, Tensor]:
         done = self.fraction
         kind = self.objective.ahead(self.step, done)

@@ -37,7 +37,7 @@ from .hull import begin
 from .measured import MeasuredDepths
 from .model import RayPool, SceneModel, build_scene
 from .plan import SEEING, SPHERE, WITNESSES, ReconstructPlan, level_stage
-from .replayed import scene_trainer
+from .replayed import ReplayedTrainer, scene_trainer
 from .seen import seen_points
 from .silhouettes import Agreement
 from .views import ViewImage, comparison_sheet, exposed_as, held_out, measure, reduced, render_image, spread
@@ -366,6 +366,7 @@ class _Reconstruction:
             "inv_std": float(model.inv_std.detach()),
             "steps": trainer.step,
             "training_seconds": round(trainer.elapsed, 3),
+            **({"replayed": trainer.facts()} if isinstance(trainer, ReplayedTrainer) else {}),
             **({} if limit is None else {"budget": {"seconds": limit, "notes": self.notes}}),
             "losses": trainer.losses,
             "environment": environment(self.device),

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from ...neural_fields.devices import Supply
 
-__all__ = ["Again", "CudaGraphs", "Recorder", "Replays"]
+__all__ = ["Again", "CudaGraphs", "Recorder", "Replays", "Work"]
 
 # Recorded kinds of steps that are kept: each holds memory for all its intermediate results.
 KEPT = 12
@@ -80,16 +80,19 @@ class _Kind:
 class Replays:
     """Works by their kinds: done once, recorded, and then replayed.
 
+    Where recording fails, as it may with another version of PyTorch or no memory left, works are done as they are.
+
     Args:
         device: where they are done.
         recorder: how they are recorded.
 
     Attributes:
         recorded: how many times something was.
+        refused: why nothing is recorded any more; empty as long as it is.
     """
 
     def __init__(self, device: torch.device, recorder: Recorder) -> None:
-        self.device, self.recorder, self.recorded = device, recorder, 0
+        self.device, self.recorder, self.recorded, self.refused = device, recorder, 0, ""
         self._kinds: OrderedDict[Hashable, _Kind] = OrderedDict()
 
     def do(self, kind: Hashable, work: Work) -> Results:
@@ -101,25 +104,33 @@ class Replays:
                 overwritten when a work of the kind is done again.
         """
         known = self._kinds.get(kind)
-        if known is None:
-            supply = Supply(self.device)
-            with supply.noting():
-                results = work()
-            self._kinds[kind] = _Kind(supply, None, results)
-            while len(self._kinds) > KEPT:
-                self._kinds.popitem(last=False)
-            return results
+        if known is None or self.refused:
+            return self._first(kind, work)
         self._kinds.move_to_end(kind)
+        known.supply.renew()
         if known.replay is None:
 
             def supplied() -> Results:
                 with known.supply.supplied():
                     return work()
 
-            known.supply.renew()
-            known.replay, known.results = self.recorder.record(supplied)
+            try:
+                known.replay, known.results = self.recorder.record(supplied)
+            except RuntimeError as error:
+                self.refused = str(error).partition("\n")[0]
+                self._kinds.clear()
+                return self._first(kind, work)
             self.recorded += 1
-        else:
-            known.supply.renew()
         known.replay()
         return known.results
+
+    def _first(self, kind: Hashable, work: Work) -> Results:
+        """Do a work as if for the first time."""
+        supply = Supply(self.device)
+        with supply.noting():
+            results = work()
+        if not self.refused:
+            self._kinds[kind] = _Kind(supply, None, results)
+            while len(self._kinds) > KEPT:
+                self._kinds.popitem(last=False)
+        return results

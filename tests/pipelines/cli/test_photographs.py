@@ -2,7 +2,7 @@
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import cv2
 import numpy as np
@@ -16,7 +16,12 @@ from mplicits.datasets.views.images import read_posed_images
 from mplicits.datasets.views.writing import write_colmap
 from mplicits.neural_fields import InputError
 from mplicits.pipelines.cli import main
-from mplicits.pipelines.reconstruct import posing
+from mplicits.pipelines.reconstruct import posing, train
+from mplicits.pipelines.reconstruct.model import RayPool, SceneModel
+from mplicits.pipelines.reconstruct.objective import SceneObjective
+from mplicits.pipelines.reconstruct.replayed import ReplayedTrainer
+from mplicits.pipelines.run.replay import Recorder, Work
+from mplicits.pipelines.run.settings import ReconstructConfig
 from mplicits.pipelines.surface.surface import read_surface
 
 TINY = (
@@ -83,6 +88,29 @@ def test_a_reconstruction_begins_with_its_cameras(
     assert [(str(call["source"]), call["project"]) for call in finder] == [("film.mp4", tmp_path / "run-cameras")]
     assert "4 of 5 photographs placed" in capsys.readouterr().out
     assert json.loads((run / "run.json").read_text())["data"].startswith(str(tmp_path / "run-cameras"))
+
+
+def test_steps_that_could_not_be_recorded_are_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    class Refusing(Recorder):
+        def record(self, work: Work) -> NoReturn:
+            raise RuntimeError("no memory for graphs")
+
+    def on_a_gpu(model: SceneModel, pool: RayPool, config: ReconstructConfig, **others: Any) -> ReplayedTrainer:
+        objective = SceneObjective(model, pool, config, others.pop("measured"))
+        return ReplayedTrainer(objective, recorder=Refusing(), stage="reconstruct", steps=config.steps)
+
+    monkeypatch.setattr(train, "scene_trainer", on_a_gpu)
+    project = tmp_path / "project"
+    write_colmap(project, render_scene(SCENES["painted-sphere"](), views=4, size=16, samples=1))
+    run = tmp_path / "run"
+    assert main(["reconstruct", str(project), "-o", str(run), *TINY.split(), "--start", "sphere"]) == 0
+    assert (
+        "warning: steps were done one operation at a time, for want of CUDA graphs (no memory" in capsys.readouterr()[1]
+    )
+    record = json.loads((run / "run.json").read_text())
+    assert record["replayed"] == {"recorded": 0, "not_taken": 0, "refused": "no memory for graphs"}
 
 
 def test_an_interruption_of_the_search_says_how_to_go_on(

@@ -1,5 +1,8 @@
 """Works that are noted down, recorded and replayed: with what the host knows by then, and without asking it."""
 
+from collections.abc import Callable, Mapping
+from typing import NoReturn
+
 import pytest
 import torch
 from mplicits.neural_fields.devices import Supply, handed, is_supplied
@@ -72,3 +75,22 @@ def test_kinds_that_were_not_used_for_long_are_forgotten(monkeypatch: pytest.Mon
     assert replays.recorded == 2
     assert int(replays.do(1, lambda: {"kind": torch.tensor(5)})["kind"]) == 5
     assert replays.recorded == 3
+
+
+def test_where_recording_fails_works_are_done_as_they_are() -> None:
+    class Refusing(Recorder):
+        def record(self, work: Callable[[], Mapping[str, Tensor]]) -> NoReturn:
+            work()
+            raise RuntimeError("operation not permitted\nmore about it")
+
+    replays, told, done = Replays(torch.device("cpu"), Refusing()), [0], []
+
+    def work() -> dict[str, Tensor]:
+        done.append(told[0])
+        return {"told": handed(lambda: torch.tensor(told[0]), torch.device("cpu")).clone()}
+
+    for told[0] in range(5):
+        assert int(replays.do("kind", work)["told"]) == told[0]
+    assert replays.refused == "operation not permitted"
+    assert replays.recorded == 0
+    assert done == [0, 1, 1, 2, 3, 4]  # it was tried once
