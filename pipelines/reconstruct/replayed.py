@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import torch
@@ -72,6 +73,11 @@ class ReplayedTrainer(Trainer[SceneObjective]):
         self.asked: dict[int, list[float]] = {}  # by the level that is on: what a ray asked for, at most
         self.left_out = 0
         self._rates: list[float] = []
+
+    def restore(self, state: Mapping[str, Tensor]) -> None:
+        """See `Trainer.restore`; what was recorded is forgotten, because it is about other memory."""
+        super().restore(state)
+        self.replays = Replays(self.replays.device, self.replays.recorder)
 
     def facts(self) -> dict[str, Any]:
         """Kinds of steps that were recorded, steps that were not taken, and why nothing is recorded, if so."""

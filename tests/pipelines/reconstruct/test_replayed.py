@@ -157,6 +157,23 @@ def test_a_step_whose_rooms_are_too_small_is_not_taken_and_there_are_larger_ones
     assert small.all[0] is None or small.all[0] >= 256
 
 
+def test_a_run_that_is_taken_up_records_anew_and_goes_on(images: PosedImages) -> None:
+    trainer, other = (replaying(images, "masks", torch.device("cpu")) for _ in range(2))
+    for _ in range(8):
+        trainer._step()
+    state = {name: tensor.clone() for name, tensor in trainer.state().items()}
+    for _ in range(3):
+        trainer._step()
+    assert trainer.replays.recorded > 0
+    for one in (trainer, other):
+        one.restore({name: tensor.clone() for name, tensor in state.items()})  # which it then works on
+        assert one.replays.recorded == 0
+        for _ in range(4):
+            one._step()
+    for name, tensor in weights(trainer).items():
+        assert torch.equal(tensor, weights(other)[name]), name
+
+
 def test_rooms_follow_what_is_asked_for_and_stay_while_they_suit(images: PosedImages) -> None:
     trainer = replaying(images, "masks", torch.device("cpu"))
     kind = trainer.objective.ahead(0, 0.0)._replace(rays=100)
