@@ -1,25 +1,34 @@
-"""``mplicits bench gpu``: what pictures of a run would cost on a GPU that is not here, by the model of `model`."""
+"""``mplicits bench gpu``: what pictures of a run cost on a GPU: by a model where it is not here, or timed."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from ...datasets.cameras import look_at
+import torch
+
+from ...datasets.cameras import Camera, look_at
 from ...neural_fields import Field, InputError, load_field
+from ...neural_fields.kernels.switch import obstacle
 from ..render.trace import Seen, trace_view
 from ..run.folder import find_field
+from ..run.machine import choose_device
 from .benchmark import Benchmark, Part
 from .cells import Workplace
+from .kernels import evaluated_by
 from .model import FrameCounts, count_frame, model_table
-from .tables import Table
+from .tables import Column, Figure, Table, ratio, tabulated
 
 __all__ = ["GpuBench", "GpuRow"]
 
 # From outside the unit ball, which fills most of a square picture.
 EYE, VIEW = (1.6, 0.9, 2.0), 40.0
+# Who evaluates the networks, and how MPLICITS_KERNELS says so.
+PYTORCH = "PyTorch"
+EVALUATORS = {PYTORCH: "off", "fused": "auto", "3 × TF32": "tf32x3"}
+REPEATS = 5
 
 
 @dataclass(frozen=True)
@@ -33,6 +42,7 @@ class GpuRow:
         levels: how many the field has.
         seconds: that it took here, counting included.
         counts: of the picture.
+        rates: pictures a second where they were timed, by who evaluates the networks; empty if nowhere.
     """
 
     width: int
@@ -41,6 +51,7 @@ class GpuRow:
     levels: int
     seconds: float
     counts: FrameCounts
+    rates: Mapping[str, float]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,6 +62,7 @@ class GpuBench(Benchmark[GpuRow]):
         run_file: a run, or a .safetensors file.
         sizes: widths and heights of the pictures.
         devices: names of those that the table tells the times on.
+        timed: a torch device on which pictures are timed as well, the best of five; None for none.
     """
 
     name = "gpu"
@@ -60,9 +72,16 @@ class GpuBench(Benchmark[GpuRow]):
     run_file: str | Path
     sizes: tuple[tuple[int, int], ...] = ((512, 512), (1920, 1080))
     devices: tuple[str, ...] = ("h100",)
+    timed: str | None = None
 
     def cells(self) -> list[Part]:
-        """One for each size and level; raises `InputError` for a field that is not three-dimensional."""
+        """One for each size and level.
+
+        Raises:
+            InputError: the field is not three-dimensional, or there is no device to time pictures on.
+        """
+        if self.timed is not None:
+            choose_device(self.timed, option="--timed")
         file = find_field(self.run_file)
         field = load_field(file).field
         if field.in_dim != 3:
@@ -90,9 +109,43 @@ class GpuBench(Benchmark[GpuRow]):
 
         start = time.perf_counter()
         counts = count_frame(field, draw, width * height)
-        return GpuRow(width, height, level, field.num_levels, time.perf_counter() - start, counts)
+        seconds = time.perf_counter() - start
+        rates = {} if self.timed is None else picture_rates(field, camera, level, choose_device(self.timed))
+        return GpuRow(width, height, level, field.num_levels, seconds, counts, rates)
 
     def tables(self, rows: Sequence[GpuRow], *, sgemm: float) -> tuple[Table, ...]:
         """See `Benchmark.tables`."""
-        items = [(f"{r.width}×{r.height}, {'all levels' if r.level else 'level 0'}", r.seconds, r.counts) for r in rows]
-        return (model_table(items, self.devices),)
+        named = [(f"{row.width}×{row.height}, {'all levels' if row.level else 'level 0'}", row) for row in rows]
+        model = model_table([(name, row.seconds, row.counts) for name, row in named], self.devices)
+        timed = [(name, row) for name, row in named if row.rates]
+        if not timed:
+            return (model,)
+
+        def shown(evaluator: str) -> Figure[GpuRow]:
+            return (Column(evaluator, ".1f"), lambda row: row.rates.get(evaluator))
+
+        def faster(row: GpuRow) -> float | None:
+            return ratio(row.rates["fused"], row.rates[PYTORCH]) if "fused" in row.rates else None
+
+        figures = [*map(shown, EVALUATORS), (Column("× PyTorch", ".1f"), faster)]
+        notes = (f"Pictures a second on {self.timed}, the best of {REPEATS}; a kernel is compiled before.",)
+        return model, tabulated(
+            f"{self.name}-timed", "Pictures that were timed", "picture", figures, timed, notes=notes
+        )
+
+
+def picture_rates(field: Field, camera: Camera, level: int, device: torch.device) -> dict[str, float]:
+    """Pictures a second of a level of a field on a device, by each of `EVALUATORS` that it has."""
+    there, rates = field.to(device), {}
+    for evaluator, mode in EVALUATORS.items():
+        if evaluator != PYTORCH and (device.type != "cuda" or obstacle(device, mode)):
+            continue
+        times = []
+        with evaluated_by(mode):
+            for _ in range(1 + REPEATS):
+                start = time.perf_counter()
+                seen = trace_view(there, camera, level=level, device=device)
+                seen.pixel.sum().item()  # which a GPU has to have finished for
+                times.append(time.perf_counter() - start)
+        rates[evaluator] = 1 / min(times[1:])
+    return rates

@@ -13,7 +13,7 @@ from ...neural_fields.kernels.rounding import gated_bound, rounding_bound
 from ..run.trainer import seeded
 from .benchmark import Benchmark, Part, network_name
 from .cells import Workplace
-from .kernels import staged_bytes, switched_off
+from .kernels import evaluated_by, staged_bytes
 from .model import count_frame
 from .tables import Column, Figure, Table, tabulated
 
@@ -106,7 +106,7 @@ class LevelsBench(Benchmark[LevelsRow]):
         x = 2 * torch.rand(self.points, 3, generator=torch.Generator().manual_seed(self.seed)) - 1
         field.requires_grad_(False)
         exact = MultiscaleSDF.from_widths(sizes, omegas=omegas, taper=taper).double().requires_grad_(False)
-        with switched_off():
+        with evaluated_by("off"):
             inside = _set_bands(field, x)
         exact.load_state_dict({name: part.double() for name, part in field.state_dict().items()})
         jets = [part.jet(x.double()) for part in exact.levels]
@@ -124,7 +124,7 @@ class LevelsBench(Benchmark[LevelsRow]):
             return (value - expected.value).abs()[sure], (gradient - expected.gradient).abs()[sure]
 
         fused = off()
-        with switched_off():
+        with evaluated_by("off"):
             plain = off()
             counts = count_frame(field.cpu(), lambda same: same.jet(x.repeat(MANY, 1)), 1)
         evaluated = (1.0, *inside)

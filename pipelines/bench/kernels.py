@@ -22,7 +22,7 @@ from .cells import Workplace
 from .model import JET, POINT, count_frame
 from .tables import Column, Figure, Table, tabulated
 
-__all__ = ["KernelRow", "KernelsBench", "staged_bytes", "switched_off"]
+__all__ = ["KernelRow", "KernelsBench", "evaluated_by", "staged_bytes"]
 
 SIZES = tuple((width, depth) for width in (16, 64, 128, 256, 400) for depth in (1, 2, 3))
 
@@ -111,7 +111,7 @@ class KernelsBench(Benchmark[KernelRow]):
             return (value - expected.value).abs(), (gradient - expected.gradient).abs()
 
         fused = off()
-        with switched_off():
+        with evaluated_by("off"):
             plain = off()
             counts = count_frame(network.cpu(), lambda field: field.jet(x.repeat(64, 1)), 1)
         shares = [float((error / bound).max()) for error, bound in zip(fused, bounds, strict=True)]
@@ -174,10 +174,10 @@ def staged_bytes(width: int, depth: int) -> float:
 
 
 @contextmanager
-def switched_off() -> Iterator[None]:
-    """Inside of this PyTorch evaluates, whatever was asked for."""
+def evaluated_by(mode: str) -> Iterator[None]:
+    """Inside of this the kernels are used as ``mode``, one of `MODES`, says, whatever was asked for."""
     before = os.environ.get(VARIABLE)
-    os.environ[VARIABLE] = "off"
+    os.environ[VARIABLE] = mode
     try:
         yield
     finally:

@@ -159,6 +159,7 @@ def _gpu_arguments(parser: argparse.ArgumentParser) -> None:
         "--sizes", type=_size, nargs="+", default=sizes, metavar="WxH", help=f"of the pictures ({shown})"
     )
     _modelled(parser, ("h100", "4090"))
+    parser.add_argument("--timed", metavar="DEVICE", help="time them on this device, too: cuda, cpu, ... (none)")
     _folder(parser)
     add_flags(parser, "--json")
 
@@ -173,7 +174,9 @@ def _modelled(parser: argparse.ArgumentParser, default: tuple[str, ...]) -> None
 def _gpu(arguments: argparse.Namespace) -> int:
     from ..bench.gpu import GpuBench
 
-    bench = GpuBench(run_file=arguments.run, sizes=tuple(arguments.sizes), devices=tuple(arguments.model))
+    bench = GpuBench(
+        run_file=arguments.run, sizes=tuple(arguments.sizes), devices=tuple(arguments.model), timed=arguments.timed
+    )
     return _run(arguments, [bench], out=arguments.out)
 
 

@@ -99,8 +99,12 @@ def peak_memory() -> int | None:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
 
 
-def choose_device(name: str) -> torch.device:
+def choose_device(name: str, *, option: str = "--device") -> torch.device:
     """``auto`` is CUDA where there is a working GPU, the CPU elsewhere.
+
+    Args:
+        name: of a device.
+        option: where it was said.
 
     Raises:
         InputError: no such device here.
@@ -112,7 +116,7 @@ def choose_device(name: str) -> torch.device:
         torch.empty(1, device=device)
     except (RuntimeError, AssertionError) as error:
         reason = str(error).splitlines()[0]
-        raise InputError(f"--device {name}: not usable here ({reason}); use auto or cpu") from error
+        raise InputError(f"{option} {name}: not usable here ({reason}); use auto or cpu") from error
     return device
 
 

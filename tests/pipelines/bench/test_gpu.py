@@ -1,5 +1,6 @@
 """Pictures of a run, counted for GPUs that are not here: the command and its table."""
 
+import os
 from pathlib import Path
 
 import pytest
@@ -42,3 +43,20 @@ def test_counts_do_not_depend_on_the_machine(tmp_path: Path) -> None:
 def test_space_time_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="a field of 4 dimensions"):
         GpuBench(run_file=saved(tmp_path / "moving.safetensors", in_dim=4)).cells()
+
+
+def test_pictures_are_timed_where_it_is_asked_for(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MPLICITS_KERNELS", "off")
+    run = saved(tmp_path / "ball.safetensors")
+    assert main(["bench", "gpu", str(run), "--sizes", "16x16", "--timed", "cpu"]) == 0
+    said = capsys.readouterr().out
+    assert "Pictures that were timed" in said
+    assert "Pictures a second on cpu" in said
+    rows = GpuBench(run_file=run, sizes=((16, 16),), timed="cpu").rows(tmp_path / "kept")
+    assert all([*row.rates] == ["PyTorch"] for row in rows)  # kernels are for CUDA
+    assert all(0 < row.rates["PyTorch"] < 1e5 for row in rows)
+    assert os.environ["MPLICITS_KERNELS"] == "off"
+    assert main(["bench", "gpu", str(run), "--timed", "abacus"]) == 2
+    assert "--timed abacus: not usable here" in capsys.readouterr().err
