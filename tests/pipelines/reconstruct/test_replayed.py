@@ -105,7 +105,7 @@ def test_replayed_steps_are_those_that_would_be_done(
         assert torch.equal(tensor, weights(trainers[1])[name]), name
 
 
-@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize("name", ["outside", "cameras", "depths"])  # which have all terms between them
 def test_on_an_accelerator_a_replayed_step_keeps_nobody_waiting(
     name: str, images: PosedImages, accelerator: torch.device
 ) -> None:
