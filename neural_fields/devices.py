@@ -9,7 +9,7 @@ from contextvars import ContextVar
 import torch
 from torch import Tensor
 
-__all__ = ["Supply", "few_numbers", "handed", "is_supplied", "makes_wait", "precise", "upload"]
+__all__ = ["Supply", "few_numbers", "handed", "is_supplied", "makes_wait", "precise", "uniform", "upload"]
 
 
 def makes_wait(device: torch.device) -> bool:
@@ -49,20 +49,17 @@ class Supply:
 
     @contextmanager
     def noting(self) -> Iterator[None]:
-        """The work is done as if there were no supply; `handed` notes down."""
-        self._makers.clear()
-        self._shapes.clear()
+        """The work is done as if there were no supply; `handed` notes down. Once."""
         token = _supply.set(self)
         try:
             yield
         finally:
             _supply.reset(token)
+        self._lay_out()
 
     @contextmanager
     def supplied(self) -> Iterator[None]:
         """`handed` gives what `renew` has put there, and makes nothing."""
-        if not self._places:
-            self._lay_out()
         self._next = 0
         token = _supply.set(self)
         try:
@@ -73,8 +70,6 @@ class Supply:
 
     def renew(self) -> None:
         """Make all of it anew, for the next time."""
-        if not self._places:
-            self._lay_out()
         made = [make() for make in self._makers]
         for dtype, store in self._stores.items():
             flat = torch.cat([one.reshape(-1) for one in made if one.dtype == dtype])
@@ -116,6 +111,11 @@ def handed(make: Callable[[], Tensor], device: torch.device) -> Tensor:
     """
     supply = _supply.get()
     return upload(make(), device) if supply is None else supply.give(make)
+
+
+def uniform(shape: Sequence[int], generator: torch.Generator, device: torch.device) -> Tensor:
+    """Random numbers from 0 to 1 that the host draws, `handed` over."""
+    return handed(lambda: torch.rand(*shape, generator=generator), device)
 
 
 def is_supplied() -> bool:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor, nn
 
-from ._fixed import FixedShapes, current_shapes
+from ._fixed import FixedShapes, Rows, current_shapes
 from ._transforms import under_vmap
 from .field import Field, Jet, SecondJet
 from .function import FieldLike, as_field
@@ -328,9 +328,8 @@ def _walk_on(
                 for part, new in zip(parts, joined, strict=True)
             )
         else:
-            taken = rows.clamp(max=count - 1)  # places that are left over get the last point, and
-            some = tuple(part.index_select(0, taken) for part in parts)
-            joined = join(some, evaluate(level, points.index_select(0, taken)), delta)
+            some = Rows(rows, count, full=False)  # places that are left over get the last point, and
+            joined = join(tuple(map(some.of, parts)), evaluate(level, some.of(points)), delta)
             parts = tuple(
                 torch.cat((part, part[:1])).index_copy(0, rows, new)[:count]  # what they find goes behind it
                 for part, new in zip(parts, joined, strict=True)

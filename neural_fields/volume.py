@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import softplus
 
-from .devices import handed
+from .devices import uniform
 
 __all__ = [
     "ball_chord",
@@ -149,9 +149,7 @@ def stratified_depths(near: Tensor, far: Tensor, count: int, *, generator: torch
     With a generator the depths of a ray are shifted together by a random part of a stratum; without, they are
     the middles of the strata.
     """
-    shift, rays = 0.5, len(near)
-    if generator:
-        shift = handed(lambda: torch.rand(rays, 1, generator=generator), near.device)
+    shift = uniform((len(near), 1), generator, near.device) if generator else 0.5
     strata = (torch.arange(count, device=near.device) + shift) / count
     return near[:, None] + (far - near)[:, None] * strata.to(near.dtype)
 
@@ -199,8 +197,7 @@ def importance_depths(
     cumulative = cumulative / cumulative[:, -1:]
     quantiles = stratified_depths(torch.zeros_like(depths[:, 0]), torch.ones_like(depths[:, 0]), count)
     if generator:
-        shape = quantiles.shape
-        shifts = handed(lambda: torch.rand(shape, generator=generator), depths.device).to(depths.dtype)
+        shifts = uniform(quantiles.shape, generator, depths.device).to(depths.dtype)
         quantiles = quantiles + (shifts - 0.5) / count
     right = torch.searchsorted(cumulative, quantiles.contiguous()).clamp(1, depths.shape[1] - 1)
     low, high = cumulative.gather(1, right - 1), cumulative.gather(1, right)

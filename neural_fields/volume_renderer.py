@@ -18,7 +18,7 @@ from torch import Tensor
 
 from ._checks import at_least, positive
 from ._fixed import chosen
-from .devices import handed, precise
+from .devices import precise, uniform
 from .field import Field, Jet
 from .function import FieldLike, as_field
 from .volume import (
@@ -291,8 +291,7 @@ def _counts(estimated: Tensor, values: Tensor, skip: float, share: float, genera
     smallest = (values[:, 1:] + values[:, :-1]).argmin(dim=1, keepdim=True)
     counts = (around >= skip).to(estimated).scatter(1, smallest, 1.0)
     if share and generator is not None:
-        shape = estimated.shape
-        chance = handed(lambda: torch.rand(shape, generator=generator), estimated.device) < share
+        chance = uniform(estimated.shape, generator, estimated.device) < share
         counts = torch.where((counts == 0) & chance, 1 / share, counts)
     return counts
 

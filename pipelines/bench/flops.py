@@ -127,9 +127,7 @@ def train_watched(
     color_cost, outside_cost = color_flops(model.color), 0.0 if model.outside is None else outside_flops(model.outside)
     model.geometry, levels = counted(plain)
     colors, outsides = _RowCounter(model.color), _RowCounter(model.outside)
-    if seconds is not None:
-        config = replace(config, steps=ENDLESS)
-    config = replace(config, graphs=False)
+    config = replace(config, graphs=False, steps=config.steps if seconds is None else ENDLESS)
     trainer = scene_trainer(model, pool, config, seconds=seconds)
     clocks = None
     if pool.device.type == "cpu":

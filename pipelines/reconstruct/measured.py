@@ -19,7 +19,7 @@ from ...datasets.cameras import Camera
 from ...datasets.views.depth_maps import DepthMap
 from ...datasets.views.images import PosedImage, PosedImages
 from ...neural_fields import Field, InputError, sphere_trace
-from ...neural_fields.devices import handed
+from ...neural_fields.devices import handed, uniform
 from ...neural_fields.function import FieldLike
 from ...neural_fields.volume import sphere_span
 from ..run.team import my_share
@@ -232,9 +232,7 @@ def depth_loss(field: Field, rays: DepthRays, *, level: int = -1, generator: tor
     on_surface = (reach > near) & (reach < far)
     end = torch.minimum(reach, far)
     seen_through = end > near
-    part, count = torch.full_like(reach, 0.5), len(reach)
-    if generator:
-        part = handed(lambda: torch.rand(count, generator=generator), end.device)
+    part = uniform(reach.shape, generator, end.device) if generator else torch.full_like(reach, 0.5)
     at = end - (end - near) * part.square()
     places = origins + torch.stack((reach, at))[..., None] * directions  # (2, B, 3)
     # Those that do not count are evaluated too: a GPU would be waited for until it says which they are.

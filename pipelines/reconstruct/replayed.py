@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -31,21 +31,8 @@ PART = 8
 CHOICES = ("sections", "colors", "outside")
 
 
-class Rooms(NamedTuple):
-    """How many rows each choice of a step has room for; None for all.
-
-    Attributes:
-        chosen: of `CHOICES`.
-        bands: of the residual levels.
-    """
-
-    chosen: tuple[int | None, ...]
-    bands: tuple[int | None, ...]
-
-    @property
-    def all(self) -> tuple[int | None, ...]:
-        """Those of the choices, then those of the bands."""
-        return (*self.chosen, *self.bands)
+# How many rows each of the CHOICES of a step has room for, and then each band; None for all.
+Rooms = tuple[int, ...] | None
 
 
 class ReplayedTrainer(Trainer[SceneObjective]):
@@ -69,10 +56,9 @@ class ReplayedTrainer(Trainer[SceneObjective]):
             group["capturable"] = device.type == "cuda"
         # What rows were asked for, of CHOICES and residual levels, the most of late; and steps that were not taken.
         self.peaks = torch.zeros(len(CHOICES) + len(objective.model.geometry.deltas) + 1, device=device)
-        self.rooms: dict[Kind, Rooms] = {}
+        self.rooms: dict[Kind, tuple[int, ...]] = {}
         self.asked: dict[int, list[float]] = {}  # by the level that is on: what a ray asked for, at most
         self.left_out = 0
-        self._rates: list[float] = []
 
     def restore(self, state: Mapping[str, Tensor]) -> None:
         """See `Trainer.restore`; what was recorded is forgotten, because it is about other memory."""
@@ -85,12 +71,10 @@ class ReplayedTrainer(Trainer[SceneObjective]):
         return {"recorded": self.replays.recorded, "not_taken": self.left_out, **refused}
 
     def _step(self) -> dict[str, Tensor]:
-        done = self.fraction
-        kind = self.objective.ahead(self.step, done)
+        kind = self.objective.ahead(self.step, self.fraction)
         part = math.ceil(self.objective.config.rays / PART)
         kind = kind._replace(rays=math.ceil(kind.rays / part) * part)
         rooms = self._rooms(kind)
-        self._rates = [rate(done) for _, rate in self.objective.groups]
         found = dict(self.replays.do((kind, rooms), lambda: self._work(kind, rooms)))
         sections = found.pop("sections")
         self.objective.behind(self.step, sections)
@@ -101,17 +85,18 @@ class ReplayedTrainer(Trainer[SceneObjective]):
 
     def _work(self, kind: Kind, rooms: Rooms) -> dict[str, Tensor]:
         """A step as the device does it."""
-        rates = handed(lambda: torch.tensor(self._rates), self.trained[0].device)
+        objective = self.objective
+        rates = handed(
+            lambda: torch.tensor([rate(objective.done) for _, rate in objective.groups]), self.trained[0].device
+        )
         for group, rate in zip(self.adam.param_groups, rates.unbind(), strict=True):
             group["lr"] = rate
-        named = {name: room for name, room in zip(CHOICES, rooms.chosen, strict=True) if room is not None}
-        # A band without a number has room for all, as has what comes after it.
-        bands = [room for room in rooms.bands if room is not None]
-        with fixed_shapes(bands, rooms=named) as shapes:
-            outcome = self.objective.evaluate(kind)
+        given = rooms or ()
+        with fixed_shapes(given[len(CHOICES) :], rooms=dict(zip(CHOICES, given, strict=False))) as shapes:
+            outcome = objective.evaluate(kind)
         with torch.no_grad():
             asked = self._asked(shapes)
-            over = [asked[row] > room for row, room in enumerate(rooms.all) if room is not None]
+            over = [asked[row] > room for row, room in enumerate(given)]
             lost = torch.stack(over).any().float() if over else asked.new_zeros(())
             self.peaks[: len(asked)] = torch.maximum(self.peaks[: len(asked)], asked)
             self.peaks[-1] += lost
@@ -128,12 +113,12 @@ class ReplayedTrainer(Trainer[SceneObjective]):
 
     def _rooms(self, kind: Kind) -> Rooms:
         """The rooms of a kind of step: those that it has, as long as they suit what was asked for."""
-        wanted = [kind.rays * each for each in self.asked.get(kind.level, [])]
-        old = self.rooms.get(kind)
-        if old is not None and all(_suits(room, need) for room, need in zip(old.all, wanted, strict=False)):
+        old, asked = self.rooms.get(kind), self.asked.get(kind.level)
+        if asked is None:
             return old
-        rooms = [_room(need) for need in wanted] or [None] * (len(self.peaks) - 1)
-        self.rooms[kind] = Rooms(tuple(rooms[: len(CHOICES)]), tuple(rooms[len(CHOICES) :]))
+        wanted = [kind.rays * each for each in asked]
+        if old is None or not all(map(_suits, old, wanted)):
+            self.rooms[kind] = tuple(map(_room, wanted))
         return self.rooms[kind]
 
     def _learn(self, kind: Kind) -> None:
@@ -148,9 +133,9 @@ def _room(need: float) -> int:
     return STEP * math.ceil((SPARE * need + MORE) / STEP)
 
 
-def _suits(room: int | None, need: float) -> bool:
+def _suits(room: int, need: float) -> bool:
     """Whether a room that was given is neither too small for what is asked for now, nor much too large."""
-    return room is not None and need <= FULL * room and _room(need) >= EMPTY * room
+    return need <= FULL * room and _room(need) >= EMPTY * room
 
 
 def scene_trainer(

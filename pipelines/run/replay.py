@@ -103,8 +103,10 @@ class Replays:
             work: made of operations of the device alone; what it needs of the host is `handed` to it. The results are
                 overwritten when a work of the kind is done again.
         """
+        if self.refused:
+            return work()
         known = self._kinds.get(kind)
-        if known is None or self.refused:
+        if known is None:
             return self._first(kind, work)
         self._kinds.move_to_end(kind)
         known.supply.renew()
@@ -119,18 +121,17 @@ class Replays:
             except RuntimeError as error:
                 self.refused = str(error).partition("\n")[0]
                 self._kinds.clear()
-                return self._first(kind, work)
+                return work()
             self.recorded += 1
         known.replay()
         return known.results
 
     def _first(self, kind: Hashable, work: Work) -> Results:
-        """Do a work as if for the first time."""
+        """Do a work for the first time."""
         supply = Supply(self.device)
         with supply.noting():
             results = work()
-        if not self.refused:
-            self._kinds[kind] = _Kind(supply, None, results)
-            while len(self._kinds) > KEPT:
-                self._kinds.popitem(last=False)
+        self._kinds[kind] = _Kind(supply, None, results)
+        if len(self._kinds) > KEPT:
+            self._kinds.popitem(last=False)
         return results

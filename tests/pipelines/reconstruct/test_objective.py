@@ -21,27 +21,10 @@ from mplicits.pipelines.reconstruct.objective import SceneObjective
 from mplicits.pipelines.reconstruct.replayed import scene_trainer
 from mplicits.pipelines.run.settings import ReconstructConfig
 from mplicits.pipelines.run.trainer import Progress, StopFlag, Trainer
+from reconstructions import QUICK, TINY_SCENE
 from torch import Tensor
 
-TINY = ReconstructConfig(
-    widths=(16, 16),
-    depths=(1, 1),
-    omegas=(10.0, 15.0),
-    starts=(0.0, 0.5),
-    features=4,
-    color_width=16,
-    color_depth=1,
-    color_grid=8,
-    color_frequencies=2,
-    steps=8,
-    rays=32,
-    uniform=8,
-    importance=4,
-    march_grid=8,
-    learning_rate=2e-3,
-    color_rate=12.0,
-    sharpening=8.0,
-)
+TINY = replace(TINY_SCENE, steps=8, **QUICK)
 
 
 @pytest.fixture(autouse=True)

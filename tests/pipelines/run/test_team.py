@@ -34,6 +34,7 @@ from mplicits.pipelines.run.team import (
     whole_batch,
 )
 from mplicits.pipelines.run.trainer import Trainer
+from reconstructions import TINY_SCENE
 
 STEPS = 12
 
@@ -50,23 +51,8 @@ def trained() -> tuple[dict[str, torch.Tensor], int]:
     return network.state_dict(), len(objective._draw(sources[0]))
 
 
-SCENE = ReconstructConfig(
-    widths=(16, 16),
-    depths=(1, 1),
-    omegas=(10.0, 15.0),
-    starts=(0.0, 0.5),
-    features=4,
-    color_width=16,
-    color_depth=1,
-    color_grid=8,
-    color_frequencies=2,
-    steps=6,
-    rays=32,
-    uniform=8,
-    importance=4,
-    march_grid=8,
-    background="outside",  # how many random numbers a step takes is decided by the light that gets there
-)
+# How many random numbers a step takes is decided by the light that gets outside.
+SCENE = replace(TINY_SCENE, steps=6, background="outside")
 
 
 def scene_gradients() -> dict[str, torch.Tensor]:
