@@ -156,13 +156,17 @@ class Method(ABC, Generic[C]):
         name: as in `Cell.method`.
         source: where it comes from.
         differs: what differs from its source here.
-        depends: whether it goes on from cells of methods that do not.
+        depends: whether its cells go on from cells of methods that do not.
     """
 
     name: str
     source: str
     differs: str
     depends: bool = False
+
+    def goes_on(self, cell: C) -> bool:
+        """Whether a cell goes on from others, which do not go on from any."""
+        return self.depends
 
     def missing(self) -> str | None:
         """What must be installed for it, in a few words; None if nothing is missing."""

@@ -30,7 +30,8 @@ from ...neural_fields import Field, Jet, levels_of
 from ...neural_fields.radiance import Outside, ViewColor
 from ..reconstruct.model import RayPool, SceneModel
 from ..reconstruct.objective import SceneObjective
-from ..reconstruct.replayed import scene_trainer
+from ..reconstruct.replayed import ReplayedTrainer, scene_trainer
+from ..run.replay import Recorder, Results, Work
 from ..run.settings import ReconstructConfig
 from ..run.trainer import Progress, StopFlag, Trainer
 from .reconstruct_rows import StepParts
@@ -38,6 +39,7 @@ from .speed import Counted, counted
 
 __all__ = [
     "LateRows",
+    "Tallied",
     "Watched",
     "color_flops",
     "jet_flops",
@@ -49,7 +51,7 @@ __all__ = [
 
 PROBE = 64  # rows on which the FLOPs of one are counted
 ENDLESS = 10**9  # steps that no training comes to the end of
-REPORT_EVERY = 20
+REPORT_EVERY = 20  # steps; a GPU is looked at no more often
 HALF = 0.5  # of the training, after which rows count as late
 
 
@@ -112,7 +114,7 @@ def train_watched(
 ) -> Watched:
     """Train to the end of the schedule, or until ``flag`` asks to stop.
 
-    Steps are not replayed on a GPU: what is counted is what each of them asks for.
+    On a GPU steps are replayed in fixed shapes, and the rows that are counted include the room that was not needed.
 
     Args:
         model: on the pool's device.
@@ -127,14 +129,17 @@ def train_watched(
     color_cost, outside_cost = color_flops(model.color), 0.0 if model.outside is None else outside_flops(model.outside)
     model.geometry, levels = counted(plain)
     colors, outsides = _RowCounter(model.color), _RowCounter(model.outside)
-    config = replace(config, graphs=False, steps=config.steps if seconds is None else ENDLESS)
+    config = replace(config, steps=config.steps if seconds is None else ENDLESS)
     trainer = scene_trainer(model, pool, config, seconds=seconds)
-    clocks = None
+    if isinstance(trainer, ReplayedTrainer):
+        trainer.replays.recorder = Tallied(trainer.replays.recorder, [*levels, colors, outsides])
+    clocks, every = None, REPORT_EVERY
     if pool.device.type == "cpu":
+        every = 1
         clocks = (_Clock(trainer.objective, "losses"), _Clock(model.geometry, "jet"), _Clock(model.color, "forward"))
     watch = _Watch(trainer, levels, colors, report, clocks)
     try:
-        finished = trainer.run(flag, report=watch, report_every=1)
+        finished = trainer.run(flag, report=watch, report_every=every)
     finally:
         colors.remove()
         outsides.remove()
@@ -172,12 +177,16 @@ class _Watch:
         self.trainer, self.levels, self.colors, self.report, self.clocks = trainer, levels, colors, report, clocks
         self.half: LateRows | None = None  # what had been asked for when half was done
         self.half_times: tuple[float, ...] = ()
-        self.times: list[float] = []
-        self.samples = self.before = 0
+        self.times: list[float] = []  # of a step, from one report to the next
+        self.spent = 0.0
+        self.samples = self.before = self.step = 0
         self.level, self.started = trainer.objective.level_at(trainer.fraction), time.perf_counter()
 
     def __call__(self, progress: Progress) -> None:
-        self.times.append(time.perf_counter() - self.started)
+        steps, spent = self.trainer.step - self.step, time.perf_counter() - self.started
+        self.spent += spent
+        if steps:
+            self.times.append(spent / steps)
         if self.level == len(self.levels) - 1:  # the level of the step that has just been made
             self.samples += self.levels[0].jets - self.before
         if self.half is None and progress.fraction >= HALF:
@@ -185,7 +194,7 @@ class _Watch:
         if self.report is not None and (progress.step % REPORT_EVERY == 0 or progress.fraction >= 1):
             self.report(progress)
         self.before, self.level = self.levels[0].jets, self.trainer.objective.level_at(progress.fraction)
-        self.started = time.perf_counter()
+        self.step, self.started = self.trainer.step, time.perf_counter()
 
     def _rows(self) -> LateRows:
         """Those of all steps so far."""
@@ -194,7 +203,7 @@ class _Watch:
 
     def _seconds(self) -> tuple[float, ...]:
         """Of all steps so far: whole, forward, jets, colours."""
-        return (math.fsum(self.times), *(clock.seconds for clock in self.clocks or ()))
+        return (self.spent, *(clock.seconds for clock in self.clocks or ()))
 
     def parts(self) -> StepParts | None:
         """See `Watched`."""
@@ -215,6 +224,41 @@ class _Watch:
             for before, after in ((half.values, now.values), (half.jets, now.jets))
         )
         return LateRows(now.steps - half.steps, values, jets, now.colors - half.colors)
+
+
+class Tallied(Recorder):
+    """A recorder whose replays are counted: as many rows each time as when the work was recorded.
+
+    Args:
+        recorder: records and replays.
+        counters: objects whose attributes ``values``, ``jets`` and ``rows``, those that they have, count.
+    """
+
+    def __init__(self, recorder: Recorder, counters: Sequence[object]) -> None:
+        self.recorder = recorder
+        self._counts = [(c, name) for c in counters for name in ("values", "jets", "rows") if hasattr(c, name)]
+
+    def record(self, work: Work) -> tuple[Callable[[], None], Results]:
+        """See `Recorder.record`; recording itself counts nothing."""
+        before = self._read()
+        try:
+            replay, results = self.recorder.record(work)
+            asked = [now - then for now, then in zip(self._read(), before, strict=True)]
+        finally:
+            self._write(before)
+
+        def counted_replay() -> None:
+            replay()
+            self._write([now + more for now, more in zip(self._read(), asked, strict=True)])
+
+        return counted_replay, results
+
+    def _read(self) -> list[int]:
+        return [getattr(counter, name) for counter, name in self._counts]
+
+    def _write(self, counts: Sequence[int]) -> None:
+        for (counter, name), count in zip(self._counts, counts, strict=True):
+            setattr(counter, name, count)
 
 
 class _RowCounter:

@@ -135,6 +135,7 @@ class GeometryBench(Benchmark[GeometryRow]):
             and ``sharpening · learning_rate`` of the config.
         seeds: 0, 1, … below it, two at least.
         geometries: those of `GEOMETRIES` that are trained.
+        streams: trainings at a time; a step of each takes longer for that.
         test_views: at most so many of the held-out views are measured, evenly chosen.
         resolution: of the marching cubes, of the exact surface as well.
         samples: points on each surface for Chamfer distances.
@@ -149,6 +150,7 @@ class GeometryBench(Benchmark[GeometryRow]):
     rates: tuple[float, ...] = (3e-4,)
     seeds: int = 3
     geometries: tuple[str, ...] = GEOMETRIES
+    streams: int = 1
     test_views: int = 8
     resolution: int = 256
     samples: int = 500_000
@@ -170,6 +172,10 @@ class GeometryBench(Benchmark[GeometryRow]):
         what = (("scene", scene.name), ("pictures", scene.digest), ("geometry", geometry), ("rate", rate))
         rates = "its rate" if isinstance(rate, tuple) else f"{rate:g}"
         return Part(self.name, f"{scene.name}, {geometry}, {rates}, seed {seed}", options=(*what, ("seed", seed)))
+
+    def goes_on(self, cell: Part) -> bool:
+        """See `Method.goes_on`: the other seeds wait for the rates of the first."""
+        return isinstance(cell.parameters["rate"], tuple)
 
     def settings(self, cell: Part) -> Mapping[str, Any]:
         """See `Benchmark.settings`; with the rate of the colours, which the cell's own does not change."""

@@ -10,7 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-from ..run.jobs import Outcome, check_jobs, run_jobs
+import torch
+
+from ..run.jobs import Outcome, check_jobs, run_jobs, run_streams
 from ..run.machine import choose_device, environment
 from ..run.trainer import Interrupted, Report
 from .cells import Catalogue, Cell, Record, Workplace, read_record, write_record
@@ -99,6 +101,7 @@ def run_cells(
     catalogue: Catalogue[C],
     *,
     jobs: int = 1,
+    streams: int = 1,
     device: str = "cpu",
     say: Say,
     progress: Report | None = None,
@@ -110,11 +113,12 @@ def run_cells(
         cells: each once.
         out: folder of the bench.
         catalogue: the methods.
-        jobs: how many at a time (see `run_jobs`).
+        jobs: how many at a time, in processes (see `run_jobs`).
+        streams: how many at a time in this process, on one GPU (see `run_streams`); with one job only.
         device: a torch device, or "auto".
         say: told one line per cell.
-        progress: called now and then with how far a training is; with one job only.
-        tell: told what comes next in a cell; with one job only.
+        progress: called now and then with how far a training is; with one at a time only.
+        tell: told what comes next in a cell; with one at a time only.
 
     Raises:
         InputError: no such device, or no Ray for more than one job.
@@ -133,13 +137,17 @@ def run_cells(
     if records and waiting:
         say(f"{len(records)} of {len(possible)} cells are there already")
     counter = _Counter(len(waiting), say)
-    heard = {"progress": progress, "say": tell} if jobs == 1 else {}
+    heard = {"progress": progress, "say": tell} if jobs == streams == 1 else {}
     work = functools.partial(run_cell, out=out, catalogue=catalogue, device=where, **heard)
     failures: dict[C, str] = {}
     # What others go on from comes first, so that it is not trained twice side by side.
     for depends in (False, True):
-        group = [cell for cell in waiting if methods[cell].depends is depends]
-        for outcome in run_jobs(work, group, jobs=jobs, report=counter):
+        group = [cell for cell in waiting if methods[cell].goes_on(cell) is depends]
+        if streams > 1:
+            outcomes = run_streams(work, group, streams=streams, device=torch.device(where), report=counter)
+        else:
+            outcomes = run_jobs(work, group, jobs=jobs, report=counter)
+        for outcome in outcomes:
             if outcome.value is None:
                 failures[outcome.item] = outcome.error or "failed"
             else:

@@ -28,13 +28,16 @@ MODELLED = ("h100", "a100", "4090", "m2")
 GEOMETRIES = ("multiscale", "neus", "single")  # those of `bench.geometries`
 
 
-def _run(arguments: argparse.Namespace, benches: Sequence[Benchmark[Any]], *, out: Path | None) -> int:
+def _run(
+    arguments: argparse.Namespace, benches: Sequence[Benchmark[Any]], *, out: Path | None, streams: int = 1
+) -> int:
     """Do what is not done yet, print the tables, and write them.
 
     Args:
         arguments: of the command.
         benches: each with its own cells.
         out: folder of the results; None keeps nothing.
+        streams: cells at a time, see `run_streams`.
     """
     from ..bench.benchmark import write_results
     from ..bench.cells import Catalogue, make_folder
@@ -53,9 +56,8 @@ def _run(arguments: argparse.Namespace, benches: Sequence[Benchmark[Any]], *, ou
         stack.enter_context(locked(folder))
         try:
             with progress_bars(whole=False) as bars:
-                ran = run_cells(
-                    cells, folder, Catalogue(benches), device=benches[0].device, say=_say, progress=bars, tell=_say
-                )
+                heard = {"say": _say, "progress": bars, "tell": _say}
+                ran = run_cells(cells, folder, Catalogue(benches), streams=streams, device=benches[0].device, **heard)
             code = 1 if ran.failures else 0
         except (Interrupted, KeyboardInterrupt):
             kept = "; the same command goes on after the last finished cell" if out else ""
@@ -379,6 +381,8 @@ def _reconstruct_arguments(parser: argparse.ArgumentParser) -> None:
     alone.add_argument("--rates", nargs="+", type=positive, metavar="RATE", help=about)
     about = f"which of them (all): {', '.join(GEOMETRIES)}"
     alone.add_argument("--geometries", nargs="+", choices=GEOMETRIES, metavar="NAME", help=about)
+    about = "trainings at a time, each in a stream of the GPU, which one alone does not fill"
+    _number(alone, "--streams", whole(1, 64), 1, about)
     add_flags(parser, "--json")
     add_settings(parser, ReconstructConfig, about="of all rows; the geometry is chosen by the benchmark")
 
@@ -393,6 +397,8 @@ def _reconstruct(arguments: argparse.Namespace) -> int:
         raise input_error("--rates: only --geometry-only tries several; add it, or give --learning-rate")
     if arguments.geometries and not arguments.geometry_only:
         raise input_error("--geometries: without --geometry-only all rows are trained; add it")
+    if arguments.streams > 1 and not arguments.geometry_only:
+        raise input_error("--streams: rows are compared by their time, one by one; only --geometry-only has several")
     if arguments.geometry_only and arguments.neus_learning_rate is not None:
         raise input_error("--neus-learning-rate: --geometry-only tries the same rates for all; give --rates")
     config = read_settings(arguments, ReconstructConfig)
@@ -415,8 +421,9 @@ def _reconstruct(arguments: argparse.Namespace) -> int:
         options["rates"] = tuple(dict.fromkeys(arguments.rates or (config.learning_rate,)))
         if arguments.geometries:
             options["geometries"] = tuple(dict.fromkeys(arguments.geometries))
-        alone = GeometryBench(scenes=scenes, config=config, seeds=arguments.seeds, **options)
-        return _run(arguments, [alone], out=arguments.out)
+        options |= {"seeds": arguments.seeds, "streams": arguments.streams}
+        alone = GeometryBench(scenes=scenes, config=config, **options)
+        return _run(arguments, [alone], out=arguments.out, streams=arguments.streams)
     options["equal_time"] = arguments.equal_time
     if arguments.neus_learning_rate is not None:
         options["neus_learning_rate"] = arguments.neus_learning_rate

@@ -1,4 +1,4 @@
-"""Many independent pieces of work: one after the other here, or side by side in the workers of Ray.
+"""Many independent pieces of work: one after the other, in streams of one GPU, or side by side in the workers of Ray.
 
 Ray (https://ray.io) is the extra ``ray``. It starts on this machine alone, joins no cluster, serves no dashboard and
 reports to nobody.
@@ -12,21 +12,24 @@ import math
 import os
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
 import torch
 
 from ...neural_fields import InputError
-from .trainer import Interrupted
+from .trainer import Interrupted, shared_flag, stop_on_signals
 
-__all__ = ["Outcome", "check_jobs", "run_jobs"]
+__all__ = ["Outcome", "check_jobs", "run_jobs", "run_streams"]
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 # How long workers may take to write their checkpoints after Ctrl-C.
 GRACE_SECONDS = 60.0
+# How long Ctrl-C may go unheard by threads.
+HEARING_SECONDS = 0.2
 # Read by Ray when it is imported: no usage reports, devices stay visible to tasks that ask for none, and workers do not
 # give way to whatever else runs: they are what was asked for, and their seconds are measured.
 RAY_ENVIRONMENT = {
@@ -98,6 +101,56 @@ def run_jobs(
             report(outcomes[-1])
         return outcomes
     return _side_by_side(function, items, min(jobs, len(items)), report)
+
+
+def run_streams(
+    function: Callable[[Item], Result],
+    items: Sequence[Item],
+    *,
+    streams: int,
+    device: torch.device,
+    report: Callable[[Outcome[Item, Result]], None] | None = None,
+) -> list[Outcome[Item, Result]]:
+    """Call ``function`` on every item in threads of this process, each with a CUDA stream of its own.
+
+    A training of small networks keeps a small part of a GPU busy. What several of them ask for in different streams is
+    done at the same time, and what comes of it is the same.
+
+    Args:
+        function: what to do; all threads call it.
+        items: what to do it on.
+        streams: how many at a time.
+        device: where it is done. A CPU has no streams, but threads.
+        report: told every outcome, as it comes.
+
+    Returns:
+        One outcome per item, in their order.
+
+    Raises:
+        Interrupted: Ctrl-C; trainings under way have heard of it by `stop_on_signals`, nothing else is begun.
+    """
+    outcomes: dict[int, Outcome[Item, Result]] = {}
+
+    def enter() -> None:
+        if device.type == "cuda":
+            torch.cuda.set_stream(torch.cuda.Stream(device))
+
+    with stop_on_signals() as flag, ThreadPoolExecutor(streams, initializer=enter) as threads:
+
+        def work(item: Item) -> Outcome[Item, Result]:
+            if flag.requested:
+                raise Interrupted(None)
+            with shared_flag(flag):
+                return _outcome(function, item)
+
+        waiting = {threads.submit(work, item): index for index, item in enumerate(items)}
+        while waiting:
+            # A signal that arrives just before a wait is heard after it, so that no wait may be long.
+            for done in wait(waiting, HEARING_SECONDS, FIRST_COMPLETED).done:
+                outcome = outcomes[waiting.pop(done)] = done.result()
+                if report is not None:
+                    report(outcome)
+    return [outcomes[index] for index in range(len(items))]
 
 
 def _outcome(function: Callable[[Item], Result], item: Item) -> Outcome[Item, Result]:

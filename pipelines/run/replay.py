@@ -7,6 +7,7 @@ is recorded, and from then on it is replayed. What the host knows, random number
 
 from __future__ import annotations
 
+import threading
 from abc import ABC, abstractmethod
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Mapping
@@ -17,7 +18,7 @@ from torch import Tensor
 
 from ...neural_fields.devices import Supply
 
-__all__ = ["Again", "CudaGraphs", "Recorder", "Replays", "Work"]
+__all__ = ["Again", "CudaGraphs", "Recorder", "Replays", "Results", "Work"]
 
 # Recorded kinds of steps that are kept: each holds memory for all its intermediate results.
 KEPT = 12
@@ -34,6 +35,10 @@ class Recorder(ABC):
         """A function that does ``work`` again, and where its results are found afterwards; nothing is done yet."""
 
 
+# PyTorch waits for the whole device before it records, which nobody else may be doing then.
+_recording = threading.Lock()
+
+
 class CudaGraphs(Recorder):
     """CUDA's graphs; all of them share their memory, because one is replayed at a time."""
 
@@ -42,9 +47,11 @@ class CudaGraphs(Recorder):
 
     def record(self, work: Work) -> tuple[Callable[[], None], Results]:
         """See `Recorder.record`."""
-        graph = torch.cuda.CUDAGraph()
+        graph, stream = torch.cuda.CUDAGraph(), torch.cuda.current_stream()
+        # The default stream cannot be recorded; PyTorch has one for that. One that was chosen by `with_streams` can.
+        own = None if stream == torch.cuda.default_stream() else stream
         # Others, as one that draws progress, may talk to the device meanwhile.
-        with torch.cuda.graph(graph, pool=self._pool, capture_error_mode="thread_local"):
+        with _recording, torch.cuda.graph(graph, pool=self._pool, stream=own, capture_error_mode="thread_local"):
             results = work()
         return graph.replay, results
 

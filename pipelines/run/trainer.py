@@ -9,6 +9,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
 from types import FrameType
 from typing import Any, Generic, NamedTuple, TypeVar
@@ -33,6 +34,7 @@ __all__ = [
     "parameter_count",
     "restore_frozen",
     "seeded",
+    "shared_flag",
     "stop_on_signals",
     "warm_cosine",
     "without_prefix",
@@ -64,12 +66,12 @@ class StopFlag:
 def stop_on_signals() -> Iterator[StopFlag]:
     """Turn the first Ctrl-C or SIGTERM into a flag that is read between two steps; a second one acts at once.
 
-    Signals belong to the main thread; elsewhere the flag is simply never raised.
+    Signals belong to the main thread. Elsewhere it is the flag of `shared_flag`, or one that is never raised.
     """
-    flag = StopFlag()
     if threading.current_thread() is not threading.main_thread():
-        yield flag
+        yield _shared.get() or StopFlag()
         return
+    flag = StopFlag()
     signals = (signal.SIGINT, signal.SIGTERM)
     before = {number: signal.getsignal(number) for number in signals}
 
@@ -87,6 +89,19 @@ def stop_on_signals() -> Iterator[StopFlag]:
             signal.signal(number, before[number])
 
 
+_shared: ContextVar[StopFlag | None] = ContextVar("shared", default=None)
+
+
+@contextmanager
+def shared_flag(flag: StopFlag) -> Iterator[None]:
+    """In a thread, inside this, `stop_on_signals` gives the flag of the main thread, which hears the signals."""
+    token = _shared.set(flag)
+    try:
+        yield
+    finally:
+        _shared.reset(token)
+
+
 def load_compiler() -> None:
     """Load PyTorch's compiler, as its first optimiser does, for two seconds: to be called between two stages.
 
@@ -100,10 +115,16 @@ def parameter_count(*modules: nn.Module) -> int:
     return sum(parameter.numel() for module in modules for parameter in module.parameters())
 
 
+_seeding = threading.RLock()
+
+
 @contextmanager
 def seeded(seed: int) -> Iterator[None]:
-    """A block whose random numbers follow from ``seed``, and leave no trace in the state of torch's."""
-    with torch.random.fork_rng(devices=[]):
+    """A block whose random numbers follow from ``seed``, and leave no trace in the state of torch's.
+
+    That state belongs to all threads, so that they wait for each other.
+    """
+    with _seeding, torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         yield
 

@@ -2,11 +2,12 @@
 
 import dataclasses
 import statistics
+from pathlib import Path
 
 import pytest
 import torch
 from mplicits.neural_fields.baselines import NeusSDF
-from mplicits.pipelines.bench.cells import Catalogue, Workplace
+from mplicits.pipelines.bench.cells import Catalogue, Workplace, make_folder
 from mplicits.pipelines.bench.geometries import (
     GEOMETRIES,
     SINGLE,
@@ -19,6 +20,7 @@ from mplicits.pipelines.bench.geometries import (
 )
 from mplicits.pipelines.bench.reconstruct import read_scene
 from mplicits.pipelines.bench.reconstruct_rows import MULTISCALE, NEUS, SurfaceFigures
+from mplicits.pipelines.bench.run import run_cells
 from mplicits.pipelines.cli.bench import GEOMETRIES as OFFERED
 from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.reconstruct.model import build_scene
@@ -42,6 +44,11 @@ def _small_reconstructions(monkeypatch: pytest.MonkeyPatch) -> None:
 def bench() -> GeometryBench:
     scene = read_scene("painted-sphere", views=4, size=8)
     return GeometryBench(scenes=[scene], config=TINY, rates=(3e-4, 1e-3), seeds=2, resolution=16, samples=500)
+
+
+def made(folder: Path) -> Path:
+    make_folder(folder)
+    return folder
 
 
 @pytest.mark.parametrize(("widths", "depths"), [((128, 256), (4, 5)), ((32, 48), (2, 2)), ((16, 24), (1, 1))])
@@ -139,6 +146,26 @@ def test_other_seeds_have_the_rate_of_the_first(bench, tmp_path, monkeypatch):
     more = dataclasses.replace(some, rates=(*some.rates, 3e-3)).rows(tmp_path)
     assert trained[3:] == [(3e-3, 0)]
     assert [(row.rate, row.seed) for row in more] == [(3e-4, 0), (1e-3, 0), (3e-3, 0), (1e-3, 1)]
+
+
+def test_several_trainings_at_a_time_find_what_one_after_the_other_does(bench, tmp_path):
+    tables = []
+    for streams in (1, 3):
+        some = dataclasses.replace(bench, geometries=(MULTISCALE, NEUS), streams=streams)
+        cells, catalogue = some.cells(), Catalogue([some])
+        ran = run_cells(cells, made(tmp_path / str(streams)), catalogue, streams=streams, say=lambda _: None)
+        assert list(ran.records) == cells
+        assert not ran.failures
+        rows = some.read(list(ran.records.values()))
+        tables.append([(row.geometry, row.rate, row.seed, row.result.psnr, row.result.surface) for row in rows])
+    assert tables[0] == tables[1]
+    # Six cells, and those of the second seed with the best rate of the first, each done once.
+    assert len(list((tmp_path / "3" / "cells").iterdir())) == 4 + 2 + 2
+
+
+def test_streams_are_for_the_geometry_alone(capsys):
+    assert main(["bench", "reconstruct", "figure", "--streams", "2"]) == 2
+    assert "--streams: rows are compared by their time, one by one" in capsys.readouterr().err
 
 
 def test_rates_without_the_geometry_alone_are_refused(capsys):

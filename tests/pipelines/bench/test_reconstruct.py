@@ -11,6 +11,7 @@ from mplicits.datasets.synthetic.scenes import SCENES, render_scene
 from mplicits.neural_fields import InputError, Siren, Sphere, Union, extract_mesh
 from mplicits.neural_fields.baselines import NeusSDF
 from mplicits.neural_fields.radiance import Outside, ViewColor
+from mplicits.pipelines.bench import flops
 from mplicits.pipelines.bench import reconstruct as module
 from mplicits.pipelines.bench.cells import Catalogue, record_file
 from mplicits.pipelines.bench.flops import (
@@ -25,8 +26,10 @@ from mplicits.pipelines.bench.reconstruct import BenchScene, ReconstructBench, r
 from mplicits.pipelines.bench.reconstruct_rows import EQUAL_TIME, MULTISCALE, NEUS, ReconstructRow, comparisons
 from mplicits.pipelines.bench.report import as_text
 from mplicits.pipelines.cli.entry import main
-from mplicits.pipelines.reconstruct.model import RayPool, build_scene
-from mplicits.pipelines.reconstruct.replayed import scene_trainer
+from mplicits.pipelines.reconstruct.model import RayPool, SceneModel, build_scene
+from mplicits.pipelines.reconstruct.objective import SceneObjective
+from mplicits.pipelines.reconstruct.replayed import ReplayedTrainer, scene_trainer
+from mplicits.pipelines.run.replay import Again
 from mplicits.pipelines.run.settings import ReconstructConfig
 from mplicits.pipelines.run.trainer import StopFlag
 from mplicits.pipelines.surface.surface import from_mesh
@@ -111,6 +114,31 @@ def test_counted_flops_are_those_of_a_training(scene: BenchScene, geometry: str)
     assert watched.finished
     assert watched.trainer.losses == trainer.losses  # watching changes nothing
     assert watched.geometry_flops + watched.color_flops == pytest.approx(counter.get_total_flops(), rel=0.02)
+
+
+def replaying(model: SceneModel, pool: RayPool, config: ReconstructConfig, *, seconds: float | None) -> ReplayedTrainer:
+    objective = SceneObjective(model, pool, config)
+    return ReplayedTrainer(objective, recorder=Again(), stage="reconstruct", steps=config.steps, seconds=seconds)
+
+
+def test_replayed_steps_are_watched_too(scene: BenchScene, monkeypatch: pytest.MonkeyPatch):
+    pool = RayPool(scene.images.views, scene.images.similarity, torch.device("cpu"))
+    config = dataclasses.replace(TINY, steps=12)
+    watched = []
+    for replayed in (False, True):
+        if replayed:
+            monkeypatch.setattr(flops, "scene_trainer", replaying)
+        watched.append(train_watched(build_scene(config, has_masks=True), pool, config, StopFlag()))
+    usual, fixed = watched
+    assert fixed.finished
+    assert fixed.trainer.replays.recorded > 0
+    assert fixed.step_seconds > 0
+    # Every section that is wanted, in fixed shapes with all the room there is, and so all levels and colours.
+    assert fixed.jets[0] >= usual.jets[0] > 0
+    assert fixed.jets[1] >= usual.jets[1] > 0
+    assert fixed.colors >= usual.colors > 0
+    assert fixed.late is not None
+    assert fixed.late.steps == 6
 
 
 def test_a_training_that_is_asked_to_stop_has_not_finished(scene: BenchScene):

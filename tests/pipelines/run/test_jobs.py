@@ -2,12 +2,14 @@
 
 import importlib.util
 import os
+import signal
+import threading
 
 import pytest
 import torch
 from mplicits.neural_fields import InputError
-from mplicits.pipelines.run.jobs import Outcome, run_jobs
-from mplicits.pipelines.run.trainer import Interrupted
+from mplicits.pipelines.run.jobs import Outcome, run_jobs, run_streams
+from mplicits.pipelines.run.trainer import Interrupted, seeded, stop_on_signals
 
 needs_ray = pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="Ray is an extra")
 
@@ -49,6 +51,50 @@ def test_several_jobs_without_ray_name_the_extra(monkeypatch: pytest.MonkeyPatch
         run_jobs(reciprocal, [1, 2], jobs=2)
     with pytest.raises(InputError, match="--jobs 0: expected a whole number from 1"):
         run_jobs(reciprocal, [1, 2], jobs=0)
+
+
+def test_streams_work_at_the_same_time_and_tell_what_failed() -> None:
+    seen: list[Outcome[int, float]] = []
+    both = threading.Barrier(2, timeout=60)  # which nobody passes alone
+
+    def work(number: int) -> float:
+        if number < 2:
+            both.wait()
+        return reciprocal(number)
+
+    outcomes = run_streams(work, [1, 0, 2, 3], streams=2, device=torch.device("cpu"), report=seen.append)
+    assert [outcome.value for outcome in outcomes] == [1.0, None, 0.5, None]
+    assert outcomes[1].error == "ZeroDivisionError: division by zero"
+    assert outcomes[3].error == "three: is not wanted; leave it out"
+    assert sorted(outcome.item for outcome in seen) == [0, 1, 2, 3]
+
+
+def test_ctrl_c_is_heard_in_every_stream_and_nothing_else_begins() -> None:
+    begun: list[int] = []
+    both = threading.Barrier(2, timeout=60)
+
+    def work(number: int) -> None:
+        begun.append(number)
+        with stop_on_signals() as flag:
+            if both.wait() == 0:
+                os.kill(os.getpid(), signal.SIGINT)
+            while not flag.requested:
+                threading.Event().wait(0.001)
+        raise Interrupted(None)
+
+    with pytest.raises(Interrupted):
+        run_streams(work, [1, 2, 3, 4], streams=2, device=torch.device("cpu"))
+    assert sorted(begun) == [1, 2]
+
+
+def test_random_numbers_of_a_seed_are_the_same_in_every_stream() -> None:
+    def work(seed: int) -> list[float]:
+        with seeded(seed):
+            return [float(torch.rand(())) for _ in range(300)]
+
+    alone = [work(seed) for seed in range(8)]
+    outcomes = run_streams(work, range(8), streams=4, device=torch.device("cpu"))
+    assert [outcome.value for outcome in outcomes] == alone
 
 
 @needs_ray
