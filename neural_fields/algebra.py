@@ -172,6 +172,13 @@ class _Boolean(_Pointwise):
         # Each blend lowers the minimum by at most smooth / 4; beyond that much more, one part alone decides the sign.
         return delta + (len(self.parts) - 1) * self.smooth / 4
 
+    def _join(self, x: Tensor, values: list[Tensor]) -> Tensor:
+        sign, signs = self._signs()
+        lowest, *others = (own * value for own, value in zip(signs, values, strict=True))
+        for other in others:
+            lowest, _ = _smooth_minimum(lowest, other, self.smooth)
+        return sign * lowest
+
     def _weigh(self, values: list[Tensor]) -> tuple[Tensor, list[Tensor]]:
         sign, signs = self._signs()
         lowest, *others = (own * value for own, value in zip(signs, values, strict=True))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -14,11 +15,15 @@ from .field import Jet, OneLevelField
 __all__ = ["Box", "Capsule", "Plane", "Sphere", "Torus"]
 
 
+# A value, and the gradient for who asks for it.
+Evaluated = tuple[Tensor, Callable[[], Tensor]]
+
+
 class ClosedForm(OneLevelField):
     """A closed-form field; a subclass gives value and gradient at points."""
 
     @abstractmethod
-    def _evaluate(self, x: Tensor) -> tuple[Tensor, Tensor]: ...
+    def _evaluate(self, x: Tensor) -> Evaluated: ...
 
     def value(self, x: Tensor, *, level: int = -1) -> Tensor:
         self.resolve_level(level)
@@ -27,14 +32,13 @@ class ClosedForm(OneLevelField):
     def jet(self, x: Tensor, *, level: int = -1) -> Jet:
         self.resolve_level(level)
         value, gradient = self._evaluate(self.check_points(x))
-        return Jet(value, gradient, x.new_empty((*x.shape[:-1], 0)))
+        return Jet(value, gradient(), x.new_empty((*x.shape[:-1], 0)))
 
 
-def _norm_and_direction(v: Tensor) -> tuple[Tensor, Tensor]:
-    """Length of ``v`` and ``v`` over it; zero vectors get direction zero instead of NaN."""
-    length = v.norm(dim=-1)
+def _direction(v: Tensor, length: Tensor) -> Tensor:
+    """``v`` over its length; zero vectors get direction zero instead of NaN."""
     safe = torch.where(length > 0, length, torch.ones_like(length))
-    return length, v / safe[..., None]
+    return v / safe[..., None]
 
 
 class Sphere(ClosedForm):
@@ -53,9 +57,10 @@ class Sphere(ClosedForm):
         positive(radius=radius)
         self.radius, self.center = radius, center
 
-    def _evaluate(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        length, direction = _norm_and_direction(x - few_numbers(self.center, x))
-        return length - self.radius, direction
+    def _evaluate(self, x: Tensor) -> Evaluated:
+        v = x - few_numbers(self.center, x)
+        length = v.norm(dim=-1)
+        return length - self.radius, lambda: _direction(v, length)
 
 
 class Plane(ClosedForm):
@@ -70,9 +75,9 @@ class Plane(ClosedForm):
             raise ValueError(f"normal={normal}: expected a vector of non-zero length")
         self.normal, self.offset = tuple(c / length for c in normal), offset
 
-    def _evaluate(self, x: Tensor) -> tuple[Tensor, Tensor]:
+    def _evaluate(self, x: Tensor) -> Evaluated:
         normal = few_numbers(self.normal, x)
-        return x @ normal - self.offset, normal.expand(x.shape)
+        return x @ normal - self.offset, lambda: normal.expand(x.shape)
 
 
 class Torus(ClosedForm):
@@ -86,10 +91,16 @@ class Torus(ClosedForm):
             raise ValueError(f"major={major}, minor={minor}: expected major > minor > 0")
         self.major, self.minor = major, minor
 
-    def _evaluate(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        rho, radial = _norm_and_direction(x[..., :2])
-        length, q = _norm_and_direction(torch.stack((rho - self.major, x[..., 2]), -1))
-        return length - self.minor, torch.cat((q[..., :1] * radial, q[..., 1:]), -1)
+    def _evaluate(self, x: Tensor) -> Evaluated:
+        rho = x[..., :2].norm(dim=-1)
+        v = torch.stack((rho - self.major, x[..., 2]), -1)
+        length = v.norm(dim=-1)
+
+        def gradient() -> Tensor:
+            q = _direction(v, length)
+            return torch.cat((q[..., :1] * _direction(x[..., :2], rho), q[..., 1:]), -1)
+
+        return length - self.minor, gradient
 
 
 class Box(ClosedForm):
@@ -111,14 +122,18 @@ class Box(ClosedForm):
             raise ValueError(f"half_size={half_size}: expected three numbers > 0")
         self.half_size, self.center = half_size, center
 
-    def _evaluate(self, x: Tensor) -> tuple[Tensor, Tensor]:
+    def _evaluate(self, x: Tensor) -> Evaluated:
         p = x - few_numbers(self.center, x)
-        sign = torch.where(p < 0, -1.0, 1.0).to(x.dtype)
         q = p.abs() - few_numbers(self.half_size, x)
-        outside, direction = _norm_and_direction(q.clamp(min=0))
+        v = q.clamp(min=0)
+        outside = v.norm(dim=-1)
         inside, axis = q.max(dim=-1)
-        facing = torch.nn.functional.one_hot(axis, 3).to(x.dtype)
-        gradient = torch.where((inside > 0)[..., None], direction, facing) * sign
+
+        def gradient() -> Tensor:
+            sign = torch.where(p < 0, -1.0, 1.0).to(x.dtype)
+            facing = torch.nn.functional.one_hot(axis, 3).to(x.dtype)
+            return torch.where((inside > 0)[..., None], _direction(v, outside), facing) * sign
+
         return outside + inside.clamp(max=0), gradient
 
 
@@ -139,9 +154,10 @@ class Capsule(ClosedForm):
             raise ValueError(f"start={start}, end={end}, radius={radius}: expected two different points and radius > 0")
         self.start, self.end, self.radius = start, end, radius
 
-    def _evaluate(self, x: Tensor) -> tuple[Tensor, Tensor]:
+    def _evaluate(self, x: Tensor) -> Evaluated:
         start = few_numbers(self.start, x)
         axis = few_numbers(self.end, x) - start
         along = (((x - start) @ axis) / (axis @ axis)).clamp(0, 1)
-        length, direction = _norm_and_direction(x - start - along[..., None] * axis)
-        return length - self.radius, direction
+        v = x - start - along[..., None] * axis
+        length = v.norm(dim=-1)
+        return length - self.radius, lambda: _direction(v, length)

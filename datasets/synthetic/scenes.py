@@ -10,10 +10,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from ...neural_fields import Box, Capsule, Field, Similarity, Sphere, Torus, Union, sphere_trace
 from ...neural_fields.meshing import Mesh, extract_mesh
@@ -105,18 +107,22 @@ def render_scene(
         shaded: whether a fixed lamp lights the shape; without, the images show the paint itself.
         glossy: whether the lamp is reflected, in a highlight that moves with the eye.
         depths: whether each image has the depths of its pixels' centres.
-        progress: called with ``(done, total)`` after every image.
+        progress: called with ``(done, total)`` after every image, or several small ones.
 
     Raises:
         ValueError: ``views``, ``size`` or ``samples`` is not positive.
     """
-    images = []
-    for index, camera in enumerate(scene_cameras(scene, views=views, size=size, seed=seed)):
-        color, mask = render_view(scene, camera, samples=samples, shaded=shaded, glossy=glossy)
-        depth = scene_depths(scene, camera) if depths else None
-        images.append(PosedImage(f"{index:03d}.png", camera, color, mask, depth))
+    _check_samples(samples)
+    cameras = scene_cameras(scene, views=views, size=size, seed=seed)
+    together = max(1, RAYS_AT_ONCE // (size * samples) ** 2)
+    images: list[PosedImage] = []
+    for first in range(0, views, together):
+        some = cameras[first : first + together]
+        maps = _depths(scene, some) if depths else [None] * len(some)
+        for camera, seen, depth in zip(some, _pictures(scene, some, samples, shaded, glossy), maps, strict=True):
+            images.append(PosedImage(f"{len(images):03d}.png", camera, *seen, depth))
         if progress is not None:
-            progress(index + 1, views)
+            progress(len(images), views)
     points = sample_surface(scene.field, SPARSE_POINTS, seed=seed).points
     seen = _observations(scene, points, [view.camera for view in images])
     return PosedImages(tuple(images), Similarity.identity(), "the unit sphere", points, Path(scene.name), seen)
@@ -129,11 +135,36 @@ def scene_depths(scene: Scene, camera: Camera) -> DepthMap:
         scene: what is seen.
         camera: in the scene's coordinates.
     """
-    eye, directions = camera.rays(dtype=torch.float64)
-    hits = sphere_trace(scene.field, eye, directions, tolerance=1e-9, lipschitz=scene.lipschitz)
-    ahead = (hits.position - eye) @ camera.forward
-    numbers = torch.where(hits.mask, ahead, torch.nan).float().numpy()
-    return DepthMap(numbers, camera, "metric", Path(scene.name))
+    return _depths(scene, [camera])[0]
+
+
+def _depths(scene: Scene, cameras: Sequence[Camera]) -> list[DepthMap]:
+    """`scene_depths` of several cameras, whose rays are traced together."""
+    maps = []
+    for camera, hits in zip(cameras, _traced(scene, cameras), strict=True):
+        ahead = (hits.position - camera.eye) @ camera.forward
+        numbers = torch.where(hits.mask, ahead, torch.nan).float().numpy()
+        maps.append(DepthMap(numbers, camera, "metric", Path(scene.name)))
+    return maps
+
+
+class _Seen(NamedTuple):
+    """What the rays of a camera meet: ``(H, W)`` whether, ``(H, W, 3)`` where, and their directions."""
+
+    mask: Tensor
+    position: Tensor
+    direction: Tensor
+
+
+def _traced(scene: Scene, cameras: Sequence[Camera]) -> list[_Seen]:
+    """The rays of several cameras in one march: of a few rays it takes as long as of thousands."""
+    rays = [camera.rays(dtype=torch.float64) for camera in cameras]
+    eyes = torch.cat([eye.expand_as(directions).reshape(-1, 3) for eye, directions in rays])
+    along = torch.cat([directions.reshape(-1, 3) for _, directions in rays])
+    hits = sphere_trace(scene.field, eyes, along, tolerance=1e-9, lipschitz=scene.lipschitz)
+    sizes = [camera.height * camera.width for camera in cameras]
+    parts = zip(cameras, *(part.split(sizes) for part in (hits.mask, hits.position, along)), strict=True)
+    return [_Seen(*(part.unflatten(0, (camera.height, camera.width)) for part in own)) for camera, *own in parts]
 
 
 def _observations(scene: Scene, points: Float64, cameras: Sequence[Camera]) -> NDArray[np.int64]:
@@ -169,26 +200,33 @@ def render_view(
     Raises:
         ValueError: ``samples`` is not positive.
     """
-    if samples < 1:
-        raise ValueError(f"samples={samples}: expected at least one")
+    _check_samples(samples)
     rows = max(1, RAYS_AT_ONCE // (camera.width * samples**2))
     strips = [
-        _strip(scene, camera.strip(first, min(rows, camera.height - first)), samples, shaded, glossy)
+        _pictures(scene, [camera.strip(first, min(rows, camera.height - first))], samples, shaded, glossy)[0]
         for first in range(0, camera.height, rows)
     ]
     color, mask = (np.concatenate(part) for part in zip(*strips, strict=True))
     return color, mask
 
 
-def _strip(scene: Scene, camera: Camera, samples: int, shaded: bool, glossy: bool) -> tuple[Float32, Float32]:
-    """Colours and mask of some rows of `render_view`."""
-    fine = camera.resized(samples * camera.width, samples * camera.height)
-    eye, directions = fine.rays(dtype=torch.float64)
-    hits = sphere_trace(scene.field, eye, directions, tolerance=1e-9, lipschitz=scene.lipschitz)
-    mask, position = hits.mask.numpy(), hits.position.numpy()
-    light = np.zeros((*mask.shape, 3))
-    light[mask] = _light(scene, position[mask], directions.numpy()[mask], shaded, glossy)
-    return developed(light, mask, samples)
+def _check_samples(samples: int) -> None:
+    if samples < 1:
+        raise ValueError(f"samples={samples}: expected at least one")
+
+
+def _pictures(
+    scene: Scene, cameras: Sequence[Camera], samples: int, shaded: bool, glossy: bool
+) -> list[tuple[Float32, Float32]]:
+    """`render_view` of several cameras, whose rays are traced together."""
+    pictures = []
+    fine = [camera.resized(samples * camera.width, samples * camera.height) for camera in cameras]
+    for seen in _traced(scene, fine):
+        mask = seen.mask.numpy()
+        light = np.zeros((*mask.shape, 3))
+        light[mask] = _light(scene, seen.position.numpy()[mask], seen.direction.numpy()[mask], shaded, glossy)
+        pictures.append(developed(light, mask, samples))
+    return pictures
 
 
 def _light(scene: Scene, points: Float64, directions: Float64, shaded: bool, glossy: bool) -> Float64:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -34,10 +36,6 @@ class Statue(OneLevelField):
     The thinnest part is the staff, of radius 0.022.
     """
 
-    def __init__(self) -> None:
-        super().__init__()
-        self._samples: tuple[Float64, NDArray[np.floating], KDTree] | None = None
-
     def value(self, x: Tensor, *, level: int = -1) -> Tensor:
         """Implicit function at ``x`` ``(..., 3)`` → ``(...,)``."""
         self.resolve_level(level)
@@ -68,7 +66,7 @@ class Statue(OneLevelField):
         points = np.asarray(points, np.float64)
         if len(points) == 0:
             return np.empty(0)
-        samples, normals, tree = self._surface()
+        samples, normals, tree = _surface()
         near = np.asarray(tree.query(points, k=candidates, workers=-1)[1])
         row, column = np.nonzero(distinct_starts(samples[near], normals[near], radius=0.02))
         found = refine_closest(self, points[row], samples[near[row, column]])
@@ -77,13 +75,6 @@ class Statue(OneLevelField):
         with torch.no_grad():
             inside = self.value(torch.from_numpy(points)).numpy() < 0
         return np.where(inside, -distance, distance)
-
-    def _surface(self) -> tuple[Float64, NDArray[np.floating], KDTree]:
-        if self._samples is None:
-            cloud = sample_surface(self, 100_000, seed=0)
-            assert cloud.normals is not None
-            self._samples = (cloud.points, cloud.normals, KDTree(cloud.points))
-        return self._samples
 
     def colors(self, points: NDArray[np.floating]) -> NDArray[np.float32]:
         """Procedural texture ``(N, 3)`` in [0, 1] at ``points`` ``(N, 3)``: plumage, gilt, amber and marble."""
@@ -105,6 +96,14 @@ class Statue(OneLevelField):
         weights = torch.softmax(-distances / 0.004, dim=0)  # soft edges, about a hundredth wide
         mixed = (weights[..., None] * torch.stack(list(paints.values()))).sum(dim=0)
         return mixed.clamp(0, 1).float().numpy()
+
+
+@cache
+def _surface() -> tuple[Float64, NDArray[np.floating], KDTree]:
+    """Samples of the surface, their normals, and the way to the nearest of them."""
+    cloud = sample_surface(Statue(), 100_000, seed=0)
+    assert cloud.normals is not None
+    return cloud.points, cloud.normals, KDTree(cloud.points)
 
 
 def _statue(p: Tensor) -> Solid:

@@ -7,6 +7,7 @@ import pytest
 import torch
 from mplicits.datasets.cameras import look_at
 from mplicits.datasets.color_space import linear_to_srgb, srgb_to_linear
+from mplicits.datasets.synthetic import scenes
 from mplicits.datasets.synthetic.scenes import (
     SCENES,
     Scene,
@@ -14,6 +15,7 @@ from mplicits.datasets.synthetic.scenes import (
     render_view,
     sample_scene,
     scene_cameras,
+    scene_depths,
     scene_mesh,
 )
 from mplicits.datasets.synthetic.studio import AMBIENT, GLOSS, LAMP, SHARPNESS
@@ -45,6 +47,26 @@ def test_pixels_have_the_colour_of_the_point_they_see(sphere):
     assert np.abs(color[expected] - sphere.color(points[expected])).max() < 1e-6
     assert not color[~expected].any()
     assert color.dtype == mask.dtype == np.float32
+
+
+@pytest.mark.parametrize("at_once", [1, 3 * 24**2, 1 << 17])
+def test_views_that_are_traced_together_show_what_each_does_alone(at_once, monkeypatch):
+    monkeypatch.setattr(scenes, "RAYS_AT_ONCE", at_once)
+    told: list[tuple[int, int]] = []
+    scene = SCENES["figure"]()
+    images = render_scene(
+        scene, views=5, size=12, samples=2, shaded=True, depths=True, progress=lambda *at: told.append(at)
+    )
+    together = {1: 1, 3 * 24**2: 3}.get(at_once, 5)
+    assert told == [(done, 5) for done in (*range(together, 5, together), 5)]
+    monkeypatch.undo()
+    for view in images.views:
+        color, mask = render_view(scene, view.camera, samples=2, shaded=True)
+        np.testing.assert_allclose(view.color, color, atol=1e-6)
+        np.testing.assert_allclose(view.mask, mask, atol=1e-6)
+        assert view.depth is not None
+        alone = scene_depths(scene, view.camera)
+        np.testing.assert_allclose(view.depth.numbers, alone.numbers, atol=1e-6)
 
 
 def test_samples_of_a_pixel_are_averaged_in_linear_light(sphere):

@@ -25,6 +25,7 @@ from mplicits.neural_fields import (
     at_time,
     load_field,
 )
+from mplicits.neural_fields.analytic import Evaluated
 from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.evolve.checks import check_evolution, slope_figures
 from mplicits.pipelines.evolve.problem import End
@@ -139,9 +140,9 @@ def test_empty_frames_and_missed_ends_are_warned_about() -> None:
             super().__init__(offset=-5.0)
             self.in_dim = 4
 
-        def _evaluate(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        def _evaluate(self, x: Tensor) -> Evaluated:
             value, gradient = super()._evaluate(x[..., :3])
-            return value, torch.nn.functional.pad(gradient, (0, 1))
+            return value, lambda: torch.nn.functional.pad(gradient(), (0, 1))
 
     points = torch.rand(100, 3)
     checks = check_evolution(Nothing(), [End("ball", 0.0, points, points)], frames=4, resolution=16)

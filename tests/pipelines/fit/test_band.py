@@ -4,6 +4,7 @@ import pytest
 import torch
 from mplicits.datasets import sample_sphere
 from mplicits.neural_fields import Field, Sphere, Union
+from mplicits.neural_fields.analytic import Evaluated
 from mplicits.pipelines.fit.band import WIDEST, Band, band_of, delta_of, with_wrong_sides
 from mplicits.pipelines.fit.cloud import CloudDistance
 
@@ -61,7 +62,7 @@ def test_a_band_holds_what_a_level_puts_on_the_wrong_side(delta: float, expected
 
 def test_a_hollow_that_a_level_invents_is_on_the_wrong_side_too() -> None:
     class Hollow(Sphere):
-        def _evaluate(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        def _evaluate(self, x: torch.Tensor) -> Evaluated:
             value, gradient = super()._evaluate(x)
             return torch.maximum(value, 0.2 - x.norm(dim=-1)), gradient
 
