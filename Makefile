@@ -26,12 +26,13 @@ $(VENV)/.dev: $(VENV)/.installed
 demo: $(VENV)/.installed
 	$(BIN)/mplicits demo $(CLOUD) -o $(OUT)
 
-# Two processes of one thread each: most tests are too small to share.
+# Two processes of one thread each: most tests are too small to share. Each has whole files at first, whose fixtures are
+# made once for that, and takes from the other when it has none left.
 test: lint
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal
 
 test-all: lint
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 -m ''
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal -m ''
 
 fuzz: $(VENV)/.dev
 	$(BIN)/python tests/fuzz/hunt.py --minutes $(MINUTES)

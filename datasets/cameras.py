@@ -173,7 +173,8 @@ class Camera:
         inside = depths > 0
         slopes = np.where(inside[:, None], seen[:, :2] / np.where(inside, depths, 1.0)[:, None], 0.0)
         pixels = self.pixels_at(slopes)
-        inside &= (pixels >= -0.5).all(axis=1) & (pixels < (self.width - 0.5, self.height - 0.5)).all(axis=1)
+        for along, most in zip(pixels.T, (self.width, self.height), strict=True):
+            inside &= (along >= -0.5) & (along < most - 0.5)
         if self.distortion:
             fx, fy, _, _ = self.fx_fy_cx_cy
             among, pixel = self.sight_lines().numpy()[..., :2], 1 / math.sqrt(fx * fy)

@@ -61,6 +61,7 @@ SMALLEST = {  # by what a line begins with, or holds
     "mplicits reconstruct *": f"{RECONSTRUCT} --quiet",
     "mplicits mesh *": "--resolution 24",
     "mplicits render *": "--size 24 --samples 1",
+    "mplicits render * -o around.mp4*": "--frames 3",
     "mplicits slice *": "--size 64",
     "mplicits animate *": "--frames 3",
     "mplicits animate *.mp4*": "--size 24 --samples 1",
@@ -72,7 +73,7 @@ SMALLEST = {  # by what a line begins with, or holds
     "mplicits scene *": "--views 3 --size 16 --samples 1",
     "mplicits bench reconstruct *": f"{RECONSTRUCT} --views 4 --size 16 --test-every 2 --test-views 1 --no-equal-time"
     " --resolution 16 --eval-samples 500",
-    "mplicits bench reconstruct * --geometry-only *": "--rates 1e-3 --seeds 2 --geometries multiscale neus",
+    "mplicits bench reconstruct * --geometry-only *": "--rates 1e-3 --seeds 2 --geometries neus",
     "mplicits bench paper *": "--preset smoke --table comparison --methods ours --jobs 1",
     "mplicits bench srb *": f"{FIT} --resolution 16 --eval-samples 500",
 }

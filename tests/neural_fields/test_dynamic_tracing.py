@@ -55,7 +55,9 @@ def test_a_ball_that_turns_and_travels_is_met_where_it_is(tolerance):
         assert float((found.depth - expected)[found.mask].abs().max()) < 1.01 * tolerance
 
 
-@pytest.mark.parametrize("step", [0.002, 0.02, 0.2])
+@pytest.mark.parametrize(
+    "step", [pytest.param(0.002, marks=pytest.mark.slow), 0.02, pytest.param(0.2, marks=pytest.mark.slow)]
+)
 def test_frames_are_those_from_scratch_however_far_apart_they_are(step):
     eye, directions = image(dtype=torch.float64)
     field = Moving(Torus(major=0.5, minor=0.2), RigidMotion(axis=(1.0, 1.0, 0.0), angle=3.0, velocity=(0.2, 0.0, 0.3)))

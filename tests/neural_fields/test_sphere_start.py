@@ -139,6 +139,7 @@ def first_step(network: Siren, radius: float) -> float:
         return float(before - geometry.sdf(x).mean()) / radius
 
 
+@pytest.mark.slow
 def test_a_trained_start_outlasts_a_first_step_without_warm_up() -> None:
     """A surface that moves by its radius is gone: instant-nsr-pl has no warm-up, and NeuS's may be cut short."""
     torch.manual_seed(0)

@@ -55,6 +55,7 @@ def test_the_level_is_measured(count, amplitude):
     assert noise_level(noisy, normals) == pytest.approx(amplitude / np.sqrt(3), rel=0.2)
 
 
+@pytest.mark.slow
 def test_points_at_the_rim_of_a_layer_come_back_as_far_as_those_in_its_middle():
     """The level of a plane is above 0.75 σ, so that a point at z = 3 σ looks through more than 3 σ: down to the middle.
 
@@ -124,7 +125,7 @@ def test_the_deviation_of_what_is_thin_is_zero():
     assert noise_deviation(*plate(4000, thickness=0.005)) == 0
 
 
-@pytest.mark.parametrize(("count", "gain"), [(8000, 5), (60000, 7)])
+@pytest.mark.parametrize(("count", "gain"), [(8000, 5), pytest.param(60000, 7, marks=pytest.mark.slow)])
 def test_points_come_back_to_the_sphere(count, gain):
     points, normals = sphere(count)
     noisy = points + RNG.uniform(-0.02, 0.02, (count, 1)) * normals
@@ -232,6 +233,7 @@ def test_distances_weigh_no_more_than_the_noise_allows():
     assert config.data_weight_after(1e-6, 0.01) == pytest.approx(2e4)
 
 
+@pytest.mark.slow
 def test_the_fit_of_a_noisy_cloud_says_what_was_smoothed_and_can_leave_it():
     noisy = add_noise(sample_sphere(6000), 0.02)
     small = {"widths": (16,), "depths": (2,), "omegas": (30.0,), "steps": (2,), "learning_rates": (1e-3,)}

@@ -168,6 +168,7 @@ def test_uneven_density_is_not_isolation():
     assert prepare_cloud(PointCloud(points, normals=points.astype(np.float32))).report.dropped_isolated == 0
 
 
+@pytest.mark.slow
 def test_points_that_smoothing_took_to_the_wrong_place_are_dropped():
     """Of a plate three deviations of the noise thick, points are counted to the wrong side, and moved away from it."""
     half = np.array([0.6, 0.5, 0.03])

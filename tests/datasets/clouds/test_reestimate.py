@@ -94,6 +94,7 @@ def test_a_box_has_edges_and_a_sphere_has_none():
     assert not has_edges(sphere.points, filter_normals(sphere.points, 2 * sphere.points))
 
 
+@pytest.mark.slow
 def test_noise_on_a_box_comes_off_and_leaves_its_edges():
     """Points near edges end up on their faces: in the mean of squares there is less left than without filtered normals.
 
@@ -156,6 +157,7 @@ def test_normals_of_slightly_noisy_points_stay():
     assert (left.normals == given.normals).all()
 
 
+@pytest.mark.slow
 def test_estimated_normals_are_fitted_again_where_noise_is_smoothed():
     sphere = sample_sphere(8000)
     cloud = PointCloud(sphere.points + RNG.normal(0, 0.008, (8000, 3)))

@@ -111,7 +111,7 @@ def test_thin_parts_as_noisy_as_they_are_thick_keep_their_sides(shape):
     assert wrong(found.normals, side[found.rows]) < 0.05
 
 
-@pytest.mark.parametrize("thickness", [0.4, 1.0])
+@pytest.mark.parametrize("thickness", [0.4, pytest.param(1.0, marks=pytest.mark.slow)])
 def test_a_blade_as_thin_as_a_part_of_a_spacing_gets_its_sides(thickness):
     """Wider dipoles of its two sides cancel: only narrow ones tell them apart."""
     size = (0.8, 0.16)

@@ -136,6 +136,7 @@ def test_statue_distance_is_exact(statue):
     assert statue.exact_distance(np.empty((0, 3))).shape == (0,)
 
 
+@pytest.mark.slow
 def test_statue_distance_has_unit_slope(statue):
     points = np.random.default_rng(1).uniform(-0.8, 0.8, (30, 3))
     h = 1e-4
@@ -157,6 +158,7 @@ def test_scan_of_a_sphere_is_complete_and_noisy_along_the_rays():
     assert scan.colors is None
 
 
+@pytest.mark.slow
 def test_statue_scan(statue):
     scan = statue_scan(seed=0)
     assert 60_000 < len(scan) < 120_000

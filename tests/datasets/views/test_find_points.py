@@ -64,6 +64,7 @@ def test_points_lie_on_what_was_drawn_and_cameras_stay(photographs: Path, tmp_pa
     assert not stages
 
 
+@pytest.mark.slow
 def test_nothing_to_see_is_said(tmp_path: Path) -> None:
     pytest.importorskip("pycolmap")
     cameras = [look_at((2, 0.2 * k, 1), (0, 0, 0), width=60, height=40) for k in range(3)]

@@ -35,6 +35,7 @@ def ball(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_rows_picture_and_table(ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "has_poisson", lambda: False)
     monkeypatch.setattr(module, "picture_of", partial(module.picture_of, samples=1))  # a quarter of the pixels

@@ -21,6 +21,7 @@ def sphere_like():
     return MultiscaleSDF(base, [residual], [0.1])
 
 
+@pytest.mark.slow
 def test_rows_ratios_and_distance(tmp_path):
     pytest.importorskip("skimage", reason="the extra mplicits[bench] is not installed")
     save_field(tmp_path / "ball.safetensors", sphere_like())

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+import pytest
 import trimesh
 from mplicits.datasets import read_cloud
 from mplicits.pipelines.bench.fits import ScaleBench, ScaleRow, write_noisy_cloud
@@ -22,6 +23,7 @@ def test_clouds_have_the_noise_that_was_asked_for(tmp_path: Path) -> None:
     assert abs(off.mean()) < 1e-4
 
 
+@pytest.mark.slow
 def test_rows_of_two_sizes(tmp_path: Path) -> None:
     trimesh.creation.icosphere(3).export(tmp_path / "ball.ply")
     config = FitConfig(

@@ -84,6 +84,7 @@ def test_folders_that_hold_none(folder: Path, tmp_path: Path) -> None:
         SrbBench(folder=folder, config=SMALL, shapes=["anchor"]).cells()
 
 
+@pytest.mark.slow
 def test_rows_in_both_units(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "has_poisson", lambda: False)
     monkeypatch.setattr(module, "NORMALISED_SAMPLES", 5000)

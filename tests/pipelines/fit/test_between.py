@@ -196,6 +196,7 @@ def test_dense_clouds_are_left_as_they_are() -> None:
     assert (index.signed(x) - truth).abs().mean() < 0.5 * (plain.signed(x) - truth).abs().mean()
 
 
+@pytest.mark.slow
 def test_sharp_edges_do_not_roughen_the_faces() -> None:
     # Edges leave errors that no network can take away. Where those count squared, the faces are learnt last.
     points, normals = box(3000)

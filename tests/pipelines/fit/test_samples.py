@@ -291,6 +291,7 @@ def test_a_level_is_to_keep_what_nobody_has_seen(cloud: CloudDistance) -> None:
     assert len(whole.unseen) == len(whole.empty) == 0
 
 
+@pytest.mark.slow
 def test_the_next_level_leaves_the_closing_of_a_hole_as_it_is() -> None:
     config = FitConfig(
         widths=(8, 48), depths=(1, 1), omegas=(30.0, 40.0), steps=(1, 100), learning_rates=(1e-3, 2e-3), batch=1500

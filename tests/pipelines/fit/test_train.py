@@ -106,6 +106,7 @@ def test_an_interrupted_run_resumes_to_the_same_result(
     assert all(torch.equal(resumed[name], whole[name]) for name in whole)
 
 
+@pytest.mark.slow
 def test_frequencies_of_residuals_follow_the_noise_where_normals_are_guesses(fitted: Path, tmp_path: Path) -> None:
     """Waves of the noise's size are its own; a resumed run has the same."""
     clean = json.loads((fitted / "run.json").read_text())

@@ -53,7 +53,7 @@ def ball() -> Mesh:
     return extract_mesh(Sphere(radius=0.5), resolution=48)
 
 
-@pytest.mark.parametrize("watched", [False, True])
+@pytest.mark.parametrize("watched", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_the_lamp_is_learnt(watched: bool) -> None:
     """At points and from directions that the network has not seen."""
     eyes = np.random.default_rng(1).normal(size=(30, 3))
