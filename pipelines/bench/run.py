@@ -136,7 +136,7 @@ def run_cells(
     waiting = [cell for cell in possible if cell not in records]
     if records and waiting:
         say(f"{len(records)} of {len(possible)} cells are there already")
-    counter = _Counter(len(waiting), say)
+    counter = _Counter(len(waiting), say, at_once=max(jobs, streams))
     heard = {"progress": progress, "say": tell} if jobs == streams == 1 else {}
     work = functools.partial(run_cell, out=out, catalogue=catalogue, device=where, **heard)
     failures: dict[C, str] = {}
@@ -162,15 +162,16 @@ def kept_records(cells: Sequence[C], out: Path, catalogue: Catalogue[C]) -> Mapp
 
 
 class _Counter:
-    """One line per finished cell, with the time left at the mean pace so far."""
+    """One line per finished cell, with the time left at the mean pace so far: those under way count as half done."""
 
-    def __init__(self, total: int, say: Say) -> None:
-        self.total, self.say = total, say
+    def __init__(self, total: int, say: Say, *, at_once: int = 1) -> None:
+        self.total, self.say, self.at_once = total, say, at_once
         self.done, self.started = 0, time.monotonic()
 
     def __call__(self, outcome: Outcome[Any, Record]) -> None:
         self.done += 1
-        left = (time.monotonic() - self.started) / self.done * (self.total - self.done)
+        under_way = min(self.at_once - 1, self.total - self.done) / 2
+        left = (time.monotonic() - self.started) / (self.done + under_way) * (self.total - self.done - under_way)
         rest = f"; about {_duration(left)} left" if self.done < self.total else ""
         result = f"failed: {outcome.error}" if outcome.value is None else _result(outcome.value)
         self.say(f"[{self.done}/{self.total}] {outcome.item.name}: {result}{rest}")

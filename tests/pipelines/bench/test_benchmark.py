@@ -9,11 +9,13 @@ from pathlib import Path
 
 import pytest
 from mplicits.neural_fields import InputError
+from mplicits.pipelines.bench import run
 from mplicits.pipelines.bench.benchmark import Benchmark, Part, from_figures, one_of_each, write_results
 from mplicits.pipelines.bench.cells import Catalogue, Workplace
 from mplicits.pipelines.bench.report import as_text
 from mplicits.pipelines.bench.run import run_cell, run_cells
 from mplicits.pipelines.bench.tables import Column, Table, tabulated
+from mplicits.pipelines.run.jobs import Outcome
 from mplicits.pipelines.run.settings import FitConfig
 from mplicits.pipelines.run.trainer import Progress
 
@@ -144,3 +146,16 @@ def test_a_part_that_was_never_asked_for(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="there is none; did you mean 'squares'"):
         run_cell(Part("square", "x"), tmp_path, Catalogue([Squares(edges=[])]))
     assert Workplace(tmp_path, "k").run() == tmp_path / "runs" / "k"
+
+
+def test_the_time_left_counts_what_is_under_way_as_half_done(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Four cells of forty seconds, two at a time: eighty in all."""
+    clock, said = [100.0], list[str]()
+    monkeypatch.setattr(run.time, "monotonic", lambda: clock[0])
+    counter = run._Counter(4, said.append, at_once=2)
+    for _ in range(4):
+        clock[0] += 40 if len(said) % 2 == 0 else 0
+        cell = Part("b", f"cell {len(said)}")
+        counter(Outcome(cell, {"outputs": [], "seconds": 40.0}, None, 40.0))
+    # 40 s for one and a half of four, and for two and a half; 80 s for three and a half.
+    assert [line.partition("about ")[2] for line in said] == ["67 s left", "24 s left", "11 s left", ""]
