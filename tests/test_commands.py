@@ -281,9 +281,25 @@ def files_of(page: Path) -> Iterator[tuple[str, str]]:
             yield named[1], block
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if shell_lines(page)], ids=lambda page: page.stem)
+def is_bench(line: str) -> bool:
+    """Whether a line measures something: for developers, and each bench has a test of its own."""
+    return line.startswith("mplicits bench ")
+
+
+LINES = [
+    pytest.param(
+        page, benches, id=f"{page.stem}{'-bench' if benches else ''}", marks=[pytest.mark.slow] if benches else []
+    )
+    for page in PAGES
+    for benches in (False, True)
+    if any(is_bench(line) is benches for line in shell_lines(page))
+]
+
+
+@pytest.mark.parametrize(("page", "benches"), LINES)
 def test_commands_of_a_page_run(
     page: Path,
+    benches: bool,
     stand_in: Maker,
     subtests: pytest.Subtests,
     tmp_path: Path,
@@ -294,7 +310,7 @@ def test_commands_of_a_page_run(
     Path("few.yaml").write_text(FEW, encoding="utf-8")
     for name, content in files_of(page):
         Path(name).write_text(content, encoding="utf-8")
-    for line in shell_lines(page):
+    for line in (line for line in shell_lines(page) if is_bench(line) is benches):
         with subtests.test(msg=line):
             if reason := reason_to_skip(line):
                 pytest.skip(reason)

@@ -71,6 +71,7 @@ def test_the_notebook_is_its_script() -> None:
     assert sum(kind == "markdown" for kind, _ in cells_of(script)) >= 5
 
 
+@pytest.mark.slow
 def test_the_cells_of_the_notebook_run(tmp_path: Path) -> None:
     cells = json.loads(NOTEBOOK.read_text(encoding="utf-8"))["cells"]
     code = "\n\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code")

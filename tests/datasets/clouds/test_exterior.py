@@ -1,6 +1,7 @@
 """Regions of space around clouds whose in- and outside is known."""
 
 import numpy as np
+import pytest
 from mplicits.datasets import sample_sphere
 from mplicits.datasets.clouds.exterior import OUTSIDE, Exterior
 
@@ -27,6 +28,7 @@ def test_a_bowl_encloses_nothing() -> None:
     assert Exterior(points[points[:, 2] < 0]).regions(PLACES[:2]).tolist() == [OUTSIDE, OUTSIDE]
 
 
+@pytest.mark.slow
 def test_single_gaps_of_a_random_cloud_do_not_leak() -> None:
     """An empty disc of two spacings' radius in each of several clouds."""
     for seed in range(3):

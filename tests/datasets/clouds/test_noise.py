@@ -136,6 +136,7 @@ def test_points_come_back_to_the_sphere(count, gain):
     assert np.abs(np.cross(moved - noisy, normals)).max() < 1e-12  # nor does anything slide
 
 
+@pytest.mark.slow
 def test_the_sides_of_a_plate_thinner_than_the_noise_stay_apart():
     """Half of the points have crossed over to the other side; their normals bring them back."""
     points, normals = plate(30000, thickness=0.01)
@@ -198,7 +199,7 @@ def test_flipped_normals_of_a_thin_part_are_no_noise():
     assert prepared.report.turned_normals > 1000
 
 
-@pytest.mark.parametrize("given", [True, False])
+@pytest.mark.parametrize("given", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_a_noisy_cloud_is_smoothed_and_says_so(given):
     clean = sample_sphere(8000)
     noisy = add_noise(clean, 0.01)

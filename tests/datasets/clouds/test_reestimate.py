@@ -111,6 +111,7 @@ def test_noise_on_a_box_comes_off_and_leaves_its_edges():
     assert np.median(angles(normals, exact)) < 2
 
 
+@pytest.mark.slow
 def test_noise_equal_in_all_directions_is_taken_off_points_and_normals():
     sphere = sample_sphere(12000)
     exact, sigma = 2 * sphere.points, 0.01

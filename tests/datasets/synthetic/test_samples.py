@@ -110,6 +110,7 @@ def test_statue_gradient_is_that_of_its_value(statue):
     assert statue.jet(torch.empty(0, 2, 3)).gradient.shape == (0, 2, 3)
 
 
+@pytest.mark.slow
 def test_statue_is_one_solid_inside_the_unit_sphere(statue):
     n = 112
     axis = torch.linspace(-1, 1, n)
@@ -120,6 +121,7 @@ def test_statue_is_one_solid_inside_the_unit_sphere(statue):
     assert float(grid.norm(dim=-1)[torch.from_numpy(inside)].max()) < 1
 
 
+@pytest.mark.slow
 def test_statue_distance_is_exact(statue):
     random = np.random.default_rng(0)
     surface = sample_surface(statue, 20000, seed=9)

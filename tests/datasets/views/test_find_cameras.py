@@ -79,6 +79,7 @@ def test_found_cameras_stand_where_the_pictures_were_drawn_from(photographs: Pat
     assert len({camera.width for camera in cameras.values()}) == 1
 
 
+@pytest.mark.slow
 def test_nothing_to_see_is_said(tmp_path: Path) -> None:
     pytest.importorskip("pycolmap")
     (tmp_path / "grey").mkdir()

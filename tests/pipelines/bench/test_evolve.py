@@ -74,6 +74,7 @@ def test_exact_cases_are_trained_and_printed(monkeypatch: pytest.MonkeyPatch, tm
     assert name in as_text(*bench.tables(rows, sgemm=1e9))
 
 
+@pytest.mark.slow
 def test_a_morph_is_measured_against_meshes(tmp_path: Path) -> None:
     meshes = []
     for name, radius in (("small", 0.4), ("large", 0.6)):

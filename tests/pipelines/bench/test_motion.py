@@ -118,6 +118,7 @@ def test_figures_are_trained_and_printed(monkeypatch: pytest.MonkeyPatch, tmp_pa
     assert bench.rows(tmp_path) == rows  # what is there is taken
 
 
+@pytest.mark.slow
 def test_scans_of_the_keys_are_fitted_and_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     monkeypatch.setattr(bench_motion, "SCAN_RESOLUTION", 40)
     few = FitConfig(

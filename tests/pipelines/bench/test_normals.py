@@ -23,6 +23,7 @@ def test_algorithm_1_is_the_jet(depth: int, method: Callable[[Siren, Tensor], tu
     torch.testing.assert_close(gradient, jet.gradient)
 
 
+@pytest.mark.slow
 def test_rows_and_table(tmp_path: Path) -> None:
     bench = NormalsBench(points=3000, sizes=((16, 2), (24, 3)), repeats=1, busy=1)
     rows = bench.rows(tmp_path)

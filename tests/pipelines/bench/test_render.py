@@ -38,6 +38,7 @@ def bench(tmp_path_factory) -> tuple[list[RenderRow], list[str], Path]:
     return rows, said, directory
 
 
+@pytest.mark.slow
 def test_rows_of_table_4_in_each_mode(bench):
     rows, said, _ = bench
     assert [(row.mode, row.model) for row in rows[:2]] == [("adaptive", "(400,4)"), ("adaptive", "(128,2)")]
@@ -54,6 +55,7 @@ def test_rows_of_table_4_in_each_mode(bench):
             assert row.agreement.mesh_depth_error < 1e-3
 
 
+@pytest.mark.slow
 def test_coarse_levels_carry_the_trace(bench):
     rows, *_ = bench
     full = next(row for row in rows if row.model.endswith("▷(400,2)") and len(row.evaluations) == 3)
@@ -67,6 +69,7 @@ def test_coarse_levels_carry_the_trace(bench):
     assert mapped.evaluations[1] == pytest.approx(math.pi / 4 * 0.8, abs=0.25)
 
 
+@pytest.mark.slow
 def test_ratios_and_format(bench):
     rows, *_ = bench
     base, coarse = rows[:2]
@@ -87,6 +90,7 @@ def test_the_networks_are_the_papers():
     }
 
 
+@pytest.mark.slow
 def test_the_naive_tracer_sees_the_same(bench):
     files = (bench[2] / "out" / "runs").glob("ball-*/field.safetensors")
     field = next(one for file in files if (one := load_field(file).field).num_levels == 3)

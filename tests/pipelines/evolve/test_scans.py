@@ -83,6 +83,7 @@ def test_other_faces_and_clouds_are_no_poses(poses: list[str], tmp_path: Path, m
     assert fitted_scans(config, scans_among(poses), tmp_path / "fits", FITS).landmarks == ()
 
 
+@pytest.mark.slow
 def test_a_series_of_scans_on_the_command_line(
     poses: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ):

@@ -280,6 +280,7 @@ def test_ours(ball: Path, out: Path) -> None:
     assert (out / "runs" / record["key"] / "field.safetensors").is_file()
 
 
+@pytest.mark.slow
 def test_a_finished_fit_is_measured_again_but_not_trained(
     ball: Path, out: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -352,6 +352,7 @@ def narrow(images: PosedImages) -> Similarity:
     return replace(images.similarity, scale=images.similarity.scale / 3)
 
 
+@pytest.mark.slow
 def test_what_lies_beside_the_region_is_learnt(images: PosedImages) -> None:
     views = [replace(view, mask=None) for view in images.views]
     config = replace(TINY, steps=60, rays=64, learning_rate=5e-3, background="outside")

@@ -95,7 +95,7 @@ def test_it_is_seen_from_anywhere_and_at_each_level(
 
 
 def test_what_keeps_no_colours_by_direction_says_so(
-    run: tuple[Reconstruction, Path], images: PosedImages, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    run: tuple[Reconstruction, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     save_field(tmp_path / "field.safetensors", Sphere(radius=0.5))
     with pytest.raises(InputError, match="keeps no colours by direction"):
@@ -105,7 +105,10 @@ def test_what_keeps_no_colours_by_direction_says_so(
     assert main(["render", str(run[1]), "-o", out, "--shading", "radiance", "--background", "black"]) == 2
     assert "--background: --shading radiance has that of the photographs" in capsys.readouterr().err
 
-    def stop(progress: Progress) -> None:  # a new training over an old run takes its colours away
+
+@pytest.mark.slow
+def test_a_new_training_over_an_old_run_takes_its_colours_away(images: PosedImages, tmp_path: Path) -> None:
+    def stop(progress: Progress) -> None:
         if progress.stage.startswith("reconstruct, level") and progress.step >= 20:
             raise KeyboardInterrupt
 

@@ -86,7 +86,8 @@ def test_replayed_steps_are_those_that_would_be_done(
         assert torch.equal(tensor, weights(trainers[1])[name]), name
 
 
-@pytest.mark.parametrize("name", ["outside", "cameras", "depths"])  # which have all terms between them
+# Which have all terms between them.
+@pytest.mark.parametrize("name", ["outside", pytest.param("cameras", marks=pytest.mark.slow), "depths"])
 def test_on_an_accelerator_a_replayed_step_keeps_nobody_waiting(
     name: str, images: PosedImages, accelerator: torch.device
 ) -> None:

@@ -66,6 +66,7 @@ def test_counts_are_those_of_the_closed_form(size: int) -> None:
     assert set(np.unique(exact)) >= {0, 1, 2}
 
 
+@pytest.mark.slow
 def test_the_command_says_how_near_the_mesh_is_where_photographs_see(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -300,6 +300,7 @@ def test_limits_and_legends_are_in_input_units(shapes, tmp_path, capsys, shading
     assert np.ptp(wide[10:14, 10:14], axis=(0, 1)).max() < 12  # all of it in the middle of the map
 
 
+@pytest.mark.slow
 def test_the_error_is_the_distance_between_surfaces(shapes):
     subject = open_subject(shapes / "blob.safetensors", level=0)
     distance = reference_distance(subject, None)  # the cloud is on level 1

@@ -97,6 +97,7 @@ def test_random_numbers_of_a_seed_are_the_same_in_every_stream() -> None:
     assert [outcome.value for outcome in outcomes] == alone
 
 
+@pytest.mark.slow
 @needs_ray
 def test_two_workers_share_the_items_and_the_threads() -> None:
     def work(number: int) -> tuple[int, int, float, int]:

@@ -78,6 +78,7 @@ def test_colors_of_a_sphere_on_it_and_on_shifted_surfaces() -> None:
     assert fitted.record["psnr_at_points"] == pytest.approx(psnr(at_points, painted(directions(4000))), abs=0.01)
 
 
+@pytest.mark.slow
 def test_the_second_term_makes_colors_constant_along_normals() -> None:
     unit = directions(2000)
     x = torch.from_numpy((0.57 * unit).astype(np.float32))

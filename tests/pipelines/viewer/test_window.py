@@ -77,6 +77,7 @@ def test_the_viewer_of_a_script(monkeypatch: pytest.MonkeyPatch, capsys: pytest.
     assert opened[1:] == ["0"]
 
 
+@pytest.mark.slow
 def test_a_notebook_gets_a_picture(monkeypatch: pytest.MonkeyPatch) -> None:
     assert not in_notebook()
     notebook = types.ModuleType("IPython")

@@ -110,6 +110,7 @@ def test_shadings_of_a_page_with_colours_by_direction(browser, glossy):
     assert browser.execute_script(counts)[-1] == 0
 
 
+@pytest.mark.slow
 def test_what_a_page_says_and_leaves_out(tmp_path, monkeypatch):
     """Highlights are learnt once, from where cameras stood; and never where nobody wants them."""
     asked = []
