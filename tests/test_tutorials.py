@@ -50,7 +50,13 @@ def check_kept(folder: Path) -> None:
 
 
 # The cells of the notebook are those of the last one.
-@pytest.mark.parametrize("name", [name for name in LEAVES if name != NOTEBOOK.stem])
+LONG = ("photographs", "shape_interpolation")
+
+
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=[pytest.mark.slow] if name in LONG else []) for name in LEAVES if name != NOTEBOOK.stem],
+)
 def test_a_tutorial_runs_in_an_empty_folder(name: str, tmp_path: Path) -> None:
     out = run([str(FOLDER / f"{name}.py"), "--small"], tmp_path)
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(LEAVES[name])

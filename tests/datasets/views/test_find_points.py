@@ -38,6 +38,7 @@ def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_points_lie_on_what_was_drawn_and_cameras_stay(photographs: Path, tmp_path: Path) -> None:
     pytest.importorskip("pycolmap")
     stages: list[tuple[str, int, int]] = []

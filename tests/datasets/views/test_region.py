@@ -129,7 +129,7 @@ def test_masks_that_say_nothing_or_contradict_each_other_are_refused():
         region_from_masks(cameras, masks)
 
 
-@pytest.mark.parametrize("count", [4, 12, 40])
+@pytest.mark.parametrize("count", [4, 12, pytest.param(40, marks=pytest.mark.slow)])
 def test_one_wrong_mask_does_not_cut_the_region(count):
     cameras = around(count, size=(96, 64))
     masks = silhouettes(cameras, CENTER, 0.9)

@@ -50,6 +50,7 @@ def test_the_picture_grows_level_by_level(
     assert "off the statue" not in said  # which was not scanned
 
 
+@pytest.mark.slow
 def test_errors_are_those_of_closed_forms(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of the statue itself they are 0, and of points beside it their distance."""
     monkeypatch.setattr(module, "CHECKED", 40)

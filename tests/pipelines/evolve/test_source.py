@@ -62,7 +62,11 @@ def most_pieces(field: Field) -> int:
         (balls_with_a_bar(0.2), balls_with_a_bar(-0.2)),
         (ball(), ball_with_a_foot()),
         (ball_with_a_foot(), ball()),
-        (balls_with_a_bar(0.2), Union(balls_with_a_bar(-0.2), Sphere(radius=0.25, center=(0.0, 0.74, 0.0)))),
+        pytest.param(
+            balls_with_a_bar(0.2),
+            Union(balls_with_a_bar(-0.2), Sphere(radius=0.25, center=(0.0, 0.74, 0.0))),
+            marks=pytest.mark.slow,
+        ),
     ],
     ids=["the link changes", "a foot comes", "a foot goes", "the link changes, and one piece more comes"],
 )

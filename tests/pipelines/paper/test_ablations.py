@@ -432,10 +432,10 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-LONG = [pytest.param(spec, marks=pytest.mark.slow) for spec in (LOSS_WEIGHTS, DELTA_FACTOR, ISOLATION)]
+LONG = [pytest.param(spec, marks=pytest.mark.slow) for spec in (LOSS_WEIGHTS, DELTA_FACTOR, ISOLATION, MARCHING_CUBES)]
 
 
-@pytest.mark.parametrize("spec", [*LONG, MARCHING_CUBES, NORMALS], ids=lambda s: s.name)
+@pytest.mark.parametrize("spec", [*LONG, NORMALS], ids=lambda s: s.name)
 def test_smoke(spec: Any, ball: Path, out: Path) -> None:
     # Clean clouds but for what needs noise, and one constraint, to be quick.
     planned = [cell for cell in spec.cells([ball], "smoke") if spec is ISOLATION or not cell.noise]

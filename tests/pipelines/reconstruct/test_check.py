@@ -414,7 +414,7 @@ def test_mistakes_end_in_one_line(tmp_path, capsys, good):
         assert message in printed.err
 
 
-@pytest.mark.parametrize("form", ["transforms", "colmap-text"])
+@pytest.mark.parametrize("form", ["transforms", pytest.param("colmap-text", marks=pytest.mark.slow)])
 def test_scenes_come_with_their_truth(tmp_path, capsys, form):
     folder = tmp_path / "scene"
     command = ["scene", "striped-torus", "-o", str(folder), "--format", form]
