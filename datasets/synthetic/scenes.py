@@ -112,9 +112,8 @@ def render_scene(
     Raises:
         ValueError: ``views``, ``size`` or ``samples`` is not positive.
     """
-    _check_samples(samples)
     cameras = scene_cameras(scene, views=views, size=size, seed=seed)
-    together = max(1, RAYS_AT_ONCE // (size * samples) ** 2)
+    together = max(1, RAYS_AT_ONCE // max(1, size * samples) ** 2)
     images: list[PosedImage] = []
     for first in range(0, views, together):
         some = cameras[first : first + together]
@@ -200,25 +199,29 @@ def render_view(
     Raises:
         ValueError: ``samples`` is not positive.
     """
-    _check_samples(samples)
-    rows = max(1, RAYS_AT_ONCE // (camera.width * samples**2))
-    strips = [
-        _pictures(scene, [camera.strip(first, min(rows, camera.height - first))], samples, shaded, glossy)[0]
-        for first in range(0, camera.height, rows)
-    ]
-    color, mask = (np.concatenate(part) for part in zip(*strips, strict=True))
-    return color, mask
-
-
-def _check_samples(samples: int) -> None:
-    if samples < 1:
-        raise ValueError(f"samples={samples}: expected at least one")
+    return _pictures(scene, [camera], samples, shaded, glossy)[0]
 
 
 def _pictures(
     scene: Scene, cameras: Sequence[Camera], samples: int, shaded: bool, glossy: bool
 ) -> list[tuple[Float32, Float32]]:
-    """`render_view` of several cameras, whose rays are traced together."""
+    """`render_view` of several cameras of one size: some rows of all of them at a time."""
+    if samples < 1:
+        raise ValueError(f"samples={samples}: expected at least one")
+    width, height = cameras[0].width, cameras[0].height
+    rows = max(1, RAYS_AT_ONCE // (len(cameras) * width * samples**2))
+    strips = [
+        _strips(scene, [c.strip(first, min(rows, height - first)) for c in cameras], samples, shaded, glossy)
+        for first in range(0, height, rows)
+    ]
+    views = ((np.concatenate(part) for part in zip(*own, strict=True)) for own in zip(*strips, strict=True))
+    return [(color, mask) for color, mask in views]
+
+
+def _strips(
+    scene: Scene, cameras: Sequence[Camera], samples: int, shaded: bool, glossy: bool
+) -> list[tuple[Float32, Float32]]:
+    """Colours and masks of some rows of `_pictures`, whose rays are traced together."""
     pictures = []
     fine = [camera.resized(samples * camera.width, samples * camera.height) for camera in cameras]
     for seen in _traced(scene, fine):

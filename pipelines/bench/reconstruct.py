@@ -76,7 +76,7 @@ class BenchScene:
         return digest_of(arrays)[:16]
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=4)  # of the scenes that are trained at a time
 def _exact_surface(scene: BenchScene, resolution: int) -> Surface | None:
     """In the coordinates of the unit sphere; None where it is not known."""
     return None if scene.exact is None else from_mesh(scene_mesh(scene.exact, resolution=resolution))

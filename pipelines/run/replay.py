@@ -48,7 +48,7 @@ class CudaGraphs(Recorder):
     def record(self, work: Work) -> tuple[Callable[[], None], Results]:
         """See `Recorder.record`."""
         graph, stream = torch.cuda.CUDAGraph(), torch.cuda.current_stream()
-        # The default stream cannot be recorded; PyTorch has one for that. One that was chosen by `with_streams` can.
+        # The default stream cannot be recorded; PyTorch has one for that. One of `run_streams` can.
         own = None if stream == torch.cuda.default_stream() else stream
         # Others, as one that draws progress, may talk to the device meanwhile.
         with _recording, torch.cuda.graph(graph, pool=self._pool, stream=own, capture_error_mode="thread_local"):

@@ -1,11 +1,12 @@
 """Scenes whose images are known in closed form: what is drawn must be that."""
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
 import torch
-from mplicits.datasets.cameras import look_at
+from mplicits.datasets.cameras import Camera, look_at
 from mplicits.datasets.color_space import linear_to_srgb, srgb_to_linear
 from mplicits.datasets.synthetic import scenes
 from mplicits.datasets.synthetic.scenes import (
@@ -53,12 +54,22 @@ def test_pixels_have_the_colour_of_the_point_they_see(sphere):
 def test_views_that_are_traced_together_show_what_each_does_alone(at_once, monkeypatch):
     monkeypatch.setattr(scenes, "RAYS_AT_ONCE", at_once)
     told: list[tuple[int, int]] = []
+    traced: list[int] = []
+
+    def spied(scene: Scene, cameras: Sequence[Camera]):
+        traced.append(sum(camera.width * camera.height for camera in cameras))
+        return together_traced(scene, cameras)
+
+    together_traced = scenes._traced
+    monkeypatch.setattr(scenes, "_traced", spied)
     scene = SCENES["figure"]()
     images = render_scene(
         scene, views=5, size=12, samples=2, shaded=True, depths=True, progress=lambda *at: told.append(at)
     )
     together = {1: 1, 3 * 24**2: 3}.get(at_once, 5)
     assert told == [(done, 5) for done in (*range(together, 5, together), 5)]
+    # No more than may be at once, or a row of a picture, or the depths of one.
+    assert max(traced) <= max(at_once, 2 * 24, 12**2)
     monkeypatch.undo()
     for view in images.views:
         color, mask = render_view(scene, view.camera, samples=2, shaded=True)

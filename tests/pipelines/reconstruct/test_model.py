@@ -10,18 +10,9 @@ from mplicits.neural_fields.baselines import NeusSDF
 from mplicits.neural_fields.volume_renderer import Sampling
 from mplicits.pipelines.reconstruct import model as scene_model
 from mplicits.pipelines.reconstruct.model import SceneModel, build_scene
-from mplicits.pipelines.run.settings import ReconstructConfig
+from reconstructions import TINY_SCENE
 
-SMALL = ReconstructConfig(
-    widths=(24, 16),
-    depths=(2, 1),
-    omegas=(10.0, 15.0),
-    starts=(0.0, 0.5),
-    features=4,
-    color_width=16,
-    color_depth=1,
-    color_grid=8,
-)
+SMALL = replace(TINY_SCENE, widths=(24, 16), depths=(2, 1))
 PAPER = replace(SMALL, widths=(128, 256), depths=(4, 5), features=32)
 
 
