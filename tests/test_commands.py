@@ -286,9 +286,14 @@ def is_bench(line: str) -> bool:
     return line.startswith("mplicits bench ")
 
 
+LONG = ("animate", "evolve")  # pages whose lines train the most; the tour has the first of each
+
 LINES = [
     pytest.param(
-        page, benches, id=f"{page.stem}{'-bench' if benches else ''}", marks=[pytest.mark.slow] if benches else []
+        page,
+        benches,
+        id=f"{page.stem}{'-bench' if benches else ''}",
+        marks=[pytest.mark.slow] if benches or page.stem in LONG else [],
     )
     for page in PAGES
     for benches in (False, True)

@@ -50,7 +50,7 @@ def test_pixels_have_the_colour_of_the_point_they_see(sphere):
     assert color.dtype == mask.dtype == np.float32
 
 
-@pytest.mark.parametrize("at_once", [1, 3 * 24**2, 1 << 17])
+@pytest.mark.parametrize("at_once", [1, 2 * 16**2, 1 << 17])
 def test_views_that_are_traced_together_show_what_each_does_alone(at_once, monkeypatch):
     monkeypatch.setattr(scenes, "RAYS_AT_ONCE", at_once)
     told: list[tuple[int, int]] = []
@@ -64,12 +64,12 @@ def test_views_that_are_traced_together_show_what_each_does_alone(at_once, monke
     monkeypatch.setattr(scenes, "_traced", spied)
     scene = SCENES["figure"]()
     images = render_scene(
-        scene, views=5, size=12, samples=2, shaded=True, depths=True, progress=lambda *at: told.append(at)
+        scene, views=3, size=8, samples=2, shaded=True, depths=True, progress=lambda *at: told.append(at)
     )
-    together = {1: 1, 3 * 24**2: 3}.get(at_once, 5)
-    assert told == [(done, 5) for done in (*range(together, 5, together), 5)]
+    together = {1: 1, 2 * 16**2: 2}.get(at_once, 3)
+    assert told == [(done, 3) for done in (*range(together, 3, together), 3)]
     # No more than may be at once, or a row of a picture, or the depths of one.
-    assert max(traced) <= max(at_once, 2 * 24, 12**2)
+    assert max(traced) <= max(at_once, 2 * 16, 8**2)
     monkeypatch.undo()
     for view in images.views:
         color, mask = render_view(scene, view.camera, samples=2, shaded=True)

@@ -54,8 +54,9 @@ def ball() -> Mesh:
 
 
 @pytest.mark.parametrize("watched", [False, pytest.param(True, marks=pytest.mark.slow)])
-def test_the_lamp_is_learnt(watched: bool) -> None:
+def test_the_lamp_is_learnt(watched: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """At points and from directions that the network has not seen."""
+    monkeypatch.setattr(highlights, "BATCH", 2048)  # a quarter: one lamp is soon learnt
     eyes = np.random.default_rng(1).normal(size=(30, 3))
     eyes *= 2 / np.linalg.norm(eyes, axis=1, keepdims=True)
     seen = list[str]()
