@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from .._checks import at_least, positive
 from ..field import Field, Jet, OneLevelField
-from ._trilinear import Place, interpolate, interpolate_jet, locate, vertices
+from ..trilinear import Place, interpolate, interpolate_jet, locate, vertices
 
 __all__ = ["BandLimited", "BanfSDF"]
 

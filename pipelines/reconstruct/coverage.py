@@ -3,16 +3,31 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-__all__ = ["Coverage"]
+from ...neural_fields.trilinear import locate, vertex_weights, vertices
+
+__all__ = ["Around", "Coverage"]
 
 CELLS = 48  # along an edge of the cube around the region: few are wider than the gaps that few cameras look into
 FORGET = 1 / 512  # of what is known is forgotten in a step: the surface moves
 LITTLE = 0.25  # of a ray, added to both densities: nothing is rare of which nothing is known
 MOST = 20.0  # times as much as usual: what one pixel in a thousand shows may be a wrong pixel
+
+
+class Around(NamedTuple):
+    """The eight vertices around places.
+
+    Attributes:
+        rows: ``(R, 8)`` of the grid, flat.
+        weights: ``(R, 8)`` trilinear, that add up to 1.
+    """
+
+    rows: Tensor
+    weights: Tensor
 
 
 class Coverage:
@@ -45,48 +60,39 @@ class Coverage:
         """What later steps depend on, for `Objective.kept`."""
         return {"covered": self.rays, "usual_cover": self.usual}
 
-    @torch.no_grad()
-    def rarity(self, ends: Tensor) -> Tensor:
-        """How rare rays are where these end ``(R,)``.
+    def take_up(self, kept: Mapping[str, Tensor]) -> None:
+        """Go on with what `kept` has put into the objective's, which may be that of a run which is resumed."""
+        self.rays, self.usual = kept["covered"], kept["usual_cover"]
 
-        Args:
-            ends: ``(R, 3)`` in unit-sphere coordinates.
-        """
-        corners, weights = _around(ends)
-        density = (self.rays.view(-1)[corners] * weights).sum(dim=1)
+    @torch.no_grad()
+    def around(self, ends: Tensor) -> Around:
+        """Where rays end ``(R, 3)``, in unit-sphere coordinates, as the two below want it."""
+        place, count = locate(ends, CELLS, 1.0), CELLS + 1
+        x, y, z = vertices(place.cell)
+        return Around(((x * count + y) * count + z).flatten(1), vertex_weights(place.within).flatten(1))
+
+    @torch.no_grad()
+    def rarity(self, around: Around) -> Tensor:
+        """How rare rays are there ``(R,)``."""
         total, rays = self.usual.unbind()
         mean = total / rays.clamp_min(LITTLE)
-        return ((mean + LITTLE) / (density + LITTLE)).clamp(1.0, MOST)
+        return ((mean + LITTLE) / (self._density(around) + LITTLE)).clamp(1.0, MOST)
 
     @torch.no_grad()
-    def learn(self, ends: Tensor, odds: Tensor, solid: Tensor) -> None:
+    def learn(self, around: Around, odds: Tensor, solid: Tensor) -> None:
         """Take note of where the rays of a step end.
 
         Args:
-            ends: ``(R, 3)``.
+            around: their ends.
             odds: ``(R,)`` how many times as often as evenly each was drawn.
             solid: ``(R,)`` its opacity: what passes the surface is on none.
         """
-        corners, weights = _around(ends)
         counts = solid / odds
         flat = self.rays.view(-1)
         flat.mul_(1 - FORGET)
-        flat.index_add_(0, corners.reshape(-1), (counts[:, None] * weights).reshape(-1))
-        density = (flat[corners] * weights).sum(dim=1)
-        self.usual.mul_(1 - FORGET).add_(torch.stack(((counts * density).sum(), counts.sum())))
+        flat.index_add_(0, around.rows.flatten(), (counts[:, None] * around.weights).flatten())
+        sums = torch.stack(((counts * self._density(around)).sum(), counts.sum()))
+        self.usual.mul_(1 - FORGET).add_(sums)
 
-
-def _around(points: Tensor) -> tuple[Tensor, Tensor]:
-    """The eight vertices around points ``(R, 3)`` and their trilinear weights, ``(R, 8)`` each."""
-    at = (points.clamp(-1, 1) + 1) * (0.5 * CELLS)
-    cell = at.floor().clamp(max=CELLS - 1)
-    part = at - cell
-    weights = cell.new_ones(len(points), 1)
-    corners = torch.zeros_like(weights, dtype=torch.long)
-    for axis in range(3):
-        ends = torch.stack((1 - part[:, axis], part[:, axis]), dim=1)
-        weights = (weights[:, :, None] * ends[:, None]).flatten(1)
-        index = cell[:, axis].long()
-        corners = corners[:, :, None] * (CELLS + 1) + torch.stack((index, index + 1), dim=1)[:, None]
-        corners = corners.flatten(1)
-    return corners, weights
+    def _density(self, around: Around) -> Tensor:
+        return (self.rays.view(-1)[around.rows] * around.weights).sum(dim=1)

@@ -106,8 +106,10 @@ class SceneObjective(Objective):
         # As of late, on the CPU, which reads them: sections of a ray that are evaluated, and the surface's uncertainty.
         self.kept["lately"] = torch.tensor([0.0, 1 / float(model.inv_std.detach())])
         self.focus = Focus(len(pool), config.focus, pool.device)
-        self.coverage = Coverage(pool.device)
-        self.kept |= {**self.focus.kept, **self.coverage.kept}
+        self.kept |= self.focus.kept
+        self.coverage = Coverage(pool.device) if config.focus else None
+        if self.coverage is not None:
+            self.kept |= self.coverage.kept
         self.grid = ValueGrid(config.march_grid, pool.device) if config.march_grid else None
         if self.grid is not None:
             self.kept |= {"march": self.grid.kept, "moved": self.grid.moved, "looks": torch.tensor([0, NEAR_EVERY, 0])}
@@ -177,7 +179,8 @@ class SceneObjective(Objective):
         """What has to be done on the host before a step, and of which kind the step is."""
         self.done = done
         self.focus.watched(step, self.kept)
-        self.coverage.rays, self.coverage.usual = self.kept["covered"], self.kept["usual_cover"]  # as a resumed run's
+        if self.coverage is not None:
+            self.coverage.take_up(self.kept)
         self.look(step, done)
         measured = self.measured
         if measured is not None:
@@ -228,8 +231,8 @@ class SceneObjective(Objective):
         if pool.has_masks:
             target = torch.lerp(self.model.background.expand_as(target), target, rays.mask[:, None])
         wrong = (self.model.photographed(seen, rays.view) - target).abs().mean(dim=1)
-        if config.focus:
-            self.watch(rays.row, wrong.detach(), origins, directions, seen)
+        if self.coverage is not None:
+            self.watch(self.coverage, rays.row, wrong, origins, directions, seen)
         color = wrong.mean()
         # A mean over all sections within the region, those that were skipped included: some stand for the others.
         within = mean_of_all((seen.counts > 0).any(dim=1).sum().to(wrong)).clamp(min=1) * seen.counts.shape[1]
@@ -253,14 +256,18 @@ class SceneObjective(Objective):
         return Outcome(terms, total, sections)
 
     @torch.no_grad()
-    def watch(self, rows: Tensor, wrong: Tensor, origins: Tensor, directions: Tensor, seen: Rendered) -> None:
+    def watch(
+        self, coverage: Coverage, rows: Tensor, wrong: Tensor, origins: Tensor, directions: Tensor, seen: Rendered
+    ) -> None:
         """Take note of how wrong pixels are, which counts the more the fewer see the same place."""
         # Where most of a ray ends: the mean of two surfaces, one behind the other, is on none.
         depth = seen.depths.gather(1, seen.weights.argmax(dim=1, keepdim=True))
-        ends, odds = origins + depth * directions, self.focus.odds(rows)
-        rare = torch.lerp(torch.ones_like(wrong), self.coverage.rarity(ends), seen.opacity)
-        self.focus.learn(gathered(rows), gathered(rare * wrong))
-        self.coverage.learn(gathered(ends), gathered(odds), gathered(seen.opacity))
+        every = (rows, wrong, origins + depth * directions, seen.opacity)
+        rows, wrong, ends, opacity = (gathered(share) for share in every)
+        around = coverage.around(ends)
+        rare = torch.lerp(torch.ones_like(wrong), coverage.rarity(around), opacity)
+        self.focus.learn(rows, rare * wrong)
+        coverage.learn(around, self.focus.odds(rows), opacity)
 
     def smooth_term(self, origins: Tensor, directions: Tensor, flat: Tensor, seen: Rendered, level: int) -> Tensor:
         """How unevenly normals turn where rays end whose pixels are like those around; of the first rays of a step.

@@ -11,7 +11,6 @@ __all__ = ["Focus"]
 
 EVERY = 16  # steps after which a training draws by newer errors
 STRIP = 16  # neighbouring pixels of a line share one error; samples that are no neighbours have one each
-
 TINY = 1e-30  # of a sum of errors: what is nowhere wrong
 
 
