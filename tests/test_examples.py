@@ -73,10 +73,20 @@ def test_commands_of_the_documents_parse(line: str) -> None:
     parser.parse_args(arguments)
 
 
+def anchors(path: Path) -> set[str]:
+    """What the headings of a page are called in links, on the site as on GitHub."""
+    text = re.sub(r"^```.*?^```", "", path.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+    headings = re.findall(r"^#+ (.+)$", text, re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading).strip().lower().replace(" ", "-") for heading in headings}
+
+
 def test_links_of_the_documents_lead_somewhere() -> None:
     for path in DOCUMENTS:
-        for target in re.findall(r"\]\((?!http)([^)#]+)", path.read_text(encoding="utf-8")):
-            assert (path.parent / target).exists(), f"{path.name} links to {target}"
+        for target, _, anchor in re.findall(r"\]\((?!http)([^)#]*)(#([^)]*))?\)", path.read_text(encoding="utf-8")):
+            page = path.parent / target if target else path
+            assert page.exists(), f"{path.name} links to {target}"
+            if anchor and page.suffix == ".md":
+                assert anchor in anchors(page), f"{path.name} links to {target}#{anchor}"
 
 
 def test_files_and_modules_that_the_documents_name_are_there() -> None:
