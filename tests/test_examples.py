@@ -81,7 +81,7 @@ def anchors(path: Path) -> set[str]:
 
 
 def test_links_of_the_documents_lead_somewhere() -> None:
-    for path in DOCUMENTS:
+    for path in (*DOCUMENTS, ROOT / "CHANGELOG.md"):
         for target, _, anchor in re.findall(r"\]\((?!http)([^)#]*)(#([^)]*))?\)", path.read_text(encoding="utf-8")):
             page = path.parent / target if target else path
             assert page.exists(), f"{path.name} links to {target}"

@@ -10,7 +10,7 @@ import argparse
 import os
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NoReturn
 
 from ..run.config import closest
@@ -39,6 +39,15 @@ examples:
   mplicits evaluate statue.ply reference.ply
 
 `mplicits COMMAND --help` says more about each; `mplicits --version` prints the version."""
+
+
+GROUP = """usage: mplicits {name} COMMAND [arguments]
+
+commands:
+{commands}
+
+`mplicits {name} COMMAND --help` says more about each."""
+HELP = ("-h", "--help")
 
 
 class _UsageError(Exception):
@@ -114,10 +123,15 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(arguments: list[str]) -> int:
-    if not arguments or arguments[0] in ("-h", "--help", "help"):
-        width = max(map(len, COMMANDS))
-        print(OVERVIEW.format(commands="\n".join(f"  {n:<{width}}  {c.summary}" for n, c in COMMANDS.items())))
+    if arguments[:1] == ["help"]:
+        arguments = [*arguments[1:], "--help"]
+    if not arguments or arguments[0] in HELP:
+        print(OVERVIEW.format(commands=_listed(COMMANDS)))
         return 0 if arguments else 2
+    group = [name for name in COMMANDS if name.startswith(f"{arguments[0]} ")]
+    if group and (len(arguments) < 2 or arguments[1] in HELP):
+        print(GROUP.format(name=arguments[0], commands=_listed(group)))
+        return 0 if len(arguments) > 1 else 2
     if arguments[0] == "--version":
         from importlib.metadata import version  # late, as all that --help can do without
 
@@ -125,7 +139,7 @@ def _run(arguments: list[str]) -> int:
         return 0
     name, command, rest = _choose(arguments)
     parser = _Parser(name, command)
-    if not {"-h", "--help"} & set(rest):
+    if not {*HELP} & set(rest):
         parser.check_flags(rest)
     given = parser.parse_args(rest)
     check_output(getattr(given, "json", None), (".json",))
@@ -133,6 +147,13 @@ def _run(arguments: list[str]) -> int:
     code = command.run(given)
     sys.stdout.flush()
     return code
+
+
+def _listed(names: Iterable[str]) -> str:
+    """A line for each command, with what it does."""
+    names = list(names)
+    width = max(map(len, names))
+    return "\n".join(f"  {name:<{width}}  {COMMANDS[name].summary}" for name in names)
 
 
 def _choose(arguments: list[str]) -> tuple[str, Command, list[str]]:
@@ -144,8 +165,7 @@ def _choose(arguments: list[str]) -> tuple[str, Command, list[str]]:
     first = {name.split()[0] for name in COMMANDS}
     if arguments[0] in first:
         known = [name.split()[1] for name in COMMANDS if name.startswith(f"{arguments[0]} ")]
-        given = arguments[1] if len(arguments) > 1 else ""
-        raise _UsageError(f"{arguments[0]}: unknown command {given!r}{closest(given, known)}")
+        raise _UsageError(f"{arguments[0]}: unknown command {arguments[1]!r}{closest(arguments[1], known)}")
     raise _UsageError(f"unknown command {arguments[0]!r}{closest(arguments[0], first)}")
 
 

@@ -13,9 +13,9 @@ from .hull import STEPS as HULL_STEPS
 from .objective import EARLY, NEAR_EVERY, SMOOTH_RAYS, WHOLE_EVERY, WHOLE_LATER
 from .seen import RAYS as SEEN_RAYS
 
-__all__ = ["SEEING", "SPHERE", "WITNESSES", "ReconstructPlan", "level_stage"]
+__all__ = ["SEEING", "START", "WITNESSES", "ReconstructPlan", "level_stage"]
 
-SPHERE = "a sphere to begin with"
+START = "a surface to begin with"
 SEEING = "what photographs see"
 TRACED = 8  # values along a ray that is traced to the surface
 SPHERE_STEPS, SPHERE_BATCH = 200, 1024
@@ -73,7 +73,7 @@ class ReconstructPlan:
         """What comes before the training."""
         hull = 0 if self.config.start == "sphere" or self.config.geometry == "neus" else HULL_STEPS
         steps = SPHERE_STEPS + hull
-        return [Stage(SPHERE, "rays", self.speed.networks(training(steps, SPHERE_BATCH, self.nets[:1]), steps=steps))]
+        return [Stage(START, "rays", self.speed.networks(training(steps, SPHERE_BATCH, self.nets[:1]), steps=steps))]
 
     def levels(self) -> list[Stage]:
         """The training, in a stage for each level that joins."""

@@ -36,7 +36,7 @@ from ..texture.train import FittedTexture, fit_texture
 from .hull import begin
 from .measured import MeasuredDepths
 from .model import RayPool, SceneModel, build_scene
-from .plan import SEEING, SPHERE, WITNESSES, ReconstructPlan, level_stage
+from .plan import SEEING, START, WITNESSES, ReconstructPlan, level_stage
 from .replayed import ReplayedTrainer, scene_trainer
 from .seen import seen_points
 from .silhouettes import Agreement
@@ -173,7 +173,7 @@ class _Reconstruction:
         pixels = round(np.mean([view.color.shape[0] * view.color.shape[1] for view in images.views]))
         self.plan = ReconstructPlan(config, machine, pixels, len(self.test_views), texture_settings(config))
         schedule.plan([*self.plan.before(), *self.plan.levels(), *self.plan.after()], budget=self.left())
-        schedule(Progress(SPHERE, 0, 0, 0.0, {}))
+        schedule(Progress(START, 0, 0, 0.0, {}))
         self.model = build_scene(config, has_masks=has_masks, views=len(self.train_views)).to(device)
         whole, flat = self.model.outside is not None, config.smooth_weight > 0
         self.holes = agreement.holes() if agreement else {}
@@ -183,7 +183,7 @@ class _Reconstruction:
         self.start = (
             "sphere" if resume else begin(self.model, self.train_views, images, config, self.measured, agreement)
         )
-        schedule(Progress(SPHERE, 0, 0, 1.0, {}))
+        schedule(Progress(START, 0, 0, 1.0, {}))
         self.trainer = scene_trainer(self.model, pool, config, measured=self.measured, seconds=self.training_seconds())
         # Of the training pixels, their masks, the cameras and what was measured.
         seen = [pool.colors, pool.eyes, pool.axes, pool.lens, *([] if pool.masks is None else [pool.masks])]

@@ -21,7 +21,7 @@ from mplicits.pipelines.bench.geometries import (
 from mplicits.pipelines.bench.reconstruct import read_scene
 from mplicits.pipelines.bench.reconstruct_rows import MULTISCALE, NEUS, SurfaceFigures
 from mplicits.pipelines.bench.run import run_cells
-from mplicits.pipelines.cli.bench import GEOMETRIES as OFFERED
+from mplicits.pipelines.cli.bench_scenes import GEOMETRIES as OFFERED
 from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.reconstruct.model import build_scene
 from mplicits.pipelines.run.settings import ReconstructConfig

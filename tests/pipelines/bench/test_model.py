@@ -18,7 +18,7 @@ from mplicits.pipelines.bench.model import (
     model_table,
     predict,
 )
-from mplicits.pipelines.cli.bench import MODELLED
+from mplicits.pipelines.cli.bench_costs import MODELLED
 
 N, W = 100, 32
 ROUND = Device("round numbers", 1e12, 6e12, 1e9, 10, True, "made up")

@@ -15,7 +15,7 @@ from mplicits.neural_fields import InputError
 from mplicits.pipelines.bench import texture as bench_texture_fits
 from mplicits.pipelines.bench.report import as_text
 from mplicits.pipelines.bench.texture import PAPER_MSE, TextureBench, TextureRow
-from mplicits.pipelines.cli import bench as bench_colour_commands
+from mplicits.pipelines.cli import bench_shapes
 from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.render.compare import Drawing, ImageError, draw, image_error, psnr
 from mplicits.pipelines.render.rasterise import mesh_view
@@ -285,7 +285,7 @@ def test_a_mesh_without_texture_coordinates_is_refused_before_any_work(tmp_path)
 
 
 def test_the_command(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(bench_colour_commands, "COARSE", COARSE)
+    monkeypatch.setattr(bench_shapes, "COARSE", COARSE)
     monkeypatch.setattr(bench_texture_fits, "FIT_POINTS", 3000)
     path = write_ball(tmp_path)
     settings = "--coarse-width 16 --coarse-omega 6 --coarse-steps 60"

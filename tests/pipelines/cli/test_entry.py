@@ -75,6 +75,21 @@ def test_help_names_every_command(capsys):
     assert re.search(r"^mplicits \d", capsys.readouterr().out, re.MULTILINE)
 
 
+def test_help_of_a_group_names_its_commands_alone(capsys):
+    for words, code in ((["bench", "--help"], 0), (["help", "bench"], 0), (["bench"], 2)):
+        assert main(words) == code
+        named = re.findall(r"^  (\S.*?)  ", capsys.readouterr().out, re.MULTILINE)
+        assert sorted(named) == sorted(name for name in COMMANDS if name.startswith("bench "))
+
+
+@pytest.mark.parametrize("name", ["mesh", "bench mesh"])
+def test_help_before_a_command_is_that_after_it(capsys, name):
+    assert main([*name.split(), "--help"]) == 0
+    after = capsys.readouterr().out
+    assert main(["help", *name.split()]) == 0
+    assert capsys.readouterr().out == after
+
+
 @pytest.mark.parametrize("name", COMMANDS)
 def test_help_of_each_command_has_examples_that_parse(capsys, name):
     from mplicits.pipelines.cli.entry import _Parser
@@ -109,6 +124,7 @@ def test_neither_help_nor_mistakes_wait_for_torch():
     ("arguments", "message"),
     [
         ("mseh", "unknown command 'mseh'; did you mean 'mesh'?"),
+        ("help mseh", "unknown command 'mseh'; did you mean 'mesh'?"),
         ("bench normls", "bench: unknown command 'normls'; did you mean 'normals'?"),
         ("fit a.ply --ouput b", "unknown flag --ouput; did you mean '--out'?"),
         ("fit a.ply", "the following arguments are required: -o/--out"),

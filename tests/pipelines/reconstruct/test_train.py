@@ -505,7 +505,7 @@ def test_stages_are_those_that_are_announced(data: Path) -> None:
     reconstruct(data, TINY, progress=said.append)
     assert list(dict.fromkeys(progress.stage for progress in said)) == [
         "reading the pictures",
-        "a sphere to begin with",
+        "a surface to begin with",
         "reconstruct, level 0",
         "reconstruct, level 1",
         "held-out views",
