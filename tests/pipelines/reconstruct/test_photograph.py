@@ -1,5 +1,6 @@
 """New pictures of a finished reconstruction: those that its training has measured, and from elsewhere."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import imageio.v3 as iio
@@ -17,28 +18,10 @@ from mplicits.pipelines.reconstruct.photograph import open_scene, photograph
 from mplicits.pipelines.reconstruct.train import Reconstruction, reconstruct
 from mplicits.pipelines.reconstruct.views import render_image
 from mplicits.pipelines.render.draw import RenderOptions
-from mplicits.pipelines.run.settings import ReconstructConfig
 from mplicits.pipelines.run.trainer import Interrupted, Progress
+from reconstructions import TINY_SCENE
 
-TINY = ReconstructConfig(
-    widths=(16, 16),
-    depths=(1, 1),
-    omegas=(10.0, 15.0),
-    starts=(0.0, 0.4),
-    features=4,
-    color_width=16,
-    color_depth=1,
-    color_grid=8,
-    color_frequencies=2,
-    background="outside",
-    steps=40,
-    rays=16,
-    uniform=8,
-    importance=4,
-    march_grid=8,
-    texture_steps=0,
-    test_every=3,
-)
+TINY = replace(TINY_SCENE, starts=(0.0, 0.4), background="outside", steps=40, rays=16, texture_steps=0, test_every=3)
 
 
 @pytest.fixture(scope="module")
@@ -116,7 +99,7 @@ def test_a_new_training_over_an_old_run_takes_its_colours_away(images: PosedImag
     reconstruct(images, TINY, out=again)
     assert (again / "radiance.safetensors").is_file()
     with pytest.raises((Interrupted, KeyboardInterrupt)):
-        reconstruct(images, ReconstructConfig(**{**vars(TINY), "seed": 1}), out=again, progress=stop)
+        reconstruct(images, replace(TINY, seed=1), out=again, progress=stop)
     geometry = {path.name for path in again.iterdir()}
     if "resume.safetensors" in geometry:
         assert "radiance.safetensors" not in geometry

@@ -38,29 +38,11 @@ from mplicits.pipelines.run.folder import load_state, state_bytes
 from mplicits.pipelines.run.settings import ReconstructConfig
 from mplicits.pipelines.run.trainer import Interrupted, Progress
 from mplicits.pipelines.surface.measure import chamfer
-from reconstructions import small_reconstructions
+from reconstructions import TINY_SCENE, small_reconstructions
 from torch import Tensor
 
 WORLD = Similarity(center=(120.0, -30.0, 8.0), scale=5.0)
-TINY = ReconstructConfig(
-    widths=(16, 16),
-    depths=(1, 1),
-    omegas=(10.0, 15.0),
-    starts=(0.0, 0.4),
-    features=4,
-    color_width=16,
-    color_depth=1,
-    color_grid=8,
-    color_frequencies=2,
-    steps=40,
-    rays=16,
-    uniform=8,
-    importance=4,
-    march_grid=8,
-    start="sphere",
-    texture_steps=3,
-    test_every=3,
-)
+TINY = replace(TINY_SCENE, starts=(0.0, 0.4), steps=40, rays=16, start="sphere", texture_steps=3, test_every=3)
 FLAGS = "--widths 16 16 --depths 1 1 --omegas 10 15 --starts 0 0.4 --features 4 --color-width 16 --color-depth 1"
 FLAGS += (
     " --color-frequencies 2 --color-grid 8 --steps 3 --rays 16 --uniform 8 --importance 4 --texture-steps 3 --quiet"
