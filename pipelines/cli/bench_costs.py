@@ -92,13 +92,13 @@ def _gpu_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--sizes", type=_size, nargs="+", default=sizes, metavar="WxH", help=f"of the pictures ({shown})"
     )
-    modelled_flag(parser, ("h100", "4090"))
+    _modelled_flag(parser, ("h100", "4090"))
     parser.add_argument("--timed", metavar="DEVICE", help="time them on this device, too: cuda, cpu, ... (none)")
     folder_flag(parser)
     add_flags(parser, "--json")
 
 
-def modelled_flag(parser: argparse.ArgumentParser, default: tuple[str, ...]) -> None:
+def _modelled_flag(parser: argparse.ArgumentParser, default: tuple[str, ...]) -> None:
     about = f"times on GPUs by a model of counts and published rates: {', '.join(MODELLED)}"
     if default:
         about += f" ({' '.join(default)})"
@@ -142,7 +142,7 @@ def _render_arguments(parser: argparse.ArgumentParser) -> None:
     number(parser, "--views", whole(1), 3, "cameras around the shape")
     number(parser, "--repeats", whole(1), 2, "the best of how many")
     parser.add_argument("--no-naive", action="store_true", help="leave out the naive tracer, which takes minutes")
-    modelled_flag(parser, ())
+    _modelled_flag(parser, ())
     add_flags(parser, "--json")
     add_settings(parser, FitConfig)
 

@@ -10,7 +10,7 @@ import argparse
 import os
 import re
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Sequence
 from typing import NoReturn
 
 from ..run.config import closest
@@ -39,7 +39,6 @@ examples:
   mplicits evaluate statue.ply reference.ply
 
 `mplicits COMMAND --help` says more about each; `mplicits --version` prints the version."""
-
 
 GROUP = """usage: mplicits {name} COMMAND [arguments]
 
@@ -128,7 +127,7 @@ def _run(arguments: list[str]) -> int:
     if not arguments or arguments[0] in HELP:
         print(OVERVIEW.format(commands=_listed(COMMANDS)))
         return 0 if arguments else 2
-    group = [name for name in COMMANDS if name.startswith(f"{arguments[0]} ")]
+    group = _group(arguments[0])
     if group and (len(arguments) < 2 or arguments[1] in HELP):
         print(GROUP.format(name=arguments[0], commands=_listed(group)))
         return 0 if len(arguments) > 1 else 2
@@ -149,9 +148,13 @@ def _run(arguments: list[str]) -> int:
     return code
 
 
-def _listed(names: Iterable[str]) -> str:
+def _group(first: str) -> list[str]:
+    """The commands of two words that begin with this one."""
+    return [name for name in COMMANDS if name.startswith(f"{first} ")]
+
+
+def _listed(names: Collection[str]) -> str:
     """A line for each command, with what it does."""
-    names = list(names)
     width = max(map(len, names))
     return "\n".join(f"  {name:<{width}}  {COMMANDS[name].summary}" for name in names)
 
@@ -164,7 +167,7 @@ def _choose(arguments: list[str]) -> tuple[str, Command, list[str]]:
             return name, COMMANDS[name], arguments[words:]
     first = {name.split()[0] for name in COMMANDS}
     if arguments[0] in first:
-        known = [name.split()[1] for name in COMMANDS if name.startswith(f"{arguments[0]} ")]
+        known = [name.split()[1] for name in _group(arguments[0])]
         raise _UsageError(f"{arguments[0]}: unknown command {arguments[1]!r}{closest(arguments[1], known)}")
     raise _UsageError(f"unknown command {arguments[0]!r}{closest(arguments[0], first)}")
 
