@@ -215,11 +215,14 @@ def fit_scale_shift(numbers: Tensor, wanted: Tensor, group: Tensor, groups: int)
 
 
 def depth_loss(field: Field, rays: DepthRays, *, level: int = -1, generator: torch.Generator | None = None) -> Tensor:
-    """How far a field is from what was measured ``(B,)``: |f(p)| + max(−f(x), 0) + max(f(x) − |p − x|, 0).
+    """How far a field is from what was measured ``(B,)``: |f(p)|, and Σ max(−f(x), 0) + max(f(x) − |p − x|, 0).
 
-    p is where the ray meets the surface, x a place at random on the way there, nearer to p more often. A distance is 0
-    at p; at x it is not negative, and not more than what is left of the way. What lies outside the unit sphere, and
-    measurements that are not known yet, count 0.
+    p is where the ray meets the surface. Two places x are on the way there: one at random, nearer to p more often, and
+    where the ray enters the unit sphere. A distance is 0 at p; on the way it is not negative, and not more than what is
+    left of it. What lies outside the unit sphere, and measurements that are not known yet, count 0.
+
+    Where rays enter has to be said: volume rendering divides by the light that is left there (NeuS, Eq. 13), so that
+    one which enters inside of something passes it, and the pictures alone leave slabs before the cameras.
 
     Args:
         field: f, in unit-sphere coordinates.
@@ -233,12 +236,13 @@ def depth_loss(field: Field, rays: DepthRays, *, level: int = -1, generator: tor
     end = torch.minimum(reach, far)
     seen_through = end > near
     part = uniform(reach.shape, generator, end.device) if generator else torch.full_like(reach, 0.5)
-    at = end - (end - near) * part.square()
-    places = origins + torch.stack((reach, at))[..., None] * directions  # (2, B, 3)
+    on_the_way = torch.stack((end - (end - near) * part.square(), near))
+    places = origins + torch.cat((reach[None], on_the_way))[..., None] * directions  # (3, B, 3)
     # Those that do not count are evaluated too: a GPU would be waited for until it says which they are.
-    on, before = field.value(places, level=level)
-    missed, free = on.abs(), (-before).clamp_min(0) + (before - (reach - at)).clamp_min(0)
-    return torch.where(on_surface, missed, 0.0) + torch.where(seen_through, free, 0.0)
+    values = field.value(places, level=level)
+    on, before = values[0], values[1:]
+    free = ((-before).clamp_min(0) + (before - (reach - on_the_way)).clamp_min(0)).sum(dim=0)
+    return torch.where(on_surface, on.abs(), 0.0) + torch.where(seen_through, free, 0.0)
 
 
 def _gathered(views: Sequence[PosedImage], images: PosedImages, random: np.random.Generator) -> list[_Part]:
