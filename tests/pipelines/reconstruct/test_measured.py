@@ -147,8 +147,8 @@ def test_without_points_the_surface_itself_says_it(images: PosedImages, kind: De
 def test_an_exact_field_misses_nothing_and_another_one_by_its_distance(images: PosedImages) -> None:
     rays = measured_of(images).at(torch.arange(500))
     random = torch.Generator().manual_seed(0)
-    # Two for each of three places: of the value there, and of the place.
-    assert float(depth_loss(EXACT, rays, generator=random).max()) <= 6 * ROUNDING
+    # One for each of three places, and one to spare.
+    assert float(depth_loss(EXACT, rays, generator=random).max()) <= 4 * ROUNDING
     # Of a smaller sphere each place is further off, by the difference of the radii, which at the end is all there is.
     smaller = depth_loss(Sphere(radius=0.5), rays)
     assert float(smaller.min()) >= 0.1 - 4 * ROUNDING
@@ -180,8 +180,8 @@ def test_a_ray_that_was_measured_does_not_enter_inside_of_anything(eye: float, e
     """Which a picture cannot tell: what the ray enters inside of stops none of its light."""
     ball, slab = Sphere(radius=0.3), Sphere(radius=0.1, center=(0.0, 0.0, entry))
     rays = along_z(-0.3 - eye, eye=eye)
-    assert float(depth_loss(ball, rays)) == pytest.approx(0, abs=6 * ROUNDING)
-    assert float(depth_loss(Union(ball, slab), rays)) == pytest.approx(0.1, abs=6 * ROUNDING)
+    assert float(depth_loss(ball, rays)) == pytest.approx(0, abs=4 * ROUNDING)
+    assert float(depth_loss(Union(ball, slab), rays)) == pytest.approx(0.1, abs=4 * ROUNDING)
 
     def white(x: Tensor, direction: Tensor, jet: Jet) -> Tensor:
         return torch.ones_like(x)
