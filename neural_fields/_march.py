@@ -17,7 +17,7 @@ from .field import Field
 __all__ = ["PATIENCE", "Expected", "Found", "Near", "Rays", "Rule", "Stand", "look", "march", "march_budget"]
 
 # Steps at a gap of one `resolution`, before it doubles: few rays need as many, and none may need thousands.
-PATIENCE = 32
+PATIENCE = 16
 # How far a step may reach into a band unseen, in δ: stepping to its edge and no further would never arrive.
 BAND_ENTRY = 0.5
 # Share of the widest step that two tangent balls on a plane allow; less than 1 lets surfaces bend towards the ray.

@@ -17,10 +17,14 @@ from .multiscale import choose_levels, levels_of
 from .siren import Siren
 from .tracing import BOUNDING_RADIUS, ball_crossing, check_rays, unit_directions
 
-__all__ = ["CONE_LIPSCHITZ", "cone_ends", "cone_starts"]
+__all__ = ["CONE_LIPSCHITZ", "CONE_STEPS", "TILES", "cone_ends", "cone_starts"]
 
 # Networks are a little steeper than a distance here and there, and a cone that goes too far loses thin parts.
 CONE_LIPSCHITZ = 1.15
+# Sides of the tiles of pixels that get a cone, each a multiple of the next.
+TILES = (16, 4)
+# Of each cone; those that have not stopped by then leave the rest to their rays.
+CONE_STEPS = 64
 
 Columns = tuple[Tensor, ...]
 
@@ -32,10 +36,10 @@ def cone_starts(
     directions: Tensor,
     *,
     level: int = -1,
-    tiles: Sequence[int] = (32, 8, 4),
+    tiles: Sequence[int] = TILES,
     lipschitz: float = 1.0,
     radius: float = BOUNDING_RADIUS,
-    max_steps: int = 64,
+    max_steps: int = CONE_STEPS,
     clearance: float = 0.0,
 ) -> Tensor:
     """Depths up to which whole tiles of an image see nothing, by marching one cone for each tile on level 0.
@@ -85,7 +89,7 @@ def cone_ends(
     tiles: Sequence[int] = (32, 8),
     lipschitz: float = 1.0,
     radius: float = BOUNDING_RADIUS,
-    max_steps: int = 64,
+    max_steps: int = CONE_STEPS,
     clearance: float = 0.0,
 ) -> Tensor:
     """Depths from which on whole tiles of an image see nothing: `cone_starts` from the other side.
@@ -158,13 +162,11 @@ def _march_cones(
     depth = torch.maximum(starts, entry).clamp(min=0)
     depth = torch.where(depth >= leave, torch.inf, depth)
     network = levels_of(field)[0]
-    precision = choose_levels((network,), axis, jet=False).precision
-    if precision and isinstance(network, Siren):
+    if isinstance(network, Siren) and choose_levels((network,), axis, jet=False).fused:
         from .kernels.cones import march_cones
+        from .kernels.packing import packed
 
-        return march_cones(
-            network.as_network(), (origin, axis, spread, leave, depth), delta, lipschitz, max_steps, precision
-        )
+        return march_cones(packed(network), (origin, axis, spread, leave, depth), delta, lipschitz, max_steps)
 
     def advance(fixed: Columns, moving: Columns, on: Tensor) -> tuple[Columns, Tensor]:
         (axis, sigma, leave), (depth, before, value_before) = fixed, moving

@@ -23,7 +23,7 @@ from .siren import Siren, needs_graph
 if TYPE_CHECKING:
     from .kernels.levels import Levels
 
-__all__ = ["MultiscaleSDF", "Parts", "choose_levels", "levels_of", "walk_levels"]
+__all__ = ["MultiscaleSDF", "Parts", "as_levels", "choose_levels", "levels_of", "walk_levels"]
 
 # The tensors of a jet of any order, the value first; ``(N,)``, alone or with features, is a jet of order 0.
 Parts = tuple[Tensor, ...]
@@ -133,12 +133,11 @@ class MultiscaleSDF(Field):
     def value(self, x: Tensor, *, level: int = -1) -> Tensor:
         """See `Field.value`; outside the band of level j − 1, level j is level j − 1."""
         self.check_points(x)
-        fused = self._fused(x, level, jet=False)
-        if fused.precision:
+        if self._choose(x, level, jet=False).fused:
             from .kernels.levels import levels_value
 
             rows = self.check_points(x).reshape(-1, self.in_dim)
-            return levels_value(rows, self.as_levels(level), fused.precision, _wanted()).reshape(x.shape[:-1])
+            return levels_value(rows, as_levels(self, level), _wanted()).reshape(x.shape[:-1])
         (f,) = deque(self._walk(x, level, _value), maxlen=1).pop()
         return f
 
@@ -155,12 +154,11 @@ class MultiscaleSDF(Field):
     def jet(self, x: Tensor, *, level: int = -1) -> Jet:
         """See `Field.jet`; inside a tapered band ∇(γr) = γ∇r + r γ′ ∇f."""
         self.check_points(x)
-        fused = self._fused(x, level, jet=True)
-        if fused.precision:
+        if self._choose(x, level, jet=True).fused:
             from .kernels.levels import levels_jet
 
             rows, shape = self.check_points(x).reshape(-1, self.in_dim), x.shape[:-1]
-            value, gradient = levels_jet(rows, self.as_levels(level), fused.precision, _wanted())
+            value, gradient = levels_jet(rows, as_levels(self, level), _wanted())
             return Jet(value.reshape(shape), gradient.reshape(x.shape), x.new_empty(*shape, 0))
         return Jet(*deque(self._walk(x, level, lambda part, points: part.jet(points)), maxlen=1).pop())
 
@@ -170,23 +168,14 @@ class MultiscaleSDF(Field):
         walk = self._walk(x, level, lambda part, points: part.second_jet(points, dims=dims))
         return SecondJet(*deque(walk, maxlen=1).pop())
 
-    def as_levels(self, level: int = -1) -> Levels:
-        """As the fused kernels take it, if all levels up to ``level`` are networks (`choose_levels`)."""
-        from .kernels.levels import Levels
-
-        networks = [
-            part.as_network() for part in self.levels[: self.resolve_level(level) + 1] if isinstance(part, Siren)
-        ]
-        return Levels.of(networks, self.deltas, self.taper)
-
-    def _fused(self, x: Tensor, level: int, *, jet: bool) -> Choice:
+    def _choose(self, x: Tensor, level: int, *, jet: bool) -> Choice:
         """Whether one launch evaluates all levels up to ``level`` at ``x``."""
         levels = self.levels[: self.resolve_level(level) + 1]
         if len(levels) == 1 or under_vmap():
-            return Choice("", "one level is evaluated by itself")
+            return Choice(False, "one level is evaluated by itself")
         choice = choose_levels(levels, x, jet=jet)
-        if choice.precision and needs_graph(x, [weight for part in levels for weight in part.parameters()]):
-            return Choice("", "a graph is recorded; levels are evaluated one by one")
+        if choice.fused and needs_graph(x, [weight for part in levels for weight in part.parameters()]):
+            return Choice(False, "a graph is recorded; levels are evaluated one by one")
         return choice
 
     def _walk(self, x: Tensor, level: int, evaluate: Callable[[Field, Tensor], Parts]) -> Iterator[Parts]:
@@ -236,6 +225,21 @@ def levels_of(field: Field) -> tuple[Field, ...]:
     return field.levels if isinstance(field, MultiscaleSDF) else (field,)
 
 
+def as_levels(field: Field, level: int = -1) -> Levels:
+    """The levels of a field of SIRENs (`choose_levels`) as the fused kernels take them.
+
+    Args:
+        field: a `MultiscaleSDF`, or a `Siren`.
+        level: the finest one.
+    """
+    from .kernels.levels import Levels
+    from .kernels.packing import packed
+
+    networks = [part for part in levels_of(field)[: field.resolve_level(level) + 1] if isinstance(part, Siren)]
+    taper = field.taper if isinstance(field, MultiscaleSDF) else 0.0
+    return Levels.of([packed(network) for network in networks], field.deltas, taper)
+
+
 def choose_levels(levels: Sequence[Field], x: Tensor, *, jet: bool) -> Choice:
     """How levels are to be evaluated together at points ``x``, without a graph: see `kernels.switch`.
 
@@ -246,7 +250,7 @@ def choose_levels(levels: Sequence[Field], x: Tensor, *, jet: bool) -> Choice:
     """
     networks = [level for level in levels if isinstance(level, Siren)]
     if len(networks) < len(levels):
-        return Choice("", "a level is no SIREN")
+        return Choice(False, "a level is no SIREN")
     return choose(
         x,
         width=max(network.width for network in networks),

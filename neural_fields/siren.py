@@ -18,7 +18,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -28,9 +28,6 @@ from ._parallel import Step, over_blocks
 from ._transforms import under_vmap
 from .field import Jet, OneLevelField, SecondJet
 from .kernels.switch import choose
-
-if TYPE_CHECKING:
-    from .kernels.launch import Network
 
 __all__ = ["Siren"]
 
@@ -155,11 +152,12 @@ class Siren(OneLevelField):
             return forward(rows, self.folded())[0][:, :channels]
         parameters = list(self.parameters())
         if not needs_graph(rows, parameters):
-            fused = choose(rows, width=self.width, depth=self.depth, features=channels - 1)
-            if fused.precision:
+            choice = choose(rows, width=self.width, depth=self.depth, features=channels - 1)
+            if choice.fused:
+                from .kernels.packing import packed
                 from .kernels.siren import siren_value
 
-                return siren_value(rows, self.as_network(), fused.precision)[:, None]
+                return siren_value(rows, packed(self))[:, None]
         parameters = self.folded()
         if needs_graph(rows, parameters):
             return forward(rows, parameters)[0][:, :channels]
@@ -185,9 +183,8 @@ class Siren(OneLevelField):
             shape = x.shape[:-1]
             features = output[:, 1:].reshape(*shape, self.num_features)
             return Jet(output[:, 0].reshape(shape), gradients[:, 0].reshape(x.shape), features)
-        fused = choose(rows, width=self.width, depth=self.depth, features=self.num_features)
-        if fused.precision:
-            value, gradient = self._fused_jet(rows, fused.precision)
+        if choose(rows, width=self.width, depth=self.depth, features=self.num_features).fused:
+            value, gradient = self._fused_jet(rows)
             shape = x.shape[:-1]
             return Jet(value.reshape(shape), gradient.reshape(x.shape), x.new_empty(*shape, 0))
         parameters = self.folded()
@@ -208,14 +205,15 @@ class Siren(OneLevelField):
         features = output[:, 1:].reshape(*shape, self.num_features)
         return Jet(output[:, 0].reshape(shape), gradient.reshape(x.shape), features)
 
-    def _fused_jet(self, rows: Tensor, precision: str) -> tuple[Tensor, Tensor]:
+    def _fused_jet(self, rows: Tensor) -> tuple[Tensor, Tensor]:
         """Value and gradient by the fused kernels, on the graph if one is recorded."""
+        from .kernels.packing import packed
         from .kernels.siren import siren_jet
 
-        network, parameters = self.as_network(), self._raw()
+        parameters = self.raw()
         if needs_graph(rows, parameters):
-            return _FusedJet.apply(rows, network.omega, network.gain, precision, *parameters)
-        return siren_jet(rows, network, precision)
+            return _FusedJet.apply(rows, self.omega * self.units[0], self.units[1], *parameters)
+        return siren_jet(rows, packed(self))
 
     def second_jet(self, x: Tensor, *, level: int = -1, dims: int | None = None) -> SecondJet:
         """See `Field.second_jet`; one tangent forward for each of the ``dims`` coordinates, without autograd.
@@ -255,15 +253,9 @@ class Siren(OneLevelField):
 
     def folded(self) -> list[Tensor]:
         """Weights and biases with units and ω₀ folded in: [W_1, b_1, …, W_d, b_d, W_out, b_out]."""
-        return fold(self._raw(), self.omega * self.units[0], self.units[1])
+        return fold(self.raw(), self.omega * self.units[0], self.units[1])
 
-    def as_network(self) -> Network:
-        """As the fused kernels take it; they are not imported without Triton."""
-        from .kernels.launch import Network
-
-        return Network.of(self._raw(), self.omega * self.units[0], self.units[1])
-
-    def _raw(self) -> list[Tensor]:
+    def raw(self) -> list[Tensor]:
         """Weights and biases as they are kept: [W_1, b_1, …, W_out, b_out]."""
         return [part for layer in (*self._sine_layers(), self.output) for part in (layer.weight, layer.bias)]
 
@@ -500,42 +492,40 @@ def _add_bars(
 
 
 class _FusedJet(torch.autograd.Function):
-    """Value and gradient of a SIREN of one output by the fused kernels, and the way back by another.
+    """Value and gradient of a SIREN of one output by a fused kernel, and the way back by another, in IEEE float32.
 
     Parameters are those that the module keeps; ω₀ is multiplied in the kernels.
     """
 
     @staticmethod
-    def forward(
-        ctx: Any, x: Tensor, omega: float, gain: float, precision: str, *parameters: Tensor
-    ) -> tuple[Tensor, Tensor]:
+    def forward(ctx: Any, x: Tensor, omega: float, gain: float, *parameters: Tensor) -> tuple[Tensor, Tensor]:
+        from .kernels.ieee import jet
         from .kernels.launch import Network
-        from .kernels.siren import siren_jet
 
-        ctx.numbers = omega, gain, precision
+        ctx.numbers = omega, gain
         ctx.save_for_backward(x, *parameters)
-        return siren_jet(x, Network.of(parameters, omega, gain), precision)
+        return jet(x, Network.of(parameters, omega, gain))
 
     @staticmethod
     def backward(ctx: Any, *cotangents: Tensor | None) -> tuple[Tensor | None, ...]:
         from .kernels.launch import Network
         from .kernels.training import jet_backward
 
-        (omega, gain, precision), (x, *parameters) = ctx.numbers, ctx.saved_tensors
+        (omega, gain), (x, *parameters) = ctx.numbers, ctx.saved_tensors
         value_bar, gradient_bar = cotangents
         assert value_bar is not None
         assert gradient_bar is not None
         if torch.is_grad_enabled():
             # Who differentiates once more gets plain operations.
-            needed = [ctx.needs_input_grad[0], *ctx.needs_input_grad[4:]]
+            needed = [ctx.needs_input_grad[0], *ctx.needs_input_grad[3:]]
             wanted = [tensor for tensor, need in zip((x, *parameters), needed, strict=True) if need]
             output, jacobian = plain_jet(x, fold(parameters, omega, gain), 1)
             outputs, bars = (output[:, 0], jacobian[:, 0]), (value_bar, gradient_bar)
             found = iter(torch.autograd.grad(outputs, wanted, bars, create_graph=True, materialize_grads=True))
             x_bar, *own = (next(found) if need else None for need in needed)
         else:
-            x_bar, own = jet_backward(x, Network.of(parameters, omega, gain), value_bar, gradient_bar, precision)
-        return x_bar, None, None, None, *own
+            x_bar, own = jet_backward(x, Network.of(parameters, omega, gain), value_bar, gradient_bar)
+        return x_bar, None, None, *own
 
 
 def _differentiable_backward(

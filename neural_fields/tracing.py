@@ -12,7 +12,7 @@ and the field itself sees to it that a residual is evaluated only inside its ban
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -36,18 +36,19 @@ from ._march import (
 from .devices import makes_wait
 from .field import Field
 from .function import FieldLike, as_field
-from .multiscale import MultiscaleSDF, choose_levels, levels_of
-from .siren import Siren
+from .multiscale import as_levels, choose_levels, levels_of
 from .volume import ball_chord
 
 __all__ = [
     "BOUNDING_RADIUS",
+    "MAX_STEPS",
     "Expected",
     "Hits",
     "Near",
     "ball_crossing",
     "ball_points",
     "check_rays",
+    "march_constants",
     "sphere_trace",
     "trace_expected",
     "unit_directions",
@@ -55,8 +56,8 @@ __all__ = [
 
 # Fields live in the unit sphere; their surfaces may pass it by a little.
 BOUNDING_RADIUS = 1.05
-# One network of so many units leaves registers enough to keep the rays there too, while one launch marches them.
-IN_REGISTERS = 128
+# Evaluations of a ray after which it ends as a miss.
+MAX_STEPS = 512
 
 
 class Hits(NamedTuple):
@@ -90,7 +91,7 @@ def sphere_trace(
     resolution: float = 1e-4,
     lipschitz: float = 1.0,
     radius: float | None = BOUNDING_RADIUS,
-    max_steps: int = 512,
+    max_steps: int = MAX_STEPS,
     budget: Sequence[int] | None = None,
     capture: float = 2e-3,
     differentiable: bool = False,
@@ -101,7 +102,7 @@ def sphere_trace(
     leave no gap between the balls around two neighbouring samples if the surface is a plane (Bálint and Valasek
     2018, from the last two values); where a gap opens after all, the step is taken back. Two crossings closer
     to each other than ``resolution`` may be overlooked, which is what lets a ray go on along a surface that it
-    nearly touches; rays that need more than 32 steps are given twice the resolution, and again after every 32.
+    nearly touches; rays that need more than 16 steps are given twice the resolution, and again after every 16.
     A change of sign is closed in on by the secant rule and bisection in turn. Rays are dropped as they end.
 
     With a ``budget``, the paper's mode: so many steps ``t ← t + f_j − δ_j`` on each level (20, 5, 5 in its Tab. 4),
@@ -200,8 +201,8 @@ def _trace_budget(
     if bool((field.deltas[:level].isinf().cpu() & (torch.tensor(budget[:level]) > 0)).any()):
         raise ValueError(f"budget={list(budget)}: a level without a band leads to no other; give it 0 steps")
     directions, length = unit_directions(directions)
-    rays, found = _begin(origins, directions, length, near, far, radius)
-    march_budget(field, rays, found, budget, tolerance, capture)
+    spans, found = _begin(origins, directions, length, near, far, radius)
+    march_budget(field, Rays.begin(*spans), found, budget, tolerance, capture)
     return _hits(found, origins, directions, length)
 
 
@@ -219,7 +220,7 @@ def trace_expected(
     resolution: float = 1e-4,
     lipschitz: float = 1.0,
     radius: float | None = BOUNDING_RADIUS,
-    max_steps: int = 512,
+    max_steps: int = MAX_STEPS,
     reach: float | None = None,
 ) -> tuple[Hits, Tensor, Near]:
     """`sphere_trace` in the default mode, with an idea of where the hits will be.
@@ -256,59 +257,52 @@ def trace_expected(
     check_rays(field, origins, directions, tolerance=tolerance, resolution=resolution, lipschitz=lipschitz)
     rule = Rule(field.deltas[:level].to(directions), tolerance, resolution, lipschitz)
     directions, length = unit_directions(directions)
-    rays, found = _begin(origins, directions, length, near, far, radius)
+    spans, found = _begin(origins, directions, length, near, far, radius)
     shape = torch.broadcast_shapes(origins.shape, directions.shape)[:-1]
+    if expected is None and reach is None and choose_levels(levels_of(field)[: level + 1], directions, jet=False).fused:
+        _march_fused(field, level, spans, found, rule, max_steps)
+        unknown = Near(*(column.reshape(shape) for column in found.near))
+        return _hits(found, origins, directions, length), found.slope.reshape(shape), unknown
+    rays = Rays.begin(*spans)
     if expected is not None:
         depth, slope, value = (part.to(directions).broadcast_to(shape) for part in expected)
         flat = Expected((depth * length).reshape(-1), slope.reshape(-1), value.reshape(-1))
         rays = rays.expecting(flat, rule)
-    precision = "" if expected is not None or reach is not None else _fused(field, level, rays)
-    if precision:
-        _march_fused(field, level, precision, rays, found, rule, max_steps)
-    else:
-        go = march_ahead if makes_wait(directions.device) else march
-        go(field, level, rays, found, rule, max_steps, reach)
+    go = march_ahead if makes_wait(directions.device) else march
+    go(field, level, rays, found, rule, max_steps, reach)
     clear, value, leave = (column.reshape(shape) for column in found.near)
     near_surface = Near(clear / length, value, leave / length)
     return _hits(found, origins, directions, length), found.slope.reshape(shape), near_surface
 
 
-def _fused(field: Field, level: int, rays: Rays) -> str:
-    """The precision of the networks' products if one launch marches all rays; empty if PyTorch does."""
-    return choose_levels(levels_of(field)[: level + 1], rays.origin, jet=False).precision
-
-
-def _march_fused(
-    field: Field, level: int, precision: str, rays: Rays, found: Found, rule: Rule, max_steps: int
-) -> None:
-    """What `march` does, by the fused kernels; what they find has the same bounds, and not the same last bits."""
-    from .kernels.levels import Levels
-    from .kernels.paths import march_levels
-    from .kernels.tracing import march_rays
-
-    networks = [part.as_network() for part in levels_of(field)[: level + 1] if isinstance(part, Siren)]
-    options: dict[str, Any] = {
-        "tolerance": rule.tolerance,
-        "resolution": rule.resolution,
-        "lipschitz": rule.lipschitz,
-        "max_steps": max_steps,
-        "constants": {
-            "PATIENCE": PATIENCE,
-            "BOLDNESS": BOLDNESS,
-            "STEEPEST_RISE": STEEPEST_RISE,
-            "BAND_ENTRY": BAND_ENTRY,
-            "FLOOR": FLOOR * torch.finfo(rays.depth.dtype).eps,
-        },
-        "precision": precision,
+def march_constants(dtype: torch.dtype) -> dict[str, float]:
+    """The numbers of `_march` that the fused kernels are compiled for."""
+    return {
+        "PATIENCE": PATIENCE,
+        "BOLDNESS": BOLDNESS,
+        "STEEPEST_RISE": STEEPEST_RISE,
+        "BAND_ENTRY": BAND_ENTRY,
+        "FLOOR": FLOOR * torch.finfo(dtype).eps,
     }
-    columns = (rays.origin, rays.direction, rays.depth, rays.entry, rays.far)
-    if len(networks) == 1 and networks[0].width <= IN_REGISTERS:
-        marched = march_rays(networks[0], columns, **options)
-    else:
-        taper = field.taper if isinstance(field, MultiscaleSDF) else 0.0
-        marched = march_levels(Levels.of(networks, rule.deltas, taper), columns, **options)
-    found.record(rays.ray, mask=marched.mask, depth=marched.depth, level=marched.level, steps=marched.steps)
-    found.record_slope(rays.ray, marched.slope)
+
+
+def _march_fused(field: Field, level: int, spans: tuple[Tensor, ...], found: Found, rule: Rule, max_steps: int) -> None:
+    """What `march` does, by the fused kernels; what they find has the same bounds, and not the same last bits."""
+    from .kernels.paths import march_levels
+    from .kernels.tracing import IN_REGISTERS, Marched, Queue, RayTensors, march_rays
+
+    origins, directions, entries, starts, ends = (column.contiguous() for column in spans)
+    if not len(starts):
+        return
+    levels = as_levels(field, level)
+    marched, queue = Marched.nothing(found.depth), Queue.of(starts, ends)
+    numbers = starts.new_tensor([rule.tolerance, rule.resolution, rule.lipschitz])
+    alone = len(levels.networks) == 1 and levels.networks[0].shape.width <= IN_REGISTERS
+    go = march_rays if alone else march_levels
+    rays = RayTensors(origins, directions, starts, entries, ends)
+    go(levels, rays, queue, marched, numbers, max_steps=max_steps, constants=march_constants(starts.dtype))
+    mask, depth, steps, slope, own = marched.in_own_types()
+    found.mask, found.depth, found.level, found.steps, found.slope = mask, depth, own, steps, slope
 
 
 def _begin(
@@ -318,8 +312,8 @@ def _begin(
     near: Tensor | float,
     far: Tensor | float,
     radius: float | None,
-) -> tuple[Rays, Found]:
-    """Rays between ``near`` and ``far``, where they are in the ball of ``radius``; and room for what they find.
+) -> tuple[tuple[Tensor, Tensor, Tensor, Tensor, Tensor], Found]:
+    """Flat rays, as `Rays.begin` takes them, inside the ball of ``radius``; and memory for what they find.
 
     The directions are of unit length; ``near`` and ``far`` count in the ``length`` that they had.
     """
@@ -331,7 +325,7 @@ def _begin(
     if radius is not None:
         entry, leave = ball_crossing(origins, directions, radius)
         entries, ends = entry.clamp(min=0), torch.minimum(ends, leave)
-    return Rays.begin(origins, directions, entries, torch.maximum(starts, entries), ends), Found(starts)
+    return (origins, directions, entries, torch.maximum(starts, entries), ends), Found(starts)
 
 
 def _like(number: Tensor | float, other: Tensor) -> Tensor:

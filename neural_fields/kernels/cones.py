@@ -6,12 +6,15 @@
 
 from __future__ import annotations
 
+import torch
 import triton
 import triton.language as tl
 from torch import Tensor
 
-from .launch import Network, on_device, program_count, scratch_for, tiling_of
-from .tiles import planes, rows_of, value_of_tile
+from .launch import launch
+from .packing import Packed
+from .siren import half_scratch
+from .tensor_tiles import keep, rows_of, value_of_tile
 
 __all__ = ["march_cones"]
 
@@ -25,25 +28,20 @@ def march(
     depths,
     margin,
     free,
-    parameters,
+    floats,
+    halves,
     scratch,
     count,
     max_steps,
     lipschitz,
-    omega,
-    gain,
-    PLANES: tl.constexpr,
+    SHAPE: tl.constexpr,
+    SCRATCH: tl.constexpr,
     ROWS: tl.constexpr,
-    WIDTH: tl.constexpr,
-    DEPTH: tl.constexpr,
-    COLUMNS: tl.constexpr,
-    PIECE: tl.constexpr,
-    PRECISION: tl.constexpr,
 ):
     """Every program marches a tile of cones until all have stopped, then the next of its own."""
-    STRIDE: tl.constexpr = (WIDTH + COLUMNS - 1) // COLUMNS * COLUMNS
     infinite = float("inf")
-    own = scratch + tl.cast(tl.program_id(0), tl.int64) * (PLANES * ROWS * STRIDE)
+    own = scratch + tl.cast(tl.program_id(0), tl.int64) * SCRATCH
+    kept = keep(halves, SHAPE)
     ox, oy, oz = tl.load(origin), tl.load(origin + 1), tl.load(origin + 2)
     delta = tl.load(margin)
     for tile in range(tl.program_id(0), tl.cdiv(count, ROWS), tl.num_programs(0)):
@@ -61,9 +59,7 @@ def march(
         while left > 0:
             t = tl.where(on > 0, depth, 0.0)
             points = (ox + t * dx, oy + t * dy, oz + t * dz)
-            value = value_of_tile(
-                points, parameters, own, omega, gain, ROWS, 3, WIDTH, DEPTH, COLUMNS, PIECE, PRECISION
-            )
+            value = value_of_tile(points, floats, halves, kept, own, SHAPE, ROWS, 3)
             passed = value * value_before < 0
             step = ((tl.abs(value) - delta) / lipschitz - t * sigma) / (1 + sigma)
             ahead = tl.where(passed, before, t + tl.maximum(step, 0.0))
@@ -76,12 +72,11 @@ def march(
 
 
 def march_cones(
-    network: Network,
+    network: Packed,
     cones: tuple[Tensor, Tensor, Tensor, Tensor, Tensor],
     margin: Tensor,
     lipschitz: float,
     max_steps: int,
-    precision: str,
 ) -> Tensor:
     """How far each cone is empty ``(C,)``, infinite where it leaves untouched.
 
@@ -92,19 +87,23 @@ def march_cones(
         margin: how far they keep from the surface, a number on the same device.
         lipschitz: see `mplicits.neural_fields.cone_starts`.
         max_steps: see there.
-        precision: see `mplicits.neural_fields.kernels.siren.siren_value`.
     """
     origin, axes, spreads, leaves, depths = (part.contiguous() for part in cones)
-    free = depths.clone()
+    free = torch.empty_like(depths)
     if len(axes):
-        tiling, kept = tiling_of(network.width), planes(network.depth, jet=False)
-        programs = program_count(axes.device, triton.cdiv(len(axes), tiling.rows))
-        with on_device(axes):
-            march[(programs,)](  # pyright: ignore[reportIndexIssue]
-                origin, axes, spreads, leaves, depths, margin, free, network.parameters,
-                scratch_for(axes, programs, kept * tiling.rows * tiling.stride(network.width)),
-                len(axes), max_steps, float(lipschitz), network.omega, network.gain,
-                PLANES=kept, ROWS=tiling.rows, WIDTH=network.width, DEPTH=network.depth, COLUMNS=tiling.columns,
-                PIECE=tiling.piece, PRECISION=precision, num_warps=tiling.warps, num_stages=2,
-            )  # fmt: skip
+        rows = network.shape.rows
+        kept = network.shape.scratch(rows, jet=False)
+        launch(
+            march,
+            axes,
+            triton.cdiv(len(axes), rows),
+            lambda programs: (
+                origin, axes, spreads, leaves, depths, margin, free, network.floats, network.halves,
+                half_scratch(axes, programs * kept), len(axes), max_steps, float(lipschitz),
+            ),
+            SHAPE=tuple(network.shape),
+            SCRATCH=kept,
+            ROWS=rows,
+            warps=rows // 16,
+        )  # fmt: skip
     return free

@@ -6,18 +6,32 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Hashable, Sequence
+from typing import Any, NamedTuple
 
 import torch
 import triton
 from torch import Tensor
 
-__all__ = ["Network", "Tiling", "on_device", "program_count", "scratch_for", "tiling_of"]
+__all__ = [
+    "Network",
+    "Tiling",
+    "launch",
+    "multiprocessors",
+    "on_device",
+    "program_count",
+    "resident_programs",
+    "scratch_for",
+    "tiling_of",
+]
 
 # Programs for each multiprocessor. By their registers two run beside each other, one of the jet of 128 units; the other
 # comes after it.
 PROGRAMS_PER_MULTIPROCESSOR = 2
+# Of a multiprocessor, of compute capability 8.0 and later: registers; and of a warp, threads.
+REGISTERS, WARP = 1 << 16, 32
+# Bytes of shared memory that the driver keeps for each program.
+RESERVED_SHARED = 1 << 10
 # The interpreter runs one after the other; three show what several do.
 INTERPRETED_PROGRAMS = 3
 # Up to this width an accumulator holds all units of a layer.
@@ -101,3 +115,66 @@ def scratch_for(x: Tensor, programs: int, floats: int) -> Tensor:
 def on_device(x: Tensor) -> contextlib.AbstractContextManager[object]:
     """Triton launches on the current device; make it that of ``x``."""
     return torch.cuda.device(x.device) if x.is_cuda else contextlib.nullcontext()
+
+
+# Programs that a multiprocessor holds at a time, of each compiled kernel.
+_resident: dict[Hashable, int] = {}
+
+
+def launch(
+    kernel: Any,
+    like: Tensor,
+    tiles: int,
+    arguments: Callable[[int], Sequence[object]],
+    *,
+    warps: int = 4,
+    stages: int = 2,
+    registers: int | None = None,
+    **constants: Any,
+) -> None:
+    """Launch as many programs of a kernel as the device holds at a time, and no more than there are ``tiles``.
+
+    How many a multiprocessor holds follows from the registers and the shared memory of the compiled kernel. The first
+    launch, which compiles it, has one program for each.
+
+    Args:
+        kernel: of Triton.
+        like: a tensor on the device.
+        tiles: pieces of work, at least 1.
+        arguments: from the number of programs to the kernel's arguments.
+        warps: of a program.
+        stages: depth of the pipeline of loads in loops.
+        registers: most of them that a thread may take, so that more programs run at a time; None for the compiler's
+            choice.
+        constants: what the kernel is compiled for.
+    """
+    options = {**constants, "num_warps": warps, "num_stages": stages}
+    if registers is not None and like.is_cuda:
+        options["maxnreg"] = registers
+    if not like.is_cuda:
+        programs = min(tiles, INTERPRETED_PROGRAMS)
+        kernel[(programs,)](*arguments(programs), **options)
+        return
+    key = (id(kernel), like.device, *options.items())
+    programs = min(tiles, multiprocessors(like.device) * _resident.get(key, 1))
+    with on_device(like):
+        compiled = kernel[(programs,)](*arguments(programs), **options)
+    if key not in _resident:
+        _resident[key] = resident_programs(
+            compiled.n_regs, compiled.metadata.shared, warps, torch.cuda.get_device_properties(like.device)
+        )
+
+
+def resident_programs(registers: int, shared: int, warps: int, properties: Any) -> int:
+    """Programs that one multiprocessor holds at a time.
+
+    Args:
+        registers: of a thread.
+        shared: bytes of a program.
+        warps: of a program.
+        properties: of the device, as PyTorch gives them.
+    """
+    by_registers = REGISTERS // (-(-registers // 8) * 8 * WARP * warps)
+    by_shared = properties.shared_memory_per_multiprocessor // (shared + RESERVED_SHARED)
+    by_threads = properties.max_threads_per_multi_processor // (WARP * warps)
+    return max(1, min(by_registers, by_shared, by_threads))

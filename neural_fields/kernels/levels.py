@@ -27,10 +27,12 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from .launch import Network, on_device, program_count, scratch_for, tiling_of
-from .tiles import jet_of_tile, planes, points_of, rows_of, value_of_tile
+from .launch import launch
+from .packing import Packed, Shape
+from .siren import half_scratch
+from .tensor_tiles import jet_of_tile, points_of, rows_of, value_of_tile
 
-__all__ = ["Levels", "gate_of", "levels_jet", "levels_value"]
+__all__ = ["Levels", "gate_of", "level_of_tile", "levels_jet", "levels_value", "walk_rows"]
 
 
 class Levels(NamedTuple):
@@ -42,75 +44,54 @@ class Levels(NamedTuple):
         taper: the share of a band over which its gate closes.
     """
 
-    networks: tuple[Network, ...]
+    networks: tuple[Packed, ...]
     deltas: Tensor
     taper: float
 
     @classmethod
-    def of(cls, networks: Sequence[Network], deltas: Tensor, taper: float) -> Levels:
+    def of(cls, networks: Sequence[Packed], deltas: Tensor, taper: float) -> Levels:
         """Up to as many levels as there are ``networks``."""
         return cls(tuple(networks), deltas[: len(networks) - 1].to(torch.float32).contiguous(), float(taper))
 
+    @property
+    def shapes(self) -> tuple[tuple[int, ...], ...]:
+        """What kernels are compiled for, of each level."""
+        return tuple(tuple(network.shape) for network in self.networks)
+
     def arguments(self) -> tuple[object, ...]:
-        """Pointers to parameters, ω₀ and gains of the levels, and half-widths, as kernels take them."""
-        omegas, gains = (tuple(getattr(one, name) for one in self.networks) for name in ("omega", "gain"))
-        return tuple(one.parameters for one in self.networks), omegas, gains, self.deltas
+        """Pointers to the levels' numbers and to half-widths, as kernels take them."""
+        floats, halves = (tuple(getattr(one, name) for one in self.networks) for name in ("floats", "halves"))
+        return floats, halves, self.deltas
 
-    def shape(self, *, jet: bool) -> Shape:
-        """See `Shape`; ``jet`` says whether the kernel makes gradients."""
-        tilings = [tiling_of(one.width) for one in self.networks]
-        return Shape(
-            sizes=tuple((n.width, n.depth, t.columns, t.piece) for n, t in zip(self.networks, tilings, strict=True)),
-            rows=tilings[0].rows,
-            floats=max(
-                planes(n.depth, jet=jet) * t.rows * t.stride(n.width)
-                for n, t in zip(self.networks, tilings, strict=True)
-            ),
-            warps=max(t.warps for t in tilings),
-        )
+    def scratch(self, *, jet: bool) -> int:
+        """Float16 numbers that a program needs for any of the levels."""
+        return max(Shape(*shape).scratch(self.rows, jet=jet) for shape in self.shapes)
 
-
-class Shape(NamedTuple):
-    """What a kernel over levels is compiled for.
-
-    Attributes:
-        sizes: width, depth, units of an accumulator and inner units of a product, of each level.
-        rows: of a tile, the same for all levels.
-        floats: of scratch that a program needs for the widest level.
-        warps: of a program.
-    """
-
-    sizes: tuple[tuple[int, int, int, int], ...]
-    rows: int
-    floats: int
-    warps: int
+    @property
+    def rows(self) -> int:
+        """Points of a tile of any level."""
+        return max(network.shape.rows for network in self.networks)
 
 
 @triton.jit
 def level_of_tile(
     LEVEL: tl.constexpr,
     points,
-    parameters,
+    floats,
+    halves,
+    kept,
     scratch,
-    omegas,
-    gains,
     JET: tl.constexpr,
-    SIZES: tl.constexpr,
+    SHAPES: tl.constexpr,
     ROWS: tl.constexpr,
     IN: tl.constexpr,
-    PRECISION: tl.constexpr,
 ):
     """One level of a tile: its value, and its gradient as a tuple of columns, which is empty unless ``JET``."""
-    WIDTH: tl.constexpr = SIZES[LEVEL][0]
-    DEPTH: tl.constexpr = SIZES[LEVEL][1]
-    COLUMNS: tl.constexpr = SIZES[LEVEL][2]
-    PIECE: tl.constexpr = SIZES[LEVEL][3]
-    own, omega, gain = parameters[LEVEL], omegas[LEVEL], gains[LEVEL]
+    SHAPE: tl.constexpr = SHAPES[LEVEL]
     if JET:
-        return jet_of_tile(points, own, scratch, omega, gain, ROWS, IN, WIDTH, DEPTH, COLUMNS, PIECE, PRECISION)
+        return jet_of_tile(points, floats[LEVEL], halves[LEVEL], scratch, SHAPE, ROWS, IN)
     else:
-        f = value_of_tile(points, own, scratch, omega, gain, ROWS, IN, WIDTH, DEPTH, COLUMNS, PIECE, PRECISION)
-        return f, ()
+        return value_of_tile(points, floats[LEVEL], halves[LEVEL], kept, scratch, SHAPE, ROWS, IN), ()
 
 
 @triton.jit
@@ -133,48 +114,48 @@ def append(entries, length, entry, chosen):
     return length + tl.sum(chosen.to(tl.int32), axis=0)
 
 
-@triton.jit(do_not_specialize=["count", "room"])
+@triton.jit(do_not_specialize=["room"])
 def walk(
     x,
     wanted,
-    parameters,
-    omegas,
-    gains,
+    floats,
+    halves,
     deltas,
     value,
     gradient,
     lists,
     scratch,
-    count,
+    counted,
     room,
     taper,
     JET: tl.constexpr,
     WANTED: tl.constexpr,
     TAPERED: tl.constexpr,
-    SIZES: tl.constexpr,
-    FLOATS: tl.constexpr,
+    SHAPES: tl.constexpr,
+    SCRATCH: tl.constexpr,
     ROWS: tl.constexpr,
     IN: tl.constexpr,
-    PRECISION: tl.constexpr,
 ):
     """Every program takes tiles from its own number on, and has a list with ``room`` for all their rows."""
-    LEVELS: tl.constexpr = len(SIZES)
+    LEVELS: tl.constexpr = len(SHAPES)
     program = tl.cast(tl.program_id(0), tl.int64)
-    own, listed = scratch + program * FLOATS, lists + program * room
+    own, listed = scratch + program * SCRATCH, lists + program * room
     length = tl.full((), 0, tl.int32)
+    count = tl.load(counted)
     for tile in range(tl.program_id(0), tl.cdiv(count, ROWS), tl.num_programs(0)):
         row = rows_of(tile, ROWS)
         real = row < count
         points = points_of(x, row, real, IN)
-        f, slope = level_of_tile(0, points, parameters, own, omegas, gains, JET, SIZES, ROWS, IN, PRECISION)
+        f, slope = level_of_tile(0, points, floats, halves, (), own, JET, SHAPES, ROWS, IN)
         tl.store(value + row, f, mask=real)
         if JET:
             for axis in tl.static_range(IN):
                 tl.store(gradient + row * IN + axis, slope[axis], mask=real)
-        inside = real & (tl.abs(f) < tl.load(deltas))
-        if WANTED:
-            inside = inside & (tl.load(wanted + row, mask=real, other=0) != 0)
-        length = append(listed, length, row, inside)
+        if LEVELS > 1:
+            inside = real & (tl.abs(f) < tl.load(deltas))
+            if WANTED:
+                inside = inside & (tl.load(wanted + row, mask=real, other=0) != 0)
+            length = append(listed, length, row, inside)
 
     for level in tl.static_range(1, LEVELS):
         tl.debug_barrier()  # what one thread wrote and listed, others read
@@ -188,7 +169,7 @@ def walk(
             points = points_of(x, row, there, IN)
             before = tl.load(value + row, mask=there, other=0.0)
             gate, fall = gate_of(before, delta, taper, TAPERED)
-            r, slope = level_of_tile(level, points, parameters, own, omegas, gains, JET, SIZES, ROWS, IN, PRECISION)
+            r, slope = level_of_tile(level, points, floats, halves, (), own, JET, SHAPES, ROWS, IN)
             f = before + gate * r
             if JET:
                 steeper = 1 + fall * r
@@ -203,41 +184,73 @@ def walk(
             done += ROWS
 
 
-def levels_value(x: Tensor, levels: Levels, precision: str, wanted: Tensor | None = None) -> Tensor:
+def levels_value(x: Tensor, levels: Levels, wanted: Tensor | None = None) -> Tensor:
     """The finest level at points ``(N, d)`` → ``(N,)``; N may be 0.
 
     Args:
         x: float32, on a CUDA device, or on the CPU under the interpreter.
         levels: two or more, on the same.
-        precision: "ieee", "tf32x3" or "tf32".
         wanted: ``(N,)`` bool, the points that are let into bands; None for all.
     """
     value = x.new_empty(len(x))
-    _launch(x, levels, precision, wanted, value, value, jet=False)
+    walk_rows(x, levels, value, value, wanted, jet=False)
     return value
 
 
-def levels_jet(x: Tensor, levels: Levels, precision: str, wanted: Tensor | None = None) -> tuple[Tensor, Tensor]:
+def levels_jet(x: Tensor, levels: Levels, wanted: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """The finest level and its gradient at ``(N, d)`` → ``(N,)``, ``(N, d)``; for the arguments see `levels_value`."""
     value, gradient = x.new_empty(len(x)), x.new_empty(x.shape)
-    _launch(x, levels, precision, wanted, value, gradient, jet=True)
+    walk_rows(x, levels, value, gradient, wanted, jet=True)
     return value, gradient
 
 
-def _launch(
-    x: Tensor, levels: Levels, precision: str, wanted: Tensor | None, value: Tensor, gradient: Tensor, *, jet: bool
+def walk_rows(
+    x: Tensor,
+    levels: Levels,
+    value: Tensor,
+    gradient: Tensor,
+    wanted: Tensor | None = None,
+    count: Tensor | None = None,
+    *,
+    jet: bool,
 ) -> None:
+    """Write values, and with ``jet`` gradients, of the first rows of ``x``.
+
+    Args:
+        x: ``(N, d)``.
+        levels: one or more.
+        value: ``(N,)``, written.
+        gradient: ``(N, d)``, written with ``jet``.
+        wanted: see `levels_value`.
+        count: how many rows, an integer tensor on the device; None for all.
+        jet: whether gradients are made.
+    """
     if not len(x):
         return
-    shape = levels.shape(jet=jet)
-    tiles = triton.cdiv(len(x), shape.rows)
-    programs = program_count(x.device, tiles)
-    room = triton.cdiv(tiles, programs) * shape.rows
-    lists = torch.empty(programs * room, dtype=torch.int64, device=x.device)
-    with on_device(x):
-        walk[(programs,)](  # pyright: ignore[reportIndexIssue]
-            x.contiguous(), lists if wanted is None else wanted.contiguous().view(torch.int8), *levels.arguments(),
-            value, gradient, lists, scratch_for(x, programs, shape.floats), len(x), room, levels.taper,
-            JET=jet, WANTED=wanted is not None, TAPERED=levels.taper > 0, SIZES=shape.sizes, FLOATS=shape.floats,
-            ROWS=shape.rows, IN=x.shape[1], PRECISION=precision, num_warps=shape.warps, num_stages=2,
-        )  # fmt: skip
+    x = x.contiguous()
+    rows, kept = levels.rows, levels.scratch(jet=jet)
+    tiles = triton.cdiv(len(x), rows)
+    counted = x.new_full((1,), len(x), dtype=torch.int64) if count is None else count
+
+    def arguments(programs: int) -> tuple[object, ...]:
+        room = triton.cdiv(tiles, programs) * rows
+        lists = torch.empty(programs * room, dtype=torch.int64, device=x.device)
+        chosen = lists if wanted is None else wanted.contiguous().view(torch.int8)
+        scratch = half_scratch(x, programs * kept)
+        return x, chosen, *levels.arguments(), value, gradient, lists, scratch, counted, room, levels.taper
+
+    launch(
+        walk,
+        x,
+        tiles,
+        arguments,
+        JET=jet,
+        WANTED=wanted is not None,
+        TAPERED=levels.taper > 0,
+        SHAPES=levels.shapes,
+        SCRATCH=kept,
+        ROWS=rows,
+        IN=x.shape[1],
+        stages=1,
+        warps=rows // 16,
+    )

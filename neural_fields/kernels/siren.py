@@ -1,103 +1,101 @@
-"""Value, or value and gradient, of a SIREN in one launch: the kernel, and what calls it."""
+"""Value, or value and gradient, of a SIREN in one launch, without a graph."""
 
 # pyright: reportGeneralTypeIssues=false, reportArgumentType=false, reportCallIssue=false
 # pyright: reportAttributeAccessIssue=false, reportMissingImports=false
 
 from __future__ import annotations
 
+import torch
 import triton
 import triton.language as tl
 from torch import Tensor
 
-from .launch import Network, on_device, program_count, scratch_for, tiling_of
-from .tiles import jet_of_tile, planes, points_of, rows_of, value_of_tile
+from .launch import launch
+from .packing import Packed
+from .tensor_tiles import jet_of_tile, keep, points_of, rows_of, value_of_tile
 
-__all__ = ["siren_jet", "siren_value"]
+__all__ = ["half_scratch", "siren_jet", "siren_value"]
 
 
 @triton.jit(do_not_specialize=["count"])
 def evaluate(
     x,
-    parameters,
+    floats,
+    halves,
     value,
     gradient,
     scratch,
     count,
-    omega,
-    gain,
     JET: tl.constexpr,
-    PLANES: tl.constexpr,
+    SHAPE: tl.constexpr,
+    SCRATCH: tl.constexpr,
     ROWS: tl.constexpr,
     IN: tl.constexpr,
-    WIDTH: tl.constexpr,
-    DEPTH: tl.constexpr,
-    COLUMNS: tl.constexpr,
-    PIECE: tl.constexpr,
-    PRECISION: tl.constexpr,
 ):
     """Every program takes tiles from its own number on, in steps of how many programs there are."""
-    STRIDE: tl.constexpr = (WIDTH + COLUMNS - 1) // COLUMNS * COLUMNS
-    own = scratch + tl.program_id(0).to(tl.int64) * (PLANES * ROWS * STRIDE)
+    own = scratch + tl.program_id(0).to(tl.int64) * SCRATCH
+    kept = ()
+    if not JET:
+        kept = keep(halves, SHAPE)
     for tile in range(tl.program_id(0), tl.cdiv(count, ROWS), tl.num_programs(0)):
         row = rows_of(tile, ROWS)
         real = row < count
         points = points_of(x, row, real, IN)
         if JET:
-            f, slope = jet_of_tile(
-                points, parameters, own, omega, gain, ROWS, IN, WIDTH, DEPTH, COLUMNS, PIECE, PRECISION
-            )
+            f, slope = jet_of_tile(points, floats, halves, own, SHAPE, ROWS, IN)
             for axis in tl.static_range(IN):
                 tl.store(gradient + row * IN + axis, slope[axis], mask=real)
         else:
-            f = value_of_tile(points, parameters, own, omega, gain, ROWS, IN, WIDTH, DEPTH, COLUMNS, PIECE, PRECISION)
+            f = value_of_tile(points, floats, halves, kept, own, SHAPE, ROWS, IN)
         tl.store(value + row, f, mask=real)
 
 
-def siren_value(x: Tensor, network: Network, precision: str) -> Tensor:
+def siren_value(x: Tensor, network: Packed) -> Tensor:
     """F at points ``(N, d)`` → ``(N,)``; N may be 0.
 
     Args:
         x: float32, on a CUDA device, or on the CPU under the interpreter.
         network: on the same.
-        precision: "ieee", "tf32x3" or "tf32".
     """
     value = x.new_empty(len(x))
-    _launch(x, network, precision, value, value, jet=False)
+    _launch(x, network, value, value, jet=False)
     return value
 
 
-def siren_jet(x: Tensor, network: Network, precision: str) -> tuple[Tensor, Tensor]:
+def siren_jet(x: Tensor, network: Packed) -> tuple[Tensor, Tensor]:
     """F and its gradient at points ``(N, d)`` → ``(N,)``, ``(N, d)``; for the arguments see `siren_value`."""
     value, gradient = x.new_empty(len(x)), x.new_empty(x.shape)
-    _launch(x, network, precision, value, gradient, jet=True)
+    _launch(x, network, value, gradient, jet=True)
     return value, gradient
 
 
-def _launch(x: Tensor, network: Network, precision: str, value: Tensor, gradient: Tensor, *, jet: bool) -> None:
+def half_scratch(like: Tensor, numbers: int) -> Tensor:
+    """Memory for so many float16 numbers, at least one, with nothing in it yet."""
+    return torch.empty(max(1, numbers), dtype=torch.float16, device=like.device)
+
+
+def _launch(x: Tensor, network: Packed, value: Tensor, gradient: Tensor, *, jet: bool) -> None:
     if not len(x):
         return
-    tiling = tiling_of(network.width)
-    programs = program_count(x.device, triton.cdiv(len(x), tiling.rows))
-    kept = planes(network.depth, jet=jet)
-    with on_device(x):
-        evaluate[(programs,)](  # pyright: ignore[reportIndexIssue]
-            x.contiguous(),
-            network.parameters,
+    x, rows = x.contiguous(), network.shape.rows
+    kept = network.shape.scratch(rows, jet=jet)
+    launch(
+        evaluate,
+        x,
+        triton.cdiv(len(x), rows),
+        lambda programs: (
+            x,
+            network.floats,
+            network.halves,
             value,
             gradient,
-            scratch_for(x, programs, kept * tiling.rows * tiling.stride(network.width)),
+            half_scratch(x, programs * kept),
             len(x),
-            network.omega,
-            network.gain,
-            JET=jet,
-            PLANES=kept,
-            ROWS=tiling.rows,
-            IN=x.shape[1],
-            WIDTH=network.width,
-            DEPTH=network.depth,
-            COLUMNS=tiling.columns,
-            PIECE=tiling.piece,
-            PRECISION=precision,
-            num_warps=tiling.warps,
-            num_stages=2,
-        )
+        ),
+        JET=jet,
+        SHAPE=tuple(network.shape),
+        SCRATCH=kept,
+        ROWS=rows,
+        IN=x.shape[1],
+        warps=rows // 16,
+    )

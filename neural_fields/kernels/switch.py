@@ -3,10 +3,8 @@
 They are used wherever they can be: float32 on CUDA, with Triton there (``pip install 'mplicits[kernels]'``; PyTorch's
 builds for CUDA bring it). The environment variable ``MPLICITS_KERNELS`` says otherwise:
 
-    auto       the kernels where they can be used, products in IEEE float32 (the default)
+    auto       the kernels where they can be used (the default)
     off        PyTorch everywhere
-    tf32x3     as auto; products on tensor cores, each operand in two parts: near float32's error
-    tf32       as auto; products on tensor cores, with operands of 11 bits: errors of 1e-3 of the terms
     interpret  the kernels on the CPU too, by Triton's interpreter, which TRITON_INTERPRET=1 has to switch on: for tests
 
 This file does not import Triton.
@@ -27,7 +25,7 @@ from ..errors import InputError
 __all__ = ["MAX_DEPTH", "MAX_LEVELS", "MAX_WIDTH", "MODES", "VARIABLE", "Choice", "choose", "mode", "obstacle"]
 
 VARIABLE = "MPLICITS_KERNELS"
-MODES = ("auto", "off", "tf32x3", "tf32", "interpret")
+MODES = ("auto", "off", "interpret")
 # What is tested; wider and deeper ones would run, and keep more in scratch than caches hold.
 MAX_WIDTH, MAX_DEPTH = 512, 8
 # A kernel over levels has the code of each; compiling takes some seconds for one of them.
@@ -40,11 +38,11 @@ class Choice(NamedTuple):
     """How a network will be evaluated.
 
     Attributes:
-        precision: of the kernels' products, "ieee", "tf32x3" or "tf32"; empty where PyTorch evaluates.
+        fused: whether the kernels evaluate it.
         reason: why PyTorch does; empty where the kernels do.
     """
 
-    precision: str
+    fused: bool
     reason: str
 
 
@@ -89,7 +87,7 @@ def choose(x: Tensor, *, width: int, depth: int, features: int = 0, levels: int 
         reason = f"{levels} levels are more than {MAX_LEVELS}; they are evaluated one by one"
     else:
         reason = obstacle(x.device, asked)
-    return Choice("", reason) if reason else Choice(asked if asked.startswith("tf32") else "ieee", "")
+    return Choice(not reason, reason)
 
 
 @functools.cache

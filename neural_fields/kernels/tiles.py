@@ -1,4 +1,4 @@
-"""What one program does with a tile of points: value, or value and gradient, of a network of any width.
+"""What one program does with a tile of points in IEEE float32: value and gradient of a network of any width.
 
 A tile is a matrix of ROWS points; a product is made COLUMNS units at a time, in an accumulator (ROWS, COLUMNS) that
 stays in registers, PIECE inner units after PIECE. Where it is as wide as the network (up to 128 units):
@@ -7,11 +7,11 @@ stays in registers, PIECE inner units after PIECE. Where it is as wide as the ne
 - the last one goes from its accumulator into the output's sum;
 - the first layer's cosines are made again from the points for the end of the sweep back.
 
-So a value of (128, 2) touches no memory but points, weights and the result, and a jet puts one matrix aside, s₂. What
-is put aside lies in a scratch of the program's own, as many `planes` of ROWS times its width, small enough for caches:
-layer i in plane i mod 2, on the way up and on the way back, since that of layer i − 1 is free by then; and after these
-two the cosines of the layers between first and last. Products read a plane piece by piece, in a loop: a product over
-all inner units at once is unrolled, and spills thousands of bytes of registers.
+So a jet of (128, 2) puts one matrix aside, s₂. What is put aside lies in a scratch of the program's own, as many
+`planes` of ROWS times its width, small enough for caches: layer i in plane i mod 2, on the way up and on the way back,
+since that of layer i − 1 is free by then; and after these two the cosines of the layers between first and last.
+Products read a plane piece by piece, in a loop: a product over all inner units at once is unrolled, and spills
+thousands of bytes of registers.
 
 Units beyond the width have weights and biases of 0: their sines are 0, and 0 is swept back to them.
 """
@@ -34,7 +34,6 @@ __all__ = [
     "product_from",
     "rows_of",
     "sine",
-    "value_of_tile",
 ]
 
 # The interpreter runs kernels with numpy and has no libdevice; its sine is numpy's.
@@ -104,7 +103,6 @@ def product_from(
     STRIDE: tl.constexpr,
     PIECE: tl.constexpr,
     TRANSPOSED: tl.constexpr,
-    PRECISION: tl.constexpr,
 ):
     """Z + P Wᵀ (``TRANSPOSED``: on the way up) or z + P W (on the way back) for some units, P a plane."""
     row = tl.arange(0, z.shape[0])
@@ -116,7 +114,7 @@ def product_from(
             matrix = tl.load(weight + unit[None, :] * WIDTH + inner[:, None], mask=real, other=0.0)
         else:
             matrix = tl.load(weight + inner[:, None] * WIDTH + unit[None, :], mask=real, other=0.0)
-        z = tl.dot(kept, matrix, z, input_precision=PRECISION)
+        z = tl.dot(kept, matrix, z, input_precision="ieee")
     return z
 
 
@@ -130,7 +128,6 @@ def _second_from_points(
     WIDTH: tl.constexpr,
     IN: tl.constexpr,
     PIECE: tl.constexpr,
-    PRECISION: tl.constexpr,
 ):
     """Z + h₁W₂ᵀ for some units, each piece of h₁ made on the way."""
     for first in range(0, WIDTH, PIECE):
@@ -138,7 +135,7 @@ def _second_from_points(
         h = sine(first_phase(points, parameters[0], parameters[1], inner, omega, WIDTH, IN))
         real = (inner < WIDTH)[:, None] & (unit < WIDTH)[None, :]
         matrix = tl.load(parameters[2] + unit[None, :] * WIDTH + inner[:, None], mask=real, other=0.0)
-        z = tl.dot(h, matrix, z, input_precision=PRECISION)
+        z = tl.dot(h, matrix, z, input_precision="ieee")
     return z
 
 
@@ -156,7 +153,6 @@ def _phase(
     STRIDE: tl.constexpr,
     COLUMNS: tl.constexpr,
     PIECE: tl.constexpr,
-    PRECISION: tl.constexpr,
 ):
     """The phases ω₀(W h + b) of some units of a layer, counted from 0, whose layer below is kept or easily made."""
     if LAYER == 0:
@@ -165,66 +161,11 @@ def _phase(
         bias = tl.load(parameters[2 * LAYER + 1] + unit, mask=unit < WIDTH, other=0.0)
         z = tl.zeros((ROWS, COLUMNS), tl.float32) + bias[None, :]
         if LAYER == 1 and STRIDE == COLUMNS:
-            z = _second_from_points(points, z, parameters, unit, omega, WIDTH, IN, PIECE, PRECISION)
+            z = _second_from_points(points, z, parameters, unit, omega, WIDTH, IN, PIECE)
         else:
             below = scratch + ((LAYER - 1) % 2) * ROWS * STRIDE
-            z = product_from(below, z, parameters[2 * LAYER], unit, WIDTH, STRIDE, PIECE, True, PRECISION)
+            z = product_from(below, z, parameters[2 * LAYER], unit, WIDTH, STRIDE, PIECE, True)
         return omega * z
-
-
-@triton.jit
-def value_of_tile(
-    points,
-    parameters,
-    scratch,
-    omega,
-    gain,
-    ROWS: tl.constexpr,
-    IN: tl.constexpr,
-    WIDTH: tl.constexpr,
-    DEPTH: tl.constexpr,
-    COLUMNS: tl.constexpr,
-    PIECE: tl.constexpr,
-    PRECISION: tl.constexpr,
-):
-    """F of a tile, (ROWS,).
-
-    Args:
-        points: the coordinates, a tuple of IN columns (ROWS,).
-        parameters: pointers (W₁, b₁, …, W_d, b_d, w_out, b_out) to what the module keeps, without ω₀.
-        scratch: pointer to what the program may write, `planes` times ROWS times its padded width.
-        omega: what phases are multiplied by, ω₀ times the unit of the sine layers' parameters.
-        gain: the unit of the output's parameters.
-        ROWS: points of a tile.
-        IN: coordinates of a point.
-        WIDTH: of the sine layers.
-        DEPTH: how many sine layers.
-        COLUMNS: units of an accumulator, a power of two ≥ 16.
-        PIECE: inner units of one ``tl.dot``, a power of two ≥ 16 and at most COLUMNS.
-        PRECISION: of the products, "ieee", "tf32x3" or "tf32".
-    """
-    BLOCKS: tl.constexpr = (WIDTH + COLUMNS - 1) // COLUMNS
-    STRIDE: tl.constexpr = BLOCKS * COLUMNS
-    row = tl.arange(0, ROWS)
-    value = tl.zeros((ROWS,), tl.float32)
-    for layer in tl.static_range(DEPTH):
-        if layer == DEPTH - 1 or layer > 0 or BLOCKS > 1:  # else the next product makes this layer itself
-            for block in range(BLOCKS):
-                unit = block * COLUMNS + tl.arange(0, COLUMNS)
-                h = sine(
-                    _phase(
-                        points, parameters, scratch, unit, omega,
-                        layer, ROWS, IN, WIDTH, STRIDE, COLUMNS, PIECE, PRECISION,
-                    )
-                )  # fmt: skip
-                if layer == DEPTH - 1:
-                    last = tl.load(parameters[2 * DEPTH] + unit, mask=unit < WIDTH, other=0.0)
-                    value += tl.sum(h * last[None, :], axis=1)
-                else:
-                    own = scratch + (layer % 2) * ROWS * STRIDE
-                    tl.store(own + row[:, None] * STRIDE + unit[None, :], h)
-            tl.debug_barrier()  # what one thread put aside, others read
-    return gain * (value + tl.load(parameters[2 * DEPTH + 1]))
 
 
 @triton.jit
@@ -240,12 +181,23 @@ def jet_of_tile(
     DEPTH: tl.constexpr,
     COLUMNS: tl.constexpr,
     PIECE: tl.constexpr,
-    PRECISION: tl.constexpr,
 ):
     """F of a tile (ROWS,), and its gradient, a tuple of IN columns (ROWS,); both sweeps.
 
-    As in `siren.py`, with ω₀ beside the cosines: s_i = g_i ⊙ ω₀ cos ω₀z_i, g_{i−1} = s_i W_i. For the arguments see
-    `value_of_tile`.
+    As in `siren.py`, with ω₀ beside the cosines: s_i = g_i ⊙ ω₀ cos ω₀z_i, g_{i−1} = s_i W_i.
+
+    Args:
+        points: the coordinates, a tuple of IN columns (ROWS,).
+        parameters: pointers (W₁, b₁, …, W_d, b_d, w_out, b_out) to what the module keeps, without ω₀.
+        scratch: pointer to what the program may write, `planes` times ROWS times its padded width.
+        omega: what phases are multiplied by, ω₀ times the unit of the sine layers' parameters.
+        gain: the unit of the output's parameters.
+        ROWS: points of a tile.
+        IN: coordinates of a point.
+        WIDTH: of the sine layers.
+        DEPTH: how many sine layers.
+        COLUMNS: units of an accumulator, a power of two ≥ 16.
+        PIECE: inner units of one ``tl.dot``, a power of two ≥ 16 and at most COLUMNS.
     """
     BLOCKS: tl.constexpr = (WIDTH + COLUMNS - 1) // COLUMNS
     STRIDE: tl.constexpr = BLOCKS * COLUMNS
@@ -259,7 +211,7 @@ def jet_of_tile(
                 cell = row[:, None] * STRIDE + unit[None, :]
                 z = _phase(
                     points, parameters, scratch, unit, omega,
-                    layer, ROWS, IN, WIDTH, STRIDE, COLUMNS, PIECE, PRECISION,
+                    layer, ROWS, IN, WIDTH, STRIDE, COLUMNS, PIECE,
                 )  # fmt: skip
                 tl.store(scratch + (layer % 2) * PLANE + cell, sine(z))
                 if layer > 0:
@@ -273,7 +225,7 @@ def jet_of_tile(
         unit = block * COLUMNS + tl.arange(0, COLUMNS)
         z = _phase(
             points, parameters, scratch, unit, omega,
-            DEPTH - 1, ROWS, IN, WIDTH, STRIDE, COLUMNS, PIECE, PRECISION,
+            DEPTH - 1, ROWS, IN, WIDTH, STRIDE, COLUMNS, PIECE,
         )  # fmt: skip
         last = gain * tl.load(parameters[2 * DEPTH] + unit, mask=unit < WIDTH, other=0.0)
         value += tl.sum(sine(z) * last[None, :], axis=1)
@@ -290,7 +242,7 @@ def jet_of_tile(
             cell = row[:, None] * STRIDE + unit[None, :]
             above = scratch + ((layer + 1) % 2) * PLANE
             g = tl.zeros((ROWS, COLUMNS), tl.float32)
-            g = product_from(above, g, parameters[2 * layer + 2], unit, WIDTH, STRIDE, PIECE, False, PRECISION)
+            g = product_from(above, g, parameters[2 * layer + 2], unit, WIDTH, STRIDE, PIECE, False)
             if layer == 0:
                 s = g * (omega * cosine(first_phase(points, parameters[0], parameters[1], unit, omega, WIDTH, IN)))
                 gradient = add_first(gradient, s, parameters[0], unit, WIDTH, IN)

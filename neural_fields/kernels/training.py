@@ -54,7 +54,6 @@ def sweep(
     DEPTH: tl.constexpr,
     COLUMNS: tl.constexpr,
     PIECE: tl.constexpr,
-    PRECISION: tl.constexpr,
 ):
     """Every program takes tiles in turn, and adds what they say of the weights to sums of its own."""
     BLOCKS: tl.constexpr = (WIDTH + COLUMNS - 1) // COLUMNS
@@ -86,7 +85,7 @@ def sweep(
                     z = tl.zeros((ROWS, COLUMNS), tl.float32) + bias[None, :]
                     below = kept + (layer - 1) * PLANE
                     weight = parameters[2 * layer]
-                    z = omega * product_from(below, z, weight, unit, WIDTH, STRIDE, PIECE, True, PRECISION)
+                    z = omega * product_from(below, z, weight, unit, WIDTH, STRIDE, PIECE, True)
                 tl.store(cell, sine(z))
                 tl.store(cell + SLOPES, omega * cosine(z))
             tl.debug_barrier()
@@ -100,7 +99,7 @@ def sweep(
                     g += gain * tl.load(parameters[2 * DEPTH] + unit, mask=unit < WIDTH, other=0.0)[None, :]
                 else:
                     above, weight = kept + SWEPT + (layer + 1) * PLANE, parameters[2 * layer + 2]
-                    g = product_from(above, g, weight, unit, WIDTH, STRIDE, PIECE, False, PRECISION)
+                    g = product_from(above, g, weight, unit, WIDTH, STRIDE, PIECE, False)
                 tl.store(cell + BACK, g)
                 tl.store(cell + SWEPT, g * tl.load(cell + SLOPES))
             tl.debug_barrier()
@@ -116,7 +115,7 @@ def sweep(
                         v += cotangents[axis][:, None] * column[None, :]
                 else:
                     below, weight = kept + TANGENTS + (layer - 1) * PLANE, parameters[2 * layer]
-                    v = product_from(below, v, weight, unit, WIDTH, STRIDE, PIECE, True, PRECISION)
+                    v = product_from(below, v, weight, unit, WIDTH, STRIDE, PIECE, True)
                 tl.store(cell + TANGENTS, v * tl.load(cell + SLOPES))
                 bent = tl.load(cell + BACK) * tl.load(cell)
                 tl.store(cell + BACK, -(omega * omega) * v * bent)
@@ -135,7 +134,7 @@ def sweep(
                     h_bar += f_bar[:, None] * last[None, :]
                 else:
                     above, weight = kept + BACK + (layer + 1) * PLANE, parameters[2 * layer + 2]
-                    h_bar = product_from(above, h_bar, weight, unit, WIDTH, STRIDE, PIECE, False, PRECISION)
+                    h_bar = product_from(above, h_bar, weight, unit, WIDTH, STRIDE, PIECE, False)
                 z_bar = h_bar * tl.load(cell + SLOPES) + tl.load(cell + BACK)
                 tl.store(cell + BACK, z_bar)
                 if layer == 0:
@@ -147,7 +146,7 @@ def sweep(
         _add_ends(own, kept, points, cotangents, f_bar, gain, ROWS, IN, WIDTH, DEPTH, COLUMNS)
         for layer in tl.static_range(1, DEPTH):
             target = own + WIDTH * (IN + 1) + (layer - 1) * WIDTH * (WIDTH + 1)
-            _add_products(target, kept + layer * PLANE, ROWS, WIDTH, DEPTH, COLUMNS, PIECE, PRECISION)
+            _add_products(target, kept + layer * PLANE, ROWS, WIDTH, DEPTH, COLUMNS, PIECE)
         tl.debug_barrier()
 
 
@@ -196,7 +195,6 @@ def _add_products(
     DEPTH: tl.constexpr,
     COLUMNS: tl.constexpr,
     PIECE: tl.constexpr,
-    PRECISION: tl.constexpr,
 ):
     """Add what a tile says of a square layer: sᵀ u + z̄ᵀ h, with u and h of the layer below, and the sum of z̄."""
     BLOCKS: tl.constexpr = (WIDTH + COLUMNS - 1) // COLUMNS
@@ -215,9 +213,9 @@ def _add_products(
                 left = layer + line[None, :] * STRIDE + unit[:, None]
                 right = layer - PLANE + line[:, None] * STRIDE + inner[None, :]
                 s, u = tl.load(left + 3 * DEPTH * PLANE), tl.load(right + 4 * DEPTH * PLANE)
-                found = tl.dot(s, u, found, input_precision=PRECISION)
+                found = tl.dot(s, u, found, input_precision="ieee")
                 z_bar, h = tl.load(left + 2 * DEPTH * PLANE), tl.load(right)
-                found = tl.dot(z_bar, h, found, input_precision=PRECISION)
+                found = tl.dot(z_bar, h, found, input_precision="ieee")
             _add(
                 target + unit[:, None] * WIDTH + inner[None, :],
                 found,
@@ -231,17 +229,14 @@ def _add(target, found, inside):
     tl.store(target, tl.load(target, mask=inside, other=0.0) + found, mask=inside)
 
 
-def jet_backward(
-    x: Tensor, network: Network, value_bar: Tensor, gradient_bar: Tensor, precision: str
-) -> tuple[Tensor, list[Tensor]]:
+def jet_backward(x: Tensor, network: Network, value_bar: Tensor, gradient_bar: Tensor) -> tuple[Tensor, list[Tensor]]:
     """Cotangents of the points ``(N, d)`` and of the network's parameters, in their order and shapes.
 
     Args:
-        x: points ``(N, d)``; see `mplicits.neural_fields.kernels.siren.siren_value`.
+        x: points ``(N, d)``; see `mplicits.neural_fields.kernels.ieee.jet`.
         network: with one output.
         value_bar: cotangent of f, ``(N,)``.
         gradient_bar: cotangent of ∇f, ``(N, d)``.
-        precision: see `mplicits.neural_fields.kernels.siren.siren_value`.
     """
     x_bar = x.new_empty(x.shape)
     sizes = [parameter.numel() for parameter in network.parameters]
@@ -268,7 +263,6 @@ def jet_backward(
                 DEPTH=network.depth,
                 COLUMNS=tiling.columns,
                 PIECE=tiling.piece,
-                PRECISION=precision,
                 num_warps=tiling.warps,
                 num_stages=2,
             )

@@ -180,7 +180,8 @@ def _kernels() -> Finding:
         return Finding("warning", "kernels", str(error))
     if choice.reason:
         return Finding("note", "kernels", f"PyTorch evaluates all networks ({choice.reason})")
-    how = f"fused, with products in {choice.precision}, for values and jets of all levels, the jets' way back, and rays"
+    how = "fused kernels; values, jets, rays and pictures by products of float16 halves, with float32's error; "
+    how += "training's jets in IEEE float32"
     return Finding("ok", "kernels", f"{how}; PyTorch for features, float64 and second derivatives")
 
 

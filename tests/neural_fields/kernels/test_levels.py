@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
+import mplicits.neural_fields.kernels.launch as launch
 import mplicits.neural_fields.kernels.levels as fused
 import pytest
 import torch
@@ -50,8 +51,8 @@ def assert_exact(field: MultiscaleSDF, x: Tensor, *, least_sure: float = 0.95) -
     """Value and jet are those of float64 but for rounding, where rounding decides no gate → the exact jet."""
     exact, rows = exact_copy(field), x.double().cpu()
     jets = [part.jet(rows) for part in exact.levels]
-    sirens = [part.as_network() for part in field.levels if isinstance(part, Siren)]
-    bounds = [tuple(b.cpu() for b in rounding_bound(x, own.parameters, own.omega, own.gain)) for own in sirens]
+    sirens = [part for part in field.levels if isinstance(part, Siren)]
+    bounds = [tuple(b.cpu() for b in rounding_bound(x, own.raw(), own.omega, halves=True)) for own in sirens]
     sure, value_bound, gradient_bound = gated_bound(
         [(j.value, j.gradient) for j in jets], bounds, exact.deltas, field.taper
     )
@@ -117,7 +118,7 @@ def test_any_number_of_points(count: int, place: torch.device, counted: list[str
 
 def test_lists_longer_than_a_tile(place: torch.device, monkeypatch: pytest.MonkeyPatch) -> None:
     """One program has everything: its list is read in several tiles, and written while it is read."""
-    monkeypatch.setattr(fused, "program_count", lambda *_: 1)
+    monkeypatch.setattr(launch, "INTERPRETED_PROGRAMS", 1)
     field, x = levels([0.9, 0.4], place, taper=1.0), points(150, place)
     first, second = inside(field, x)
     assert first > 64
@@ -183,8 +184,8 @@ def test_a_gate_that_is_a_little_wrong_would_be_noticed(place: torch.device) -> 
     exact = exact_copy(field)
     field.taper = 0.5
     off = (field.value(x).cpu().double() - exact.value(x.double().cpu())).abs()
-    own = [part.as_network() for part in field.levels if isinstance(part, Siren)]
-    bounds = [rounding_bound(x.cpu(), [p.cpu() for p in one.parameters], one.omega, one.gain) for one in own]
+    own = [part for part in field.levels if isinstance(part, Siren)]
+    bounds = [rounding_bound(x.cpu(), [p.cpu() for p in one.raw()], one.omega, halves=True) for one in own]
     jets = [part.jet(x.double().cpu()) for part in exact.levels]
     _, bound, _ = gated_bound([(j.value, j.gradient) for j in jets], bounds, exact.deltas, 0.5)
     assert bool((off > bound).any())

@@ -31,8 +31,8 @@ def assert_exact(network: Siren, x: torch.Tensor) -> None:
     exact = Siren(network.width, network.depth, omega=network.omega, in_dim=network.in_dim).double()
     exact.load_state_dict({name: part.double().cpu() for name, part in network.state_dict().items()})
     expected = exact.requires_grad_(False).jet(x.double().cpu())
-    own = network.as_network()
-    bounds = [bound.cpu() for bound in rounding_bound(x, own.parameters, own.omega, own.gain)]
+    frequency, gain = network.omega * network.units[0], network.units[1]
+    bounds = [bound.cpu() for bound in rounding_bound(x, network.raw(), frequency, gain, halves=True)]
     # That holds for any network, and grows with each layer's weights beyond what is of use; this is what happens to
     # this one when weights and points are changed by rounding.
     if len(x):
@@ -114,8 +114,7 @@ def test_values_of_a_network_with_features(place: torch.device, counted: list[st
     network, x = siren(24, 2, place, num_features=3), points(65, place)
     value, features = network.value_features(x)
     assert counted == []
-    own = network.as_network()
-    bound, _ = rounding_bound(x, own.parameters, own.omega)
+    bound, _ = rounding_bound(x, network.raw(), network.omega, halves=True)
     assert_within(network.value(x), value, 2 * bound)
     assert counted == ["siren_value"]
     assert features.shape == (65, 3)
@@ -132,8 +131,7 @@ def test_what_has_a_graph_is_pytorchs(place: torch.device, counted: list[str]) -
 def test_a_bound_that_is_no_bound_would_be_noticed(place: torch.device) -> None:
     """Weights changed by a thousandth are told from rounding, so that the tests above can fail."""
     network, x = siren(24, 2, place), points(65, place)
-    own = network.as_network()
-    value_bound, gradient_bound = rounding_bound(x, own.parameters, own.omega)
+    value_bound, gradient_bound = rounding_bound(x, network.raw(), network.omega, halves=True)
     before = network.jet(x)
     network.layers[1].weight.mul_(1.001)
     after = network.jet(x)
@@ -142,6 +140,5 @@ def test_a_bound_that_is_no_bound_would_be_noticed(place: torch.device) -> None:
 
 
 def test_planes() -> None:
-    """The matrices of a program, as its doc says."""
-    assert [planes(depth, jet=False) for depth in (1, 2, 3)] == [2, 2, 2]
+    """The matrices that a training's jet puts aside, as its doc says."""
     assert [planes(depth, jet=True) for depth in (1, 2, 3, 5)] == [2, 2, 3, 5]

@@ -28,15 +28,15 @@ def test_what_the_kernels_cannot_do(place: torch.device, changes: dict, reason: 
     options = {"width": 128, "depth": 2} | changes
     x = torch.zeros(2, 3, dtype=options.pop("dtype", torch.float32), device=place)
     choice = choose(x, **options)
-    assert choice.precision == ""
+    assert not choice.fused
     assert reason in choice.reason
 
 
 def test_switched_off(place: torch.device, monkeypatch: pytest.MonkeyPatch) -> None:
     x = torch.zeros(2, 3, device=place)
-    assert choose(x, width=128, depth=2) == ("ieee", "")
+    assert choose(x, width=128, depth=2) == (True, "")
     monkeypatch.setenv("MPLICITS_KERNELS", "off")
-    assert choose(x, width=128, depth=2) == ("", "MPLICITS_KERNELS=off")
+    assert choose(x, width=128, depth=2) == (False, "MPLICITS_KERNELS=off")
 
 
 def test_a_word_that_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
