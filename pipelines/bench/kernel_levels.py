@@ -13,9 +13,9 @@ from ...neural_fields.kernels.rounding import gated_bound, rounding_bound
 from ..run.trainer import seeded
 from .benchmark import Benchmark, Part, network_name
 from .cells import Workplace
-from .kernels import evaluated_by, staged_bytes
-from .model import count_frame
+from .kernels import JET, MANY, POINT, evaluated_by, staged_bytes
 from .tables import Column, Figure, Table, tabulated
+from .traffic import traffic_of
 
 __all__ = ["LevelsBench", "LevelsRow"]
 
@@ -23,8 +23,7 @@ SIZES = (((16, 1), (24, 2)), ((64, 2), (128, 2)), ((128, 2), (256, 2), (400, 2))
 TAPERS = (0.0, 0.5)
 # Of points that come to a band, the share that lies in it.
 INSIDE = 0.5
-# Bytes are counted of so many times the points, so that those of weights do not count.
-MANY = 64
+LISTED = 16  # bytes of a row on the list of a band in `kernels/levels.py`, written and read
 
 
 @dataclass(frozen=True)
@@ -126,7 +125,8 @@ class LevelsBench(Benchmark[LevelsRow]):
         fused = off()
         with evaluated_by("off"):
             plain = off()
-            counts = count_frame(field.cpu(), lambda same: same.jet(x.repeat(MANY, 1)), 1)
+            many, same = x.repeat(MANY, 1), field.cpu()
+            traffic = traffic_of(lambda: same.jet(many))
         evaluated = (1.0, *inside)
         return LevelsRow(
             name=network_name(sizes),
@@ -137,11 +137,11 @@ class LevelsBench(Benchmark[LevelsRow]):
             gradient_error=float(fused[1].max()),
             pytorch_gradient_error=float(plain[1].max()),
             share=max(float((error / limit[sure]).max()) for error, limit in zip(fused, limits, strict=True)),
-            unfused_bytes=(counts.product_bytes + counts.other_bytes + counts.around_bytes) / (MANY * self.points),
-            fused_bytes=counts.fused_bytes / (MANY * self.points),
+            unfused_bytes=traffic.moved / len(many),
+            fused_bytes=POINT + JET + sum(inside) * (POINT + JET + LISTED + JET),
             staged_bytes=sum(part * staged_bytes(*size) for part, size in zip(evaluated, sizes, strict=True)),
-            unfused_launches=counts.launches + counts.around_launches,
-            unfused_waits=counts.around_waits,
+            unfused_launches=traffic.launches,
+            unfused_waits=traffic.waits,
         )
 
     def tables(self, rows: Sequence[LevelsRow], *, sgemm: float) -> tuple[Table, ...]:

@@ -19,11 +19,14 @@ from ...neural_fields.kernels.switch import VARIABLE, choose
 from ..run.trainer import seeded
 from .benchmark import Benchmark, Part, network_name
 from .cells import Workplace
-from .model import JET, POINT, count_frame
 from .tables import Column, Figure, Table, tabulated
+from .traffic import traffic_of
 
-__all__ = ["KernelRow", "KernelsBench", "evaluated_by", "staged_bytes"]
+__all__ = ["JET", "MANY", "POINT", "KernelRow", "KernelsBench", "evaluated_by", "staged_bytes"]
 
+POINT, JET = 12, 16  # bytes of a point, and of a value with its gradient
+# Bytes are counted of so many times the points, so that those of weights do not count.
+MANY = 64
 SIZES = tuple((width, depth) for width in (16, 64, 128, 256, 400) for depth in (1, 2, 3))
 
 
@@ -113,7 +116,8 @@ class KernelsBench(Benchmark[KernelRow]):
         fused = off()
         with evaluated_by("off"):
             plain = off()
-            counts = count_frame(network.cpu(), lambda field: field.jet(x.repeat(64, 1)), 1)
+            many, own = x.repeat(MANY, 1), network.cpu()
+            traffic = traffic_of(lambda: own.jet(many))
         shares = [float((error / bound).max()) for error, bound in zip(fused, bounds, strict=True)]
         return KernelRow(
             width=width,
@@ -125,7 +129,7 @@ class KernelsBench(Benchmark[KernelRow]):
             pytorch_gradient_error=float(plain[1].max()),
             gradient_bound=float(bounds[1].max()),
             share=max(shares),
-            unfused_bytes=(counts.product_bytes + counts.other_bytes) / (64 * self.points),
+            unfused_bytes=traffic.moved / len(many),
             fused_bytes=POINT + JET,
             staged_bytes=staged_bytes(width, depth),
         )

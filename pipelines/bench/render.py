@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -22,7 +21,6 @@ from ..run.trainer import parameter_count
 from .benchmark import Benchmark, Part
 from .cells import Workplace
 from .fits import fit_home, kept_fit
-from .model import FrameCounts, count_frame, model_table
 from .render_truth import Agreement, Truth
 from .speed import counted
 from .tables import Column, Figure, Table, ratio, tabulated
@@ -80,8 +78,6 @@ class RenderRow:
         evaluations: per pixel of the image, of each level, one jet counted as one.
         flops: of the matrix products for one image.
         agreement: with the converged image of what the model is to show, and with a raycast of its mesh.
-        counts: of the first camera's picture, for the model of a GPU; None for modes that it is not made for, and where
-            it was not asked for.
     """
 
     shape: str
@@ -94,7 +90,6 @@ class RenderRow:
     evaluations: tuple[float, ...]
     flops: float
     agreement: Agreement
-    counts: FrameCounts | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,7 +105,6 @@ class RenderBench(Benchmark[RenderRow]):
         repeats: the best of so many is what counts.
         naive: whether to time the naive tracer as well (one camera, once: it takes a minute).
         networks: what to fit; the names are those of `NETWORKS`.
-        devices: names of those that a table tells the times on, by a model; see `mplicits.pipelines.bench.model`.
     """
 
     name = "render"
@@ -125,7 +119,6 @@ class RenderBench(Benchmark[RenderRow]):
     repeats: int = 2
     naive: bool = True
     networks: Networks = field(default_factory=lambda: NETWORKS)
-    devices: tuple[str, ...] = ()
 
     def cells(self) -> list[Part]:
         """One for each shape; see `Benchmark.cells`."""
@@ -150,8 +143,6 @@ class RenderBench(Benchmark[RenderRow]):
             for model in models:
                 work.say(f"{shape.stem}: {model.name}, {mode}")
                 row = _time(fields[model.network], model, mode, seen, truth, repeats, self.device)
-                if self.devices and mode == "adaptive":
-                    row = replace(row, counts=_counts(fields[model.network], model, cameras[0]))
                 base = found[0].seconds if found else row.seconds
                 paper = None if mode == "naive" else row.paper_speedup
                 found.append(replace(row, shape=shape.stem, speedup=base / row.seconds, paper_speedup=paper))
@@ -188,20 +179,7 @@ class RenderBench(Benchmark[RenderRow]):
             (Column("false", "d"), lambda r: r.agreement.false_hits),
         ]
         items = [(f"{row.shape} {row.mode} {row.model}", row) for row in rows]
-        measured = tabulated(self.name, "What a picture costs", "shape, mode, model", figures, items)
-        counted_rows = [(f"{r.shape} {r.model}", r.seconds, r.counts) for r in rows if r.counts is not None]
-        if not self.devices or not counted_rows:
-            return (measured,)
-        return measured, model_table(counted_rows, self.devices)
-
-
-def _counts(field: Field, model: _Model, camera: Camera) -> FrameCounts:
-    """Of one picture, made on the CPU."""
-
-    def draw(same: Field) -> Seen:
-        return trace_view(same, camera, level=model.level, normal_level=model.normal_level)
-
-    return count_frame(copy.deepcopy(field).cpu(), draw, camera.width * camera.height)
+        return (tabulated(self.name, "What a picture costs", "shape, mode, model", figures, items),)
 
 
 def _time(

@@ -14,9 +14,6 @@ from .common import Command, add_flags, add_settings, positive, read_settings, w
 
 __all__ = ["COSTS"]
 
-# The names of `bench.model.DEVICES`, which help must not load torch for.
-MODELLED = ("h100", "a100", "4090", "m2")
-
 
 def _normals_arguments(parser: argparse.ArgumentParser) -> None:
     number(parser, "--points", whole(1), 262_144, "how many")
@@ -77,43 +74,6 @@ def _kernels(arguments: argparse.Namespace) -> int:
     return run_benches(arguments, [bench, *levels], out=arguments.out)
 
 
-def _size(text: str) -> tuple[int, int]:
-    """Width and height of a picture."""
-    width, _, height = text.partition("x")
-    if not (width.isdecimal() and height.isdecimal() and 4 <= min(int(width), int(height)) <= 8192):
-        raise argparse.ArgumentTypeError(f"{text!r}: expected WIDTHxHEIGHT, of 4 to 8192 pixels each")
-    return int(width), int(height)
-
-
-def _gpu_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("run", metavar="RUN", help="run directory or .safetensors file")
-    sizes = ((512, 512), (1920, 1080))
-    shown = " ".join(f"{width}x{height}" for width, height in sizes)
-    parser.add_argument(
-        "--sizes", type=_size, nargs="+", default=sizes, metavar="WxH", help=f"of the pictures ({shown})"
-    )
-    _modelled_flag(parser, ("h100", "4090"))
-    parser.add_argument("--timed", metavar="DEVICE", help="time them on this device, too: cuda, cpu, ... (none)")
-    folder_flag(parser)
-    add_flags(parser, "--json")
-
-
-def _modelled_flag(parser: argparse.ArgumentParser, default: tuple[str, ...]) -> None:
-    about = f"times on GPUs by a model of counts and published rates: {', '.join(MODELLED)}"
-    if default:
-        about += f" ({' '.join(default)})"
-    parser.add_argument("--model", nargs="+", choices=MODELLED, default=default, metavar="GPU", help=about)
-
-
-def _gpu(arguments: argparse.Namespace) -> int:
-    from ..bench.gpu import GpuBench
-
-    bench = GpuBench(
-        run_file=arguments.run, sizes=tuple(arguments.sizes), devices=tuple(arguments.model), timed=arguments.timed
-    )
-    return run_benches(arguments, [bench], out=arguments.out)
-
-
 def _mesh_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("run", metavar="RUN", help="run directory or .safetensors file")
     number(parser, "--resolutions", whole(8, 2048), (256, 512, 1024), "where ours is timed", nargs="+")
@@ -142,7 +102,6 @@ def _render_arguments(parser: argparse.ArgumentParser) -> None:
     number(parser, "--views", whole(1), 3, "cameras around the shape")
     number(parser, "--repeats", whole(1), 2, "the best of how many")
     parser.add_argument("--no-naive", action="store_true", help="leave out the naive tracer, which takes minutes")
-    _modelled_flag(parser, ())
     add_flags(parser, "--json")
     add_settings(parser, FitConfig)
 
@@ -154,7 +113,7 @@ def _render(arguments: argparse.Namespace) -> int:
 
     options = {name: getattr(arguments, name) for name in ("shapes", "size", "views", "repeats")}
     naive, device = not arguments.no_naive, str(choose_device(config.device))
-    bench = RenderBench(config=config, naive=naive, device=device, devices=tuple(arguments.model), **options)
+    bench = RenderBench(config=config, naive=naive, device=device, **options)
     return run_benches(arguments, [bench], out=arguments.out)
 
 
@@ -202,14 +161,6 @@ COSTS: Mapping[str, Command] = MappingProxyType(
             "Compare jets by the fused kernels (pip install 'mplicits[kernels]') with the same networks in float64, "
             "and count what they read and write. Without CUDA, Triton's interpreter runs them, slowly.",
         ),
-        "bench gpu": Command(
-            "what pictures of a run would cost on GPUs: a model",
-            "  mplicits bench gpu runs/scan\n  mplicits bench gpu runs/scan --sizes 512x512 --model h100 m2",
-            _gpu_arguments,
-            _gpu,
-            "Count, on the CPU, what pictures of the coarsest and the finest level ask of a device, and tell by "
-            "published rates how long they would take on GPUs that are not here.",
-        ),
         "bench mesh": Command(
             "what extraction costs: adaptive, the paper's, dense",
             "  mplicits bench mesh runs/scan\n  mplicits bench mesh runs/scan --resolutions 128 256 --reference 256",
@@ -219,8 +170,7 @@ COSTS: Mapping[str, Command] = MappingProxyType(
         "bench render": Command(
             "what a picture costs: the rows of the paper's Tab. 4",
             """  mplicits bench render armadillo.ply -o bench_render
-  mplicits bench render armadillo.ply eiffel.ply -o bench_render --views 1 --no-naive --json render.json
-  mplicits bench render armadillo.ply -o bench_render --model h100 4090""",
+  mplicits bench render armadillo.ply eiffel.ply -o bench_render --views 1 --no-naive --json render.json""",
             _render_arguments,
             _render,
             "Fit the networks of the paper's Tab. 4 to each shape, trace pictures of them in several ways, and judge "

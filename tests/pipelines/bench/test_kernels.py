@@ -55,11 +55,11 @@ def test_bytes_of_the_papers_coarse_network() -> None:
     """At least eight times fewer than PyTorch's operations, s₂ counted as if no cache held it."""
     from mplicits.neural_fields import Siren
     from mplicits.pipelines.bench.kernels import staged_bytes
-    from mplicits.pipelines.bench.model import count_frame
+    from mplicits.pipelines.bench.traffic import traffic_of
 
     x = torch.rand(4096, 3)
-    counts = count_frame(Siren(128, 2).requires_grad_(False), lambda field: field.jet(x), 1)  # type: ignore[attr-defined]
-    unfused = (counts.product_bytes + counts.other_bytes) / len(x)
+    network = Siren(128, 2).requires_grad_(False)
+    unfused = traffic_of(lambda: network.jet(x)).moved / len(x)
     assert staged_bytes(128, 2) == 1024
     assert unfused >= 8 * (28 + staged_bytes(128, 2))
     # 400 units are made 64 at a time, in seven blocks, and each of them reads the whole layer below, 416 with its rest.
