@@ -12,8 +12,7 @@ import mplicits.datasets
 import mplicits.neural_fields
 import mplicits.pipelines
 import pytest
-from mplicits.pipelines.cli import entry as cli
-from mplicits.pipelines.cli.commands import COMMANDS
+from mplicits.pipelines.cli.entry import MPLICITS
 
 ROOT = Path(__file__).parent.parent
 DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -67,7 +66,7 @@ def test_the_documents_have_python_and_commands() -> None:
 def test_commands_of_the_documents_parse(line: str) -> None:
     words = shlex.split(line)[1:]
     name = " ".join(words[:2]) if words[0] == "bench" else words[0]
-    parser = cli._Parser(name, COMMANDS[name])
+    parser = MPLICITS.parser(name)
     arguments = words[len(name.split()) :]
     parser.check_flags(arguments)
     parser.parse_args(arguments)

@@ -92,7 +92,7 @@ def test_help_before_a_command_is_that_after_it(capsys, name):
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_help_of_each_command_has_examples_that_parse(capsys, name):
-    from mplicits.pipelines.cli.entry import _Parser
+    from mplicits.pipelines.cli.entry import MPLICITS
 
     assert main([*name.split(), "--help"]) == 0
     assert "examples:" in capsys.readouterr().out
@@ -103,7 +103,7 @@ def test_help_of_each_command_has_examples_that_parse(capsys, name):
         assert words[0] == "mplicits"
         assert words[1 : 1 + len(name.split())] == name.split()
         rest = words[1 + len(name.split()) :]
-        parser = _Parser(name, COMMANDS[name])
+        parser = MPLICITS.parser(name)
         parser.check_flags(rest)
         parser.parse_args(rest)
 
