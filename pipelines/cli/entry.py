@@ -10,8 +10,8 @@ import argparse
 import os
 import re
 import sys
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import NoReturn
 
 from ..run.config import closest
@@ -41,13 +41,8 @@ examples:
 
 `mplicits COMMAND --help` says more about each; `mplicits --version` prints the version."""
 
-GROUP = """usage: {program} {name} COMMAND [arguments]
-
-commands:
-{commands}
-
-`{program} {name} COMMAND --help` says more about each."""
 HELP = ("-h", "--help")
+MOVED = {"bench": "benchmarks are not in the package; run `python -m benchmarks NAME` in a checkout of mplicits"}
 
 
 class _UsageError(Exception):
@@ -91,11 +86,13 @@ class Program:
         name: what is typed before a command.
         commands: by name.
         overview: what ``--help`` prints; ``{commands}`` is replaced by the list of commands.
+        moved: commands of earlier versions, each with what to run instead.
     """
 
     name: str
     commands: Mapping[str, Command]
     overview: str
+    moved: Mapping[str, str] = field(default_factory=dict)
 
     def main(self, argv: Sequence[str] | None = None) -> int:
         """Run one command.
@@ -148,18 +145,18 @@ class Program:
         if arguments[:1] == ["help"]:
             arguments = [*arguments[1:], "--help"]
         if not arguments or arguments[0] in HELP:
-            print(self.overview.format(commands=self._listed(self.commands)))
+            print(self.overview.format(commands=self._listed()))
             return 0 if arguments else 2
-        group = self._group(arguments[0])
-        if group and (len(arguments) < 2 or arguments[1] in HELP):
-            print(GROUP.format(program=self.name, name=arguments[0], commands=self._listed(group)))
-            return 0 if len(arguments) > 1 else 2
         if arguments[0] == "--version":
             from importlib.metadata import version  # late, as all that --help can do without
 
             print(f"mplicits {version('mplicits')}")
             return 0
-        name, rest = self._choose(arguments)
+        name, *rest = arguments
+        if name in self.moved:
+            raise _UsageError(f"{name}: {self.moved[name]}")
+        if name not in self.commands:
+            raise _UsageError(f"unknown command {name!r}{closest(name, self.commands)}")
         parser = self.parser(name)
         if not {*HELP} & set(rest):
             parser.check_flags(rest)
@@ -170,33 +167,17 @@ class Program:
         sys.stdout.flush()
         return code
 
-    def _group(self, first: str) -> list[str]:
-        """The commands of two words that begin with this one."""
-        return [name for name in self.commands if name.startswith(f"{first} ")]
-
-    def _listed(self, names: Collection[str]) -> str:
+    def _listed(self) -> str:
         """A line for each command, with what it does."""
-        width = max(map(len, names))
-        return "\n".join(f"  {name:<{width}}  {self.commands[name].summary}" for name in names)
-
-    def _choose(self, arguments: list[str]) -> tuple[str, list[str]]:
-        """The command that the first word names, or with ``bench`` the first two, and the other words."""
-        for words in (2, 1):
-            name = " ".join(arguments[:words])
-            if name in self.commands:
-                return name, arguments[words:]
-        first = {name.split()[0] for name in self.commands}
-        if arguments[0] in first:
-            known = [name.split()[1] for name in self._group(arguments[0])]
-            raise _UsageError(f"{arguments[0]}: unknown command {arguments[1]!r}{closest(arguments[1], known)}")
-        raise _UsageError(f"unknown command {arguments[0]!r}{closest(arguments[0], first)}")
+        width = max(map(len, self.commands))
+        return "\n".join(f"  {name:<{width}}  {command.summary}" for name, command in self.commands.items())
 
     def _fail(self, message: str) -> int:
         print(f"{self._short}: error: {' '.join(message.split())}", file=sys.stderr)
         return 2
 
 
-MPLICITS = Program("mplicits", COMMANDS, OVERVIEW)
+MPLICITS = Program("mplicits", COMMANDS, OVERVIEW, MOVED)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
