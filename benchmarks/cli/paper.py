@@ -54,9 +54,11 @@ def _paper(arguments: argparse.Namespace) -> int:
     from mplicits.pipelines.run.trainer import Interrupted
 
     from ..harness.cells import make_folder
+    from ..harness.plots import check_matplotlib
     from ..harness.report import as_text, section_as_dict
     from ..paper.bench import PAGE, Bench, bench_paper, find_shapes
 
+    check_matplotlib()
     make_folder(arguments.out)
     bench = Bench(
         find_shapes(arguments.shapes, reference=arguments.reference),

@@ -11,6 +11,7 @@ from mplicits.neural_fields import Similarity, Sphere, extract_mesh
 from mplicits.pipelines.mesh.files import write_mesh
 
 from benchmarks.cli import main
+from benchmarks.harness import plots
 from benchmarks.harness.cells import Catalogue, Findings, Method
 from benchmarks.paper import bench, names
 from benchmarks.paper.bench import SPECS
@@ -89,7 +90,7 @@ def test_a_bench(ball: Path, tmp_path: Path, exact, capsys: pytest.CaptureFixtur
     assert [record["outputs"][0]["name"] for record in kept["records"]] == ["Ours fine", "SIREN"]
     assert kept["records"][0]["outputs"][0]["chamfer"] == first["values"][0]
     assert iio.imread(out / "sheets" / "comparison-ball.jpg").shape == (136, 4 * 108, 3)
-    assert (out / "plots" / "comparison-per-mesh-all.svg").read_text().startswith("<svg")
+    assert (out / "plots" / "comparison-per-mesh-all.svg").read_text().startswith("<?xml")
     for link in ("sheets/comparison-ball.jpg", "plots/comparison-per-mesh-all.svg"):
         assert f"]({link})" in page
 
@@ -168,3 +169,12 @@ def test_mistakes_in_places(ball: Path, tmp_path: Path, capsys: pytest.CaptureFi
         assert message in capsys.readouterr().err
     assert main(["paper", str(tmp_path / "gone.ply"), "-o", str(tmp_path / "bench")]) == 2
     assert "no such file" in capsys.readouterr().err
+
+
+def test_without_matplotlib_nothing_is_begun(
+    ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(plots, "find_spec", lambda name: None)
+    assert main(["paper", str(ball), "-o", str(tmp_path / "bench")]) == 2
+    assert "pip install 'mplicits[bench]'" in capsys.readouterr().err
+    assert not (tmp_path / "bench").exists()

@@ -342,3 +342,11 @@ def test_presets_grow() -> None:
         assert numbers[0] < numbers[1]
     assert (sizes[2].resolution, sizes[2].samples, sizes[2].poisson_depth) == (512, 500_000, 10)
     assert fit_config("paper").widths == (128, 256, 400)
+
+
+def test_keys_are_those_of_folders_written_before(tmp_path: Path) -> None:
+    """Computed at commit 9deaa32, when the modules were in the package: finished cells are found again."""
+    cloud = tmp_path / "cloud.ply"
+    cloud.write_bytes(b"ply\n")
+    expected = {"ours": "13b93019e551", "siren": "99e6b3b4f17f", "bacon": "0d43bf57cf44", "banf": "91e5a59ab74b"}
+    assert {name: CATALOGUE.key(PaperCell(cloud, name, "cpu")) for name in expected} == expected
