@@ -64,6 +64,7 @@ def test_a_missing_part_is_seen() -> None:
     assert row.mean_value > 0.1
 
 
+@pytest.mark.slow
 def test_exact_cases_are_trained_and_printed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(bench_evolve, "TIMES", 3)
     monkeypatch.setattr(bench_evolve, "RESOLUTION", 24)

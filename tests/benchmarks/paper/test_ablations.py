@@ -87,6 +87,7 @@ def test_distances_to_a_box_are_exact_inside_outside_and_over_its_edges() -> Non
     np.testing.assert_allclose(MeshDistance(CUBOID).signed(points), exact, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_long_faces_beside_many_small_ones_hide_nobody() -> None:
     # A large triangle far below a finely triangulated patch: its centre is much further away than it is.
     grid = np.linspace(-0.05, 0.05, 30)

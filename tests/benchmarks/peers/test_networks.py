@@ -285,6 +285,7 @@ def test_siren_loss_by_hand() -> None:
     assert term(off_surface=3.0) == pytest.approx(math.exp(-2.0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("omega", [SIREN_PRESETS["cpu"].omega, IDF_PRESETS["cpu"].omegas[0]])
 def test_sphere_start_reaches_into_the_corners_of_the_cube(omega: float) -> None:
     torch.manual_seed(0)

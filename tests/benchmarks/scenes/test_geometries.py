@@ -149,6 +149,7 @@ def test_other_seeds_have_the_rate_of_the_first(bench, tmp_path, monkeypatch):
     assert [(row.rate, row.seed) for row in more] == [(3e-4, 0), (1e-3, 0), (3e-3, 0), (1e-3, 1)]
 
 
+@pytest.mark.slow
 def test_several_trainings_at_a_time_find_what_one_after_the_other_does(bench, tmp_path):
     tables = []
     for streams in (1, 2):

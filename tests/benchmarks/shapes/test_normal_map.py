@@ -130,6 +130,7 @@ def test_the_angle_between_normals_in_closed_form(opened, tmp_path):
     assert rows[1].degrees == pytest.approx(np.concatenate(angles).mean(), rel=5e-3)
 
 
+@pytest.mark.slow
 def test_lambert_and_normals_are_compared_too(opened, tmp_path):
     bench = opened(bumpy_ball(), 1)
     for shading in ("lambert", "normals"):

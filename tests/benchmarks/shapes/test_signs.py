@@ -36,6 +36,7 @@ def test_a_ball_has_no_wrong_signs(ball: Path, tmp_path: Path, noise: float, poi
     assert ("+ isotropic noise 0.005" in as_text(*bench.tables([row], sgemm=1e9))) == (noise > 0)
 
 
+@pytest.mark.slow
 def test_normals_that_point_inward_are_counted(ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of each point's own: a third is turned round, and the network turns it back."""
 
