@@ -43,9 +43,12 @@ kills: $(VENV)/.dev
 clients: $(VENV)/.dev
 	$(BIN)/python tests/clients.py --minutes $(MINUTES)
 
+# The type checker does not follow setuptools' names of folders, which benchmarks import: it finds them by links.
 lint: $(VENV)/.dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	mkdir -p build/types/mplicits
+	ln -sfn $(addprefix ../../../,configs datasets neural_fields pipelines) build/types/mplicits
 	$(BIN)/basedpyright --pythonpath $(BIN)/python
 
 $(VENV)/.docs: $(VENV)/.installed
@@ -53,7 +56,7 @@ $(VENV)/.docs: $(VENV)/.installed
 	touch $@
 
 docs: $(VENV)/.docs
-	rm -rf build site
+	rm -rf $(filter-out build/types,$(wildcard build/*)) site
 	$(PIP) --no-deps --target build/api .
 	$(BIN)/mkdocs build
 

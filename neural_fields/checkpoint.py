@@ -19,7 +19,6 @@ from torch import Tensor, nn
 
 from .algebra import Bounded, Combined, Difference, Intersection, Offset, Placed, Shell, Union
 from .analytic import Box, Capsule, Plane, Sphere, Torus
-from .baselines import NeusSDF
 from .color import ColorSiren, TextureField
 from .encoded import EncodedField
 from .errors import InputError
@@ -27,6 +26,7 @@ from .field import Field, plain
 from .files import write_whole
 from .hash_encoding import HashEncoding, grid_resolutions
 from .multiscale import MultiscaleSDF
+from .neus_mlp import NeusSDF
 from .radiance import Outside, Radiance, ViewColor
 from .similarity import Similarity
 from .siren import Siren

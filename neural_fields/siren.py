@@ -32,7 +32,7 @@ from .kernels.switch import choose
 __all__ = ["Siren"]
 
 # Floats per activation matrix of one block: 1 MiB, so that the handful of matrices that a block needs at a time
-# fit the second- and third-level caches of current CPUs (`mplicits bench normals` shows the effect).
+# fit the second- and third-level caches of current CPUs (`python -m benchmarks normals` shows the effect).
 BLOCK_FLOATS = 1 << 18
 # A GPU keeps nothing in cache between kernels; blocks only bound the memory.
 GPU_BLOCK_FLOATS = 1 << 27

@@ -1,13 +1,14 @@
 """What the tests of evolutions share: small settings, a fit that takes no time, bad input."""
 
 import inspect
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 from mplicits.neural_fields import MultiscaleSDF, Similarity, Siren, Sphere, save_field
-from mplicits.pipelines.cli.entry import main
+from mplicits.pipelines.cli.entry import main as mplicits_command
 from mplicits.pipelines.evolve import checks as evolve_checks
 from mplicits.pipelines.evolve import deform, source
 from mplicits.pipelines.evolve import problem as evolve_problem
@@ -74,7 +75,9 @@ def ball(path: Path, radius: float, *, levels: bool = False) -> None:
     save_field(path, field, similarity=Similarity((5.0, 0.0, 0.0), 2.0))
 
 
-def fails(capsys: pytest.CaptureFixture[str], line: str) -> str:
+def fails(
+    capsys: pytest.CaptureFixture[str], line: str, main: Callable[[Sequence[str]], int] = mplicits_command
+) -> str:
     """Run a command that must fail as bad input does → its one line."""
     capsys.readouterr()
     assert main(line.split()) == 2

@@ -3,7 +3,6 @@
 from collections.abc import Callable
 
 import torch
-from mplicits.datasets.synthetic.figures import DeformingField, Twisting
 from mplicits.neural_fields import (
     Bounded,
     Box,
@@ -34,9 +33,12 @@ from mplicits.neural_fields import (
     Union,
     VelocitySiren,
 )
-from mplicits.neural_fields.baselines import BaconSDF, BandLimited, BanfSDF, HashGridSDF, NeusSDF
 from mplicits.neural_fields.hash_encoding import HashEncoding
+from mplicits.neural_fields.neus_mlp import NeusSDF
 from torch import Tensor
+
+from benchmarks.motion.figures import DeformingField, Twisting
+from benchmarks.peers import BaconSDF, BandLimited, BanfSDF, HashGridSDF
 
 
 def small_multiscale(taper: float = 0.0) -> MultiscaleSDF:

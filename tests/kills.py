@@ -17,6 +17,7 @@ import os
 import random
 import shutil
 import signal
+import sys
 import time
 from collections import Counter
 from collections.abc import Sequence
@@ -32,6 +33,9 @@ from mplicits.pipelines.cli.info import describe
 from mplicits.pipelines.run.folder import RunFolder, find_field, is_fitted, load_state, read_record
 from mplicits.pipelines.run.trainer import Trainer
 from safetensors.torch import load_file
+
+sys.path.append(str(Path(__file__).parents[1]))  # where benchmarks are; they are not installed
+from benchmarks.cli import main as benchmarks
 
 FIT = (
     "--widths 8 8 --depths 1 1 --omegas 5 10 --steps 40 40 --learning-rates 1e-3 1e-3 --batch 64 --samples 400 "
@@ -83,7 +87,7 @@ def begun(line: Sequence[str], said: Path) -> int:
         file = os.open(said, os.O_CREAT | os.O_WRONLY | os.O_TRUNC)
         os.dup2(file, 1)
         os.dup2(file, 2)
-        code = mplicits(list(line))
+        code = benchmarks(line[1:]) if line[0] == "bench" else mplicits(line)
     finally:
         os._exit(code)
 

@@ -45,8 +45,6 @@ from mplicits.neural_fields.volume_renderer import Sampling
 from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.fit.unoriented import give_signs
 from mplicits.pipelines.mesh.files import write_mesh
-from mplicits.pipelines.paper.grids import NGP_PRESETS, BanfRecipe, InstantNgpRecipe
-from mplicits.pipelines.paper.networks import BaconRecipe, IdfRecipe, SirenRecipe
 from mplicits.pipelines.run.config import load_config
 from mplicits.pipelines.run.settings import FitConfig
 from mplicits.pipelines.viewer.frames import Look
@@ -54,6 +52,10 @@ from mplicits.pipelines.viewer.paint import Painter
 from reconstructions import small_reconstructions
 from test_commands import EVOLVE, FIT, RECONSTRUCT, TEXTURE
 from torch import Tensor, nn
+
+from benchmarks.cli import main as benchmarks
+from benchmarks.paper.grids import NGP_PRESETS, BanfRecipe, InstantNgpRecipe
+from benchmarks.paper.networks import BaconRecipe, IdfRecipe, SirenRecipe
 
 Result = Sequence[Tensor | np.ndarray]
 CAMERA = look_at((0.4, 0.5, 2.6), (0.0, 0.0, 0.0), fov=42.0, width=12, height=12)
@@ -271,7 +273,7 @@ COMMANDS = (
     f"reconstruct photos -o photographed {RECONSTRUCT} --quiet",
     f"evolve sphere:0.4 torus:0.4,0.15 -o moving {EVOLVE} --quiet",
     "animate moving -o moving.png --frames 2 --size 16 --samples 1",
-    "bench normal-map run mesh.ply -o compared --size 16 --views 1 --repeats 1 --resolution 16",
+    "normal-map run mesh.ply -o compared --size 16 --views 1 --repeats 1 --resolution 16",
 )
 FIELDS = ("run", "photographed", "moving")
 PICTURES = ("lambert.png", "color.png", "error.png", "photographed/held_out.png", "moving.png", "compared/images.png")
@@ -294,7 +296,8 @@ def test_commands(accelerator: torch.device, tmp_path: Path, monkeypatch: pytest
         write_mesh(Path("mesh.ply"), extract_mesh(Torus(major=0.5, minor=0.2), resolution=16), Similarity.identity())
         write_neus(Path("photos"), scene)
         for command in COMMANDS:
-            assert main([*command.split(), "--device", str(device)]) == 0, command
+            run = benchmarks if command.startswith("normal-map") else main
+            assert run([*command.split(), "--device", str(device)]) == 0, command
         found = [tensor for name in FIELDS for tensor in tensors(load_field(f"{name}/field.safetensors").field)]
         return [*found, *(cv2.imread(name, cv2.IMREAD_UNCHANGED) for name in PICTURES)]
 
@@ -302,5 +305,5 @@ def test_commands(accelerator: torch.device, tmp_path: Path, monkeypatch: pytest
 
 
 def test_a_device_that_is_not_there_is_refused_before_any_work(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["bench", "eta", "--device", "warp"]) == 2
+    assert benchmarks(["eta", "--device", "warp"]) == 2
     assert "--device warp: not usable here" in capsys.readouterr().err

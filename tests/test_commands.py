@@ -37,6 +37,8 @@ from mplicits.pipelines.texture import riding
 from mplicits.pipelines.web import export
 from reconstructions import small_reconstructions
 
+from benchmarks.cli.entry import BENCHMARKS
+
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 FIT = (
@@ -71,11 +73,11 @@ SMALLEST = {  # by what a line begins with, or holds
     "mplicits offset *": "--resolution 24",
     "mplicits offset * --shell *": "--by -0.25",  # more than two of these cells
     "mplicits scene *": "--views 3 --size 16 --samples 1",
-    "mplicits bench reconstruct *": f"{RECONSTRUCT} --views 4 --size 16 --test-every 2 --test-views 1 --no-equal-time"
-    " --resolution 16 --eval-samples 500",
-    "mplicits bench reconstruct * --geometry-only *": "--rates 1e-3 --seeds 2 --geometries neus",
-    "mplicits bench paper *": "--preset smoke --table comparison --methods ours --jobs 1",
-    "mplicits bench srb *": f"{FIT} --resolution 16 --eval-samples 500",
+    "python -m benchmarks reconstruct *": f"{RECONSTRUCT} --views 4 --size 16 --test-every 2 --test-views 1"
+    " --no-equal-time --resolution 16 --eval-samples 500",
+    "python -m benchmarks reconstruct * --geometry-only *": "--rates 1e-3 --seeds 2 --geometries neus",
+    "python -m benchmarks paper *": "--preset smoke --table comparison --methods ours --jobs 1",
+    "python -m benchmarks srb *": f"{FIT} --resolution 16 --eval-samples 500",
 }
 SMALLER = {"--frames": "2", "--texture": "64", "--jobs": "1"}
 # Flags that name what a command writes.
@@ -91,7 +93,7 @@ def shell_lines(page: Path) -> list[str]:
 
 def smallest(line: str) -> list[str]:
     """The arguments of a line, at the smallest setting."""
-    words = shlex.split(line)
+    words = shlex.split(line.removeprefix("python -m "))
     small = [SMALLER.get(before, word) for before, word in zip(["", *words[:-1]], words, strict=True)]
     return [*small[1:], *(flag for begin, flags in SMALLEST.items() if fnmatch(line, begin) for flag in flags.split())]
 
@@ -283,7 +285,7 @@ def files_of(page: Path) -> Iterator[tuple[str, str]]:
 
 def is_bench(line: str) -> bool:
     """Whether a line measures something: for developers, and each bench has a test of its own."""
-    return line.startswith("mplicits bench ")
+    return line.startswith(f"{BENCHMARKS.name} ")
 
 
 LONG = ("animate", "evolve")  # pages whose lines train the most; the tour has the first of each
@@ -325,7 +327,7 @@ def test_commands_of_a_page_run(
             for name in read_by(line):
                 stand_in(name)
             capsys.readouterr()
-            code = main(smallest(line))
+            code = (BENCHMARKS.main if benches else main)(smallest(line))
             assert code == 0, capsys.readouterr().err
 
 
@@ -335,4 +337,6 @@ def test_no_command_hides_in_a_block_of_another_kind() -> None:
             r"^```(\w*)\n(.*?)^```", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL
         ):
             if language != "sh":
-                assert not re.search(r"^mplicits ", block, re.MULTILINE), f"{page.name}: call this block sh:\n{block}"
+                assert not re.search(r"^(mplicits|python -m benchmarks) ", block, re.MULTILINE), (
+                    f"{page.name}: call this block sh:\n{block}"
+                )

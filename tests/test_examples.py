@@ -12,15 +12,17 @@ import mplicits.datasets
 import mplicits.neural_fields
 import mplicits.pipelines
 import pytest
-from mplicits.pipelines.cli import entry as cli
-from mplicits.pipelines.cli.commands import COMMANDS
+from mplicits.pipelines.cli.entry import MPLICITS
+
+import benchmarks
+from benchmarks.cli.entry import BENCHMARKS
 
 ROOT = Path(__file__).parent.parent
 DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 PLUGIN = "mplicits.pipelines.nerfstudio."  # whose modules, but for the export, load where nerfstudio is installed only
 MODULES = [
     module.name
-    for package in (mplicits.neural_fields, mplicits.datasets, mplicits.pipelines)
+    for package in (mplicits.neural_fields, mplicits.datasets, mplicits.pipelines, benchmarks)
     for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}.")
     if find_spec("nerfstudio") or not module.name.startswith(PLUGIN) or module.name == f"{PLUGIN}export"
 ]
@@ -37,9 +39,9 @@ def blocks(language: str) -> list[str]:
 
 
 def commands() -> list[str]:
-    """Every ``mplicits …`` line of the documents' shell blocks, without its comment."""
+    """Every ``mplicits …`` and ``python -m benchmarks …`` line of the documents' shell blocks, without its comment."""
     lines = [line for block in blocks("sh") for line in block.splitlines()]
-    return [line.partition("#")[0].strip() for line in lines if line.startswith("mplicits ")]
+    return [line.partition("#")[0].strip() for line in lines if line.startswith(("mplicits ", "python -m benchmarks "))]
 
 
 @pytest.mark.parametrize("name", MODULES)
@@ -65,10 +67,9 @@ def test_the_documents_have_python_and_commands() -> None:
 
 @pytest.mark.parametrize("line", commands())
 def test_commands_of_the_documents_parse(line: str) -> None:
-    words = shlex.split(line)[1:]
-    name = " ".join(words[:2]) if words[0] == "bench" else words[0]
-    parser = cli._Parser(name, COMMANDS[name])
-    arguments = words[len(name.split()) :]
+    program = MPLICITS if line.startswith("mplicits ") else BENCHMARKS
+    name, *arguments = shlex.split(line.removeprefix(f"{program.name} "))
+    parser = program.parser(name)
     parser.check_flags(arguments)
     parser.parse_args(arguments)
 
@@ -92,7 +93,7 @@ def test_links_of_the_documents_lead_somewhere() -> None:
 def test_files_and_modules_that_the_documents_name_are_there() -> None:
     for path in DOCUMENTS:
         text = path.read_text(encoding="utf-8")
-        for name in re.findall(r"`((?:neural_fields|datasets|pipelines|configs|tests)/[\w./-]*)`", text):
+        for name in re.findall(r"`((?:neural_fields|datasets|pipelines|benchmarks|configs|tests)/[\w./-]*)`", text):
             assert (ROOT / name).exists(), f"{path.name} names {name}"
         for name in re.findall(r"`(mplicits(?:\.\w+)+)`", text) + re.findall(r"^::: ([\w.]+)$", text, re.MULTILINE):
             assert pkgutil.resolve_name(name), f"{path.name} names {name}"

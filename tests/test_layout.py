@@ -37,8 +37,6 @@ ROOMS = (
     "pipelines/web",
     "pipelines/evolve",
     "pipelines/reconstruct",
-    "pipelines/bench",
-    "pipelines/paper",
     "pipelines/cli",
     "pipelines/nerfstudio",
     "pipelines/front",
@@ -51,10 +49,28 @@ KERNELS = "neural_fields/kernels"  # where Triton may be imported; the files tha
 LIGHT = "import {}, sys; assert not {{'torch', 'numpy', 'scipy'}} & set(sys.modules), sorted(sys.modules)"
 
 
+# The same for benchmarks, which may import from any room above, by its installed name.
+BENCHMARKS = (
+    "benchmarks/harness",
+    "benchmarks/peers",
+    "benchmarks/shapes",
+    "benchmarks/costs",
+    "benchmarks/scenes",
+    "benchmarks/motion",
+    "benchmarks/paper",
+    "benchmarks/cli",
+)
+
+
 def sources() -> list[Path]:
+    """The files of the wheel."""
     return sorted(
         path for package in ("neural_fields", "datasets", "pipelines") for path in (ROOT / package).rglob("*.py")
     )
+
+
+def benchmarks() -> list[Path]:
+    return sorted((ROOT / "benchmarks").rglob("*.py"))
 
 
 def package_of(folder: str) -> str:
@@ -80,8 +96,8 @@ def imported(path: Path) -> list[Path]:
     for level, module, names in imports(path):
         if level == 0:
             # The front door has another name when it is installed, so that relative imports would lead elsewhere.
-            door = path.parent == ROOT / FRONT
-            assert door or module.split(".")[0] != "mplicits", f"{path}: import {module} relatively"
+            apart = path.parent == ROOT / FRONT or path.is_relative_to(ROOT / "benchmarks")
+            assert apart or module.split(".")[0] != "mplicits", f"{path}: import {module} relatively"
             continue
         folder = path.parents[level - 1]
         assert folder != ROOT.parent, f"{path}: import leads out of mplicits"
@@ -99,11 +115,11 @@ def imported(path: Path) -> list[Path]:
 
 def room(path: Path) -> str:
     inside = path.relative_to(ROOT).parent.as_posix()
-    return next((name for name in ROOMS if inside == name or inside.startswith(f"{name}/")), inside)
+    return next((name for name in (*ROOMS, *BENCHMARKS) if inside == name or inside.startswith(f"{name}/")), inside)
 
 
 def test_every_file_has_a_room() -> None:
-    lost = {room(path) for path in sources()} - set(ROOMS) - {"pipelines"}
+    lost = {room(path) for path in [*sources(), *benchmarks()]} - {*ROOMS, *BENCHMARKS, "pipelines", "benchmarks"}
     assert not lost, f"no room in the order: {sorted(lost)}"
 
 
@@ -117,6 +133,24 @@ def test_rooms_import_from_rooms_before_them(name: str) -> None:
             assert room(other) in allowed, f"{path.relative_to(ROOT)} imports {other.relative_to(ROOT)}"
 
 
+@pytest.mark.parametrize("name", BENCHMARKS)
+def test_benchmarks_import_from_benchmarks_before_them(name: str) -> None:
+    """Relative imports stay inside; the library is imported as ``mplicits``."""
+    files = [path for path in benchmarks() if room(path) == name]
+    assert files
+    allowed = {"benchmarks", *BENCHMARKS[: BENCHMARKS.index(name) + 1]}
+    for path in files:
+        assert not {module.split(".")[0] for level, module, _ in imports(path) if level == 0} & {"benchmarks"}
+        for other in imported(path):
+            assert room(other) in allowed, f"{path.relative_to(ROOT)} imports {other.relative_to(ROOT)}"
+
+
+def test_the_package_does_not_know_its_benchmarks() -> None:
+    for path in sources():
+        assert not any(module.split(".")[0] == "benchmarks" for _, module, _ in imports(path)), path
+        assert not any(other.is_relative_to(ROOT / "benchmarks") for other in imported(path)), path
+
+
 def test_nobody_imports_the_plugin() -> None:
     for path in sources():
         assert room(path) == PLUGIN or PLUGIN not in map(room, imported(path)), path
@@ -124,7 +158,8 @@ def test_nobody_imports_the_plugin() -> None:
 
 def test_no_two_files_import_each_other() -> None:
     """Not even by way of others, nor late; a folder's face, which imports its files, may be asked by others only."""
-    graph = {path: {other for other in imported(path) if other != path} for path in sources()}
+    files = [*sources(), *benchmarks()]
+    graph = {path: {other for other in imported(path) if other != path} for path in files}
     for path, others in graph.items():
         assert path.parent / "__init__.py" not in others, f"{path.relative_to(ROOT)} imports the face of its own folder"
     list(TopologicalSorter(graph).static_order())
@@ -133,7 +168,7 @@ def test_no_two_files_import_each_other() -> None:
 def test_one_file_goes_up_by_name() -> None:
     """The tests above do not see imports written as words: only the front door has them, and one file below it."""
     named = {path.relative_to(ROOT).as_posix() for path in sources() if "import_module(" in path.read_text("utf-8")}
-    assert named == {"neural_fields/upward.py", f"{FRONT}/__init__.py", "pipelines/paper/ours.py"}  # pymeshlab
+    assert named == {"neural_fields/upward.py", f"{FRONT}/__init__.py"}
     for module, name in upward.OFFERED.values():
         assert callable(getattr(importlib.import_module(f"mplicits.{module}"), name))
 
@@ -172,6 +207,14 @@ def test_every_folder_with_python_in_it_is_packaged() -> None:
         assert (path.parent / "__init__.py").is_file(), f"{path.parent} has no __init__.py"
 
 
+def test_the_wheel_holds_no_benchmarks() -> None:
+    setuptools = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["setuptools"]
+    words = {word for package in setuptools["packages"] for word in package.split(".")}
+    assert not words & {"bench", "benchmarks", "paper", "baselines", "peers"}
+    assert all(package.split(".")[0] == "mplicits" for package in setuptools["packages"])
+    assert not any(folder.startswith("benchmarks") for folder in setuptools["package-dir"].values())
+
+
 def plain(name: str) -> str:
     """A distribution's name as indexes compare it."""
     return re.sub(r"[-_.]+", "-", name).lower()
@@ -186,13 +229,16 @@ def test_dependencies_are_those_that_are_imported() -> None:
     def names(requirements: list[str]) -> set[str]:
         return {plain(re.split(r"[^\w-]", line)[0]) for line in requirements}
 
-    used = {name.split(".")[0] for path in sources() for level, name, _ in imports(path) if level == 0}
-    used -= {"mplicits", *sys.stdlib_module_names}
+    def used(files: list[Path]) -> set[str]:
+        tops = {name.split(".")[0] for path in files for level, name, _ in imports(path) if level == 0}
+        return tops - {"mplicits", *sys.stdlib_module_names}
+
+    own, all_used = used(sources()), used([*sources(), *benchmarks()])
     needed = names(project["dependencies"])
     optional = set().union(*(names(lines) for extra, lines in extras.items() if extra not in ("dev", "docs")))
-    unknown = {name for name in used if not {*homes.get(name, [name])} & (needed | optional | {"imageio-ffmpeg"})}
+    unknown = {name for name in all_used if not {*homes.get(name, [name])} & (needed | optional | {"imageio-ffmpeg"})}
     assert not unknown, f"imported, but in no list of pyproject.toml: {sorted(unknown)}"
-    found = {home for name in used for home in homes.get(name, [name])}
+    found = {home for name in own for home in homes.get(name, [name])}
     assert needed <= found, f"in pyproject.toml, but never imported: {sorted(needed - found)}"
     recorded = set(environment(torch.device("cpu"))["versions"]) - {"mplicits"}
     assert recorded <= needed, f"the record of a run asks for versions of {sorted(recorded - needed)}"

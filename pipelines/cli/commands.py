@@ -14,7 +14,6 @@ from typing import Any
 
 from ..run.config import input_error
 from ..run.settings import FitConfig
-from .bench import BENCH_COMMANDS
 from .common import Command, add_flags, add_settings, between, check_output, read_settings
 from .draw import ANIMATE, RENDER, SLICE, VIEW
 from .fit import FIT
@@ -118,7 +117,8 @@ def _solid(arguments: argparse.Namespace) -> int:
 
     vertices, faces = PRISMS[arguments.name]()
     write_triangles(arguments.out, Triangles(vertices, faces, None, None), Similarity.identity())
-    print(f"{arguments.out}: an exact mesh; draw points on it with: mplicits bench fit {arguments.out} --points 12000")
+    command = f"python -m benchmarks fit {arguments.out} --points 12000"
+    print(f"{arguments.out}: an exact mesh; in a checkout of mplicits, `{command}` fits points drawn on it")
     return 0
 
 
@@ -182,6 +182,5 @@ COMMANDS: Mapping[str, Command] = MappingProxyType(
             _demo,
             "Fit a cloud, write mesh.ply, mesh.glb and picture.png, and say how near the result is.",
         ),
-        **BENCH_COMMANDS,
     }
 )

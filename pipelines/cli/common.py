@@ -280,7 +280,7 @@ def check_output(path: Path | None, suffixes: Sequence[str]) -> None:
 def typed(arguments: argparse.Namespace) -> str:
     """The command as it could be typed again beside its files: pages are for others, who have other folders."""
     words = (Path(word).name if Path(word).is_absolute() else word for word in arguments.words)
-    return shlex.join(["mplicits", *words])
+    return shlex.join(words)
 
 
 def write_json(path: Path | None, data: Any) -> None:

@@ -10,14 +10,15 @@ import argparse
 import os
 import re
 import sys
-from collections.abc import Collection, Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import NoReturn
 
 from ..run.config import closest
 from .commands import COMMANDS
 from .common import Command, Stopped, check_output
 
-__all__ = ["main"]
+__all__ = ["MPLICITS", "Program", "main"]
 
 # How often an idle thread of GNU's OpenMP, which PyTorch uses on Linux, looks for its next share of work before it
 # sleeps: 0.2 ms rather than several. Meanwhile it holds a core that another process, or a thread with blocks of its
@@ -40,13 +41,8 @@ examples:
 
 `mplicits COMMAND --help` says more about each; `mplicits --version` prints the version."""
 
-GROUP = """usage: mplicits {name} COMMAND [arguments]
-
-commands:
-{commands}
-
-`mplicits {name} COMMAND --help` says more about each."""
 HELP = ("-h", "--help")
+MOVED = {"bench": "benchmarks are not in the package; run `python -m benchmarks NAME` in a checkout of mplicits"}
 
 
 class _UsageError(Exception):
@@ -56,9 +52,9 @@ class _UsageError(Exception):
 class _Parser(argparse.ArgumentParser):
     """An argument parser that raises instead of exiting, and knows what a mistyped flag should have been."""
 
-    def __init__(self, name: str, command: Command) -> None:
+    def __init__(self, name: str, command: Command, *, program: str) -> None:
         super().__init__(
-            prog=f"mplicits {name}",
+            prog=f"{program} {name}",
             description=command.description or command.summary,
             epilog=f"examples:\n{command.examples}",
             formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -82,96 +78,108 @@ class _Parser(argparse.ArgumentParser):
                 self.error(f"unknown flag {flag}{closest(flag, known)}")
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command.
+@dataclass(frozen=True)
+class Program:
+    """A table of commands with its own name on the command line.
 
-    Args:
-        argv: arguments without the program's name; those of the process by default.
-
-    Returns:
-        Exit code: 0, 1 (a check failed), 2 (bad input or arguments) or 130 (interrupted).
+    Attributes:
+        name: what is typed before a command.
+        commands: by name.
+        overview: what ``--help`` prints; ``{commands}`` is replaced by the list of commands.
+        moved: commands of earlier versions, each with what to run instead.
     """
-    os.environ.setdefault(*SPINS)
-    try:
-        return _run(list(sys.argv[1:] if argv is None else argv))
-    except SystemExit as stop:  # argparse's --help
-        return int(stop.code or 0)
-    except _UsageError as error:
-        return _fail(str(error))
-    except Stopped as stop:
-        print(stop, file=sys.stderr)
-        return 130
-    except KeyboardInterrupt:
-        print("mplicits: interrupted", file=sys.stderr)
-        return 130
-    except BrokenPipeError:
-        # Whoever read our output has left, `head` say. Python would complain again when it flushes at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 141
-    except OSError as error:
-        if error.filename is None:
-            raise
-        reason = error.strerror or type(error).__name__
-        return _fail(f"{os.fsdecode(error.filename)}: {reason}; check the path and its permissions")
-    except ValueError as error:
-        from ...neural_fields import InputError
 
-        if not isinstance(error, InputError):
-            raise
-        return _fail(str(error))
+    name: str
+    commands: Mapping[str, Command]
+    overview: str
+    moved: Mapping[str, str] = field(default_factory=dict)
+
+    def main(self, argv: Sequence[str] | None = None) -> int:
+        """Run one command.
+
+        Args:
+            argv: arguments without the program's name; those of the process by default.
+
+        Returns:
+            Exit code: 0, 1 (a check failed), 2 (bad input or arguments) or 130 (interrupted).
+        """
+        os.environ.setdefault(*SPINS)
+        try:
+            return self._run(list(sys.argv[1:] if argv is None else argv))
+        except SystemExit as stop:  # argparse's --help
+            return int(stop.code or 0)
+        except _UsageError as error:
+            return self._fail(str(error))
+        except Stopped as stop:
+            print(stop, file=sys.stderr)
+            return 130
+        except KeyboardInterrupt:
+            print(f"{self._short}: interrupted", file=sys.stderr)
+            return 130
+        except BrokenPipeError:
+            # Whoever read our output has left, `head` say. Python would complain again when it flushes at exit.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return 141
+        except OSError as error:
+            if error.filename is None:
+                raise
+            reason = error.strerror or type(error).__name__
+            return self._fail(f"{os.fsdecode(error.filename)}: {reason}; check the path and its permissions")
+        except ValueError as error:
+            from ...neural_fields import InputError
+
+            if not isinstance(error, InputError):
+                raise
+            return self._fail(str(error))
+
+    def parser(self, name: str) -> _Parser:
+        """The parser of a command's arguments."""
+        return _Parser(name, self.commands[name], program=self.name)
+
+    @property
+    def _short(self) -> str:
+        """The name that messages begin with."""
+        return self.name.split()[-1]
+
+    def _run(self, arguments: list[str]) -> int:
+        if arguments[:1] == ["help"]:
+            arguments = [*arguments[1:], "--help"]
+        if not arguments or arguments[0] in HELP:
+            print(self.overview.format(commands=self._listed()))
+            return 0 if arguments else 2
+        if arguments[0] == "--version":
+            from importlib.metadata import version  # late, as all that --help can do without
+
+            print(f"mplicits {version('mplicits')}")
+            return 0
+        name, *rest = arguments
+        if name in self.moved:
+            raise _UsageError(f"{name}: {self.moved[name]}")
+        if name not in self.commands:
+            raise _UsageError(f"unknown command {name!r}{closest(name, self.commands)}")
+        parser = self.parser(name)
+        if not {*HELP} & set(rest):
+            parser.check_flags(rest)
+        given = parser.parse_args(rest)
+        check_output(getattr(given, "json", None), (".json",))
+        given.words = [*self.name.split(), *arguments]  # as they were typed, for pages of results
+        code = self.commands[name].run(given)
+        sys.stdout.flush()
+        return code
+
+    def _listed(self) -> str:
+        """A line for each command, with what it does."""
+        width = max(map(len, self.commands))
+        return "\n".join(f"  {name:<{width}}  {command.summary}" for name, command in self.commands.items())
+
+    def _fail(self, message: str) -> int:
+        print(f"{self._short}: error: {' '.join(message.split())}", file=sys.stderr)
+        return 2
 
 
-def _run(arguments: list[str]) -> int:
-    if arguments[:1] == ["help"]:
-        arguments = [*arguments[1:], "--help"]
-    if not arguments or arguments[0] in HELP:
-        print(OVERVIEW.format(commands=_listed(COMMANDS)))
-        return 0 if arguments else 2
-    group = _group(arguments[0])
-    if group and (len(arguments) < 2 or arguments[1] in HELP):
-        print(GROUP.format(name=arguments[0], commands=_listed(group)))
-        return 0 if len(arguments) > 1 else 2
-    if arguments[0] == "--version":
-        from importlib.metadata import version  # late, as all that --help can do without
-
-        print(f"mplicits {version('mplicits')}")
-        return 0
-    name, command, rest = _choose(arguments)
-    parser = _Parser(name, command)
-    if not {*HELP} & set(rest):
-        parser.check_flags(rest)
-    given = parser.parse_args(rest)
-    check_output(getattr(given, "json", None), (".json",))
-    given.words = arguments  # as they were typed, for pages of results
-    code = command.run(given)
-    sys.stdout.flush()
-    return code
+MPLICITS = Program("mplicits", COMMANDS, OVERVIEW, MOVED)
 
 
-def _group(first: str) -> list[str]:
-    """The commands of two words that begin with this one."""
-    return [name for name in COMMANDS if name.startswith(f"{first} ")]
-
-
-def _listed(names: Collection[str]) -> str:
-    """A line for each command, with what it does."""
-    width = max(map(len, names))
-    return "\n".join(f"  {name:<{width}}  {COMMANDS[name].summary}" for name in names)
-
-
-def _choose(arguments: list[str]) -> tuple[str, Command, list[str]]:
-    """The command that the first word names, or with ``bench`` the first two."""
-    for words in (2, 1):
-        name = " ".join(arguments[:words])
-        if name in COMMANDS:
-            return name, COMMANDS[name], arguments[words:]
-    first = {name.split()[0] for name in COMMANDS}
-    if arguments[0] in first:
-        known = [name.split()[1] for name in _group(arguments[0])]
-        raise _UsageError(f"{arguments[0]}: unknown command {arguments[1]!r}{closest(arguments[1], known)}")
-    raise _UsageError(f"unknown command {arguments[0]!r}{closest(arguments[0], first)}")
-
-
-def _fail(message: str) -> int:
-    print(f"mplicits: error: {' '.join(message.split())}", file=sys.stderr)
-    return 2
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command of ``mplicits``; see `Program.main`."""
+    return MPLICITS.main(argv)

@@ -13,9 +13,9 @@ from torch import Tensor, nn
 from ...datasets.cameras import Camera
 from ...datasets.views.images import PosedImage
 from ...neural_fields import Field, InputError, Jet, MultiscaleSDF, Similarity, Siren
-from ...neural_fields.baselines import NeusSDF
 from ...neural_fields.devices import handed, precise
 from ...neural_fields.hash_encoding import HashEncoding
+from ...neural_fields.neus_mlp import NeusSDF
 from ...neural_fields.radiance import Outside, Radiance, ViewColor
 from ...neural_fields.sphere_start import fit_sphere
 from ...neural_fields.volume import sphere_span

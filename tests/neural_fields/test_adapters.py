@@ -18,9 +18,10 @@ from mplicits.neural_fields import (
 )
 from mplicits.neural_fields.radiance import ViewColor
 from mplicits.neural_fields.volume import transmittance_weights
-from mplicits.pipelines.bench.speed import Counted, counted
 from torch import Tensor, nn
 from torch.nn.functional import normalize, relu
+
+from benchmarks.costs.speed import Counted, counted
 
 # NeuS
 

@@ -2,8 +2,9 @@
 
 import pytest
 import torch
-from mplicits.neural_fields.baselines import HashGridSDF
 from mplicits.neural_fields.hash_encoding import HashEncoding, grid_resolutions, spatial_hash, tables_apart
+
+from benchmarks.peers import HashGridSDF
 
 
 def small(**options: int) -> HashEncoding:

@@ -11,8 +11,9 @@ import torch
 from fields import small_multiscale
 from hosts import points
 from mplicits.neural_fields import Field, Jet, NeuSGeometry, Siren
-from mplicits.pipelines.bench.speed import Counted
 from torch import Tensor
+
+from benchmarks.costs.speed import Counted
 
 
 def counting() -> tuple[NeuSGeometry, Counted]:

@@ -16,8 +16,9 @@ from mplicits.neural_fields import (
     Torus,
     sphere_trace,
 )
-from mplicits.neural_fields.baselines import BaconSDF
 from torch import Tensor
+
+from benchmarks.peers import BaconSDF
 
 THREE_D = {name: make for name, make in FIELDS.items() if make().in_dim == 3}
 

@@ -22,8 +22,9 @@ from mplicits.neural_fields.radiance import Outside
 from mplicits.neural_fields.value_grid import ValueGrid
 from mplicits.neural_fields.volume import sphere_span
 from mplicits.neural_fields.volume_renderer import sample_depths
-from mplicits.pipelines.bench.speed import counted
 from torch import Tensor
+
+from benchmarks.costs.speed import counted
 
 
 def rays(count: int, *, seed: int = 0) -> tuple[Tensor, Tensor]:

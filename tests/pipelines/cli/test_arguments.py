@@ -6,11 +6,12 @@ import random
 from pathlib import Path
 
 import pytest
-from mplicits.pipelines.cli.commands import COMMANDS
-from mplicits.pipelines.cli.entry import main
+from mplicits.pipelines.cli.entry import MPLICITS, Program
+
+from benchmarks.cli.entry import BENCHMARKS
 
 # Those without an input that can be missing would begin to work where all their other arguments happen to be right.
-NEED_NOTHING = {"doctor", "demo", "sample", "scene", "bench eta"}
+NEED_NOTHING = {"doctor", "demo", "sample", "scene", "eta"}
 JUNK = [
     "", " ", "-", "--", "nothing.ply", "nothing.npz", "nothing.safetensors", "nothing/", ".", "..", "/", "/dev/null",
     "a" * 300 + ".ply", "ä\u202e.obj", "x\ny.ply", "%s%n", "-1", "0", "1e400", "nan", "inf", "-inf", "1" * 400, "0x10",
@@ -18,16 +19,16 @@ JUNK = [
 ]  # fmt: skip
 
 
-def flags_of(name: str) -> list[argparse.Action]:
+def flags_of(program: Program, name: str) -> list[argparse.Action]:
     parser = argparse.ArgumentParser(add_help=False)
-    COMMANDS[name].add_arguments(parser)
+    program.commands[name].add_arguments(parser)
     return parser._actions
 
 
-def line_of(name: str, chance: random.Random) -> list[str]:
+def line_of(program: Program, name: str, chance: random.Random) -> list[str]:
     """A command with inputs that are not there, and a few of its flags with whatever."""
-    words = name.split()
-    for action in flags_of(name):
+    words = [name]
+    for action in flags_of(program, name):
         if not action.option_strings:
             words += [chance.choice(JUNK) for _ in range(chance.randint(0, 2))]
         elif action.required or chance.random() < 0.15:
@@ -37,34 +38,42 @@ def line_of(name: str, chance: random.Random) -> list[str]:
     return words
 
 
-def has_input(name: str) -> bool:
-    return any(not action.option_strings for action in flags_of(name)) and name not in NEED_NOTHING
+def has_input(program: Program, name: str) -> bool:
+    return any(not action.option_strings for action in flags_of(program, name)) and name not in NEED_NOTHING
 
 
-def one_line_and_2(line: list[str], capfd: pytest.CaptureFixture[str]) -> None:
-    code = main(line)
+WITH_INPUT = [
+    pytest.param(program, name, id=f"{program.name.split()[-1]} {name}")
+    for program in (MPLICITS, BENCHMARKS)
+    for name in program.commands
+    if has_input(program, name)
+]
+
+
+def one_line_and_2(program: Program, line: list[str], capfd: pytest.CaptureFixture[str]) -> None:
+    code = program.main(line)
     said = capfd.readouterr()
     assert (code, len(said.err.splitlines())) == (2, 1), (line, code, said.err[-2000:])
-    assert said.err.startswith("mplicits: error: ")
+    assert said.err.startswith(f"{program.name.split()[-1]}: error: ")
     assert len(said.err) < 1500
 
 
-@pytest.mark.parametrize("name", [name for name in COMMANDS if has_input(name)])
+@pytest.mark.parametrize(("program", "name"), WITH_INPUT)
 def test_junk_is_refused_in_one_line(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+    program: Program, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    chance = random.Random(name)
+    chance = random.Random(name if program is MPLICITS else f"bench {name}")
     for _ in range(15):
-        line = line_of(name, chance)
+        line = line_of(program, name, chance)
         if not {"-h", "--help"} & set(line):
-            one_line_and_2(line, capfd)
+            one_line_and_2(program, line, capfd)
     assert list(tmp_path.iterdir()) == []  # nothing was begun
 
 
-@pytest.mark.parametrize("name", [name for name in COMMANDS if has_input(name)])
+@pytest.mark.parametrize(("program", "name"), WITH_INPUT)
 def test_a_folder_that_one_may_not_enter_is_named(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+    program: Program, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """As for a user who is not root: every look into it is refused."""
     closed = tmp_path / "closed"
@@ -81,10 +90,10 @@ def test_a_folder_that_one_may_not_enter_is_named(
 
     for look in looks:
         monkeypatch.setattr(os, look, refuse(look))
-    words = name.split()
-    for action in flags_of(name):
+    words = [name]
+    for action in flags_of(program, name):
         if not action.option_strings:
             words += [str(closed / "scan.ply")] * (2 if action.nargs == 2 else 1)
         elif action.required:
             words += [action.option_strings[0], str(tmp_path / "out.ply")]
-    one_line_and_2(words, capfd)
+    one_line_and_2(program, words, capfd)

@@ -75,35 +75,32 @@ def test_help_names_every_command(capsys):
     assert re.search(r"^mplicits \d", capsys.readouterr().out, re.MULTILINE)
 
 
-def test_help_of_a_group_names_its_commands_alone(capsys):
-    for words, code in ((["bench", "--help"], 0), (["help", "bench"], 0), (["bench"], 2)):
-        assert main(words) == code
-        named = re.findall(r"^  (\S.*?)  ", capsys.readouterr().out, re.MULTILINE)
-        assert sorted(named) == sorted(name for name in COMMANDS if name.startswith("bench "))
-
-
-@pytest.mark.parametrize("name", ["mesh", "bench mesh"])
-def test_help_before_a_command_is_that_after_it(capsys, name):
-    assert main([*name.split(), "--help"]) == 0
+def test_help_before_a_command_is_that_after_it(capsys):
+    assert main(["mesh", "--help"]) == 0
     after = capsys.readouterr().out
-    assert main(["help", *name.split()]) == 0
+    assert main(["help", "mesh"]) == 0
     assert capsys.readouterr().out == after
+
+
+@pytest.mark.parametrize("words", ["bench", "bench fit a.ply", "bench --help", "help bench"])
+def test_benchmarks_have_moved(capsys, words):
+    assert "run `python -m benchmarks NAME` in a checkout" in fails(capsys, *words.split())
 
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_help_of_each_command_has_examples_that_parse(capsys, name):
-    from mplicits.pipelines.cli.entry import _Parser
+    from mplicits.pipelines.cli.entry import MPLICITS
 
-    assert main([*name.split(), "--help"]) == 0
+    assert main([name, "--help"]) == 0
     assert "examples:" in capsys.readouterr().out
     examples = [line.strip() for line in COMMANDS[name].examples.splitlines()]
     assert examples
     for example in examples:
         words = example.split()
         assert words[0] == "mplicits"
-        assert words[1 : 1 + len(name.split())] == name.split()
-        rest = words[1 + len(name.split()) :]
-        parser = _Parser(name, COMMANDS[name])
+        assert words[1] == name
+        rest = words[2:]
+        parser = MPLICITS.parser(name)
         parser.check_flags(rest)
         parser.parse_args(rest)
 
@@ -125,7 +122,6 @@ def test_neither_help_nor_mistakes_wait_for_torch():
     [
         ("mseh", "unknown command 'mseh'; did you mean 'mesh'?"),
         ("help mseh", "unknown command 'mseh'; did you mean 'mesh'?"),
-        ("bench normls", "bench: unknown command 'normls'; did you mean 'normals'?"),
         ("fit a.ply --ouput b", "unknown flag --ouput; did you mean '--out'?"),
         ("fit a.ply", "the following arguments are required: -o/--out"),
         ("fit a.ply -o b --preset fsat", "no preset 'fsat' for fit; did you mean 'fast'?"),
@@ -145,7 +141,6 @@ def test_neither_help_nor_mistakes_wait_for_torch():
         ("sample -o a.ply --quantise 3miles", "--quantise 3miles: expected a number"),
         ("sample -o a.ply --smear 2", "--smear: got '2', expected a number from 0 to 1"),
         ("sample -o a.ply --uneven 0", "--uneven: got '0', expected a number from 1"),
-        ("bench fit a.ply --isotropic", "--isotropic: how much noise? add --noise"),
         ("sample gear -o a.ply --noise 0.1mm", "--noise: is of scans, and gear is an exact mesh"),
     ],
 )
@@ -432,13 +427,6 @@ def test_the_demo_writes_meshes_and_a_picture_of_any_cloud(cloud, tmp_path, caps
     text = capsys.readouterr().out
     assert re.search(r"level 1 +\d", text)
     assert "is a file" in fails(capsys, "demo", cloud, "-o", out / "mesh.ply")
-
-
-def test_bench_normals_prints_a_table_and_writes_json(tmp_path, capsys):
-    figures = tmp_path / "normals.json"
-    assert main(["bench", "normals", "--points", "256", "--repeats", "1", "--json", str(figures)]) == 0
-    assert len(json.loads(figures.read_text())["records"]) == 4
-    assert "autograd" in capsys.readouterr().out
 
 
 # --- doctor ------------------------------------------------------------------------------------------

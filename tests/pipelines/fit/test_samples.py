@@ -23,9 +23,10 @@ from mplicits.pipelines.fit.samples import (
     usual_errors,
     with_previous,
 )
-from mplicits.pipelines.paper.base import train_level
 from mplicits.pipelines.run.settings import FitConfig
 from torch import Tensor
+
+from benchmarks.paper.base import train_level
 
 RADIUS = 0.6
 CPU = torch.device("cpu")

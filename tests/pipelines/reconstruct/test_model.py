@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 from mplicits.neural_fields import MultiscaleSDF, Sphere, ViewColor
-from mplicits.neural_fields.baselines import NeusSDF
+from mplicits.neural_fields.neus_mlp import NeusSDF
 from mplicits.neural_fields.volume_renderer import Sampling
 from mplicits.pipelines.reconstruct import model as scene_model
 from mplicits.pipelines.reconstruct.model import SceneModel, build_scene

@@ -1,0 +1,5 @@
+"""The command line: ``python -m benchmarks NAME …``."""
+
+from .entry import main
+
+__all__ = ["main"]

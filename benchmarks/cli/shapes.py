@@ -1,0 +1,199 @@
+"""``python -m benchmarks …`` of what comes of a shape: fits of clouds and scans, textures, borrowed normals."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from types import MappingProxyType
+
+from mplicits.pipelines.cli.common import Command, add_flags, add_settings, check_output, positive, read_settings, whole
+from mplicits.pipelines.run.config import add_config_flags, given_flags, input_error, load_config, preset_names
+from mplicits.pipelines.run.settings import FitConfig, TextureConfig
+
+from .common import folder_flag, measured_flags, noise_of, noisy_flags, number, run_benches, view_flags
+
+__all__ = ["SHAPES"]
+
+
+def _fit_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("shapes", nargs="+", metavar="SHAPE", help="mesh files")
+    noisy_flags(parser)
+    measured_flags(parser, 512)
+    number(parser, "--poisson-depth", whole(4, 14), 10, "octree depth")
+    parser.add_argument("--pictures", type=Path, metavar="DIR", help="write two pictures of all methods per shape")
+    folder_flag(parser)
+    add_flags(parser, "--json")
+    add_settings(parser, FitConfig)
+
+
+def _fit(arguments: argparse.Namespace) -> int:
+    config, noise = read_settings(arguments, FitConfig), noise_of(arguments)
+    from ..shapes.fits import FitBench
+
+    bench = FitBench(
+        shapes=arguments.shapes,
+        config=config,
+        noise=noise,
+        isotropic=arguments.isotropic,
+        points=arguments.points,
+        resolution=arguments.resolution,
+        samples=arguments.eval_samples,
+        poisson_depth=arguments.poisson_depth,
+        pictures=arguments.pictures,
+    )
+    return run_benches(arguments, [bench], out=arguments.out)
+
+
+def _signs_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("shapes", nargs="+", metavar="SHAPE", help="mesh files")
+    noisy_flags(parser)
+    folder_flag(parser)
+    add_flags(parser, "--json")
+    add_settings(parser, FitConfig)
+
+
+def _signs(arguments: argparse.Namespace) -> int:
+    config, noise = read_settings(arguments, FitConfig), noise_of(arguments)
+    from ..shapes.signs import SignsBench
+
+    options = {"noise": noise, "isotropic": arguments.isotropic, "points": arguments.points, "device": config.device}
+    return run_benches(arguments, [SignsBench(shapes=arguments.shapes, config=config, **options)], out=arguments.out)
+
+
+def _srb_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("folder", metavar="DIR", help="scans and true surfaces of the same names")
+    parser.add_argument(
+        "--rows",
+        nargs="+",
+        choices=("file", "none"),
+        default=("file", "none"),
+        help="fits with the file's normals, and without (both)",
+    )
+    parser.add_argument("--shapes", nargs="+", default=(), metavar="NAME", help="only scans of these surfaces (all)")
+    measured_flags(parser, 512, 1_000_000)
+    number(parser, "--poisson-depth", whole(4, 14), 10, "octree depth")
+    folder_flag(parser)
+    add_flags(parser, "--json")
+    add_settings(parser, FitConfig)
+
+
+def _srb(arguments: argparse.Namespace) -> int:
+    if "normals" in given_flags(arguments, FitConfig):
+        raise input_error("--normals: the benchmark fits with and without them; choose by --rows")
+    config = read_settings(arguments, FitConfig)
+    from ..shapes.srb import SrbBench
+
+    options = {name: getattr(arguments, name) for name in ("folder", "shapes", "resolution", "poisson_depth")}
+    bench = SrbBench(config=config, normals=arguments.rows, samples=arguments.eval_samples, **options)
+    return run_benches(arguments, [bench], out=arguments.out)
+
+
+# The paper's (64,1), with a frequency and a schedule at which it is a closed surface that looks like the shape.
+COARSE = FitConfig(widths=(64,), depths=(1,), omegas=(40.0,), steps=(1500,), learning_rates=(2e-2,), samples=200_000)
+
+
+def _texture_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("meshes", nargs="+", metavar="MESH", help="OBJ, GLB or glTF with a texture")
+    folder_flag(parser, required=True)
+    view_flags(parser, views=6)
+    coarse = parser.add_argument_group("coarse surface")
+    number(coarse, "--coarse-width", whole(1), 64, "neurons per layer")
+    number(coarse, "--coarse-depth", whole(1), 1, "sine layers")
+    number(coarse, "--coarse-omega", positive, 40.0, "SIREN frequency")
+    number(coarse, "--coarse-steps", whole(1), 1500, "training steps")
+    coarse.add_argument("--full", action="store_true", help="compare with a fit of several levels as well")
+    names = ", ".join(preset_names("fit"))
+    coarse.add_argument("--fit-preset", default="default", metavar="NAME", help=f"of --full: {names} (default)")
+    add_config_flags(parser, TextureConfig, about="of the textures; seed and device are also the fits'")
+
+
+def _texture(arguments: argparse.Namespace) -> int:
+    texture = load_config(TextureConfig, None, given_flags(arguments, TextureConfig))
+    shared = {"seed": texture.seed, "device": texture.device}
+    own = {f"{name}s": (getattr(arguments, f"coarse_{name}"),) for name in ("width", "depth", "omega")}
+    coarse = dataclasses.replace(COARSE, **own, steps=(arguments.coarse_steps,), **shared)
+    full = load_config(FitConfig, arguments.fit_preset, shared) if arguments.full else None
+    from ..shapes.texture import TextureBench
+
+    options = {name: getattr(arguments, name) for name in ("meshes", "views", "size", "up", "resolution")}
+    bench = TextureBench(texture=texture, coarse=coarse, full=full, device=texture.device, **options)
+    return run_benches(arguments, [bench], out=arguments.out)
+
+
+def _normal_map_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("run", metavar="RUN", help="run directory or .safetensors file")
+    parser.add_argument("reference", metavar="REFERENCE", help="the mesh that was fitted")
+    about = "a .png or .jpg with all the images, or a folder that keeps them and the figures"
+    parser.add_argument("-o", "--out", type=Path, metavar="PATH", help=about)
+    shadings = ("headlight", "lambert", "normals")
+    parser.add_argument("--shading", choices=shadings, default="headlight", help="what is compared")
+    number(parser, "--repeats", whole(1), 2, "the best of how many")
+    parser.add_argument("--device", default="auto", help="torch device (auto)")
+    view_flags(parser, views=3)
+
+
+def _normal_map(arguments: argparse.Namespace) -> int:
+    out: Path | None = arguments.out
+    picture = None
+    if out is not None and out.suffix and not out.is_dir():
+        check_output(out, (".png", ".jpg", ".jpeg"))
+        picture, out = out, None
+    elif out is not None:
+        picture = out / "images.png"
+    from ..shapes.normal_map import NormalMapBench
+
+    names = ("reference", "shading", "size", "views", "up", "resolution", "repeats", "device")
+    options = {name: getattr(arguments, name) for name in names}
+    return run_benches(arguments, [NormalMapBench(run_file=arguments.run, picture=picture, **options)], out=out)
+
+
+SHAPES: Mapping[str, Command] = MappingProxyType(
+    {
+        "fit": Command(
+            "how near fits come: ours per level, screened Poisson",
+            """  python -m benchmarks fit armadillo.ply --time-budget 180
+  python -m benchmarks fit armadillo.ply bunny.ply --noise 0.01 --preset fast --pictures pictures""",
+            _fit_arguments,
+            _fit,
+            "Fit the vertices of each mesh and measure the result against the mesh; Poisson needs mplicits[poisson].",
+        ),
+        "signs": Command(
+            "how many estimated normals point the wrong way",
+            """  python -m benchmarks signs armadillo.ply
+  python -m benchmarks signs armadillo.ply eiffel.ply --noise 0.005 --isotropic --json signs.json""",
+            _signs_arguments,
+            _signs,
+            "Estimate the normals of the vertices of each mesh as a fit does, then by a network that is not told of "
+            "signs (fit --normals none), and compare both with the exact ones.",
+        ),
+        "srb": Command(
+            "the surface reconstruction benchmark, beside what papers print",
+            """  python -m benchmarks srb srb/ -o bench_srb --preset fast
+  python -m benchmarks srb srb/ -o bench_srb --shapes anchor --rows none --json srb.json""",
+            _srb_arguments,
+            _srb,
+            "Fit the scans of a folder with their normals and without, and measure every level against the true "
+            "surfaces, in raw units and in the unit sphere, by the protocols of the papers.",
+        ),
+        "texture": Command(
+            "how near textures on coarse surfaces come to UV textures",
+            """  python -m benchmarks texture spot.obj bob.obj -o bench_texture
+  python -m benchmarks texture spot.obj -o bench_texture --full --fit-preset fast --json texture.json""",
+            _texture_arguments,
+            _texture,
+            "Fit a coarse surface to each mesh, train a texture field around it, and compare unlit images of it with "
+            "those of the mesh and its UV texture. Errors are in display RGB from 0 to 1.",
+        ),
+        "normal-map": Command(
+            "what the normals of a fine level do for a coarse surface",
+            """  python -m benchmarks normal-map runs/scan scan.ply
+  python -m benchmarks normal-map runs/scan scan.ply --shading lambert --views 6 -o images.png""",
+            _normal_map_arguments,
+            _normal_map,
+            "Compare shaded images of the levels of a run, and of the coarsest with the normals of the finest, with "
+            "images of the mesh that was fitted.",
+        ),
+    }
+)

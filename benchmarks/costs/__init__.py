@@ -1,0 +1,1 @@
+"""Times and counts: gradients, kernels, meshes, pictures, and the time left."""

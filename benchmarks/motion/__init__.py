@@ -1,0 +1,1 @@
+"""Shapes that move in closed form, and evolutions measured against them."""

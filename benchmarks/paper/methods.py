@@ -1,0 +1,35 @@
+"""All methods, in the order of the tables' rows."""
+
+from __future__ import annotations
+
+from ..harness.cells import Catalogue, Method
+from .ablations import DeltaFactor, LossWeights
+from .cells import PaperCell
+from .grids import BanfRecipe, InstantNgpRecipe
+from .isolation import Isolation
+from .judge import protocol_of
+from .networks import BaconRecipe, IdfRecipe, SirenRecipe
+from .ours import FromRecipe, Ours, Poisson
+from .speed import MarchingCubes, Normals
+
+__all__ = ["CATALOGUE", "METHODS"]
+
+# The first ones are those of `names.METHODS`; a test holds the two together.
+METHODS: tuple[Method[PaperCell], ...] = (
+    Ours(),
+    FromRecipe(SirenRecipe()),
+    FromRecipe(InstantNgpRecipe("coarse")),
+    FromRecipe(InstantNgpRecipe("fine")),
+    FromRecipe(IdfRecipe()),
+    FromRecipe(BaconRecipe()),
+    FromRecipe(BanfRecipe()),
+    Poisson(),
+    Poisson(trim=0.01),
+    Poisson(smoothed=True),
+    Isolation(),
+    LossWeights(),
+    DeltaFactor(),
+    MarchingCubes(),
+    Normals(),
+)
+CATALOGUE = Catalogue(METHODS, lambda cell: protocol_of(cell.preset).as_dict())

@@ -1,0 +1,153 @@
+"""The methods: ours, whose levels are coarse, medium and fine rows of the paper, recipes, and screened Poisson."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import time
+from collections.abc import Mapping
+from itertools import accumulate
+from typing import Any
+
+import numpy as np
+from mplicits.neural_fields.meshing import Mesh
+from mplicits.pipelines.run.folder import FIELD_FILE
+from mplicits.pipelines.run.settings import FitConfig
+from mplicits.pipelines.surface.trim import read_support
+
+from ..harness.cells import Findings, Method, Workplace
+from ..shapes.fits import has_poisson, kept_fit, screened_poisson
+from .cells import PaperCell
+from .judge import Judge, damaged_cloud, fit_config, oriented_cloud, protocol_of
+from .recipe import Recipe
+
+__all__ = ["FromRecipe", "Ours", "Poisson", "level_names", "our_config"]
+
+LIPSCHITZ = 1.25  # the eikonal term keeps |∇f| near 1
+
+
+def our_config(cell: PaperCell) -> FitConfig:
+    """The preset's settings with what the cell overrides.
+
+    Raises:
+        ValueError: a setting is out of range.
+    """
+    return dataclasses.replace(fit_config(cell.preset), **dict(cell.overrides), seed=cell.seed)
+
+
+def level_names(count: int) -> list[str]:
+    """Names of the outputs, as in the paper's tables.
+
+    Example:
+        >>> level_names(3)
+        ['Ours coarse', 'Ours medium', 'Ours fine']
+    """
+    middle = ["medium"] if count == 3 else [f"medium {i}" for i in range(1, count - 1)]
+    return [f"Ours {name}" for name in ["coarse", *middle, "fine"][:count]]
+
+
+class Ours(Method[PaperCell]):
+    """One training; every level is an output, with the time and the parameters up to and with it."""
+
+    name = "ours"
+    source = "the paper, Sec. 3.2 and Eq. 4 and 5"
+    differs = (
+        "distances come from the cloud, not from a mesh; see docs/fit.md. The cpu preset is the preset fast of "
+        "`mplicits fit`, whose finest level is (256, 2), not (400, 2)"
+    )
+
+    def settings(self, cell: PaperCell) -> Mapping[str, Any]:
+        """All settings of the fit but the device."""
+        return {"fit": {k: v for k, v in dataclasses.asdict(our_config(cell)).items() if k != "device"}}
+
+    def run(self, cell: PaperCell, work: Workplace) -> Findings:
+        """Fit, and measure every level; an interrupted fit goes on, and a finished one is taken as it is."""
+        judge, directory = Judge(cell, work), work.run()
+        config = dataclasses.replace(our_config(cell), device=work.device)
+        run = kept_fit(directory, damaged_cloud(cell), config, progress=work.progress)
+        stages = run.record["stages"]
+        seconds = accumulate(stage["sampling_seconds"] + stage["training_seconds"] for stage in stages)
+        parameters = accumulate(stage["parameters"] for stage in stages)
+        outputs = [
+            judge.field(
+                name,
+                run.field,
+                run.similarity,
+                level=level,
+                parameters=count,
+                train_seconds=spent,
+                lipschitz=LIPSCHITZ,
+                support=read_support(directory / FIELD_FILE, run.record, level),
+            )
+            for level, (name, spent, count) in enumerate(
+                zip(level_names(len(stages)), seconds, parameters, strict=True)
+            )
+        ]
+        details = {"cleaning": run.record["cleaning"], "stages": stages}
+        return Findings(tuple(outputs), tuple(run.record["deltas"]), details)
+
+
+class FromRecipe(Method[PaperCell]):
+    """A recipe, trained on the cell's cloud, and the figures of each of its outputs."""
+
+    def __init__(self, recipe: Recipe) -> None:
+        self.recipe = recipe
+        self.name, self.source, self.differs = recipe.name, recipe.source, recipe.differs
+
+    def settings(self, cell: PaperCell) -> Mapping[str, Any]:
+        """Size and schedule at the cell's preset."""
+        return {"recipe": repr(self.recipe.presets[cell.preset])}
+
+    def run(self, cell: PaperCell, work: Workplace) -> Findings:
+        """Train, then measure every output."""
+        judge, cloud = Judge(cell, work), oriented_cloud(cell)
+        trained = self.recipe.train(cloud, cell.preset, seed=cell.seed, device=work.device, progress=work.progress)
+        outputs = [
+            judge.field(
+                output.name,
+                output.field,
+                cloud.similarity,
+                level=output.level,
+                parameters=output.parameters,
+                train_seconds=trained.seconds,
+            )
+            for output in trained.outputs
+        ]
+        return Findings(tuple(outputs), details={"steps": trained.steps})
+
+
+class Poisson(Method[PaperCell]):
+    """Screened Poisson reconstruction.
+
+    Args:
+        trim: this part of the vertices, those of least density, is cut away, with their faces; 0 cuts nothing.
+        smoothed: noise is smoothed off the cloud first, as our fit does, so that the rest of the two can be compared.
+    """
+
+    source = "Kazhdan and Hoppe 2013, octree depth 10"
+
+    def __init__(self, *, trim: float = 0.0, smoothed: bool = False) -> None:
+        self.trim, self.smoothed = trim, smoothed
+        self.name = f"poisson{'-trim' if trim else ''}{'-smoothed' if smoothed else ''}"
+        self.label = "Screened Poisson"
+        self.differs = "MeshLab's implementation with its defaults; the paper's is Open3D's"
+        if trim:
+            self.label += f" ({trim:.0%} trim)"
+            self.differs += "; the trim follows Open3D's rule"
+        if smoothed:
+            self.label += " (our smoothing)"
+            self.differs += "; it gets the cloud from which ours has smoothed the noise, not the noisy one"
+
+    def missing(self) -> str | None:
+        """The extra, where it is not installed."""
+        return None if has_poisson() else "needs pip install mplicits[poisson]"
+
+    def run(self, cell: PaperCell, work: Workplace) -> Findings:
+        """Reconstruct, and measure."""
+        judge, cloud = Judge(cell, work), oriented_cloud(cell, smooth_noise=self.smoothed)
+        importlib.import_module("pymeshlab")  # so that loading it is not timed
+        started = time.perf_counter()
+        surface = screened_poisson(cloud, depth=protocol_of(cell.preset).poisson_depth, trim=self.trim)
+        seconds = time.perf_counter() - started
+        mesh = Mesh(surface.vertices, surface.faces.astype(np.int32))
+        return Findings((judge.mesh(self.label, mesh, cloud.similarity, train_seconds=seconds),))

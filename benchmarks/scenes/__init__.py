@@ -1,0 +1,1 @@
+"""Reconstructions of photographs: the multiscale geometry beside that of NeuS."""

@@ -1,0 +1,1 @@
+"""Fits of clouds, scans and textures against the shapes that they were made from."""

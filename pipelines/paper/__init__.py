@@ -1,1 +1,0 @@
-"""``bench paper``: the tables of the paper, our fields and their peers on the same clouds, measured in the same way."""

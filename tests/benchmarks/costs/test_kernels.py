@@ -1,0 +1,85 @@
+"""The bench of the fused kernels: errors within their bounds, and bytes that are counted by hand."""
+
+import json
+import os
+from pathlib import Path
+
+import pytest
+import torch
+
+from benchmarks.cli import main
+from benchmarks.costs.kernel_levels import LevelsBench
+from benchmarks.costs.kernels import KernelsBench
+from benchmarks.harness.report import as_text
+
+pytest.importorskip("triton", reason="Triton is not installed: pip install 'mplicits[kernels]' on Linux")
+
+
+def test_a_network_is_as_exact_as_it_has_to_be(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    if not torch.cuda.is_available():
+        monkeypatch.setenv("MPLICITS_KERNELS", "interpret")
+    bench = KernelsBench(sizes=((16, 2), (16, 1)), points=20, device="cuda" if torch.cuda.is_available() else "cpu")
+    rows = bench.rows(tmp_path / "out")
+    for row in rows:
+        assert 0 < row.value_error < row.value_bound
+        assert 0 < row.gradient_error < row.gradient_bound
+        assert row.share < 1
+        assert row.pytorch_value_error < row.value_bound
+        assert row.fused_bytes == 28  # a point, a value and a gradient of four bytes a number
+    assert rows[0].staged_bytes == 4 * 2 * 16  # one matrix, written and read
+    assert rows[1].staged_bytes == 0
+    (table,) = bench.tables(rows, sgemm=1.0)
+    assert "(16,2)" in as_text(table)
+
+
+def test_levels_are_as_exact_as_they_have_to_be(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    if not torch.cuda.is_available():
+        monkeypatch.setenv("MPLICITS_KERNELS", "interpret")
+    sizes = ((8, 1), (16, 1))
+    bench = LevelsBench(fields=(sizes,), points=40, device="cuda" if torch.cuda.is_available() else "cpu")
+    rows = bench.rows(tmp_path / "out")
+    assert [row.taper for row in rows] == [0.0, 0.5]
+    for row in rows:
+        assert row.inside == (0.5,)
+        assert 0 < row.value_error < 1e-5
+        assert row.share < 1
+        # A point and a jet for all; for half of them a place on the list, the point again, and the jet there and back.
+        assert row.fused_bytes == 28 + (16 + 28 + 16) / 2
+        assert row.staged_bytes == 0  # one layer is never put aside
+        assert row.unfused_launches > 20
+        assert row.unfused_waits == 1
+    (table,) = bench.tables(rows, sgemm=1.0)
+    assert "(8,1)▷(16,1), taper 0.5" in as_text(table)
+
+
+def test_bytes_of_the_papers_coarse_network() -> None:
+    """At least eight times fewer than PyTorch's operations, s₂ counted as if no cache held it."""
+    from mplicits.neural_fields import Siren
+
+    from benchmarks.costs.kernels import staged_bytes
+    from benchmarks.costs.traffic import traffic_of
+
+    x = torch.rand(4096, 3)
+    network = Siren(128, 2).requires_grad_(False)
+    unfused = traffic_of(lambda: network.jet(x)).moved / len(x)
+    assert staged_bytes(128, 2) == 1024
+    assert unfused >= 8 * (28 + staged_bytes(128, 2))
+    # 400 units are made 64 at a time, in seven blocks, and each of them reads the whole layer below, 416 with its rest.
+    assert staged_bytes(400, 2) == 4 * (448 + 7 * 416 + 448 + 7 * 416)
+
+
+def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MPLICITS_KERNELS", "auto")  # put back afterwards
+    monkeypatch.setenv("TRITON_INTERPRET", os.environ.get("TRITON_INTERPRET", "0"))
+    words = ["kernels", "--widths", "16", "--depths", "1", "--points", "5"]
+    assert main([*words, "--json", str(tmp_path / "kernels.json")]) == 0
+    assert "of bound" in (tmp_path / "kernels.json").read_text()
+    assert json.loads((tmp_path / "kernels.json").read_text())
+
+
+def test_where_the_kernels_cannot_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from mplicits.neural_fields import InputError
+
+    monkeypatch.setenv("MPLICITS_KERNELS", "off")
+    with pytest.raises(InputError, match="cannot run here: MPLICITS_KERNELS=off"):
+        KernelsBench(sizes=((16, 1),)).rows(tmp_path / "out")

@@ -1,0 +1,162 @@
+"""What every benchmark of ours shares: rows to JSON and back, finished cells that are kept, tables in three forms."""
+
+import csv
+import dataclasses
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from mplicits.neural_fields import InputError
+from mplicits.pipelines.run.jobs import Outcome
+from mplicits.pipelines.run.settings import FitConfig
+from mplicits.pipelines.run.trainer import Progress
+
+from benchmarks.harness import run
+from benchmarks.harness.benchmark import Benchmark, Part, from_figures, one_of_each, write_results
+from benchmarks.harness.cells import Catalogue, Workplace
+from benchmarks.harness.report import as_text
+from benchmarks.harness.run import run_cell, run_cells
+from benchmarks.harness.tables import Column, Table, tabulated
+
+
+@dataclass(frozen=True)
+class Size:
+    edge: float
+    corners: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Row:
+    name: str
+    size: Size | None
+    times: tuple[float, ...] = ()
+
+    @property
+    def area(self) -> float | None:
+        """What follows from the fields is in the JSON files too."""
+        return None if self.size is None else self.size.edge**2
+
+
+@dataclass(frozen=True, kw_only=True)
+class Squares(Benchmark[Row]):
+    """Squares, one of which fails."""
+
+    name = "squares"
+    source = "a test"
+    row = Row
+    apart = ("edges",)
+    edges: Sequence[float]
+    config: FitConfig = dataclasses.field(default_factory=FitConfig)
+    done: list[str] = dataclasses.field(default_factory=list, compare=False)
+
+    def settings(self, cell):
+        return {k: v for k, v in super().settings(cell).items() if k != "done"}
+
+    def cells(self):
+        return [Part(self.name, f"edge {edge:g}", options=(("edge", edge),)) for edge in self.edges]
+
+    def measure(self, cell, work):
+        edge = cell.parameters["edge"]
+        if edge < 0:
+            raise InputError("no such square")
+        self.done.append(cell.name)
+        work.say(f"drawing {cell.name}")
+        work.stage("square")(Progress("drawn", 1, 1, 1.0, {}))
+        return [Row(cell.name, Size(edge, (1, 2)) if edge else None, (0.5,))]
+
+    def tables(self, rows, *, sgemm) -> tuple[Table, ...]:
+        figures = [(Column("area", ".1f", "lowest"), lambda row: row.area)]
+        return (
+            tabulated(self.name, "Squares", "square", figures, [(row.name, row) for row in rows], notes=["A note."]),
+        )
+
+
+def test_rows_come_back_as_they_were(tmp_path: Path) -> None:
+    bench, said, stages = Squares(edges=[2.0, 0.0]), [], []
+    rows = bench.rows(tmp_path, say=said.append, progress=lambda step: stages.append(step.stage))
+    assert rows == [Row("edge 2", Size(2.0, (1, 2)), (0.5,)), Row("edge 0", None, (0.5,))]
+    assert said == ["drawing edge 2", "drawing edge 0"]
+    assert stages == ["square drawn"] * 2
+    assert bench.rows(tmp_path) == rows
+    assert len(bench.done) == 2
+    record = run_cell(bench.cells()[0], tmp_path, Catalogue([bench]))
+    assert record["outputs"] == [
+        {"name": "edge 2", "size": {"edge": 2.0, "corners": [1, 2]}, "times": [0.5], "area": 4.0}
+    ]
+    assert record["cell"] == {"method": "squares", "name": "edge 2", "files": [], "edge": 2.0}
+    assert from_figures(Size | None, None) is None
+
+
+def test_keys_are_of_settings_but_not_of_other_cells_and_devices() -> None:
+    bench = Squares(edges=[2.0])
+    (part,) = bench.cells()
+
+    def key(**changes: object) -> str:
+        return Catalogue([dataclasses.replace(bench, **changes)]).key(part)  # type: ignore[arg-type]
+
+    assert key() == key(edges=[2.0, 3.0]) == key(config=FitConfig(device="cpu"))
+    assert key() != key(config=FitConfig(seed=1))
+    assert json.loads(json.dumps(bench.settings(part))) == bench.settings(part)
+    assert {"device", "threads"} <= set(bench.settings(part))
+
+
+def test_results_of_what_is_done(tmp_path: Path) -> None:
+    bench = Squares(edges=[2.0, -1.0, 1.0])
+    lines: list[str] = []
+    (tmp_path / "cells").mkdir()
+    ran = run_cells(bench.cells(), tmp_path, Catalogue([bench]), say=lines.append)
+    assert [part.name for part in ran.records] == ["edge 2", "edge 1"]
+    assert "edge -1: failed: no such square" in lines[1]
+    with pytest.raises(InputError, match="no such square"):
+        bench.rows(tmp_path)
+    other = Squares(edges=[7.0])
+    planned = [(bench, bench.cells()), (other, other.cells())]
+    tables, figures = write_results(planned, tmp_path, command="python -m benchmarks squares")
+    (table,) = tables
+    assert [row.values for row in table.rows] == [(4.0,), (1.0,)]
+    written = json.loads((tmp_path / "results.json").read_text())
+    assert written == json.loads(json.dumps(figures))
+    assert [record["outputs"][0]["area"] for record in written["records"]] == [4.0, 1.0]
+    assert [row["values"] for row in written["tables"][0]["rows"]] == [[4.0], [1.0]]
+    with (tmp_path / "squares.csv").open() as file:
+        assert [row["area"] for row in csv.DictReader(file)] == ["4.0", "1.0"]
+    page = (tmp_path / "results.md").read_text()
+    for part in ("    python -m benchmarks squares\n", "| edge 1 | **1.0** |", "- A note.", "GFLOP/s"):
+        assert part in page
+    assert as_text(table).splitlines() == [
+        "Squares",
+        "square  area",
+        "------  ----",
+        "edge 2   4.0",
+        "edge 1   1.0",
+        "A note.",
+    ]
+    bench = Squares(edges=[7.0])
+    assert write_results([(bench, bench.cells())], tmp_path, command="x")[0] == []
+
+
+def test_two_of_one_name() -> None:
+    one_of_each(["a", "b"], "meshes")
+    with pytest.raises(InputError, match="b: two of the meshes are called that; rename one of them"):
+        one_of_each(["a", "b", "b"], "meshes")
+
+
+def test_a_part_that_was_never_asked_for(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="there is none; did you mean 'squares'"):
+        run_cell(Part("square", "x"), tmp_path, Catalogue([Squares(edges=[])]))
+    assert Workplace(tmp_path, "k").run() == tmp_path / "runs" / "k"
+
+
+def test_the_time_left_counts_what_is_under_way_as_half_done(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Four cells of forty seconds, two at a time: eighty in all."""
+    clock, said = [100.0], list[str]()
+    monkeypatch.setattr(run.time, "monotonic", lambda: clock[0])
+    counter = run._Counter(4, said.append, at_once=2)
+    for _ in range(4):
+        clock[0] += 40 if len(said) % 2 == 0 else 0
+        cell = Part("b", f"cell {len(said)}")
+        counter(Outcome(cell, {"outputs": [], "seconds": 40.0}, None, 40.0))
+    # 40 s for one and a half of four, and for two and a half; 80 s for three and a half.
+    assert [line.partition("about ")[2] for line in said] == ["67 s left", "24 s left", "11 s left", ""]

@@ -1,0 +1,321 @@
+"""Tables from made-up records, in every format; plots."""
+
+import csv
+import io
+import json
+from xml.etree import ElementTree
+
+import pytest
+
+from benchmarks.harness.plots import Plot, Series, to_svg
+from benchmarks.harness.report import (
+    Section,
+    as_csv,
+    as_dict,
+    as_markdown,
+    as_page,
+    from_dict,
+    section_as_dict,
+    section_from_dict,
+    with_missing,
+)
+from benchmarks.harness.tables import Column, Row, Table, mean, median, ratio
+from benchmarks.paper.cells import printed_name, select
+from benchmarks.paper.comparison import banf_tables, comparison_tables, noise_plots, noise_tables, poisson_tables
+from benchmarks.paper.published import BANF, COMPARISON, NOISE
+from benchmarks.paper.robustness import delta_tables, outlier_plots, outlier_tables, shortened, undertrained_tables
+
+
+def record(shape, method, chamfers, *, iou=0.9, deltas=(), **cell):
+    """One whose outputs are named after their Chamfer distances' keys."""
+    fields = {"noise": 0.0, "outliers": 0.0, "flipped": 0.0, "overrides": {}, "preset": "smoke", "seed": 0} | cell
+    outputs = [
+        {
+            "name": name,
+            "chamfer": value,
+            "chamfer_floor": 1e-6,
+            "iou": iou,
+            "shell_iou": iou / 2,
+            "components": 3,
+            "parameters": 10,
+            "train_seconds": 30.0,
+            "mesh_seconds": 2.0,
+            "rays_per_second": 512 * 512 * 4.0,
+        }
+        if value is not None
+        else {"name": name, "chamfer": None, "train_seconds": 30.0, "mesh_seconds": 2.0, "parameters": 10}
+        for name, value in chamfers.items()
+    ]
+    return {
+        "cell": {"shape": shape, "method": method, **fields},
+        "method": {"source": f"by {method}", "differs": f"not {method}"},
+        "outputs": outputs,
+        "deltas": list(deltas),
+    }
+
+
+def rows_of(table):
+    return {row.name: dict(zip((c.name for c in table.columns), row.values, strict=True)) for row in table.rows}
+
+
+def test_comparison() -> None:
+    records = [
+        record("a", "ours", {"Ours coarse": 4e-5, "Ours fine": 1e-5}, iou=0.8),
+        record("b", "ours", {"Ours coarse": 6e-5, "Ours fine": 2e-5}, iou=0.9),
+        record("c", "ours", {"Ours coarse": 8e-5, "Ours fine": 6e-5}, iou=1.0),
+        record("a", "idf", {"IDF": 1e-4}),
+        record("b", "idf", {"IDF": None}),
+        record("c", "poisson", {"Screened Poisson": 9e-5}),
+    ]
+    table, chamfer, _, parts = comparison_tables(records)
+    rows = rows_of(table)
+    fine = rows["Ours fine"]
+    assert fine["mean CD"] == pytest.approx(3e-5)
+    assert fine["median CD"] == pytest.approx(2e-5)
+    assert fine["mean IoU"] == pytest.approx(0.9)
+    assert fine["mean shell IoU"] == pytest.approx(0.45)
+    assert fine["training (min)"] == pytest.approx(0.5)
+    assert fine["FPS at 512²"] == pytest.approx(4)
+    assert (fine["found"], fine["parameters"], fine["meshing (s)"]) == ("3/3", 10, 2.0)
+    assert rows["IDF"]["found"] == "1/2"
+    assert rows["IDF"]["mean CD"] == 1e-4
+    assert rows["(sampling floor)"]["mean CD"] == pytest.approx(1e-6)
+    assert table.notes[0] == (
+        "The mean Chamfer distance of Ours fine is 3.00 times lower than that of the best other row, Screened Poisson."
+    )
+    by_name = {row.name: row for row in table.rows}
+    published = by_name["IDF"].published
+    assert published is not None
+    assert published[:4] == COMPARISON["IDF"][:4]
+    assert published[-4:] == (1_191_943, 8.26, 42.38, None)
+    assert by_name["Screened Poisson"].published is None
+    assert (by_name["IDF"].source, by_name["IDF"].differs) == ("by idf", "not idf")
+    assert [column.name for column in chamfer.columns] == ["a", "b", "c"]
+    assert rows_of(chamfer)["IDF"] == {"a": 1e-4, "b": None, "c": None}
+    assert rows_of(parts)["Ours fine"] == {"a": 3, "b": 3, "c": 3}
+
+
+def test_noise_is_told_from_the_clean_cells_of_its_curves() -> None:
+    records = [
+        record("a", "ours", {"Ours fine": 1e-5}),
+        record("a", "ours", {"Ours fine": 2e-5}, noise=0.01),
+        record("a", "ours", {"Ours fine": 3e-5}, noise=0.02),
+        record("a", "poisson", {"Screened Poisson": 8e-5}, noise=0.01),
+        record("a", "idf", {"IDF": 5e-5}, noise=0.01),
+    ]
+    table, *_ = noise_tables(records)
+    assert rows_of(table)["Ours fine"]["mean CD"] == 2e-5
+    assert table.rows[0].published == (*NOISE["Ours fine"], None, None, None)
+    assert "2.50 times lower" in table.notes[0]
+    assert "4.00 times below that of screened Poisson" in table.notes[0]
+    curves, everything, levels, *pairs = noise_plots(records)
+    assert curves.places == ("0 %", "1 %", "2 %")
+    assert curves.series == (Series("Ours fine", (1e-5, 2e-5, 3e-5)),)
+    assert [series.name for series in everything.series] == ["Ours fine", "Screened Poisson", "IDF"]
+    assert everything.series[0].values == (2e-5,)
+    assert [series.name for series in levels.series] == ["Ours fine"]
+    assert [plot.name for plot in pairs] == [
+        "noise-per-mesh-ours-fine-idf",
+        "noise-per-mesh-ours-fine-screened-poisson",
+    ]
+
+
+def test_poisson() -> None:
+    records = [
+        record("a", "ours", {"Ours coarse": 9e-5, "Ours fine": 1e-5}),
+        record("a", "ours", {"Ours coarse": 9e-5, "Ours fine": 2e-5}, noise=0.01),
+        record("a", "poisson", {"Screened Poisson": 3e-5}),
+        record("a", "poisson", {"Screened Poisson": 8e-5}, noise=0.01),
+        record("a", "poisson-smoothed", {"Screened Poisson (our smoothing)": 5e-5}, noise=0.01),
+    ]
+    (table,) = poisson_tables(records)
+    rows = rows_of(table)
+    assert "clean, Screened Poisson (our smoothing)" not in rows
+    assert rows["1 % noise, Screened Poisson (our smoothing)"]["mean CD"] == 5e-5
+    assert rows["clean, Screened Poisson"]["mean CD"] == 3e-5
+    assert rows["1 % noise, Ours fine"]["mean CD"] == 2e-5
+    assert table.rows[1].published == (3.87e-5, 0.653, None, None)
+    assert "is 3.00 times that of Ours fine on clean clouds, and 4.00 times under noise" in table.notes[0]
+    assert "smoothed, screened Poisson is at 2.50 times ours" in table.notes[1]
+
+
+def test_banf() -> None:
+    records = [
+        record("Armadillo_2", "ours", {"Ours coarse": 1.0, "Ours fine": 1e-5}),
+        record("Armadillo_2", "banf", {"BANF 32": 1.0, "BANF 64": 2e-5}),
+        record("Armadillo_2", "ours", {"Ours coarse": 1.0, "Ours fine": 3e-5}, noise=0.01),
+        record("Armadillo_2", "banf", {"BANF 32": 1.0, "BANF 64": None}, noise=0.01),
+    ]
+    (table,) = banf_tables(records)
+    (row,) = table.rows
+    assert row.values == (1e-5, 2e-5, 3e-5, None, pytest.approx(3), None)
+    assert row.published is not None
+    assert row.published[:4] == BANF["armadillo"]
+    assert row.published[5] == pytest.approx(7.3, abs=0.05)  # as the paper prints it
+
+
+def test_outliers() -> None:
+    records = [
+        record("lucy", "ours", {"Ours coarse": 1.0, "Ours fine": 1e-5}, iou=0.95, outliers=0.01),
+        record("lucy", "poisson", {"Screened Poisson": 2e-3}, iou=0.1, outliers=0.01),
+        record("spot", "ours", {"Ours fine": 2e-5}, iou=0.93, outliers=0.01),
+        record("spot", "ours", {"Ours fine": 4e-5}, iou=0.5, outliers=0.05),
+        record("spot", "ours", {"Ours fine": 3e-5}, iou=0.7, flipped=0.1),
+    ]
+    table, flipped = outlier_tables(records)
+    rows = rows_of(table)
+    assert list(rows) == [f"{shape} {share} %" for shape in ("lucy", "spot") for share in ("0.1", "1", "5")]
+    assert rows["lucy 1 %"]["ours IoU"] == 0.95
+    assert rows["lucy 1 %"]["SPSR IoU"] == 0.1
+    assert rows["lucy 1 %"]["SPSR (trim) IoU"] is None
+    assert rows["lucy 1 %"]["ours CD"] == 1e-5
+    assert rows["lucy 0.1 %"]["ours IoU"] is None
+    by_name = {row.name: row.published for row in table.rows}
+    assert by_name["lucy 1 %"] == (0.002, 0.004, 0.938, None, None, None, None)
+    assert by_name["lucy 5 %"] is None
+    assert by_name["spot 1 %"] is None
+    assert "Lowest IoU of ours at 1 %: 0.930, of spot." in table.notes
+    assert rows_of(flipped) == {
+        "spot": {"ours IoU": 0.7, "SPSR IoU": None, "ours CD": 3e-5, "SPSR CD": None, "ours parts": 3}
+    }
+    (plot,) = outlier_plots(records)
+    assert plot.series == (Series("lucy", (None, 1e-5, None)), Series("spot", (None, 2e-5, 4e-5)))
+
+
+def test_undertrained() -> None:
+    assert shortened((100, 40, 40), 1.0) == ()
+    records = [
+        record("armadillo", "ours", {"Ours fine": 4e-5}, deltas=[0.4], overrides={"steps": [25, 40, 40]}),
+        record("armadillo", "ours", {"Ours fine": 3e-5}, deltas=[0.3], overrides={"steps": [50, 40, 40]}),
+        record("armadillo", "ours", {"Ours fine": 2e-5}, deltas=[0.2]),
+    ]
+    (table,) = undertrained_tables(records)
+    (row,) = table.rows
+    assert row.values == (0.4, 0.3, 0.2, 4e-5, 3e-5, 2e-5, pytest.approx(2))
+    assert row.published == (6.2e-2, 2e-2, 1.71e-2, 1.11e-5, 1.06e-4, 9.81e-5, pytest.approx(1.11e-5 / 9.81e-5))
+    assert table.notes[0] == "A coarse stage of 25 % costs at most a factor of 2.00 in Chamfer distance."
+    (partial,) = undertrained_tables(records[:2])
+    assert partial.rows[0].values[2] is None
+
+
+def test_deltas() -> None:
+    records = [
+        record("thai", "ours", {"Ours fine": 4e-5}, deltas=[0.02, 0.01]),
+        record("thai", "ours", {"Ours fine": 4e-5}, deltas=[0.04, 0.03], noise=0.01),
+    ]
+    (table,) = delta_tables(records)
+    assert [column.name for column in table.columns] == ["δ₁", "δ₂"]
+    assert [(row.name, row.values, row.published) for row in table.rows] == [
+        ("thai", (0.02, 0.01), (2.71e-2, 1.57e-2)),
+        ("thai + 1 % noise", (0.04, 0.03), (6.9e-2, 5.2e-2)),
+    ]
+    assert table.notes[0] == "The widest band is 4.00 % of the unit sphere's radius."
+
+
+def test_helpers() -> None:
+    assert mean([1.0, None, 3.0]) == 2.0
+    assert mean([None]) is median([]) is None
+    assert median([1.0, None, 9.0, 2.0]) == 2.0
+    assert ratio(1.0, 0.0) is ratio(None, 1.0) is None
+    assert printed_name("xyzrgb_Dragon", BANF) == "dragon"
+    assert printed_name("cow", BANF) is None
+    assert select([record("a", "x", {}), record("b", "x", {})], shape="b", method="x", overrides={})[0]["outputs"] == []
+
+
+TABLE = Table(
+    "made-up",
+    "A table",
+    "method",
+    (Column("CD", ".1e", "lowest"), Column("IoU", ".2f", "highest"), Column("found")),
+    (
+        Row("first", (1e-5, 0.5, "1/1"), (2e-5, None, None), "A, B", "it | that"),
+        Row("second", (3e-5, 0.75, "1/1")),
+        Row("floor", (1e-6, None, None), competes=False),
+    ),
+    ("A note.",),
+)
+
+
+def test_markdown() -> None:
+    assert as_markdown(TABLE) == "\n".join(
+        [
+            "| method | CD | IoU | found |",
+            "|---|---:|---:|---:|",
+            "| first | **1.0e-05** *(2.0e-05)* | 0.50 | 1/1 |",
+            "| second | 3.0e-05 | **0.75** | 1/1 |",
+            "| floor | 1.0e-06 | – | – |",
+        ]
+    )
+
+
+def test_csv() -> None:
+    lines = list(csv.DictReader(io.StringIO(as_csv(TABLE))))
+    assert [line["method"] for line in lines] == ["first", "second", "floor"]
+    assert float(lines[0]["CD"]) == 1e-5
+    assert float(lines[0]["CD (paper)"]) == 2e-5
+    assert lines[1]["CD (paper)"] == lines[2]["IoU"] == ""
+    assert (lines[0]["source"], lines[0]["differs"]) == ("A, B", "it | that")
+
+
+def test_json_gives_the_same_table_back() -> None:
+    assert from_dict(json.loads(json.dumps(as_dict(TABLE)))) == TABLE
+    section = Section("n", "l", "s", (TABLE,), (("p.svg", "P"),), (("s.png", "S"),), (("m", "s", "d"),), ("f",))
+    assert section_from_dict(json.loads(json.dumps(section_as_dict(section)))) == section
+
+
+def test_rows_must_fit() -> None:
+    with pytest.raises(ValueError, match="t: r: 1 values for 2 columns"):
+        Table("t", "T", "h", (Column("a"), Column("b")), (Row("r", (1,)),))
+    with pytest.raises(ValueError, match="3 values for 2 columns"):
+        Table("t", "T", "h", (Column("a"), Column("b")), (Row("r", (1, 2), (1, 2, 3)),))
+
+
+def test_page() -> None:
+    section = Section(
+        "made-up",
+        "tab:made-up",
+        "what it shows",
+        (with_missing(TABLE, {"poisson": "needs an extra"}),),
+        (("plots/a.svg", "A plot"), ("plots/b.svg", "Another")),
+        (("sheets/a.png", "A sheet"),),
+        (("ours", "A | B", "nothing"),),
+        ("a, idf: no luck",),
+    )
+    page = as_page(
+        [section, section],
+        title="Made up",
+        command="python -m benchmarks paper x",
+        protocol=["One.", "Two."],
+        machine="a lathe",
+    )
+    assert "    python -m benchmarks paper x\n" in page
+    assert page.count("| ours | A \\| B | nothing |") == 1
+    assert "| poisson: needs an extra | – | – | – |" in page
+    assert page.count("## made-up: what it shows") == 2
+    for part in ("- One.\n- Two.", "a lathe", "`tab:made-up`", "![A plot](plots/a.svg)", "[Another](plots/b.svg)"):
+        assert part in page
+    assert "![A sheet](sheets/a.png)" in page
+    assert "- a, idf: no luck" in page
+
+
+def test_a_plot() -> None:
+    plot = Plot("p", "A <b>", ("x", "y"), (Series("s", (1e-4, 1e-3)), Series("t", (None, 1e-1))), "CD", lines=True)
+    svg = to_svg(plot)
+    root = ElementTree.fromstring(svg)
+    texts = [text.text for text in root.iter("{http://www.w3.org/2000/svg}text")]
+    assert {"A <b>", "x", "y", "s", "t", "CD"} <= set(texts)
+    assert to_svg(plot) == svg
+    dots = [dot for dot in root.iter("{http://www.w3.org/2000/svg}use") if "stroke-opacity" in dot.get("style", "")]
+    (x0, y0), (x1, y1), (x2, y2), *legend = [(float(dot.attrib["x"]), float(dot.attrib["y"])) for dot in dots]
+    assert len(legend) == 2
+    assert x0 < x1 == x2
+    assert y1 - y2 == pytest.approx(2 * (y0 - y1), abs=0.01)  # one decade up, then two
+
+
+def test_plots_take_only_what_they_can_draw() -> None:
+    with pytest.raises(ValueError, match="1 values for 2 places"):
+        Plot("p", "t", ("x", "y"), (Series("s", (1.0,)),), "CD")
+    with pytest.raises(ValueError, match="numbers > 0"):
+        Plot("p", "t", ("x",), (Series("s", (0.0,)),), "CD")
+    with pytest.raises(ValueError, match="no values"):
+        to_svg(Plot("p", "t", ("x",), (Series("s", (None,)),), "CD"))

@@ -1,0 +1,126 @@
+"""The benchmark of evolutions: closed forms score no error, fields that miss something do, morphs are measured."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+import trimesh
+from evolutions import QUICK, ball, fails, few_points
+from mplicits.neural_fields import Field, Jet
+from mplicits.neural_fields.files import write_json
+from mplicits.pipelines.run.settings import FitConfig
+from torch import Tensor
+
+from benchmarks.cli import main
+from benchmarks.harness.report import as_text
+from benchmarks.motion import evolve as bench_evolve
+from benchmarks.motion.evolve import CASES, ExactBench, MorphBench, measure_exact
+from benchmarks.shapes.fits import fit_home
+
+
+@pytest.fixture(autouse=True)
+def _few_points(monkeypatch: pytest.MonkeyPatch) -> None:
+    few_points(monkeypatch)
+
+
+class United(Field):
+    """The union of fields of space-time."""
+
+    def __init__(self, parts: list[Field]) -> None:
+        super().__init__()
+        self.parts, self.in_dim, self.num_levels, self.deltas = parts, 4, 1, torch.empty(0)
+
+    def value(self, x: Tensor, *, level: int = -1) -> Tensor:
+        return self.jet(x).value
+
+    def jet(self, x: Tensor, *, level: int = -1) -> Jet:
+        jets = [part.jet(x) for part in self.parts]
+        value, nearest = torch.stack([jet.value for jet in jets]).min(dim=0)
+        gradients = torch.stack([jet.gradient for jet in jets])
+        index = nearest[None, ..., None].expand(1, *x.shape)
+        return Jet(value, gradients.gather(0, index)[0], x.new_empty((*x.shape[:-1], 0)))
+
+
+@pytest.mark.parametrize("name", list(CASES))
+def test_the_truth_of_an_exact_case_scores_no_error(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    monkeypatch.setattr(bench_evolve, "RESOLUTION", 32)
+    row = measure_exact(name, United(CASES[name].truth()), CASES[name], 0.0)
+    assert row.mean_error < 1e-4
+    assert row.mean_value < 1e-4
+    assert row.slopes["mean"] == pytest.approx(1, abs=1e-4)
+    # Spheres that are nearer than a cell look like one.
+    wrong = [found != expected for found, expected in zip(row.components, row.expected, strict=True)]
+    assert sum(wrong) <= 1
+    assert len(row.times) == 20
+
+
+def test_a_missing_part_is_seen() -> None:
+    case = CASES["two spheres, merging"]
+    assert [case.components(t) for t in (0.0, 0.62, 0.63, 1.0)] == [2, 2, 1, 1]
+    row = measure_exact("half of it", case.truth()[0], case, 0.0)
+    assert row.components == (1,) * 20
+    assert row.mean_value > 0.1
+
+
+@pytest.mark.slow
+def test_exact_cases_are_trained_and_printed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(bench_evolve, "TIMES", 3)
+    monkeypatch.setattr(bench_evolve, "RESOLUTION", 24)
+    (name, *_) = CASES
+    bench = ExactBench(config=replace(QUICK, steps=(120,)), cases=[name])
+    rows = bench.rows(tmp_path)
+    assert rows[0].mean_error < 0.05
+    assert rows[0].components == (1, 1, 1)
+    assert rows[0].case == name
+    assert name in as_text(*bench.tables(rows, sgemm=1e9))
+
+
+@pytest.mark.slow
+def test_a_morph_is_measured_against_meshes(tmp_path: Path) -> None:
+    meshes = []
+    for name, radius in (("small", 0.4), ("large", 0.6)):
+        mesh = trimesh.creation.icosphere(subdivisions=4, radius=2 * radius)
+        mesh.apply_translation((5.0, 0.0, 0.0))  # the similarity of `ball`
+        meshes.append(tmp_path / f"{name}.ply")
+        mesh.export(meshes[-1])
+        home = fit_home(tmp_path / "out", meshes[-1], FitConfig())  # where its fit is kept
+        home.mkdir(parents=True)
+        ball(home / "field.safetensors", radius, levels=True)
+        write_json(home / "run.json", {"config": {}, "finished": True})
+    config = replace(QUICK, align="none", steps=(150,), samples=4000)
+    first, second = meshes
+    bench = MorphBench(meshes=(first, second), config=config, resolution=32, samples=5000)
+    (row,) = bench.rows(tmp_path / "out")
+    assert row.shapes == ("small", "large")
+    for end, fitted, floor in zip(row.ends, row.fits, row.floors, strict=True):
+        # Nothing but the sampling, and in units of the meshes' spheres the errors of fit and morph, squared.
+        assert floor < fitted < floor + 0.002
+        assert floor < end < floor + 0.01
+    assert row.volumes[0] == pytest.approx(4 / 3 * math.pi * 0.4**3, rel=0.2)
+    assert row.volumes[-1] == pytest.approx(4 / 3 * math.pi * 0.6**3, rel=0.2)
+    assert row.components == (1, 1, 1)
+    ends, curves = bench.tables([row], sgemm=1e9)
+    table = as_text(ends)
+    assert "small at t = 0" in table
+    assert f"{row.ends[1] / row.fits[1]:.2f}" in table
+    assert [frame.values for frame in curves.rows] == list(zip(row.volumes, row.components, strict=True))
+    assert len(list((tmp_path / "out" / "runs").glob("*/run.json"))) == 3
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("--meshes a.ply b.ply", "--meshes: the fits need a folder; add -o DIR"),
+        ("--no-exact", "--no-exact: nothing is left to measure"),
+        ("--kind smooth", "--kind: the benchmark says what is trained"),
+        ("--json figures.txt", "unknown extension"),
+        ("--meshes a.ply b.ply --no-exact -o OUT", "a.ply: no such file"),
+        ("--meshes x/a.ply y/a.ply --no-exact -o OUT", "rename one"),
+    ],
+)
+def test_bad_arguments_of_the_benchmark(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: str, message: str
+) -> None:
+    assert message in fails(capsys, f"evolve {arguments.replace('OUT', str(tmp_path / 'out'))}", main)

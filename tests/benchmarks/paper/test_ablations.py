@@ -1,0 +1,463 @@
+"""The paper's ablations: exact distances, variants that are what they say, rows from made-up records, smoke cells."""
+
+import dataclasses
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from imageio.v3 import imread
+from mplicits.datasets import read_cloud
+from mplicits.neural_fields import Box, InputError, MultiscaleSDF, Similarity, Siren, Sphere, extract_mesh
+from mplicits.pipelines.fit.cloud import CloudDistance
+from mplicits.pipelines.fit.samples import Weights, banded_sources
+from mplicits.pipelines.fit.train import fit, prepare
+from mplicits.pipelines.mesh.files import write_mesh
+from mplicits.pipelines.surface.distance import MeshDistance, approximation_error, barycentric_of_nearest, near_surface
+from mplicits.pipelines.surface.surface import Surface, from_mesh
+
+from benchmarks.harness.cells import make_folder
+from benchmarks.harness.run import run_cell
+from benchmarks.paper.ablations import (
+    DELTA_FACTOR,
+    LOSS_WEIGHTS,
+    delta_factor_tables,
+    error_plots,
+    loss_weight_tables,
+    short,
+)
+from benchmarks.paper.base import (
+    Base,
+    delta_after,
+    domain_sources,
+    generator_for,
+    on_its_own,
+    reviewed,
+    train_level,
+    up_to,
+    without_bands,
+)
+from benchmarks.paper.cells import PaperCell
+from benchmarks.paper.isolation import ISOLATION, IndependentLevels, isolation_tables, residuals_everywhere, steepness
+from benchmarks.paper.judge import fit_config
+from benchmarks.paper.methods import CATALOGUE
+from benchmarks.paper.sheets import write_sheets
+from benchmarks.paper.speed import MARCHING_CUBES, NORMALS, grid_seconds, marching_cubes_tables, normals_tables
+
+HALF = np.array([0.5, 0.3, 0.4])
+# Two triangles a side, outward.
+CUBOID = Surface(
+    HALF * [[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)],
+    np.array(
+        [
+            *[[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1]],
+            *[[2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]],
+        ]
+    ),
+)
+
+
+# Exact distances
+
+
+@pytest.mark.parametrize(
+    ("point", "expected"),
+    [
+        ((0.2, 0.3, 1.0), (0.5, 0.2, 0.3)),  # above the inside
+        ((-1.0, -1.0, 0.5), (1, 0, 0)),
+        ((2.0, -0.5, 0.0), (0, 1, 0)),
+        ((0.5, -1.0, 0.0), (0.5, 0.5, 0)),
+        ((1.0, 1.0, 0.0), (0, 0.5, 0.5)),
+        ((-1.0, 0.25, 0.0), (0.75, 0, 0.25)),
+    ],
+)
+def test_nearest_point_of_a_triangle(point: tuple[float, ...], expected: tuple[float, ...]) -> None:
+    corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    weights = barycentric_of_nearest(np.array(point), corners)
+    np.testing.assert_allclose(weights, expected, atol=1e-15)
+    assert [w == 0 for w in weights] == [e == 0 for e in expected]
+
+
+def test_distances_to_a_box_are_exact_inside_outside_and_over_its_edges() -> None:
+    points = np.random.default_rng(0).uniform(-1, 1, (3000, 3))
+    q = np.abs(points) - HALF
+    exact = np.linalg.norm(np.maximum(q, 0), axis=1) + np.minimum(q.max(axis=1), 0)
+    np.testing.assert_allclose(MeshDistance(CUBOID).signed(points), exact, atol=1e-14)
+
+
+@pytest.mark.slow
+def test_long_faces_beside_many_small_ones_hide_nobody() -> None:
+    # A large triangle far below a finely triangulated patch: its centre is much further away than it is.
+    grid = np.linspace(-0.05, 0.05, 30)
+    x, y = np.meshgrid(grid, grid, indexing="ij")
+    patch = np.stack((x, y, np.full_like(x, 0.2)), axis=-1).reshape(-1, 3)
+    corner = np.arange(30 * 30).reshape(30, 30)[:-1, :-1].reshape(-1)
+    faces = np.concatenate((corner[:, None] + [0, 30, 1], corner[:, None] + [1, 30, 31]))
+    vertices = np.concatenate((patch, [[-1, -1, 0], [1, -1, 0], [0, 2, 0]]))
+    both = Surface(vertices, np.concatenate((faces, len(patch) + np.array([[0, 1, 2]]))))
+    points = np.array([[0.0, -0.9, 0.03], [0.03, 0.02, 0.06], [0.03, 0.02, 0.14], [0.0, 0.0, 0.25]])
+    np.testing.assert_allclose(MeshDistance(both).signed(points), [0.03, 0.06, -0.06, 0.05], atol=1e-14)
+
+
+def test_sign_at_a_sharp_tip_is_that_of_all_faces_around_it() -> None:
+    # Past the tip of a flat needle two of its faces, taken alone, would say inside.
+    tip = Surface(
+        np.array([[1.0, 0, 0], [0, 0.2, 0], [0, -0.1, 0.17], [0, -0.1, -0.17]]),
+        np.array([[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]]),
+    )
+    directions = np.random.default_rng(1).normal(size=(500, 3)) * 0.1
+    directions[:, 0] = np.abs(directions[:, 0]) + 0.3
+    assert (MeshDistance(tip).signed(np.add([1, 0, 0], directions)) > 0).all()
+    assert MeshDistance(tip).signed(np.array([[0.5, 0.0, 0.0]]))[0] < 0
+
+
+def test_a_surface_without_faces_has_no_distances() -> None:
+    with pytest.raises(ValueError, match="no faces"):
+        MeshDistance(Surface(np.eye(3), np.array([[0, 0, 1]])))
+
+
+def test_approximation_error_of_an_exact_and_of_a_shifted_field() -> None:
+    points = near_surface(CUBOID, 4000, reach=0.05, seed=3)
+    distances = MeshDistance(CUBOID).signed(points)
+    assert 0.045 < np.abs(distances).max() <= 0.05
+    assert 0.4 < (distances < 0).mean() < 0.6
+    box = Box(half_size=(0.5, 0.3, 0.4))
+    assert approximation_error(box, points, distances) < 1e-6
+    grown = Box(half_size=(0.51, 0.31, 0.41))
+    inside = (np.abs(points) < HALF).all(axis=1)
+    assert approximation_error(grown, points[inside], distances[inside]) == pytest.approx(0.01, abs=1e-6)
+
+
+def test_error_of_a_sphere_field_against_its_own_mesh() -> None:
+    mesh = from_mesh(extract_mesh(Sphere(radius=0.6), resolution=48))
+    points = near_surface(mesh, 3000, reach=0.02)
+    distances = MeshDistance(mesh).signed(points)
+    sag = (2.04 / 48) ** 2 * 3 / (8 * 0.6)  # of a cell's diagonal, the longest edge that a face can have
+    assert approximation_error(Sphere(radius=0.6), points, distances) < sag / 2
+    assert approximation_error(Sphere(radius=0.59), points, distances) == pytest.approx(0.01, abs=sag / 2)
+
+
+# Variants
+
+
+def small(levels: int = 3) -> MultiscaleSDF:
+    torch.manual_seed(0)
+    return MultiscaleSDF(
+        Sphere(radius=0.5), [Siren(16, 2, omega=5.0) for _ in range(levels - 1)], [0.2, 0.1][: levels - 1]
+    )
+
+
+def test_without_bands_is_the_sum_of_all_levels_everywhere() -> None:
+    field, x = small(), 2 * torch.rand(500, 3) - 1
+    everywhere = without_bands(field)
+    torch.testing.assert_close(everywhere.value(x), torch.stack([level.value(x) for level in field.levels]).sum(dim=0))
+    gradients = torch.stack([level.jet(x).gradient for level in field.levels]).sum(dim=0)
+    torch.testing.assert_close(everywhere.jet(x).gradient, gradients)
+    assert not torch.allclose(everywhere.value(x), field.value(x))
+    assert everywhere.in_band(x, level=2).all()
+
+
+def test_up_to_a_level() -> None:
+    field, x = small(), 2 * torch.rand(200, 3) - 1
+    assert [up_to(field, level).num_levels for level in range(3)] == [1, 2, 3]
+    for level in range(3):
+        torch.testing.assert_close(up_to(field, level).value(x), field.value(x, level=level))
+
+
+def test_independent_levels_hand_over_inside_their_bands() -> None:
+    torch.manual_seed(1)
+    base, middle, fine = Sphere(radius=0.5), Sphere(radius=0.55), Siren(16, 2, omega=5.0)
+    field = IndependentLevels([base, middle], [0.2]).with_level(fine, delta=0.1)
+    x = 1.6 * torch.rand(2000, 3) - 0.8
+    first = base.value(x).abs() < 0.2
+    second = first & (middle.value(x).abs() < 0.1)
+    assert 50 < second.sum() < first.sum() < 1990
+    value, gradient, features = field.jet(x)
+    assert features.shape == (2000, 0)
+    for rows, level in ((~first, base), (first & ~second, middle), (second, fine)):
+        torch.testing.assert_close(field.value(x)[rows], level.value(x[rows]))
+        torch.testing.assert_close(value[rows], level.value(x[rows]))
+        torch.testing.assert_close(gradient[rows], level.jet(x[rows]).gradient)
+    assert torch.equal(field.in_band(x, level=0), torch.ones(2000, dtype=torch.bool))
+    assert torch.equal(field.in_band(x, level=1), first)
+    assert torch.equal(field.in_band(x, level=2), second)
+    torch.testing.assert_close(field.value(x, level=0), base.value(x))
+    assert field.value(x[:6].reshape(2, 3, 3)).shape == (2, 3)
+    assert field.value(x[:0]).shape == (0,)
+    with pytest.raises(ValueError, match="expected one less"):
+        IndependentLevels([base], [0.1])
+
+
+def test_steepness_bounds_the_slope() -> None:
+    assert steepness(Sphere(radius=0.5), margin=1.0) == 1.25
+    siren = Siren(16, 1, omega=8.0)
+    with torch.no_grad():
+        siren.output.weight.mul_(100)
+        slopes = siren.jet(2 * torch.rand(3000, 3) - 1).gradient.norm(dim=-1)
+    assert slopes.max() > 1.25
+    assert steepness(siren) > float(slopes.max())
+
+
+# Levels trained out of order
+
+
+@pytest.fixture(scope="module")
+def ball(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("shapes") / "ball.ply"
+    write_mesh(path, extract_mesh(Sphere(radius=0.7), resolution=24), Similarity((5.0, 0.0, -1.0), 20.0))
+    return path
+
+
+@pytest.fixture(scope="module")
+def base(ball: Path) -> Base:
+    config = fit_config("smoke")
+    cloud = read_cloud(ball)
+    run = fit(cloud, config)
+    return Base(run.field, run.similarity, config, prepare(cloud, config))
+
+
+def test_a_level_trained_with_the_fits_own_weights_is_the_fits_own_level(base: Base) -> None:
+    index, previous = base.index(), up_to(base.field, 0)
+    delta = delta_after(index, previous, base.config)
+    assert delta == pytest.approx(float(base.field.deltas[0]), rel=1e-6)
+    generator = generator_for(base.config, 1)
+    sources = banded_sources(index, previous, delta, base.config, generator=generator)
+    network = train_level(1, sources, base.config, generator=generator)
+    x = torch.from_numpy(base.cloud.points)
+    again = previous.with_level(network, delta=delta)
+    torch.testing.assert_close(again.value(x), base.field.value(x, level=1), atol=1e-5, rtol=0)
+    assert float((again.value(x) - previous.value(x)).abs().max()) > 1e-4
+
+
+def test_residual_levels_see_the_cloud_that_level_0_has_judged(base: Base) -> None:
+    normals = base.cloud.normals.copy()
+    normals[::40] *= -1
+    flipped = dataclasses.replace(base.cloud, normals=normals)
+    np.testing.assert_array_equal(reviewed(flipped, up_to(base.field, 0), base.config).normals, base.cloud.normals)
+    trusting = dataclasses.replace(base.config, turn_normals=False)
+    np.testing.assert_array_equal(reviewed(flipped, up_to(base.field, 0), trusting).normals, normals)
+
+
+def test_weights_stand_where_they_are_given(base: Base) -> None:
+    errors, cloud = torch.full((4,), 0.01), base.index()
+    assert cloud.noise == 0
+    usual = Weights().resolved(base.config, errors, cloud)
+    assert usual == pytest.approx((1e4, base.config.normal_weight, base.config.eikonal_weight))
+    assert Weights(data=0.0, eikonal=7.0).resolved(base.config, errors, cloud) == (0.0, base.config.normal_weight, 7.0)
+
+
+def test_sources_of_the_variants(base: Base) -> None:
+    index, previous = base.index(), up_to(base.field, 0)
+    delta = delta_after(index, previous, base.config)
+    banded = banded_sources(index, previous, delta, base.config, generator=torch.Generator())
+    assert [source.name for source in banded] == ["surface", "offset", "band"]
+    assert all(bool((previous.value(s.samples.points).abs() < delta).all()) for s in banded)
+    assert banded[0].samples.value is not None
+    for source, alone in zip(banded, on_its_own(banded), strict=True):
+        assert alone.samples.value is None
+        assert alone.samples.gradient is None
+        assert torch.equal(alone.samples.points, source.samples.points)
+    surface, domain = domain_sources(index, previous, base.config, generator=torch.Generator())
+    assert len(surface.samples) == len(base.cloud)
+    assert len(domain.samples) == base.config.samples
+    assert domain.samples.distance is not None
+    assert float(domain.samples.distance.max()) > 0.6  # near the corners of the domain
+    assert domain.data == pytest.approx(surface.data * base.config.domain_weight)
+
+
+def test_a_residual_without_bands_learns_the_whole_domain(base: Base) -> None:
+    field = residuals_everywhere(base)
+    assert field.deltas.tolist() == [math.inf, math.inf]
+    index = CloudDistance(torch.from_numpy(base.cloud.points), torch.from_numpy(base.cloud.normals))
+    x = 1.6 * torch.rand(2000, 3, generator=torch.Generator().manual_seed(5)) - 0.8
+    exact = index.signed(x)
+    assert float((field.value(x) - exact).abs().mean()) < float((base.field.base.value(x) - exact).abs().mean())  # type: ignore[operator]
+
+
+def test_short_schedules_are_for_cpus_only() -> None:
+    config = fit_config("smoke")
+    assert short(config, "smoke") is config
+    assert short(config, "paper") is config
+    assert max(short(fit_config("cpu"), "cpu").steps) == 120
+
+
+def test_grid_seconds_count_what_was_left_out() -> None:
+    rows = []
+
+    class Slow(Sphere):
+        def value(self, x: torch.Tensor, *, level: int = -1) -> torch.Tensor:
+            rows.append(x.clone())
+            return super().value(x, level=level)
+
+    assert grid_seconds(Slow(radius=0.5), 8) > 0
+    whole = torch.cat(rows[1:])  # the first call warms up
+    assert len(whole) == 9**3
+    assert len(torch.unique(whole, dim=0)) == 9**3
+    assert whole.min() == pytest.approx(-1.02)
+    rows.clear()
+    grid_seconds(Slow(radius=0.5), 8, every=4)
+    assert sorted({round(float(part[0, 0]), 3) for part in rows[1:]}) == [-0.51, 0.51]
+
+
+# Tables
+
+
+def record(method: str, outputs: list[dict[str, Any]], *, shape: str = "ball", **more: Any) -> dict[str, Any]:
+    cell = {"shape": shape, "method": method, "preset": "cpu", "noise": 0.0, "overrides": {}} | more.pop("cell", {})
+    return {"cell": cell, "outputs": outputs, "deltas": [], "details": {}, "environment": {"device": "cpu"}} | more
+
+
+def test_loss_weight_rows() -> None:
+    def at(shape: str, level: int, errors: dict[float, float]) -> dict[str, Any]:
+        outputs = [{"name": f"{w:g}", "weight": w, "error": e} for w, e in errors.items()]
+        cell = {"overrides": {"constraint": "normal", "level": level}}
+        return record(
+            "loss-weights", outputs, shape=shape, cell=cell, details={"without": 0.5 * level, "fit": 0.1 * level}
+        )
+
+    records = [
+        record("ours", [{"name": "Ours fine", "chamfer": 1.0}]),
+        at("ball", 1, {0: 0.1, 100: 0.2}),
+        at("ball", 2, {0: 0.01, 100: 0.02}),
+        at("cube", 1, {0: 0.3, 100: 0.4}),
+    ]
+    (table,) = loss_weight_tables(records)
+    assert table.name == "loss-weights-normal"
+    names = ["0", "100", "level not trained at all", "the finished fit, its own weights"]
+    assert [row.name for row in table.rows] == names
+    assert table.rows[0].values == pytest.approx((0.2, 0.01))
+    assert table.rows[1].values == pytest.approx((0.3, 0.02))
+    assert table.rows[2].values == pytest.approx((0.5, 1.0))
+    assert table.rows[3].values == pytest.approx((0.1, 0.2))
+    assert table.rows[0].published == (0.0073, 0.0017)
+    assert table.rows[1].published == (0.0081, 0.0013)
+    assert "ball, cube" in table.notes[0]
+    (plot,) = LOSS_WEIGHTS.plots(records)
+    assert plot.places == ("0", "100")
+    assert [series.name for series in plot.series] == [
+        f"{level} level{whose}" for level in ("medium", "fine") for whose in ("", ", paper")
+    ]
+    assert plot.series[0].values == pytest.approx((0.2, 0.3))
+    assert plot.series[1].values == (0.0073, 0.0081)
+
+
+def test_delta_factor_rows() -> None:
+    def at(epsilon: float, medium: float, fine: float) -> dict[str, Any]:
+        outputs = [{"name": "medium", "error": medium}, {"name": "fine", "error": fine}]
+        return record("delta-factor", outputs, cell={"overrides": {"epsilon": epsilon}}, deltas=[0.02, 0.01])
+
+    (table,) = delta_factor_tables([at(4.0, 0.3, 0.2), at(0.01, 0.03, 0.02), at(0.3, 0.05, 0.04)])
+    assert [row.name for row in table.rows] == ["1.01", "1.3", "5"]
+    assert table.rows[1].values == pytest.approx((0.02, 0.01, 0.05, 0.04))
+    assert table.rows[1].published == (None, None, 0.0103, 0.0050)
+    (plot,) = error_plots([table])
+    assert [series.values for series in plot.series[:2]] == [(0.03, 0.05, 0.3), (0.0098, 0.0103, 0.0139)]
+
+
+def test_isolation_rows() -> None:
+    def figures(name: str, chamfer: float | None, components: int) -> dict[str, Any]:
+        found = {"hausdorff": 2 * (chamfer or 0), "shell_iou": 0.5, "iou": 0.9, "components": components}
+        return {"name": name, "chamfer": chamfer} | (found if chamfer is not None else {})
+
+    noisy = {"noise": 0.01}
+    records = [
+        record("ours", [figures("Ours coarse", 9.0, 9), figures("Ours fine", 9.0, 9)], cell=noisy),
+        record("isolation", [figures("a", 1.0, 1), figures("a without culling", 1.5, 1)], cell=noisy),
+        record("isolation", [figures("a", 3.0, 3)], shape="cube", cell=noisy),
+        record("isolation", [figures("a", 0.25, 1)]),
+        record("isolation", [figures("b", 4.0, 2)], cell=noisy),
+        record("isolation", [figures("b", None, 0)], shape="cube", cell=noisy),
+        record("isolation", [figures("c", 5.0, 2), figures("c without culling", 50.0, 1234)], cell=noisy),
+    ]
+    table, culling = isolation_tables(records)
+    a, b, c = table.rows
+    assert a.values == pytest.approx((2.0, 2.0, 4.0, 0.5, 0.9, 2.0, 0.25, 0.25, 0.5, 0.5, 0.9, 1.0))
+    assert b.values[:6] == pytest.approx((4.0, 4.0, 8.0, 0.5, 0.9, 2.0))
+    assert b.values[6:] == (None,) * 6
+    assert c.values[0] == 5.0
+    assert a.published is not None
+    assert a.published[:4] == (6.39e-5, 1.49e-5, 1.45e-3, 0.687)
+    assert a.published[6:10] == (3.87e-5, 1.38e-5, 5.86e-3, 0.653)
+    assert [row.values for row in culling.rows] == [
+        (2.0, "1 to 3"),
+        (1.5, "1"),
+        (5.0, "2"),
+        (50.0, "1,234"),
+    ]
+    assert culling.rows[3].published == (2.8e-1, "365 to 4,109")
+
+
+def test_marching_cubes_rows() -> None:
+    seconds = {"baseline": 8.0, "without culling": 6.0, "with culling": 2.0, "ours": 0.5}
+    outputs = [{"name": name, "seconds": spent} for name, spent in seconds.items()]
+    (table,) = marching_cubes_tables([record("ours", []), record("marching-cubes", outputs, shape="armadillo")])
+    assert table.rows[0].values == (8.0, 6.0, 2.0, 4.0, 0.5, 16.0)
+    assert table.rows[0].published == pytest.approx((4.87, 4.10, 0.99, 4.87 / 0.99, None, None))
+    assert [row.name for row in table.rows[1:]] == [f"{name} (paper only)" for name in ("Lucy", "Dragon", "Thai")]
+
+
+def test_normals_rows() -> None:
+    seconds = {"autograd": 4.0, "algorithm 1": 2.0, "ours": 1.0}
+    outputs = [{"name": name, "seconds": spent} for name, spent in seconds.items()]
+    cell = {"overrides": {"depth": 2, "side": 512}}
+    (table,) = normals_tables([record("normals", outputs, cell=cell, details={"largest_difference": 3e-6})])
+    assert table.rows[0].name == "256x2, 512x512"
+    assert table.rows[0].values == (4.0, 2.0, 1.0, 2.0, 4.0)
+    published = table.rows[0].published
+    assert published is not None
+    assert published[:2] == pytest.approx((0.022 / 3, 0.004))
+    assert "3.0e-06" in table.notes[1]
+
+
+def test_tables_of_nothing() -> None:
+    for spec in (LOSS_WEIGHTS, DELTA_FACTOR, ISOLATION, MARCHING_CUBES, NORMALS):
+        assert spec.tables([]) == ()
+        failed = {**record(spec.name, []), "error": "out of memory"}
+        assert spec.tables([failed]) == ()
+
+
+# Smoke: every cell of every table
+
+
+@pytest.fixture(scope="module")
+def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("bench") / "out"
+    make_folder(path)
+    return path
+
+
+LONG = [pytest.param(spec, marks=pytest.mark.slow) for spec in (LOSS_WEIGHTS, DELTA_FACTOR, ISOLATION, MARCHING_CUBES)]
+
+
+@pytest.mark.parametrize("spec", [*LONG, NORMALS], ids=lambda s: s.name)
+def test_smoke(spec: Any, ball: Path, out: Path) -> None:
+    # Clean clouds but for what needs noise, and one constraint, to be quick.
+    planned = [cell for cell in spec.cells([ball], "smoke") if spec is ISOLATION or not cell.noise]
+    cells = [cell for cell in planned if dict(cell.overrides).get("constraint", "sdf") == "sdf"]
+    records = [run_cell(cell, out, CATALOGUE) for cell in cells]
+    tables = spec.tables(records)
+    assert tables
+    for row in tables[0].rows:
+        assert "paper only" in row.name or any(value is not None for value in row.values)
+    if spec is ISOLATION:
+        chamfers = [row.values[6] for row in tables[0].rows]
+        assert all(isinstance(c, float) and c < 0.01 for c in chamfers)
+        assert all(row.values[0] is not None for row in tables[1].rows)  # with and without culling
+        sheets = write_sheets("isolation", dict(zip(cells, records, strict=True)), out)
+        assert [title for _, title in sheets] == ["isolation: ball", "isolation: ball + noise 0.01"]
+        clean, noisy = (imread(out / file).shape for file, _ in sheets)
+        assert noisy[0] > clean[0]  # a row more: what culling hides
+    again = [run_cell(cell, out, CATALOGUE) for cell in cells]
+    assert again == records
+
+
+def test_a_cloud_without_faces_has_no_exact_distances(tmp_path: Path, out: Path) -> None:
+    rng = np.random.default_rng(0)
+    normals = rng.normal(size=(400, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    np.savetxt(tmp_path / "cloud.xyz", np.concatenate((normals, normals), axis=1))
+    cell = PaperCell(tmp_path / "cloud.xyz", "delta-factor", "smoke", overrides=(("epsilon", 0.3),))
+    with pytest.raises(InputError, match="has no faces"):
+        run_cell(cell, out, CATALOGUE)

@@ -1,0 +1,384 @@
+"""BACON, IDF and the single SIREN: what their papers say of the fields, and what their recipes reach."""
+
+import itertools
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+import torch
+from mplicits.datasets import OrientedCloud, prepare_cloud, sample_sphere
+from mplicits.neural_fields import Field, Jet, Siren, extract_mesh, sphere_trace
+from mplicits.pipelines.fit.cloud import CloudDistance
+from mplicits.pipelines.run.trainer import Progress
+
+# The contract, over the fields below in place of those of the common table, whose levels are nested in bands.
+from test_field_contract import (  # noqa: F401
+    test_jet_agrees_with_value_and_autograd,
+    test_levels_count_from_both_ends_and_stop_there,
+    test_results_without_a_graph_are_the_same,
+    test_shapes_and_types_follow_the_input,
+    test_wrong_dimension_is_refused,
+)
+
+from benchmarks.paper.networks import (
+    BACON_PRESETS,
+    IDF_PRESETS,
+    SIREN_PRESETS,
+    BaconRecipe,
+    IdfRecipe,
+    SirenRecipe,
+    SirenWeights,
+    _CloudBatches,
+    begin_as_sphere,
+    displaced,
+    hand_over,
+    laplacian_samples,
+    siren_loss,
+)
+from benchmarks.paper.recipe import Recipe, descend
+from benchmarks.peers import BaconSDF, IdfSDF
+from benchmarks.peers.idf import attenuation
+
+
+def small_bacon() -> BaconSDF:
+    return BaconSDF(12, bands=(1, 1, 2, 2), outputs=(1, 3))
+
+
+def small_idf() -> IdfSDF:
+    """An untrained displacement of a base that has the unit cube within its reach."""
+    field = IdfSDF(16, 2, omegas=(2.0, 4.0), limit=0.2, reach=0.5)
+    with torch.no_grad():
+        field.base.output.weight.mul_(3.0)
+    return field
+
+
+LEVELS = {"bacon": small_bacon, "idf": small_idf}
+
+
+@pytest.fixture(params=LEVELS)
+def make(request: pytest.FixtureRequest) -> Callable[[], Field]:
+    return LEVELS[request.param]
+
+
+@pytest.fixture
+def field(make: Callable[[], Field], dtype: torch.dtype, device: torch.device) -> Field:
+    return make().to(device=device, dtype=dtype)
+
+
+def test_levels_are_alternatives_everywhere(field: Field, dtype: torch.dtype, device: torch.device) -> None:
+    x = 2 * torch.rand(500, 3, dtype=dtype, device=device) - 1
+    assert field.in_band(x, level=1).all()
+    assert bool((field.value(x, level=0) != field.value(x, level=1)).any())
+
+
+class Spheres(Field):
+    """Two concentric spheres as alternatives, which notes the levels that it is asked for."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.in_dim, self.num_levels = 3, 2
+        self.register_buffer("deltas", torch.tensor([math.inf]))
+        self.asked: set[int] = set()
+
+    def value(self, x: torch.Tensor, *, level: int = -1) -> torch.Tensor:
+        self.asked.add(self.resolve_level(level))
+        return x.norm(dim=-1) - (0.3, 0.6)[self.resolve_level(level)]
+
+    def jet(self, x: torch.Tensor, *, level: int = -1) -> Jet:
+        return Jet(self.value(x, level=level), x / x.norm(dim=-1, keepdim=True), x.new_empty(*x.shape[:-1], 0))
+
+
+@pytest.mark.parametrize(("level", "radius"), [(0, 0.3), (1, 0.6)])
+def test_infinite_bands_make_levels_alternatives_for_mesher_and_tracer(level: int, radius: float) -> None:
+    """What BACON and IDF rely on: where a coarse level bounds nothing, nothing is concluded from it."""
+    mesh = extract_mesh(spheres := Spheres(), resolution=24, level=level)
+    assert spheres.asked == {level}
+    lengths = torch.from_numpy(mesh.vertices).norm(dim=1)
+    torch.testing.assert_close(lengths, torch.full_like(lengths, radius), atol=1e-4, rtol=0)
+    hits = sphere_trace(spheres, torch.tensor([[0.1, 0.0, -2.0]]), torch.tensor([[0.0, 0.0, 1.0]]), level=level)
+    assert bool(hits.mask)
+    assert float(hits.depth) == pytest.approx(2 - math.sqrt(radius**2 - 0.01), abs=1e-4)
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_bacon_holds_no_frequency_above_its_bound(axis: int) -> None:
+    """On a line of one period an output has the harmonics up to the sum of its filters' bands, and no other."""
+    field = BaconSDF(10, bands=(1, 2, 2, 3), outputs=(1, 2, 3), period=2.5).double()
+    samples = 64
+    line = torch.rand(1, 3, dtype=torch.float64).repeat(samples, 1)
+    line[:, axis] += torch.arange(samples) * (field.period / samples)
+    values = torch.stack(field.level_values(line)).detach()
+    for level, bound in enumerate((3, 5, 8)):
+        assert field.harmonics(level=level) == bound
+        torch.testing.assert_close(values[level], field.value(line, level=level), atol=1e-13, rtol=0)
+        spectrum = torch.fft.rfft(values[level]).abs() / samples
+        assert float(spectrum[bound + 1 :].max()) < 1e-14
+        assert float(spectrum[1 : bound + 1].max()) > 1e-3
+
+
+def test_bacon_is_a_sum_of_the_sines_that_its_bound_allows() -> None:
+    """One layer of one neuron by hand: sin a · (w sin b + c) = w/2 (cos(a − b) − cos(a + b)) + c sin a."""
+    field = BaconSDF(1, bands=(2, 3), outputs=(1,), period=2.0).double()
+    x = torch.rand(20, 3, dtype=torch.float64)
+    b, a = (x @ (math.pi * field.frequencies[i, 0]) + field.phases[i] for i in range(2))
+    w, c = field.layers[0].weight[0, 0], field.layers[0].bias[0]
+    expected = w / 2 * ((a - b).cos() - (a + b).cos()) + c * a.sin()
+    head = field.heads[0]
+    torch.testing.assert_close(field.value(x), expected * head.weight[0, 0] + head.bias[0])
+
+
+def test_bacon_has_the_published_size_but_for_what_is_never_used() -> None:
+    field = BaconSDF()
+    assert field.harmonics(level=-1) == 192
+    # 530,953 with five filters and five outputs that take no part.
+    assert sum(p.numel() for p in field.parameters()) == 530_953 - 5 * 256 - 5 * 257
+    assert field.parameters_to(-1) == sum(p.numel() for p in field.parameters()) - 3 * 257
+    assert field.parameters_to(0) == 256 + 2 * 257 * 256 + 257
+
+
+@pytest.mark.parametrize(
+    ("options", "word"),
+    [
+        ({"width": 0}, "width"),
+        ({"bands": (3,)}, "bands"),
+        ({"bands": (1, 0)}, "bands"),
+        ({"outputs": ()}, "outputs"),
+        ({"outputs": (2, 2)}, "outputs"),
+        ({"outputs": (9,)}, "outputs"),
+        ({"period": 0.0}, "period"),
+    ],
+)
+def test_bacon_says_what_is_wrong(options: dict[str, object], word: str) -> None:
+    with pytest.raises(ValueError, match=f"{word}="):
+        BaconSDF(**options)  # pyright: ignore[reportArgumentType]
+
+
+def test_idf_without_displacement_is_its_base() -> None:
+    field = small_idf().double()
+    x = 2 * torch.rand(200, 3, dtype=torch.float64) - 1
+    assert bool((field.value(x) != field.value(x, level=0)).any())
+    with torch.no_grad():
+        field.displacement.output.weight.zero_()
+        field.displacement.output.bias.zero_()
+    assert torch.equal(field.value(x), field.value(x, level=0))
+    torch.testing.assert_close(field.jet(x).gradient, field.jet(x, level=0).gradient, atol=1e-14, rtol=0)
+
+
+def test_idf_moves_the_surface_by_no_more_than_its_limit() -> None:
+    """A base that is a plane and a displacement that is always full: the surface is where y is on the plane."""
+    field = IdfSDF(4, 1, limit=0.1, reach=0.3).double()
+    with torch.no_grad():
+        # sin(1e-3 x) / 1e-3, which is x to seven digits, and tanh 50, which is 1.
+        for network in (field.base, field.displacement):
+            for parameter in network.parameters():
+                parameter.zero_()
+        field.base.layers[0].weight[0, 0] = 1e-3 / field.base.omega
+        field.base.output.weight[0, 0] = 1e3
+        field.displacement.output.bias[:] = 50.0
+    x = torch.zeros(41, 3, dtype=torch.float64)
+    x[:, 0] = torch.linspace(-1, 1, 41)
+    chi = 1 / (1 + (x[:, 0] / 0.3) ** 4)
+    torch.testing.assert_close(field.value(x), x[:, 0] + 0.1 * chi, atol=1e-5, rtol=0)
+    with torch.no_grad():
+        field.displacement.output.bias[:] = -50.0
+    torch.testing.assert_close(field.value(x), x[:, 0] - 0.1 * chi, atol=1e-5, rtol=0)
+
+
+def test_attenuation_is_a_half_at_its_reach_and_has_its_derivative() -> None:
+    value = torch.linspace(-0.5, 0.5, 101, dtype=torch.float64, requires_grad=True)
+    chi, slope = attenuation(value, 0.05)
+    torch.testing.assert_close(torch.autograd.grad(chi.sum(), value)[0], slope)
+    assert float(attenuation(torch.tensor(0.05), 0.05)[0]) == pytest.approx(0.5)
+    assert all(a > b for a, b in itertools.pairwise(chi[50:].detach().tolist()))
+
+
+@pytest.mark.parametrize("name", ["limit", "reach"])
+def test_idf_says_what_is_wrong(name: str) -> None:
+    with pytest.raises(ValueError, match=f"{name}=0"):
+        IdfSDF(8, 2, **{name: 0.0})  # pyright: ignore[reportArgumentType]
+
+
+def test_both_train_through_their_gradients() -> None:
+    for make in LEVELS.values():
+        field = make()
+        jet = field.jet(2 * torch.rand(50, 3) - 1)
+        ((jet.gradient.norm(dim=1) - 1).square().mean() + jet.value.square().mean()).backward()
+        missing = [name for name, p in field.named_parameters() if p.grad is None and not name.startswith("heads.0")]
+        assert missing == []
+
+
+@pytest.fixture(scope="module")
+def sphere() -> OrientedCloud:
+    return prepare_cloud(sample_sphere(2000, radius=3.0))
+
+
+NAMES = ("siren", "bacon", "idf")
+RECIPES = (SirenRecipe(), BaconRecipe(), IdfRecipe())
+
+
+def with_steps(steps: int) -> tuple[Recipe, ...]:
+    """The same recipes cut short; after no step at all, what they start from."""
+    return (
+        SirenRecipe({"smoke": replace(SIREN_PRESETS["smoke"], steps=steps)}),
+        BaconRecipe({"smoke": replace(BACON_PRESETS["smoke"], steps=steps)}),
+        IdfRecipe({"smoke": replace(IDF_PRESETS["smoke"], steps=steps, sphere_steps=2)}),
+    )
+
+
+UNTRAINED, BRIEF = with_steps(0), with_steps(4)
+
+
+def error_near_the_sphere(recipe: Recipe, cloud: OrientedCloud) -> float:
+    """Mean error within 0.1 of the surface."""
+    output = recipe.train(cloud, "smoke", seed=1).outputs[-1]
+    x = torch.nn.functional.normalize(torch.randn(2000, 3), dim=1) * (0.9 + 0.2 * torch.rand(2000, 1))
+    return float((output.field.value(x, level=output.level) - (x.norm(dim=1) - 1)).abs().mean())
+
+
+@pytest.mark.parametrize(("recipe", "untrained"), list(zip(RECIPES, UNTRAINED, strict=True)), ids=NAMES)
+def test_recipe_finds_a_sphere(recipe: Recipe, untrained: Recipe, sphere: OrientedCloud) -> None:
+    after, before = error_near_the_sphere(recipe, sphere), error_near_the_sphere(untrained, sphere)
+    assert after < 0.02
+    assert after < before / 5
+
+
+@pytest.mark.parametrize("recipe", BRIEF, ids=NAMES)
+def test_recipe_reports_repeats_itself_and_leaves_no_trace(recipe: Recipe, sphere: OrientedCloud) -> None:
+    reports: list[Progress] = []
+    state = torch.get_rng_state()
+    trained = recipe.train(sphere, "smoke", seed=3, progress=reports.append)
+    assert torch.equal(torch.get_rng_state(), state)
+    assert reports[-1].step == reports[-1].steps == trained.steps
+    (output,) = trained.outputs
+    assert output.parameters <= sum(p.numel() for p in output.field.parameters())
+    assert not any(p.requires_grad for p in output.field.parameters())
+    x = 2 * torch.rand(100, 3) - 1
+    again, other = (recipe.train(sphere, "smoke", seed=seed).outputs[0].field for seed in (3, 4))
+    assert torch.equal(again.value(x), output.field.value(x))
+    assert not torch.equal(other.value(x), output.field.value(x))
+    assert recipe.source
+    assert recipe.differs
+
+
+def test_published_sizes_are_those_of_the_paper_preset() -> None:
+    siren, bacon, idf = SIREN_PRESETS["paper"], BACON_PRESETS["paper"], IDF_PRESETS["paper"]
+    assert (siren.width, siren.depth, siren.omega) == (256, 4, 30.0)
+    assert BaconSDF(bacon.width, bands=bacon.bands, outputs=bacon.outputs).harmonics() == 192
+    field = IdfSDF(idf.width, idf.depth, omegas=idf.omegas)
+    assert sum(p.numel() for p in field.parameters()) == (1_191_943 - 1) // 3
+
+
+def test_siren_loss_by_hand() -> None:
+    """Two points on the surface, one off it; a gradient at 60 degrees to the normal has a cosine of a half."""
+    value = torch.tensor([0.1, -0.3, 0.02])
+    gradient = torch.tensor([[2.0, 0.0, 0.0], [0.5, math.sqrt(0.75), 0.0], [0.0, 0.0, 1.5]])
+    normals = torch.tensor([[1.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+
+    def term(**weights: float) -> float:
+        zero = {"surface": 0.0, "normal": 0.0, "eikonal": 0.0, "off_surface": 0.0}
+        return float(siren_loss(value, gradient, normals, SirenWeights(**(zero | weights))))
+
+    assert term(surface=3.0) == pytest.approx(0.4)
+    assert term(normal=3.0) == pytest.approx(0.5)
+    assert term(eikonal=3.0) == pytest.approx(1.5)
+    assert term(off_surface=3.0) == pytest.approx(math.exp(-2.0))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("omega", [SIREN_PRESETS["cpu"].omega, IDF_PRESETS["cpu"].omegas[0]])
+def test_sphere_start_reaches_into_the_corners_of_the_cube(omega: float) -> None:
+    torch.manual_seed(0)
+    network = Siren(128, 4, omega=omega)
+    begin_as_sphere(network, 200, batch=256)
+    x = 2.1 * torch.rand(20_000, 3) - 1.05
+    value, distance = network.value(x).detach(), x.norm(dim=1)
+    assert float((value - (distance - 0.4)).abs().mean()) < 0.02
+    assert bool((value[distance > 1] > 0.2).all())
+
+
+def test_no_step_towards_a_sphere_changes_nothing() -> None:
+    network = Siren(8, 1)
+    before = [parameter.clone() for parameter in network.parameters()]
+    begin_as_sphere(network, 0)
+    assert all(torch.equal(a, b) for a, b in zip(before, network.parameters(), strict=True))
+
+
+def test_batches_hold_the_share_of_points_off_the_surface(sphere: OrientedCloud) -> None:
+    points, normals = _CloudBatches(sphere, 200, 0.6, seed=0, device="cpu").draw()
+    assert (len(points), len(normals)) == (200, 80)
+    torch.testing.assert_close(points[:80].norm(dim=1), torch.ones(80), atol=2e-3, rtol=0)
+    torch.testing.assert_close(points[:80], normals, atol=0.05, rtol=0)
+    assert float(points[80:].norm(dim=1).std()) > 0.1
+
+
+def test_laplacian_samples_have_their_spread_and_stay_in_the_period(sphere: OrientedCloud) -> None:
+    distances = CloudDistance(torch.from_numpy(sphere.points), torch.from_numpy(sphere.normals))
+    generator = torch.Generator().manual_seed(0)
+    points, distance = laplacian_samples(distances, 4000, scale=0.02, period=2.1, generator=generator)
+    assert float(points.abs().max()) <= 1.05
+    # Each coordinate is moved by 0.02 on average, and so is the distance, whose spread is that along a normal.
+    assert float(distance.abs().mean()) == pytest.approx(0.02, rel=0.1)
+    # The discs of 2,000 points lie 0.001 within the sphere.
+    assert float((distance - (points.norm(dim=1) - 1)).abs().median()) < 2e-3
+
+
+def test_schedule_of_idf_hands_over_from_base_to_displacement() -> None:
+    assert [hand_over(done) for done in (0.0, 0.2, 0.35, 0.5, 1.0)] == pytest.approx([1.0, 1.0, 0.5, 0.0, 0.0])
+
+
+def test_idf_trains_on_its_own_gradient_where_the_base_is_flat() -> None:
+    """With a base that is a plane and a reach without end, the terms that the training leaves out are zero."""
+    field = IdfSDF(8, 1, omegas=(1.0, 5.0), limit=0.1, reach=1e4).double()
+    with torch.no_grad():
+        for parameter in field.base.parameters():
+            parameter.zero_()
+        field.base.layers[0].weight[0, 0] = 1e-5
+        field.base.output.weight[0, 0] = 1e5
+    x = 2 * torch.rand(50, 3, dtype=torch.float64) - 1
+    base, jet = field.base.jet(x), field.jet(x)
+    value, gradient = displaced(field, x, base.value, base.gradient)
+    torch.testing.assert_close(value, jet.value, atol=1e-9, rtol=0)
+    torch.testing.assert_close(gradient, jet.gradient, atol=1e-6, rtol=0)
+    assert bool(((jet.gradient - base.gradient).abs() > 0.01).any())
+
+
+def test_descent_minimises_with_a_rate_for_each_group() -> None:
+    moved, slower, still = (torch.nn.Parameter(torch.zeros(1)) for _ in range(3))
+    reports: list[Progress] = []
+    descend(
+        [moved],
+        lambda step: ((moved - 1) ** 2 + (slower - 1) ** 2 + (still - 1) ** 2).sum(),
+        steps=50,
+        rate=lambda done: 0.1 * (1 - done),
+        stage="stage",
+        progress=reports.append,
+        also=[([slower], lambda done: 0.001), ([still], lambda done: 0.0)],
+        report_every=30,
+    )
+    assert moved.item() == pytest.approx(1.0, abs=0.05)
+    assert 0.03 < slower.item() < 0.06
+    assert still.item() == 0.0
+    assert [(report.stage, report.step, report.fraction) for report in reports] == [
+        ("stage", 0, 0.0),
+        ("stage", 30, 0.6),
+        ("stage", 50, 1),
+    ]
+
+
+def test_descent_clips_the_whole_gradient() -> None:
+    """Adam forgets a common factor but not one step: after a step of gradient 1e6, clipped, one of 1 still counts."""
+    scales, ends = (1e6, -1.0, -1.0, -1.0), []
+    for clip in (None, 1.0):
+        parameter = torch.nn.Parameter(torch.zeros(1))
+        descend(
+            [parameter],
+            lambda step, p=parameter: (scales[step] * p).sum(),
+            steps=4,
+            rate=lambda done: 0.1,
+            stage="",
+            clip=clip,
+        )
+        ends.append(parameter.item())
+    assert ends[0] < -0.2
+    assert ends[1] > -0.15

@@ -1,0 +1,153 @@
+"""The fit benchmark on a small shape: every level has a row, noise is applied, Poisson joins when it is there."""
+
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from mplicits.datasets import add_isotropic_noise, read_cloud
+from mplicits.datasets.synthetic.prisms import PRISMS
+from mplicits.neural_fields import InputError, Mesh, MultiscaleSDF, Similarity, Sphere, Union, extract_mesh
+from mplicits.pipelines.mesh.files import write_mesh
+from mplicits.pipelines.run.settings import FitConfig
+from mplicits.pipelines.surface.surface import Surface, components, face_normals, from_mesh
+
+from benchmarks.harness.report import as_text
+from benchmarks.shapes import fits as module
+from benchmarks.shapes.fits import STEEPEST, FitBench, facing_camera
+
+SMALL = FitConfig(
+    widths=(32, 32),
+    depths=(2, 2),
+    omegas=(10.0, 15.0),
+    steps=(120, 40),
+    learning_rates=(4e-3, 1e-3),
+    batch=1024,
+    samples=10_000,
+)
+
+
+@pytest.fixture(scope="module")
+def ball(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("shapes") / "ball.ply"
+    write_mesh(path, extract_mesh(Sphere(radius=0.7), resolution=40), Similarity((5.0, 0.0, -1.0), 20.0))
+    return path
+
+
+@pytest.mark.slow
+def test_rows_picture_and_table(ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "has_poisson", lambda: False)
+    monkeypatch.setattr(module, "picture_of", partial(module.picture_of, samples=1))  # a quarter of the pixels
+    bench = FitBench(shapes=[ball], config=SMALL, resolution=32, samples=5000, pictures=tmp_path)
+    rows = bench.rows(tmp_path / "out")
+    assert [row.method for row in rows] == ["level 0", "level 1"]
+    assert rows[1].seconds > rows[0].seconds > 0
+    for row in rows:
+        assert row.metrics is not None
+        assert row.metrics.iou is not None
+        assert row.metrics.iou > 0.95
+        assert row.metrics.components == 1
+        assert row.metrics.chamfer < 2 * row.metrics.chamfer_floor
+    assert (tmp_path / "ball.png").stat().st_size > 1000
+    table = as_text(*bench.tables(rows, sgemm=1e9))
+    finest = rows[1].metrics
+    assert finest is not None
+    assert finest.chamfer_floor is not None
+    assert f"{finest.chamfer:.2e}" in table
+    assert f"{finest.chamfer - finest.chamfer_floor:.2e}" in table
+
+
+def test_blobs_go_as_mplicits_mesh_drops_them(ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = module.kept_fit(tmp_path / "run", read_cloud(ball), SMALL)
+    blob = Sphere(radius=0.08, center=(0.85, 0.85, 0.85))  # far from all points
+
+    def with_blob(field: MultiscaleSDF, *, resolution: int, level: int) -> Mesh:
+        return extract_mesh(Union(field.levels[level], blob), resolution=resolution)
+
+    monkeypatch.setattr(module, "extract_mesh", with_blob)
+    for kept, parts in ((replace(run, directory=None), 2), (run, 1)):
+        mesh, _ = module.timed_mesh(kept, 64, level=0)
+        assert mesh is not None
+        assert components(from_mesh(mesh)) == parts
+
+
+def test_noise_reaches_the_fit(ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = []
+
+    def reconstruct(self, cloud, *_):
+        radii = np.linalg.norm(cloud.points - [5.0, 0.0, -1.0], axis=1)
+        seen.append(abs(radii - 14.0).max())
+        return []
+
+    monkeypatch.setattr(FitBench, "reconstructions", reconstruct)
+    FitBench(shapes=[ball], config=SMALL).rows(tmp_path)
+    FitBench(shapes=[ball], config=SMALL, noise=0.01).rows(tmp_path)
+    diagonal = 28.0 * 3**0.5
+    assert seen[0] < 0.02
+    assert 0.9 * 0.01 * diagonal < seen[1] < 1.01 * 0.01 * diagonal + 0.02
+
+
+def test_isotropic_noise_reaches_the_fit(ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = []
+    monkeypatch.setattr(
+        FitBench, "reconstructions", lambda _, cloud, *__: seen.append(cloud) or [("level 0", 1, 1, None)]
+    )
+    bench = FitBench(shapes=[ball], config=SMALL, noise=0.01, isotropic=True)
+    rows = bench.rows(tmp_path)
+    assert np.array_equal(seen[0].points, add_isotropic_noise(read_cloud(ball), 0.01).points)
+    assert "ball + isotropic noise 0.01" in as_text(*bench.tables(rows, sgemm=1e9))
+
+
+def test_poisson_has_normals_of_its_own_where_ours_are_estimated(ball: Path, tmp_path: Path) -> None:
+    pytest.importorskip("pymeshlab", reason="the extra mplicits[poisson] is not installed")
+    config = replace(SMALL, normals="estimate")
+    rows = FitBench(shapes=[ball], config=config, resolution=32, samples=5000, poisson_depth=6).rows(tmp_path)
+    assert [row.method for row in rows[2:]] == ["screened Poisson", "screened Poisson, MeshLab's normals"]
+    assert rows[-1].metrics is not None
+    assert rows[-1].metrics.iou is not None
+    assert rows[-1].metrics.iou > 0.95
+
+
+def test_screened_poisson_when_installed(ball: Path, tmp_path: Path) -> None:
+    pytest.importorskip("pymeshlab", reason="the extra mplicits[poisson] is not installed")
+    rows = FitBench(shapes=[ball], config=SMALL, resolution=32, samples=5000, poisson_depth=6).rows(tmp_path)
+    assert [row.method for row in rows] == ["level 0", "level 1", "screened Poisson"]
+    assert rows[-1].metrics is not None
+    assert rows[-1].metrics.iou is not None
+    assert rows[-1].metrics.iou > 0.95
+
+
+def test_screened_poisson_on_what_ours_has_smoothed(ball: Path, tmp_path: Path) -> None:
+    pytest.importorskip("pymeshlab", reason="the extra mplicits[poisson] is not installed")
+    bench = FitBench(shapes=[ball], config=SMALL, noise=0.02, resolution=32, samples=5000, poisson_depth=6)
+    rows = bench.rows(tmp_path)
+    assert [row.method for row in rows[-2:]] == ["screened Poisson", "screened Poisson, smoothed"]
+    noisy, smoothed = (row.metrics for row in rows[-2:])
+    assert noisy is not None
+    assert smoothed is not None
+    assert smoothed.chamfer - smoothed.chamfer_floor < (noisy.chamfer - noisy.chamfer_floor) / 3
+
+
+def test_a_level_without_a_surface_is_a_row(monkeypatch: pytest.MonkeyPatch, ball: Path, tmp_path: Path) -> None:
+    monkeypatch.setattr(FitBench, "reconstructions", lambda *_: [("level 0", 1.0, 0.1, None)])
+    bench = FitBench(shapes=[ball], config=SMALL)
+    assert "no surface" in as_text(*bench.tables(bench.rows(tmp_path), sgemm=1e9))
+
+
+def test_a_cloud_is_no_reference(tmp_path: Path) -> None:
+    np.savetxt(tmp_path / "cloud.xyz", np.random.default_rng(0).random((50, 3)))
+    with pytest.raises(InputError, match="has no faces"):
+        FitBench(shapes=[tmp_path / "cloud.xyz"], config=SMALL).cells()
+
+
+def test_the_camera_faces_the_widest_side() -> None:
+    gear = Surface(*PRISMS["gear"]())  # the two flat sides
+    normals, areas = face_normals(gear)
+    flat = normals[((normals @ normals.T > 0.999) @ areas).argmax()]
+    assert float(facing_camera(gear).forward @ torch.from_numpy(flat)) == pytest.approx(-1, abs=1e-6)
+    # Of a slab that lies the camera stands a little before it, not in its axis: up would have no direction.
+    slab = Surface(np.array([[-2.0, 0, -1], [2, 0, -1], [2, 0, 1], [-2, 0, 1]]), np.array([[0, 2, 1], [0, 3, 2]]))
+    down = facing_camera(slab).forward
+    assert float(down[1]) == pytest.approx(-np.sin(np.radians(STEEPEST)), abs=1e-6)

@@ -1,0 +1,58 @@
+"""The benchmark of cloud sizes."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from mplicits.datasets import read_cloud
+from mplicits.pipelines.run.settings import FitConfig
+from mplicits.pipelines.surface.surface import read_surface
+
+from benchmarks.harness.report import as_text
+from benchmarks.shapes.fits import ScaleBench, ScaleRow, write_noisy_cloud
+
+
+def test_clouds_have_the_noise_that_was_asked_for(tmp_path: Path) -> None:
+    trimesh.creation.box((2, 2, 2)).export(tmp_path / "box.ply")
+    write_noisy_cloud(tmp_path / "cloud.ply", read_surface(tmp_path / "box.ply"), 25_000, noise=0.001, rows=10_000)
+    cloud = read_cloud(tmp_path / "cloud.ply")
+    assert len(cloud) == 25_000
+    assert cloud.normals is not None
+    off = (cloud.points * cloud.normals).sum(axis=1) - 1
+    assert abs(off.std() / (0.001 * np.sqrt(12)) - 1) < 0.03
+    assert abs(off.mean()) < 1e-4
+
+
+@pytest.mark.slow
+def test_rows_of_two_sizes(tmp_path: Path) -> None:
+    trimesh.creation.icosphere(3).export(tmp_path / "ball.ply")
+    config = FitConfig(
+        widths=(32,),
+        depths=(1,),
+        omegas=(10.0,),
+        steps=(150,),
+        learning_rates=(5e-3,),
+        batch=256,
+        samples=2000,
+        merge_above=2000,
+        device="cpu",
+    )
+    bench = ScaleBench(
+        counts=[1000, 20_000], config=config, folder=tmp_path, shape=tmp_path / "ball.ply", resolution=32, samples=2000
+    )
+    rows = bench.rows(tmp_path / "out")
+    assert [row.points for row in rows] == [1000, 20_000]
+    assert rows[0].kept == 1000
+    assert 300 < rows[1].kept <= 2000
+    assert all(row.chamfer is not None and row.chamfer < 0.05 for row in rows)
+    assert not list(tmp_path.glob("cloud_*"))
+
+
+def test_the_table_says_how_many_times_as_long() -> None:
+    small = ScaleRow(1000, 1000, 1.0, 2.0, 3.0, 0.004, 8.0, 2.0, 3 << 20, 1e-5, 2e-6)
+    large = ScaleRow(100_000, 2000, 1.0, 2.0, 3.0, 0.004, 13.0, 2.0, None, None, 2e-6)
+    text = as_text(*ScaleBench(counts=[], config=FitConfig()).tables([small, large], sgemm=1e9)).splitlines()
+    assert text[3].split() == ["1,000", "1,000", "1.0", "2.0", "3.0", "4", "8.0", "2.0", "1.00", "3", "1.000e-05"]
+    assert text[4].split()[-4:] == ["1.50", "–", "no", "surface"]
+    assert "2.000e-06" in text[5]

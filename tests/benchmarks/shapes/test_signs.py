@@ -1,0 +1,72 @@
+"""The benchmark of signs on a ball, whose normals all point away from its centre."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mplicits.datasets import OrientedCloud, PointCloud
+from mplicits.neural_fields import InputError, Similarity, Sphere, extract_mesh
+from mplicits.pipelines.fit.train import prepare
+from mplicits.pipelines.mesh.files import write_mesh
+from mplicits.pipelines.run.settings import FitConfig
+
+from benchmarks.harness.report import as_text
+from benchmarks.shapes import signs as module
+from benchmarks.shapes.signs import SignsBench
+
+CONFIG = FitConfig(widths=(32, 32), depths=(2, 2), omegas=(20.0, 20.0), steps=(1, 1), learning_rates=(3e-3, 1e-3))
+
+
+@pytest.fixture
+def ball(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    for name, less in (("STEPS", 150), ("BATCH", 1024), ("SAMPLES", 10_000)):
+        monkeypatch.setattr(f"mplicits.pipelines.fit.unoriented.{name}", less)
+    write_mesh(tmp_path / "ball.ply", extract_mesh(Sphere(radius=0.7), resolution=32), Similarity((5.0, 0, -1), 20.0))
+    return tmp_path / "ball.ply"
+
+
+@pytest.mark.parametrize(("noise", "points"), [(0.0, None), (0.005, 2000)])
+def test_a_ball_has_no_wrong_signs(ball: Path, tmp_path: Path, noise: float, points: int | None) -> None:
+    bench = SignsBench(shapes=[ball], config=CONFIG, noise=noise, isotropic=noise > 0, points=points, device="auto")
+    (row,) = bench.rows(tmp_path / "out")
+    assert row.before == row.after == 0.0
+    assert not row.asked
+    assert row.points == points or noise == 0
+    assert ("+ isotropic noise 0.005" in as_text(*bench.tables([row], sgemm=1e9))) == (noise > 0)
+
+
+@pytest.mark.slow
+def test_normals_that_point_inward_are_counted(ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of each point's own: a third is turned round, and the network turns it back."""
+
+    def spoilt(cloud: PointCloud, config: FitConfig) -> OrientedCloud:
+        good = prepare(cloud, config)
+        return replace(good, normals=np.where(np.arange(len(good))[:, None] % 3, good.normals, -good.normals))
+
+    monkeypatch.setattr(module, "prepare", spoilt)
+    (row,) = SignsBench(shapes=[ball], config=CONFIG).rows(tmp_path / "out")
+    assert row.before == pytest.approx(1 / 3, abs=1 / row.points)
+    assert row.after == 0.0
+
+
+def test_points_that_smoothing_drops_do_not_mix_up_the_others(ball: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every point has another normal here, so that one that is taken for its neighbour shows."""
+    points = np.random.default_rng(0).normal(size=(500, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    clean = PointCloud(points, points.astype(np.float32), None, "ball")
+    still = prepare(clean, CONFIG)
+    left = np.arange(500) % 50 > 0
+    moved = (still.points + 0.01 * np.random.default_rng(1).normal(size=(500, 3))).astype(np.float32)[left]
+    smoothed = replace(
+        still, points=moved, normals=still.normals[left], report=replace(still.report, smoothed_noise=1.0)
+    )
+    monkeypatch.setattr(module, "prepare", lambda *_: still)
+    exact = module._exact_normals(clean, clean, smoothed, CONFIG)
+    assert (exact == clean.normals[left]).mean() > 0.99  # but for two that lie closer together than they were moved
+
+
+def test_a_cloud_is_no_shape(ball: Path, tmp_path: Path) -> None:
+    (tmp_path / "cloud.xyz").write_text("\n".join(f"{i} {i % 7} {i % 5}" for i in range(100)), encoding="utf-8")
+    with pytest.raises(InputError, match=r"cloud\.xyz"):
+        SignsBench(shapes=[tmp_path / "cloud.xyz"], config=CONFIG).cells()

@@ -1,0 +1,303 @@
+"""The texture benchmark: colours of textured meshes in closed form, image errors, and a small shape end to end."""
+
+import dataclasses
+import json
+import math
+from pathlib import Path
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+import torch
+import trimesh
+from mplicits.datasets import Camera, TexturedMesh, linear_to_srgb, look_at, srgb_to_linear
+from mplicits.neural_fields import InputError
+from mplicits.pipelines.render.rasterise import mesh_view
+from mplicits.pipelines.render.trace import Seen
+from mplicits.pipelines.run.settings import FitConfig, TextureConfig
+
+from benchmarks.cli import main
+from benchmarks.cli import shapes as bench_shapes
+from benchmarks.harness.report import as_text
+from benchmarks.shapes import texture as bench_texture_fits
+from benchmarks.shapes.compare import Drawing, ImageError, draw, image_error, psnr
+from benchmarks.shapes.texture import PAPER_MSE, TextureBench, TextureRow
+
+CORNERS = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
+TRIANGLES = np.array([[0, 1, 2], [0, 2, 3]])
+FILLING = 2 * math.degrees(math.atan(1 / 3))  # the angle at which the square just fills an image from 3 away
+
+
+def square(image: np.ndarray, corners: np.ndarray = CORNERS) -> TexturedMesh:
+    """A square with the whole image on it."""
+    uv = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])[TRIANGLES]
+    return TexturedMesh(corners, TRIANGLES, uv, image.astype(np.float32))
+
+
+def front(pixels: int, z: float = 3.0) -> Camera:
+    return look_at((0.0, 0.0, z), (0.0, 0.0, 0.0), fov=FILLING, width=pixels, height=pixels)
+
+
+def ramp(size: int) -> np.ndarray:
+    """An image whose red, in linear light, is u, and whose green is v."""
+    middle = (np.arange(size) + 0.5) / size
+    light = np.stack((*np.meshgrid(middle, middle[::-1]), np.full((size, size), 0.5)), axis=2)
+    return linear_to_srgb(light)
+
+
+def test_a_square_seen_from_the_front_is_its_image():
+    image = np.random.default_rng(0).random((8, 8, 3))
+    seen = mesh_view(square(image), front(8))
+    assert seen.pixel.tolist() == list(range(64))
+    assert seen.color is not None
+    np.testing.assert_allclose(seen.color.numpy().reshape(8, 8, 3), image, atol=1e-6)
+    np.testing.assert_allclose(seen.normal.numpy(), np.tile([0.0, 0.0, 1.0], (64, 1)), atol=1e-6)
+    _, directions = front(8).rays()
+    torch.testing.assert_close(seen.direction, directions.reshape(-1, 3))
+    torch.testing.assert_close(seen.depth, -3 / directions.reshape(-1, 3)[:, 2])
+
+
+def test_between_texels_light_is_interpolated_linearly():
+    image = np.random.default_rng(1).random((4, 4, 3)).astype(np.float32)
+    seen = mesh_view(square(image), front(8))
+    assert seen.color is not None
+    shown = seen.color.numpy().reshape(8, 8, 3)
+    light = srgb_to_linear(image)
+    # The centre of pixel (2, 3) is a quarter of a texel above texel row 1 and to the right of texel column 1.
+    expected = (
+        0.75 * 0.75 * light[1, 1] + 0.25 * 0.75 * light[0, 1] + 0.75 * 0.25 * light[1, 2] + 0.25 * 0.25 * light[0, 2]
+    )
+    np.testing.assert_allclose(srgb_to_linear(shown)[2, 3], expected, atol=1e-5)
+
+
+def test_a_tilted_square_is_interpolated_in_space_and_not_on_the_screen():
+    turn = trimesh.transformations.rotation_matrix(1.1, [0.0, 1.0, 0.0])[:3, :3]
+    camera = look_at((0.3, 0.4, 3.0), (0.0, 0.0, 0.0), fov=50, width=60, height=40)
+    seen = mesh_view(square(ramp(64), CORNERS @ turn.T), camera)
+    eye, directions = camera.rays(dtype=torch.float64)
+    rays = directions.reshape(-1, 3).numpy() @ turn  # in the square's own axes
+    start = eye.numpy() @ turn
+    hit = start - (start[2] / rays[:, 2])[:, None] * rays
+    inside = (np.abs(hit[:, :2]) < 1).all(axis=1) & (-start[2] / rays[:, 2] > 0)
+    assert inside.sum() > 200
+    assert seen.pixel.tolist() == np.flatnonzero(inside).tolist()
+    np.testing.assert_allclose(seen.position.numpy() @ turn, hit[inside], atol=1e-5)
+    # Nearer to the image's sides than half a texel, the texture repeats.
+    inner = (np.abs(hit[inside, :2]) < 1 - 1 / 64).all(axis=1)
+    assert seen.color is not None
+    light = srgb_to_linear(seen.color.numpy())[inner]
+    np.testing.assert_allclose(light[:, :2], (hit[inside, :2][inner] + 1) / 2, atol=1e-4)
+
+
+def test_the_nearer_of_two_faces_is_seen_and_what_is_behind_the_camera_is_not():
+    ahead = np.array([0.0, 0.0, 1.0])
+    both = np.concatenate((CORNERS, 0.5 * CORNERS + ahead, CORNERS + 5 * ahead))
+    colors = np.repeat(np.eye(3, dtype=np.float32), 4, axis=0)
+    faces = np.concatenate((TRIANGLES, TRIANGLES + 4, TRIANGLES + 8))
+    seen = mesh_view(TexturedMesh(both, faces, vertex_colors=colors), front(40))
+    assert seen.color is not None
+    shown = seen.color.reshape(40, 40, 3).numpy()
+    # The small square, at two thirds of the distance, covers three quarters of the image.
+    expected = np.tile([1.0, 0.0, 0.0], (40, 40, 1))
+    expected[5:35, 5:35] = [0.0, 1.0, 0.0]
+    np.testing.assert_allclose(shown, expected, atol=1e-6)
+
+
+def test_map_coordinates_lose_nothing():
+    away = np.array([400_000.0, 5_600_000.0, 100.0])
+    near = mesh_view(square(ramp(32)), front(24))
+    camera = look_at(away + np.array([0.0, 0.0, 3.0]), away, fov=FILLING, width=24, height=24)
+    far = mesh_view(square(ramp(32), CORNERS + away), camera)
+    torch.testing.assert_close(far.color, near.color, atol=1e-4, rtol=0)
+    torch.testing.assert_close(far.depth, near.depth, atol=1e-5, rtol=0)
+
+
+def seen_at(pixels: list[int], size: tuple[int, int]) -> Seen:
+    rows = torch.zeros(len(pixels), 3)
+    return Seen(size, torch.tensor(pixels), rows[:, 0], rows, rows, rows)
+
+
+def test_drawings_are_averaged_in_linear_light():
+    drawing = draw(seen_at([0, 1, 2, 3, 6, 7], (4, 2)), torch.tensor([[0.0] * 3, [1.0] * 3] * 3), samples=2)
+    # Left: black, white and two of the background; right: two of each.
+    assert drawing.coverage.tolist() == [[0.5, 1.0]]
+    quarters = srgb_to_linear(drawing.rgb.astype(np.float64))
+    np.testing.assert_allclose(quarters, [[[0.75] * 3, [0.5] * 3]], atol=1e-6)
+    with pytest.raises(ValueError, match="samples=3: expected a divisor of both sides of a 4 × 2 image"):
+        draw(seen_at([0], (4, 2)), torch.zeros(1, 3), samples=3)
+
+
+def test_errors_of_images():
+    rng = np.random.default_rng(0)
+    rgb = rng.uniform(0.3, 0.6, (4, 5, 3)).astype(np.float32)
+    coverage = np.zeros((4, 5), np.float32)
+    coverage[1:3, 1:4] = 1
+    same = image_error([(Drawing(rgb, coverage), Drawing(rgb, coverage))])
+    assert (same.everywhere, same.either, same.both) == (0, 0, 0)
+    assert (same.pixels_either, same.pixels_both) == (6, 6)
+    assert psnr(same.both) == 120
+    # A quarter more inside, and half on one pixel that only the second image sees a part of.
+    other, wider = rgb.copy(), coverage.copy()
+    other[1:3, 1:4] += 0.25
+    other[0, 0] += 0.5
+    wider[0, 0] = 0.3
+    error = image_error([(Drawing(rgb, coverage), Drawing(other, wider))])
+    assert error.both == pytest.approx(0.0625)
+    assert error.either == pytest.approx((6 * 0.0625 + 0.25) / 7)
+    assert error.everywhere == pytest.approx((6 * 0.0625 + 0.25) / 20)
+    assert (error.pixels_either, error.pixels_both) == (7, 6)
+    assert psnr(0.01) == pytest.approx(20)
+    # Two cameras: every pixel counts the same.
+    pair = (Drawing(rgb, coverage), Drawing(other, wider))
+    assert image_error([pair, (Drawing(rgb, coverage), Drawing(rgb, coverage))]).both == pytest.approx(0.0625 / 2)
+    nothing = np.zeros_like(coverage)
+    assert math.isnan(image_error([(Drawing(rgb, nothing), Drawing(rgb, nothing))]).both)
+
+
+COARSE = FitConfig(
+    widths=(24,), depths=(1,), omegas=(8.0,), steps=(150,), learning_rates=(1e-2,), batch=1024, samples=8000
+)
+FULL = FitConfig(
+    widths=(24, 24),
+    depths=(1, 1),
+    omegas=(8.0, 10.0),
+    steps=(150, 30),
+    learning_rates=(1e-2, 1e-3),
+    batch=1024,
+    samples=8000,
+)
+SMALL = TextureConfig(
+    width=32, depth=2, omega=12.0, steps=150, learning_rate=4e-3, batch=1024, band_batch=256, samples=8000
+)
+VIEW = {"views": 2, "size": 48, "resolution": 48}
+
+
+def of(*meshes: Path, **options: object) -> TextureBench:
+    given = {"texture": SMALL, "coarse": COARSE, "device": "cpu", **VIEW, **options}
+    return TextureBench(meshes=meshes, **given)  # type: ignore[arg-type]
+
+
+def write_ball(folder: Path, *, image: np.ndarray | None = None) -> Path:
+    """spot.obj: a ball of radius 7 about (5, 0, -1), painted along z with a smooth image."""
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=1.0)
+    if image is None:
+        y, x = np.mgrid[0:64, 0:64] / 63
+        image = np.stack((x, y, 0.5 + 0.4 * np.sin(9 * x)), axis=2)
+    iio.imwrite(folder / "ball.png", (image * 255).astype(np.uint8))
+    (folder / "ball.mtl").write_text("newmtl paint\nmap_Kd ball.png\n")
+    lines = ["mtllib ball.mtl", "usemtl paint"]
+    lines += ["v {} {} {}".format(*(7 * v + [5.0, 0.0, -1.0])) for v in ball.vertices]
+    lines += [f"vt {0.5 + 0.45 * v[0]} {0.5 + 0.45 * v[1]}" for v in ball.vertices]
+    lines += ["f " + " ".join(f"{i + 1}/{i + 1}" for i in face) for face in ball.faces]
+    path = folder / "spot.obj"
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, list[TextureRow]]:
+    folder = tmp_path_factory.mktemp("ball")
+    path, out = write_ball(folder), folder / "out"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(bench_texture_fits, "FIT_POINTS", 3000)
+        return path, out, of(path, full=FULL).rows(out)
+
+
+def test_rows_errors_and_sheet(bench):
+    _, out, rows = bench
+    assert [(row.surface, row.texture) for row in rows] == [
+        ("(24,1) traced", "(24,1)"),
+        ("(24,1)▷(24,1) traced", "(24,1)▷(24,1)"),
+        ("(24,1) mesh", "(24,1)"),
+        ("(24,1) traced", "(24,1)▷(24,1)"),
+    ]
+    for row in rows:
+        assert row.paper == PAPER_MSE["spot"]
+        assert row.error.both < 1e-3
+        assert row.error.either < 5e-3
+        assert 0.4 * 2 * 48**2 < row.error.pixels_both < row.error.pixels_either < 0.8 * 2 * 48**2
+        assert row.error.everywhere == pytest.approx(row.error.either * row.error.pixels_either / (2 * 48**2))
+        assert min(row.fit_seconds, row.texture_seconds) > 0
+    assert (rows[0].parameters, rows[0].texture_parameters) == (24 * 3 + 24 + 24 + 1, 32 * 3 + 32 + 33 * 32 + 33 * 3)
+    # The mesh of a surface shows what its trace does.
+    assert rows[2].error.both == pytest.approx(rows[0].error.both, rel=0.1)
+    sheet = iio.imread(out / "spot.png")
+    assert sheet.shape == (2 * (48 + 40), 5 * (48 + 12), 3)
+
+
+def test_the_table_prints_the_papers_figures_beside_ours(bench):
+    rows = bench[2]
+    known = dataclasses.replace(rows[0], error=ImageError(0.00329, 0.00823, 0.0658, 7, 6))
+    (table,) = of().tables([known, *rows[1:]], sgemm=1e9)
+    text = as_text(table)
+    assert "0.0329" in text
+    assert "0.00329 (10×)" in text
+    assert "0.00823 (4.0×)" in text
+    assert "0.0658 (0.5×)" in text
+    assert f"{psnr(0.0658):.1f}" in text
+    assert len(text.splitlines()) == 3 + len(rows)
+    unknown = as_text(*of().tables([dataclasses.replace(rows[0], shape="teapot", paper=None)], sgemm=1e9))
+    assert "0.0329" not in unknown
+    assert "×" not in unknown
+    assert rows[0].psnr_either == psnr(rows[0].error.either)
+
+
+def test_what_is_there_is_used_and_what_is_not_is_trained(bench, tmp_path, monkeypatch):
+    monkeypatch.setattr(bench_texture_fits, "FIT_POINTS", 3000)
+    path, out, rows = bench
+    runs = sorted((out / "runs").iterdir())
+    assert len(runs) == 2
+    files = [run / name for run in runs for name in ("field.safetensors", "texture.safetensors")]
+    before = [file.stat().st_mtime_ns for file in files]
+    assert of(path, full=FULL).rows(out) == rows
+    other = of(path, full=FULL, size=24).rows(out)
+    assert [row.texture_seconds for row in other] == [row.texture_seconds for row in rows]
+    assert [file.stat().st_mtime_ns for file in files] == before
+    # A texture that was interrupted is trained again, its fit is not.
+    coarse = next(run for run in runs if len(json.loads((run / "run.json").read_text())["stages"]) == 1)
+    record = json.loads((coarse / "run.json").read_text())
+    record["texture"]["finished"] = False
+    (coarse / "run.json").write_text(json.dumps(record))
+    of(path, size=32).rows(out)
+    changed = [file for file, then in zip(files, before, strict=True) if file.stat().st_mtime_ns != then]
+    assert changed == [coarse / "texture.safetensors"]
+    # Other settings, or an image of another mesh beside the same OBJ file, are other fits.
+    kept = {part.name: of(path).settings(part) for part in of(path).cells()}
+    assert kept != {part.name: of(path, coarse=FULL).settings(part) for part in of(path).cells()}
+    painted = write_ball(tmp_path, image=np.full((4, 4, 3), 0.5))
+    assert painted.read_bytes() == path.read_bytes()
+    assert of(painted).cells()[0].options != of(path).cells()[0].options
+
+
+def test_two_meshes_of_one_name_are_refused(bench, tmp_path):
+    path, other = bench[0], write_ball(tmp_path)
+    with pytest.raises(InputError, match="spot: two of the meshes are called that"):
+        of(path, other).rows(tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_mesh_without_texture_coordinates_is_refused_before_any_work(tmp_path):
+    ball = trimesh.creation.icosphere(subdivisions=1)
+    ball.visual.vertex_colors = np.full((len(ball.vertices), 4), 200, np.uint8)  # type: ignore[union-attr]
+    ball.export(tmp_path / "ball.ply")
+    with pytest.raises(InputError, match=r"ball.ply: no texture coordinates and image in it"):
+        of(tmp_path / "ball.ply").rows(tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_command(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(bench_shapes, "COARSE", COARSE)
+    monkeypatch.setattr(bench_texture_fits, "FIT_POINTS", 3000)
+    path = write_ball(tmp_path)
+    settings = "--coarse-width 16 --coarse-omega 6 --coarse-steps 60"
+    settings += " --width 16 --depth 1 --steps 20 --samples 2000 --batch 512"
+    view = "--views 1 --size 32 --resolution 32 --json"
+    command = ["texture", str(path), "-o", str(tmp_path / "out"), *settings.split(), *view.split()]
+    assert main([*command, str(tmp_path / "figures.json")]) == 0
+    assert "spot (16,1) mesh" in capsys.readouterr().out
+    figures = json.loads((tmp_path / "figures.json").read_text())["records"][0]["outputs"]
+    assert [row["surface"] for row in figures] == ["(16,1) traced", "(16,1) mesh"]
+    assert figures[0]["error"]["either"] < 0.2
+    (tmp_path / "spot.obj").unlink()
+    assert main([*command, str(tmp_path / "figures.json")]) == 2
+    assert "spot.obj: no such file" in capsys.readouterr().err
