@@ -75,6 +75,25 @@ def _kernels(arguments: argparse.Namespace) -> int:
     return run_benches(arguments, [bench, *levels], out=arguments.out)
 
 
+def _pictures_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("run", metavar="RUN", help="run directory or .safetensors file")
+    number(parser, "--sizes", whole(1), (512, 512, 1920, 1080), "widths and heights in turn", nargs="+")
+    number(parser, "--repeats", whole(1), 30, "pictures that are timed")
+    number(parser, "--points", whole(1), 1 << 20, "at which networks are evaluated")
+    parser.add_argument("--device", default="cuda", help="torch device (cuda)")
+    folder_flag(parser)
+    add_flags(parser, "--json")
+
+
+def _pictures(arguments: argparse.Namespace) -> int:
+    from ..costs.pictures import PicturesBench, SamplesBench
+
+    pairs = tuple(zip(arguments.sizes[::2], arguments.sizes[1::2], strict=False))
+    pictures = PicturesBench(run_file=arguments.run, sizes=pairs, repeats=arguments.repeats, device=arguments.device)
+    samples = SamplesBench(points=arguments.points, device=arguments.device)
+    return run_benches(arguments, [pictures, samples], out=arguments.out)
+
+
 def _mesh_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("run", metavar="RUN", help="run directory or .safetensors file")
     number(parser, "--resolutions", whole(8, 2048), (256, 512, 1024), "where ours is timed", nargs="+")
@@ -162,6 +181,15 @@ COSTS: Mapping[str, Command] = MappingProxyType(
             _kernels,
             "Compare jets by the fused kernels (pip install 'mplicits[kernels]') with the same networks in float64, "
             "and count what they read and write. Without CUDA, Triton's interpreter runs them, slowly.",
+        ),
+        "pictures": Command(
+            "pictures a second on a GPU, and how far they are from the CPU's",
+            "  python -m benchmarks pictures runs/scan\n"
+            "  python -m benchmarks pictures runs/scan --device cpu --sizes 64 48 --repeats 3 --points 4096",
+            _pictures_arguments,
+            _pictures,
+            "Time whole pictures of a run, the host's work included, compare them with the CPU's, and time values and "
+            "jets of networks at many points.",
         ),
         "mesh": Command(
             "what extraction costs: adaptive, the paper's, dense",

@@ -112,8 +112,7 @@ class LevelsBench(Benchmark[LevelsRow]):
         bounds = []
         for part in field.levels:
             assert isinstance(part, Siren)
-            own = part.as_network()
-            bounds.append(rounding_bound(x, own.parameters, own.omega, own.gain))
+            bounds.append(rounding_bound(x, part.raw(), part.omega, halves=True))
         sure, *limits = gated_bound([(jet.value, jet.gradient) for jet in jets], bounds, exact.deltas, taper)
         expected = exact.jet(x.double())
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import torch
 from mplicits.neural_fields import InputError, Siren
+from mplicits.neural_fields.kernels.packing import Shape
 from mplicits.neural_fields.kernels.rounding import rounding_bound
 from mplicits.neural_fields.kernels.switch import VARIABLE, choose
 from mplicits.pipelines.run.trainer import seeded
@@ -102,8 +103,7 @@ class KernelsBench(Benchmark[KernelRow]):
         with seeded(self.seed):
             network = Siren(width, depth).requires_grad_(False)
         x = 2 * torch.rand(self.points, 3, generator=torch.Generator().manual_seed(self.seed)) - 1
-        own = network.as_network()
-        bounds = rounding_bound(x, own.parameters, own.omega, own.gain)
+        bounds = rounding_bound(x, network.raw(), network.omega, halves=True)
         exact = Siren(width, depth).double()
         exact.load_state_dict({name: part.double() for name, part in network.state_dict().items()})
         expected = exact.jet(x.double())
@@ -159,22 +159,20 @@ class KernelsBench(Benchmark[KernelRow]):
 
 
 def staged_bytes(width: int, depth: int) -> float:
-    """What the kernel of a jet puts aside and reads again, of a point; as `kernels/tiles.py` does it.
+    """What the kernel of a jet puts aside and reads again, of a point; as `kernels/tensor_tiles.py` does it.
 
-    Each product reads a layer once for each block of units that it makes, but where it makes that layer itself.
+    A number is two of float16. Each product reads a layer once for each block of units that it makes, but where it
+    makes that layer itself.
     """
-    from mplicits.neural_fields.kernels.launch import tiling_of
-
-    tiling = tiling_of(width)
-    stride = tiling.stride(width)
-    blocks, read = stride // tiling.columns, -(-width // tiling.piece) * tiling.piece
-    numbers = 0
+    shape = Shape.of(width, depth)
+    if shape.direct:
+        return 0.0
+    blocks, numbers = shape.width // shape.columns, 0
     for layer in range(depth - 1):  # up: sines, and the cosines of all but the first
-        kept = layer > 0 or blocks > 1
-        numbers += kept * (stride + blocks * read) + (layer > 0) * stride
-    if depth > 1:  # the last layer's s; then each product back, with the cosines and the next s
-        numbers += stride + (depth - 1) * blocks * read + (depth - 2) * 2 * stride
-    return 4.0 * numbers
+        numbers += (layer > 0 or blocks > 1) * (1 + blocks) + (layer > 0)
+    # The last layer's s; then each product back, with the cosines and the next s.
+    numbers += 1 + (depth - 1) * blocks + (depth - 2) * 2
+    return 4.0 * numbers * shape.width
 
 
 @contextmanager
