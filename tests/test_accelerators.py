@@ -305,5 +305,5 @@ def test_commands(accelerator: torch.device, tmp_path: Path, monkeypatch: pytest
 
 
 def test_a_device_that_is_not_there_is_refused_before_any_work(capsys: pytest.CaptureFixture[str]) -> None:
-    assert benchmarks(["eta", "--device", "warp"]) == 2
+    assert benchmarks(["normals", "--device", "warp"]) == 2
     assert "--device warp: not usable here" in capsys.readouterr().err

@@ -47,7 +47,7 @@ def run_benches(
         make_folder(folder)
         stack.enter_context(locked(folder))
         try:
-            with progress_bars(whole=False) as bars:
+            with progress_bars() as bars:
                 heard = {"say": _say, "progress": bars, "tell": _say}
                 ran = run_cells(cells, folder, Catalogue(benches), streams=streams, device=benches[0].device, **heard)
             code = 1 if ran.failures else 0

@@ -1,4 +1,4 @@
-"""``python -m benchmarks …`` of what things cost: gradients, kernels, meshes, pictures, many points, the time left."""
+"""``python -m benchmarks …`` of what things cost: gradients, kernels, meshes, pictures, many points."""
 
 from __future__ import annotations
 
@@ -31,23 +31,6 @@ def _normals(arguments: argparse.Namespace) -> int:
 
     options = {name: getattr(arguments, name) for name in ("points", "repeats", "busy", "seed", "device")}
     return run_benches(arguments, [NormalsBench(**options)], out=arguments.out)
-
-
-def _eta_arguments(parser: argparse.ArgumentParser) -> None:
-    what = "fit, reconstruct or evolve (all three)"
-    parser.add_argument("works", nargs="*", metavar="WORK", help=what)
-    number(parser, "--share", positive, 1.0, "factor on the steps of the fast presets")
-    number(parser, "--points", whole(100), 50_000, "of the cloud that is fitted")
-    parser.add_argument("--device", default="cpu", help="torch device (cpu)")
-    folder_flag(parser)
-    add_flags(parser, "--json")
-
-
-def _eta(arguments: argparse.Namespace) -> int:
-    from ..costs.eta import WORKS, EtaBench
-
-    options = {name: getattr(arguments, name) for name in ("share", "points", "device")}
-    return run_benches(arguments, [EtaBench(works=tuple(arguments.works) or WORKS, **options)], out=arguments.out)
 
 
 def _kernels_arguments(parser: argparse.ArgumentParser) -> None:
@@ -165,14 +148,6 @@ COSTS: Mapping[str, Command] = MappingProxyType(
             "  python -m benchmarks normals\n  python -m benchmarks normals --points 65536 --json normals.json",
             _normals_arguments,
             _normals,
-        ),
-        "eta": Command(
-            "what progress bars say of the time left, and what is true",
-            "  python -m benchmarks eta\n  python -m benchmarks eta fit --share 0.5 --json eta.json",
-            _eta_arguments,
-            _eta,
-            "Do a fit, a reconstruction and a morph, and compare the time that they take with what was said after five "
-            "seconds, a quarter and half of it.",
         ),
         "kernels": Command(
             "how exact the fused kernels are, and what they move",

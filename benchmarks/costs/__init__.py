@@ -1,1 +1,1 @@
-"""Times and counts: gradients, kernels, meshes, pictures, and the time left."""
+"""Times and counts: gradients, kernels, meshes and pictures."""

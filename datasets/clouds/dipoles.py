@@ -188,12 +188,11 @@ class DipoleField:
         self._radii = (self._x - self._middles[:, None]).norm(dim=2).amax(dim=1)
         self._total = self._mu.sum(dim=1)
 
-    def winding(self, x: NDArray[np.floating], *, watch: Callable[[int], object] | None = None) -> Float64:
+    def winding(self, x: NDArray[np.floating]) -> Float64:
         """``Σ_j ⟨p_j − x, μ_j⟩ / 4π (|p_j − x|² + ε_j²)^(3/2)`` at ``(M, 3)`` places → ``(M,)``.
 
         Args:
             x: the places.
-            watch: told of the pairs of a place and a dipole that are summed, as they are.
         """
         if len(x) == 0:
             return np.empty(0)
@@ -213,8 +212,6 @@ class DipoleField:
             x_near, mu_near = (self._x[batch.near] - middle[:, None]).flatten(1, 2), self._mu[batch.near] * batch.there
             total += _sums_of(asked, x_near, mu_near.flatten(1, 2), self._epsilon2[batch.near].flatten(1, 3)[:, None])
             sums[batch.leaves] = total
-            if watch is not None:
-                watch(len(asked) * size * (leaves + x_near.shape[1]))
         result = torch.empty(len(x))
         result[torch.from_numpy(order[real])] = sums.view(-1)[torch.from_numpy(real)]
         return result.double().numpy() / (4 * math.pi)

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from ..run.config import add_config_flags, given_flags, input_error, load_config, preset_names, thing_of
 
 if TYPE_CHECKING:
-    from ..run.schedule import Progress, Report, Schedule
+    from ..run.report import Progress, Report
 
 __all__ = [
     "Command",
@@ -91,7 +91,7 @@ def stoppable(kept: str = "", *, at_any_time: bool = False) -> Iterator[None]:
 @contextmanager
 def training(
     kept: str = "", *, quiet: bool = False, at_any_time: bool = False, heard: Sequence[Report] = ()
-) -> Iterator[Schedule | None]:
+) -> Iterator[Report | None]:
     """`stoppable` work with progress bars, unless it is to be ``quiet``.
 
     Args:
@@ -101,19 +101,18 @@ def training(
         heard: others that are told of all progress.
     """
     from ..run.progress import progress_bars
-    from ..run.schedule import Schedule
 
     with stoppable(kept, at_any_time=at_any_time), nullcontext() if quiet else progress_bars() as bars:
         if not heard:
             yield bars
             return
-        listeners = [*heard, *([] if bars is None else [bars.report])]
+        listeners = [*heard, *([] if bars is None else [bars])]
 
         def tell(progress: Progress, /) -> None:
             for listener in listeners:
                 listener(progress)
 
-        yield Schedule(tell)
+        yield tell
 
 
 def add_tensorboard(parser: argparse.ArgumentParser) -> None:

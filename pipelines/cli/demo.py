@@ -27,18 +27,15 @@ from ...datasets.synthetic.samples import feet_and_normals
 from ...neural_fields import Field, InputError, Placement, Similarity
 from ...neural_fields.files import check_place
 from ...neural_fields.meshing import Mesh, NoSurfaceError, extract_mesh
-from ..fit.plan import FitPlan
 from ..fit.train import Run, fit
 from ..mesh.files import write_mesh
-from ..mesh.plan import mesh_stage
 from ..render.picture import Image, contact_sheet, write_picture
 from ..render.rasterise import picture_of
 from ..render.shade import ShadeOptions, compose, shade
 from ..render.trace import trace_view
-from ..run.costs import Net, values
-from ..run.machine import choose_device, format_table, speed
+from ..run.machine import format_table
 from ..run.progress import progress_bars
-from ..run.schedule import Progress, Schedule, Stage
+from ..run.report import Progress, Report, reported
 from ..run.settings import FitConfig
 from ..surface.surface import from_cloud, from_mesh
 from .common import tell_budget
@@ -50,9 +47,6 @@ Float64 = NDArray[np.float64]
 CHECKED = 3_000  # vertices of the mesh whose exact distance to the statue is worked out
 EVEN = 8_000  # points spread evenly over the statue
 TILE = (480, 640)
-# Stages, and what they cost: FLOPs of the scan and of exact distances to the statue, values for each traced pixel.
-SCAN, MESHES, PICTURE, FIGURES = "scan", "meshes", "picture", "figures"
-SCANNED, JUDGED, DRAWN = 6e11, 5e11, 15
 
 
 def demo(
@@ -85,9 +79,8 @@ def demo(
     drawn: list[Image] = []
     said: list[str] = []  # once the bars are gone
     with progress_bars() as report:
-        after = _plan(report, config, resolution, scan=cloud is None)
         # Before anything is made.
-        points = statue_scan(progress=_counter(report, SCAN)) if cloud is None else read_cloud(cloud)
+        points = statue_scan(progress=_counter(report, "scan")) if cloud is None else read_cloud(cloud)
         out.mkdir(parents=True, exist_ok=True)
         file = out / "scan.ply" if cloud is None else Path(cloud)
         if cloud is None:
@@ -97,17 +90,14 @@ def demo(
         def show(field: Field, similarity: Similarity) -> None:
             """Draw the level that is finished beside those before, so that there is something to look at meanwhile."""
             level = field.num_levels - 1
-            count = _counter(report, f"level {level}: picture")
-            count(0, 1)
-            write_picture(picture, draw_levels(points, field, None, similarity, up=up, drawn=drawn))
-            count(1, 1)
-            report.follow(after(level + 1))
+            with reported(report, f"level {level}: picture"):
+                write_picture(picture, draw_levels(points, field, None, similarity, up=up, drawn=drawn))
             print(f"{picture}: drawn up to level {level}", flush=True)
 
         run = fit(file, config, out=out / "run", progress=report, level_done=show)
 
         meshes, levels = [], run.field.num_levels
-        mesh_count = _counter(report, MESHES)
+        mesh_count = _counter(report, "meshes")
         for level in range(levels):
             mesh_count(level, levels)
             meshes.append(_extract(run.field, level, resolution))
@@ -118,39 +108,19 @@ def demo(
             write_mesh(out / name, finest, run.similarity, placement if name == "mesh.glb" else None)
         mesh_count(levels, levels)
         write_picture(picture, draw_levels(points, run.field, finest, run.similarity, up=up, drawn=drawn))
-        _counter(report, FIGURES)(0, 1)
-        said.append(_figures(run, meshes, points))
-        if cloud is None:
-            said.append(_true_errors(points, run.field, finest, run.similarity))
-        _counter(report, FIGURES)(1, 1)
+        with reported(report, "figures"):
+            said.append(_figures(run, meshes, points))
+            if cloud is None:
+                said.append(_true_errors(points, run.field, finest, run.similarity))
     tell_budget(run.record)
     print("\n".join(said))
     print(f"{out / 'mesh.ply'}, mesh.glb, picture.png, run/: {time.monotonic() - started:.0f} s in all")
     return 0
 
 
-def _plan(schedule: Schedule, config: FitConfig, resolution: int, *, scan: bool) -> Callable[[int], list[Stage]]:
-    """Say what the demo will do beside the fit, and about how long that takes → what is left when levels are drawn."""
-    machine = speed(choose_device(config.device))
-    nets = [Net.siren(width, depth) for width, depth in zip(config.widths, config.depths, strict=True)]
-    levels = [nets[: level + 1] for level in range(config.num_levels)]
-    meshed = sum(mesh_stage(each, machine, resolution=resolution).seconds for each in levels)
-    drawn = [machine.points(values(DRAWN * TILE[0] * TILE[1], each)) for each in levels]
-    if scan:
-        schedule.plan([Stage(SCAN, "scan", machine.points(SCANNED)), *FitPlan(config, 100_000, machine).levels()])
-
-    def after(done: int) -> list[Stage]:
-        """Pictures are counted here until they are drawn, though they are drawn between the levels of the fit."""
-        pictures, figures = Stage(PICTURE, "picture", sum(drawn[done:])), machine.points(JUDGED if scan else 0.0)
-        return [Stage(MESHES, "mesh", meshed), pictures, Stage(FIGURES, "figures", figures)]
-
-    schedule.follow(after(0))
-    return after
-
-
-def _counter(schedule: Schedule, stage: str) -> Callable[[int, int], None]:
+def _counter(report: Report, stage: str) -> Callable[[int, int], None]:
     """Tells that so many parts of a stage are done, and of how many."""
-    return lambda done, total: schedule(Progress(stage, done, total, done / total, {}))
+    return lambda done, total: report(Progress(stage, done, total, done / total, {}))
 
 
 def _extract(field: Field, level: int, resolution: int) -> Mesh:

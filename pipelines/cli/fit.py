@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..run.config import given_flags, input_error, load_config
+from ..run.config import given_flags, input_error
 from ..run.settings import FitConfig
 from .common import (
     Command,
@@ -93,7 +93,7 @@ def _fit_one(arguments: argparse.Namespace, cloud: str, config: FitConfig | None
     from ..fit.depth import fit_depth, trim_suggestion
     from ..fit.train import fit
     from ..run.folder import TEXTURE_FILE, check_new_run, is_fitted, read_record
-    from ..run.machine import choose_device, peak_memory, speed
+    from ..run.machine import peak_memory
     from .info import describe
 
     directory, depth = arguments.out, _depth_input(arguments, cloud)
@@ -111,9 +111,6 @@ def _fit_one(arguments: argparse.Namespace, cloud: str, config: FitConfig | None
         tensorboard(arguments.tensorboard) as heard,
         training(again, quiet=arguments.quiet, heard=heard) as report,
     ):
-        if mesh is not None and report is not None:
-            used = config or load_config(FitConfig, None, read_record(directory)["config"])
-            report.follow(mesh.stages(used, speed(choose_device(used.device))))
         if not fitted and depth is None:
             fit(cloud, config, out=directory, resume=arguments.resume, progress=report)
         elif not fitted and depth is not None:

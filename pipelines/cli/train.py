@@ -164,30 +164,24 @@ def _help_reconstruct(arguments: argparse.Namespace, config: ReconstructConfig |
 
 def _reconstruct_here(arguments: argparse.Namespace, config: ReconstructConfig | None) -> int:
     """Train, measure and mesh."""
+    from ...datasets.views.find_cameras import find_cameras
     from ..mesh.extract import mesh_run
-    from ..mesh.plan import mesh_stage, meshing
-    from ..reconstruct.posing import find_cameras_timed
-    from ..reconstruct.train import HELD_OUT_FILE, MESH_FILE, reconstruct, usual_stages
-    from ..run.costs import Net
-    from ..run.folder import check_new_run, read_record
-    from ..run.machine import choose_device, speed
+    from ..reconstruct.posing import colmap_report
+    from ..reconstruct.train import HELD_OUT_FILE, MESH_FILE, reconstruct
+    from ..run.folder import check_new_run
+    from ..run.report import reported
 
     directory = check_new_run(arguments.out, resume=arguments.resume, force=arguments.force)
     data = arguments.data
     with tensorboard(arguments.tensorboard) as heard, training(quiet=arguments.quiet, heard=heard) as report:
-        used = config or load_config(ReconstructConfig, None, read_record(directory)["config"])
-        machine = speed(choose_device(used.device))
-        if report is not None:
-            nets = [Net.siren(*size) for size in zip(used.widths, used.depths, strict=True)]
-            report.follow([mesh_stage(nets, machine)])
         if arguments.poses == "colmap":
             data = directory.with_name(f"{directory.name}-cameras")
             with stoppable("the same command continues", at_any_time=True):
-                found = find_cameras_timed(arguments.data, data, progress=report, then=usual_stages(used, machine))
+                found = find_cameras(arguments.data, data, report=colmap_report(report))
             tell_found(found)
         with stoppable(f"to continue: mplicits reconstruct {data} -o {directory} --resume"):
             run = reconstruct(data, config, out=directory, resume=arguments.resume, progress=report)
-        with meshing(report):
+        with reported(report, "mesh"):
             lines: list[str] = []
             mesh = mesh_run(directory, directory / MESH_FILE, say=lines.append)
     tell_budget(run.record)

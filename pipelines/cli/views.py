@@ -29,11 +29,13 @@ def _find_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _find_cameras(arguments: argparse.Namespace) -> int:
-    from ..reconstruct.posing import find_cameras_timed
+    from ...datasets.views.find_cameras import find_cameras
+    from ..reconstruct.posing import colmap_report
 
     out = arguments.out
     with training("the same command continues", quiet=arguments.quiet, at_any_time=True) as report:
-        found = find_cameras_timed(arguments.photos, out, frames=arguments.frames, lens=arguments.lens, progress=report)
+        lens, told = arguments.lens, colmap_report(report)
+        found = find_cameras(arguments.photos, out, frames=arguments.frames, lens=lens, report=told)
     tell_found(found)
     print(f"next: mplicits check-cameras {out} -o cameras.glb")
     write_json(arguments.json, asdict(found) | {"project": str(out)})
@@ -73,11 +75,12 @@ def _points_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _find_points(arguments: argparse.Namespace) -> int:
-    from ..reconstruct.posing import find_points_timed, said_of_points
+    from ...datasets.views.find_points import find_points
+    from ..reconstruct.posing import colmap_report, said_of_points
 
     out = arguments.out
     with training("the same command continues", quiet=arguments.quiet, at_any_time=True) as report:
-        found = find_points_timed(arguments.data, out, progress=report)
+        found = find_points(arguments.data, out, report=colmap_report(report))
     _tell(*said_of_points(found))
     print(f"next: mplicits reconstruct {out} -o RUN")
     write_json(arguments.json, asdict(found) | {"project": str(out)})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -17,7 +18,7 @@ from .problem import End
 from .samples import band_points
 from .topology import Change, Topology, find_changes, surface_of, topology_of
 
-__all__ = ["FrameFigures", "check_evolution", "end_figures", "slope_figures", "volume", "warnings"]
+__all__ = ["FrameFigures", "check_evolution", "end_figures", "frame_figures", "slope_figures", "volume", "warnings"]
 
 END_RESOLUTION = 192
 # A surface that shall be met counts as missed where its Chamfer distance is so much above what it would score itself.
@@ -56,6 +57,7 @@ def check_evolution(
     frames: int,
     resolution: int,
     count: Callable[[int, int], None] | None = None,
+    until: float = math.inf,
 ) -> dict[str, Any]:
     """All figures of a trained field, on the CPU, as ``run.json`` holds them under ``checks``.
 
@@ -66,21 +68,21 @@ def check_evolution(
         frames: at how many times it is meshed.
         resolution: of those meshes; ends are meshed finer.
         count: told how many frames, ends and slopes are done, and of how many.
+        until: see `find_changes`.
     """
     total = frames + len(ends) + 2
     count = count or (lambda _done, _total: None)
     shown, met = [], []
     for time in torch.linspace(0, 1, frames).tolist():
-        shown.append(_frame_figures(field, time, resolution))
+        shown.append(frame_figures(field, time, resolution))
         count(len(shown), total)
     for end in ends:
         met.append(end_figures(field, end))
         count(frames + len(met), total)
     slopes = slope_figures(field)
     count(total - 1, total)
-    changes = find_changes(
-        field, [frame.time for frame in shown], [frame.topology for frame in shown], resolution=resolution
-    )
+    times, found = [frame.time for frame in shown], [frame.topology for frame in shown]
+    changes = find_changes(field, times, found, resolution=resolution, until=until)
     count(total, total)
     place = similarity or Similarity.identity()
     checks = {
@@ -185,7 +187,8 @@ def volume(surface: Surface) -> float:
     return float((a * np.cross(b, c)).sum() / 6)
 
 
-def _frame_figures(field: Field, time: float, resolution: int) -> FrameFigures:
+def frame_figures(field: Field, time: float, resolution: int) -> FrameFigures:
+    """Figures of the surface at a time, from a mesh of so many cells along each side."""
     still = TimeSlice(field, time)
     surface = surface_of(still, resolution=resolution)
     if surface is None:

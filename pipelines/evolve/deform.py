@@ -29,7 +29,8 @@ from torch import Tensor
 from torch.nn.functional import huber_loss, normalize, pad
 
 from ...neural_fields import CarriedKeyframes, Field, VelocitySiren, at_time, flow
-from ..run.schedule import Report
+from ..run.budget import LEAST_SECONDS, Budget
+from ..run.report import Report
 from ..run.settings import EvolveConfig
 from ..run.trainer import Group, Objective, Trainer, seeded, warm_cosine
 from .landmarks import Landmarks, nearness, placed_landmarks
@@ -62,6 +63,7 @@ DEPTHS = (0.05, 0.1, 0.2, 0.3)
 # longest way in the unit sphere, 2²: where it costs less, of a shape that has travelled the rear stays behind.
 BLUR, LEAST_BLUR, COOLING, ROUNDS, LEFT = 0.1, 0.003, 0.93, 100, 5.0
 NEWTON = 2
+MOVING_SHARE = 0.3  # of a time budget, for learning the motion
 ROWS = 8192
 
 
@@ -178,16 +180,29 @@ class MotionObjective(Objective):
 
 
 def learn_motion(
-    shapes: Sequence[StaticShape], keys: Sequence[float], config: EvolveConfig, progress: Report | None = None
+    shapes: Sequence[StaticShape],
+    keys: Sequence[float],
+    config: EvolveConfig,
+    progress: Report | None = None,
+    *,
+    budget: Budget | None = None,
 ) -> VelocitySiren:
-    """A velocity that takes each of the shapes to the next one, on the CPU."""
+    """A velocity that takes each of the shapes to the next one, on the CPU.
+
+    Of a time ``budget`` it takes `MOVING_SHARE` at most.
+    """
     with seeded(config.seed):
         velocity = VelocitySiren(config.motion_width, 2, omega=config.motion_omega)
     generator = torch.Generator().manual_seed(config.seed * 1009 + 71)
     for shape in shapes:
         shape.field.requires_grad_(False)
     objective = MotionObjective(velocity, shapes, keys, config, generator)
-    Trainer(objective, stage="motion", steps=config.motion_steps * (len(keys) - 1)).run(report=progress)
+    left = None if budget is None else budget.left()
+    seconds = None if left is None else max(MOVING_SHARE * left, LEAST_SECONDS)
+    trainer = Trainer(objective, stage="motion", steps=config.motion_steps * (len(keys) - 1), seconds=seconds)
+    trainer.run(report=progress)
+    if budget is not None and trainer.ended_early:
+        budget.notes.append(f"{trainer.step} steps of the motion instead of {trainer.steps}")
     return velocity.requires_grad_(False)
 
 

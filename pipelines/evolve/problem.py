@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -28,7 +29,8 @@ from ...neural_fields import (
     transport,
 )
 from ...neural_fields.evolution import VectorField
-from ..run.schedule import Report
+from ..run.budget import SAMPLING_SHARE, Budget, affordable
+from ..run.report import Report
 from ..run.settings import EvolveConfig
 from .deform import carried_samples, learn_motion, motion_figures
 from .samples import Bounds, Carried, Known, around, joined, known_at, no_bounds, signs, uniform, values_at
@@ -77,6 +79,7 @@ class Problem:
         motion_figures: how well it does that, for each two shapes.
         keys: moments between which the law moves a surface all the way from one shape to the next. The more of them,
             the faster it moves: its error is taken per interval, not per unit of time, as what is known does not grow.
+        samples: known samples that were made, fewer than the settings' where a time budget left no time for all.
     """
 
     similarity: Similarity
@@ -88,6 +91,7 @@ class Problem:
     motion: VelocitySiren | None = None
     motion_figures: tuple[Mapping[str, float], ...] = ()
     keys: tuple[float, ...] = (0.0, 1.0)
+    samples: int | None = None
 
 
 def build_problem(
@@ -96,6 +100,7 @@ def build_problem(
     *,
     motion: VelocitySiren | None = None,
     progress: Report | None = None,
+    budget: Budget | None = None,
 ) -> Problem:
     """The problem that a configuration means.
 
@@ -104,6 +109,7 @@ def build_problem(
         config: settings.
         motion: of a deformation, if it is learnt already.
         progress: of learning it.
+        budget: of time, of which the motion and the known samples get a share.
 
     Raises:
         InputError: too few or too many shapes for this kind, or a motion that cannot be followed.
@@ -114,10 +120,10 @@ def build_problem(
         expected = f"{least}" if least == most else f"at least {least}"
         raise InputError(f"{len(shapes)} shapes for kind {config.kind}; expected {expected}")
     if config.kind == "deform":
-        return _deform(list(shapes), config, motion, progress)
+        return _deform(list(shapes), config, motion, progress, budget)
     build = {"morph": _morph, "transport": _transport, "smooth": _smooth}[config.kind]
     try:
-        return build(list(shapes), config)
+        return build(list(shapes), config, budget)
     except IntegrationError as error:
         raise InputError(
             f"the motion cannot be followed ({error}); use a smaller --angle, --twist or --velocity"
@@ -163,19 +169,25 @@ def velocity_field(motion: RigidMotion, twist: float = 0.0) -> VectorField:
 
 
 def _deform(
-    shapes: list[StaticShape], config: EvolveConfig, motion: VelocitySiren | None, progress: Report | None
+    shapes: list[StaticShape],
+    config: EvolveConfig,
+    motion: VelocitySiren | None,
+    progress: Report | None,
+    budget: Budget | None,
 ) -> Problem:
     placed, region = _together(shapes, config)
     keys = config.key_times()
-    motion = motion or learn_motion(placed, keys, config, progress)
+    motion = motion or learn_motion(placed, keys, config, progress, budget=budget)
     frames = Keyframes(keys, [shape.field for shape in placed])
     between_keys = zip(itertools.pairwise(placed), itertools.pairwise(keys), strict=True)
     paces = [pace_of([shape.field for shape in pair], times, motion) for pair, times in between_keys]
     carried = PacedKeyframes(frames, motion, paces)
-    known, bounds = carried_samples(carried, placed, config.samples, config.seed)
+    made = _sampled(lambda count: carried_samples(carried, placed, count, config.seed), config, budget)
     ends = tuple(_end(shape, time, config.seed) for shape, time in zip(placed, keys, strict=True))
     similarity, figures = _composed(shapes[0].similarity, region), tuple(motion_figures(motion, placed, keys))
-    return Problem(similarity, known, bounds, None, ends, _placements(placed), motion, figures)
+    return Problem(
+        similarity, made.known, made.bounds, None, ends, _placements(placed), motion, figures, samples=made.number
+    )
 
 
 def _together(shapes: list[StaticShape], config: EvolveConfig) -> tuple[list[StaticShape], Similarity]:
@@ -184,21 +196,26 @@ def _together(shapes: list[StaticShape], config: EvolveConfig) -> tuple[list[Sta
     return into_unit_sphere(placed, np.concatenate([shape.surface.vertices for shape in placed]))
 
 
-def _morph(shapes: list[StaticShape], config: EvolveConfig) -> Problem:
+def _morph(shapes: list[StaticShape], config: EvolveConfig, budget: Budget | None) -> Problem:
     placed, region = _together(shapes, config)
-    generator, keys = torch.Generator().manual_seed(config.seed), config.key_times()
-    per_shape = -(-config.samples // len(placed))
+    keys = config.key_times()
     pairs = list(zip(placed, keys, strict=True))
-    known = [known_at(shape, time, per_shape, config.seed, generator) for shape, time in pairs]
-    x, t = uniform(config.samples, generator), torch.rand(config.samples, generator=generator)
-    values = torch.stack([values_at(shape.field, x) for shape in placed], dim=1)
-    low, high = between(t, keys, values)
-    bounded = torch.isfinite(low) | torch.isfinite(high)
-    bounds = Bounds(at_time(x, t)[bounded], CAUTION * low[bounded], CAUTION * high[bounded])
+
+    def samples(count: int) -> tuple[Known, Bounds]:
+        generator, per_shape = torch.Generator().manual_seed(config.seed), -(-count // len(placed))
+        known = [known_at(shape, time, per_shape, config.seed, generator) for shape, time in pairs]
+        x, t = uniform(count, generator), torch.rand(count, generator=generator)
+        values = torch.stack([values_at(shape.field, x) for shape in placed], dim=1)
+        low, high = between(t, keys, values)
+        bounded = torch.isfinite(low) | torch.isfinite(high)
+        return joined(known), Bounds(at_time(x, t)[bounded], CAUTION * low[bounded], CAUTION * high[bounded])
+
+    made = _sampled(samples, config, budget)
     guide = Keyframes(keys, [shape.field for shape in placed]).requires_grad_(False)
     ends = tuple(_end(shape, time, config.seed) for shape, time in pairs)
     similarity = _composed(shapes[0].similarity, region)
-    return Problem(similarity, joined(known), bounds, morph_law(guide), ends, _placements(placed), keys=keys)
+    law, places = morph_law(guide), _placements(placed)
+    return Problem(similarity, made.known, made.bounds, law, ends, places, keys=keys, samples=made.number)
 
 
 def morph_law(guide: Field) -> Law:
@@ -215,24 +232,29 @@ def morph_law(guide: Field) -> Law:
     return normal_speed(speed, extend=True)
 
 
-def _smooth(shapes: list[StaticShape], config: EvolveConfig) -> Problem:
+def _smooth(shapes: list[StaticShape], config: EvolveConfig, budget: Budget | None) -> Problem:
     placed, region = into_unit_sphere(shapes, shapes[0].surface.vertices)
     (shape,), alpha = placed, config.alpha / region.scale**2
-    generator = torch.Generator().manual_seed(config.seed)
-    known = known_at(shape, 0.0, config.samples, config.seed, generator)
-    # What is inside a sphere stays inside it while both shrink.
-    x, t = uniform(config.samples, generator), torch.rand(config.samples, generator=generator)
     squared = float((shape.surface.vertices**2).sum(axis=1).max())
-    beyond = x.norm(dim=1) - (squared - 4 * max(alpha, 0.0) * t).clamp(min=0).sqrt()
-    outside = (beyond > 0) & (alpha > 0)
-    low = CAUTION * beyond[outside]
-    bounds = Bounds(at_time(x, t)[outside], low, torch.full_like(low, math.inf))
+
+    def samples(count: int) -> tuple[Known, Bounds]:
+        generator = torch.Generator().manual_seed(config.seed)
+        known = known_at(shape, 0.0, count, config.seed, generator)
+        # What is inside a sphere stays inside it while both shrink.
+        x, t = uniform(count, generator), torch.rand(count, generator=generator)
+        beyond = x.norm(dim=1) - (squared - 4 * max(alpha, 0.0) * t).clamp(min=0).sqrt()
+        outside = (beyond > 0) & (alpha > 0)
+        low = CAUTION * beyond[outside]
+        return known, Bounds(at_time(x, t)[outside], low, torch.full_like(low, math.inf))
+
+    made = _sampled(samples, config, budget)
     end = _end(shape, 0.0, config.seed)
     law = mean_curvature(alpha, extend=True)
-    return Problem(_composed(shape.similarity, region), known, bounds, law, (end,), _placements(placed))
+    similarity, places = _composed(shape.similarity, region), _placements(placed)
+    return Problem(similarity, made.known, made.bounds, law, (end,), places, samples=made.number)
 
 
-def _transport(shapes: list[StaticShape], config: EvolveConfig) -> Problem:
+def _transport(shapes: list[StaticShape], config: EvolveConfig, budget: Budget | None) -> Problem:
     shapes = aligned(shapes, "none")
     reach = [
         trajectories(_velocity(config, index, Similarity.identity()), shape.points(REACH_POINTS, 0), _reach_times())
@@ -241,21 +263,44 @@ def _transport(shapes: list[StaticShape], config: EvolveConfig) -> Problem:
     placed, region = into_unit_sphere(shapes, torch.cat(reach).reshape(-1, 3).double().numpy())
     velocities = [_velocity(config, index, region) for index in range(len(placed))]
     carried = Carried([shape.field for shape in placed], velocities)
-    generator, count = torch.Generator().manual_seed(config.seed), -(-config.samples // len(placed))
-    points = []
-    for index, (shape, velocity) in enumerate(zip(placed, velocities, strict=True)):
-        y = around(shape, count, config.seed + index, generator)
-        t = torch.rand(count, generator=generator) * (torch.rand(count, generator=generator) > STILL)
-        points.append(at_time(flow(velocity, y, 0.0, t), t))
-    samples = carried.samples(torch.cat(points))
     rigid = not any(config.twist)
-    known, bounds = (samples, no_bounds()) if rigid else signs(samples)
+
+    def samples(count: int) -> tuple[Known, Bounds]:
+        generator, each = torch.Generator().manual_seed(config.seed), -(-count // len(placed))
+        points = []
+        for index, (shape, velocity) in enumerate(zip(placed, velocities, strict=True)):
+            y = around(shape, each, config.seed + index, generator)
+            t = torch.rand(each, generator=generator) * (torch.rand(each, generator=generator) > STILL)
+            points.append(at_time(flow(velocity, y, 0.0, t), t))
+        known = carried.samples(torch.cat(points))
+        return (known, no_bounds()) if rigid else signs(known)
+
+    made = _sampled(samples, config, budget)
     law = transport(velocities[0], extend=not rigid) if len(placed) == 1 else None
     name = " + ".join(shape.name for shape in shapes)
     ends = tuple(
         End(name, time, *(carried.surface(placed, time, END_POINTS, seed) for seed in (0, 1))) for time in (0.0, 1.0)
     )
-    return Problem(_composed(shapes[0].similarity, region), known, bounds, law, ends, _placements(placed))
+    similarity, places = _composed(shapes[0].similarity, region), _placements(placed)
+    return Problem(similarity, made.known, made.bounds, law, ends, places, samples=made.number)
+
+
+class _Sampled(NamedTuple):
+    """Known samples and bounds, and how many samples were asked for."""
+
+    known: Known
+    bounds: Bounds
+    number: int
+
+
+def _sampled(samples: Callable[[int], tuple[Known, Bounds]], config: EvolveConfig, budget: Budget | None) -> _Sampled:
+    """As many samples as the settings want, or as a time budget leaves time for."""
+    count, left = config.samples, None if budget is None else budget.left()
+    if budget is not None and left is not None:
+        count = affordable(samples, config.samples, SAMPLING_SHARE * left)
+        if count < config.samples:
+            budget.notes.append(f"{count:,} known samples instead of {config.samples:,}")
+    return _Sampled(*samples(count), count)
 
 
 def _velocity(config: EvolveConfig, index: int, region: Similarity) -> VectorField:

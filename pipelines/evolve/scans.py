@@ -20,7 +20,7 @@ from ...neural_fields.files import write_whole
 from ..fit.train import fit
 from ..run.config import load_config
 from ..run.folder import FIELD_FILE, STATE_FILE, find_field, is_fitted, read_record
-from ..run.schedule import Report
+from ..run.report import Report
 from ..run.settings import EvolveConfig, FitConfig
 from ..surface.surface import Surface, read_surface
 from .landmarks import FAR_OUT

@@ -7,8 +7,10 @@ space-time, so that two moments before and after a change differ near one place 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from time import monotonic
 from typing import NamedTuple
 
 import numpy as np
@@ -83,7 +85,12 @@ def surface_of(field: FieldLike, *, resolution: int, level: int = -1) -> Surface
 
 
 def find_changes(
-    field: Field, times: Sequence[float], found: Sequence[Topology], *, resolution: int = 96
+    field: Field,
+    times: Sequence[float],
+    found: Sequence[Topology],
+    *,
+    resolution: int = 96,
+    until: float = math.inf,
 ) -> list[Change]:
     """The changes between moments whose topology is known, each by halving the interval that it lies in.
 
@@ -94,6 +101,7 @@ def find_changes(
         times: ``(T,)``, growing.
         found: the topology at each, of meshes of the same ``resolution``.
         resolution: cells along each side of the meshes.
+        until: moment, by `time.monotonic`, from which intervals stay as wide as they are and places unknown.
     """
     pending = [
         _Bracket(times[index - 1], times[index], found[index - 1], found[index])
@@ -104,7 +112,7 @@ def find_changes(
     looked = 0
     while pending:
         start, end, before, after = bracket = pending.pop()
-        if end - start > NARROW and looked < MOST:
+        if end - start > NARROW and looked < MOST and monotonic() < until:
             looked += 1
             middle = (start + end) / 2
             now = topology_of(surface_of(TimeSlice(field, middle), resolution=resolution))
@@ -116,7 +124,8 @@ def find_changes(
             narrow.append(bracket)
     changes: list[Change] = []
     for start, end, before, after in (bracket for bracket in narrow if bracket.before != bracket.after):
-        place = _place(field, start, end, before, resolution) if len(changes) < PLACED else None
+        placed = len(changes) < PLACED and monotonic() < until
+        place = _place(field, start, end, before, resolution) if placed else None
         changes.append(Change((start + end) / 2, (end - start) / 2, before, after, place))
     return changes
 

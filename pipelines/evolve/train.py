@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
+import itertools
 import math
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,10 +17,11 @@ from torch import Tensor
 from ...neural_fields import InputError, MultiscaleSDF, Similarity, SpaceTimeSDF
 from ..fit.band import delta_of
 from ..fit.level import new_level
+from ..run.budget import LEAST_SECONDS, Budget, step_seconds
 from ..run.folder import RunFolder, digest_of
-from ..run.machine import choose_device, environment, speed
+from ..run.machine import choose_device, environment
 from ..run.motion import VELOCITY_FILE, load_motion
-from ..run.schedule import Progress, Report, Schedule
+from ..run.report import Progress, Report, reported, silent
 from ..run.settings import EvolveConfig
 from ..run.trainer import (
     Interrupted,
@@ -32,17 +34,18 @@ from ..run.trainer import (
     stop_on_signals,
     without_prefix,
 )
-from .checks import check_evolution
+from .checks import check_evolution, frame_figures
 from .landmarks import read_landmarks
 from .objective import LONGEST_GRADIENT, EvolveObjective, learn_start
-from .plan import FEWEST_STEPS, EvolvePlan, within
 from .problem import Problem, build_problem
 from .shapes import StaticShape, read_shape
 
 __all__ = ["Evolution", "evolve", "train_evolution"]
 
-# Of a time budget, what the start may take; and what is left for a level where all is spent.
-STARTING_SHARE, LEAST_SECONDS = 0.2, 0.5
+# Of a time budget, what the start and the checks may take.
+STARTING_SHARE, CHECKING_SHARE = 0.2, 0.25
+# Frames that are checked in any case; and how many frames the check of an end costs, by its finer mesh.
+FEWEST_FRAMES, END_FRAMES = 3, 3
 
 
 @dataclass(frozen=True)
@@ -87,27 +90,23 @@ def evolve(
         >>> run.record["checks"]["warnings"]  # doctest: +SKIP
     """
     started, folder = time.monotonic(), RunFolder(out, resume=resume)
-    config = folder.config(EvolveConfig, config)
-    device, schedule = choose_device(config.device), Schedule.of(progress)
-    machine, notes = speed(device), list[str]()
-    plan, count, shapes = EvolvePlan(config, machine), len(config.shapes), []
-    schedule.plan([plan.shapes(), *plan.moving(resume), plan.known(), *plan.stages()], budget=config.time_budget)
+    config, report = folder.config(EvolveConfig, config), progress or silent
+    budget = Budget(config.time_budget, choose_device(config.device), started=started)
+    count, shapes = len(config.shapes), []
     for path in config.landmarks:
         read_landmarks(path)  # before the shapes, which take their time
     for index, text in enumerate(config.shapes):
-        schedule(Progress("shapes", index, count, index / count, {}))
+        report(Progress("shapes", index, count, index / count, {}))
         shapes.append(read_shape(text))
-    schedule(Progress("shapes", count, count, 1.0, {}))
+    report(Progress("shapes", count, count, 1.0, {}))
     load_compiler()
-    if config.time_budget is not None and not resume:  # what is resumed has its settings
-        config, notes = within(config, machine, max(config.time_budget - (time.monotonic() - started), 0.0))
     motion = load_motion(folder.path) if resume and folder.path else None
-    schedule(Progress("known samples", 0, 0, 0.0, {}))
-    problem = build_problem(shapes, config, motion=motion, progress=schedule)
-    schedule(Progress("known samples", 0, 0, 1.0, {}))
-    return train_evolution(
-        problem, config, shapes=shapes, out=out, resume=resume, progress=schedule, started=started, notes=notes
-    )
+    # A resumed run has the number of samples that its budget allowed in its settings.
+    limit = None if resume else budget
+    with reported(report, "known samples"):
+        problem = build_problem(shapes, config, motion=motion, progress=report, budget=limit)
+    config = dataclasses.replace(config, samples=problem.samples or config.samples)
+    return train_evolution(problem, config, shapes=shapes, out=out, resume=resume, progress=report, budget=budget)
 
 
 def train_evolution(
@@ -118,18 +117,16 @@ def train_evolution(
     out: str | Path | None = None,
     resume: bool = False,
     progress: Report | None = None,
-    started: float | None = None,
-    notes: Sequence[str] = (),
+    budget: Budget | None = None,
 ) -> Evolution:
     """`evolve` for a problem that was put together by hand; see there.
 
-    The time budget counts from ``started``, by `time.monotonic`, or from now; ``notes`` say what it has changed so far.
+    The ``budget`` is that of the settings where it began earlier; by default it begins now.
     """
     names, folder = [shape.name for shape in shapes or []], RunFolder(out, resume=resume)
-    device, schedule = choose_device(config.device), Schedule.of(progress)
-    training = _Evolving(problem, names, config, device, folder, schedule)
-    training.started = time.monotonic() if started is None else started
-    training.notes = list(notes)
+    device = choose_device(config.device)
+    budget = budget or Budget(config.time_budget, device)
+    training = _Evolving(problem, names, config, device, folder, progress or silent, budget)
     with folder.writing(VELOCITY_FILE), stop_on_signals() as flag:
         if resume:
             training.restore()
@@ -148,13 +145,13 @@ class _Evolving:
         config: EvolveConfig,
         device: torch.device,
         folder: RunFolder,
-        schedule: Schedule,
+        report: Report,
+        budget: Budget,
     ) -> None:
         self.problem, self.names, self.config, self.device = problem, names, config, device
-        self.folder, self.schedule = folder, schedule
-        self.plan, self.started, self.before = EvolvePlan(config, speed(device)), time.monotonic(), 0.0
-        self.notes: list[str] = []  # what the time budget changed
-        self.left_out: list[int] = []
+        self.folder, self.report, self.budget = folder, report, budget
+        self.costs: dict[int, float] = {}  # measured seconds of a step, by level
+        self.frame_seconds = 0.0  # to check a frame
         self.fingerprint = digest_of(part.numpy() for part in vars(problem.known).values())
         self.frozen: SpaceTimeSDF | None = None
         self.stages: list[dict[str, Any]] = []
@@ -162,23 +159,29 @@ class _Evolving:
 
     def run(self, flag: StopFlag) -> Evolution:
         for level in range(len(self.stages), self.config.num_levels):
-            self.schedule.plan(self.plan.stages(level, begun=bool(self.trainer_state)), budget=self.left())
-            if not self.trainer_state and not self.is_worth(level):
-                self.leave_out(level)
+            if level and self.share(level) is None:
+                self.budget.leave_out(level, self.config.num_levels)
                 break
             self.train_level(level, flag)
-        self.schedule.plan([self.plan.checking()])
         assert self.frozen is not None
         field = self.frozen.cpu()
+        frames = self.affordable_frames()
         record = self.record(finished=True)
 
         def count(done: int, total: int) -> None:
-            self.schedule(Progress("checks", done, total, done / total, {}))
+            self.report(Progress("checks", done, total, done / total, {}))
 
         count(0, 1)
-        frames, resolution = self.config.frames, self.config.resolution
+        resolution, left = self.config.resolution, self.budget.left()
+        until = math.inf if left is None else time.monotonic() + left
         record["checks"] = check_evolution(
-            field, self.problem.ends, self.problem.similarity, frames=frames, resolution=resolution, count=count
+            field,
+            self.problem.ends,
+            self.problem.similarity,
+            frames=frames,
+            resolution=resolution,
+            count=count,
+            until=until,
         )
         record = self.folder.finish(field, self.problem.similarity, record)
         return Evolution(field, self.problem.similarity, self.folder.out, record)
@@ -196,12 +199,12 @@ class _Evolving:
             raise InputError(
                 f"{error}; train the level before longer (--steps), or widen the band (--epsilon)"
             ) from error
-        seconds, steps = self.seconds_for(level), config.steps[level]
+        seconds, steps = self.seconds_for(level, field), config.steps[level]
         trainer = Trainer(objective, stage=f"level {level}", steps=steps, seconds=seconds, clip=LONGEST_GRADIENT)
         if self.trainer_state:
             trainer.restore(self.trainer_state)
             self.trainer_state = {}
-        if not trainer.run(flag, report=self.schedule, save=lambda: self.save(field, trainer)):
+        if not trainer.run(flag, report=self.report, save=lambda: self.save(field, trainer)):
             raise Interrupted(self.folder.out)
         self.frozen = field.requires_grad_(False)
         errors = self.errors_at_ends()
@@ -228,10 +231,10 @@ class _Evolving:
         if level == 0:
             if self.trainer_state:
                 return self.empty(1).to(self.device)
-            left = self.left()
+            left = self.budget.left()
             seconds = None if left is None else max(STARTING_SHARE * left, LEAST_SECONDS)
             known = self.problem.known.to(self.device)
-            return learn_start(known, config, generator, self.schedule, seconds=seconds).to(self.device)
+            return learn_start(known, config, generator, self.report, seconds=seconds).to(self.device)
         assert self.frozen is not None
         assert delta is not None
         residual = new_level(config, level, residual=True, in_dim=4)
@@ -256,45 +259,55 @@ class _Evolving:
         rows = [torch.nn.functional.pad(end.points, (0, 1), value=end.time) for end in self.problem.ends]
         return torch.cat([self.frozen.value(part.to(self.device)).cpu() for part in torch.cat(rows).split(1 << 16)])
 
-    def left(self) -> float | None:
-        """Seconds of the time budget that are left for levels: all but the checks at the end."""
-        budget = self.config.time_budget
-        if budget is None:
-            return None
-        left = budget - self.before - (time.monotonic() - self.started)
-        return max(left - min(self.schedule.predicted(self.plan.checking()), left / 2), LEAST_SECONDS)
-
-    def seconds_for(self, level: int) -> float | None:
-        """How long this level may train within the time budget: by the work that its steps are, if it is too little."""
-        left = self.left()
+    def share(self, level: int) -> float | None:
+        """Seconds for the training of a level; None if it is not worth beginning, infinite without a budget."""
+        left = self.budget.left()
         if left is None:
+            return math.inf
+        left = max(left - min(self.checking_seconds(), CHECKING_SHARE * left), LEAST_SECONDS)
+        steps, begun = self.config.steps[: self.config.num_levels], bool(self.trainer_state)
+        return self.budget.share(left, level, steps, self.cost, begun=begun)
+
+    def cost(self, level: int) -> float:
+        """Measured seconds of a training step of a level, on networks that are not trained."""
+        if level not in self.costs:
+            field = self.empty(level + 1).to(self.device).requires_grad_(False)
+            field.sdf.levels[level].requires_grad_(True)
+            generator = torch.Generator().manual_seed(0)
+            objective = EvolveObjective(field, self.problem, self.config, level=level, generator=generator)
+            steps, left = itertools.count(), self.budget.left() or 0.0
+            self.costs[level] = step_seconds(lambda: objective.losses(next(steps), 0.0)[1], left)
+        return self.costs[level]
+
+    def seconds_for(self, level: int, field: SpaceTimeSDF) -> float | None:
+        """How long a level may train that begins as ``field``; None without a budget."""
+        if self.budget.left() is None:
             return None
-        work = [self.plan.level(each).seconds for each in range(level, self.config.num_levels)]
-        while len(work) > 1 and left * work[-1] / sum(work) < self.least_seconds(level + len(work) - 1):
-            work.pop()  # it will be left out
+        begun, shown = time.monotonic(), copy.deepcopy(field).cpu()
+        frame_figures(shown, 0.0, self.config.resolution)
+        self.frame_seconds = time.monotonic() - begun
         took = float(self.trainer_state["progress"][1]) if self.trainer_state else 0.0
-        return left * work[0] / math.fsum(work) + took
+        return max(self.share(level) or 0.0, LEAST_SECONDS) + took
 
-    def least_seconds(self, level: int) -> float:
-        """Training that makes a level worth beginning."""
-        steps = min(FEWEST_STEPS, -(-self.config.steps[level] // 4))
-        return steps * self.plan.step_seconds(level) * self.schedule.slowness("steps")
+    def checking_seconds(self) -> float:
+        """Seconds for all checks at the end, at what a frame took when the last level began."""
+        return self.frame_seconds * (self.config.frames + END_FRAMES * len(self.problem.ends))
 
-    def is_worth(self, level: int) -> bool:
-        """Whether a level is to be trained; level 0 is in any case."""
-        left = self.left()
-        return left is None or level == 0 or left >= self.least_seconds(level)
-
-    def leave_out(self, first: int) -> None:
-        """Say that levels are not trained."""
-        self.left_out = list(range(first, self.config.num_levels))
-        names = f"level {first} is" if len(self.left_out) == 1 else f"levels {first} to {self.left_out[-1]} are"
-        self.notes.append(f"{names} left out: too little time for {FEWEST_STEPS} steps")
+    def affordable_frames(self) -> int:
+        """How many frames there is time to check."""
+        left, frames = self.budget.left(), self.config.frames
+        if left is None or left >= self.checking_seconds():
+            return frames
+        count = int(left / self.frame_seconds) - END_FRAMES * len(self.problem.ends)
+        count = min(max(count, FEWEST_FRAMES), frames)
+        if count < frames:
+            self.budget.notes.append(f"{count} frames are checked instead of {frames}")
+        return count
 
     def save(self, field: SpaceTimeSDF, trainer: Trainer[EvolveObjective] | None) -> None:
         """Write a usable field and all that `restore` needs."""
         tensors = checkpoint_of(self.frozen, trainer)
-        progress = {"fingerprint": self.fingerprint, "stages": self.stages, "notes": self.notes}
+        progress = {"fingerprint": self.fingerprint, "stages": self.stages, "notes": self.budget.notes}
         self.folder.save(field, self.problem.similarity, self.record(finished=False), tensors, progress)
 
     def restore(self) -> None:
@@ -302,18 +315,16 @@ class _Evolving:
         names = ", ".join(self.names)
         mismatch = f"{names}: not the shapes that {self.folder.path} was trained on; bring those back"
         tensors, progress = self.folder.restore(self.fingerprint, mismatch)
-        self.stages, self.notes = progress["stages"], progress.get("notes", [])
+        self.stages, self.budget.notes = progress["stages"], progress.get("notes", [])
         if self.stages:
             self.frozen = restore_frozen(self.empty(len(self.stages)).to(self.device), tensors)
         self.trainer_state = without_prefix("trainer.", tensors)
         took = sum(stage["beginning_seconds"] + stage["training_seconds"] for stage in self.stages)
-        self.before = took + (float(self.trainer_state["progress"][1]) if self.trainer_state else 0.0)
+        self.budget.before = took + (float(self.trainer_state["progress"][1]) if self.trainer_state else 0.0)
 
     def record(self, *, finished: bool) -> dict[str, Any]:
         """What ``run.json`` holds."""
         seconds = sum(stage["beginning_seconds"] + stage["training_seconds"] for stage in self.stages)
-        limit = self.config.time_budget
-        budget = {"seconds": limit, "left_out": self.left_out, "notes": self.notes}
         return {
             "finished": finished,
             "kind": self.config.kind,
@@ -328,6 +339,6 @@ class _Evolving:
             "parameters": sum(stage["parameters"] for stage in self.stages),
             "deltas": [stage["delta"] for stage in self.stages if stage["delta"] is not None],
             "training_seconds": round(seconds, 3),
-            **({} if limit is None else {"budget": budget}),
+            **self.budget.record(),
             "environment": environment(self.device),
         }

@@ -14,7 +14,6 @@ import dataclasses
 import json
 import math
 import zipfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +29,6 @@ from ...datasets.clouds.large import Merging, merge_cloud
 from ...datasets.clouds.reading import check_cloud, open_stream
 from ...datasets.clouds.stream import MemoryStream
 from ...neural_fields.files import whole_file
-from ..run.costs import queries, windings
 from ..run.folder import MERGED_FILE
 
 __all__ = ["CloudDistance", "load_cloud"]
@@ -155,9 +153,6 @@ class CloudDistance:
         given: how many of the points are the cloud's own, the first ones; None for all. The others fill it in.
         gap: the spacing of those; None for that of all.
         repaired: how many normals of points on edges were replaced by one side's.
-
-    Attributes:
-        watch: told of work as it is done, in the units of :mod:`..run.costs`.
     """
 
     def __init__(
@@ -172,7 +167,6 @@ class CloudDistance:
         gap: float | None = None,
         repaired: int = 0,
     ) -> None:
-        self.watch: Callable[[float], None] = lambda _: None
         self.points: Float32 = points.cpu().numpy()
         self.normals: Float32 = normals.cpu().numpy()
         self.tree = KDTree(self.points, compact_nodes=False, balanced_tree=False)
@@ -224,7 +218,6 @@ class CloudDistance:
     def _query(self, x: NDArray[np.floating], k: int) -> tuple[NDArray[np.float64], NDArray[np.integer]]:
         """Distances to the k nearest points, and their indices."""
         distance, index = self.tree.query(x, k=k, workers=-1)
-        self.watch(queries(len(x), len(self.points)))
         return np.asarray(distance), np.asarray(index)
 
     def winding_number(self, x: Float32, *, soft: float = SOFT) -> NDArray[np.float64]:
@@ -237,12 +230,8 @@ class CloudDistance:
             soft: softening of the dipoles, in standard deviations of the noise.
         """
         dipoles = self._softened(soft)
-
-        def watch(pairs: int) -> None:
-            self.watch(windings(pairs, 1))
-
         starts = range(0, max(len(x), 1), PLACES)
-        return np.concatenate([dipoles.winding(x[start : start + PLACES], watch=watch) for start in starts])
+        return np.concatenate([dipoles.winding(x[start : start + PLACES]) for start in starts])
 
     def _softened(self, soft: float) -> DipoleField:
         """The points as dipoles, softened by so many standard deviations of the noise, or `SOFT` of their discs."""

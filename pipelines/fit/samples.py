@@ -190,7 +190,6 @@ def banded_sources(
     generator: torch.Generator,
     weights: Weights | None = None,
     name: str = "cloud",
-    watch: Callable[[int], None] | None = None,
 ) -> list[Source]:
     """A residual level's: the cloud, its offsets and dithered points, inside the band (Sec. 3.2); and remote places.
 
@@ -204,7 +203,6 @@ def banded_sources(
         generator: draws the samples.
         weights: other weights than the fit's own.
         name: what messages call the cloud.
-        watch: told after each part of the points at how many of them ``previous`` was evaluated.
 
     Raises:
         InputError: one kind of samples is empty.
@@ -216,7 +214,7 @@ def banded_sources(
         beside = "offset", offset_samples(index, delta, config.samples, generator=generator)
     band = band_samples(index, delta, config.samples, generator=generator)
     kept = {
-        kind: with_previous(samples, previous, delta, device=device, watch=watch)
+        kind: with_previous(samples, previous, delta, device=device)
         for kind, samples in (("surface", surface_samples(index)), beside, ("band", band))
     }
     for kind, samples in kept.items():
@@ -235,7 +233,7 @@ def banded_sources(
     sources = [Source(kind, samples, third, *terms, usual) for kind, samples in kept.items()]
     # Of its own generator: a cloud without such places is fitted as if nobody had looked for them.
     own = torch.Generator().manual_seed(generator.initial_seed() + 1)
-    remote = remote_samples(index, previous, delta, config.samples, generator=own, device=device, watch=watch)
+    remote = remote_samples(index, previous, delta, config.samples, generator=own, device=device)
     for kind, samples in remote._asdict().items():
         if len(samples) >= FEWEST:
             sources.append(Source(kind, samples, third // 4, terms[0], 0.0, 0.0))
@@ -303,7 +301,6 @@ def remote_samples(
     *,
     generator: torch.Generator,
     device: torch.device,
-    watch: Callable[[int], None] | None = None,
 ) -> Remote:
     """Points of the band around ``field`` that are far from every point of the cloud.
 
@@ -320,14 +317,13 @@ def remote_samples(
         count: how many points are tried, spread as for level 0; as many again around unseen ones, if there are some.
         generator: draws them.
         device: where the field is.
-        watch: see `banded_sources`.
 
     Returns:
         Samples with distances, values and gradients, on ``device``; often none.
     """
 
     def found(tried: Tensor) -> Remote:
-        samples = with_previous(Samples(tried), field, delta, device=device, watch=watch)
+        samples = with_previous(Samples(tried), field, delta, device=device)
         points = samples.points.cpu().numpy()
         assert samples.value is not None
         distance = cloud.nearest(points)
@@ -426,18 +422,10 @@ def with_previous(
     delta: float,
     *,
     device: torch.device,
-    watch: Callable[[int], None] | None = None,
 ) -> Samples:
-    """Add the frozen levels' value and gradient, and reject the samples outside ``|f| < delta`` or a coarser band.
-
-    ``watch`` is told after each part how many points it had.
-    """
+    """Add the frozen levels' value and gradient, and reject the samples outside ``|f| < delta`` or a coarser band."""
     points = samples.points.to(device)
-    jets = []
-    for part in points.split(1 << 16):
-        jets.append(field.jet(part))
-        if watch is not None:
-            watch(len(part))
+    jets = [field.jet(part) for part in points.split(1 << 16)]
     jet = Jet(*(torch.cat(parts) for parts in zip(*jets, strict=True)))
     size = jet.value.abs()
     kept = size < delta

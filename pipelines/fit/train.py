@@ -6,6 +6,7 @@ What the coarse level shows to be wrong with the cloud, outliers and flipped nor
 from __future__ import annotations
 
 import dataclasses
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -20,9 +21,12 @@ from torch import Tensor, nn
 from ...datasets import OrientedCloud, PointCloud, prepare_cloud, spacing_of
 from ...datasets.clouds.large import Merging
 from ...neural_fields import InputError, MultiscaleSDF, Similarity, Siren, WorldField, save_field
+from ..run.budget import SAMPLING_SHARE, Budget, affordable, least_share, step_seconds
 from ..run.folder import SUPPORT_FILE, RunFolder, digest_of, named_cloud
 from ..run.machine import choose_device, environment, peak_memory
+from ..run.report import reported, silent
 from ..run.settings import FitConfig
+from ..run.team import agreed
 from ..run.trainer import (
     Interrupted,
     Report,
@@ -41,10 +45,8 @@ from .between import dense_distance
 from .cloud import CloudDistance, load_cloud
 from .heldout import FEWEST, Judge, held_out
 from .level import RESIDUAL_GAIN, LevelObjective, calm_omega, new_level
-from .plan import Share
 from .review import Review, review_points
-from .samples import Source, banded_sources, first_sources
-from .timing import Timing
+from .samples import DOMAIN, Source, banded_sources, first_sources
 from .unoriented import Places, Signs, fits_better, give_signs, signed
 
 __all__ = ["FitConfig", "Review", "Run", "fit", "fit_moved", "prepare", "review_points"]
@@ -161,14 +163,14 @@ def _fit(
 ) -> Run:
     config = folder.config(FitConfig, config)
     device = choose_device(config.device)
-    timing, points = Timing(config, progress, device), _as_cloud(cloud)
-    timing.begin(points)
-    raw, merging = load_cloud(points, limit=config.merge_above, isolation=config.isolation, cache=folder.path)
-    timing.has_read(len(raw))
-    prepared = prepare(raw, config)
-    timing.has_prepared()
+    budget, points = Budget(config.time_budget, device), _as_cloud(cloud)
+    with reported(progress, "reading the cloud"):
+        raw, merging = load_cloud(points, limit=config.merge_above, isolation=config.isolation, cache=folder.path)
+    with reported(progress, "preparing the cloud"):
+        prepared = prepare(raw, config)
     load_compiler()
-    fitting = _Fitting(prepared, source or raw.source, config, device, folder, timing, merging)
+    fitting = _Fitting(prepared, source or raw.source, config, device, folder, budget, merging)
+    fitting.report = progress or silent
     fitting.level_done = level_done
     with folder.writing(), stop_on_signals() as flag:
         if folder.resume:
@@ -214,12 +216,14 @@ class _Fitting:
         config: FitConfig,
         device: torch.device,
         folder: RunFolder,
-        timing: Timing,
+        budget: Budget,
         merging: Merging | None,
     ) -> None:
         self.cloud, self.source, self.config = cloud, source, config
         self.device, self.folder, self.merging = device, folder, merging
-        self.timing, self.preparation_seconds = timing, time.monotonic() - timing.started
+        self.budget, self.preparation_seconds = budget, time.monotonic() - budget.started
+        self.report: Report = silent
+        self.costs: dict[int, float] = {}  # measured seconds of a step, by level
         self.fingerprint = digest_of((cloud.points, cloud.normals))
         self.points, self.normals = torch.from_numpy(cloud.points), torch.from_numpy(cloud.normals)
         self.index: CloudDistance | None = None  # of the points above
@@ -231,7 +235,8 @@ class _Fitting:
         self.stages: list[dict[str, Any]] = []
         self.trainer_state: dict[str, Tensor] = {}
         self.level_done: LevelDone | None = None
-        self.samples: int | None = None  # of the level under way, where a time budget leaves it fewer
+        # Of the level under way, and of the cloud's index; fewer than the settings' where a time budget leaves no more.
+        self.samples = self.filling = config.samples
 
     def run(self, flag: StopFlag) -> Run:
         if not self.stages and not self.trainer_state:
@@ -240,6 +245,7 @@ class _Fitting:
         for level in range(len(self.stages), self.config.num_levels):
             share = self.share(level)
             if share is None:
+                self.budget.leave_out(level, self.config.num_levels)
                 break
             self.train_level(level, share, flag)
         assert self.frozen is not None
@@ -251,13 +257,9 @@ class _Fitting:
         if self.config.normals != "none" and self.cloud.report.oriented_by not in GUESSED:
             return
         asked = self.config.normals == "none"
-        if asked:
-            self.timing.finds_signs()
         places = Places.around(CloudDistance(self.points, self.normals), seed=self.config.seed)
-        if not asked:
-            if not places.contested:
-                return
-            self.timing.finds_signs()
+        if not asked and not places.contested:
+            return
         signs = give_signs(
             self.points,
             self.normals,
@@ -265,7 +267,7 @@ class _Fitting:
             device=self.device,
             places=places,
             flag=flag,
-            report=self.timing.schedule,
+            report=self.report,
         )
         if signs is None:
             self.save(self.grown(new_level(self.config, 0, residual=False), None), None)
@@ -284,58 +286,66 @@ class _Fitting:
         if self.folder.out is not None:
             self.folder.keep_tensors(SUPPORT_FILE, thinned(self.points.numpy()))
 
-    def share(self, level: int) -> Share | None:
-        """Samples of a level, and seconds for it all in the time budget; None if none are left that are worth it."""
-        share = self.timing.share(level, lambda: self.indexed(level), begun=bool(self.trainer_state))
-        if share is not None and self.trainer_state:  # it goes on with what it has learnt from, and the time it took
-            took = float(self.trainer_state["progress"][1])
-            share = Share(share.seconds + took, self.samples or share.samples)
-        self.samples = None if share is None else share.samples
-        return share
+    def share(self, level: int) -> float | None:
+        """Seconds for samples and training of a level; infinite without a budget, None if it is not worth beginning."""
+        left, steps = self.budget.left(), self.config.steps[: self.config.num_levels]
+        if left is None:
+            return math.inf
+        training, begun = 1 - SAMPLING_SHARE, bool(self.trainer_state)
+        return self.budget.share(left, level, steps, self.cost, training=training, begun=begun)
+
+    def cost(self, level: int) -> float:
+        """Measured seconds of a training step of a level."""
+        if level not in self.costs:
+            siren = new_level(self.config, level, residual=False).to(self.device)
+            points = torch.rand(self.config.batch, 3, generator=torch.Generator().manual_seed(0))
+            points = ((2 * points - 1) * DOMAIN).to(self.device)
+
+            def step() -> Tensor:
+                jet = siren.jet(points)
+                return jet.value.square().mean() + jet.gradient.square().mean()
+
+            self.costs[level] = step_seconds(step, self.budget.left() or 0.0)
+        return self.costs[level]
 
     def indexed(self, level: int) -> CloudDistance:
         """`distances` of a level, made once."""
         self.index = self.index or self.distances(level)
         return self.index
 
-    def train_level(self, level: int, share: Share, flag: StopFlag) -> None:
-        """Make the samples of one level, train it, freeze it."""
-        config, started = dataclasses.replace(self.config, samples=share.samples), time.monotonic()
-        generator = torch.Generator().manual_seed(config.seed * 1009 + level)
-        work = self.timing.sampling(level, share.samples)
-        band = None if self.frozen is None else self.next_band()
-        delta = None if band is None else band.delta
-        index = self.indexed(level)
-        gain = SMALL_GAIN if index.filled and config.robust_normals else RESIDUAL_GAIN
-        noisy = self.cloud.estimated and not index.filled
-        omega = calm_omega(config, level, self.cloud.noise if noisy else 0.0)
-        siren = new_level(config, level, residual=level > 0, gain=gain, omega=omega).to(self.device)
-        work.indexed()
-        index.watch = work.points
-        if self.frozen is None or delta is None:
-            sources = first_sources(index, config, generator=generator, device=self.device)
-        else:
-            sources = banded_sources(
-                index, self.frozen, delta, config, generator=generator, name=self.source, watch=work.looked
-            )
-        judge = None if delta is None else self.judge(delta, sources[0])
-        work.end()
+    def train_level(self, level: int, share: float, flag: StopFlag) -> None:
+        """Make the samples of one level, train it, freeze it, in ``share`` seconds."""
+        started = time.monotonic()
+        with reported(self.report, f"level {level}: samples"):
+            if share < math.inf and level == 0 and not self.trainer_state:
+                self.filling = self.affordable_filling(share)
+            generator = torch.Generator().manual_seed(self.config.seed * 1009 + level)
+            band = None if self.frozen is None else self.next_band()
+            delta = None if band is None else band.delta
+            index = self.indexed(level)
+            if not self.trainer_state:
+                self.samples = self.affordable_samples(level, share, started, index, delta)
+            config = dataclasses.replace(self.config, samples=self.samples)
+            gain = SMALL_GAIN if index.filled and config.robust_normals else RESIDUAL_GAIN
+            noisy = self.cloud.estimated and not index.filled
+            omega = calm_omega(config, level, self.cloud.noise if noisy else 0.0)
+            siren = new_level(config, level, residual=level > 0, gain=gain, omega=omega).to(self.device)
+            sources = self.sources(index, delta, config, generator)
+            judge = None if delta is None else self.judge(delta, sources[0])
         sampling_seconds = time.monotonic() - started
-        seconds = None if config.time_budget is None else share.seconds - sampling_seconds
+        seconds = None if share == math.inf else self.training_seconds(level, share - sampling_seconds)
         rate = config.learning_rates[level]
         objective = LevelObjective(siren, sources, learning_rate=rate, generator=generator, judge=judge)
         trainer = Trainer(
             objective,
             stage=f"level {level}",
             steps=config.steps[level],
-            seconds=None if seconds is None else max(seconds, self.timing.least_seconds(level)),
+            seconds=seconds,
         )
         if self.trainer_state:
             trainer.restore(self.trainer_state)
             self.trainer_state = {}
-        if not trainer.run(
-            flag, report=self.timing.schedule, save=lambda: self.save(self.grown(siren, delta), trainer)
-        ):
+        if not trainer.run(flag, report=self.report, save=lambda: self.save(self.grown(siren, delta), trainer)):
             raise Interrupted(self.folder.out)
         verdict = objective.take_best()
         self.frozen = self.grown(siren, delta).requires_grad_(False)
@@ -378,6 +388,57 @@ class _Fitting:
         if self.level_done is not None:
             self.level_done(self.frozen, self.cloud.similarity)
 
+    def sources(
+        self, index: CloudDistance, delta: float | None, config: FitConfig, generator: torch.Generator
+    ) -> list[Source]:
+        """The samples of the next level; those of a residual level lie in the band of half-width ``delta``."""
+        if self.frozen is None or delta is None:
+            return first_sources(index, config, generator=generator, device=self.device)
+        return banded_sources(index, self.frozen, delta, config, generator=generator, name=self.source)
+
+    def affordable_filling(self, share: float) -> int:
+        """Points of the index that level 0 has time for, if it gets ``share`` seconds in all."""
+        full = self.config.samples
+        if not self.config.between or full <= len(self.points):
+            return full
+        index, generator = CloudDistance(self.points, self.normals), torch.Generator().manual_seed(0)
+        return self.affordable(
+            lambda count: self.sources(index, None, dataclasses.replace(self.config, samples=count), generator),
+            SAMPLING_SHARE / 2 * share,
+        )
+
+    def affordable_samples(
+        self, level: int, share: float, started: float, index: CloudDistance, delta: float | None
+    ) -> int:
+        """Samples of each kind that a level has time for, which began at ``started``."""
+        if share == math.inf:
+            return self.config.samples
+        spare = share - self.config.steps[level] * self.cost(level)
+        generator, full = torch.Generator().manual_seed(0), self.config.samples
+        count = self.affordable(
+            lambda count: self.sources(index, delta, dataclasses.replace(self.config, samples=count), generator),
+            max(SAMPLING_SHARE * share, spare) - (time.monotonic() - started),
+        )
+        if count < full:
+            note = f"level {level} learns from {count:,} samples of each kind instead of {full:,}"
+            self.budget.notes.append(note)
+        return count
+
+    def affordable(self, make: Callable[[int], object], seconds: float) -> int:
+        """`affordable` samples, the same number for all processes of a team."""
+        count = affordable(make, self.config.samples, seconds)
+        return int(agreed(False, count, self.device)[1])
+
+    def training_seconds(self, level: int, left: float) -> float:
+        """Seconds for the steps of a level of which ``left`` remain: at least so many that there is a surface."""
+        steps, took = self.config.steps[level], 0.0
+        if self.trainer_state:
+            took = float(self.trainer_state["progress"][1])
+        least = least_share(steps) * steps * self.cost(level)
+        if left < least:
+            self.budget.notes.append(f"the time was up before level {level}, which is trained briefly all the same")
+        return took + agreed(False, max(left, least), self.device)[1]
+
     def distances(self, level: int) -> CloudDistance:
         """The points that are trained on, and where they are sparse, what they say of the places between them.
 
@@ -392,9 +453,8 @@ class _Fitting:
         if not config.between:
             return CloudDistance(points, normals, noise=noise, guessed=guessed)
         omega = max(config.omegas[: config.num_levels])
-        count = self.timing.first_samples()
         about = {"noise": noise, "guessed": guessed, "seed": config.seed}
-        return dense_distance(points, normals, omega=omega, count=count, **about)
+        return dense_distance(points, normals, omega=omega, count=self.filling, **about)
 
     def next_band(self) -> Band:
         """The band around the last frozen level (Eq. 5), inside the one before: under noise it could be wider."""
@@ -402,7 +462,7 @@ class _Fitting:
         assert self.frozen is not None
         band = band_of(self.errors, epsilon=config.epsilon, quantile=config.quantile)
         if level == 1 and config.quantile is None:
-            asked = {"epsilon": config.epsilon, "count": config.samples, "seed": config.seed, "device": self.device}
+            asked = {"epsilon": config.epsilon, "count": self.filling, "seed": config.seed, "device": self.device}
             band = with_wrong_sides(band, self.errors, self.indexed(level), self.frozen, **asked)
         return band.within(self.stages[-1]["delta"], self.errors)
 
@@ -461,7 +521,7 @@ class _Fitting:
         tensors = checkpoint_of(self.frozen, trainer)
         if self.signs is not None:
             tensors["signs.turned"] = torch.from_numpy(self.signs.turned)
-        kept = {"samples": self.samples, "notes": self.timing.notes}
+        kept = {"samples": self.samples, "filling": self.filling, "notes": self.budget.notes}
         signs = None if self.signs is None else self.signs.record()
         progress = {"fingerprint": self.fingerprint, "stages": self.stages, "signs": signs, **kept}
         self.folder.save(field, self.cloud.similarity, self.record(finished=False), tensors, progress)
@@ -470,8 +530,9 @@ class _Fitting:
         """Take up an interrupted run; see `RunFolder.restore`."""
         mismatch = f"{self.source}: not the cloud that {self.folder.path} was fitted to; resume with that cloud"
         tensors, progress = self.folder.restore(self.fingerprint, mismatch)
-        self.stages, self.samples = progress["stages"], progress.get("samples")
-        self.timing.notes = progress.get("notes", [])
+        self.stages, full = progress["stages"], self.config.samples
+        self.samples, self.filling = progress.get("samples") or full, progress.get("filling") or full
+        self.budget.notes = progress.get("notes", [])
         signs = progress.get("signs")
         if signs is not None:
             self.take_signs(Signs(tensors["signs.turned"].numpy(), signs["slope"], signs["witness"]))
@@ -484,7 +545,7 @@ class _Fitting:
             self.errors = self.values_at_cloud()
         self.trainer_state = without_prefix("trainer.", tensors)
         took = sum(stage["sampling_seconds"] + stage["training_seconds"] for stage in self.stages)
-        self.timing.before = took + (float(self.trainer_state["progress"][1]) if self.trainer_state else 0.0)
+        self.budget.before = took + (float(self.trainer_state["progress"][1]) if self.trainer_state else 0.0)
 
     def record(self, *, finished: bool) -> dict[str, Any]:
         """What ``run.json`` holds."""
@@ -501,7 +562,7 @@ class _Fitting:
             "deltas": [stage["delta"] for stage in self.stages if stage["delta"] is not None],
             "preparation_seconds": round(self.preparation_seconds, 3),
             "training_seconds": round(sum(s["sampling_seconds"] + s["training_seconds"] for s in self.stages), 3),
-            **self.timing.record(),
+            **self.budget.record(),
             "peak_memory": peak_memory(),
             "environment": environment(self.device),
         }

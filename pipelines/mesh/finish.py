@@ -13,15 +13,13 @@ from ...datasets import read_cloud
 from ...neural_fields import InputError, Similarity
 from ...neural_fields.meshing import Mesh
 from ..fit.depth import DepthInput, trim_suggestion
-from ..run.costs import Net, Speed
 from ..run.folder import CLOUD_FILE, TEXTURE_FILE, kept_cloud, read_record, texture_state_file
-from ..run.schedule import Progress, Stage
-from ..run.settings import FitConfig, TextureConfig
+from ..run.report import Progress, reported
+from ..run.settings import TextureConfig
 from ..texture.samples import has_colors
-from ..texture.train import FittedTexture, texture_run, texture_stages
+from ..texture.train import FittedTexture, texture_run
 from .extract import MeshOptions, mesh_run
 from .files import check_mesh_path
-from .plan import mesh_stage, meshing
 
 __all__ = ["FitMesh", "plan_mesh"]
 
@@ -38,7 +36,6 @@ class FitMesh:
         source: what holds the colours, a cloud or a mesh in the coordinates of the fit.
         colored: whether there are colours, and they are wanted.
         trim: whether what the fit closes behind a depth map is cut off.
-        points: of the source; a guess where that is made only then.
     """
 
     out: Path
@@ -46,7 +43,6 @@ class FitMesh:
     source: Path
     colored: bool
     trim: bool
-    points: int = 100_000
 
     def texture(self, *, refit: bool, progress: Callable[[Progress], None] | None = None) -> FittedTexture | None:
         """Train the texture with the default settings, on the device and with the seed of the fit.
@@ -70,18 +66,6 @@ class FitMesh:
         config = dataclasses.replace(TextureConfig(), device=fitted["device"], seed=fitted["seed"])
         return texture_run(self.run, self.source, config, resume=resume, progress=progress)
 
-    def stages(self, config: FitConfig, speed: Speed) -> list[Stage]:
-        """What `texture` and `extract` will do, and about how long that takes.
-
-        Args:
-            config: of the fit.
-            speed: of the machine.
-        """
-        nets = [Net.siren(width, depth) for width, depth in zip(config.widths, config.depths, strict=True)]
-        nets = nets[: config.num_levels]
-        colors = texture_stages(TextureConfig(), self.points, nets, speed) if self.colored else []
-        return [*colors, mesh_stage(nets, speed)]
-
     def extract(
         self, say: Callable[[str], None] | None = None, *, progress: Callable[[Progress], None] | None = None
     ) -> Mesh:
@@ -96,7 +80,7 @@ class FitMesh:
         """
         trim = trim_suggestion(self.run) if self.trim else None
         options = MeshOptions(colors=self.colored, trim_distance=trim, cloud=self.source if self.trim else None)
-        with meshing(progress):
+        with reported(progress, "mesh"):
             return mesh_run(self.run, self.out, options, say=say)
 
 
@@ -128,4 +112,4 @@ def plan_mesh(out: Path, run: Path, source: Path | DepthInput, *, colors: bool, 
         colored = colors and has_colors(cloud)
     except InputError as error:
         raise InputError(f"{error} (or leave the colours out: --no-colors)") from error
-    return FitMesh(out, run, cloud, colored, trim=depth, points=len(finite))
+    return FitMesh(out, run, cloud, colored, trim=depth)

@@ -23,20 +23,19 @@ from ...datasets.views.images import PosedImage, PosedImages, read_posed_images
 from ...neural_fields import InputError, Jet, NoSurfaceError, TextureField, extract_mesh
 from ...neural_fields.checkpoint import radiance_bytes, texture_bytes
 from ..render.picture import Image, picture_bytes, write_picture
-from ..run.costs import Speed
+from ..run.budget import LEAST_SECONDS, Budget
 from ..run.folder import RADIANCE_FILE, SUPPORT_FILE, TEXTURE_FILE, RunFolder, digest_of
-from ..run.machine import choose_device, environment, speed
-from ..run.schedule import Progress, Report, Schedule, Stage
+from ..run.machine import choose_device, environment
+from ..run.report import Progress, Report, reported, silent
 from ..run.settings import ReconstructConfig, TextureConfig
 from ..run.team import agreed, apart, is_leader
 from ..run.trainer import Interrupted, load_compiler, parameter_count, stop_on_signals
 from ..surface.surface import from_mesh, sample_points
 from ..surface.trim import in_region, thinned
-from ..texture.train import FittedTexture, fit_texture
+from ..texture.train import FittedTexture, fit_texture, texture_step_seconds
 from .hull import begin
 from .measured import MeasuredDepths
 from .model import RayPool, SceneModel, build_scene
-from .plan import SEEING, START, WITNESSES, ReconstructPlan, level_stage
 from .replayed import ReplayedTrainer, scene_trainer
 from .seen import seen_points
 from .silhouettes import Agreement
@@ -50,12 +49,10 @@ __all__ = [
     "reconstruct",
     "scene_texture",
     "surface_colors",
-    "usual_stages",
 ]
 
 HELD_OUT_FILE = "held_out.png"
 PREVIEW_FILE = "preview.png"
-READING = "reading the pictures"
 MESH_FILE = "mesh.ply"  # that the command makes of a finished run
 PREVIEWS = 5  # pictures of the first view on the way
 PREVIEW_PIXELS = 4096  # of each: through fog, which a scene is at first, every pixel costs as much as one in training
@@ -66,10 +63,10 @@ BATCH = 1 << 13
 # Of the cameras that decide the colour of a point, at least; the cosine within which they face it; and which of their
 # colours it is, from dark to light.
 LEAST_WITNESSES, FACING, DARKER = 3, 0.5, 0.25
-# Of pictures that are not read yet.
-USUAL_PIXELS, USUAL_HELD_OUT, USUAL_READING = 60_000, 6, 2.0
-LEAST_SECONDS = 0.5  # of training, where a time budget leaves none
-AFTER_SHARE = 0.15  # of a time budget, at most, for what comes after the training
+WITNESSES = 9  # cameras whose colours of a point of the texture count, at most
+# Of a time budget, at most, for what comes after the training. What that takes follows from the time of a picture of so
+# many pixels, and of a few steps of the texture, whose surface and samples take about as long as its steps.
+AFTER_SHARE, TIMED_PIXELS, TEXTURE_FACTOR = 0.15, 1024, 2
 
 
 @dataclass(frozen=True)
@@ -121,28 +118,18 @@ def reconstruct(
     """
     started, folder = time.monotonic(), RunFolder(out, resume=resume)
     config = folder.config(ReconstructConfig, config)
-    device, schedule = choose_device(config.device), Schedule.of(progress)
-    machine = speed(device)
-    schedule.plan(usual_stages(config, machine), budget=config.time_budget)
-    schedule(Progress(READING, 0, 0, 0.0, {}))
-    maps = None if config.depth_maps is None else Path(config.depth_maps)
-    depths = DepthSource(maps, config.depth_kind, config.depth_scale)
-    images = data if isinstance(data, PosedImages) else read_posed_images(data, width=config.width, depths=depths)
-    schedule(Progress(READING, 0, 0, 1.0, {}))
+    device = choose_device(config.device)
+    budget = Budget(config.time_budget, device, started=started)
+    with reported(progress, "reading the pictures"):
+        maps = None if config.depth_maps is None else Path(config.depth_maps)
+        depths = DepthSource(maps, config.depth_kind, config.depth_scale)
+        images = data if isinstance(data, PosedImages) else read_posed_images(data, width=config.width, depths=depths)
     load_compiler()
-    training = _Reconstruction(
-        images, config, device, folder, schedule, machine=machine, started=started, resume=resume
-    )
+    training = _Reconstruction(images, config, device, folder, progress or silent, budget, resume=resume)
     with folder.writing(HELD_OUT_FILE, PREVIEW_FILE, MESH_FILE):
         if resume:
             training.restore()
         return training.run()
-
-
-def usual_stages(config: ReconstructConfig, machine: Speed) -> list[Stage]:
-    """What `reconstruct` will do, of photographs of which nothing is known yet."""
-    plan = ReconstructPlan(config, machine, USUAL_PIXELS, USUAL_HELD_OUT, texture_settings(config))
-    return [Stage(READING, "reading", USUAL_READING), *plan.before(), *plan.levels(), *plan.after()]
 
 
 class _Reconstruction:
@@ -154,15 +141,13 @@ class _Reconstruction:
         config: ReconstructConfig,
         device: torch.device,
         folder: RunFolder,
-        schedule: Schedule,
+        report: Report,
+        budget: Budget,
         *,
-        machine: Speed,
-        started: float,
         resume: bool,
     ) -> None:
         self.images, self.config, self.device = images, config, device
-        self.folder, self.schedule, self.started = folder, schedule, started
-        self.notes: list[str] = []  # what the time budget changed
+        self.folder, self.report, self.budget = folder, report, budget
         self.train_views, self.test_views = held_out(images.views, config.test_every)
         has_masks = all(view.mask is not None for view in self.train_views)
         agreement = Agreement.of(self.train_views, images.similarity) if has_masks else None
@@ -170,21 +155,18 @@ class _Reconstruction:
         if agreement:
             agreement = agreement.without(self.odd)
             self.train_views = [*agreement.views]
-        pixels = round(np.mean([view.color.shape[0] * view.color.shape[1] for view in images.views]))
-        self.plan = ReconstructPlan(config, machine, pixels, len(self.test_views), texture_settings(config))
-        schedule.plan([*self.plan.before(), *self.plan.levels(), *self.plan.after()], budget=self.left())
-        schedule(Progress(START, 0, 0, 0.0, {}))
         self.model = build_scene(config, has_masks=has_masks, views=len(self.train_views)).to(device)
         whole, flat = self.model.outside is not None, config.smooth_weight > 0
         self.holes = agreement.holes() if agreement else {}
         pool = RayPool(self.train_views, images.similarity, device, whole=whole, flat=flat, left_out=self.holes)
         measured = MeasuredDepths(self.train_views, images, device, seed=config.seed) if config.depth_weight else None
         self.measured = measured or None
-        self.start = (
-            "sphere" if resume else begin(self.model, self.train_views, images, config, self.measured, agreement)
-        )
-        schedule(Progress(START, 0, 0, 1.0, {}))
-        self.trainer = scene_trainer(self.model, pool, config, measured=self.measured, seconds=self.training_seconds())
+        with reported(report, "a surface to begin with"):
+            self.start = (
+                "sphere" if resume else begin(self.model, self.train_views, images, config, self.measured, agreement)
+            )
+        self.trainer = scene_trainer(self.model, pool, config, measured=self.measured)
+        self.trainer.seconds = self.training_seconds()
         # Of the training pixels, their masks, the cameras and what was measured.
         seen = [pool.colors, pool.eyes, pool.axes, pool.lens, *([] if pool.masks is None else [pool.masks])]
         if self.measured is not None:
@@ -192,19 +174,28 @@ class _Reconstruction:
         self.fingerprint = digest_of(tensor.cpu().numpy() for tensor in seen)
         self.shown = 0
 
-    def left(self) -> float | None:
-        """Seconds left of the time budget."""
-        budget = self.config.time_budget
-        return None if budget is None else max(budget - (time.monotonic() - self.started), 0.0)
-
     def training_seconds(self) -> float | None:
         """How long the training may take within the time budget: all but what comes after it, which is held short."""
-        left = self.left()
+        left = self.budget.left()
         if left is None:
             return None
-        after = sum(self.schedule.predicted(stage) for stage in self.plan.after())
+        after = self.after_seconds(left) if is_leader() else 0.0
+        left = max((self.budget.left() or 0.0) - min(after, AFTER_SHARE * left), LEAST_SECONDS)
         # A team agrees, or one would go on while another has ended.
-        return agreed(False, max(left - min(after, AFTER_SHARE * left), LEAST_SECONDS), self.device)[1]
+        return agreed(False, left, self.device)[1]
+
+    def after_seconds(self, left: float) -> float:
+        """Seconds for the held-out views and the texture, from the time of a small picture and a few steps."""
+        seconds, views = 0.0, self.test_views
+        if views:
+            started, small = time.monotonic(), reduced(views[0], TIMED_PIXELS)
+            self._image(small, level=-1)
+            pixels = sum(view.color.shape[0] * view.color.shape[1] for view in views)
+            seconds += (time.monotonic() - started) * pixels / (small.color.shape[0] * small.color.shape[1])
+        if self.config.texture_steps:
+            step = texture_step_seconds(texture_settings(self.config), self.device, left)
+            seconds += TEXTURE_FACTOR * self.config.texture_steps * step
+        return seconds
 
     @property
     def level(self) -> int:
@@ -228,12 +219,11 @@ class _Reconstruction:
         """Measure, colour, write."""
         pairs = self._render_held_out()
         record = self._record(finished=True) | {"held_out": self._figures(pairs)}
-        self.schedule(Progress(SEEING, 0, 0, 0.0, {}))
-        views = [(view.camera.moved(self.images.similarity), view.mask) for view in self.train_views]
-        points, within = seen_points(self.model.geometry, views)
-        if len(points):
-            self.folder.keep_tensors(SUPPORT_FILE, thinned(points.numpy(), seen_within=within))
-        self.schedule(Progress(SEEING, 0, 0, 1.0, {}))
+        with reported(self.report, "what photographs see"):
+            views = [(view.camera.moved(self.images.similarity), view.mask) for view in self.train_views]
+            points, within = seen_points(self.model.geometry, views)
+            if len(points):
+                self.folder.keep_tensors(SUPPORT_FILE, thinned(points.numpy(), seen_within=within))
         self.model.cpu()
         texture, record["texture"] = self._texture()
         out = self.folder.out
@@ -249,9 +239,7 @@ class _Reconstruction:
         return Reconstruction(self.model, texture, self.images, out, record)
 
     def _report(self, progress: Progress) -> None:
-        begin, end = ([*self.plan.starts(), 1.0][self.level + ahead] for ahead in (0, 1))
-        within = (progress.fraction - begin) / (end - begin)
-        self.schedule(dataclasses.replace(progress, stage=level_stage(self.level), fraction=min(max(within, 0.0), 1.0)))
+        self.report(progress)
         done = progress.fraction
         if self.folder.out is not None and done * (PREVIEWS + 1) >= self.shown + 1 and done < 1:
             self.shown = int(done * (PREVIEWS + 1))
@@ -263,29 +251,29 @@ class _Reconstruction:
     def _sheet(self, pairs: Sequence[tuple[PosedImage, ViewImage]]) -> Image:
         return comparison_sheet(pairs, self.model.background)
 
-    def _image(self, view: PosedImage) -> ViewImage:
-        objective = self.trainer.objective
+    def _image(self, view: PosedImage, *, level: int | None = None) -> ViewImage:
+        """A view as the levels up to ``level`` show it; None: those that are switched on by now."""
+        objective, level = self.trainer.objective, self.level if level is None else level
         image = render_image(
-            self.model, view, self.images.similarity, objective.sampling, level=self.level, guide=objective.grid
+            self.model, view, self.images.similarity, objective.sampling, level=level, guide=objective.grid
         )
         # A view that is not trained on has an exposure that nobody knows.
         return image if self.model.exposures is None else exposed_as(image, view, self.model.background)
 
     def _render_held_out(self) -> list[tuple[PosedImage, ViewImage]]:
-        pairs, count, limit = [], len(self.test_views), self.left()
+        pairs, count, limit = [], len(self.test_views), self.budget.left()
         begun = time.monotonic()
         if self.trainer.objective.grid is not None:
             self.trainer.objective.grid.refresh(self.model.geometry)
-        self.schedule.plan(self.plan.after(), budget=limit)
         if count:
-            self.schedule(Progress("held-out views", 0, count, 0.0, {}))
+            self.report(Progress("held-out views", 0, count, 0.0, {}))
         for index, view in enumerate(spread(self.test_views)):
             # Half of what is left of a time budget is for the texture.
             if pairs and limit is not None and time.monotonic() - begun > limit / 2:
-                self.notes.append(f"{index} of {count} held-out views are measured")
+                self.budget.notes.append(f"{index} of {count} held-out views are measured")
                 break
             pairs.append((view, self._image(view)))
-            self.schedule(Progress("held-out views", index + 1, count, (index + 1) / count, {}))
+            self.report(Progress("held-out views", index + 1, count, (index + 1) / count, {}))
         return pairs
 
     def _torn(self) -> dict[str, int]:
@@ -307,7 +295,9 @@ class _Reconstruction:
         if self.config.texture_steps == 0:
             return None, None
         try:
-            fitted = scene_texture(self.model, self.images, self.config, progress=self.schedule, seconds=self.left())
+            fitted = scene_texture(
+                self.model, self.images, self.config, progress=self.report, seconds=self.budget.left()
+            )
         except NoSurfaceError as error:
             raise InputError(
                 f"{self.images.source}: the training found no surface ({error}); see `mplicits check-cameras`, "
@@ -346,7 +336,7 @@ class _Reconstruction:
 
     def _record(self, *, finished: bool) -> dict[str, Any]:
         """What ``run.json`` holds."""
-        model, trainer, limit = self.model, self.trainer, self.config.time_budget
+        model, trainer = self.model, self.trainer
         parts = {"geometry": model.geometry, "color": model.color}
         return {
             "finished": finished,
@@ -367,7 +357,7 @@ class _Reconstruction:
             "steps": trainer.step,
             "training_seconds": round(trainer.elapsed, 3),
             **({"replayed": trainer.facts()} if isinstance(trainer, ReplayedTrainer) else {}),
-            **({} if limit is None else {"budget": {"seconds": limit, "notes": self.notes}}),
+            **self.budget.record(),
             "losses": trainer.losses,
             "environment": environment(self.device),
         }
@@ -426,18 +416,17 @@ def scene_texture(
     Raises:
         NoSurfaceError: the geometry has no surface.
     """
-    started, report = time.monotonic(), progress or (lambda _: None)
-    report(Progress("texture: surface", 0, 0, 0.0, {}))
-    mesh = in_region(extract_mesh(model.geometry, resolution=TEXTURE_RESOLUTION))
-    if mesh is None:
-        raise NoSurfaceError("all of it is outside the region of interest")
-    points, _ = sample_points(from_mesh(mesh), TEXTURE_SAMPLES, np.random.default_rng(config.seed))
-    random = np.random.default_rng(config.seed)
-    eyes = np.stack([view.camera.eye.numpy() for view in images.views])[random.permutation(len(images.views))]
-    seen_from = torch.from_numpy(images.similarity.to_unit(eyes)).float()
-    colors = surface_colors(model, torch.from_numpy(points).float(), seen_from).numpy()
-    cloud = PointCloud(images.similarity.to_input(points), colors=colors, source=str(images.source))
-    report(Progress("texture: surface", 0, 0, 1.0, {}))
+    started = time.monotonic()
+    with reported(progress, "texture: surface"):
+        mesh = in_region(extract_mesh(model.geometry, resolution=TEXTURE_RESOLUTION))
+        if mesh is None:
+            raise NoSurfaceError("all of it is outside the region of interest")
+        points, _ = sample_points(from_mesh(mesh), TEXTURE_SAMPLES, np.random.default_rng(config.seed))
+        random = np.random.default_rng(config.seed)
+        eyes = np.stack([view.camera.eye.numpy() for view in images.views])[random.permutation(len(images.views))]
+        seen_from = torch.from_numpy(images.similarity.to_unit(eyes)).float()
+        colors = surface_colors(model, torch.from_numpy(points).float(), seen_from).numpy()
+        cloud = PointCloud(images.similarity.to_input(points), colors=colors, source=str(images.source))
     settings = texture_settings(config)
     if seconds is not None:
         settings = dataclasses.replace(settings, time_budget=max(seconds, LEAST_SECONDS))

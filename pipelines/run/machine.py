@@ -16,15 +16,12 @@ from typing import Any
 import torch
 
 from ...neural_fields import InputError
-from .costs import Speed
 
-__all__ = ["best_seconds", "environment", "format_table", "peak_memory", "sgemm_rate", "speed"]
+__all__ = ["best_seconds", "environment", "format_table", "peak_memory", "sgemm_rate"]
 
 # Linux keeps the high-water mark of a process here. Not getrusage: its maximum survives exec, so that a child would
 # report what its parent held when it was born.
 STATUS = Path("/proc/self/status")
-# Seconds of the smallest training step: on a CPU the calls from Python, on a GPU those and the launches of kernels.
-LEAST_STEP = {"cpu": 1.5e-3, "cuda": 3e-3}
 
 _version = functools.cache(importlib.metadata.version)  # it reads files, and every record of a run asks
 
@@ -54,21 +51,6 @@ def sgemm_rate(width: int = 512, *, rows: int = 2048, device: torch.device | str
     b = torch.randn(width, width, generator=random).to(device)
     out = torch.empty(rows, width, device=device)
     return 2 * rows * width * width / best_seconds(lambda: torch.mm(a, b, out=out), repeats=repeats)
-
-
-def speed(device: torch.device | str = "cpu") -> Speed:
-    """How fast this machine is, measured in a tenth of a second, once: what predictions of times begin with."""
-    return _speed(torch.device(device), torch.get_num_threads())
-
-
-@functools.cache
-def _speed(device: torch.device, threads: int) -> Speed:
-    """See `speed`; ``threads`` are those of the calling process, and say of which measurement this is."""
-    del threads
-    cpu = sgemm_rate(repeats=3)
-    if device.type == "cpu":
-        return Speed(cpu, cpu, LEAST_STEP["cpu"])
-    return Speed(cpu, sgemm_rate(device=device, repeats=3), LEAST_STEP.get(device.type, LEAST_STEP["cuda"]))
 
 
 def format_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

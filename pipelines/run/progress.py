@@ -1,4 +1,4 @@
-"""What is seen of a work under way: one bar for the whole with the time left, and its stages below; or lines."""
+"""Progress on stderr: a bar for each stage, with the elapsed time and the time left at the pace so far; or lines."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rich.progress import BarColumn, ProgressColumn, Task, TaskID, TaskProgressC
 from rich.progress import Progress as Bars
 from rich.text import Text
 
-from .schedule import Progress, Schedule
+from .report import Progress, Report
 
 __all__ = ["Lines", "counter_bar", "progress_bars", "time_words"]
 
@@ -21,20 +21,19 @@ SILENCE = 30.0
 
 
 @contextmanager
-def progress_bars(*, whole: bool = True, clock: Callable[[], float] = time.monotonic) -> Iterator[Schedule]:
-    """Show bars on stderr; where that is no terminal, a line for each finished stage, and now and then one between.
+def progress_bars(*, clock: Callable[[], float] = time.monotonic) -> Iterator[Report]:
+    """Show a bar for each stage on stderr; where that is no terminal, print lines, see `Lines`.
 
     Args:
-        whole: whether there is a bar for the whole; without a plan it would be that of the stage under way.
         clock: seconds, from any origin.
     """
     console = Console(stderr=True)
     if not console.is_terminal:
-        yield Schedule(Lines(whole=whole, clock=clock), clock=clock)
+        yield Lines(clock=clock)
         return
     with _StagesAndLosses(*_columns(), console=console, get_time=clock) as bars:
-        shown = _Bars(bars, whole=whole)
-        yield Schedule(shown, clock=clock)
+        shown = _Bars(bars)
+        yield shown
         shown.end()
 
 
@@ -58,34 +57,46 @@ class Lines:
     """A line on stderr for each finished stage, and one in between when there was none for half a minute.
 
     Args:
-        whole: whether the time left of the whole is said.
         counting: whether stages count something, and are not worth a line when they are done.
         clock: seconds, from any origin.
     """
 
-    def __init__(
-        self, *, whole: bool = True, counting: bool = False, clock: Callable[[], float] = time.monotonic
-    ) -> None:
-        self.whole, self.counting, self.clock = whole, counting, clock
+    def __init__(self, *, counting: bool = False, clock: Callable[[], float] = time.monotonic) -> None:
+        self.counting, self.clock = counting, clock
         self.told, self.finished = clock(), ""
+        self.begun: dict[str, tuple[float, float]] = {}  # when each stage began, and its fraction then
 
     def __call__(self, progress: Progress, /) -> None:
         """Print what is worth a line."""
         ended, now = progress.fraction >= 1, self.clock()
+        begun, before = self.begun.setdefault(progress.stage, (now, progress.fraction))
         if ended and (self.counting or progress.stage == self.finished):
             return
         if not ended and now - self.told < SILENCE:
             return
-        steps = f"{progress.step:,} steps" if progress.losses else "done"
-        facts = [steps, _losses(progress)] if ended else [f"{progress.fraction:.0%}"]
-        if self.whole and progress.left:
-            facts.append(f"about {time_words(progress.left)} left" + " of the whole" * (not self.counting))
+        if ended:
+            steps = f"{progress.step:,} steps" if progress.losses else "done"
+            facts = [f"{steps} in {time_words(now - begun)}", _losses(progress)]
+        else:
+            left = seconds_left(now - begun, before, progress.fraction)
+            facts = [f"{progress.fraction:.0%}"] + ([] if left is None else [f"about {time_words(left)} left"])
         print(f"{progress.stage}: {'; '.join(fact for fact in facts if fact)}", file=sys.stderr, flush=True)
         self.told, self.finished = now, progress.stage if ended else ""
 
 
+def seconds_left(elapsed: float, before: float, fraction: float) -> float | None:
+    """Seconds that a stage still takes, at the pace so far; None before there is any.
+
+    Args:
+        elapsed: seconds since it began.
+        before: fraction that was done by then; more than 0 for a resumed one.
+        fraction: that is done now.
+    """
+    return elapsed * (1 - fraction) / (fraction - before) if fraction > before else None
+
+
 class _TimeLeft(ProgressColumn):
-    """The time left by a task's own ``left`` seconds, told ``at`` some moment, and counted down from there."""
+    """Elapsed time of a task, and its time left as estimated at its last report, counted down from there."""
 
     def render(self, task: Task) -> Text:
         left, at = task.fields.get("left"), task.fields.get("at")
@@ -112,28 +123,21 @@ class _StagesAndLosses(Bars):
 
 
 class _Bars:
-    def __init__(self, bars: _StagesAndLosses, *, whole: bool) -> None:
+    def __init__(self, bars: _StagesAndLosses) -> None:
         self.bars = bars
-        self.whole = bars.add_task("whole", total=1.0) if whole else None
         self.stages: dict[str, TaskID] = {}
 
     def __call__(self, progress: Progress, /) -> None:
         if progress.stage not in self.stages:
-            for task in self.stages.values():
-                self.bars.update(task, completed=1.0)
-            self.stages[progress.stage] = self.bars.add_task(f"  {progress.stage}", total=1.0)
+            self.end()
+            self.stages[progress.stage] = self.bars.add_task(progress.stage, total=1.0, before=progress.fraction)
         self.bars.losses = _losses(progress)
         _advance(self.bars, self.stages[progress.stage], progress.fraction)
-        if self.whole is None:
-            return
-        # The whole is not over before who shows it says so, by leaving: what follows may not have been planned yet.
-        done = min(progress.whole or 0.0, 0.999)
-        self.bars.update(self.whole, completed=done, left=progress.left, at=self.bars.get_time())
 
     def end(self) -> None:
-        """All is done."""
-        for task in (*self.stages.values(), *([] if self.whole is None else [self.whole])):
-            self.bars.update(task, completed=1.0)
+        """All stages so far are done."""
+        for task in self.stages.values():
+            self.bars.update(task, total=1.0, completed=1.0)
 
 
 def _losses(progress: Progress) -> str:
@@ -145,8 +149,8 @@ def counter_bar(title: str, *, clock: Callable[[], float] = time.monotonic) -> I
     """A bar with the time left on stderr, to be told ``(done, total)``; lines now and then where it is no terminal."""
     console = Console(stderr=True)
     if not console.is_terminal:
-        schedule = Schedule(Lines(counting=True, clock=clock), clock=clock)
-        yield lambda done, total: schedule(Progress(title, done, total, done / max(total, 1), {}))
+        lines = Lines(counting=True, clock=clock)
+        yield lambda done, total: lines(Progress(title, done, total, done / max(total, 1), {}))
         return
     with Bars(*_columns(), console=console, transient=True, get_time=clock) as bars:
         task = bars.add_task(title, total=1.0)
@@ -154,7 +158,8 @@ def counter_bar(title: str, *, clock: Callable[[], float] = time.monotonic) -> I
 
 
 def _advance(bars: Bars, task: TaskID, fraction: float) -> None:
-    """Show how much of a stage is done, and how long the rest will take at the pace of what is."""
-    elapsed = bars.tasks[bars.task_ids.index(task)].elapsed or 0.0
-    left = elapsed * (1 - fraction) / fraction if fraction else None
+    """Show how much of a stage is done, and how long the rest takes at that pace; a pulse before anything is."""
+    shown = bars.tasks[bars.task_ids.index(task)]
+    left = seconds_left(shown.elapsed or 0.0, shown.fields.get("before", 0.0), fraction)
+    shown.total = 1.0 if fraction else None  # `update` cannot take a total away
     bars.update(task, completed=fraction, left=left, at=bars.get_time())

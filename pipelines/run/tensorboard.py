@@ -1,4 +1,4 @@
-"""Losses and time left of a training for TensorBoard: ``--tensorboard DIR``, which needs ``mplicits[tensorboard]``."""
+"""Losses of a training for TensorBoard: ``--tensorboard DIR``, which needs ``mplicits[tensorboard]``."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ...neural_fields import InputError
-from .schedule import Progress, Report
+from .report import Progress, Report
 
 __all__ = ["tensorboard_log"]
 
@@ -17,8 +17,7 @@ __all__ = ["tensorboard_log"]
 def tensorboard_log(directory: str | Path) -> Iterator[Report]:
     """A receiver of progress that writes scalars for TensorBoard.
 
-    Each loss term of a stage is ``STAGE/TERM`` over the steps of that stage, as "level 0/surface.data"; ``time/left``
-    is in seconds, and ``time/whole`` in parts of one, both over seconds since the beginning.
+    Each loss term of a stage is ``STAGE/TERM`` over the steps of that stage, as "level 0/surface.data".
 
     Args:
         directory: of the event files; made where it is absent. An older run's stay, under their own names.
@@ -40,9 +39,6 @@ class _Log:
     def __call__(self, progress: Progress, /) -> None:
         for name, value in progress.losses.items():
             self.writer.add_scalar(f"{progress.stage}/{name}", value, progress.step)
-        if progress.left is not None and progress.whole is not None and progress.elapsed is not None:
-            for name, value in (("left", progress.left), ("whole", progress.whole)):
-                self.writer.add_scalar(f"time/{name}", value, round(progress.elapsed))
 
 
 def _writer(directory: Path) -> Any:

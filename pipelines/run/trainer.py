@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from ...neural_fields.devices import precise
-from .schedule import Progress, Report
+from .report import Progress, Report, silent
 from .team import agreed, as_the_leader, average_gradients, is_alone
 
 __all__ = [
@@ -103,9 +103,9 @@ def shared_flag(flag: StopFlag) -> Iterator[None]:
 
 
 def load_compiler() -> None:
-    """Load PyTorch's compiler, as its first optimiser does, for two seconds: to be called between two stages.
+    """Load PyTorch's compiler, as its first optimiser does; it takes two seconds.
 
-    Within a stage those seconds would count as slowness of its kind of work, and all forecasts would bear them.
+    Loaded before the first stage, they count neither as a step's nor against the share of a level in a time budget.
     """
     torch.optim.Adam([torch.zeros(1, requires_grad=True)])
 
@@ -258,7 +258,7 @@ class Trainer(Generic[O]):
             report_seconds: no more than about so many seconds between reports.
             save_every: seconds between checkpoints.
         """
-        flag, report, save = flag or StopFlag(), report or (lambda _: None), save or (lambda: None)
+        flag, report, save = flag or StopFlag(), report or silent, save or (lambda: None)
         start, saved = time.monotonic() - self.elapsed, time.monotonic()
         told = saved
         device = self.trained[0].device

@@ -20,9 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ...neural_fields import ColorSiren, Field, Jet, Mesh, TextureField, ViewColor, project_to_surface, sphere_trace
-from ..run.costs import Net, training
-from ..run.machine import speed
-from ..run.schedule import Report, Schedule, Stage
+from ..run.report import Report
 from ..run.trainer import Group, Interrupted, Objective, Trainer, seeded, stop_on_signals, warm_cosine
 from ..surface.surface import from_mesh, sample_points
 
@@ -87,9 +85,6 @@ def fit_highlights(
     Raises:
         Interrupted: Ctrl-C.
     """
-    schedule = Schedule.of(progress)
-    net = Net.siren(WIDTH, DEPTH, inputs=6)
-    schedule.plan([Stage(STAGE, "texture", speed(torch.device("cpu")).networks(training(steps, BATCH / 2, [net])))])
     pool = _Looks.of(color, texture, mesh, eyes, seed)
     known, unseen = pool.parted(HELD_OUT)
     with seeded(seed):
@@ -97,7 +92,7 @@ def fit_highlights(
     objective = _HighlightObjective(network, known, torch.Generator().manual_seed(seed))
     trainer = Trainer(objective, stage=STAGE, steps=steps)
     with stop_on_signals() as flag:
-        if not trainer.run(flag, report=schedule):
+        if not trainer.run(flag, report=progress):
             raise Interrupted(None)
     network.requires_grad_(False)
     before, after = (unseen.error(one) for one in (None, network))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,7 +21,6 @@ from ...neural_fields import (
     InputError,
     Similarity,
     TextureField,
-    levels_of,
     load_field,
     load_texture,
 )
@@ -30,8 +29,8 @@ from ...neural_fields.devices import upload
 from ...neural_fields.dynamic_tracing import moment
 from ...neural_fields.files import write_whole
 from ...neural_fields.losses import color_loss, tangential_loss
+from ..run.budget import SAMPLING_SHARE, Budget, affordable, step_seconds
 from ..run.config import load_config
-from ..run.costs import Net, Speed, jets, training
 from ..run.folder import (
     TEXTURE_FILE,
     chosen_level,
@@ -43,8 +42,8 @@ from ..run.folder import (
     write_texture,
 )
 from ..run.lock import locked
-from ..run.machine import choose_device, environment, speed
-from ..run.schedule import Progress, Report, Schedule, Stage
+from ..run.machine import choose_device, environment
+from ..run.report import Report, reported
 from ..run.settings import TextureConfig
 from ..run.swap import sweep
 from ..run.trainer import (
@@ -65,15 +64,14 @@ __all__ = [
     "fit_texture",
     "texture_of",
     "texture_run",
-    "texture_stages",
+    "texture_step_seconds",
 ]
 
 # A band at least this wide (in units of the field) holds decimated meshes, and the surfaces of small networks.
 LEAST_DELTA = 0.02
 # The default for a field of one level, which has no band of its own that says how near it is to its points.
 SINGLE_LEVEL_DELTA = 0.05
-# Of a time budget, what samples may take, and what the steps get in any case.
-SAMPLING_SHARE, LEAST_SHARE = 1 / 3, 0.1
+LEAST_SHARE = 0.1  # of a time budget, that the steps get in any case
 FEWEST = 2_000  # points that are left where time is short
 # Points of the pool at which the final error is measured.
 JUDGED = 100_000
@@ -92,23 +90,14 @@ class FittedTexture:
     record: dict[str, Any]
 
 
-def texture_stages(config: TextureConfig, points: int, nets: Sequence[Net], speed: Speed) -> list[Stage]:
-    """What `fit_texture` will do, and about how long that takes.
-
-    Args:
-        config: its settings.
-        points: with colours.
-        nets: sizes of the levels of the geometry.
-        speed: of the machine.
-    """
-    network = Net.siren(config.width, config.depth)
-    # Without gradients a step costs about half of one with them; the change along a direction is a jet.
-    work = training(config.steps, config.batch / 2 + config.band_batch, [network])
-    looked = jets(points + config.samples // 2, nets)
-    return [
-        Stage("texture: samples", "texture samples", speed.networks(looked)),
-        Stage("texture", "texture", speed.networks(work, steps=config.steps)),
-    ]
+def texture_step_seconds(config: TextureConfig, device: torch.device, left: float) -> float:
+    """Measured seconds of a step of `fit_texture`; see `step_seconds`."""
+    generator = torch.Generator().manual_seed(0)
+    points, others = (torch.rand(config.batch, 3, generator=generator).to(device) for _ in range(2))
+    network = ColorSiren(config.width, config.depth, omega=config.omega).to(device)
+    samples, band = ColorSamples(points, others, 0), BandSamples(points, others)
+    objective = TextureObjective(network, samples, band, config, delta=LEAST_DELTA, generator=generator)
+    return step_seconds(lambda: objective.losses(0, 0.0)[1], left)
 
 
 def fit_texture(
@@ -154,35 +143,44 @@ def fit_texture(
     device = choose_device(config.device)
     level = geometry.resolve_level(level)
     delta = config.delta or default_delta(geometry)
-    schedule, budget, notes = Schedule.of(progress), config.time_budget, list[str]()
-    band_samples = config.samples // 2
-    if progress is not None or budget is not None:
-        nets = [Net.about(parameter_count(each)) for each in levels_of(geometry)]
-        left = None if budget is None else max(budget - (time.monotonic() - started), 0.0)
-        making, learning = texture_stages(config, len(cloud), nets, speed(device))
-        if left is not None and schedule.predicted(making) > SAMPLING_SHARE * left:
-            share = SAMPLING_SHARE * left / schedule.predicted(making)
-            cloud, band_samples = _thinned(cloud, share, config.seed), max(int(share * band_samples), FEWEST)
-            notes.append(f"learns from {len(cloud):,} points and {band_samples:,} of the band, for want of time")
-        schedule.plan([making, learning], budget=left)
-    schedule(Progress("texture: samples", 0, 0, 0.0, {}))
-    generator = torch.Generator().manual_seed(config.seed)
+    budget, band_samples = Budget(config.time_budget, device, started=started), config.samples // 2
     home = geometry.like.device
     geometry = geometry.to(device)
-    samples = match_colors(cloud, geometry, similarity, level=level, delta=delta)
-    band = band_directions(samples, geometry, band_samples, level=level, delta=delta, generator=generator)
-    mean = samples.colors.mean(dim=0).tolist()
-    with seeded(config.seed):
-        network = ColorSiren(config.width, config.depth, omega=config.omega, mean=mean).to(samples.points)
-    schedule(Progress("texture: samples", 0, 0, 1.0, {}))
+
+    def made(cloud: PointCloud, band_samples: int) -> tuple[ColorSamples, BandSamples]:
+        generator.manual_seed(config.seed)
+        samples = match_colors(cloud, geometry, similarity, level=level, delta=delta)
+        return samples, band_directions(samples, geometry, band_samples, level=level, delta=delta, generator=generator)
+
+    def part(count: int) -> tuple[PointCloud, int]:
+        """So many of the points, and as large a part of the band's."""
+        share = count / max(len(cloud), 1)
+        return _thinned(cloud, share, config.seed), max(int(share * band_samples), FEWEST)
+
+    generator = torch.Generator()
+    with reported(progress, "texture: samples"):
+        left = budget.left()
+        if left is not None:
+            seconds = SAMPLING_SHARE * left
+            count = affordable(lambda count: made(*part(count)), len(cloud), seconds, fewest=FEWEST)
+            if count < len(cloud):
+                cloud, band_samples = part(count)
+                note = f"learns from {len(cloud):,} points and {band_samples:,} of the band, for want of time"
+                budget.notes.append(note)
+        samples, band = made(cloud, band_samples)
+        mean = samples.colors.mean(dim=0).tolist()
+        with seeded(config.seed):
+            network = ColorSiren(config.width, config.depth, omega=config.omega, mean=mean).to(samples.points)
     sampling_seconds = time.monotonic() - started
-    seconds = None if budget is None else max(budget - sampling_seconds, LEAST_SHARE * budget)
+    left, seconds = budget.left(), None
+    if left is not None and config.time_budget is not None:
+        seconds = max(left, LEAST_SHARE * config.time_budget)
     objective = TextureObjective(network, samples, band, config, delta=delta, generator=generator)
     trainer = Trainer(objective, stage="texture", steps=config.steps, seconds=seconds)
     if state is not None:
         trainer.restore(state)
     with stop_on_signals() as flag:
-        finished = trainer.run(flag, report=schedule, save=None if save is None else lambda: save(trainer.state()))
+        finished = trainer.run(flag, report=progress, save=None if save is None else lambda: save(trainer.state()))
     record = {
         "finished": finished,
         "source": cloud.source,
@@ -190,7 +188,7 @@ def fit_texture(
         "delta": delta,
         "points": len(samples.points),
         "left_out": samples.left_out,
-        **({} if budget is None else {"budget": {"seconds": budget, "notes": notes}}),
+        **budget.record(),
         "parameters": parameter_count(network),
         "steps": trainer.step,
         "sampling_seconds": round(sampling_seconds, 3),

@@ -30,7 +30,7 @@ from ...neural_fields.spacetime import SpaceTimeSDF
 from ...neural_fields.tracing import BOUNDING_RADIUS
 from ..render.subject import FRAME_RESOLUTION, traced_part
 from ..run.folder import RADIANCE_FILE, chosen_level, find_field, load_still
-from ..run.schedule import Report
+from ..run.report import Report
 from ..surface.trim import in_region, read_support, seen_part
 from ..texture.highlights import Highlights, fit_highlights
 from ..texture.train import texture_of

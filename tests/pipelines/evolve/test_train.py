@@ -269,13 +269,11 @@ def test_the_defaults_are_the_default_preset() -> None:
     assert load_config(EvolveConfig, "default", thing="evolve") == EvolveConfig()
 
 
-def test_stages_are_those_that_are_announced() -> None:
+def test_stages_are_reported_in_order() -> None:
     said: list[Progress] = []
     evolve(BRIEF, progress=said.append)
     stages = ["shapes", "known samples", "first shape", "level 0", "level 1", "checks"]
     assert list(dict.fromkeys(progress.stage for progress in said)) == stages
-    assert all(progress.left is not None for progress in said)
-    assert said[-1].whole == 1.0
 
 
 def test_a_budget_that_is_too_small_leaves_out_levels_and_samples(tmp_path: Path) -> None:

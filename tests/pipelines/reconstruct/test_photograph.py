@@ -92,7 +92,7 @@ def test_what_keeps_no_colours_by_direction_says_so(
 @pytest.mark.slow
 def test_a_new_training_over_an_old_run_takes_its_colours_away(images: PosedImages, tmp_path: Path) -> None:
     def stop(progress: Progress) -> None:
-        if progress.stage.startswith("reconstruct, level") and progress.step >= 20:
+        if progress.stage.startswith("reconstruct") and progress.step >= 20:
             raise KeyboardInterrupt
 
     again = tmp_path / "again"

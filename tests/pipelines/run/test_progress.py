@@ -6,8 +6,8 @@ import sys
 
 import pytest
 from mplicits.pipelines.run import progress as module
-from mplicits.pipelines.run.progress import Lines, counter_bar, progress_bars, time_words
-from mplicits.pipelines.run.schedule import Progress, Schedule, Stage
+from mplicits.pipelines.run.progress import Lines, counter_bar, progress_bars, seconds_left, time_words
+from mplicits.pipelines.run.report import Progress
 from rich.console import Console
 
 
@@ -17,44 +17,51 @@ def test_times_in_words() -> None:
 
 
 def test_lines_now_and_then(capsys: pytest.CaptureFixture[str]) -> None:
-    """A line for each stage that ends, and one for each half minute between; each with the time left of the whole."""
+    """A line for each stage that ends, and one for each half minute between, with the time left of the stage."""
     now = [0.0]
-    schedule = Schedule(Lines(clock=lambda: now[0]), clock=lambda: now[0])
-    schedule.plan([Stage("samples", "samples", 10.0), Stage("level 0", "steps", 190.0)])
-    for second in range(11):
+    lines = Lines(clock=lambda: now[0])
+    for second in (0, 10):
         now[0] = float(second)
-        schedule(Progress("samples", 0, 0, second / 10, {}))
+        lines(Progress("samples", 0, 0, second / 10, {}))
     for second in range(191):
         now[0] = 10.0 + second
-        schedule(Progress("level 0", second, 190, second / 190, {"data": 1e-3}))
-    lines = capsys.readouterr().err.splitlines()
-    assert lines[0] == "samples: done; about 3 min 10 s left of the whole"
-    assert lines[1] == "level 0: 16%; about 2 min 40 s left of the whole"
-    assert lines[-1] == "level 0: 190 steps; data 1.0e-03"
-    assert len(lines) == 1 + 190 // 30 + 1
+        lines(Progress("level 0", second, 190, second / 190, {"data": 1e-3}))
+    said = capsys.readouterr().err.splitlines()
+    assert said[0] == "samples: done in 10 s"
+    assert said[1] == "level 0: 16%; about 2 min 40 s left"
+    assert said[-1] == "level 0: 190 steps in 3 min 10 s; data 1.0e-03"
+    assert len(said) == 1 + 190 // 30 + 1
+
+
+def test_the_time_left_of_a_resumed_stage_follows_from_the_steps_since() -> None:
+    assert seconds_left(0.0, 0.6, 0.6) is None
+    assert seconds_left(40.0, 0.6, 0.8) == pytest.approx(40.0)
 
 
 def interrupted(now: list[float]) -> None:
-    with progress_bars(clock=lambda: now[0]) as schedule:
-        schedule.plan([Stage("samples", "samples", 90.0), Stage("level 0", "steps", 210.0)])
-        schedule(Progress("samples", 0, 0, 0.0, {}))
+    with progress_bars(clock=lambda: now[0]) as report:
+        report(Progress("preparing", 0, 0, 0.0, {}))
+        report(Progress("preparing", 0, 0, 1.0, {}))
+        report(Progress("level 0", 0, 100, 0.0, {}))
         now[0] = 45.0
-        schedule(Progress("samples", 0, 0, 0.5, {}))
+        report(Progress("level 0", 50, 100, 0.5, {"data": 1e-3}))
+        now[0] = 55.0
         raise KeyboardInterrupt
 
 
-def test_bars_show_the_whole_and_its_time_left(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Also where a stage is silent, and where messages are further apart than rich remembers."""
+def test_bars_show_elapsed_time_and_time_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where messages are further apart than rich remembers."""
     screen, now = io.StringIO(), [0.0]
     console = Console(file=screen, force_terminal=True, width=100, color_system=None)
     monkeypatch.setattr(module, "Console", lambda **_: console)
     with pytest.raises(KeyboardInterrupt):
         interrupted(now)  # the last that is drawn is the state in between
-    lines = screen.getvalue().splitlines()[-4:]  # below them are the losses
-    assert "whole" in lines[0]
-    assert "about 4 min 20 s left" in lines[0]  # 255 s
-    assert "samples" in lines[1]
-    assert "about 45 s left" in lines[1]
+    lines = screen.getvalue().splitlines()[-4:]
+    assert "preparing" in lines[0]
+    assert "100%" in lines[0]
+    assert "level 0" in lines[1]
+    assert "55 s, about 35 s left" in lines[1]
+    assert "data 1.0e-03" in lines[2]
 
 
 def test_a_counter_without_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:

@@ -7,27 +7,21 @@ import numpy as np
 import pytest
 from mplicits.datasets import sample_sphere, write_cloud_ply
 from mplicits.pipelines.cli.entry import main
-from mplicits.pipelines.run.schedule import Progress, Schedule, Stage
+from mplicits.pipelines.run.report import Progress
 from mplicits.pipelines.run.tensorboard import tensorboard_log
 
 
 def test_scalars_are_those_that_were_reported(tmp_path: Path) -> None:
     loading = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
-    now = [0.0]
     with tensorboard_log(tmp_path / "logs") as log:
-        schedule = Schedule(log, clock=lambda: now[0])
-        schedule.plan([Stage("level 0", "steps", 40.0)])
         for step in (0, 20, 40):
-            now[0] = float(step)
             losses = {"data": 0.5**step} if step else {}
-            schedule(Progress("level 0", step, 40, step / 40, losses))
+            log(Progress("level 0", step, 40, step / 40, losses))
     found = loading.EventAccumulator(str(tmp_path / "logs"))
     found.Reload()
     data = [(event.step, event.value) for event in found.Scalars("level 0/data")]
     assert [step for step, _ in data] == [20, 40]
     np.testing.assert_array_equal([value for _, value in data], np.float32([0.5**20, 0.5**40]))
-    assert [(event.step, event.value) for event in found.Scalars("time/left")] == [(0, 40.0), (20, 20.0), (40, 0.0)]
-    assert [event.value for event in found.Scalars("time/whole")] == [0.0, 0.5, 1.0]
 
 
 @pytest.mark.parametrize("command", ["fit", "evolve", "reconstruct"])

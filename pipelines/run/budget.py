@@ -1,0 +1,153 @@
+"""The clock of ``--time-budget``: how long each level may train, by the measured time of a few of its steps."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+
+from .team import agreed
+
+__all__ = ["FEWEST_SAMPLES", "LEAST_SECONDS", "SAMPLING_SHARE", "Budget", "affordable", "least_share", "step_seconds"]
+
+# A level is not worth fewer steps, or fewer than a quarter of its own: its learning rate would hardly be warm.
+FEWEST_STEPS = 60
+# Samples of each kind that there are at least, and what they may take of the time where that is too short for all.
+FEWEST_SAMPLES, SAMPLING_SHARE = 5_000, 1 / 3
+# Seconds of training where a budget leaves none.
+LEAST_SECONDS = 0.5
+# Timed steps, of which the fastest counts; and the share of the time left that they may take.
+TIMED, TIMING_SHARE = 4, 0.02
+
+
+class Budget:
+    """A time budget, and what it has changed.
+
+    Args:
+        seconds: for the whole work; None for no limit.
+        device: that trains.
+        started: beginning of the work, by `time.monotonic`; None is now.
+
+    Attributes:
+        before: seconds that interrupted processes spent on what they kept.
+        left_out: levels that are not trained.
+        notes: sentences on what has changed.
+    """
+
+    def __init__(self, seconds: float | None, device: torch.device, *, started: float | None = None) -> None:
+        self.seconds, self.device = seconds, device
+        self.started = time.monotonic() if started is None else started
+        self.before = 0.0
+        self.left_out: list[int] = []
+        self.notes: list[str] = []
+
+    def left(self) -> float | None:
+        """Seconds left, at least 0; None without a limit."""
+        if self.seconds is None:
+            return None
+        return max(self.seconds - self.before - (time.monotonic() - self.started), 0.0)
+
+    def share(
+        self,
+        seconds: float,
+        level: int,
+        steps: Sequence[int],
+        cost: Callable[[int], float],
+        *,
+        training: float = 1.0,
+        begun: bool = False,
+    ) -> float | None:
+        """Seconds for the next level: ``seconds`` times its part of the work that is left, ``steps`` times ``cost``.
+
+        The finest levels are left out while the levels before them would get less than `FEWEST_STEPS`, or than a
+        quarter of their steps.
+
+        Args:
+            seconds: for all levels from ``level`` on.
+            level: the next one.
+            steps: of each level.
+            cost: measured seconds of a step of a level.
+            training: share of a level's time that is spent on steps.
+            begun: whether the level is under way, and is finished in any case. Level 0 always is.
+
+        Returns:
+            Seconds; None where the level is not worth beginning.
+        """
+        levels, work = list[int](), list[float]()
+        for each in range(level, len(steps)):
+            work.append(steps[each] * cost(each))
+            if work[-1] * least_share(steps[each]) > training * seconds:
+                work.pop()
+                break
+            levels.append(each)
+        while levels and training * seconds < math.fsum(work) * max(least_share(steps[each]) for each in levels):
+            del levels[-1], work[-1]
+        share = seconds if begun or level == 0 else -1.0
+        if levels:
+            share = seconds * work[0] / math.fsum(work)
+        share = agreed(False, share, self.device)[1]  # all processes of a team train the same levels
+        return None if share < 0 else share
+
+    def leave_out(self, first: int, levels: int) -> None:
+        """Record that the levels from ``first`` up to ``levels`` are not trained."""
+        self.left_out = list(range(first, levels))
+        names = f"level {first} is" if len(self.left_out) == 1 else f"levels {first} to {levels - 1} are"
+        self.notes.append(f"{names} left out: too little time for {FEWEST_STEPS} steps")
+
+    def record(self) -> dict[str, Any]:
+        """For ``run.json``."""
+        if self.seconds is None:
+            return {}
+        return {"budget": {"seconds": self.seconds, "left_out": self.left_out, "notes": self.notes}}
+
+
+def least_share(steps: int) -> float:
+    """The smallest share of a level's steps that is worth beginning, see `FEWEST_STEPS`."""
+    return min(FEWEST_STEPS / steps, 0.25) if steps else 0.0
+
+
+def step_seconds(step: Callable[[], torch.Tensor], left: float) -> float:
+    """Measured seconds of a training step: the fastest of a few.
+
+    Args:
+        step: computes a loss.
+        left: seconds of the budget; a small share of them is spent on this.
+    """
+    least, begun = math.inf, time.monotonic()
+    for _ in range(TIMED):
+        started = time.monotonic()
+        loss = step()
+        loss.backward()
+        float(loss.detach())  # waits for a GPU
+        now = time.monotonic()
+        least = min(least, now - started)
+        if now - begun > TIMING_SHARE * left:
+            break
+    return least
+
+
+def affordable(make: Callable[[int], object], count: int, seconds: float, *, fewest: int = FEWEST_SAMPLES) -> int:
+    """How many samples can be made in so many seconds: from ``fewest`` to ``count``.
+
+    A half and twice the ``fewest`` are made and timed; samples beyond those cost the difference.
+
+    Args:
+        make: makes so many samples, which are dropped.
+        count: that are wanted.
+        seconds: for them.
+        fewest: that are made in any case.
+    """
+    if count <= fewest:
+        return count
+    took = list[float]()
+    for few in (max(fewest // 8, 1), max(fewest // 2, 1), 2 * fewest):  # the first fills caches
+        started = time.monotonic()
+        make(min(few, count))
+        took.append(time.monotonic() - started)
+        if took[-1] > seconds:
+            return fewest
+    each = max(took[2] - took[1], 0.1 * took[2]) / (1.5 * fewest)
+    return max(fewest, min(count, int(2 * fewest + (seconds - took[2]) / each)))
