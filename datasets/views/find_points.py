@@ -71,9 +71,9 @@ def find_points(source: str | Path, project: str | Path, *, report: Report | Non
     Raises:
         InputError: the photographs cannot be read, the project is another's, or no two of them show the same.
     """
-    check_colmap()
     source, project = find_source(source), Path(project)
     shots = read_shots(source)
+    check_colmap()
     files = [file for shot in shots for file in (shot.image, shot.mask, shot.depth) if file is not None]
     files += [source] if source.is_file() else files_in(source, (".bin", ".txt"))
     asked = {"source": str(source.resolve()), "content": fingerprint([file for file in files if file.is_file()])}
