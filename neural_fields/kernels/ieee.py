@@ -10,7 +10,8 @@ import triton.language as tl
 from torch import Tensor
 
 from .launch import Network, on_device, program_count, scratch_for, tiling_of
-from .tiles import jet_of_tile, planes, points_of, rows_of
+from .tensor_tiles import points_of, rows_of
+from .tiles import jet_of_tile, planes
 
 __all__ = ["jet"]
 

@@ -14,16 +14,13 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple, Protocol
 from weakref import WeakKeyDictionary
 
 import torch
 from torch import Tensor
 
-if TYPE_CHECKING:
-    from ..siren import Siren
-
-__all__ = ["LARGEST", "SINES", "Packed", "Shape", "is_hopper", "pack", "packed", "state_of"]
+__all__ = ["LARGEST", "SINES", "Packed", "Shape", "Weights", "is_hopper", "pack", "packed", "state_of"]
 
 # Sines are multiplied by this before they are split: a power of two, so that their low halves are normal numbers.
 SINES = 1024.0
@@ -153,10 +150,21 @@ def power_of_two(target: float, like: Tensor) -> Tensor:
     return torch.exp2(exponent)
 
 
-_kept: WeakKeyDictionary[Siren, tuple[tuple[object, ...], Packed]] = WeakKeyDictionary()
+class Weights(Protocol):
+    """What is asked of a `Siren`: its parameters, and what phases and outputs are multiplied by."""
+
+    omega: float
+    units: tuple[float, float]
+
+    def raw(self) -> list[Tensor]:
+        """(W₁, b₁, …, W_out, b_out)."""
+        ...
 
 
-def state_of(network: Siren) -> tuple[object, ...]:
+_kept: WeakKeyDictionary[Weights, tuple[tuple[object, ...], Packed]] = WeakKeyDictionary()
+
+
+def state_of(network: Weights) -> tuple[object, ...]:
     """A key that differs whenever the weights may have changed."""
     parameters = network.raw()
     if any(parameter.is_inference() for parameter in parameters):  # nothing counts their changes
@@ -164,7 +172,7 @@ def state_of(network: Siren) -> tuple[object, ...]:
     return (network.omega, network.units, *((each.data_ptr(), each._version, each.device) for each in parameters))
 
 
-def packed(network: Siren) -> Packed:
+def packed(network: Weights) -> Packed:
     """A SIREN's weights for the kernels; packed again, into the same memory, when they have changed."""
     state, before = state_of(network), _kept.get(network)
     if before is not None and before[0] == state:

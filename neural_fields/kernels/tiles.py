@@ -30,9 +30,7 @@ __all__ = [
     "first_phase",
     "jet_of_tile",
     "planes",
-    "points_of",
     "product_from",
-    "rows_of",
     "sine",
 ]
 
@@ -65,21 +63,6 @@ def cosine(z):
         return tl.cos(z)
     else:
         return libdevice.cos(z)
-
-
-@triton.jit
-def rows_of(tile, ROWS: tl.constexpr):
-    """The rows of a tile (ROWS,), in 64 bits: offsets of 2³¹ and more are no rarity."""
-    return tl.full((ROWS,), ROWS, tl.int64) * tile + tl.arange(0, ROWS)
-
-
-@triton.jit
-def points_of(x, row, real, IN: tl.constexpr):
-    """The coordinates of the points ``row`` (ROWS,), a tuple of IN columns."""
-    points = ()
-    for axis in tl.static_range(IN):
-        points = points + (tl.load(x + row * IN + axis, mask=real, other=0.0),)
-    return points
 
 
 @triton.jit

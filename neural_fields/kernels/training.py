@@ -26,7 +26,8 @@ import triton.language as tl
 from torch import Tensor
 
 from .launch import Network, Tiling, on_device, program_count, scratch_for, tiling_of
-from .tiles import add_first, cosine, first_phase, points_of, product_from, rows_of, sine
+from .tensor_tiles import points_of, rows_of
+from .tiles import add_first, cosine, first_phase, product_from, sine
 
 __all__ = ["jet_backward"]
 
