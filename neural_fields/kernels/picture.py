@@ -310,7 +310,9 @@ class Picture:
             torch.empty(count, **numbers),
             *(torch.empty(count, 3, **numbers) for _ in range(3)),
         )
+        # Recorded with the second picture: a size that is drawn once is not worth it.
         self.graph: torch.cuda.CUDAGraph | None = None
+        self.begun = False
         # Where the host writes a view; memory that the device reads without a stop.
         self.staged = torch.zeros(CAMERA, dtype=torch.float64, pin_memory=device.type == "cuda")
 
@@ -322,19 +324,17 @@ class Picture:
         """
         self.staged.copy_(torch.tensor(view, dtype=torch.float64))
         self.view.copy_(self.staged, non_blocking=True)
-        if self.graph is not None:
-            self.graph.replay()
-        elif self.view.is_cuda:
-            self._launch()  # compiles
-            self._launch()  # with as many programs as run at a time
+        if self.graph is None and self.begun and self.view.is_cuda:
             torch.cuda.synchronize(self.view.device)
             graph = torch.cuda.CUDAGraph()
             with torch.cuda.graph(graph):
                 self._launch()
             self.graph = graph
-            graph.replay()
-        else:
+        if self.graph is None:
             self._launch()
+        else:
+            self.graph.replay()
+        self.begun = True
         rows = int(self.hits)
         return Drawn(*(column[:rows].clone() for column in self.drawn))
 
