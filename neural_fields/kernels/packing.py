@@ -173,7 +173,11 @@ def state_of(network: Weights) -> tuple[object, ...]:
 
 
 def packed(network: Weights) -> Packed:
-    """A SIREN's weights for the kernels; packed again, into the same memory, when they have changed."""
+    """A SIREN's weights for the kernels; packed again, into the same memory, when they have changed.
+
+    Changes are known by PyTorch's version counters, which changes through ``.data`` and CUDA graphs do not count: after
+    those, call ``torch.autograd.graph.increment_version(parameters)``.
+    """
     state, before = state_of(network), _kept.get(network)
     if before is not None and before[0] == state:
         return before[1]

@@ -76,6 +76,8 @@ class ReplayedTrainer(Trainer[SceneObjective]):
         kind = kind._replace(rays=math.ceil(kind.rays / part) * part)
         rooms = self._rooms(kind)
         found = dict(self.replays.do((kind, rooms), lambda: self._work(kind, rooms)))
+        # A replay changes parameters behind PyTorch's back; the fused kernels pack them again by their versions.
+        torch.autograd.graph.increment_version(self.trained)
         sections = found.pop("sections")
         self.objective.behind(self.step, sections)
         self.step += 1

@@ -16,7 +16,7 @@ from mplicits.pipelines.reconstruct.measured import MeasuredDepths
 from mplicits.pipelines.reconstruct.model import RayPool, build_scene
 from mplicits.pipelines.reconstruct.objective import SceneObjective
 from mplicits.pipelines.reconstruct.replayed import ReplayedTrainer
-from mplicits.pipelines.run.replay import Again, CudaGraphs, Replays
+from mplicits.pipelines.run.replay import Again, CudaGraphs, Recorder, Replays, Results, Work
 from mplicits.pipelines.run.trainer import Trainer
 from reconstructions import QUICK, TINY_SCENE
 from torch import Tensor
@@ -114,6 +114,25 @@ def test_the_first_steps_are_the_usual_ones(images: PosedImages) -> None:
         losses = usual._step(), trainer._step()
         for one, other in zip(losses[0].values(), losses[1].values(), strict=True):
             assert float(other) == pytest.approx(float(one), rel=1e-4)
+
+
+class Unheard(Recorder):
+    """A replay of which PyTorch hears nothing, as of a CUDA graph; here it does nothing either."""
+
+    def record(self, work: Work) -> tuple[Callable[[], None], Results]:
+        """See `Recorder.record`."""
+        return lambda: None, work()
+
+
+def test_a_replay_counts_as_a_change_of_the_weights(images: PosedImages) -> None:
+    """By their versions the fused kernels know when to pack them again."""
+    trainer = replaying(images, "masks", torch.device("cpu"))
+    trainer.replays.recorder = Unheard()
+    for _ in range(3):
+        before = [parameter._version for parameter in trainer.trained]
+        trainer._step()
+        assert all(new._version > old for new, old in zip(trainer.trained, before, strict=True))
+    assert trainer.replays.recorded > 0
 
 
 def test_a_step_whose_rooms_are_too_small_is_not_taken_and_there_are_larger_ones(images: PosedImages) -> None:
