@@ -251,6 +251,8 @@ def choose_levels(levels: Sequence[Field], x: Tensor, *, jet: bool) -> Choice:
     networks = [level for level in levels if isinstance(level, Siren)]
     if len(networks) < len(levels):
         return Choice(False, "a level is no SIREN")
+    if any((network.like.dtype, network.like.device) != (x.dtype, x.device) for network in networks):
+        return Choice(False, "points and networks differ in precision or device, which PyTorch will say")
     return choose(
         x,
         width=max(network.width for network in networks),

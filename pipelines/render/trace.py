@@ -154,8 +154,8 @@ def _draws_at_once(field: Field, level: int, device: torch.device | str) -> bool
     networks = levels_of(field)[: level + 1]
     if field.in_dim != 3 or not all(isinstance(network, Siren) for network in networks):
         return False
-    like = torch.empty(0, field.in_dim, device=device)
-    return choose_levels(networks, like, jet=True).fused
+    like = field.like.new_empty(0, field.in_dim)
+    return like.device.type == torch.device(device).type and choose_levels(networks, like, jet=True).fused
 
 
 def _draw(

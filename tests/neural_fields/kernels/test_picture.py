@@ -117,11 +117,13 @@ def test_few_pictures_are_kept(place: torch.device, counted: list[tuple[int, int
 
 
 def test_what_is_not_drawn_at_once(place: torch.device, counted: list[tuple[int, int]]) -> None:
-    """A lens with distortion, the paper's fixed steps, and fields that are no networks."""
+    """A lens with distortion, the paper's fixed steps, fields that are no networks, and networks in float64."""
     view = camera(8, 6)
     bent = Camera(view.intrinsics, view.world_from_camera, 8, 6, distortion=(0.01,))
     field = waves(place)
     trace_view(field, bent, level=0, device=place)
     trace_view(field, view, budget=(5, 2, 2), device=place)
     trace_view(Sphere(radius=0.5).to(place), view, device=place)
+    with pytest.raises(TypeError, match="float64"):  # a camera's rays are float32
+        trace_view(field.double(), view, device=place)
     assert counted == []
