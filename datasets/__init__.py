@@ -1,10 +1,10 @@
 """Files and sensors → tensors: point clouds, synthetic ones whose exact surface is known, and cameras."""
 
 from .cameras import Camera, look_at, orbit, turntable
-from .clouds.ply import write_cloud_ply
+from .clouds.cleaning.prepare import CleaningReport, OrientedCloud, prepare_cloud
 from .clouds.point_cloud import PointCloud, spacing_of, thin
-from .clouds.prepare import CleaningReport, OrientedCloud, prepare_cloud
-from .clouds.reading import read_cloud
+from .clouds.readers.ply import write_cloud_ply
+from .clouds.readers.reading import read_cloud
 from .color_space import linear_to_srgb, srgb_to_linear
 from .depth.camera import DepthCamera, read_intrinsics
 from .depth.cloud import DepthReport, DepthSettings, frame_cloud, fuse_frames
@@ -23,8 +23,8 @@ from .synthetic.scanner import STATUE_PLACEMENT, SimulatedScan, scan_with_truth,
 from .synthetic.scenes import SCENES, Scene, render_scene, sample_scene, scene_mesh
 from .synthetic.statue import Statue
 from .textured.reading import TexturedMesh, colors_at, read_textured, sample_textured
+from .views.formats.reading import read_cameras
 from .views.images import PosedImage, PosedImages, read_posed_images
-from .views.reading import read_cameras
 from .views.region import region_from_cameras, region_from_masks, region_from_points
 from .views.writing import write_colmap, write_neus, write_transforms
 

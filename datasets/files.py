@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..neural_fields import InputError
-from ..neural_fields.files import damage
+from ..neural_fields.backend.files import damage
 
 __all__ = [
     "DAMAGED_ARRAYS",

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..neural_fields import InputError
-from ..neural_fields.files import write_whole
+from ..neural_fields.backend.files import write_whole
 from .files import readable
 
 __all__ = ["read_landmarks", "write_landmarks"]

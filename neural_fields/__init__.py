@@ -1,20 +1,7 @@
 """Neural signed distance fields, and the mathematics that evaluates them."""
 
-from ._fixed import FixedShapes, fixed_shapes
-from .adapters import Deviation, InstantNSRGeometry, NerfstudioField, NeuSGeometry
-from .algebra import Bounded, Difference, Intersection, Offset, Placed, Shell, Union
-from .analytic import Box, Capsule, Plane, Sphere, Torus
-from .attributes import Mapped, map_attribute, map_colors, project_to_surface
-from .characteristics import (
-    IntegrationError,
-    Solver,
-    Tracks,
-    flow,
-    flow_jacobian,
-    track,
-    trajectories,
-    transport_error,
-)
+from .backend.errors import InputError
+from .backend.fixed_shapes import FixedShapes, fixed_shapes
 from .checkpoint import (
     SavedField,
     load_field,
@@ -24,28 +11,42 @@ from .checkpoint import (
     save_radiance,
     save_texture,
 )
-from .color import ColorSiren, TextureField
-from .cones import cone_starts
-from .encoded import EncodedField
-from .errors import InputError
-from .evolution import Law, curvature, key_loss, law_loss, mean_curvature, morph, near_surface, normal_speed, transport
-from .field import Field, Jet, OneLevelField, SecondJet
-from .function import FieldLike, FunctionField, as_field
-from .mesh import Mesh
-from .meshing import NoSurfaceError, extract_mesh, map_normals
-from .moving import Keyframes, Moving, RigidMotion, ShrinkingSphere
-from .multiscale import MultiscaleSDF, levels_of
-from .placement import Placement
-from .radiance import Outside, Radiance, ViewColor
-from .rates import parameter_groups, share_rate
-from .similarity import Similarity
-from .siren import Siren
-from .spacetime import SpaceTimeJet, SpaceTimeSDF, TimeSlice, at_time, spacetime_jet
-from .sphere_start import fit_sphere, solve_sphere
-from .tracing import Hits, sphere_trace
-from .velocity import CarriedKeyframes, Velocity, VelocityJet, VelocitySiren
-from .volume_renderer import Rendered, Sampling, render_volume
-from .world import Closest, WorldField, WorldHits, in_one_frame
+from .fields.csg import Bounded, Difference, Intersection, Offset, Placed, Shell, Union
+from .fields.field import Field, Jet, OneLevelField, SecondJet
+from .fields.function import FieldLike, FunctionField, as_field
+from .fields.primitives import Box, Capsule, Plane, Sphere, Torus
+from .fields.similarity import Similarity
+from .hosts.adapters import Deviation, InstantNSRGeometry, NerfstudioField, NeuSGeometry
+from .hosts.learning_rates import parameter_groups, share_rate
+from .meshing.extract import NoSurfaceError, extract_mesh, map_normals
+from .meshing.mesh import Mesh
+from .meshing.placement import Placement
+from .networks.encoded import EncodedField
+from .networks.multiscale import MultiscaleSDF, levels_of
+from .networks.radiance import Outside, Radiance, ViewColor
+from .networks.siren import Siren
+from .networks.sphere_init import fit_sphere, solve_sphere
+from .networks.texture import ColorSiren, TextureField
+from .shape import Closest, WorldField, WorldHits, in_one_frame
+from .spacetime.evolution import (
+    Law,
+    curvature,
+    key_loss,
+    law_loss,
+    mean_curvature,
+    morph,
+    near_surface,
+    normal_speed,
+    transport,
+)
+from .spacetime.field import SpaceTimeJet, SpaceTimeSDF, TimeSlice, at_time, spacetime_jet
+from .spacetime.flow import IntegrationError, Solver, Tracks, flow, flow_jacobian, track, trajectories, transport_error
+from .spacetime.moving import Keyframes, Moving, RigidMotion, ShrinkingSphere
+from .spacetime.velocity import CarriedKeyframes, Velocity, VelocityJet, VelocitySiren
+from .tracing.cones import cone_starts
+from .tracing.projection import Mapped, map_attribute, map_colors, project_to_surface
+from .tracing.sphere import Hits, sphere_trace
+from .volume.render import Rendered, Sampling, render_volume
 
 __all__ = [
     "Bounded",

@@ -17,20 +17,20 @@ from safetensors import safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from .algebra import Bounded, Combined, Difference, Intersection, Offset, Placed, Shell, Union
-from .analytic import Box, Capsule, Plane, Sphere, Torus
-from .color import ColorSiren, TextureField
-from .encoded import EncodedField
-from .errors import InputError
-from .field import Field, plain
-from .files import write_whole
-from .hash_encoding import HashEncoding, grid_resolutions
-from .multiscale import MultiscaleSDF
-from .neus_mlp import NeusSDF
-from .radiance import Outside, Radiance, ViewColor
-from .similarity import Similarity
-from .siren import Siren
-from .spacetime import SpaceTimeSDF
+from .backend.errors import InputError
+from .backend.files import write_whole
+from .fields.csg import Bounded, Combined, Difference, Intersection, Offset, Placed, Shell, Union
+from .fields.field import Field, plain
+from .fields.primitives import Box, Capsule, Plane, Sphere, Torus
+from .fields.similarity import Similarity
+from .networks.encoded import EncodedField
+from .networks.hash_encoding import HashEncoding, grid_resolutions
+from .networks.multiscale import MultiscaleSDF
+from .networks.neus_mlp import NeusSDF
+from .networks.radiance import Outside, Radiance, ViewColor
+from .networks.siren import Siren
+from .networks.texture import ColorSiren, TextureField
+from .spacetime.field import SpaceTimeSDF
 
 __all__ = [
     "SavedField",

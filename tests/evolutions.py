@@ -12,7 +12,7 @@ from mplicits.pipelines.cli.entry import main as mplicits_command
 from mplicits.pipelines.evolve import checks as evolve_checks
 from mplicits.pipelines.evolve import deform, source
 from mplicits.pipelines.evolve import problem as evolve_problem
-from mplicits.pipelines.run.settings import EvolveConfig
+from mplicits.pipelines.training.settings import EvolveConfig
 
 BRIEF = EvolveConfig(
     kind="transport",

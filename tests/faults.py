@@ -1,6 +1,6 @@
 """A disk that fails, or a process that is killed, at a chosen one of the operations that change a disk for good.
 
-Every such operation of the package goes through `mplicits.neural_fields.disk`. `Faults` counts them, and at one of them
+Every such operation of the package goes through `neural_fields.backend.disk`. `Faults` counts them, and at one of them
 
 - "killed": nothing of it happens, nor of any that would follow: no clean-up, as after SIGKILL or a power cut;
 - "torn": half of it happens, if it is a write, and nothing after it;
@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from mplicits.neural_fields import disk
+from mplicits.neural_fields.backend import disk
 
 __all__ = ["KINDS", "Faults", "Killed", "dead_holder"]
 

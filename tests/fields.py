@@ -33,8 +33,8 @@ from mplicits.neural_fields import (
     Union,
     VelocitySiren,
 )
-from mplicits.neural_fields.hash_encoding import HashEncoding
-from mplicits.neural_fields.neus_mlp import NeusSDF
+from mplicits.neural_fields.networks.hash_encoding import HashEncoding
+from mplicits.neural_fields.networks.neus_mlp import NeusSDF
 from torch import Tensor
 
 from benchmarks.motion.figures import DeformingField, Twisting

@@ -30,8 +30,8 @@ import torch
 from mplicits.neural_fields import InputError, load_field, load_texture
 from mplicits.pipelines.cli.entry import main as mplicits
 from mplicits.pipelines.cli.info import describe
-from mplicits.pipelines.run.folder import RunFolder, find_field, is_fitted, load_state, read_record
-from mplicits.pipelines.run.trainer import Trainer
+from mplicits.pipelines.training.folder import RunFolder, find_field, is_fitted, load_state, read_record
+from mplicits.pipelines.training.trainer import Trainer
 from safetensors.torch import load_file
 
 sys.path.append(str(Path(__file__).parents[1]))  # where benchmarks are; they are not installed
@@ -116,7 +116,7 @@ def worked(number: int) -> float:
 def prepare(place: Path) -> None:
     """What the commands read, and settings that no flag has: small, so that a case takes a second."""
     from mplicits.datasets import PointCloud
-    from mplicits.datasets.clouds.ply import write_cloud_ply
+    from mplicits.datasets.clouds.readers.ply import write_cloud_ply
     from mplicits.datasets.synthetic.scenes import SCENES, render_scene
     from mplicits.datasets.views.writing import write_neus
     from mplicits.neural_fields import Sphere, extract_mesh

@@ -15,8 +15,8 @@ import torch
 from browser import start_browser
 from mplicits.datasets.cameras import turntable
 from mplicits.neural_fields import Siren, extract_mesh, save_field
-from mplicits.neural_fields.multiscale import levels_of
-from mplicits.pipelines.run.folder import load_still
+from mplicits.neural_fields.networks.multiscale import levels_of
+from mplicits.pipelines.training.folder import load_still
 from mplicits.pipelines.web.export import BITS, WebOptions, web_run
 from mplicits.pipelines.web.networks import network_layers, rounded_field
 from pages import differences, rendered, until

@@ -20,7 +20,7 @@ from fields import small_multiscale, small_spacetime, two_levels
 from hosts import Heads, NeuSHost, ray_samples
 from mplicits.datasets import PointCloud, sample_torus, write_cloud_ply
 from mplicits.datasets.cameras import look_at
-from mplicits.datasets.clouds.prepare import prepare_cloud
+from mplicits.datasets.clouds.cleaning.prepare import prepare_cloud
 from mplicits.datasets.synthetic.scenes import SCENES, render_scene
 from mplicits.datasets.views.writing import write_neus
 from mplicits.neural_fields import (
@@ -37,16 +37,16 @@ from mplicits.neural_fields import (
     render_volume,
     sphere_trace,
 )
-from mplicits.neural_fields.cones import cone_ends, cone_starts
-from mplicits.neural_fields.dynamic_tracing import DynamicTracer
-from mplicits.neural_fields.radiance import ViewColor
-from mplicits.neural_fields.sphere_start import fit_sphere, solve_sphere
-from mplicits.neural_fields.volume_renderer import Sampling
+from mplicits.neural_fields.networks.radiance import ViewColor
+from mplicits.neural_fields.networks.sphere_init import fit_sphere, solve_sphere
+from mplicits.neural_fields.spacetime.dynamic_tracing import DynamicTracer
+from mplicits.neural_fields.tracing.cones import cone_ends, cone_starts
+from mplicits.neural_fields.volume.render import Sampling
 from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.fit.unoriented import give_signs
 from mplicits.pipelines.mesh.files import write_mesh
-from mplicits.pipelines.run.config import load_config
-from mplicits.pipelines.run.settings import FitConfig
+from mplicits.pipelines.training.config import load_config
+from mplicits.pipelines.training.settings import FitConfig
 from mplicits.pipelines.viewer.frames import Look
 from mplicits.pipelines.viewer.paint import Painter
 from reconstructions import small_reconstructions
@@ -81,7 +81,7 @@ def same(work: Callable[[torch.device], Result], accelerator: torch.device) -> N
 @pytest.fixture(autouse=True)
 def _one_march(monkeypatch: pytest.MonkeyPatch) -> None:
     """Rays march on the CPU too as they do on accelerators; test_ahead.py compares the two marches."""
-    monkeypatch.setattr("mplicits.neural_fields.tracing.makes_wait", lambda _: True)
+    monkeypatch.setattr("mplicits.neural_fields.tracing.sphere.makes_wait", lambda _: True)
 
 
 def rays(device: torch.device) -> tuple[Tensor, Tensor]:

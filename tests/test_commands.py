@@ -32,8 +32,8 @@ from mplicits.pipelines.mesh import finish
 from mplicits.pipelines.mesh.extract import MeshOptions
 from mplicits.pipelines.mesh.files import write_mesh
 from mplicits.pipelines.render import subject
-from mplicits.pipelines.run.settings import TextureConfig
 from mplicits.pipelines.texture import riding
+from mplicits.pipelines.training.settings import TextureConfig
 from mplicits.pipelines.web import export
 from reconstructions import small_reconstructions
 

@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mplicits.datasets import PointCloud
-from mplicits.datasets.clouds.ply import write_cloud_ply
+from mplicits.datasets.clouds.readers.ply import write_cloud_ply
 from mplicits.neural_fields import InputError, Siren, Sphere, extract_mesh, save_field
-from mplicits.neural_fields.files import check_place, whole_file, write_whole
+from mplicits.neural_fields.backend.files import check_place, whole_file, write_whole
 from mplicits.pipelines.cli.common import write_json
 from mplicits.pipelines.mesh.files import write_mesh
 from mplicits.pipelines.render.picture import write_picture
-from mplicits.pipelines.run.folder import save_state
+from mplicits.pipelines.training.folder import save_state
 
 WRITERS: dict[str, Callable[[Path], None]] = {
     "cloud.ply": lambda path: write_cloud_ply(path, PointCloud(np.ones((5, 3)))),

@@ -20,14 +20,14 @@ import numpy as np
 import pytest
 import torch
 from mplicits.neural_fields import upward
-from mplicits.pipelines.run.machine import environment
+from mplicits.pipelines.training.machine import environment
 
 ROOT = Path(__file__).parent.parent
 # From the ground up. A room imports from those above it in this list, never from those below.
 ROOMS = (
     "neural_fields",
     "datasets",
-    "pipelines/run",
+    "pipelines/training",
     "pipelines/surface",
     "pipelines/fit",
     "pipelines/texture",
@@ -42,10 +42,12 @@ ROOMS = (
     "pipelines/front",
 )
 FRONT = "pipelines/front"
+FACE = ROOT / "neural_fields" / "__init__.py"  # which offers the names of all folders beside it
 PLUGIN = "pipelines/nerfstudio"  # for whom nerfstudio is installed, and who imports it, not we
 OUTSIDE = {"torch", "numpy", "safetensors"}  # what neural_fields may import
 LATE = {"torchdiffeq", "trimesh"}  # and what only inside a function that needs it
-KERNELS = "neural_fields/kernels"  # where Triton may be imported; the files that do are imported late themselves
+# Where Triton may be imported; the files that do are imported late themselves.
+KERNELS = ("neural_fields/backend/kernels", "neural_fields/tracing/picture.py")
 LIGHT = "import {}, sys; assert not {{'torch', 'numpy', 'scipy'}} & set(sys.modules), sorted(sys.modules)"
 
 
@@ -115,7 +117,8 @@ def imported(path: Path) -> list[Path]:
 
 def room(path: Path) -> str:
     inside = path.relative_to(ROOT).parent.as_posix()
-    return next((name for name in (*ROOMS, *BENCHMARKS) if inside == name or inside.startswith(f"{name}/")), inside)
+    rooms = [name for name in (*ROOMS, *BENCHMARKS) if inside == name or inside.startswith(f"{name}/")]
+    return max(rooms, key=len, default=inside)
 
 
 def test_every_file_has_a_room() -> None:
@@ -130,7 +133,8 @@ def test_rooms_import_from_rooms_before_them(name: str) -> None:
     allowed = set(ROOMS[: ROOMS.index(name) + 1])
     for path in files:
         for other in imported(path):
-            assert room(other) in allowed, f"{path.relative_to(ROOT)} imports {other.relative_to(ROOT)}"
+            if path != FACE:
+                assert room(other) in allowed, f"{path.relative_to(ROOT)} imports {other.relative_to(ROOT)}"
 
 
 @pytest.mark.parametrize("name", BENCHMARKS)
@@ -178,14 +182,16 @@ def test_neural_fields_is_light() -> None:
         for level, module, _ in imports(path):
             top = module.split(".")[0]
             if level == 0:
-                known = OUTSIDE | LATE | ({"triton"} if path.parent == ROOT / KERNELS else set())
+                known = (
+                    OUTSIDE | LATE | ({"triton"} if path.relative_to(ROOT).as_posix().startswith(KERNELS) else set())
+                )
                 assert top in known or top in sys.stdlib_module_names, f"{path} imports {top}"
         assert not LATE & {module for _, module, _ in imports(path, nested=False)}, (
             f"{path} imports one of {LATE} too early"
         )
 
 
-@pytest.mark.parametrize("module", ["mplicits", "mplicits.pipelines.cli", "mplicits.pipelines.run.settings"])
+@pytest.mark.parametrize("module", ["mplicits", "mplicits.pipelines.cli", "mplicits.pipelines.training.settings"])
 def test_help_and_settings_do_not_load_torch(module: str) -> None:
     subprocess.run([sys.executable, "-c", LIGHT.format(module)], check=True, cwd="/")
 

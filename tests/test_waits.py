@@ -33,7 +33,9 @@ def test_cones_are_looked_at_once_for_each_size_of_tiles() -> None:
             Sphere(radius=0.5).to(waits.DEVICE), origin.to(waits.DEVICE), directions.to(waits.DEVICE), tiles=(8, 4)
         )
     assert torch.equal(ahead.cpu(), near)
-    looks = sum(times for (_, where), times in ledger.waits.items() if where.startswith("neural_fields/cones.py"))
+    looks = sum(
+        times for (_, where), times in ledger.waits.items() if where.startswith("neural_fields/tracing/cones.py")
+    )
     assert looks == 2, ledger.report()
 
 

@@ -21,10 +21,10 @@ from mplicits.datasets.cameras import look_at
 from mplicits.datasets.synthetic.scenes import SCENES, render_scene
 from mplicits.datasets.views.writing import write_neus
 from mplicits.neural_fields import Field, MultiscaleSDF, Siren, fixed_shapes, sphere_trace
-from mplicits.neural_fields.sphere_start import solve_sphere
+from mplicits.neural_fields.networks.sphere_init import solve_sphere
 from mplicits.pipelines.cli.entry import main as command
 from mplicits.pipelines.render.trace import trace_view
-from mplicits.pipelines.run.trainer import Trainer
+from mplicits.pipelines.training.trainer import Trainer
 from torch import Tensor
 
 DEVICE = torch.device(standin.NAME)

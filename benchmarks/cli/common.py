@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mplicits.pipelines.cli.common import add_flags, positive, typed, whole, write_json
-from mplicits.pipelines.run.config import input_error
+from mplicits.pipelines.training.config import input_error
 
 if TYPE_CHECKING:
     from ..harness.benchmark import Benchmark
@@ -30,9 +30,9 @@ def run_benches(
         out: folder of the results; None keeps nothing.
         streams: cells at a time, see `run_streams`.
     """
-    from mplicits.pipelines.run.lock import locked
-    from mplicits.pipelines.run.progress import progress_bars
-    from mplicits.pipelines.run.trainer import Interrupted
+    from mplicits.pipelines.training.lock import locked
+    from mplicits.pipelines.training.progress import progress_bars
+    from mplicits.pipelines.training.trainer import Interrupted
 
     from ..harness.benchmark import write_results
     from ..harness.cells import Catalogue, make_folder

@@ -9,7 +9,7 @@ from pathlib import Path
 from types import MappingProxyType
 
 from mplicits.pipelines.cli.common import Command, add_flags, add_settings, positive, read_settings, whole
-from mplicits.pipelines.run.settings import FitConfig
+from mplicits.pipelines.training.settings import FitConfig
 
 from .common import folder_flag, measured_flags, number, run_benches
 
@@ -44,7 +44,7 @@ def _kernels_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _kernels(arguments: argparse.Namespace) -> int:
-    from mplicits.pipelines.run.machine import choose_device
+    from mplicits.pipelines.training.machine import choose_device
 
     device = str(choose_device("auto"))
     if device == "cpu":  # before anything imports Triton
@@ -111,7 +111,7 @@ def _render_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _render(arguments: argparse.Namespace) -> int:
     config = read_settings(arguments, FitConfig)
-    from mplicits.pipelines.run.machine import choose_device
+    from mplicits.pipelines.training.machine import choose_device
 
     from ..costs.render import RenderBench
 

@@ -9,8 +9,8 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, get_args, get_type_hints
 
 from mplicits.pipelines.cli.common import Command, add_flags, add_settings, positive, read_settings, whole
-from mplicits.pipelines.run.config import given_flags, input_error, load_config
-from mplicits.pipelines.run.settings import EvolveConfig, ReconstructConfig
+from mplicits.pipelines.training.config import given_flags, input_error, load_config
+from mplicits.pipelines.training.settings import EvolveConfig, ReconstructConfig
 
 from .common import folder_flag, measured_flags, number, run_benches
 
@@ -69,7 +69,7 @@ def _reconstruct(arguments: argparse.Namespace) -> int:
     config = read_settings(arguments, ReconstructConfig)
     if config.time_budget is not None:
         raise input_error("--time-budget: rows are compared after as many steps; leave it out, and give --steps")
-    from mplicits.pipelines.run.progress import counter_bar
+    from mplicits.pipelines.training.progress import counter_bar
 
     from ..scenes.reconstruct import ReconstructBench, read_scene
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import torch
 from mplicits.neural_fields import MultiscaleSDF, Siren
-from mplicits.neural_fields.kernels.rounding import gated_bound, rounding_bound
-from mplicits.pipelines.run.trainer import seeded
+from mplicits.neural_fields.backend.kernels.rounding import gated_bound, rounding_bound
+from mplicits.pipelines.training.trainer import seeded
 from torch import Tensor
 
 from ..harness.benchmark import Benchmark, Part, network_name

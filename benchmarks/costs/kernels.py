@@ -12,10 +12,10 @@ from dataclasses import dataclass
 
 import torch
 from mplicits.neural_fields import InputError, Siren
-from mplicits.neural_fields.kernels.packing import Shape
-from mplicits.neural_fields.kernels.rounding import rounding_bound
-from mplicits.neural_fields.kernels.switch import VARIABLE, choose
-from mplicits.pipelines.run.trainer import seeded
+from mplicits.neural_fields.backend.kernels.packing import Shape
+from mplicits.neural_fields.backend.kernels.rounding import rounding_bound
+from mplicits.neural_fields.backend.kernels.switch import VARIABLE, choose
+from mplicits.pipelines.training.trainer import seeded
 from torch import Tensor
 
 from ..harness.benchmark import Benchmark, Part, network_name

@@ -15,7 +15,7 @@ import torch
 from mplicits.datasets.cameras import look_at
 from mplicits.neural_fields import Field, Siren, load_field
 from mplicits.pipelines.render.trace import Seen, pixel_size, trace_view
-from mplicits.pipelines.run.trainer import seeded
+from mplicits.pipelines.training.trainer import seeded
 
 from ..harness.benchmark import Benchmark, Part
 from ..harness.cells import Workplace

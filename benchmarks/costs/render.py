@@ -12,10 +12,10 @@ import torch
 from mplicits.datasets import orbit, read_cloud
 from mplicits.datasets.cameras import Camera
 from mplicits.neural_fields import Field, Siren, levels_of
-from mplicits.neural_fields.tracing import BOUNDING_RADIUS
+from mplicits.neural_fields.tracing.sphere import BOUNDING_RADIUS
 from mplicits.pipelines.render.trace import Seen, trace_view
-from mplicits.pipelines.run.settings import FitConfig
-from mplicits.pipelines.run.trainer import parameter_count
+from mplicits.pipelines.training.settings import FitConfig
+from mplicits.pipelines.training.trainer import parameter_count
 from torch import Tensor
 
 from ..harness.benchmark import Benchmark, Part

@@ -20,11 +20,11 @@ from typing import Any
 import numpy as np
 import torch
 from mplicits.neural_fields import Field, InputError, Jet, MultiscaleSDF, Siren, levels_of, load_field
-from mplicits.neural_fields._parallel import one_thread, over_blocks, split_operations
-from mplicits.neural_fields.meshing import DEFAULT_BOUNDS, extract_mesh
-from mplicits.pipelines.run.folder import find_field
-from mplicits.pipelines.run.machine import best_seconds, peak_memory, sgemm_rate
-from mplicits.pipelines.run.trainer import seeded
+from mplicits.neural_fields.backend._parallel import one_thread, over_blocks, split_operations
+from mplicits.neural_fields.meshing.extract import DEFAULT_BOUNDS, extract_mesh
+from mplicits.pipelines.training.folder import find_field
+from mplicits.pipelines.training.machine import best_seconds, peak_memory, sgemm_rate
+from mplicits.pipelines.training.trainer import seeded
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from torch import Tensor

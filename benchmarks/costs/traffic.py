@@ -7,7 +7,8 @@ from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import torch
-from mplicits.neural_fields import _parallel, siren
+from mplicits.neural_fields.backend import _parallel
+from mplicits.neural_fields.networks import siren
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 

@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
 from mplicits.neural_fields import InputError
-from mplicits.neural_fields.files import write_json
-from mplicits.pipelines.run.config import closest
-from mplicits.pipelines.run.trainer import Progress, Report
+from mplicits.neural_fields.backend.files import write_json
+from mplicits.pipelines.training.config import closest
+from mplicits.pipelines.training.trainer import Progress, Report
 
 __all__ = [
     "Catalogue",

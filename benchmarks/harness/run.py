@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 import torch
-from mplicits.pipelines.run.jobs import Outcome, check_jobs, run_jobs, run_streams
-from mplicits.pipelines.run.machine import choose_device, environment
-from mplicits.pipelines.run.trainer import Interrupted, Report
+from mplicits.pipelines.training.jobs import Outcome, check_jobs, run_jobs, run_streams
+from mplicits.pipelines.training.machine import choose_device, environment
+from mplicits.pipelines.training.trainer import Interrupted, Report
 
 from .cells import Catalogue, Cell, Record, Workplace, read_record, write_record
 

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 from mplicits.datasets.cameras import Camera, orbit
 from mplicits.neural_fields import Field, Hits, InputError, SpaceTimeSDF, extract_mesh, load_field, sphere_trace
-from mplicits.neural_fields.dynamic_tracing import DynamicTracer, moment
-from mplicits.neural_fields.meshing import DEFAULT_BOUNDS
+from mplicits.neural_fields.meshing.extract import DEFAULT_BOUNDS
+from mplicits.neural_fields.spacetime.dynamic_tracing import DynamicTracer, moment
 from mplicits.pipelines.render.trace import RESOLUTION, TOLERANCE, pixel_size, trace_hits
-from mplicits.pipelines.run.folder import find_field
+from mplicits.pipelines.training.folder import find_field
 
 from ..costs.speed import counted, evaluate_slabs, peer_mesher
 from ..harness.benchmark import Benchmark, Part

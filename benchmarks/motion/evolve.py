@@ -28,10 +28,10 @@ from mplicits.neural_fields import (
 from mplicits.pipelines.evolve.checks import slope_figures
 from mplicits.pipelines.evolve.shapes import Placed, Placement
 from mplicits.pipelines.evolve.train import evolve
-from mplicits.pipelines.run.folder import find_field
-from mplicits.pipelines.run.settings import EvolveConfig, FitConfig
 from mplicits.pipelines.surface.measure import evaluate_surfaces
 from mplicits.pipelines.surface.surface import components, from_mesh, read_reference
+from mplicits.pipelines.training.folder import find_field
+from mplicits.pipelines.training.settings import EvolveConfig, FitConfig
 from torch import Tensor
 
 from ..harness.benchmark import Benchmark, Part

@@ -16,7 +16,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
-from mplicits.datasets.clouds.ply import write_cloud_ply
+from mplicits.datasets.clouds.readers.ply import write_cloud_ply
 from mplicits.datasets.synthetic.scanner import simulate_scan
 from mplicits.neural_fields import (
     Field,
@@ -31,15 +31,15 @@ from mplicits.neural_fields import (
     project_to_surface,
     trajectories,
 )
-from mplicits.neural_fields.carried import CarriedVelocity
-from mplicits.neural_fields.evolution import VectorField
+from mplicits.neural_fields.spacetime.evolution import VectorField
+from mplicits.neural_fields.spacetime.surface_velocity import CarriedVelocity
 from mplicits.pipelines.evolve.checks import volume
 from mplicits.pipelines.evolve.problem import build_problem
 from mplicits.pipelines.evolve.shapes import StaticShape, aligned, into_unit_sphere, read_shape
 from mplicits.pipelines.evolve.train import train_evolution
-from mplicits.pipelines.run.settings import EvolveConfig, FitConfig
 from mplicits.pipelines.surface.distance import MeshDistance
 from mplicits.pipelines.surface.surface import Surface, components, face_normals, from_mesh, sample_points
+from mplicits.pipelines.training.settings import EvolveConfig, FitConfig
 from numpy.typing import NDArray
 from torch import Tensor
 

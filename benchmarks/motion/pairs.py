@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from mplicits.datasets.cameras import Camera
 from mplicits.neural_fields import Field, InputError, TimeSlice
-from mplicits.neural_fields.evolution import VectorField
+from mplicits.neural_fields.spacetime.evolution import VectorField
 from mplicits.pipelines.evolve.checks import volume
 from mplicits.pipelines.evolve.problem import build_problem
 from mplicits.pipelines.evolve.shapes import read_shape
@@ -28,9 +28,9 @@ from mplicits.pipelines.evolve.train import train_evolution
 from mplicits.pipelines.render.picture import contact_sheet, in_rows, write_picture
 from mplicits.pipelines.render.rasterise import mesh_view, picture_of
 from mplicits.pipelines.render.subject import Orbit, orbit_cameras
-from mplicits.pipelines.run.settings import EvolveConfig, FitConfig
 from mplicits.pipelines.surface.surface import Surface, face_normals, read_reference
 from mplicits.pipelines.texture.riding import Colors, RidingColors
+from mplicits.pipelines.training.settings import EvolveConfig, FitConfig
 from numpy.typing import NDArray
 from torch import Tensor
 

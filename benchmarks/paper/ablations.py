@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from mplicits.neural_fields import MultiscaleSDF, Similarity
 from mplicits.pipelines.fit.cloud import CloudDistance
 from mplicits.pipelines.fit.samples import Weights, banded_sources
-from mplicits.pipelines.run.settings import FitConfig
-from mplicits.pipelines.run.trainer import Report
 from mplicits.pipelines.surface.distance import Float64, MeshDistance, approximation_error, near_surface
+from mplicits.pipelines.training.settings import FitConfig
+from mplicits.pipelines.training.trainer import Report
 
 from ..harness.cells import Findings, Method, Record, Workplace
 from ..harness.plots import Plot, Series

@@ -20,9 +20,9 @@ from mplicits.pipelines.fit.cloud import CloudDistance
 from mplicits.pipelines.fit.level import LevelObjective, new_level
 from mplicits.pipelines.fit.samples import Source, Weights, distance_samples, surface_samples, with_previous
 from mplicits.pipelines.fit.train import prepare, review_points
-from mplicits.pipelines.run.folder import find_field
-from mplicits.pipelines.run.settings import FitConfig
-from mplicits.pipelines.run.trainer import Report, Trainer
+from mplicits.pipelines.training.folder import find_field
+from mplicits.pipelines.training.settings import FitConfig
+from mplicits.pipelines.training.trainer import Report, Trainer
 
 from ..harness.cells import Workplace
 from .cells import PaperCell

@@ -10,9 +10,9 @@ from typing import Literal
 import torch
 from mplicits.datasets import OrientedCloud
 from mplicits.neural_fields import Field
-from mplicits.neural_fields.losses import data_loss, eikonal_loss
+from mplicits.neural_fields.fields.losses import data_loss, eikonal_loss
 from mplicits.pipelines.fit.samples import DOMAIN
-from mplicits.pipelines.run.trainer import Report, parameter_count, seeded
+from mplicits.pipelines.training.trainer import Report, parameter_count, seeded
 from torch import Tensor
 
 from ..peers import BandLimited, BanfSDF, HashGridSDF

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 from mplicits.neural_fields import Field, Jet, MultiscaleSDF, NoSurfaceError, extract_mesh
-from mplicits.neural_fields.multiscale import Parts, walk_levels
+from mplicits.neural_fields.networks.multiscale import Parts, walk_levels
 from mplicits.pipelines.fit.samples import banded_sources
-from mplicits.pipelines.run.trainer import Report, parameter_count
+from mplicits.pipelines.training.trainer import Report, parameter_count
 from torch import Tensor, nn
 
 from ..harness.cells import Findings, Method, Record, Workplace

@@ -14,15 +14,15 @@ import numpy as np
 import torch
 from mplicits.datasets import OrientedCloud, PointCloud, add_noise, add_outliers, orbit, prepare_cloud, read_cloud
 from mplicits.neural_fields import Field, InputError, Similarity, sphere_trace
-from mplicits.neural_fields.meshing import Mesh, NoSurfaceError, extract_mesh
+from mplicits.neural_fields.meshing.extract import Mesh, NoSurfaceError, extract_mesh
 from mplicits.pipelines.mesh.files import write_mesh
 from mplicits.pipelines.render.picture import write_picture
 from mplicits.pipelines.render.rasterise import picture_of
-from mplicits.pipelines.run.config import load_config
-from mplicits.pipelines.run.settings import FitConfig
 from mplicits.pipelines.surface.measure import evaluate_surfaces
 from mplicits.pipelines.surface.surface import Surface, from_mesh, read_reference
 from mplicits.pipelines.surface.trim import Support, drop_unsupported
+from mplicits.pipelines.training.config import load_config
+from mplicits.pipelines.training.settings import FitConfig
 
 from ..harness.cells import Workplace
 from .cells import PaperCell, Preset

@@ -9,7 +9,7 @@ import torch
 from mplicits.datasets import OrientedCloud
 from mplicits.neural_fields import Siren
 from mplicits.pipelines.fit.cloud import CloudDistance
-from mplicits.pipelines.run.trainer import Report, parameter_count, seeded
+from mplicits.pipelines.training.trainer import Report, parameter_count, seeded
 from torch import Tensor, nn
 
 from ..peers import BaconSDF, IdfSDF

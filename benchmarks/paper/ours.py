@@ -10,10 +10,10 @@ from itertools import accumulate
 from typing import Any
 
 import numpy as np
-from mplicits.neural_fields.meshing import Mesh
-from mplicits.pipelines.run.folder import FIELD_FILE
-from mplicits.pipelines.run.settings import FitConfig
+from mplicits.neural_fields.meshing.extract import Mesh
 from mplicits.pipelines.surface.trim import read_support
+from mplicits.pipelines.training.folder import FIELD_FILE
+from mplicits.pipelines.training.settings import FitConfig
 
 from ..harness.cells import Findings, Method, Workplace
 from ..shapes.fits import has_poisson, kept_fit, screened_poisson

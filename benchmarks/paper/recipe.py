@@ -13,7 +13,7 @@ from mplicits.datasets import OrientedCloud
 from mplicits.neural_fields import Field
 from mplicits.pipelines.fit.cloud import CloudDistance
 from mplicits.pipelines.fit.samples import DOMAIN
-from mplicits.pipelines.run.trainer import Group, Objective, Report, Trainer
+from mplicits.pipelines.training.trainer import Group, Objective, Report, Trainer
 from torch import Tensor, nn
 
 from .cells import Preset

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 from mplicits.neural_fields import Field, Siren, extract_mesh
-from mplicits.pipelines.run.trainer import seeded
+from mplicits.pipelines.training.trainer import seeded
 
 from ..costs.speed import NormalsBench
 from ..harness.cells import Findings, Method, Record, Workplace

@@ -19,8 +19,8 @@ import math
 from collections.abc import Sequence
 
 import torch
-from mplicits.neural_fields._checks import at_least, positive
-from mplicits.neural_fields.field import Field, Jet
+from mplicits.neural_fields.backend._checks import at_least, positive
+from mplicits.neural_fields.fields.field import Field, Jet
 from torch import Tensor, nn
 
 __all__ = ["BaconSDF"]

@@ -10,9 +10,9 @@ import itertools
 from collections.abc import Iterator, Sequence
 
 import torch
-from mplicits.neural_fields._checks import at_least, positive
-from mplicits.neural_fields.field import Field, Jet, OneLevelField
-from mplicits.neural_fields.trilinear import Place, interpolate, interpolate_jet, locate, vertices
+from mplicits.neural_fields.backend._checks import at_least, positive
+from mplicits.neural_fields.fields.field import Field, Jet, OneLevelField
+from mplicits.neural_fields.networks.trilinear import Place, interpolate, interpolate_jet, locate, vertices
 from torch import Tensor, nn
 
 __all__ = ["BandLimited", "BanfSDF"]

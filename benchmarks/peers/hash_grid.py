@@ -9,10 +9,10 @@ from __future__ import annotations
 from itertools import pairwise
 
 import torch
-from mplicits.neural_fields._checks import at_least, positive
-from mplicits.neural_fields.field import Jet, OneLevelField
-from mplicits.neural_fields.hash_encoding import INITIAL, check_table, grid_resolutions, spatial_hash
-from mplicits.neural_fields.trilinear import Place, interpolate, interpolate_jet, locate, vertices
+from mplicits.neural_fields.backend._checks import at_least, positive
+from mplicits.neural_fields.fields.field import Jet, OneLevelField
+from mplicits.neural_fields.networks.hash_encoding import INITIAL, check_table, grid_resolutions, spatial_hash
+from mplicits.neural_fields.networks.trilinear import Place, interpolate, interpolate_jet, locate, vertices
 from torch import Tensor, nn
 
 __all__ = ["HashGridSDF"]

@@ -15,9 +15,9 @@ from __future__ import annotations
 import math
 
 import torch
-from mplicits.neural_fields._checks import positive
-from mplicits.neural_fields.field import Field, Jet
-from mplicits.neural_fields.siren import Siren
+from mplicits.neural_fields.backend._checks import positive
+from mplicits.neural_fields.fields.field import Field, Jet
+from mplicits.neural_fields.networks.siren import Siren
 from torch import Tensor
 
 __all__ = ["IdfSDF", "attenuation"]

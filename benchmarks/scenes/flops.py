@@ -24,13 +24,13 @@ from typing import Any
 
 import torch
 from mplicits.neural_fields import Field, Jet, levels_of
-from mplicits.neural_fields.radiance import Outside, ViewColor
-from mplicits.pipelines.reconstruct.model import RayPool, SceneModel
-from mplicits.pipelines.reconstruct.objective import SceneObjective
-from mplicits.pipelines.reconstruct.replayed import ReplayedTrainer, scene_trainer
-from mplicits.pipelines.run.replay import Recorder, Results, Work
-from mplicits.pipelines.run.settings import ReconstructConfig
-from mplicits.pipelines.run.trainer import Progress, StopFlag, Trainer
+from mplicits.neural_fields.networks.radiance import Outside, ViewColor
+from mplicits.pipelines.reconstruct.model.model import RayPool, SceneModel
+from mplicits.pipelines.reconstruct.model.objective import SceneObjective
+from mplicits.pipelines.reconstruct.model.replayed import ReplayedTrainer, scene_trainer
+from mplicits.pipelines.training.replay import Recorder, Results, Work
+from mplicits.pipelines.training.settings import ReconstructConfig
+from mplicits.pipelines.training.trainer import Progress, StopFlag, Trainer
 from torch import Tensor, nn
 from torch.utils.flop_counter import FlopCounterMode
 

@@ -9,10 +9,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from mplicits.neural_fields.neus_mlp import NeusSDF
-from mplicits.pipelines.reconstruct.model import SceneModel, build_scene
-from mplicits.pipelines.run.settings import ReconstructConfig
-from mplicits.pipelines.run.trainer import seeded
+from mplicits.neural_fields.networks.neus_mlp import NeusSDF
+from mplicits.pipelines.reconstruct.model.model import SceneModel, build_scene
+from mplicits.pipelines.training.settings import ReconstructConfig
+from mplicits.pipelines.training.trainer import seeded
 from scipy.special import stdtrit
 
 from ..harness.benchmark import Benchmark, Part, one_of_each, plain

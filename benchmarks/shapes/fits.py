@@ -21,15 +21,11 @@ import torch
 from mplicits.datasets import Camera, OrientedCloud, PointCloud, add_isotropic_noise, add_noise, orbit, read_cloud
 from mplicits.datasets.synthetic.statue import Statue
 from mplicits.neural_fields import InputError, MultiscaleSDF, Similarity, load_field
-from mplicits.neural_fields.meshing import Mesh, NoSurfaceError, extract_mesh
+from mplicits.neural_fields.meshing.extract import Mesh, NoSurfaceError, extract_mesh
 from mplicits.pipelines.fit.cloud import load_cloud
 from mplicits.pipelines.fit.train import Run, fit, prepare
 from mplicits.pipelines.render.picture import contact_sheet, write_picture
 from mplicits.pipelines.render.rasterise import picture_of
-from mplicits.pipelines.run.folder import STATE_FILE, find_field, is_fitted, read_record
-from mplicits.pipelines.run.machine import peak_memory
-from mplicits.pipelines.run.settings import FitConfig
-from mplicits.pipelines.run.trainer import Report
 from mplicits.pipelines.surface.measure import Metrics, evaluate_surfaces
 from mplicits.pipelines.surface.surface import (
     Surface,
@@ -41,6 +37,10 @@ from mplicits.pipelines.surface.surface import (
     sample_points,
 )
 from mplicits.pipelines.surface.trim import drop_unsupported, read_support
+from mplicits.pipelines.training.folder import STATE_FILE, find_field, is_fitted, read_record
+from mplicits.pipelines.training.machine import peak_memory
+from mplicits.pipelines.training.settings import FitConfig
+from mplicits.pipelines.training.trainer import Report
 
 from ..harness.benchmark import Benchmark, Part, plain
 from ..harness.cells import Workplace, key_of

@@ -13,15 +13,15 @@ from typing import Any
 import torch
 from mplicits.datasets import Camera, turntable
 from mplicits.neural_fields import Field, InputError, levels_of, load_field
-from mplicits.neural_fields.meshing import NoSurfaceError, extract_mesh, map_normals
+from mplicits.neural_fields.meshing.extract import NoSurfaceError, extract_mesh, map_normals
 from mplicits.pipelines.render.picture import check_picture_path, contact_sheet, write_picture
 from mplicits.pipelines.render.rasterise import mesh_view
 from mplicits.pipelines.render.shade import ShadeOptions, compose, shade
 from mplicits.pipelines.render.trace import Seen, trace_view
-from mplicits.pipelines.run.folder import find_field
-from mplicits.pipelines.run.machine import choose_device
-from mplicits.pipelines.run.trainer import parameter_count
 from mplicits.pipelines.surface.surface import Surface, from_mesh, read_reference
+from mplicits.pipelines.training.folder import find_field
+from mplicits.pipelines.training.machine import choose_device
+from mplicits.pipelines.training.trainer import parameter_count
 from torch import Tensor
 
 from ..harness.benchmark import Benchmark, Part

@@ -20,9 +20,9 @@ import numpy as np
 from mplicits.datasets import PointCloud, read_cloud
 from mplicits.neural_fields import Field, InputError, Similarity
 from mplicits.pipelines.fit.train import prepare
-from mplicits.pipelines.run.settings import FitConfig
 from mplicits.pipelines.surface.distance import MeshDistance, approximation_error, near_surface
 from mplicits.pipelines.surface.surface import Surface, components, from_mesh, is_closed, read_surface, sample_points
+from mplicits.pipelines.training.settings import FitConfig
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 

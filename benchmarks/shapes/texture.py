@@ -13,15 +13,15 @@ import numpy as np
 import torch
 from mplicits.datasets import Camera, TexturedMesh, read_textured, sample_textured, turntable
 from mplicits.neural_fields import Field, InputError, Similarity, TextureField, load_field, load_texture, map_colors
-from mplicits.neural_fields.meshing import NoSurfaceError, extract_mesh
+from mplicits.neural_fields.meshing.extract import NoSurfaceError, extract_mesh
 from mplicits.pipelines.render.picture import Image, as_bytes, contact_sheet, write_picture
 from mplicits.pipelines.render.rasterise import mesh_view
 from mplicits.pipelines.render.trace import trace_view
-from mplicits.pipelines.run.folder import TEXTURE_FILE, digest_of, find_field, read_record
-from mplicits.pipelines.run.machine import choose_device
-from mplicits.pipelines.run.settings import FitConfig, TextureConfig
 from mplicits.pipelines.surface.surface import Surface, from_mesh
 from mplicits.pipelines.texture.train import texture_run
+from mplicits.pipelines.training.folder import TEXTURE_FILE, digest_of, find_field, read_record
+from mplicits.pipelines.training.machine import choose_device
+from mplicits.pipelines.training.settings import FitConfig, TextureConfig
 
 from ..harness.benchmark import Benchmark, Part, network_name, one_of_each
 from ..harness.cells import Workplace

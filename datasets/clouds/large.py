@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from .point_cloud import PointCloud, begins, colors_from, normals_from, unit_rows, usable_rows
-from .stream import CloudStream
+from .readers.stream import CloudStream
 
 __all__ = ["Merging", "merge_cloud"]
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ...neural_fields import InputError
 from ..clouds.point_cloud import PointCloud, colors_from, select, spread, thin
-from ..clouds.reading import MIN_POINTS
+from ..clouds.readers.reading import MIN_POINTS
 from .cleaning import edge_pixels, grid_normals, measure_noise, smooth_depth, specks
 from .frame import RgbdFrame
 

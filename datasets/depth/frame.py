@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ...neural_fields import InputError
 from ..cameras import Camera
 from ..files import readable, reader
-from ..views.reading import read_cameras
+from ..views.formats.reading import read_cameras
 from .camera import DepthCamera
 from .images import fit_color, read_color, read_depth
 

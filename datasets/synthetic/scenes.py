@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ...neural_fields import Box, Capsule, Field, Similarity, Sphere, Torus, Union, sphere_trace
-from ...neural_fields.meshing import Mesh, extract_mesh
+from ...neural_fields.meshing.extract import Mesh, extract_mesh
 from ..cameras import Camera
 from ..clouds.point_cloud import PointCloud
 from ..color_space import srgb_to_linear
-from ..views.depth_maps import DepthMap
+from ..views.formats.depth_maps import DepthMap
 from ..views.images import PosedImage, PosedImages
 from .samples import sample_surface
 from .statue import Statue

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from ..cameras import UP_AXES, Camera, look_at
-from ..clouds.orientation import fibonacci_directions
+from ..clouds.cleaning.orientation import fibonacci_directions
 from ..color_space import linear_to_srgb
 
 __all__ = ["cameras_around", "developed", "lit"]

@@ -10,7 +10,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from ..color_space import linear_to_srgb, srgb_to_linear
-from ..views.depth_maps import DepthMap
+from ..views.formats.depth_maps import DepthMap
 from ..views.images import PosedImage, PosedImages
 
 __all__ = ["VIEW_FAULTS", "with_fault"]

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ...neural_fields import InputError
-from ...neural_fields.glb import GENERATOR
+from ...neural_fields.meshing.glb import GENERATOR
 from ..color_space import linear_to_srgb, srgb_to_linear
 from .mesh import Paint, TexturedMesh, Wrap, decode_texture, pack
 

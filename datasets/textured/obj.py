@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...neural_fields import InputError
-from ..clouds.meshes import ObjText, triangulate
-from ..clouds.tables import is_number
+from ..clouds.readers.meshes import ObjText, triangulate
+from ..clouds.readers.tables import is_number
 from .mesh import Paint, TexturedMesh, Wrap, decode_texture, pack
 
 __all__ = ["read_textured_obj"]

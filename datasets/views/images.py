@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from ...neural_fields import InputError, Similarity
 from ..cameras import Camera
 from ..files import readable
-from .colmap import read_colmap_points
-from .depth_maps import DepthMap, DepthSource, find_depth_maps, read_depth_map
-from .neus import read_neus_sphere
+from .formats.colmap import read_colmap_points
+from .formats.depth_maps import DepthMap, DepthSource, find_depth_maps, read_depth_map
+from .formats.neus import read_neus_sphere
+from .formats.reading import find_source, read_shots
+from .formats.shots import Shot
 from .pictures import read_mask, read_picture, resample, shrink, undistort, undistorted_camera
-from .reading import find_source, read_shots
 from .region import region_from_cameras, region_from_masks, region_from_points
-from .shots import Shot
 
 __all__ = ["PosedImage", "PosedImages", "read_posed_images"]
 
@@ -99,7 +99,7 @@ def read_posed_images(
         >>> read_posed_images("photos")
         Traceback (most recent call last):
         ...
-        mplicits.neural_fields.errors.InputError: photos: no such file; check the path
+        mplicits.neural_fields.backend.errors.InputError: photos: no such file; check the path
     """
     if width is not None and width < 1:
         raise ValueError(f"width={width}: expected at least one pixel")

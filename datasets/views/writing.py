@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ...neural_fields import InputError
-from ...neural_fields.files import check_place
+from ...neural_fields.backend.files import check_place
 from ..cameras import Camera
 from .images import PosedImage, PosedImages
 

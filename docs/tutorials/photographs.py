@@ -14,7 +14,7 @@ from mplicits.datasets import SCENES, render_scene
 from mplicits.pipelines.mesh.extract import MeshOptions, mesh_run
 from mplicits.pipelines.reconstruct import reconstruct
 from mplicits.pipelines.render.draw import RenderOptions, render_run
-from mplicits.pipelines.run.settings import ReconstructConfig
+from mplicits.pipelines.training.settings import ReconstructConfig
 
 small = "--small" in sys.argv
 folders = [word for word in sys.argv[1:] if not word.startswith("--")]

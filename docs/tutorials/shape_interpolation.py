@@ -13,7 +13,7 @@ import sys
 import mplicits
 from mplicits.pipelines.evolve import evolve
 from mplicits.pipelines.evolve.animate import SequenceOptions, animate_run
-from mplicits.pipelines.run.settings import EvolveConfig
+from mplicits.pipelines.training.settings import EvolveConfig
 
 small = "--small" in sys.argv
 shapes = ("sphere:0.5", "torus:0.5,0.2")  # or two run directories: ("runs/cat", "runs/dog")

@@ -12,8 +12,8 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from ..run.config import input_error
-from ..run.settings import FitConfig
+from ..training.config import input_error
+from ..training.settings import FitConfig
 from .common import Command, add_flags, add_settings, between, check_output, read_settings
 from .draw import ANIMATE, RENDER, SLICE, VIEW
 from .fit import FIT
@@ -77,7 +77,7 @@ def _sample(arguments: argparse.Namespace) -> int:
         return _solid(arguments)
     options = _faults(arguments) if given else {}
     from ...datasets import statue_scan, write_cloud_ply
-    from ..run.progress import counter_bar
+    from ..training.progress import counter_bar
 
     with counter_bar("scan") as progress:
         cloud = statue_scan(seed=arguments.seed, progress=progress, **options)

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from ..run.config import add_config_flags, given_flags, input_error, load_config, preset_names, thing_of
+from ..training.config import add_config_flags, given_flags, input_error, load_config, preset_names, thing_of
 
 if TYPE_CHECKING:
-    from ..run.report import Progress, Report
+    from ..training.report import Progress, Report
 
 __all__ = [
     "Command",
@@ -78,7 +78,7 @@ def stoppable(kept: str = "", *, at_any_time: bool = False) -> Iterator[None]:
     Raises:
         Stopped: it was interrupted.
     """
-    from ..run.trainer import Interrupted
+    from ..training.trainer import Interrupted
 
     try:
         yield
@@ -100,7 +100,7 @@ def training(
         at_any_time: see `stoppable`.
         heard: others that are told of all progress.
     """
-    from ..run.progress import progress_bars
+    from ..training.progress import progress_bars
 
     with stoppable(kept, at_any_time=at_any_time), nullcontext() if quiet else progress_bars() as bars:
         if not heard:
@@ -131,7 +131,7 @@ def tensorboard(directory: Path | None) -> Iterator[list[Report]]:
     if directory is None:
         yield []
         return
-    from ..run.tensorboard import tensorboard_log
+    from ..training.tensorboard import tensorboard_log
 
     with tensorboard_log(directory) as log:
         yield [log]
@@ -271,7 +271,7 @@ def check_output(path: Path | None, suffixes: Sequence[str]) -> None:
         raise input_error(f"{path}: unknown extension {path.suffix!r}; known: {', '.join(suffixes)}")
     if path.is_dir():
         raise input_error(f"{path}: is a directory; name a file")
-    from ...neural_fields.files import check_place
+    from ...neural_fields.backend.files import check_place
 
     check_place(path)
 
@@ -286,6 +286,6 @@ def write_json(path: Path | None, data: Any) -> None:
     """Write figures through a temporary file beside the target; nothing without a path."""
     if path is None:
         return
-    from ...neural_fields import files
+    from ...neural_fields.backend import files
 
     files.write_json(path, data)

@@ -25,19 +25,19 @@ from ...datasets import (
 )
 from ...datasets.synthetic.samples import feet_and_normals
 from ...neural_fields import Field, InputError, Placement, Similarity
-from ...neural_fields.files import check_place
-from ...neural_fields.meshing import Mesh, NoSurfaceError, extract_mesh
+from ...neural_fields.backend.files import check_place
+from ...neural_fields.meshing.extract import Mesh, NoSurfaceError, extract_mesh
 from ..fit.train import Run, fit
 from ..mesh.files import write_mesh
 from ..render.picture import Image, contact_sheet, write_picture
 from ..render.rasterise import picture_of
 from ..render.shade import ShadeOptions, compose, shade
 from ..render.trace import trace_view
-from ..run.machine import format_table
-from ..run.progress import progress_bars
-from ..run.report import Progress, Report, reported
-from ..run.settings import FitConfig
 from ..surface.surface import from_cloud, from_mesh
+from ..training.machine import format_table
+from ..training.progress import progress_bars
+from ..training.report import Progress, Report, reported
+from ..training.settings import FitConfig
 from .common import tell_budget
 
 __all__ = ["demo", "distances_to_surface", "draw_levels", "spread_colors"]

@@ -11,8 +11,8 @@ from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
-from ..run.config import add_config_flags, given_flags, input_error, load_config
-from ..run.settings import SHADINGS, ShadeOptions
+from ..training.config import add_config_flags, given_flags, input_error, load_config
+from ..training.settings import SHADINGS, ShadeOptions
 from .common import Command, add_flags, between, check_output, finite, whole
 
 __all__ = ["ANIMATE", "RENDER", "SLICE", "VIEW"]
@@ -29,7 +29,7 @@ OWNED = {"limits": MEASURED, "matcap": ("matcap",), "reference": ("error",)}
 
 def _draw(out: Path, title: str | None, work: Callable[[Callable[[int, int], None] | None], str]) -> int:
     """Do the work, which says what it has drawn, and say that; with a progress bar if it has a title."""
-    from ..run.progress import counter_bar
+    from ..training.progress import counter_bar
 
     started = time.monotonic()
     with nullcontext() if title is None else counter_bar(title) as progress:
@@ -324,7 +324,7 @@ def _view(arguments: argparse.Namespace) -> int:
         for name in ("cloud", "time"):
             if getattr(arguments, name) is not None:
                 raise input_error(f"--{name}: does not go with --landmarks; leave one of the two out")
-        from ...neural_fields.files import check_place
+        from ...neural_fields.backend.files import check_place
 
         check_place(arguments.landmarks)
         stream = True
@@ -365,7 +365,7 @@ def _served(arguments: argparse.Namespace) -> Iterator[str]:
 @contextmanager
 def _streamed(arguments: argparse.Namespace) -> Iterator[str]:
     """The viewer that traces on this machine, and where it is."""
-    from ..run.machine import choose_device
+    from ..training.machine import choose_device
     from ..viewer.picks import open_picks
     from ..viewer.server import Viewer, open_run, show_field
 

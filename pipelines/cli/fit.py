@@ -10,8 +10,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..run.config import given_flags, input_error
-from ..run.settings import FitConfig
+from ..training.config import given_flags, input_error
+from ..training.settings import FitConfig
 from .common import (
     Command,
     add_new_run,
@@ -82,7 +82,7 @@ def _fit(arguments: argparse.Namespace) -> int:
     config = None if arguments.resume else read_settings(arguments, FitConfig)
     if len(arguments.clouds) > 1 or arguments.jobs is not None:
         return _fit_many(arguments, config)
-    from ..run.team import team
+    from ..training.team import team
 
     with team(device="auto" if config is None else config.device) as leads:
         work = _fit_one if leads else _follow
@@ -92,8 +92,8 @@ def _fit(arguments: argparse.Namespace) -> int:
 def _fit_one(arguments: argparse.Namespace, cloud: str, config: FitConfig | None) -> int:
     from ..fit.depth import fit_depth, trim_suggestion
     from ..fit.train import fit
-    from ..run.folder import TEXTURE_FILE, check_new_run, is_fitted, read_record
-    from ..run.machine import peak_memory
+    from ..training.folder import TEXTURE_FILE, check_new_run, is_fitted, read_record
+    from ..training.machine import peak_memory
     from .info import describe
 
     directory, depth = arguments.out, _depth_input(arguments, cloud)
@@ -161,7 +161,7 @@ def _planned(arguments: argparse.Namespace, source: Path | DepthInput) -> FitMes
 def _follow(arguments: argparse.Namespace, cloud: str, config: FitConfig | None) -> int:
     """Help the process that does the rest, and speaks for all; see `team`."""
     from ..fit.train import fit
-    from ..run.trainer import Interrupted
+    from ..training.trainer import Interrupted
 
     if _depth_input(arguments, cloud) is not None:
         raise input_error(f"{cloud}: depth maps are fitted by one process; leave out torchrun")
@@ -184,7 +184,7 @@ def _fit_many(arguments: argparse.Namespace, config: FitConfig | None) -> int:
         if _depth_input(arguments, cloud) is not None:
             raise input_error(f"{cloud}: holds depth maps; fit them on their own, without --jobs")
     from ..fit.many import fit_many, format_fits, plan_fits
-    from ..run.jobs import check_jobs
+    from ..training.jobs import check_jobs
 
     jobs = arguments.jobs or 1
     check_jobs(jobs)

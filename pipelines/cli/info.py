@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from ...neural_fields import Siren, levels_of, load_field
-from ..run.folder import RECORD_FILE, find_field, is_field, read_record, resumes_with
-from ..run.trainer import parameter_count
 from ..surface.surface import Surface, components, is_closed, read_surface
+from ..training.folder import RECORD_FILE, find_field, is_field, read_record, resumes_with
+from ..training.trainer import parameter_count
 
 __all__ = ["describe"]
 

@@ -7,7 +7,7 @@ import dataclasses
 import functools
 import time
 
-from ..run.config import given_flags
+from ..training.config import given_flags
 from .common import Command, add_flags, positive, whole, write_json
 
 __all__ = ["EVALUATE", "MESH"]
@@ -94,9 +94,9 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     if arguments.photos is None:
         metrics = evaluate_files(arguments.mesh, arguments.reference, **options)
     else:
-        from ...datasets.views.reading import read_cameras
-        from ..reconstruct.witnesses import count_witnesses
-        from ..run.progress import counter_bar
+        from ...datasets.views.formats.reading import read_cameras
+        from ..reconstruct.data.witnesses import count_witnesses
+        from ..training.progress import counter_bar
 
         cameras = [camera for _, camera in read_cameras(arguments.photos)]
         with counter_bar("photographs") as progress:

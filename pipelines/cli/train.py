@@ -7,8 +7,8 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..run.config import given_flags, input_error, load_config
-from ..run.settings import EvolveConfig, FitConfig, ReconstructConfig, TextureConfig
+from ..training.config import given_flags, input_error, load_config
+from ..training.settings import EvolveConfig, FitConfig, ReconstructConfig, TextureConfig
 from .common import (
     Command,
     Stopped,
@@ -49,8 +49,8 @@ def _texture(arguments: argparse.Namespace) -> int:
         raise input_error("--resume: continues with its own settings; leave out --preset, --level and the rest")
     config = read_settings(arguments, TextureConfig)
     check_output(arguments.out, (".safetensors",))
-    from ..run.folder import TEXTURE_FILE, find_field
     from ..texture.train import texture_run
+    from ..training.folder import TEXTURE_FILE, find_field
 
     field = find_field(arguments.run)
     target = arguments.out or field.with_name(TEXTURE_FILE)
@@ -74,7 +74,7 @@ def _texture(arguments: argparse.Namespace) -> int:
 
 def _check_state(target: Path, *, resume: bool, force: bool) -> None:
     """Refuse what would lose a texture or a training, or resume where there is nothing to resume."""
-    from ..run.folder import texture_state_file
+    from ..training.folder import texture_state_file
 
     state = texture_state_file(target)
     if resume and not state.is_file():
@@ -142,7 +142,7 @@ def _reconstruct(arguments: argparse.Namespace) -> int:
     if arguments.resume and were_given(arguments, ReconstructConfig):
         raise input_error("--resume: continues with the run's own settings; leave out --preset, --config and the rest")
     config = None if arguments.resume else read_settings(arguments, ReconstructConfig)
-    from ..run.team import is_alone, team
+    from ..training.team import is_alone, team
 
     with team(device="auto" if config is None else config.device) as leads:
         if arguments.poses == "colmap" and not is_alone():
@@ -153,7 +153,7 @@ def _reconstruct(arguments: argparse.Namespace) -> int:
 def _help_reconstruct(arguments: argparse.Namespace, config: ReconstructConfig | None) -> int:
     """Help the process that does the rest, and speaks for all; see `team`."""
     from ..reconstruct.train import reconstruct
-    from ..run.trainer import Interrupted
+    from ..training.trainer import Interrupted
 
     try:
         reconstruct(arguments.data, config, out=arguments.out, resume=arguments.resume)
@@ -164,12 +164,12 @@ def _help_reconstruct(arguments: argparse.Namespace, config: ReconstructConfig |
 
 def _reconstruct_here(arguments: argparse.Namespace, config: ReconstructConfig | None) -> int:
     """Train, measure and mesh."""
-    from ...datasets.views.find_cameras import find_cameras
+    from ...datasets.views.poses.find_cameras import find_cameras
     from ..mesh.extract import mesh_run
     from ..reconstruct.posing import colmap_report
     from ..reconstruct.train import HELD_OUT_FILE, MESH_FILE, reconstruct
-    from ..run.folder import check_new_run
-    from ..run.report import reported
+    from ..training.folder import check_new_run
+    from ..training.report import reported
 
     directory = check_new_run(arguments.out, resume=arguments.resume, force=arguments.force)
     data = arguments.data
@@ -207,7 +207,7 @@ def _reconstruct_here(arguments: argparse.Namespace, config: ReconstructConfig |
 
 def _tell_left_out(record: dict[str, Any]) -> None:
     """Warn, on stderr, of photographs, and parts of them, that were not trained on."""
-    from ..reconstruct.silhouettes import named
+    from ..reconstruct.data.silhouettes import named
 
     odd, torn = record.get("left_out", []), record.get("mask_holes", {})
     trained = record["views"]["trained"]
@@ -252,7 +252,7 @@ def _evolve(arguments: argparse.Namespace) -> int:
     config, fits = _evolve_settings(arguments), load_config(FitConfig, arguments.fits)
     from ..evolve.scans import fits_beside, fitted_scans, scans_among
     from ..evolve.train import evolve
-    from ..run.folder import check_new_run
+    from ..training.folder import check_new_run
 
     directory = check_new_run(arguments.out, resume=arguments.resume, force=arguments.force)
     scans = {} if arguments.resume else scans_among(config.shapes)

@@ -8,14 +8,14 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, get_args, get_type_hints
 
-from ..run.config import input_error
-from ..run.settings import ReconstructConfig
+from ..training.config import input_error
+from ..training.settings import ReconstructConfig
 from .common import Command, add_flags, check_output, positive, training, whole, write_json
 
 __all__ = ["CHECK_CAMERAS", "FIND_CAMERAS", "FIND_POINTS", "SCENE", "tell_found"]
 
 if TYPE_CHECKING:
-    from ...datasets.views.find_cameras import FoundCameras
+    from ...datasets.views.poses.find_cameras import FoundCameras
 
 
 def _find_arguments(parser: argparse.ArgumentParser) -> None:
@@ -29,7 +29,7 @@ def _find_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _find_cameras(arguments: argparse.Namespace) -> int:
-    from ...datasets.views.find_cameras import find_cameras
+    from ...datasets.views.poses.find_cameras import find_cameras
     from ..reconstruct.posing import colmap_report
 
     out = arguments.out
@@ -75,7 +75,7 @@ def _points_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _find_points(arguments: argparse.Namespace) -> int:
-    from ...datasets.views.find_points import find_points
+    from ...datasets.views.poses.find_points import find_points
     from ..reconstruct.posing import colmap_report, said_of_points
 
     out = arguments.out
@@ -117,8 +117,8 @@ def _check_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _check_cameras(arguments: argparse.Namespace) -> int:
     check_output(arguments.out, (".glb", ".ply"))
-    from ...datasets.views.depth_maps import DepthSource
-    from ..reconstruct.check import check_files
+    from ...datasets.views.formats.depth_maps import DepthSource
+    from ..reconstruct.checks.check import check_files
 
     depths = DepthSource(arguments.depth_maps, arguments.depth_kind, arguments.depth_scale)
     _, check, text = check_files(arguments.data, arguments.out, depths)
@@ -177,7 +177,7 @@ def _scene(arguments: argparse.Namespace) -> int:
     from ...datasets.views.writing import check_new_folder, write_colmap, write_neus, write_transforms
     from ..mesh.files import write_mesh
     from ..render.studio import photograph_mesh, true_mesh
-    from ..run.progress import counter_bar
+    from ..training.progress import counter_bar
 
     folder = check_new_folder(arguments.out)
     if arguments.fault and arguments.views < 3:

@@ -6,7 +6,7 @@ import argparse
 import time
 from pathlib import Path
 
-from ..run.config import given_flags, input_error
+from ..training.config import given_flags, input_error
 from .common import Command, add_flags, check_output, training, whole
 
 __all__ = ["WEB"]
@@ -34,7 +34,7 @@ def _check_folder(out: Path) -> None:
     """Refuse a folder in which something else is than what this command writes."""
     if out.exists() and not out.is_dir():
         raise input_error(f"{out}: is a file; name a folder, or a file that ends with {' or '.join(PAGES)}")
-    from ...neural_fields.files import check_place
+    from ...neural_fields.backend.files import check_place
 
     check_place(out / "index.html")
     field = out / "field.bin"

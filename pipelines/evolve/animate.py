@@ -15,19 +15,19 @@ from torch import Tensor
 
 from ...datasets.cameras import Camera
 from ...neural_fields import Field, InputError, Placement, Similarity, load_field
-from ...neural_fields.dynamic_tracing import DynamicTracer, moment
-from ...neural_fields.files import check_place
-from ...neural_fields.meshing import NoSurfaceError, extract_mesh
+from ...neural_fields.backend.files import check_place
+from ...neural_fields.meshing.extract import NoSurfaceError, extract_mesh
+from ...neural_fields.spacetime.dynamic_tracing import DynamicTracer, moment
 from ..mesh.files import write_mesh, write_moving
 from ..render.film import ANIMATIONS, write_animation
 from ..render.picture import Image, contact_sheet, in_rows, write_picture
 from ..render.shade import ShadeOptions, compose, downsample, shade
 from ..render.subject import Orbit, orbit_cameras, traced_part
 from ..render.trace import RESOLUTION, TOLERANCE, fine_strips, pixel_size, see_hits
-from ..run.folder import FIELD_FILE, RECORD_FILE, chosen_level, find_field, read_record
-from ..run.machine import choose_device
-from ..run.motion import load_motion
 from ..texture.riding import Colors, RidingColors, borrowed_texture, pinned_texture, start_texture
+from ..training.folder import FIELD_FILE, RECORD_FILE, chosen_level, find_field, read_record
+from ..training.machine import choose_device
+from ..training.motion import load_motion
 from .follow import follow_mesh
 from .shapes import Placement as ShapePlacement
 

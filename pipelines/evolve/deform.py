@@ -29,10 +29,10 @@ from torch import Tensor
 from torch.nn.functional import huber_loss, normalize, pad
 
 from ...neural_fields import CarriedKeyframes, Field, VelocitySiren, at_time, flow
-from ..run.budget import LEAST_SECONDS, Budget
-from ..run.report import Report
-from ..run.settings import EvolveConfig
-from ..run.trainer import Group, Objective, Trainer, seeded, warm_cosine
+from ..training.budget import LEAST_SECONDS, Budget
+from ..training.report import Report
+from ..training.settings import EvolveConfig
+from ..training.trainer import Group, Objective, Trainer, seeded, warm_cosine
 from .landmarks import Landmarks, nearness, placed_landmarks
 from .samples import Bounds, Known, around, joined, known_at, uniform
 from .shapes import StaticShape

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ...neural_fields import Field, InputError, IntegrationError, Solver, flow, project_to_surface
-from ...neural_fields.carried import CarriedVelocity
-from ...neural_fields.dynamic_tracing import moment
-from ...neural_fields.meshing import NoSurfaceError, extract_mesh
+from ...neural_fields.meshing.extract import NoSurfaceError, extract_mesh
+from ...neural_fields.spacetime.dynamic_tracing import moment
+from ...neural_fields.spacetime.surface_velocity import CarriedVelocity
 from .topology import surface_of, topology_of
 
 __all__ = ["TrackedMesh", "follow_mesh"]

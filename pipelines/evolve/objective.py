@@ -6,11 +6,11 @@ import torch
 from torch import Tensor
 
 from ...neural_fields import Jet, Siren, SpaceTimeSDF, key_loss, law_loss, spacetime_jet
-from ...neural_fields.devices import upload
-from ...neural_fields.losses import eikonal_loss
-from ..run.focus import Focus
-from ..run.settings import EvolveConfig
-from ..run.trainer import Group, Objective, Report, Trainer, seeded, warm_cosine
+from ...neural_fields.backend.devices import upload
+from ...neural_fields.fields.losses import eikonal_loss
+from ..training.focus import Focus
+from ..training.settings import EvolveConfig
+from ..training.trainer import Group, Objective, Report, Trainer, seeded, warm_cosine
 from .problem import Problem
 from .samples import Known, band_points, indices_in_band, uniform_spacetime
 

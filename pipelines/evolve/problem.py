@@ -28,10 +28,10 @@ from ...neural_fields import (
     trajectories,
     transport,
 )
-from ...neural_fields.evolution import VectorField
-from ..run.budget import SAMPLING_SHARE, Budget, affordable
-from ..run.report import Report
-from ..run.settings import EvolveConfig
+from ...neural_fields.spacetime.evolution import VectorField
+from ..training.budget import SAMPLING_SHARE, Budget, affordable
+from ..training.report import Report
+from ..training.settings import EvolveConfig
 from .deform import carried_samples, learn_motion, motion_figures
 from .samples import Bounds, Carried, Known, around, joined, known_at, no_bounds, signs, uniform, values_at
 from .shapes import Placement, StaticShape, aligned, into_unit_sphere

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ...neural_fields import Field, at_time, flow
-from ...neural_fields.evolution import VectorField
+from ...neural_fields.spacetime.evolution import VectorField
 from ..fit.samples import DOMAIN, Rows
 from .shapes import StaticShape
 

@@ -16,13 +16,13 @@ import torch
 from numpy.typing import NDArray
 
 from ...neural_fields import load_field
-from ...neural_fields.files import write_whole
+from ...neural_fields.backend.files import write_whole
 from ..fit.train import fit
-from ..run.config import load_config
-from ..run.folder import FIELD_FILE, STATE_FILE, find_field, is_fitted, read_record
-from ..run.report import Report
-from ..run.settings import EvolveConfig, FitConfig
 from ..surface.surface import Surface, read_surface
+from ..training.config import load_config
+from ..training.folder import FIELD_FILE, STATE_FILE, find_field, is_fitted, read_record
+from ..training.report import Report
+from ..training.settings import EvolveConfig, FitConfig
 from .landmarks import FAR_OUT
 
 __all__ = ["fits_beside", "fitted_scans", "scans_among"]

@@ -30,8 +30,8 @@ from ...neural_fields import (
     load_field,
     project_to_surface,
 )
-from ..run.folder import find_field
 from ..surface.surface import Surface, from_mesh, sample_points
+from ..training.folder import find_field
 
 __all__ = ["Placed", "Placement", "StaticShape", "aligned", "into_unit_sphere", "read_shape"]
 

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from ...neural_fields import Field, NoSurfaceError, TimeSlice, at_time, extract_mesh
-from ...neural_fields.function import FieldLike
+from ...neural_fields.fields.function import FieldLike
 from ..surface.surface import Surface, components, from_mesh
 
 __all__ = ["Change", "Topology", "find_changes", "surface_of", "topology_of"]

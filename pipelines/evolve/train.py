@@ -17,13 +17,13 @@ from torch import Tensor
 from ...neural_fields import InputError, MultiscaleSDF, Similarity, SpaceTimeSDF
 from ..fit.band import delta_of
 from ..fit.level import new_level
-from ..run.budget import LEAST_SECONDS, Budget, step_seconds
-from ..run.folder import RunFolder, digest_of
-from ..run.machine import choose_device, environment
-from ..run.motion import VELOCITY_FILE, load_motion
-from ..run.report import Progress, Report, reported, silent
-from ..run.settings import EvolveConfig
-from ..run.trainer import (
+from ..training.budget import LEAST_SECONDS, Budget, step_seconds
+from ..training.folder import RunFolder, digest_of
+from ..training.machine import choose_device, environment
+from ..training.motion import VELOCITY_FILE, load_motion
+from ..training.report import Progress, Report, reported, silent
+from ..training.settings import EvolveConfig
+from ..training.trainer import (
     Interrupted,
     StopFlag,
     Trainer,
@@ -85,7 +85,7 @@ def evolve(
         Interrupted: Ctrl-C or SIGTERM; ``out`` then holds a checkpoint and a usable field.
 
     Example:
-        >>> from mplicits.pipelines.run.settings import EvolveConfig
+        >>> from mplicits.pipelines.training.settings import EvolveConfig
         >>> run = evolve(EvolveConfig(shapes=("runs/spot", "runs/bob")), out="runs/morph")  # doctest: +SKIP
         >>> run.record["checks"]["warnings"]  # doctest: +SKIP
     """

@@ -24,12 +24,12 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from ...datasets import PointCloud, read_cloud
-from ...datasets.clouds.dipoles import DipoleField
+from ...datasets.clouds.cleaning.dipoles import DipoleField
 from ...datasets.clouds.large import Merging, merge_cloud
-from ...datasets.clouds.reading import check_cloud, open_stream
-from ...datasets.clouds.stream import MemoryStream
-from ...neural_fields.files import whole_file
-from ..run.folder import MERGED_FILE
+from ...datasets.clouds.readers.reading import check_cloud, open_stream
+from ...datasets.clouds.readers.stream import MemoryStream
+from ...neural_fields.backend.files import whole_file
+from ..training.folder import MERGED_FILE
 
 __all__ = ["CloudDistance", "load_cloud"]
 

@@ -29,10 +29,10 @@ from ...datasets import (
 from ...datasets.depth.frame import PosedFrame
 from ...datasets.depth.images import COLOR_SUFFIXES, DEPTH_SUFFIXES
 from ...neural_fields import InputError
-from ...neural_fields.files import files_in, partial_of
-from ..run.folder import CLOUD_FILE, kept_cloud, read_record
-from ..run.machine import choose_device
-from ..run.trainer import Report
+from ...neural_fields.backend.files import files_in, partial_of
+from ..training.folder import CLOUD_FILE, kept_cloud, read_record
+from ..training.machine import choose_device
+from ..training.trainer import Report
 from .train import FitConfig, Run, fit, fit_moved
 
 __all__ = ["DepthInput", "depth_cloud", "fit_depth", "trim_suggestion"]

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ...neural_fields import Field, Siren
-from ...neural_fields.losses import data_loss, normal_loss, pseudo_huber
+from ...neural_fields.fields.losses import data_loss, normal_loss, pseudo_huber
 from .samples import SQUARES, Samples, Usual, with_previous
 
 __all__ = ["FEWEST", "LEARNT", "LOOKS", "Error", "Fall", "Judge", "Verdict", "held_out", "standard_errors", "voxels_of"]

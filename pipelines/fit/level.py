@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 
 from ...neural_fields import Siren
-from ...neural_fields.devices import upload
-from ...neural_fields.losses import data_loss, eikonal_loss, normal_loss, pseudo_huber
-from ..run.settings import EvolveConfig, FitConfig
-from ..run.team import my_share, whole_batch
-from ..run.trainer import Group, Objective, seeded, warm_cosine
+from ...neural_fields.backend.devices import upload
+from ...neural_fields.fields.losses import data_loss, eikonal_loss, normal_loss, pseudo_huber
+from ..training.settings import EvolveConfig, FitConfig
+from ..training.team import my_share, whole_batch
+from ..training.trainer import Group, Objective, seeded, warm_cosine
 from .heldout import LOOKS, Judge, Verdict
 from .samples import Source
 

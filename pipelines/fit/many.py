@@ -10,15 +10,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ...datasets.clouds.reading import check_cloud_path
+from ...datasets.clouds.readers.reading import check_cloud_path
 from ...neural_fields import InputError
-from ...neural_fields.files import write_json
-from ..run.config import load_config
-from ..run.folder import STATE_FILE, check_new_run, is_fitted, read_record
-from ..run.jobs import Outcome, check_jobs, run_jobs
-from ..run.machine import format_table
-from ..run.settings import FitConfig
-from ..run.trainer import Progress, Report
+from ...neural_fields.backend.files import write_json
+from ..training.config import load_config
+from ..training.folder import STATE_FILE, check_new_run, is_fitted, read_record
+from ..training.jobs import Outcome, check_jobs, run_jobs
+from ..training.machine import format_table
+from ..training.settings import FitConfig
+from ..training.trainer import Progress, Report
 from .train import fit
 
 __all__ = ["FitJob", "FitOutcome", "fit_many", "format_fits", "plan_fits"]

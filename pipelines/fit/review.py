@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from ...datasets.clouds.outliers import agreement
+from ...datasets.clouds.cleaning.outliers import agreement
 from ...neural_fields import Field
 
 __all__ = ["Review", "review_points"]

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ...neural_fields import Field, InputError, Jet
-from ...neural_fields.losses import data_loss, eikonal_loss, normal_loss
-from ..run.settings import FitConfig
+from ...neural_fields.fields.losses import data_loss, eikonal_loss, normal_loss
+from ..training.settings import FitConfig
 from .cloud import SOFT_GUESSED, CloudDistance
 
 __all__ = [

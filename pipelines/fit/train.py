@@ -21,13 +21,14 @@ from torch import Tensor, nn
 from ...datasets import OrientedCloud, PointCloud, prepare_cloud, spacing_of
 from ...datasets.clouds.large import Merging
 from ...neural_fields import InputError, MultiscaleSDF, Similarity, Siren, WorldField, save_field
-from ..run.budget import SAMPLING_SHARE, Budget, affordable, least_share, step_seconds
-from ..run.folder import SUPPORT_FILE, RunFolder, digest_of, named_cloud
-from ..run.machine import choose_device, environment, peak_memory
-from ..run.report import reported, silent
-from ..run.settings import FitConfig
-from ..run.team import agreed
-from ..run.trainer import (
+from ..surface.trim import thinned
+from ..training.budget import SAMPLING_SHARE, Budget, affordable, least_share, step_seconds
+from ..training.folder import SUPPORT_FILE, RunFolder, digest_of, named_cloud
+from ..training.machine import choose_device, environment, peak_memory
+from ..training.report import reported, silent
+from ..training.settings import FitConfig
+from ..training.team import agreed
+from ..training.trainer import (
     Interrupted,
     Report,
     StopFlag,
@@ -39,7 +40,6 @@ from ..run.trainer import (
     stop_on_signals,
     without_prefix,
 )
-from ..surface.trim import thinned
 from .band import Band, band_of, with_wrong_sides
 from .between import dense_distance
 from .cloud import CloudDistance, load_cloud

@@ -28,16 +28,16 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ...datasets import OrientedCloud
-from ...datasets.clouds.exterior import OUTSIDE, Exterior
-from ...datasets.clouds.noise import noise_deviation
-from ...datasets.clouds.orientation import settle_signs
+from ...datasets.clouds.cleaning.exterior import OUTSIDE, Exterior
+from ...datasets.clouds.cleaning.noise import noise_deviation
+from ...datasets.clouds.cleaning.orientation import settle_signs
+from ...datasets.clouds.cleaning.reestimate import denoise
+from ...datasets.clouds.cleaning.winding import MUCH_LESS
 from ...datasets.clouds.point_cloud import spread
-from ...datasets.clouds.reestimate import denoise
-from ...datasets.clouds.winding import MUCH_LESS
 from ...neural_fields import Siren
-from ...neural_fields.devices import upload
-from ..run.settings import FitConfig
-from ..run.trainer import Group, Objective, Report, StopFlag, Trainer, warm_cosine
+from ...neural_fields.backend.devices import upload
+from ..training.settings import FitConfig
+from ..training.trainer import Group, Objective, Report, StopFlag, Trainer, warm_cosine
 from .cloud import CloudDistance
 from .level import new_level
 from .samples import SURE, spread_points

@@ -93,7 +93,7 @@ def load(path: str | Path, *, time: float | None = None, device: Device | str = 
     Raises:
         InputError: there is no such run, it is damaged, or the time does not fit to it.
     """
-    folder = importlib.import_module("mplicits.pipelines.run.folder")
+    folder = importlib.import_module("mplicits.pipelines.training.folder")
     saved = folder.load_still(path, time, device=device)
     return importlib.import_module("mplicits.neural_fields").WorldField(saved.field, saved.similarity)
 

@@ -13,8 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...datasets.clouds.meshes import vertex_normals
 from ...datasets.clouds.point_cloud import unit_rows
+from ...datasets.clouds.readers.meshes import vertex_normals
 from ...neural_fields import InputError
 
 __all__ = ["Unwrapped", "check_unwrap_tools", "decimate", "from_frame", "to_frame", "unwrap", "vertex_tangents"]

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...neural_fields import InputError
-from ...neural_fields.meshing import Mesh
+from ...neural_fields.meshing.extract import Mesh
 from ..surface.distance import MeshDistance
 from ..surface.surface import Surface, is_closed
 from .atlas import decimate

@@ -1,7 +1,7 @@
 """Meshes out, in input coordinates, complete or not at all: PLY, OBJ, STL and GLB; with textures; and moving, as GLB.
 
 `write_mesh` has colours at the vertices, `write_textured` in images (in a GLB, or beside an OBJ with its MTL), and
-`write_moving` a mesh whose vertices move. The formats themselves are in ``neural_fields/mesh_files.py``.
+`write_moving` a mesh whose vertices move. The formats themselves are in ``neural_fields/meshing/writers.py``.
 """
 
 from __future__ import annotations
@@ -15,9 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...neural_fields import InputError, Mesh, Similarity
-from ...neural_fields.files import whole_file
-from ...neural_fields.glb import MATERIAL, Motion
-from ...neural_fields.mesh_files import (
+from ...neural_fields.backend.files import whole_file
+from ...neural_fields.meshing.glb import MATERIAL, Motion
+from ...neural_fields.meshing.placement import Placement
+from ...neural_fields.meshing.writers import (
     Triangles,
     check_mesh_path,
     glb_attributes,
@@ -27,7 +28,6 @@ from ...neural_fields.mesh_files import (
     write_obj,
     write_triangles,
 )
-from ...neural_fields.placement import Placement
 from .atlas import Unwrapped, check_unwrap_tools
 
 __all__ = [

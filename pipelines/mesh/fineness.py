@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 
 from ...neural_fields import Field
-from ...neural_fields.devices import upload
+from ...neural_fields.backend.devices import upload
 
 __all__ = ["LEAST", "RESOLUTIONS", "Fineness", "fineness", "thin_share"]
 

@@ -11,13 +11,13 @@ import numpy as np
 
 from ...datasets import read_cloud
 from ...neural_fields import InputError, Similarity
-from ...neural_fields.meshing import Mesh
+from ...neural_fields.meshing.extract import Mesh
 from ..fit.depth import DepthInput, trim_suggestion
-from ..run.folder import CLOUD_FILE, TEXTURE_FILE, kept_cloud, read_record, texture_state_file
-from ..run.report import Progress, reported
-from ..run.settings import TextureConfig
 from ..texture.samples import has_colors
 from ..texture.train import FittedTexture, texture_run
+from ..training.folder import CLOUD_FILE, TEXTURE_FILE, kept_cloud, read_record, texture_state_file
+from ..training.report import Progress, reported
+from ..training.settings import TextureConfig
 from .extract import MeshOptions, mesh_run
 from .files import check_mesh_path
 

@@ -27,12 +27,12 @@ from ...neural_fields import (
     in_one_frame,
     save_field,
 )
-from ...neural_fields.meshing import Mesh, NoSurfaceError, extract_mesh
-from ...neural_fields.placement import METRES, Placement
-from ..run.folder import chosen_level, find_field, is_field, load_still
+from ...neural_fields.meshing.extract import Mesh, NoSurfaceError, extract_mesh
+from ...neural_fields.meshing.placement import METRES, Placement
 from ..surface.solid import MeshField
 from ..surface.surface import Surface, from_mesh, is_closed, read_surface
 from ..surface.trim import Support, drop_unsupported, read_support
+from ..training.folder import chosen_level, find_field, is_field, load_still
 from .files import check_mesh_path, write_mesh
 
 __all__ = ["OPERATIONS", "Made", "SolidOptions", "boolean", "length_in", "offset"]

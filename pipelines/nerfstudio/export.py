@@ -15,11 +15,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from ...datasets.cameras import Camera
 from ...neural_fields import InputError, Mesh, NerfstudioField, NoSurfaceError, Similarity
-from ...neural_fields.mesh_files import check_mesh_path
+from ...neural_fields.meshing.writers import check_mesh_path
 from ..mesh.bake import check_texture_size, textured_mesh
 from ..mesh.extract import normals_near
 from ..mesh.files import check_textured_path
-from ..reconstruct.seen import seen_points
+from ..reconstruct.data.seen import seen_points
 from ..surface.trim import Support, seen_part
 
 __all__ = ["colored", "export_mesh", "host_cameras", "in_data_coordinates", "main", "part_seen"]

@@ -22,9 +22,9 @@ from nerfstudio.models.neus_facto import NeuSFactoModel, NeuSFactoModelConfig  #
 from torch import Tensor, nn
 
 from ...neural_fields import MultiscaleSDF, NerfstudioField, Siren, ViewColor, fit_sphere
-from ...neural_fields.hash_encoding import HashEncoding, tables_apart
-from ...neural_fields.rates import HOST_RATE
-from ..run.settings import ReconstructConfig
+from ...neural_fields.hosts.learning_rates import HOST_RATE
+from ...neural_fields.networks.hash_encoding import HashEncoding, tables_apart
+from ..training.settings import ReconstructConfig
 from .schedule import WarmCosine
 
 __all__ = [

@@ -12,14 +12,14 @@ import torch
 
 from ...datasets.cameras import Camera
 from ...neural_fields import InputError, Similarity, load_radiance
-from ...neural_fields.files import damage
-from ...neural_fields.value_grid import ValueGrid
-from ...neural_fields.volume_renderer import Sampling
+from ...neural_fields.backend.files import damage
+from ...neural_fields.networks.value_grid import ValueGrid
+from ...neural_fields.volume.render import Sampling
 from ..render.draw import RenderOptions, render_run
 from ..render.picture import Image
-from ..run.folder import RADIANCE_FILE, find_field, load_still
-from ..run.machine import choose_device
-from .model import SceneModel
+from ..training.folder import RADIANCE_FILE, find_field, load_still
+from ..training.machine import choose_device
+from .model.model import SceneModel
 from .views import render_camera
 
 __all__ = ["TrainedScene", "open_scene", "photograph"]

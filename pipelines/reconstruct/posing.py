@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from ...datasets.views.colmap_process import Report as ColmapReport
-from ...datasets.views.find_cameras import FoundCameras
-from ...datasets.views.find_points import FoundPoints
-from ..run.report import Progress, Report, silent
+from ...datasets.views.poses.colmap_process import Report as ColmapReport
+from ...datasets.views.poses.find_cameras import FoundCameras
+from ...datasets.views.poses.find_points import FoundPoints
+from ..training.report import Progress, Report, silent
 
 __all__ = ["colmap_report", "said_of", "said_of_points"]
 

@@ -18,27 +18,27 @@ import torch
 from torch import Tensor
 
 from ...datasets import PointCloud
-from ...datasets.views.depth_maps import DepthSource
+from ...datasets.views.formats.depth_maps import DepthSource
 from ...datasets.views.images import PosedImage, PosedImages, read_posed_images
 from ...neural_fields import InputError, Jet, NoSurfaceError, TextureField, extract_mesh
 from ...neural_fields.checkpoint import radiance_bytes, texture_bytes
 from ..render.picture import Image, picture_bytes, write_picture
-from ..run.budget import LEAST_SECONDS, Budget
-from ..run.folder import RADIANCE_FILE, SUPPORT_FILE, TEXTURE_FILE, RunFolder, digest_of
-from ..run.machine import choose_device, environment
-from ..run.report import Progress, Report, reported, silent
-from ..run.settings import ReconstructConfig, TextureConfig
-from ..run.team import agreed, apart, is_leader
-from ..run.trainer import Interrupted, load_compiler, parameter_count, stop_on_signals
 from ..surface.surface import from_mesh, sample_points
 from ..surface.trim import in_region, thinned
 from ..texture.train import FittedTexture, fit_texture, texture_step_seconds
-from .hull import begin
-from .measured import MeasuredDepths
-from .model import RayPool, SceneModel, build_scene
-from .replayed import ReplayedTrainer, scene_trainer
-from .seen import seen_points
-from .silhouettes import Agreement
+from ..training.budget import LEAST_SECONDS, Budget
+from ..training.folder import RADIANCE_FILE, SUPPORT_FILE, TEXTURE_FILE, RunFolder, digest_of
+from ..training.machine import choose_device, environment
+from ..training.report import Progress, Report, reported, silent
+from ..training.settings import ReconstructConfig, TextureConfig
+from ..training.team import agreed, apart, is_leader
+from ..training.trainer import Interrupted, load_compiler, parameter_count, stop_on_signals
+from .data.measured import MeasuredDepths
+from .data.seen import seen_points
+from .data.silhouettes import Agreement
+from .initialisation.hull import begin
+from .model.model import RayPool, SceneModel, build_scene
+from .model.replayed import ReplayedTrainer, scene_trainer
 from .views import ViewImage, comparison_sheet, exposed_as, held_out, measure, reduced, render_image, spread
 
 __all__ = [

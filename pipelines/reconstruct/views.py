@@ -17,11 +17,11 @@ from ...datasets.cameras import Camera
 from ...datasets.views.images import PosedImage
 from ...datasets.views.pictures import resample, shrink
 from ...neural_fields import Similarity
-from ...neural_fields.volume import sphere_span
-from ...neural_fields.volume_renderer import Sampling
+from ...neural_fields.volume.render import Sampling
+from ...neural_fields.volume.weights import sphere_span
 from ..render.picture import Image, stacked
-from .model import SceneModel, camera_rays
-from .silhouettes import OBJECT
+from .data.silhouettes import OBJECT
+from .model.model import SceneModel, camera_rays
 
 __all__ = [
     "ViewImage",

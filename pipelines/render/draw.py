@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ...datasets.cameras import Camera
 from ...neural_fields import InputError, WorldField
-from ..run.machine import choose_device
+from ..training.machine import choose_device
 from .film import ANIMATIONS, write_animation
 from .legend import with_color_bar
 from .light import load_matcap

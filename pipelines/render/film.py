@@ -14,7 +14,7 @@ import imageio_ffmpeg
 import numpy as np
 
 from ...neural_fields import InputError
-from ...neural_fields.files import whole_file
+from ...neural_fields.backend.files import whole_file
 from .picture import Image
 
 __all__ = ["ANIMATIONS", "write_animation"]

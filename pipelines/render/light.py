@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample, normalize
 
 from ...neural_fields import Field, InputError
-from ...neural_fields.tracing import BOUNDING_RADIUS
+from ...neural_fields.tracing.sphere import BOUNDING_RADIUS
 
 __all__ = ["MATCAPS", "ambient_occlusion", "level_set_curvature", "load_matcap", "sample_matcap", "soft_shadow"]
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...neural_fields import InputError
-from ...neural_fields.files import check_place, write_whole
+from ...neural_fields.backend.files import check_place, write_whole
 
 __all__ = [
     "Image",

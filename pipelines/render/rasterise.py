@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from ...datasets.cameras import Camera
-from ...datasets.clouds.meshes import vertex_normals
+from ...datasets.clouds.readers.meshes import vertex_normals
 from ...datasets.textured.reading import TexturedMesh, colors_at, read_textured
 from ...neural_fields import InputError
 from ..surface.raster import clip, cover

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from ...datasets.cameras import Camera
 from ...neural_fields import Field
-from ..run.settings import SHADINGS, ShadeOptions
+from ..training.settings import SHADINGS, ShadeOptions
 from .light import ambient_occlusion, level_set_curvature, load_matcap, sample_matcap, soft_shadow
 from .picture import Image
 from .trace import Seen

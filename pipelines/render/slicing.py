@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...neural_fields import Field, InputError, Similarity, load_field
-from ...neural_fields.meshing import NoSurfaceError, extract_mesh
-from ..run.folder import chosen_level, find_field
+from ...neural_fields.meshing.extract import NoSurfaceError, extract_mesh
+from ..training.folder import chosen_level, find_field
 from .film import ANIMATIONS, write_animation
 from .legend import with_legend
 from .picture import Image, write_picture

@@ -12,11 +12,11 @@ import torch
 from numpy.typing import NDArray
 
 from ...datasets.cameras import Camera
-from ...datasets.clouds.meshes import vertex_normals
+from ...datasets.clouds.readers.meshes import vertex_normals
 from ...datasets.color_space import srgb_to_linear
 from ...datasets.synthetic.studio import cameras_around, developed, lit
 from ...datasets.textured.mesh import TexturedMesh
-from ...datasets.views.depth_maps import DepthMap
+from ...datasets.views.formats.depth_maps import DepthMap
 from ...datasets.views.images import PosedImage, PosedImages
 from ...neural_fields import InputError, Mesh, Similarity
 from ..surface.surface import Surface, read_reference, sample_points

@@ -15,14 +15,14 @@ from torch import Tensor
 
 from ...datasets.cameras import Camera, turntable
 from ...datasets.textured.mesh import TexturedMesh
-from ...datasets.views.reading import read_cameras
+from ...datasets.views.formats.reading import read_cameras
 from ...neural_fields import Field, InputError, Similarity
-from ...neural_fields.meshing import NoSurfaceError, extract_mesh
-from ...neural_fields.tracing import BOUNDING_RADIUS
+from ...neural_fields.meshing.extract import NoSurfaceError, extract_mesh
+from ...neural_fields.tracing.sphere import BOUNDING_RADIUS
 from ..fit.cloud import CloudDistance
-from ..run.folder import chosen_level, find_field, fitted_cloud, is_field, load_still
 from ..surface.surface import read_surface, sample_points
 from ..texture.riding import Colors, colors_of_run
+from ..training.folder import chosen_level, find_field, fitted_cloud, is_field, load_still
 from .rasterise import cloud_view, mesh_view, read_painted
 from .trace import Seen, trace_view
 

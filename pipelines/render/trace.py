@@ -16,9 +16,9 @@ from torch.nn.functional import normalize
 
 from ...datasets.cameras import Camera
 from ...neural_fields import Field, Hits, Siren, TextureField, cone_starts, levels_of, map_colors, sphere_trace
-from ...neural_fields.cones import CONE_LIPSCHITZ, CONE_STEPS
-from ...neural_fields.multiscale import as_levels, choose_levels
-from ...neural_fields.tracing import BOUNDING_RADIUS, MAX_STEPS, march_constants
+from ...neural_fields.networks.multiscale import as_levels, choose_levels
+from ...neural_fields.tracing.cones import CONE_LIPSCHITZ, CONE_STEPS
+from ...neural_fields.tracing.sphere import BOUNDING_RADIUS, MAX_STEPS, march_constants
 
 __all__ = [
     "Seen",
@@ -162,7 +162,7 @@ def _draw(
     field: Field, camera: Camera, level: int, normal_level: int, colors: Callable[[Tensor], Tensor] | None
 ) -> Seen:
     """What `trace_view` does, in a dozen launches."""
-    from ...neural_fields.kernels.picture import Setting, draw
+    from ...neural_fields.tracing.picture import Setting, draw
 
     pixel, eye = pixel_size(camera), camera.eye.tolist()
     axes = camera.world_from_camera[:3, :3].flatten().tolist()

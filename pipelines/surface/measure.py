@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from ...neural_fields import InputError, Similarity
-from ...neural_fields.files import write_json
+from ...neural_fields.backend.files import write_json
 from .raster import cover
 from .roughness import feet_among, roughness
 from .surface import Surface, components, is_closed, read_surface, sample_points

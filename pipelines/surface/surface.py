@@ -14,11 +14,11 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from ...datasets import PointCloud, read_cloud
-from ...datasets.clouds.meshes import spread_on_faces
 from ...datasets.clouds.point_cloud import unit_rows
+from ...datasets.clouds.readers.meshes import spread_on_faces
 from ...datasets.textured.gltf import read_gltf
 from ...neural_fields import InputError, Similarity
-from ...neural_fields.meshing import Mesh
+from ...neural_fields.meshing.extract import Mesh
 
 __all__ = [
     "MESH_SUFFIXES",

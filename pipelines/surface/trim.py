@@ -19,8 +19,8 @@ from torch import Tensor
 from ...datasets import spacing_of
 from ...datasets.clouds.point_cloud import voxel_representatives
 from ...neural_fields import InputError
-from ...neural_fields.meshing import Mesh
-from ..run.folder import FIELD_FILE, SUPPORT_FILE, load_state
+from ...neural_fields.meshing.extract import Mesh
+from ..training.folder import FIELD_FILE, SUPPORT_FILE, load_state
 from .surface import component_of_faces, face_normals
 
 __all__ = [

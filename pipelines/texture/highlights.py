@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ...neural_fields import ColorSiren, Field, Jet, Mesh, TextureField, ViewColor, project_to_surface, sphere_trace
-from ..run.report import Report
-from ..run.trainer import Group, Interrupted, Objective, Trainer, seeded, stop_on_signals, warm_cosine
 from ..surface.surface import from_mesh, sample_points
+from ..training.report import Report
+from ..training.trainer import Group, Interrupted, Objective, Trainer, seeded, stop_on_signals, warm_cosine
 
 __all__ = ["Highlights", "fit_highlights"]
 

@@ -31,13 +31,13 @@ from ...neural_fields import (
     load_field,
     map_colors,
 )
-from ...neural_fields.attributes import project_to_surface
-from ...neural_fields.carried import CarriedVelocity
-from ...neural_fields.dynamic_tracing import moment
-from ...neural_fields.evolution import VectorField
-from ...neural_fields.meshing import NoSurfaceError
-from ..run.folder import find_field
-from ..run.motion import load_motion
+from ...neural_fields.meshing.extract import NoSurfaceError
+from ...neural_fields.spacetime.dynamic_tracing import moment
+from ...neural_fields.spacetime.evolution import VectorField
+from ...neural_fields.spacetime.surface_velocity import CarriedVelocity
+from ...neural_fields.tracing.projection import project_to_surface
+from ..training.folder import find_field
+from ..training.motion import load_motion
 from .spread import CELL, SpreadColors
 from .train import texture_of
 

@@ -24,14 +24,14 @@ from ...neural_fields import (
     load_field,
     load_texture,
 )
+from ...neural_fields.backend.devices import upload
+from ...neural_fields.backend.files import write_whole
 from ...neural_fields.checkpoint import texture_bytes
-from ...neural_fields.devices import upload
-from ...neural_fields.dynamic_tracing import moment
-from ...neural_fields.files import write_whole
-from ...neural_fields.losses import color_loss, tangential_loss
-from ..run.budget import SAMPLING_SHARE, Budget, affordable, step_seconds
-from ..run.config import load_config
-from ..run.folder import (
+from ...neural_fields.fields.losses import color_loss, tangential_loss
+from ...neural_fields.spacetime.dynamic_tracing import moment
+from ..training.budget import SAMPLING_SHARE, Budget, affordable, step_seconds
+from ..training.config import load_config
+from ..training.folder import (
     TEXTURE_FILE,
     chosen_level,
     digest_of,
@@ -41,20 +41,12 @@ from ..run.folder import (
     texture_state_file,
     write_texture,
 )
-from ..run.lock import locked
-from ..run.machine import choose_device, environment
-from ..run.report import Report, reported
-from ..run.settings import TextureConfig
-from ..run.swap import sweep
-from ..run.trainer import (
-    Group,
-    Objective,
-    Trainer,
-    parameter_count,
-    seeded,
-    stop_on_signals,
-    warm_cosine,
-)
+from ..training.lock import locked
+from ..training.machine import choose_device, environment
+from ..training.report import Report, reported
+from ..training.settings import TextureConfig
+from ..training.swap import sweep
+from ..training.trainer import Group, Objective, Trainer, parameter_count, seeded, stop_on_signals, warm_cosine
 from .samples import BandSamples, ColorSamples, band_directions, match_colors, read_colors
 
 __all__ = [

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ...datasets.cameras import Camera, orbit, pinhole_intrinsics
 from ...neural_fields import Field, Similarity
-from ...neural_fields.tracing import sphere_trace
+from ...neural_fields.tracing.sphere import sphere_trace
 from ..render.trace import Seen
 
 __all__ = [

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...neural_fields import Field, InputError, Similarity
-from ..run.settings import SHADINGS
+from ..training.settings import SHADINGS
 from .camera import describe_reading, image_size, probe, viser_camera
 from .controls import LARGEST_PICTURE_SIDE, Controls
 from .frames import Frame, FrameScheduler, Superseded, View

@@ -17,8 +17,8 @@ from torch import Tensor
 
 from ...datasets.cameras import Camera, look_at
 from ...neural_fields import Field, TextureField, map_colors
-from ...neural_fields.dynamic_tracing import moment
-from ...neural_fields.evolution import VectorField
+from ...neural_fields.spacetime.dynamic_tracing import moment
+from ...neural_fields.spacetime.evolution import VectorField
 from ..render.light import load_matcap
 from ..render.shade import ShadeOptions, compose, measure, shade
 from ..render.trace import Seen, merge_strips, strips, trace_view

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ...datasets.landmarks import read_landmarks, write_landmarks
 from ...neural_fields import Field, InputError, Jet, OneLevelField, Similarity, load_field
-from ..run.folder import find_field
+from ..training.folder import find_field
 
 __all__ = ["Picks", "SideBySide", "open_picks"]
 

@@ -16,12 +16,12 @@ from typing import Any
 import torch
 
 from ...datasets.cameras import UP_AXES
-from ...datasets.clouds.reading import check_cloud_path
+from ...datasets.clouds.readers.reading import check_cloud_path
 from ...neural_fields import FieldLike, InputError, Similarity, TextureField, as_field, load_field
-from ...neural_fields.evolution import VectorField
-from ..run.folder import find_field, fitted_cloud
-from ..run.motion import load_motion
+from ...neural_fields.spacetime.evolution import VectorField
 from ..texture.riding import start_texture
+from ..training.folder import find_field, fitted_cloud
+from ..training.motion import load_motion
 from .camera import first_eye
 from .client import Client, Shown
 from .frames import Frame, FrameScheduler

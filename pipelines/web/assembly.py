@@ -12,7 +12,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from ...neural_fields.files import write_whole
+from ...neural_fields.backend.files import write_whole
 from .payload import deflated, text_of
 
 __all__ = ["field_file", "fill_page", "write_folder"]

@@ -23,17 +23,17 @@ from ...neural_fields import (
     load_field,
     load_radiance,
 )
-from ...neural_fields.files import damage, write_whole
-from ...neural_fields.meshing import NoSurfaceError
-from ...neural_fields.multiscale import levels_of
-from ...neural_fields.spacetime import SpaceTimeSDF
-from ...neural_fields.tracing import BOUNDING_RADIUS
+from ...neural_fields.backend.files import damage, write_whole
+from ...neural_fields.meshing.extract import NoSurfaceError
+from ...neural_fields.networks.multiscale import levels_of
+from ...neural_fields.spacetime.field import SpaceTimeSDF
+from ...neural_fields.tracing.sphere import BOUNDING_RADIUS
 from ..render.subject import FRAME_RESOLUTION, traced_part
-from ..run.folder import RADIANCE_FILE, chosen_level, find_field, load_still
-from ..run.report import Report
 from ..surface.trim import in_region, read_support, seen_part
 from ..texture.highlights import Highlights, fit_highlights
 from ..texture.train import texture_of
+from ..training.folder import RADIANCE_FILE, chosen_level, find_field, load_still
+from ..training.report import Report
 from .assembly import fill_page, write_folder
 from .film import MOMENTS, band_reach, swept_shell
 from .networks import Rounding, network_layers, rounding_error, shader_levels, taper_of

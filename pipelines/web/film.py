@@ -13,9 +13,9 @@ import torch
 from torch import Tensor
 
 from ...neural_fields import Field, Jet
-from ...neural_fields.mesh import Mesh
-from ...neural_fields.spacetime import SpaceTimeSDF, at_time
-from ...neural_fields.tracing import BOUNDING_RADIUS
+from ...neural_fields.meshing.mesh import Mesh
+from ...neural_fields.spacetime.field import SpaceTimeSDF, at_time
+from ...neural_fields.tracing.sphere import BOUNDING_RADIUS
 from .shell import CELLS, shell_mesh
 
 __all__ = ["MOMENTS", "Swept", "band_reach", "fastest_change", "swept_shell"]

@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 
 from ...neural_fields import Field, InputError, MultiscaleSDF, Siren
-from ...neural_fields.multiscale import levels_of
+from ...neural_fields.networks.multiscale import levels_of
 
 __all__ = [
     "Layer",

@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from ...neural_fields import Field, extract_mesh
-from ...neural_fields.mesh import Mesh
-from ...neural_fields.tracing import BOUNDING_RADIUS
+from ...neural_fields.meshing.mesh import Mesh
+from ...neural_fields.tracing.sphere import BOUNDING_RADIUS
 
 __all__ = ["CELLS", "GRID", "shell_mesh", "surface_reach"]
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from ...neural_fields import InputError
-from ..run.folder import FIELD_FILE
+from ..training.folder import FIELD_FILE
 from .export import WebOptions
 from .serve import PageServer, import_websockets
 

@@ -17,7 +17,7 @@ from mplicits.neural_fields import (
     save_field,
     save_radiance,
 )
-from mplicits.neural_fields.hash_encoding import HashEncoding
+from mplicits.neural_fields.networks.hash_encoding import HashEncoding
 from safetensors import safe_open
 from safetensors.torch import save_file
 

@@ -7,7 +7,7 @@ import torch
 from mplicits.datasets import look_at, sample_sphere, write_cloud_ply
 from mplicits.neural_fields import InputError, Plane, Sphere, load_field
 from mplicits.pipelines.render.trace import trace_view
-from mplicits.pipelines.run.settings import FitConfig
+from mplicits.pipelines.training.settings import FitConfig
 
 from benchmarks.cli import main
 from benchmarks.costs.render import NETWORKS, RenderBench, RenderRow, naive_view

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 from mplicits.neural_fields import InputError
-from mplicits.pipelines.run.jobs import Outcome
-from mplicits.pipelines.run.settings import FitConfig
-from mplicits.pipelines.run.trainer import Progress
+from mplicits.pipelines.training.jobs import Outcome
+from mplicits.pipelines.training.settings import FitConfig
+from mplicits.pipelines.training.trainer import Progress
 
 from benchmarks.harness import run
 from benchmarks.harness.benchmark import Benchmark, Part, from_figures, one_of_each, write_results

@@ -9,8 +9,8 @@ import torch
 import trimesh
 from evolutions import QUICK, ball, fails, few_points
 from mplicits.neural_fields import Field, Jet
-from mplicits.neural_fields.files import write_json
-from mplicits.pipelines.run.settings import FitConfig
+from mplicits.neural_fields.backend.files import write_json
+from mplicits.pipelines.training.settings import FitConfig
 from torch import Tensor
 
 from benchmarks.cli import main

@@ -9,7 +9,7 @@ import pytest
 import torch
 from evolutions import QUICK, fails, few_points
 from mplicits.neural_fields import Keyframes, Solver, TimeSlice
-from mplicits.pipelines.run.settings import FitConfig
+from mplicits.pipelines.training.settings import FitConfig
 from torch import Tensor
 
 from benchmarks.cli import main

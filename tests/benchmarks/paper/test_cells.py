@@ -10,7 +10,7 @@ import pytest
 from mplicits.datasets import PointCloud, read_cloud
 from mplicits.neural_fields import InputError, Similarity, Sphere, extract_mesh
 from mplicits.pipelines.mesh.files import write_mesh
-from mplicits.pipelines.run.trainer import Interrupted
+from mplicits.pipelines.training.trainer import Interrupted
 
 from benchmarks.harness.cells import Catalogue, Findings, Method, key_of, make_folder, read_record, record_file
 from benchmarks.harness.run import run_cell, run_cells

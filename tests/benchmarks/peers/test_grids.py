@@ -9,8 +9,8 @@ import torch
 from fields import Watched
 from mplicits.datasets import prepare_cloud, sample_sphere
 from mplicits.neural_fields import Field, Plane, Siren, Sphere, Torus, extract_mesh, sphere_trace
-from mplicits.neural_fields.hash_encoding import spatial_hash
-from mplicits.pipelines.run.trainer import Progress
+from mplicits.neural_fields.networks.hash_encoding import spatial_hash
+from mplicits.pipelines.training.trainer import Progress
 from scipy.interpolate import RegularGridInterpolator
 
 # The contract, over a cascade in place of the fields of the common table, whose levels are nested in bands.

@@ -10,7 +10,7 @@ import torch
 from mplicits.datasets import OrientedCloud, prepare_cloud, sample_sphere
 from mplicits.neural_fields import Field, Jet, Siren, extract_mesh, sphere_trace
 from mplicits.pipelines.fit.cloud import CloudDistance
-from mplicits.pipelines.run.trainer import Progress
+from mplicits.pipelines.training.trainer import Progress
 
 # The contract, over the fields below in place of those of the common table, whose levels are nested in bands.
 from test_field_contract import (  # noqa: F401

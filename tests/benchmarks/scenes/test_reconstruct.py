@@ -9,16 +9,16 @@ import pytest
 import torch
 from mplicits.datasets.synthetic.scenes import SCENES, render_scene
 from mplicits.neural_fields import InputError, Siren, Sphere, Union, extract_mesh
-from mplicits.neural_fields.neus_mlp import NeusSDF
-from mplicits.neural_fields.radiance import Outside, ViewColor
-from mplicits.pipelines.reconstruct.model import RayPool, SceneModel, build_scene
-from mplicits.pipelines.reconstruct.objective import SceneObjective
-from mplicits.pipelines.reconstruct.replayed import ReplayedTrainer, scene_trainer
-from mplicits.pipelines.run.replay import Again
-from mplicits.pipelines.run.settings import ReconstructConfig
-from mplicits.pipelines.run.trainer import StopFlag
+from mplicits.neural_fields.networks.neus_mlp import NeusSDF
+from mplicits.neural_fields.networks.radiance import Outside, ViewColor
+from mplicits.pipelines.reconstruct.model.model import RayPool, SceneModel, build_scene
+from mplicits.pipelines.reconstruct.model.objective import SceneObjective
+from mplicits.pipelines.reconstruct.model.replayed import ReplayedTrainer, scene_trainer
 from mplicits.pipelines.surface.surface import from_mesh
 from mplicits.pipelines.surface.trim import in_region
+from mplicits.pipelines.training.replay import Again
+from mplicits.pipelines.training.settings import ReconstructConfig
+from mplicits.pipelines.training.trainer import StopFlag
 from reconstructions import small_reconstructions
 
 from benchmarks.cli import main

@@ -11,8 +11,8 @@ from mplicits.datasets import add_isotropic_noise, read_cloud
 from mplicits.datasets.synthetic.prisms import PRISMS
 from mplicits.neural_fields import InputError, Mesh, MultiscaleSDF, Similarity, Sphere, Union, extract_mesh
 from mplicits.pipelines.mesh.files import write_mesh
-from mplicits.pipelines.run.settings import FitConfig
 from mplicits.pipelines.surface.surface import Surface, components, face_normals, from_mesh
+from mplicits.pipelines.training.settings import FitConfig
 
 from benchmarks.harness.report import as_text
 from benchmarks.shapes import fits as module

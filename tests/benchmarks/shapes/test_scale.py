@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import trimesh
 from mplicits.datasets import read_cloud
-from mplicits.pipelines.run.settings import FitConfig
 from mplicits.pipelines.surface.surface import read_surface
+from mplicits.pipelines.training.settings import FitConfig
 
 from benchmarks.harness.report import as_text
 from benchmarks.shapes.fits import ScaleBench, ScaleRow, write_noisy_cloud

@@ -9,7 +9,7 @@ from mplicits.datasets import OrientedCloud, PointCloud
 from mplicits.neural_fields import InputError, Similarity, Sphere, extract_mesh
 from mplicits.pipelines.fit.train import prepare
 from mplicits.pipelines.mesh.files import write_mesh
-from mplicits.pipelines.run.settings import FitConfig
+from mplicits.pipelines.training.settings import FitConfig
 
 from benchmarks.harness.report import as_text
 from benchmarks.shapes import signs as module

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from mplicits.neural_fields import InputError, Similarity, Sphere, extract_mesh
 from mplicits.pipelines.mesh.files import write_mesh
-from mplicits.pipelines.run.settings import FitConfig
+from mplicits.pipelines.training.settings import FitConfig
 
 from benchmarks.harness.report import as_text
 from benchmarks.shapes import srb as module

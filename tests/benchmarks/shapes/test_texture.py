@@ -14,7 +14,7 @@ from mplicits.datasets import Camera, TexturedMesh, linear_to_srgb, look_at, srg
 from mplicits.neural_fields import InputError
 from mplicits.pipelines.render.rasterise import mesh_view
 from mplicits.pipelines.render.trace import Seen
-from mplicits.pipelines.run.settings import FitConfig, TextureConfig
+from mplicits.pipelines.training.settings import FitConfig, TextureConfig
 
 from benchmarks.cli import main
 from benchmarks.cli import shapes as bench_shapes

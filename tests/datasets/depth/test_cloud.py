@@ -26,7 +26,7 @@ from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.fit import depth as fit_depth_module
 from mplicits.pipelines.fit.depth import DepthInput, fit_depth
 from mplicits.pipelines.fit.train import FitConfig
-from mplicits.pipelines.run.trainer import Interrupted
+from mplicits.pipelines.training.trainer import Interrupted
 
 LENS = DepthCamera(96, 72, 90.0, 92.0, 46.5, 36.5)
 EXACT = DepthSettings(smoothing=0)

@@ -19,7 +19,7 @@ from mplicits.datasets import (
 )
 from mplicits.datasets.textured.mesh import Paint, decode_texture, lookup, pack
 from mplicits.neural_fields import InputError
-from mplicits.neural_fields.meshing import Mesh
+from mplicits.neural_fields.meshing.extract import Mesh
 from mplicits.pipelines.mesh.files import write_mesh
 from mplicits.pipelines.surface.surface import read_surface
 

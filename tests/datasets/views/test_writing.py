@@ -13,9 +13,9 @@ import pytest
 import torch
 from mplicits.datasets.cameras import Camera, look_at
 from mplicits.datasets.synthetic.scenes import SCENES, render_scene
-from mplicits.datasets.views.depth_maps import DepthSource
+from mplicits.datasets.views.formats.depth_maps import DepthSource
+from mplicits.datasets.views.formats.reading import read_cameras
 from mplicits.datasets.views.images import PosedImage, PosedImages, read_posed_images
-from mplicits.datasets.views.reading import read_cameras
 from mplicits.datasets.views.writing import check_new_folder, write_colmap, write_neus, write_transforms
 from mplicits.neural_fields import InputError, Similarity
 from scipy.spatial.transform import Rotation

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from mplicits.pipelines.cli.common import Stopped, between, finite, positive, stoppable, training, whole
-from mplicits.pipelines.run.trainer import Interrupted
+from mplicits.pipelines.training.trainer import Interrupted
 
 
 @pytest.mark.parametrize(

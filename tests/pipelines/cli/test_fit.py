@@ -14,9 +14,9 @@ from mplicits.datasets import DepthCamera, PointCloud, read_cloud, write_cloud_p
 from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.mesh import finish as fit_mesh
 from mplicits.pipelines.mesh.extract import MeshOptions
-from mplicits.pipelines.run.progress import Lines
-from mplicits.pipelines.run.settings import TextureConfig
 from mplicits.pipelines.surface.surface import Surface, read_surface
+from mplicits.pipelines.training.progress import Lines
+from mplicits.pipelines.training.settings import TextureConfig
 from scipy.spatial import KDTree
 
 CENTER = np.array([3.0, -1.0, 10.0])

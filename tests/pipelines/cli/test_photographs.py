@@ -9,20 +9,20 @@ import numpy as np
 import pytest
 import trimesh
 from mplicits.datasets.synthetic.scenes import SCENES, render_scene
-from mplicits.datasets.views.colmap_process import FEATURES
-from mplicits.datasets.views.find_cameras import FoundCameras
-from mplicits.datasets.views.find_points import FoundPoints
 from mplicits.datasets.views.images import read_posed_images
+from mplicits.datasets.views.poses.colmap_process import FEATURES
+from mplicits.datasets.views.poses.find_cameras import FoundCameras
+from mplicits.datasets.views.poses.find_points import FoundPoints
 from mplicits.datasets.views.writing import write_colmap
 from mplicits.neural_fields import InputError
 from mplicits.pipelines.cli import main
 from mplicits.pipelines.reconstruct import train
-from mplicits.pipelines.reconstruct.model import RayPool, SceneModel
-from mplicits.pipelines.reconstruct.objective import SceneObjective
-from mplicits.pipelines.reconstruct.replayed import ReplayedTrainer
-from mplicits.pipelines.run.replay import Recorder, Work
-from mplicits.pipelines.run.settings import ReconstructConfig
+from mplicits.pipelines.reconstruct.model.model import RayPool, SceneModel
+from mplicits.pipelines.reconstruct.model.objective import SceneObjective
+from mplicits.pipelines.reconstruct.model.replayed import ReplayedTrainer
 from mplicits.pipelines.surface.surface import read_surface
+from mplicits.pipelines.training.replay import Recorder, Work
+from mplicits.pipelines.training.settings import ReconstructConfig
 
 TINY = (
     "--widths 8 8 --depths 1 1 --color-width 8 --color-depth 1 --color-grid 8 --steps 3 --rays 8 --uniform 8"
@@ -43,7 +43,7 @@ def finder(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
         options["report"](FEATURES, 1, 4)
         return FoundCameras(project, 5, ("4.png",), 40, 0.5)
 
-    monkeypatch.setattr("mplicits.datasets.views.find_cameras.find_cameras", find)
+    monkeypatch.setattr("mplicits.datasets.views.poses.find_cameras.find_cameras", find)
     return calls
 
 
@@ -71,7 +71,7 @@ def test_points_are_found_and_few_are_said(
     photos, project, said = tmp_path / "photos", tmp_path / "project", tmp_path / "said.json"
     write_colmap(photos, render_scene(SCENES["painted-sphere"](), views=4, size=16, samples=1))
     with monkeypatch.context() as patch:
-        patch.setattr("mplicits.datasets.views.find_points.find_points", find)
+        patch.setattr("mplicits.datasets.views.poses.find_points.find_points", find)
         assert main(["find-points", str(photos), "-o", str(project), "--json", str(said), "--quiet"]) == 0
     out, err = capsys.readouterr()
     assert f"{project}: 40 points that 4 photographs show, seen 0.50 pixels off" in out
@@ -120,7 +120,7 @@ def test_an_interruption_of_the_search_says_how_to_go_on(
     def interrupted(*_: Any, **__: Any) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("mplicits.datasets.views.find_cameras.find_cameras", interrupted)
+    monkeypatch.setattr("mplicits.datasets.views.poses.find_cameras.find_cameras", interrupted)
     assert main(["reconstruct", "photos", "-o", str(tmp_path / "run"), "--poses", "colmap", *TINY.split()]) == 130
     assert "interrupted; the same command continues" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
@@ -132,7 +132,7 @@ def test_photographs_that_hang_together_badly_are_one_line(
     def failed(*_: Any, **__: Any) -> None:
         raise InputError("project: no photographs could be placed")
 
-    monkeypatch.setattr("mplicits.datasets.views.find_cameras.find_cameras", failed)
+    monkeypatch.setattr("mplicits.datasets.views.poses.find_cameras.find_cameras", failed)
     assert main(["find-cameras", "photos", "-o", str(tmp_path / "project"), "--quiet"]) == 2
     assert capsys.readouterr().err.strip() == "mplicits: error: project: no photographs could be placed"
 

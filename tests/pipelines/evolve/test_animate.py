@@ -33,8 +33,8 @@ from mplicits.neural_fields import (
     save_field,
     save_texture,
 )
-from mplicits.neural_fields.attributes import project_to_surface
-from mplicits.neural_fields.dynamic_tracing import moment
+from mplicits.neural_fields.spacetime.dynamic_tracing import moment
+from mplicits.neural_fields.tracing.projection import project_to_surface
 from mplicits.pipelines.cli.draw import ANIMATE as COMMAND
 from mplicits.pipelines.evolve.animate import (
     SequenceOptions,
@@ -48,10 +48,10 @@ from mplicits.pipelines.evolve.follow import follow_mesh
 from mplicits.pipelines.mesh.extract import MeshOptions, mesh_run
 from mplicits.pipelines.render.draw import RenderOptions, render_run
 from mplicits.pipelines.render.subject import Orbit
-from mplicits.pipelines.run.folder import load_still
 from mplicits.pipelines.surface.surface import read_surface
 from mplicits.pipelines.texture.riding import RidingColors, borrowed_texture
 from mplicits.pipelines.texture.spread import CELL
+from mplicits.pipelines.training.folder import load_still
 
 RADIUS, DRIFT = 0.3, torch.tensor([0.5, 0.0, 0.0])
 START = torch.tensor([-0.25, 0.0, 0.0])

@@ -14,10 +14,10 @@ from mplicits.pipelines.evolve import deform
 from mplicits.pipelines.evolve.deform import carried_samples, learn_motion, match
 from mplicits.pipelines.evolve.shapes import read_shape
 from mplicits.pipelines.evolve.train import evolve
-from mplicits.pipelines.run.budget import Budget
-from mplicits.pipelines.run.motion import VELOCITY_FILE, load_motion
-from mplicits.pipelines.run.settings import EvolveConfig
-from mplicits.pipelines.run.trainer import Interrupted, Progress
+from mplicits.pipelines.training.budget import Budget
+from mplicits.pipelines.training.motion import VELOCITY_FILE, load_motion
+from mplicits.pipelines.training.settings import EvolveConfig
+from mplicits.pipelines.training.trainer import Interrupted, Progress
 
 LEFT, RIGHT = "sphere:0.25@-0.45,0,0", "sphere:0.25@0.45,0,0"
 SMALL = replace(

@@ -13,7 +13,7 @@ from mplicits.pipelines.evolve.deform import learn_motion, match
 from mplicits.pipelines.evolve.landmarks import Landmarks, nearness, placed_landmarks, read_landmarks
 from mplicits.pipelines.evolve.shapes import Placement, read_shape
 from mplicits.pipelines.evolve.train import evolve
-from mplicits.pipelines.run.settings import EvolveConfig
+from mplicits.pipelines.training.settings import EvolveConfig
 
 BALL = "sphere:0.5"
 TURN = RigidMotion(axis=(0.0, 0.0, 1.0), angle=0.8)

@@ -33,8 +33,8 @@ from mplicits.pipelines.evolve import problem as evolve_problem
 from mplicits.pipelines.evolve.objective import EvolveObjective
 from mplicits.pipelines.evolve.problem import between, build_problem, velocity_field
 from mplicits.pipelines.evolve.shapes import Placed, Placement, StaticShape, aligned, into_unit_sphere, read_shape
-from mplicits.pipelines.run.settings import EvolveConfig
 from mplicits.pipelines.surface.surface import from_mesh
+from mplicits.pipelines.training.settings import EvolveConfig
 
 CONFIG = EvolveConfig(samples=2000)
 TURN = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]

@@ -8,14 +8,14 @@ import pytest
 import trimesh
 from evolutions import QUICK, fails, few_points
 from mplicits.neural_fields import Similarity, Sphere, save_field
-from mplicits.neural_fields.files import write_json
+from mplicits.neural_fields.backend.files import write_json
 from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.evolve import deform, scans
 from mplicits.pipelines.evolve.landmarks import read_landmarks
 from mplicits.pipelines.evolve.scans import fits_beside, fitted_scans, scans_among
-from mplicits.pipelines.run.folder import FIELD_FILE, RECORD_FILE, read_record
-from mplicits.pipelines.run.settings import FitConfig
 from mplicits.pipelines.surface.surface import read_surface
+from mplicits.pipelines.training.folder import FIELD_FILE, RECORD_FILE, read_record
+from mplicits.pipelines.training.settings import FitConfig
 
 FITS = FitConfig(widths=(16,), depths=(1,), omegas=(4.0,), steps=(30,), learning_rates=(1e-2,), batch=256, samples=1000)
 

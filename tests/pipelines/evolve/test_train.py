@@ -25,15 +25,15 @@ from mplicits.neural_fields import (
     at_time,
     load_field,
 )
-from mplicits.neural_fields.analytic import Evaluated
+from mplicits.neural_fields.fields.primitives import Evaluated
 from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.evolve.checks import check_evolution, slope_figures
 from mplicits.pipelines.evolve.problem import End
 from mplicits.pipelines.evolve.samples import band_points
 from mplicits.pipelines.evolve.train import evolve
-from mplicits.pipelines.run.config import load_config, preset_names
-from mplicits.pipelines.run.settings import EvolveConfig
-from mplicits.pipelines.run.trainer import Interrupted, Progress
+from mplicits.pipelines.training.config import load_config, preset_names
+from mplicits.pipelines.training.settings import EvolveConfig
+from mplicits.pipelines.training.trainer import Interrupted, Progress
 from torch import Tensor
 
 TRAVEL = RigidMotion(velocity=(0.4, 0.0, 0.0))

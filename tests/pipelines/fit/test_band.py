@@ -4,7 +4,7 @@ import pytest
 import torch
 from mplicits.datasets import sample_sphere
 from mplicits.neural_fields import Field, Sphere, Union
-from mplicits.neural_fields.analytic import Evaluated
+from mplicits.neural_fields.fields.primitives import Evaluated
 from mplicits.pipelines.fit.band import WIDEST, Band, band_of, delta_of, with_wrong_sides
 from mplicits.pipelines.fit.cloud import CloudDistance
 

@@ -12,7 +12,7 @@ from mplicits.pipelines.fit import between
 from mplicits.pipelines.fit.between import ONE_SIDED, TURN, Densified, dense_distance, densified
 from mplicits.pipelines.fit.cloud import CloudDistance
 from mplicits.pipelines.fit.train import fit
-from mplicits.pipelines.run.settings import FitConfig
+from mplicits.pipelines.training.settings import FitConfig
 from scipy.spatial import KDTree
 
 Float64 = np.ndarray

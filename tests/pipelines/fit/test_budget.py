@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from mplicits.datasets import PointCloud
 from mplicits.pipelines.fit.train import fit
-from mplicits.pipelines.run.folder import read_record
-from mplicits.pipelines.run.report import Progress
-from mplicits.pipelines.run.settings import FitConfig
+from mplicits.pipelines.training.folder import read_record
+from mplicits.pipelines.training.report import Progress
+from mplicits.pipelines.training.settings import FitConfig
 
 
 def sphere_cloud(count: int = 3000) -> PointCloud:

@@ -27,8 +27,8 @@ from mplicits.pipelines.fit.heldout import (
 from mplicits.pipelines.fit.level import LevelObjective
 from mplicits.pipelines.fit.samples import Samples, Source, Usual, with_previous
 from mplicits.pipelines.fit.train import fit
-from mplicits.pipelines.run.settings import FitConfig
-from mplicits.pipelines.run.trainer import Trainer
+from mplicits.pipelines.training.settings import FitConfig
+from mplicits.pipelines.training.trainer import Trainer
 
 CPU = torch.device("cpu")
 RADIUS, OFF = 0.5, 0.02

@@ -11,10 +11,10 @@ from mplicits.datasets import sample_sphere, sample_torus, write_cloud_ply
 from mplicits.neural_fields import load_field
 from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.fit.many import fit_many, plan_fits
-from mplicits.pipelines.run.config import load_config
-from mplicits.pipelines.run.folder import STATE_FILE, find_field, read_record
-from mplicits.pipelines.run.settings import FitConfig
-from mplicits.pipelines.run.trainer import Interrupted, Progress
+from mplicits.pipelines.training.config import load_config
+from mplicits.pipelines.training.folder import STATE_FILE, find_field, read_record
+from mplicits.pipelines.training.settings import FitConfig
+from mplicits.pipelines.training.trainer import Interrupted, Progress
 
 SMALL = (
     *("--widths", "16", "--depths", "1", "--omegas", "15", "--steps", "30", "--learning-rates", "1e-2"),

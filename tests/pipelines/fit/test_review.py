@@ -9,13 +9,13 @@ import pytest
 import torch
 from mplicits.datasets import OrientedCloud, PointCloud, add_outliers, sample_sphere, sample_torus
 from mplicits.neural_fields import InputError, MultiscaleSDF, Plane, Siren, Sphere, Torus
-from mplicits.neural_fields.meshing import Mesh, extract_mesh
+from mplicits.neural_fields.meshing.extract import Mesh, extract_mesh
 from mplicits.pipelines.fit.review import review_points
 from mplicits.pipelines.fit.train import fit, prepare
 from mplicits.pipelines.mesh.extract import MeshOptions, mesh_run
-from mplicits.pipelines.run.folder import SUPPORT_FILE
-from mplicits.pipelines.run.settings import FitConfig
 from mplicits.pipelines.surface.trim import read_support
+from mplicits.pipelines.training.folder import SUPPORT_FILE
+from mplicits.pipelines.training.settings import FitConfig
 
 SMALL = FitConfig(
     widths=(32, 48),

@@ -23,7 +23,7 @@ from mplicits.pipelines.fit.samples import (
     usual_errors,
     with_previous,
 )
-from mplicits.pipelines.run.settings import FitConfig
+from mplicits.pipelines.training.settings import FitConfig
 from torch import Tensor
 
 from benchmarks.paper.base import train_level

@@ -12,15 +12,15 @@ import pytest
 import torch
 from mplicits.datasets import PointCloud
 from mplicits.neural_fields import InputError, load_field
-from mplicits.neural_fields.meshing import extract_mesh
+from mplicits.neural_fields.meshing.extract import extract_mesh
 from mplicits.pipelines.cli.info import describe
 from mplicits.pipelines.fit.heldout import FEWEST
 from mplicits.pipelines.fit.level import CALM, calm_omega
 from mplicits.pipelines.fit.train import fit
-from mplicits.pipelines.run.folder import read_record
-from mplicits.pipelines.run.machine import choose_device
-from mplicits.pipelines.run.settings import FitConfig
-from mplicits.pipelines.run.trainer import Interrupted, Progress
+from mplicits.pipelines.training.folder import read_record
+from mplicits.pipelines.training.machine import choose_device
+from mplicits.pipelines.training.settings import FitConfig
+from mplicits.pipelines.training.trainer import Interrupted, Progress
 
 SMALL = FitConfig(
     widths=(32, 48),

@@ -13,8 +13,8 @@ from mplicits.neural_fields import load_field
 from mplicits.pipelines.fit.cloud import CloudDistance
 from mplicits.pipelines.fit.train import fit, prepare
 from mplicits.pipelines.fit.unoriented import STAGES, Places, Signs, fits_better, give_signs
-from mplicits.pipelines.run.settings import FitConfig
-from mplicits.pipelines.run.trainer import Interrupted, Progress, StopFlag
+from mplicits.pipelines.training.settings import FitConfig
+from mplicits.pipelines.training.trainer import Interrupted, Progress, StopFlag
 from torch import Tensor
 
 SMALL = FitConfig(

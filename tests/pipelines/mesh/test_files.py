@@ -7,7 +7,7 @@ import pytest
 import trimesh
 from mplicits.datasets import linear_to_srgb, read_cloud
 from mplicits.neural_fields import InputError, Similarity, Sphere
-from mplicits.neural_fields.meshing import Mesh, extract_mesh
+from mplicits.neural_fields.meshing.extract import Mesh, extract_mesh
 from mplicits.pipelines.mesh.files import check_mesh_path, needs_doubles, write_mesh
 from mplicits.pipelines.surface.surface import read_surface
 

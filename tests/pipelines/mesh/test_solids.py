@@ -9,9 +9,9 @@ import trimesh
 from mplicits.neural_fields import Box, InputError, Similarity, Sphere, Union, extract_mesh, load_field, save_field
 from mplicits.pipelines.cli import entry as cli
 from mplicits.pipelines.mesh.solids import length_in
-from mplicits.pipelines.run.trainer import parameter_count
 from mplicits.pipelines.surface import Surface
 from mplicits.pipelines.surface.solid import MeshField
+from mplicits.pipelines.training.trainer import parameter_count
 
 RADIUS, OTHER, APART = 30.0, 25.0, 35.0  # millimetres
 RESOLUTION = 32

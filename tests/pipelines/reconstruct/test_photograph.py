@@ -11,14 +11,14 @@ from mplicits.datasets.synthetic.scenes import SCENES, render_scene
 from mplicits.datasets.views.images import PosedImages
 from mplicits.datasets.views.writing import write_transforms
 from mplicits.neural_fields import InputError, Similarity, Sphere, save_field
-from mplicits.neural_fields.value_grid import ValueGrid
-from mplicits.neural_fields.volume_renderer import Sampling
+from mplicits.neural_fields.networks.value_grid import ValueGrid
+from mplicits.neural_fields.volume.render import Sampling
 from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.reconstruct.photograph import open_scene, photograph
 from mplicits.pipelines.reconstruct.train import Reconstruction, reconstruct
 from mplicits.pipelines.reconstruct.views import render_image
 from mplicits.pipelines.render.draw import RenderOptions
-from mplicits.pipelines.run.trainer import Interrupted, Progress
+from mplicits.pipelines.training.trainer import Interrupted, Progress
 from reconstructions import TINY_SCENE
 
 TINY = replace(TINY_SCENE, starts=(0.0, 0.4), background="outside", steps=40, rays=16, texture_steps=0, test_every=3)

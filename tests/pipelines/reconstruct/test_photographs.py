@@ -9,12 +9,12 @@ import torch
 from mplicits.datasets.synthetic.scenes import SCENES, render_scene
 from mplicits.datasets.views.images import PosedImage, PosedImages
 from mplicits.neural_fields import Jet, Similarity, Sphere
-from mplicits.neural_fields.volume_renderer import Rendered, Sampling
-from mplicits.pipelines.reconstruct.model import Exposures, PoseCorrections, RayPool, SceneModel, build_scene
-from mplicits.pipelines.reconstruct.objective import SceneObjective
+from mplicits.neural_fields.volume.render import Rendered, Sampling
+from mplicits.pipelines.reconstruct.model.model import Exposures, PoseCorrections, RayPool, SceneModel, build_scene
+from mplicits.pipelines.reconstruct.model.objective import SceneObjective
 from mplicits.pipelines.reconstruct.train import reconstruct
 from mplicits.pipelines.reconstruct.views import ViewImage, exposed_as, measure, render_image
-from mplicits.pipelines.run.settings import ReconstructConfig
+from mplicits.pipelines.training.settings import ReconstructConfig
 from reconstructions import small_reconstructions
 from torch import Tensor, nn
 

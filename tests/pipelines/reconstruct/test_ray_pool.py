@@ -6,8 +6,8 @@ import torch
 from mplicits.datasets import look_at
 from mplicits.datasets.views.images import PosedImage
 from mplicits.neural_fields import InputError, Similarity
-from mplicits.neural_fields.volume import sphere_span
-from mplicits.pipelines.reconstruct.model import RayPool, camera_rays
+from mplicits.neural_fields.volume.weights import sphere_span
+from mplicits.pipelines.reconstruct.model.model import RayPool, camera_rays
 
 WORLD = Similarity(center=(50.0, -20.0, 7.0), scale=4.0)
 CPU = torch.device("cpu")

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 from mplicits.datasets import read_cloud
-from mplicits.datasets.clouds.orientation import fibonacci_directions
+from mplicits.datasets.clouds.cleaning.orientation import fibonacci_directions
 from mplicits.datasets.synthetic.scenes import SCENES, render_scene, sample_scene
 from mplicits.datasets.synthetic.view_faults import with_fault
 from mplicits.datasets.views.images import PosedImages
@@ -30,14 +30,14 @@ from mplicits.neural_fields import (
 )
 from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.mesh.extract import MeshOptions, mesh_run
-from mplicits.pipelines.reconstruct import silhouettes
-from mplicits.pipelines.reconstruct.model import SceneModel
+from mplicits.pipelines.reconstruct.data import silhouettes
+from mplicits.pipelines.reconstruct.model.model import SceneModel
 from mplicits.pipelines.reconstruct.train import Reconstruction, reconstruct, surface_colors
-from mplicits.pipelines.run.config import load_config
-from mplicits.pipelines.run.folder import load_state, state_bytes
-from mplicits.pipelines.run.settings import ReconstructConfig
-from mplicits.pipelines.run.trainer import Interrupted, Progress
 from mplicits.pipelines.surface.measure import chamfer
+from mplicits.pipelines.training.config import load_config
+from mplicits.pipelines.training.folder import load_state, state_bytes
+from mplicits.pipelines.training.settings import ReconstructConfig
+from mplicits.pipelines.training.trainer import Interrupted, Progress
 from reconstructions import TINY_SCENE, small_reconstructions
 from torch import Tensor
 

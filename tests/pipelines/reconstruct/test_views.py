@@ -10,9 +10,9 @@ from mplicits.datasets import look_at
 from mplicits.datasets.synthetic.scenes import SCENES, render_scene, render_view, scene_cameras
 from mplicits.datasets.views.images import PosedImage
 from mplicits.neural_fields import Jet, Similarity
-from mplicits.neural_fields.value_grid import ValueGrid
-from mplicits.neural_fields.volume_renderer import Sampling
-from mplicits.pipelines.reconstruct.model import SceneModel
+from mplicits.neural_fields.networks.value_grid import ValueGrid
+from mplicits.neural_fields.volume.render import Sampling
+from mplicits.pipelines.reconstruct.model.model import SceneModel
 from mplicits.pipelines.reconstruct.views import (
     ViewImage,
     comparison_sheet,

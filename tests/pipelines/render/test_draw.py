@@ -14,7 +14,7 @@ from fields import FIELDS
 from mplicits.datasets import PointCloud, look_at, orbit, write_cloud_ply
 from mplicits.datasets.cameras import Camera
 from mplicits.neural_fields import InputError, MultiscaleSDF, Similarity, Siren, Sphere, Torus, save_field
-from mplicits.neural_fields.meshing import extract_mesh
+from mplicits.neural_fields.meshing.extract import extract_mesh
 from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.mesh.files import write_mesh
 from mplicits.pipelines.render import trace

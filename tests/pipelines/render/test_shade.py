@@ -394,5 +394,5 @@ def test_downsampling_a_transparent_image_and_pasting_it_is_the_other_way_round_
 
 
 def test_the_names_are_known_without_torch():
-    code = "import sys, mplicits.pipelines.run.settings; assert not {'torch', 'numpy', 'cv2'} & set(sys.modules)"
+    code = "import sys, mplicits.pipelines.training.settings; assert not {'torch', 'numpy', 'cv2'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 from mplicits.neural_fields import InputError, Sphere, Union
-from mplicits.neural_fields.meshing import Mesh, extract_mesh
+from mplicits.neural_fields.meshing.extract import Mesh, extract_mesh
 from mplicits.pipelines.surface.surface import face_normals
 from mplicits.pipelines.surface.trim import (
     drop_unsupported,

@@ -16,9 +16,9 @@ from mplicits.neural_fields import (
     extract_mesh,
     solve_sphere,
 )
-from mplicits.pipelines.run.trainer import StopFlag
 from mplicits.pipelines.texture import highlights
 from mplicits.pipelines.texture.highlights import FACING, LOOKS, fit_highlights
+from mplicits.pipelines.training.trainer import StopFlag
 from torch import Tensor
 
 LAMP = torch.tensor([0.0, 0.6, 0.8])

@@ -29,9 +29,9 @@ from mplicits.neural_fields import (
     TimeSlice,
     save_field,
 )
-from mplicits.neural_fields.analytic import Plane
+from mplicits.neural_fields.fields.primitives import Plane
 from mplicits.pipelines.render.trace import trace_view
-from mplicits.pipelines.run.folder import named_cloud
+from mplicits.pipelines.training.folder import named_cloud
 from mplicits.pipelines.viewer import frames
 from mplicits.pipelines.viewer.camera import (
     describe_reading,

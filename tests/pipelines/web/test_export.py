@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from mplicits.neural_fields import MultiscaleSDF, Similarity, Siren, Sphere, save_field, solve_sphere
-from mplicits.neural_fields.spacetime import SpaceTimeSDF
+from mplicits.neural_fields.spacetime.field import SpaceTimeSDF
 from mplicits.pipelines.cli import main
 from mplicits.pipelines.web.export import BITS
 from mplicits.pipelines.web.payload import text_of

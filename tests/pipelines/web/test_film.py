@@ -15,7 +15,7 @@ from mplicits.neural_fields import (
     save_field,
     solve_sphere,
 )
-from mplicits.neural_fields.spacetime import SpaceTimeSDF
+from mplicits.neural_fields.spacetime.field import SpaceTimeSDF
 from mplicits.pipelines.cli import main
 from mplicits.pipelines.web.export import WebOptions, web_run
 from mplicits.pipelines.web.film import Swept, fastest_change, swept_shell

@@ -5,7 +5,7 @@ import pytest
 import torch
 import trimesh
 from mplicits.neural_fields import MultiscaleSDF, Siren, Sphere, Torus, Union
-from mplicits.neural_fields.tracing import BOUNDING_RADIUS
+from mplicits.neural_fields.tracing.sphere import BOUNDING_RADIUS
 from mplicits.pipelines.web.shell import MARGIN, shell_mesh, surface_reach
 
 SHAPES = {

@@ -1,0 +1,1 @@
+"""Outliers, noise and normals of point clouds."""

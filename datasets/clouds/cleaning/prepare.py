@@ -1,0 +1,371 @@
+"""``prepare_cloud``: a file's points → clean, oriented points in the unit sphere."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from ....neural_fields import InputError, Similarity
+from ..point_cloud import PointCloud, centred, middle_of, unit_rows, usable_rows
+from ..readers.meshes import weld
+from ..readers.reading import MIN_POINTS
+from .judging import layer_level, neighborly, worse_normals
+from .noise import noise_deviation, noise_level, smooth_along_normals
+from .orientation import estimate_normals, nearest, openness, orient_normals, outwardness
+from .outliers import agreement, inspect_points
+from .reestimate import denoise, refit_normals
+from .winding import orient_by_winding
+
+__all__ = ["CleaningReport", "OrientedCloud", "prepare_cloud"]
+
+Float64 = NDArray[np.float64]
+
+# Least share of neighbours that support a point (see `agreement`) once noise is smoothed off points whose normals were
+# estimated: fewer support those that were moved along another layer's normal, and to the wrong place.
+SUPPORTED = 0.3
+
+
+@dataclass(frozen=True)
+class CleaningReport:
+    """What was done to a cloud.
+
+    Attributes:
+        read: points in the file.
+        kept: points left.
+        dropped_nan: points with a coordinate that is not finite.
+        dropped_duplicates: points at exactly the place of an earlier one.
+        dropped_isolated: points far from all others.
+        dropped_outliers: other points that belong to no surface.
+        repaired_normals: zero or NaN normals replaced by their neighbours' mean.
+        dropped_normals: points whose normal could not be repaired.
+        turned_normals: normals turned round because their neighbours' point the other way.
+        normals_source: "file", "mesh" (from the file's faces) or "estimated".
+        flipped: whether all normals pointed inward and were turned round.
+        pieces: connected pieces of the cloud; 0 if normals were not estimated, or a sensor oriented them.
+        oriented_by: what gave estimated normals their signs: "winding" numbers, "propagation" from point to point in
+            each piece, the "sensor", or the first "level" of a fit; None for those of a file.
+        smoothed_noise: thickness, in input units, of the layer that the points were moved together from, along the
+            normals (see `noise_level`); 0 if they were left where they are.
+        noise_deviation: standard deviation, in input units, of that noise (see `noise_deviation`).
+        reestimated_normals: normals of the file that were worse than planes through the points, and were replaced.
+    """
+
+    read: int
+    kept: int
+    dropped_nan: int
+    dropped_duplicates: int
+    dropped_isolated: int
+    dropped_outliers: int
+    repaired_normals: int
+    dropped_normals: int
+    turned_normals: int
+    normals_source: Literal["file", "mesh", "estimated"]
+    flipped: bool
+    pieces: int
+    smoothed_noise: float = 0.0
+    oriented_by: Literal["winding", "propagation", "sensor", "level"] | None = None
+    noise_deviation: float = 0.0
+    reestimated_normals: int = 0
+
+    def summary(self) -> str:
+        """One line for people."""
+        source = {"file": "from the file", "mesh": "of the mesh", "estimated": "estimated"}[self.normals_source]
+        parts = [f"{self.kept:,} of {self.read:,} points", f"normals {source}"]
+        ways = {
+            "winding": "by winding numbers",
+            "propagation": "from point to point" + f" in {self.pieces:,} separate pieces" * (self.pieces > 1),
+            "sensor": "towards the sensor",
+            "level": "by level 0, which was not told",
+        }
+        if self.oriented_by:
+            parts.append(f"oriented {ways[self.oriented_by]}")
+        if self.flipped:
+            parts.append("all normals pointed inward and were flipped (--normals file keeps them)")
+        counts = {
+            "not finite": self.dropped_nan,
+            "duplicate": self.dropped_duplicates,
+            "isolated": self.dropped_isolated,
+            "outliers": self.dropped_outliers,
+            "without a usable normal": self.dropped_normals,
+        }
+        dropped = ", ".join(f"{count:,} {what}" for what, count in counts.items() if count)
+        if self.repaired_normals:
+            parts.append(f"{self.repaired_normals:,} normals repaired")
+        if self.reestimated_normals:
+            parts.append(
+                f"{self.reestimated_normals:,} normals disagreed with the points and were estimated again "
+                "(--normals file keeps them)"
+            )
+        if self.turned_normals:
+            parts.append(f"{self.turned_normals:,} normals turned round (--no-turn-normals keeps them)")
+        if self.smoothed_noise:
+            parts.append(
+                f"noise of about {self.noise_deviation or self.smoothed_noise:.2g} along the normals smoothed "
+                "(--no-smooth-noise keeps it)"
+            )
+        return "; ".join([*parts, *([f"dropped {dropped}"] if dropped else [])])
+
+
+@dataclass(frozen=True)
+class OrientedCloud:
+    """A clean cloud in the unit sphere.
+
+    Attributes:
+        points: ``(N, 3)`` float32, in the unit sphere.
+        normals: ``(N, 3)`` float32, of unit length, outward.
+        colors: ``(N, 3)`` float32 in [0, 1], or None.
+        similarity: the way back to input coordinates.
+        report: what was dropped, repaired and estimated.
+    """
+
+    points: NDArray[np.float32]
+    normals: NDArray[np.float32]
+    colors: NDArray[np.float32] | None
+    similarity: Similarity
+    report: CleaningReport
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    @property
+    def noise(self) -> float:
+        """Standard deviation, in the unit sphere, of the noise that was smoothed off the points; 0 for none."""
+        return self.report.smoothed_noise / self.similarity.scale
+
+    @property
+    def estimated(self) -> bool:
+        """Whether normals, all or some, were estimated from the points: at sharp edges each is one side's by chance."""
+        return self.report.normals_source == "estimated" or self.report.reestimated_normals > 0
+
+
+def prepare_cloud(
+    cloud: PointCloud,
+    *,
+    normals: Literal["auto", "file", "estimate"] = "auto",
+    sensor_origin: tuple[float, float, float] | None = None,
+    neighbors: int = 16,
+    isolation: float | None = 30.0,
+    drop_outliers: bool = False,
+    turn_normals: bool = False,
+    smooth_noise: bool = False,
+) -> OrientedCloud:
+    """Clean a cloud, give it oriented unit normals and move it into the unit sphere.
+
+    Points that are not finite and exact duplicates (all but the first) are dropped, then the cloud is centred and
+    scaled in float64, and only then rounded to float32.
+
+    Args:
+        cloud: as read.
+        normals: "file" keeps the file's normals and their sign; "estimate" ignores them; "auto" takes the
+            file's if at least half are usable, and turns them all round when they plainly point inward.
+        sensor_origin: where the scanner stood, in input coordinates; estimated normals are turned towards it.
+        neighbors: size of the neighbourhoods normals are estimated and repaired from; doubled for estimation,
+            at most twice, while the cloud is too noisy for them to look flat.
+        isolation: points whose eighth neighbour is this many times further away than the median point's are dropped:
+            a single stray point of a scan would get a bubble of surface to itself, and set the scale. Those that
+            neighbours about as sparse support (see `inspect_points`) stay: they are a sparser part. None keeps all.
+        drop_outliers: whether other points that belong to no surface are dropped (see `inspect_points`); and after
+            noise was smoothed along estimated normals, those that few of their neighbours support (`SUPPORTED`).
+        turn_normals: whether single normals of the file that point the other way than their neighbours' are turned
+            round; with ``normals="file"`` none is.
+        smooth_noise: whether points are moved along their normals to where their neighbours agree, if the noise is
+            wide enough for that to be told (see :mod:`.noise`); estimated normals are then fitted once more to the
+            moved points (see :mod:`.reestimate`). With ``normals="auto"`` those of a file are judged by the points
+            first, and replaced, with their sign, where they are worse than what the points say (see :mod:`.judging`).
+
+    Raises:
+        InputError: too few points are left, or ``normals="file"`` and there are none.
+        ValueError: ``normals`` or ``neighbors`` is none of those allowed.
+    """
+    if normals not in ("auto", "file", "estimate"):
+        raise ValueError(f"normals={normals!r}: expected 'auto', 'file' or 'estimate'")
+    if neighbors < 3:
+        raise ValueError(f"neighbors={neighbors}: expected at least 3, to span a plane")
+    if isolation is not None and not isolation > 1:
+        raise ValueError(f"isolation={isolation}: expected a factor > 1, or None")
+    if sensor_origin is not None and not np.isfinite(np.asarray(sensor_origin, np.float64)).all():
+        raise InputError(f"sensor_origin={sensor_origin}: expected three finite numbers")
+
+    finite = np.flatnonzero(usable_rows(cloud.points))
+    distinct = finite[np.sort(weld(cloud.points[finite])[0])]
+    _check_enough(len(distinct), cloud, "are left after dropping NaN and duplicates")
+
+    given = unit_rows(cloud.normals[distinct]) if cloud.normals is not None and normals != "estimate" else None
+    usable: NDArray[np.bool_] = np.zeros(len(distinct), bool)
+    if given is not None:
+        usable = (given != 0).any(axis=1)
+    if normals == "file" and not usable.any():
+        raise InputError(f"{cloud.source}: normals: the file has none; use --normals estimate")
+    kept, unit, repaired = distinct, None, 0
+    if given is not None and (normals == "file" or 2 * usable.sum() >= len(distinct)):
+        unit, decided = _repair(cloud.points[distinct], given, usable, neighbors)
+        repaired = int(decided.sum() - usable.sum())
+        unit, kept = unit[decided], distinct[decided]
+        _check_enough(len(kept), cloud, "have a usable normal; use --normals estimate")
+    dropped_normals = len(distinct) - len(kept)
+    places, noise, deviation, reestimated = cloud.points[kept], 0.0, 0.0, 0
+    if unit is not None and normals == "auto" and smooth_noise and cloud.normals_source == "file":
+        unit, reestimated = _agreeing(places, unit)
+    if unit is not None and smooth_noise:  # before the rest: noise mixes up the sides of thin parts
+        places, noise, deviation = _smoothed(places, unit, flips=turn_normals and normals == "auto")
+    found = inspect_points(
+        places,
+        unit,
+        isolation=isolation,
+        outliers=drop_outliers,
+        flips=turn_normals and normals == "auto",
+    )
+    sound = ~(found.isolated | found.outliers)
+    kept = kept[sound]
+    _check_enough(len(kept), cloud, "are left after dropping outliers; keep them with --no-drop-outliers")
+    similarity = Similarity.to_unit_sphere(places[sound])
+    points = similarity.to_unit(places[sound])
+
+    source: Literal["file", "mesh", "estimated"] = cloud.normals_source
+    flipped, pieces, oriented_by, strays = False, 0, None, int(found.outliers.sum())
+    if unit is not None:
+        unit = np.where(found.flipped[:, None], -unit, unit)[sound]
+        flipped = normals == "auto" and _plainly_inward(points, unit)
+        unit = -unit if flipped else unit
+    else:
+        source = "estimated"
+        unit, pieces, oriented_by = _estimate(points, neighbors, similarity, sensor_origin)
+        if smooth_noise:
+            noisy = points
+            points, unit, noise = denoise(noisy, unit)
+            deviation = noise_deviation(noisy, unit, thick=0.0) * similarity.scale if noise else 0.0
+            noise *= similarity.scale
+            if noise and drop_outliers:
+                supported = agreement(points, unit, np.arange(len(points)))[0] >= SUPPORTED
+                points, unit, kept = points[supported], unit[supported], kept[supported]
+                _check_enough(len(kept), cloud, "are left after dropping outliers; keep them with --no-drop-outliers")
+                strays += int((~supported).sum())
+    report = CleaningReport(
+        read=len(cloud),
+        kept=len(kept),
+        dropped_nan=len(cloud) - len(finite),
+        dropped_duplicates=len(finite) - len(distinct),
+        dropped_isolated=int(found.isolated.sum()),
+        dropped_outliers=strays,
+        repaired_normals=repaired,
+        dropped_normals=dropped_normals,
+        turned_normals=int(found.flipped.sum()),
+        normals_source=source,
+        flipped=flipped,
+        pieces=pieces,
+        smoothed_noise=noise,
+        oriented_by=oriented_by,
+        noise_deviation=deviation,
+        reestimated_normals=reestimated,
+    )
+    colors = None if cloud.colors is None else cloud.colors[kept]
+    return OrientedCloud(points.astype(np.float32), unit.astype(np.float32), colors, similarity, report)
+
+
+def _check_enough(count: int, cloud: PointCloud, why: str) -> None:
+    if count < MIN_POINTS:
+        raise InputError(
+            f"{cloud.source}: points: only {count} of {len(cloud)} {why}; at least {MIN_POINTS} are needed"
+        )
+
+
+def _agreeing(points: Float64, normals: Float64) -> tuple[Float64, int]:
+    """Normals of a file, those that are worse than planes through the points replaced, and how many were.
+
+    Where the points are noisy as well, planes are fitted in turns with smoothing, as for normals that are estimated,
+    and replace all.
+    """
+    around = centred(points)
+    level = layer_level(around, normals)
+    worse = worse_normals(around, normals, level)
+    if not worse.any():
+        return normals, 0
+    guides = neighborly(around, normals)
+    if level:
+        return denoise(around, guides)[1], len(normals)
+    fitted = refit_normals(around, guides, 0.0, neighbors=16)
+    return np.where(worse[:, None], fitted, normals), int(worse.sum())
+
+
+def _smoothed(points: Float64, normals: Float64, *, flips: bool = False) -> tuple[Float64, float, float]:
+    """Points without the noise along their normals, how thick their layer was, and its standard deviation.
+
+    Where ``flips`` may be among the normals of a thin part, one side passes for noise about the other: what is no noise
+    once they are turned round is none.
+    """
+    middle = middle_of(points)
+    level, sound = noise_level(points - middle, normals), normals
+    if level and flips:
+        flipped = inspect_points(points, normals, outliers=False).flipped
+        sound = np.where(flipped[:, None], -normals, normals)
+        level = noise_level(points - middle, sound)
+    if not level:
+        return points, 0.0, 0.0
+    deviation = noise_deviation(points - middle, sound)
+    return smooth_along_normals(points - middle, normals, level) + middle, level, deviation
+
+
+def _repair(
+    points: Float64, normals: Float64, usable: NDArray[np.bool_], neighbors: int, *, agreement: float = 0.5
+) -> tuple[Float64, NDArray[np.bool_]]:
+    """Replace unusable normals by the mean of the nearest usable ones.
+
+    A mean shorter than ``agreement`` (1: all equal, 0: they cancel) decides nothing.
+
+    Returns:
+        Normals ``(N, 3)``, and which of them are decided ``(N,)``.
+    """
+    missing = np.flatnonzero(~usable)
+    if len(missing) == 0:
+        return normals, usable
+    shifted = centred(points)
+    near = KDTree(shifted[usable]).query(shifted[missing], k=min(neighbors, int(usable.sum())), workers=-1)[1]
+    mean = normals[usable][near.reshape(len(missing), -1)].mean(axis=1)
+    length = np.linalg.norm(mean, axis=1)
+    clear = length > agreement
+    repaired, decided = normals.copy(), usable.copy()
+    repaired[missing[clear]] = mean[clear] / length[clear, None]
+    decided[missing[clear]] = True
+    return repaired, decided
+
+
+def _plainly_inward(
+    points: Float64, normals: Float64, *, score: float = -0.3, share: float = 0.9, opening: float = 0.15
+) -> bool:
+    """Whether the evidence is overwhelming: an open scan, seen from one side, must not be turned round.
+
+    A hollow seen from its open side has inward normals, rightly; it is told from a closed body turned inside out
+    by the sum of its area-weighted normals, which over a closed surface is zero (see :func:`openness`).
+    """
+    mean, negative = outwardness(points, normals)
+    return mean < score and negative >= share and openness(points, normals) < opening
+
+
+def _estimate(
+    points: Float64, neighbors: int, similarity: Similarity, sensor_origin: tuple[float, float, float] | None
+) -> tuple[Float64, int, Literal["winding", "propagation", "sensor"]]:
+    near, normals, spread = _planes(points, neighbors)
+    if sensor_origin is not None:
+        towards = similarity.to_unit(np.asarray(sensor_origin, np.float64)) - points
+        return np.where((normals * towards).sum(axis=1, keepdims=True) < 0, -normals, normals), 0, "sensor"
+    propagated, pieces = orient_normals(points, normals, spread, near)
+    oriented = orient_by_winding(points, propagated)
+    if oriented is None:
+        return propagated, pieces, "propagation"
+    return oriented, pieces, "winding"
+
+
+def _planes(
+    points: Float64, neighbors: int, *, flat: float = 0.25, doublings: int = 2
+) -> tuple[NDArray[np.int64], Float64, Float64]:
+    """Neighbourhoods with a median thickness below ``flat`` times their radius, and the planes through them."""
+    near = nearest(points, neighbors)
+    normals, spread = estimate_normals(points, near)
+    radius = np.linalg.norm(points[near[:, -1]] - points, axis=1)
+    if doublings == 0 or np.median(spread / radius) < flat:
+        return near, normals, spread
+    return _planes(points, 2 * neighbors, flat=flat, doublings=doublings - 1)

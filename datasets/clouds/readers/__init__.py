@@ -1,0 +1,1 @@
+"""Files of points → ``PointCloud``, whole or in pieces."""

@@ -1,0 +1,332 @@
+"""PLY point clouds, exactly: any vertex type and order, lists, elements before and after the vertices.
+
+Format: G. Turk, "The PLY Polygon File Format", 1994. An ASCII body is turned into the binary body of a
+file whose properties are all doubles, so that one decoder serves all three encodings.
+"""
+
+from __future__ import annotations
+
+import re
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ....neural_fields import InputError
+from ....neural_fields.backend.files import write_whole
+from ..point_cloud import PointCloud, colors_from, columns_of, normals_from
+from .meshes import triangulate, vertex_normals
+from .stream import TableStream
+
+__all__ = ["ply_stream", "read_ply", "read_ply_mesh", "write_cloud_ply"]
+
+_KINDS = {
+    **dict.fromkeys(("char", "int8"), "i1"),
+    **dict.fromkeys(("uchar", "uint8"), "u1"),
+    **dict.fromkeys(("short", "int16"), "i2"),
+    **dict.fromkeys(("ushort", "uint16"), "u2"),
+    **dict.fromkeys(("int", "int32"), "i4"),
+    **dict.fromkeys(("uint", "uint32"), "u4"),
+    **dict.fromkeys(("float", "float32"), "f4"),
+    **dict.fromkeys(("double", "float64"), "f8"),
+}
+_ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
+_LONGEST_HEADER = 1 << 20
+
+
+@dataclass(frozen=True)
+class _Property:
+    name: str
+    kind: str
+    length_kind: str | None  # of a list: the type of its length
+
+
+@dataclass(frozen=True)
+class _Element:
+    name: str
+    count: int
+    properties: tuple[_Property, ...]
+
+
+@dataclass(frozen=True)
+class _Lists:
+    """One list per row: ``lengths`` ``(n,)`` and all items in one array."""
+
+    lengths: NDArray[np.int64]
+    items: NDArray[Any]
+
+
+_Columns = dict[str, "NDArray[Any] | _Lists"]
+
+
+def read_ply(path: Path) -> PointCloud:
+    """Read the vertices of a PLY file; if they have no normals but the file has faces, take those of the mesh.
+
+    Raises:
+        InputError: the header is not PLY, x, y or z is missing, or the file ends too early.
+    """
+    return _read(path, meshes=False)[0]
+
+
+def read_ply_mesh(path: Path) -> tuple[PointCloud, NDArray[np.int64]]:
+    """Read the vertices and the triangles ``(F, 3)`` of a PLY file; of polygons, fans. There may be none.
+
+    Raises:
+        InputError: see `read_ply`.
+    """
+    return _read(path, meshes=True)
+
+
+def _read(path: Path, *, meshes: bool) -> tuple[PointCloud, NDArray[np.int64]]:
+    """Vertices and faces; unless ``meshes`` are asked for, no faces where the vertices have normals of their own."""
+    data = path.read_bytes()
+    encoding, elements, body = _parse_header(data, path)
+    order = _ORDERS[encoding]
+    if encoding == "ascii":
+        data, body = _ascii_to_doubles(data[body:], path), 0
+    vertex: _Columns | None = None
+    faces = np.empty((0, 3), np.int64)
+    for element in elements:
+        stored = _as_doubles(element) if encoding == "ascii" else element
+        columns, body = _decode(data, body, stored, order, path)
+        if element.name == "vertex":
+            vertex = {p.name: _restore(columns[p.name], p) for p in element.properties}
+            if not meshes and _channels(vertex, "normals") is not None:
+                break  # nothing that follows is needed
+        elif element.name == "face":
+            lists = columns.get("vertex_indices", columns.get("vertex_index"))
+            if isinstance(lists, _Lists):
+                faces = triangulate(lists.lengths, lists.items.astype(np.int64))
+    if vertex is None:
+        raise InputError(f"{path}: vertex: the header declares no such element; export it as a point cloud")
+    return _cloud(vertex, faces, path), faces
+
+
+def ply_stream(path: Path) -> TableStream | None:
+    """The vertices of a PLY file, to be read in pieces; None if that cannot be: only `read_ply` reads such a file.
+
+    The file must be binary, its vertices must come first and hold no lists, and their normals must stand with them if
+    there are faces.
+
+    Raises:
+        InputError: the header is not PLY, or the file ends too early.
+    """
+    with path.open("rb") as file:
+        head = file.read(_LONGEST_HEADER)
+    if b"end_header" not in head:
+        return None
+    encoding, elements, body = _parse_header(head, path)
+    vertex = next(iter(elements), None)
+    if (
+        encoding == "ascii"
+        or vertex is None
+        or vertex.name != "vertex"
+        or any(p.length_kind for p in vertex.properties)
+    ):
+        return None
+    names = {p.name for p in vertex.properties}
+    normals, colors = columns_of(names, "normals"), columns_of(names, "colors")
+    has_faces = any(element.name == "face" for element in elements)
+    if len(names) < len(vertex.properties) or not names.issuperset("xyz") or (normals is None and has_faces):
+        return None
+    row = np.dtype([(p.name, _ORDERS[encoding] + p.kind) for p in vertex.properties])
+    return TableStream(
+        path, offset=body, row=row, count=vertex.count, points=("x", "y", "z"), normals=normals, colors=colors
+    )
+
+
+def write_cloud_ply(path: str | Path, cloud: PointCloud) -> None:
+    """Write ``cloud`` as binary little-endian PLY with double coordinates; an existing file is replaced at the end."""
+    fields = [(name, "<f8") for name in "xyz"]
+    values = list(cloud.points.T)
+    if cloud.normals is not None:
+        fields += [(name, "<f4") for name in ("nx", "ny", "nz")]
+        values += list(cloud.normals.T)
+    if cloud.colors is not None:
+        fields += [(name, "u1") for name in ("red", "green", "blue")]
+        values += list(np.rint(cloud.colors * 255).astype(np.uint8).T)
+    rows = np.empty(len(cloud), np.dtype(fields))
+    for (name, _), column in zip(fields, values, strict=True):
+        rows[name] = column
+    types = {"<f8": "double", "<f4": "float", "u1": "uchar"}
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(cloud)}"]
+    header += [f"property {types[kind]} {name}" for name, kind in fields]
+    write_whole(path, "\n".join([*header, "end_header\n"]).encode() + rows.tobytes())
+
+
+def _cloud(vertex: _Columns, faces: NDArray[np.int64], path: Path) -> PointCloud:
+    points = _channels(vertex, "points")
+    if points is None:
+        missing = ", ".join(name for name in "xyz" if name not in vertex)
+        raise InputError(f"{path}: vertex: property {missing} is missing; export it with x, y and z")
+    points = points.astype(np.float64)
+    normals, colors = _channels(vertex, "normals"), _channels(vertex, "colors")
+    if len(faces) and (faces.min() < 0 or faces.max() >= len(points)):
+        raise InputError(f"{path}: face: names a vertex beyond the {len(points)} there are; export it again")
+    shades = None if colors is None else colors_from(colors)
+    if normals is None and len(faces):
+        return PointCloud(points, vertex_normals(points, faces), shades, str(path), "mesh")
+    return PointCloud(points, None if normals is None else normals_from(normals), shades, str(path))
+
+
+def _channels(columns: _Columns, what: str) -> NDArray[Any] | None:
+    """The scalar properties that hold points, normals or colours, as ``(N, 3)``; see `columns_of`."""
+    scalars = {name: column for name, column in columns.items() if isinstance(column, np.ndarray)}
+    triple = columns_of(scalars, what)
+    return None if triple is None else np.stack([scalars[name] for name in triple], axis=1)
+
+
+def _parse_header(data: bytes, path: Path) -> tuple[str, list[_Element], int]:
+    if not re.match(rb"ply[ \t]*\r?\n", data):
+        raise InputError(f"{path}: does not start with 'ply', so it is not a PLY file; check its extension")
+    end = re.search(rb"^end_header[ \t]*(\r\n|\n|\r)", data, re.MULTILINE)
+    if end is None:
+        raise InputError(f"{path}: end_header is missing, so the header is cut off; export it again")
+    encoding = ""
+    elements: list[_Element] = []
+    for number, line in enumerate(data[: end.start()].decode("ascii", "replace").splitlines()[1:], start=2):
+        words = line.split()
+        try:
+            match words:
+                case [] | ["comment" | "obj_info", *_]:
+                    continue
+                case ["format", name, *_] if name in _ORDERS:
+                    encoding = name
+                case ["element", name, count] if int(count) >= 0:
+                    elements.append(_Element(name, int(count), ()))
+                case ["property", "list", length_kind, kind, name]:
+                    elements[-1] = _with(elements[-1], _Property(name, _KINDS[kind], _KINDS[length_kind]))
+                case ["property", kind, name]:
+                    elements[-1] = _with(elements[-1], _Property(name, _KINDS[kind], None))
+                case _:
+                    raise ValueError(line)
+        except (ValueError, KeyError, IndexError) as error:
+            raise InputError(
+                f"{path}: header line {number}: {line.strip()[:80]!r} is not valid PLY; export it again"
+            ) from error
+    if not encoding:
+        raise InputError(f"{path}: format: missing from the header; expected one of {', '.join(_ORDERS)}")
+    return encoding, elements, end.end()
+
+
+def _with(element: _Element, added: _Property) -> _Element:
+    return _Element(element.name, element.count, (*element.properties, added))
+
+
+def _ascii_to_doubles(body: bytes, path: Path) -> bytes:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", DeprecationWarning)  # what numpy < 2.3 gives instead of a ValueError
+        try:
+            return np.fromstring(body.decode("ascii"), np.float64, sep=" ").astype("<f8").tobytes()
+        except (ValueError, DeprecationWarning) as error:
+            raise InputError(f"{path}: {_first_bad_word(body)} in an ascii PLY; export it again") from error
+
+
+def _first_bad_word(body: bytes) -> str:
+    for number, line in enumerate(body.splitlines(), start=1):
+        for word in line.split():
+            try:
+                float(word)
+            except ValueError:
+                return f"line {number} after the header: {word[:40].decode('ascii', 'replace')!r} is not a number"
+    return "something is not a number"
+
+
+def _as_doubles(element: _Element) -> _Element:
+    doubles = (_Property(p.name, "f8", "f8" if p.length_kind else None) for p in element.properties)
+    return _Element(element.name, element.count, tuple(doubles))
+
+
+def _restore(column: NDArray[Any] | _Lists, declared: _Property) -> NDArray[Any] | _Lists:
+    """Give a scalar column its declared type back (an ASCII body was read as doubles)."""
+    if isinstance(column, _Lists):
+        return column
+    # A double written into an ascii "float" property keeps its digits: people do write map coordinates so.
+    return column if declared.kind[0] == "f" else column.astype(declared.kind)
+
+
+def _decode(data: bytes, start: int, element: _Element, order: str, path: Path) -> tuple[_Columns, int]:
+    """Read all rows of ``element`` from ``data[start:]`` → columns by name, and where the rows end."""
+    if element.count == 0 or not element.properties:
+        return {p.name: np.empty(0, p.kind) for p in element.properties}, start
+    # Before anything is made of it: each row takes its numbers, and a list its length, at the least.
+    least = sum(np.dtype(p.length_kind or p.kind).itemsize for p in element.properties)
+    if element.count > (len(data) - start) // least:
+        raise _cut_off(path, element)
+    try:
+        uniform = _decode_uniform(data, start, element, order)
+        return uniform if uniform is not None else _decode_ragged(data, start, element, order)
+    except (ValueError, IndexError) as error:
+        raise _cut_off(path, element) from error
+
+
+def _cut_off(path: Path, element: _Element) -> InputError:
+    return InputError(
+        f"{path}: {element.name}: the file ends before its {element.count:.6g} rows do (truncated?); "
+        "copy or export it again"
+    )
+
+
+def _list_length(data: bytes, at: int, kind: str, item: str) -> int:
+    """The length of the list that begins at ``at``.
+
+    Raises:
+        ValueError: it is none, or longer than what is left of the file.
+    """
+    length = float(np.frombuffer(data, kind, 1, at)[0])
+    left = len(data) - at - np.dtype(kind).itemsize
+    if not (length.is_integer() and 0 <= length <= left // np.dtype(item).itemsize):
+        raise ValueError(f"a list of {length:g} items")
+    return int(length)
+
+
+def _decode_uniform(data: bytes, start: int, element: _Element, order: str) -> tuple[_Columns, int] | None:
+    """Decode rows that are all as long as the first one; None if they are not."""
+    fields: list[tuple[str, str] | tuple[str, str, tuple[int]]] = []
+    at = start
+    for number, p in enumerate(element.properties):
+        if p.length_kind is None:
+            fields.append((f"{number}", order + p.kind))
+            at += np.dtype(p.kind).itemsize
+            continue
+        length = _list_length(data, at, order + p.length_kind, p.kind)
+        fields += [(f"{number}#", order + p.length_kind), (f"{number}", order + p.kind, (length,))]
+        at += np.dtype(p.length_kind).itemsize + length * np.dtype(p.kind).itemsize
+    row = np.dtype(fields)
+    has_lists = any(p.length_kind for p in element.properties)
+    if has_lists and start + row.itemsize * element.count > len(data):
+        return None
+    rows = np.frombuffer(data, row, element.count, start)
+    columns: _Columns = {}
+    for number, p in enumerate(element.properties):
+        column = rows[f"{number}"]
+        if p.length_kind is None:
+            columns[p.name] = column.astype(p.kind)
+            continue
+        lengths = rows[f"{number}#"].astype(np.int64)
+        if bool((lengths != lengths[0]).any()):
+            return None
+        columns[p.name] = _Lists(lengths, column.reshape(-1).astype(p.kind))
+    return columns, start + row.itemsize * element.count
+
+
+def _decode_ragged(data: bytes, start: int, element: _Element, order: str) -> tuple[_Columns, int]:
+    """Decode row by row: where each row starts depends on all rows before it."""
+    values: list[list[NDArray[Any]]] = [[] for _ in element.properties]
+    at = start
+    for _ in range(element.count):
+        for column, p in zip(values, element.properties, strict=True):
+            length = 1
+            if p.length_kind is not None:
+                length = _list_length(data, at, order + p.length_kind, p.kind)
+                at += np.dtype(p.length_kind).itemsize
+            column.append(np.frombuffer(data, order + p.kind, length, at) if length else np.empty(0, p.kind))
+            at += length * np.dtype(p.kind).itemsize
+    columns: _Columns = {}
+    for column, p in zip(values, element.properties, strict=True):
+        items = np.concatenate(column).astype(p.kind)
+        columns[p.name] = items if p.length_kind is None else _Lists(np.array([len(c) for c in column]), items)
+    return columns, at

@@ -1,0 +1,1 @@
+"""Files of cameras, sparse points and depth maps that belong to photographs."""

@@ -1,0 +1,180 @@
+"""transforms.json in its dialects: nerfstudio, instant-ngp and the Blender scenes of NeRF."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ....neural_fields import InputError
+from ...cameras import COEFFICIENTS, Camera, intrinsics
+from ...files import finite_number, read_json
+from .shots import Shot, find_image, image_size
+
+__all__ = ["read_transforms"]
+
+Float64 = NDArray[np.float64]
+
+# Camera models of nerfstudio and COLMAP that are pinholes, once undistorted.
+LENSES = ("PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "FULL_OPENCV", "SIMPLE_RADIAL", "RADIAL")
+COMMON, DIVISOR = COEFFICIENTS[:5], COEFFICIENTS[5:]
+OBLIQUE = 1e-3  # how far the axes of a pose may be from orthogonal and of one length, as a share of their length
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """One frame of a transforms.json; what it does not say itself stands at the top of the file."""
+
+    path: Path
+    index: int
+    own: dict[str, Any]
+    shared: dict[str, Any]
+
+    def named(self, key: str) -> str:
+        """File and field, as the beginning of a message."""
+        return f"{self.path}: {key}" if key in self.shared and key not in self.own else self._own(key)
+
+    def _own(self, key: str) -> str:
+        return f"{self.path}: frames[{self.index}].{key}"
+
+    def get(self, key: str) -> Any:
+        return self.own.get(key, self.shared.get(key))
+
+    def number(self, key: str) -> float | None:
+        value = self.get(key)
+        return None if value is None else finite_number(value, self.named(key))
+
+    def positive(self, key: str) -> float | None:
+        value = self.number(key)
+        if value is not None and value <= 0:
+            raise InputError(f"{self.named(key)}: {value:g}; expected more than 0")
+        return value
+
+    def angle(self, key: str) -> float | None:
+        value = self.positive(key)
+        if value is not None and value >= math.pi:
+            raise InputError(f"{self.named(key)}: {value:g}; expected radians, less than π")
+        return value
+
+
+def read_transforms(path: Path) -> list[Shot]:
+    """Read a transforms.json; see `read_cameras` for what it may hold.
+
+    Raises:
+        InputError: the file is damaged, or a frame in it cannot be one.
+    """
+    content = read_json(path)
+    frames = content.get("frames") if isinstance(content, dict) else None
+    if not isinstance(frames, list) or not frames:
+        raise InputError(f"{path}: frames: expected a list of at least one camera; is it a transforms.json?")
+    shots = []
+    for index, own in enumerate(frames):
+        if not isinstance(own, dict):
+            raise InputError(f"{path}: frames[{index}]: expected an object with file_path and transform_matrix")
+        shots.append(_shot(_Frame(path, index, own, content)))
+    return shots
+
+
+def _shot(frame: _Frame) -> Shot:
+    name, mask = (_file_name(frame, key) for key in ("file_path", "mask_path"))
+    if name is None:
+        raise InputError(f"{frame.named('file_path')}: None; expected the name of the image")
+    folder = frame.path.parent
+    image = find_image(folder, name)
+    # nerfstudio's name of the key, and instant-ngp's, which says how much a step of an integer is.
+    depth = _file_name(frame, "depth_file_path") or _file_name(frame, "depth_path")
+    step = frame.positive("integer_depth_scale")
+    return Shot(
+        name,
+        _camera(frame, image),
+        image,
+        None if mask is None else folder / mask,
+        f"{frame.path}: frames[{frame.index}]",
+        None if depth is None else folder / depth,
+        None if step is None else 1 / step,
+    )
+
+
+def _file_name(frame: _Frame, key: str) -> str | None:
+    name = frame.own.get(key)
+    if name is not None and (not isinstance(name, str) or not name):
+        raise InputError(f"{frame.named(key)}: {name!r}; expected the name of the image")
+    return name
+
+
+def _camera(frame: _Frame, image: Path) -> Camera:
+    from kornia.geometry.conversions import camtoworld_graphics_to_vision_4x4  # here: it takes a fifth of a second
+
+    lens = frame.get("camera_model")
+    unknown = lens is not None and str(lens).upper() not in LENSES
+    foreign = {"camera_model": unknown, "is_fisheye": frame.get("is_fisheye")}
+    for key in filter(foreign.get, foreign):
+        raise InputError(f"{frame.named(key)}: {frame.get(key)!r}: no pinhole; undistort the images and export again")
+    width, height = _size(frame, image)
+    fx, fy = frame.positive("fl_x"), frame.positive("fl_y")
+    angle_x, angle_y = frame.angle("camera_angle_x"), frame.angle("camera_angle_y")
+    if fx is None and angle_x is not None:
+        fx = width / 2 / math.tan(angle_x / 2)
+        if fy is None and angle_y is not None:
+            fy = height / 2 / math.tan(angle_y / 2)
+    if fx is None:
+        raise InputError(f"{frame.named('fl_x')}: missing, and so is camera_angle_x; add one of them")
+    cx, cy = frame.number("cx"), frame.number("cy")
+    cx, cy = width / 2 if cx is None else cx, height / 2 if cy is None else cy
+    pose = _matrix(frame.own.get("transform_matrix"), frame.named("transform_matrix"))
+    turned = camtoworld_graphics_to_vision_4x4(torch.from_numpy(pose)[None])[0]
+    matrix = intrinsics(fx, fx if fy is None else fy, cx - 0.5, cy - 0.5)
+    return Camera(matrix, turned, width, height, _distortion(frame))
+
+
+def _distortion(frame: _Frame) -> tuple[float, ...]:
+    """OpenCV's coefficients. k4 to k6 are the divisor of its full model; elsewhere k4 is a fourth radial term."""
+    common = tuple(frame.number(key) or 0.0 for key in COMMON)
+    divisor = tuple(frame.number(key) or 0.0 for key in DIVISOR)
+    if not any(divisor):
+        return common
+    if str(frame.get("camera_model")).upper() != "FULL_OPENCV":
+        key = DIVISOR[[bool(value) for value in divisor].index(True)]
+        raise InputError(
+            f"{frame.named(key)}: {frame.get(key):g}; expected 0 unless camera_model is FULL_OPENCV; "
+            "undistort the images and export again"
+        )
+    return common + divisor
+
+
+def _size(frame: _Frame, image: Path) -> tuple[int, int]:
+    width, height = frame.positive("w"), frame.positive("h")
+    if width is None or height is None:
+        if not image.is_file():
+            raise InputError(f"{frame.named('file_path')}: no image {image} to take the size from; add it, or w and h")
+        return image_size(image)
+    for key, value in (("w", width), ("h", height)):
+        if value != int(value):
+            raise InputError(f"{frame.named(key)}: {value:g}; expected whole pixels")
+    return int(width), int(height)
+
+
+def _matrix(value: Any, named: str) -> Float64:
+    """A rigid pose ``(4, 4)`` from the lists of a file; a common scale of its axes, which moves no ray, is dropped."""
+    if value is None:
+        raise InputError(f"{named}: missing; add the pose of the camera, four rows of four numbers")
+    try:
+        matrix = np.asarray(value, np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{named}: expected four rows of four numbers") from error
+    if matrix.shape not in ((4, 4), (3, 4)):
+        raise InputError(f"{named}: shape {matrix.shape}; expected (4, 4)")
+    if not np.isfinite(matrix).all():
+        raise InputError(f"{named}: holds a number that is not finite; leave that frame out")
+    left, lengths, right = np.linalg.svd(matrix[:3, :3])
+    axes = left @ right  # the nearest rotation: files have the digits of float32, or fewer
+    if lengths[2] < (1 - OBLIQUE) * lengths[0] or not lengths[0] or np.linalg.det(axes) < 0:
+        raise InputError(f"{named}: is singular, mirrored or oblique; expected a rotation and a place")
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = axes, matrix[:3, 3]
+    return pose

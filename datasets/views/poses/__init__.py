@@ -1,0 +1,1 @@
+"""Cameras and sparse points of photographs, by COLMAP."""

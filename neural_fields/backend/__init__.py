@@ -1,0 +1,1 @@
+"""Devices, fixed shapes, threads, argument checks, files and kernels."""

@@ -1,0 +1,255 @@
+"""Rays that march through one network in one launch: each stays in registers until it meets the surface or leaves.
+
+`tracing._march` evaluates the field once a pass for all rays that are left, and between passes has some
+seventy small operations for what a value allows; on a GPU each is a launch. Here a program marches ROWS rays at a time:
+a value of its tile, then the same rules (`rules.py`) in registers. A ray that ends writes what it found, and its place
+is taken by the next ray of a queue that all programs share, so that tiles stay full though rays are of different
+lengths. Which program marches a ray depends on the order of their requests; what the ray finds does not.
+
+The rules are those of `sphere_trace` for a field without bands and without expectations: steps as wide as two tangent
+balls on a plane allow, taken back where a gap opens, then the secant and bisection in turn. What they decide is the
+same; values differ by rounding, so depths do by about as much over the slope.
+"""
+
+# pyright: reportGeneralTypeIssues=false, reportArgumentType=false, reportCallIssue=false
+# pyright: reportAttributeAccessIssue=false, reportMissingImports=false, reportAssignmentType=false
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from .launch import launch
+from .levels import Levels
+from .rules import look_at, turned_back
+from .siren import half_scratch
+from .tensor_tiles import keep, value_of_tile
+
+__all__ = ["IN_REGISTERS", "REFILL", "Marched", "Queue", "RayTensors", "march_rays"]
+
+# Places of a tile that are free before a program takes new rays. Fewer waste requests, more waste places.
+REFILL = 16
+# One network of so many units leaves registers enough to keep rays there too.
+IN_REGISTERS = 128
+
+
+class RayTensors(NamedTuple):
+    """Rays on a device.
+
+    Attributes:
+        origins: ``(N, 3)``, or ``(1, 3)`` for all of them.
+        directions: ``(N, 3)`` of unit length.
+        starts: ``(N,)`` depth at which each begins.
+        entries: ``(N,)`` depth to which it may go back if that is behind the surface.
+        ends: ``(N,)`` depth at which it gives up.
+    """
+
+    origins: Tensor
+    directions: Tensor
+    starts: Tensor
+    entries: Tensor
+    ends: Tensor
+
+
+class Queue(NamedTuple):
+    """Rays that wait to be marched.
+
+    Attributes:
+        rays: ``(N,)`` int32, numbers of rays.
+        state: ``(2,)`` int32: how many of them there are, and how many programs have taken; the second begins at 0.
+    """
+
+    rays: Tensor
+    state: Tensor
+
+    @classmethod
+    def of(cls, starts: Tensor, ends: Tensor) -> Queue:
+        """All rays that begin before they end, in order; nothing waits."""
+        begins = starts < ends
+        place = begins.cumsum(0)
+        rays = torch.empty(len(starts) + 1, dtype=torch.int32, device=starts.device)
+        numbers = torch.arange(len(starts), dtype=torch.int32, device=starts.device)
+        rays.scatter_(0, torch.where(begins, place - 1, len(starts)), numbers)
+        state = torch.zeros(2, dtype=torch.int32, device=starts.device)
+        state[:1] = place[-1:]
+        return cls(rays, state)
+
+
+class Marched(NamedTuple):
+    """What rays found, ``(N,)`` each; the names are those of `mplicits.neural_fields.Hits`.
+
+    Attributes:
+        mask: whether a ray meets the surface.
+        depth: where, or where its search ended.
+        steps: how often the network was evaluated on it.
+        slope: how fast the field fell along the ray at its last step.
+        level: how many bands its last value lay in.
+    """
+
+    mask: Tensor
+    depth: Tensor
+    steps: Tensor
+    slope: Tensor
+    level: Tensor
+
+    @classmethod
+    def nothing(cls, starts: Tensor) -> Marched:
+        """Memory for what kernels find, in the types that they write, filled in for rays that never begin."""
+        small, number = (torch.zeros_like(starts, dtype=dtype) for dtype in (torch.int8, torch.int32))
+        return cls(small, starts.clone(), number, torch.ones_like(starts), torch.zeros_like(number))
+
+    def in_own_types(self) -> Marched:
+        """In those of `mplicits.neural_fields.Hits`."""
+        return self._replace(mask=self.mask.bool(), steps=self.steps.long(), level=self.level.long())
+
+
+@triton.jit(do_not_specialize=["max_steps"])
+def march(
+    origins,
+    directions,
+    starts,
+    entries,
+    ends,
+    listed,
+    queue,
+    floats,
+    halves,
+    found_mask,
+    found_depth,
+    found_steps,
+    found_slope,
+    scratch,
+    exchanged,
+    numbers,
+    max_steps,
+    PATIENCE: tl.constexpr,
+    BOLDNESS: tl.constexpr,
+    STEEPEST_RISE: tl.constexpr,
+    BAND_ENTRY: tl.constexpr,
+    FLOOR: tl.constexpr,
+    ORIGIN: tl.constexpr,
+    SHAPE: tl.constexpr,
+    SCRATCH: tl.constexpr,
+    ROWS: tl.constexpr,
+    REFILL: tl.constexpr,
+):
+    """March all rays of a queue; ``numbers`` are the tolerance, the resolution and the Lipschitz constant."""
+    infinite = float("inf")
+    own = scratch + tl.cast(tl.program_id(0), tl.int64) * SCRATCH
+    cell = exchanged + tl.program_id(0) * ROWS + tl.arange(0, ROWS)
+    tolerance, resolution = tl.load(numbers).to(tl.float32), tl.load(numbers + 1).to(tl.float32)
+    lipschitz = tl.load(numbers + 2).to(tl.float32)
+    count = tl.load(queue)
+    kept = keep(halves, SHAPE)
+    # Nothing under way yet: every place is free.
+    ray = tl.full((ROWS,), 0, tl.int64)
+    free_place = tl.full((ROWS,), 1, tl.int32)
+    zero = tl.zeros((ROWS,), tl.float32)
+    ox, oy, oz, dx, dy, dz = zero, zero, zero, zero, zero, zero
+    depth, entry, far, sign, low, free = zero, zero, zero, zero + 1, zero, zero
+    low_value, gap, high, high_value, boldness = zero, zero, zero, zero, zero
+    steps = tl.zeros((ROWS,), tl.int32)
+    left = tl.full((), ROWS, tl.int32)  # free places
+    more = count > 0
+    running = more
+    while running:
+        if more & (left >= REFILL):  # free places take the next rays
+            first = tl.atomic_add(queue + 1, left)
+            place = first + tl.cumsum(free_place, axis=0) - 1
+            new = (free_place > 0) & (place < count)
+            taken = tl.cast(tl.load(listed + place, mask=new, other=0), tl.int64)
+            ray = tl.where(new, taken, ray)
+            ox = tl.where(new, tl.load(origins + ray * ORIGIN, mask=new, other=0.0), ox)
+            oy = tl.where(new, tl.load(origins + ray * ORIGIN + 1, mask=new, other=0.0), oy)
+            oz = tl.where(new, tl.load(origins + ray * ORIGIN + 2, mask=new, other=0.0), oz)
+            dx = tl.where(new, tl.load(directions + ray * 3, mask=new, other=0.0), dx)
+            dy = tl.where(new, tl.load(directions + ray * 3 + 1, mask=new, other=0.0), dy)
+            dz = tl.where(new, tl.load(directions + ray * 3 + 2, mask=new, other=0.0), dz)
+            depth = tl.where(new, tl.load(starts + ray, mask=new, other=0.0), depth)
+            entry = tl.where(new, tl.load(entries + ray, mask=new, other=0.0), entry)
+            far = tl.where(new, tl.load(ends + ray, mask=new, other=0.0), far)
+            sign, low, free = tl.where(new, 1.0, sign), tl.where(new, depth, low), tl.where(new, 0.0, free)
+            low_value, gap = tl.where(new, infinite, low_value), tl.where(new, infinite, gap)
+            high, high_value = tl.where(new, infinite, high), tl.where(new, 0.0, high_value)
+            boldness, steps = tl.where(new, BOLDNESS, boldness), tl.where(new, 0, steps)
+            more = first + left < count
+            free_place = tl.where(new, 0, free_place)
+        under_way = free_place == 0
+
+        points = (ox + depth * dx, oy + depth * dy, oz + depth * dz)
+        raw = value_of_tile(points, floats, halves, kept, own, SHAPE, ROWS, 3)
+        # By way of memory the values leave the layout of a product, in which each ray would take twice the registers.
+        tl.store(cell, raw)
+        tl.debug_barrier()
+        raw = tl.load(cell)
+
+        sent_back, sign = turned_back(raw, depth, entry, low, low_value, sign)
+        looks = under_way & (sent_back == 0)
+        steps = tl.where(looks, steps + 1, steps)
+        ahead, new_low, new_low_value, new_free, wide, new_high, new_high_value, bold, hit, passed, end, fall = look_at(
+            raw * sign, 0.0, depth, far, low, low_value, free, gap, high, high_value, boldness, steps,
+            tolerance, resolution, lipschitz, PATIENCE, BOLDNESS, STEEPEST_RISE, BAND_ENTRY, FLOOR,
+        )  # fmt: skip
+        ended = looks & (hit | passed | (steps >= max_steps))
+        tl.store(found_mask + ray, hit.to(tl.int8), mask=ended)
+        tl.store(found_depth + ray, end, mask=ended)
+        tl.store(found_steps + ray, steps, mask=ended)
+        tl.store(found_slope + ray, fall, mask=ended)
+
+        depth = tl.where(looks, ahead, tl.where(sent_back, entry, depth))
+        low = tl.where(looks, new_low, tl.where(sent_back, entry, low))
+        low_value, free = tl.where(looks, new_low_value, low_value), tl.where(looks, new_free, free)
+        high, high_value = tl.where(looks, new_high, high), tl.where(looks, new_high_value, high_value)
+        boldness, gap = tl.where(looks, bold, boldness), tl.where(looks, wide, gap)
+        free_place = tl.where(ended, 1, free_place)
+        left = tl.sum(free_place, axis=0)
+        tl.debug_barrier()  # all have read their values
+        running = more | (left < ROWS)
+
+
+def march_rays(
+    levels: Levels,
+    rays: RayTensors,
+    queue: Queue,
+    found: Marched,
+    numbers: Tensor,
+    *,
+    max_steps: int,
+    constants: dict[str, float],
+) -> None:
+    """March the rays of a queue to the surface of one network, up to 128 units wide.
+
+    Args:
+        levels: one, on the rays' device, in three dimensions.
+        rays: contiguous.
+        queue: its state is changed.
+        found: written, for the rays of the queue.
+        numbers: ``(3,)`` on the device: tolerance, resolution and Lipschitz constant of `sphere_trace`.
+        max_steps: see there.
+        constants: PATIENCE, BOLDNESS, STEEPEST_RISE and BAND_ENTRY of `_march`, and FLOOR, the size below which a value
+            is zero.
+    """
+    (network,) = levels.networks
+    rows = network.shape.rows
+    kept = network.shape.scratch(rows, jet=False)
+    launch(
+        march,
+        rays.starts,
+        triton.cdiv(len(rays.starts), rows),
+        lambda programs: (
+            *rays, *queue, network.floats, network.halves, *found[:4],
+            half_scratch(rays.starts, programs * kept),
+            torch.empty(programs * rows, dtype=torch.float32, device=rays.starts.device), numbers, max_steps,
+        ),
+        **constants,
+        ORIGIN=3 * (len(rays.origins) > 1),
+        SHAPE=tuple(network.shape),
+        SCRATCH=kept,
+        ROWS=rows,
+        REFILL=REFILL,
+        warps=rows // 16,
+    )  # fmt: skip

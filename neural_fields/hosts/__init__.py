@@ -1,0 +1,1 @@
+"""Geometry for NeuS, instant-nsr-pl and nerfstudio."""

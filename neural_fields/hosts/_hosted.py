@@ -1,0 +1,187 @@
+"""What the shells for hosts have in common: scale, learning rates, bands that narrow, meshes in the host's units."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from ..backend._checks import positive
+from ..fields.field import Jet
+from ..fields.function import FieldLike, as_field
+from ..fields.similarity import Similarity
+from ..meshing._lattice import Bounds
+from ..meshing.mesh import Mesh
+from ..shape import WorldField
+from .learning_rates import HOST_RATE, Pace, parameter_groups, share_rate
+
+__all__ = ["Box", "Hosted", "as_bounds", "joined", "mark"]
+
+# The corners of a box, lowest and highest: a tensor or an array ``(2, 3)``, or two triples.
+Box = Tensor | Sequence[Sequence[float]]
+
+
+class Hosted(nn.Module):
+    """A field f in a host's units: f(s x) / s, whose gradient is ∇f(s x).
+
+    Args:
+        field: signed distance, negative inside.
+        scale: s; None for 1, or with ``bounds`` for what brings their farthest corner onto the field's unit sphere.
+        bounds: lowest and highest corner of what the host samples and meshes, in its own units ``(2, 3)``; None for
+            the box from −half to half on each axis.
+        half: of that box, in the host's units.
+        learning_rate: see `share_rate`; None leaves the parameters in their own units.
+        pace: share of the rates that suit the field; see `Pace`.
+
+    Raises:
+        ValueError: a number is not positive, or the bounds are none.
+    """
+
+    def __init__(
+        self,
+        field: FieldLike,
+        *,
+        scale: float | None,
+        bounds: Box | None,
+        half: float,
+        learning_rate: float | None,
+        pace: Pace,
+    ) -> None:
+        super().__init__()
+        box = _cube(half) if bounds is None else as_bounds(bounds)
+        if scale is None:
+            corner = (max(abs(low), abs(high)) for low, high in zip(*box, strict=True))
+            scale = 1.0 if bounds is None else 1 / math.hypot(*corner)
+        positive(scale=scale)
+        self.field, self.scale, self.bounds = as_field(field), float(scale), box
+        self.pace = pace
+        if learning_rate is not None:
+            share_rate(self.field, learning_rate, pace=pace)
+
+    @property
+    def world(self) -> WorldField:
+        """The field in the host's coordinates and units: distances, rays, meshes, pictures."""
+        return WorldField(self.field, Similarity((0.0, 0.0, 0.0), 1 / self.scale))
+
+    def mesh(self, resolution: int = 256, *, bounds: Box | None = None, level: int = -1, normals: bool = True) -> Mesh:
+        """A triangle mesh of the surface, in the host's coordinates.
+
+        Args:
+            resolution: cells along the longest side of the box.
+            bounds: lowest and highest corner of the box, in the host's coordinates; the host's own box by default.
+            level: of detail, 0 the coarsest, -1 the finest.
+            normals: whether vertices get normals.
+
+        Raises:
+            NoSurfaceError: there is no surface in the box.
+            ValueError: see `extract_mesh`.
+        """
+        box = self.bounds if bounds is None else as_bounds(bounds)
+        return self.world.mesh(resolution, level=level, bounds=box, normals=normals)
+
+    def parameter_groups(self, lr: float = HOST_RATE) -> list[dict[str, Any]]:
+        """Groups for the host's optimiser, with a rate for each layer of the field; see `rates.parameter_groups`."""
+        return parameter_groups(self.field, lr, pace=self.pace)
+
+    @torch.no_grad()
+    def follow(self, inv_s: Tensor | float, *, band: float = 4.0, least: float = 0.02, most: float = 0.3) -> None:
+        """Let the bands be as wide as the surface is unsure; to be called after each step of the optimiser.
+
+        Every band gets the half-width ``band`` · s / inv_s, held between ``least`` and ``most``, s being the scale.
+
+        Args:
+            inv_s: inverse standard deviation of NeuS's density, in the host's units; of several numbers the mean.
+            band: half-width in standard deviations.
+            least: half-width that a band keeps, in the field's units.
+            most: half-width that it does not exceed.
+
+        Raises:
+            ValueError: the numbers do not grow from above 0 to ``most``.
+        """
+        if not 0 < least <= most:
+            raise ValueError(f"least={least}, most={most}: expected 0 < least <= most")
+        deltas = self.field.deltas
+        width = band * self.scale / torch.as_tensor(inv_s).to(deltas).mean()
+        deltas.copy_(width.clamp(least, most).expand_as(deltas))
+
+    def _value(self, x: Tensor) -> Tensor:
+        with _full_precision(x):
+            return self.field.value(x * self.scale) / self.scale
+
+    def _value_features(self, x: Tensor) -> Tensor:
+        """Distance and features ``(..., 1 + F)``, for the price of a value."""
+        with _full_precision(x):
+            value, features = self.field.value_features(x * self.scale)
+        return torch.cat((value[..., None] / self.scale, features), dim=-1)
+
+    def _jet(self, x: Tensor) -> Jet:
+        """The jet of f(s x) / s, in a graph that reaches ``x``."""
+        with _full_precision(x), _reaching(x) as reached:
+            value, gradient, features = self.field.jet(reached * self.scale)
+            return Jet(value / self.scale, gradient, features)
+
+    def _second_jet(self, x: Tensor) -> tuple[Jet, Tensor]:
+        """The same, and the Laplacian ``(...,)``."""
+        with _full_precision(x):
+            value, gradient, features, hessian = self.field.second_jet(x * self.scale)
+        laplacian = self.scale * hessian.diagonal(dim1=-2, dim2=-1).sum(dim=-1)
+        return Jet(value / self.scale, gradient, features), laplacian
+
+
+def as_bounds(box: Box) -> Bounds:
+    """Two corners as plain numbers.
+
+    Raises:
+        ValueError: it is no ``(2, 3)``, or the second corner is not above the first.
+    """
+    corners = torch.as_tensor(box).detach().double().cpu()
+    if corners.shape != (2, 3) or not bool((corners[0] < corners[1]).all()):
+        raise ValueError(f"bounds={corners.tolist()}: expected the lowest and the highest corner of a box, (2, 3)")
+    low, high = corners.tolist()
+    return (low[0], low[1], low[2]), (high[0], high[1], high[2])
+
+
+def _cube(half: float) -> Bounds:
+    """The box from −half to half on each axis."""
+    return (-half, -half, -half), (half, half, half)
+
+
+def joined(jet: Jet) -> Tensor:
+    """Distance and features in one tensor ``(..., 1 + F)``."""
+    return torch.cat((jet.value[..., None], jet.features), dim=-1)
+
+
+def mark(x: Tensor, gradient: Tensor) -> Tensor:
+    """Return ``gradient``, with ``x`` requiring gradients from now on."""
+    if torch.is_grad_enabled() and not x.is_inference():
+        x.requires_grad_(True)
+    return gradient
+
+
+def _full_precision(x: Tensor) -> torch.autocast:
+    """Hosts train in half precision, in which a distance near the surface has no digits left."""
+    return torch.autocast(x.device.type, enabled=False)
+
+
+@contextmanager
+def _reaching(x: Tensor) -> Iterator[Tensor]:
+    """``x`` for an evaluation whose graph reaches it, with its own flag as it was afterwards.
+
+    The hosts evaluate first and mark the points as requiring gradients later, inside ``gradient``. Whoever then
+    differentiates the gradient by the points (curvature) needs a graph that knew them. While the flag is
+    off, autograd passes such points by.
+    """
+    if not torch.is_grad_enabled() or x.requires_grad:
+        yield x
+    elif x.is_inference():
+        yield x.clone()  # autograd cannot save inference tensors
+    else:
+        x.requires_grad_(True)
+        try:
+            yield x
+        finally:
+            x.requires_grad_(False)

@@ -1,0 +1,329 @@
+"""Fields in the shapes that other people's renderers call: NeuS, instant-nsr-pl, nerfstudio and sdfstudio.
+
+Each shell holds a `Field` f and evaluates it in the host's own units: with ``scale`` s, points are multiplied by s and
+distances divided by it, so that f(s x) / s is again a distance and its gradient is ∇f(s x). None of the hosts is
+imported; what they pass in is used by the names of its attributes. How to change each host is in docs/drop-in.md.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from ..backend._checks import positive
+from ..fields.function import FieldLike
+from ..volume.weights import neus_alpha
+from ._hosted import Box, Hosted, joined, mark
+from ._point_memo import PointMemo
+from .learning_rates import HOST_RATE, Pace
+
+__all__ = ["Deviation", "InstantNSRGeometry", "NerfstudioField", "NeuSGeometry"]
+
+
+class NeuSGeometry(Hosted):
+    """NeuS's ``SDFNetwork`` (Wang et al. 2021, ``models/fields.py``) around any field.
+
+    NeuS's renderer calls ``forward`` and then ``gradient`` on the same tensor of points. Both come from one jet: the
+    second call is served from what the first one evaluated (see `PointMemo`).
+
+    Args:
+        field: signed distance, negative inside; with F features for a colour network that takes F.
+        scale: NeuS's own argument: points are multiplied by it, distances divided by it. 1 by default, or with
+            ``bounds`` what brings their farthest corner onto the field's unit sphere.
+        bounds: box of the mesh, ``(2, 3)``; from -1.01 to 1.01 by default, as in NeuS.
+        learning_rate: at which NeuS trains all its networks alike; the parameters of the field are then kept in units
+            in which this rate suits them (`share_rate`). None leaves them alone.
+        pace: share of the rates that suit the field, one for all levels or one for each; see `Pace`.
+
+    Raises:
+        ValueError: a number is not positive, or the bounds are none.
+
+    Example:
+        >>> import torch
+        >>> from mplicits.neural_fields import MultiscaleSDF, NeuSGeometry
+        >>> network = NeuSGeometry(MultiscaleSDF.from_widths([(128, 4), (256, 5)], omegas=[30, 45], num_features=64))
+        >>> points = torch.zeros(10, 3)
+        >>> network(points).shape, network.gradient(points).shape
+        (torch.Size([10, 65]), torch.Size([10, 1, 3]))
+    """
+
+    def __init__(
+        self,
+        field: FieldLike,
+        *,
+        scale: float | None = None,
+        bounds: Box | None = None,
+        learning_rate: float | None = None,
+        pace: Pace = 1.0,
+    ) -> None:
+        super().__init__(field, scale=scale, bounds=bounds, half=1.01, learning_rate=learning_rate, pace=pace)
+        self._memo = PointMemo()
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Distance and features at ``x`` ``(N, 3)`` → ``(N, 1 + F)``; without a graph they cost a value only."""
+        if not torch.is_grad_enabled():  # nor could the host ask for a gradient, which it takes by autograd
+            return self._value_features(x)
+        return self._memo.ask("value", x, self.field, lambda: self._evaluate(x))
+
+    def sdf_hidden_appearance(self, x: Tensor) -> Tensor:
+        """The same as ``forward``, under the other name that NeuS gives it."""
+        return self(x)
+
+    def sdf(self, x: Tensor) -> Tensor:
+        """Distance at ``x`` ``(N, 3)`` → ``(N, 1)``; costs a value only."""
+        return self._value(x)[..., None]
+
+    def gradient(self, x: Tensor) -> Tensor:
+        """Gradient at ``x`` ``(N, 3)`` → ``(N, 1, 3)``, with its graph; like NeuS, leaves ``x`` requiring gradients."""
+        gradient = self._memo.ask("gradient", x, self.field, lambda: self._evaluate(x))
+        return mark(x, gradient)
+
+    def _evaluate(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        jet = self._jet(x)
+        return joined(jet), jet.gradient.unsqueeze(-2)
+
+
+class InstantNSRGeometry(Hosted):
+    """instant-nsr-pl's ``VolumeSDF`` (``models/geometry.py``) around any field.
+
+    Args:
+        field: signed distance in the unit sphere, negative inside, with F = ``feature_dim`` − 1 features.
+        radius: the host's ``radius``: points reach from −radius to radius on each axis.
+        scale: points are multiplied by it, distances divided by it; 1 / radius by default, which leaves the corners
+            of the host's cube outside the field's unit sphere; 1 / (√3 radius) takes them in.
+        resolution: cells along each axis of the mesh that ``isosurface`` extracts.
+        learning_rate: of the host's group ``geometry``; see `NeuSGeometry`.
+        pace: see `NeuSGeometry`.
+
+    Raises:
+        ValueError: a number is not positive.
+
+    Example:
+        >>> import torch
+        >>> from mplicits.neural_fields import InstantNSRGeometry, Sphere
+        >>> geometry = InstantNSRGeometry(Sphere(radius=0.5), radius=1.5)
+        >>> sdf, gradient, feature = geometry(torch.tensor([[1.5, 0.0, 0.0]]))
+        >>> sdf.tolist(), gradient.tolist(), feature.tolist()
+        ([0.75], [[1.0, 0.0, 0.0]], [[0.75]])
+    """
+
+    def __init__(
+        self,
+        field: FieldLike,
+        *,
+        radius: float = 1.0,
+        scale: float | None = None,
+        resolution: int = 512,
+        learning_rate: float | None = None,
+        pace: Pace = 1.0,
+    ) -> None:
+        positive(radius=radius)
+        scale = 1 / radius if scale is None else scale
+        super().__init__(field, scale=scale, bounds=None, half=radius, learning_rate=learning_rate, pace=pace)
+        self.radius, self.resolution = float(radius), resolution
+
+    def forward(
+        self,
+        points: Tensor,
+        with_grad: bool = True,
+        with_feature: bool = True,
+        with_laplace: bool = False,
+        camera_indices: object = None,
+        ray_indices: object = None,
+    ) -> Tensor | list[Tensor]:
+        """What the flags ask for, in this order; a list, or the tensor itself if it is alone.
+
+        Args:
+            points: ``(..., 3)`` in the host's units.
+            with_grad: the gradient too, ``(..., 3)``.
+            with_feature: the feature too, ``(..., 1 + F)``; its channel 0 is the distance.
+            with_laplace: the Laplacian too, ``(...,)``, from exact second derivatives; the host has finite differences.
+            camera_indices: unused; the host passes it for its appearance embedding.
+            ray_indices: unused, likewise.
+
+        Returns:
+            ``sdf`` ``(...,)``, alone or first in the list. Value and gradient come from one jet; without the gradient
+            a value is all it costs. A graph is recorded while training, as the host does, and only where gradients
+            are enabled.
+        """
+        with torch.set_grad_enabled(self.training and torch.is_grad_enabled()):
+            if not (with_grad or with_feature or with_laplace):
+                return self._value(points)
+            if not (with_grad or with_laplace):
+                feature = self._value_features(points)
+                return [feature[..., 0], feature]
+            if with_laplace:
+                jet, trace = self._second_jet(points)
+                laplacian = [trace]
+            else:
+                jet, laplacian = self._jet(points), []
+            gradient = [jet.gradient] if with_grad else []
+            feature = [joined(jet)] if with_feature else []
+            return [jet.value, *gradient, *feature, *laplacian]
+
+    def forward_level(self, points: Tensor) -> Tensor:
+        """Distance ``(...,)`` at ``points`` ``(..., 3)``, for the host's marching cubes; a value only."""
+        return self._value(points)
+
+    @torch.no_grad()
+    def isosurface(self) -> dict[str, Tensor]:
+        """The mesh in the host's form: ``v_pos`` ``(V, 3)`` and ``t_pos_idx`` ``(T, 3)``."""
+        mesh = self.mesh(self.resolution, normals=False)
+        vertices = torch.as_tensor(mesh.vertices, dtype=torch.float32)
+        return {"v_pos": vertices, "t_pos_idx": torch.as_tensor(mesh.faces, dtype=torch.int64)}
+
+    def update_step(self, epoch: int, global_step: int) -> None:
+        """Called by the host before every step, without what the bands depend on; see ``follow``."""
+
+    def regularizations(self, out: object) -> dict[str, Tensor]:
+        """Extra losses that the host adds: none."""
+        return {}
+
+
+class Deviation(nn.Module):
+    """The one number that says how sharp the surface is: s = exp(10 v), NeuS's inverse standard deviation.
+
+    Args:
+        initial: v at the start; 0.3, that is s = 20, in NeuS.
+    """
+
+    def __init__(self, initial: float = 0.3) -> None:
+        super().__init__()
+        self.variance = nn.Parameter(torch.full((1,), float(initial)))
+
+    def get_variance(self) -> Tensor:
+        """s, ``(1,)``, kept between 1e-6 and 1e6 as the hosts do."""
+        return (10 * self.variance).exp().clamp(1e-6, 1e6)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """The same s for each row of ``x`` → ``(len(x), 1)``."""
+        return self.get_variance().expand(len(x), 1)
+
+
+class NerfstudioField(Hosted):
+    """nerfstudio's and sdfstudio's ``SDFField`` (``nerfstudio/fields/sdf_field.py``) for their NeuS models.
+
+    Args:
+        field: signed distance, negative inside.
+        color: called as ``color(x, direction, jet)`` with ``(..., 3)``, ``(..., 3)`` and the field's `Jet` there, in
+            the host's units; gives RGB ``(..., 3)``. `ViewColor` is one.
+        heads: the host's ``FieldHeadNames``, whose members are the keys of the outputs.
+        scale: points are multiplied by it, distances divided by it. 1 by default, or with ``bounds`` what brings their
+            farthest corner onto the field's unit sphere.
+        bounds: the host's ``scene_box.aabb`` ``(2, 3)``, box of the mesh too; from -1 to 1 by default.
+        deviation: initial value of the deviation network, the host's ``beta_init``.
+        learning_rate: of the host's group ``fields``; see `NeuSGeometry`. It is the geometry alone that changes units.
+        pace: see `NeuSGeometry`.
+
+    Raises:
+        ValueError: a number is not positive, or the bounds are none.
+    """
+
+    def __init__(
+        self,
+        field: FieldLike,
+        color: nn.Module,
+        *,
+        heads: Any,
+        scale: float | None = None,
+        bounds: Box | None = None,
+        deviation: float = 0.3,
+        learning_rate: float | None = None,
+        pace: Pace = 1.0,
+    ) -> None:
+        super().__init__(field, scale=scale, bounds=bounds, half=1.0, learning_rate=learning_rate, pace=pace)
+        self.color, self.heads = color, heads
+        self.deviation_network = Deviation(deviation)
+        self.cos_anneal_ratio = 1.0
+        self._memo = PointMemo()
+
+    def set_cos_anneal_ratio(self, anneal: float) -> None:
+        """How true the slope in the opacity is: 0 at the start of training, 1 at the end of the annealing."""
+        self.cos_anneal_ratio = float(anneal)
+
+    def forward_geonetwork(self, inputs: Tensor) -> Tensor:
+        """Distance and features at ``inputs`` ``(..., 3)`` → ``(..., 1 + F)``; without a graph a value only."""
+        if not torch.is_grad_enabled():  # as the host's exporters ask, who want the distance
+            return self._value_features(inputs)
+        return self._memo.ask("value", inputs, self.field, lambda: self._evaluate(inputs))
+
+    def gradient(self, x: Tensor) -> Tensor:
+        """Gradient at ``x`` ``(..., 3)`` → ``(..., 3)``, with its graph; free after `forward_geonetwork`."""
+        return mark(x, self._memo.ask("gradient", x, self.field, lambda: self._evaluate(x)))
+
+    def get_sdf(self, ray_samples: Any) -> Tensor:
+        """Distance at the starts of the samples ``(R, S)`` → ``(R, S, 1)``; costs a value only."""
+        return self._value(ray_samples.frustums.get_start_positions())[..., None]
+
+    def get_alpha(self, ray_samples: Any, sdf: Tensor | None = None, gradients: Tensor | None = None) -> Tensor:
+        """Opacity of the samples ``(R, S)`` → ``(R, S, 1)``.
+
+        Args:
+            ray_samples: the host's samples, with ``frustums`` and ``deltas`` ``(R, S, 1)``.
+            sdf: ``(R, S, 1)`` if known.
+            gradients: ``(R, S, 3)`` if known; where one of the two is missing, both come from one jet.
+        """
+        if sdf is None or gradients is None:
+            jet = self._jet(ray_samples.frustums.get_start_positions())
+            sdf, gradients = jet.value[..., None], jet.gradient
+        return neus_alpha(
+            sdf,
+            (ray_samples.frustums.directions * gradients).sum(dim=-1, keepdim=True),
+            ray_samples.deltas,
+            self.deviation_network.get_variance(),
+            cos_anneal=self.cos_anneal_ratio,
+        )
+
+    def get_outputs(
+        self, ray_samples: Any, density_embedding: object = None, return_alphas: bool = False
+    ) -> dict[Any, Tensor]:
+        """Colour, distance, normal and gradient of the samples, and their opacity, under the host's names.
+
+        Args:
+            ray_samples: the host's samples ``(R, S)``.
+            density_embedding: unused; the host's signature has it.
+            return_alphas: whether the opacity is among the outputs.
+        """
+        frustums = ray_samples.frustums
+        points = frustums.get_start_positions()
+        jet = self._jet(points)
+        sdf = jet.value[..., None]
+        outputs = {
+            self.heads.RGB: self.color(points, frustums.directions, jet),
+            self.heads.SDF: sdf,
+            self._normal_head(): nn.functional.normalize(jet.gradient, dim=-1),
+            self.heads.GRADIENT: jet.gradient,
+        }
+        if return_alphas:
+            outputs[self.heads.ALPHA] = self.get_alpha(ray_samples, sdf, jet.gradient)
+        return outputs
+
+    def forward(
+        self, ray_samples: Any, compute_normals: bool = False, return_alphas: bool = False
+    ) -> dict[Any, Tensor]:
+        """See `get_outputs`; normals are always among the outputs."""
+        return self.get_outputs(ray_samples, return_alphas=return_alphas)
+
+    def frontal_colors(self, x: Tensor) -> Tensor:
+        """Colours ``(..., 3)`` of points of the surface ``(..., 3)``, each seen against its normal."""
+        jet = self._jet(x)
+        return self.color(x, -nn.functional.normalize(jet.gradient, dim=-1), jet)
+
+    def follow(self, inv_s: Tensor | float | None = None, **widths: float) -> None:
+        """See `Hosted.follow`; the deviation is this field's own by default."""
+        super().follow(self.deviation_network.get_variance() if inv_s is None else inv_s, **widths)
+
+    def parameter_groups(self, lr: float = HOST_RATE) -> list[dict[str, Any]]:
+        """See `Hosted.parameter_groups`; colours and deviation have ``lr`` itself."""
+        others = [*self.color.parameters(), *self.deviation_network.parameters()]
+        return [*super().parameter_groups(lr), {"params": others, "lr": lr}]
+
+    def _normal_head(self) -> Any:
+        """What the host calls normals: NORMALS in nerfstudio, NORMAL in sdfstudio."""
+        return self.heads.NORMALS if hasattr(self.heads, "NORMALS") else self.heads.NORMAL
+
+    def _evaluate(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        jet = self._jet(x)
+        return joined(jet), jet.gradient

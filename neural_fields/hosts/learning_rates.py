@@ -1,0 +1,116 @@
+"""Learning rates for SIRENs in trainers that were made for softplus networks.
+
+In a layer z = ω₀ (W h + b) the weights are about ω₀ times as small as in a softplus layer that does as much, but Adam
+moves every weight by the learning rate, however small it is. At one rate for both a SIREN therefore takes steps about
+ω₀ times as long: at NeuS's 5e-4 the surface falls to pieces while the colours are learnt. `parameter_groups` has a rate
+for each layer; where a trainer sets the rate of all groups to the same number in every step, as NeuS's does,
+`share_rate` keeps the parameters in units in which one rate means as much.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from torch import nn
+
+from ..backend._checks import positive
+from ..fields.field import Field
+from ..networks.multiscale import MultiscaleSDF
+from ..networks.siren import Siren
+
+__all__ = ["HOST_RATE", "Pace", "parameter_groups", "share_rate"]
+
+# Shares of the rates below at which levels learn, the coarsest first; the last is for all that are finer, and one
+# number for all. Where colours do not need the geometry's own features, half of the rates leaves fewer waves.
+Pace = float | Sequence[float]
+
+# Adam's rate for the softplus networks of NeuS, sdfstudio and nerfstudio, beside which the two below were found.
+HOST_RATE = 5e-4
+SINE_RATE = 3e-3  # of sine layers, over ω₀
+OUTPUT_RATE = 1e-4  # of their outputs, which ω₀ is no part of
+
+
+def parameter_groups(field: Field, lr: float = HOST_RATE, *, pace: Pace = 1.0) -> list[dict[str, Any]]:
+    """The parameters of a field as groups for an optimiser, each with the rate that suits it.
+
+    Args:
+        field: SIRENs anywhere in it get rates of their own; all else gets ``lr``.
+        lr: at which the host trains its own geometry; all rates are in proportion to it.
+        pace: share of these rates at which SIRENs learn; see `Pace`.
+
+    Returns:
+        Dicts with ``params`` and ``lr``.
+
+    Raises:
+        ValueError: a rate or a pace is not positive.
+
+    Example:
+        >>> from mplicits.neural_fields import MultiscaleSDF, parameter_groups
+        >>> sdf = MultiscaleSDF.from_widths([(128, 4), (256, 5)], omegas=[10, 30])
+        >>> [f"{group['lr']:.1e}" for group in parameter_groups(sdf, 5e-4)]
+        ['3.0e-04', '1.0e-04', '1.0e-04', '1.0e-04']
+    """
+    positive(lr=lr)
+    groups, taken = [], set()
+    for siren, rates in _wanted(field, pace):
+        for params, wanted, unit in zip(_parts(siren), rates, siren.units, strict=True):
+            groups.append({"params": params, "lr": lr / HOST_RATE * wanted / unit})
+            taken.update(map(id, params))
+    rest = [parameter for parameter in field.parameters() if id(parameter) not in taken]
+    return [*groups, {"params": rest, "lr": lr}] if rest else groups
+
+
+def share_rate(field: Field, lr: float = HOST_RATE, *, pace: Pace = 1.0) -> None:
+    """Keep a field's parameters in units in which one rate serves all of them; the field stays the same function.
+
+    The units are powers of two (`Siren.set_units`), so that values and jets stay the same bit for bit; the steps are
+    those of `parameter_groups` to within a factor of √2.
+
+    Args:
+        field: changed in place; before an optimiser has seen it.
+        lr: at which the host will train it, at the peak of its schedule.
+        pace: see `Pace`.
+
+    Raises:
+        ValueError: a rate or a pace is not positive.
+
+    Example:
+        >>> import torch
+        >>> from mplicits.neural_fields import Siren, share_rate
+        >>> siren, x = Siren(16, 2, omega=30.0), torch.rand(5, 3)
+        >>> before = siren.value(x)
+        >>> share_rate(siren, 5e-4)
+        >>> siren.units, torch.equal(siren.value(x), before)
+        ((0.25, 0.25), True)
+    """
+    positive(lr=lr)
+    for siren, rates in _wanted(field, pace):
+        sines, output = (2.0 ** round(math.log2(wanted / lr)) for wanted in rates)
+        siren.set_units(sines, output)
+
+
+def _parts(siren: Siren) -> tuple[Sequence[nn.Parameter], Sequence[nn.Parameter]]:
+    """Parameters of the sine layers, and those of the output."""
+    return list(siren.layers.parameters()), list(siren.output.parameters())
+
+
+def _wanted(field: Field, pace: Pace) -> Iterator[tuple[Siren, tuple[float, float]]]:
+    """Each SIREN with Adam's rates for weights and biases of its sine layers, and for those of its output."""
+    paces = [pace] if isinstance(pace, float | int) else list(pace)
+    for share in paces:
+        positive(pace=share)
+    if not paces:
+        raise ValueError("pace: there is none")
+    level = {
+        part: number
+        for module in field.modules()
+        if isinstance(module, MultiscaleSDF)
+        for number, siren in enumerate(module.levels)
+        for part in siren.modules()
+    }
+    for module in field.modules():
+        if isinstance(module, Siren):
+            share = paces[min(level.get(module, 0), len(paces) - 1)]
+            yield module, (share * SINE_RATE / module.omega, share * OUTPUT_RATE)

@@ -1,0 +1,1 @@
+"""Marching cubes of fields, meshes, and the files that hold them."""

@@ -1,0 +1,154 @@
+"""How the coordinates of an input become those that other programs expect: which axis is up, how long a unit is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..fields.similarity import Similarity
+
+__all__ = ["FRAMES", "METRES", "UP_AXES", "FileTransform", "Frame", "Placement"]
+
+Float64 = NDArray[np.float64]
+
+METRES = {"um": 1e-6, "mm": 1e-3, "cm": 1e-2, "m": 1.0, "km": 1e3, "in": 0.0254, "ft": 0.3048}
+UP_AXES = ("y", "z")
+
+# Turns by a right angle about x, exactly. Z_TO_Y: (x, y, z) → (x, z, −y).
+Z_TO_Y = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+
+
+class Frame(NamedTuple):
+    """What programs take the coordinates of a format for.
+
+    Attributes:
+        up: the axis.
+        unit: a key of `METRES`.
+        always: whether that is so by the standard, so that files follow it unasked; else it is what importers assume.
+    """
+
+    up: str
+    unit: str
+    always: bool
+
+
+# glTF 2.0, Sec. 3.4: +y up, metres. Slicers take STL for millimetres on the xy-plane. Blender's importers take PLY and
+# STL for z-up, OBJ for y-up, and their units for metres.
+FRAMES = {
+    ".glb": Frame("y", "m", always=True),
+    ".obj": Frame("y", "m", always=False),
+    ".ply": Frame("z", "m", always=False),
+    ".stl": Frame("z", "mm", always=False),
+}
+
+
+@dataclass(frozen=True)
+class Placement:
+    """What is known of an input's coordinates, and whether its shape shall stand at the origin.
+
+    A GLB is y-up and in metres by its standard; where nothing is said, the input is taken to be so as well. In PLY,
+    OBJ and STL the coordinates of the input stay as they are but for what is said here.
+
+    Attributes:
+        up: the axis that points up in the input, "y" or "z".
+        unit: the length of one input unit, a key of `METRES`: "mm", "cm", "m", ….
+        center: whether the middle of the shape's bounding box goes to the origin.
+
+    Raises:
+        ValueError: there is no such axis or unit.
+    """
+
+    up: str | None = None
+    unit: str | None = None
+    center: bool = False
+
+    def __post_init__(self) -> None:
+        if self.up is not None and self.up not in UP_AXES:
+            raise ValueError(f"up={self.up!r}: expected one of {', '.join(UP_AXES)}")
+        if self.unit is not None and self.unit not in METRES:
+            raise ValueError(f"unit={self.unit!r}: expected one of {', '.join(METRES)}")
+
+    def into(self, suffix: str, vertices: Float64) -> FileTransform:
+        """The map from input coordinates to those of a file.
+
+        Args:
+            suffix: of the file, a key of `FRAMES`.
+            vertices: ``(V, 3)`` in input coordinates; their box is what is centred.
+        """
+        frame = FRAMES[suffix.lower()]
+        turn = np.eye(3)
+        if self.up is not None and self.up != frame.up:
+            turn = Z_TO_Y if frame.up == "y" else Z_TO_Y.T
+        scale = 1.0 if self.unit is None else METRES[self.unit] / METRES[frame.unit]
+        middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2 if self.center else np.zeros(3)
+        return FileTransform(turn, scale, middle)
+
+    def describe(self, suffix: str) -> str | None:
+        """A line that says what a file's coordinates are, and what was taken for granted; None: they are the input's.
+
+        Args:
+            suffix: of the file, a key of `FRAMES`.
+        """
+        frame = FRAMES[suffix.lower()]
+        words = []
+        if self.up is not None or frame.always:
+            words.append(f"{frame.up} up")
+        if self.unit is not None or frame.always:
+            scale = 1.0 if self.unit is None else METRES[self.unit] / METRES[frame.unit]
+            words.append(f"in {frame.unit}" + (f" (1 input unit = {scale:.6g} {frame.unit})" if scale != 1 else ""))
+        if self.center:
+            words.append("centred at the origin")
+        if not words:
+            return None
+        assumed = []
+        if frame.always and self.unit is None:
+            assumed.append(f"one input unit is taken for 1 {frame.unit} (--unit says what it is)")
+        if frame.always and self.up is None:
+            assumed.append(f"{frame.up} is taken to be up (--up says otherwise)")
+        return "; ".join([", ".join(words), *assumed])
+
+
+class FileTransform(NamedTuple):
+    """The map ``x → scale · turn (x − middle)``, float64.
+
+    Attributes:
+        turn: ``(3, 3)``, a rotation by right angles.
+        scale: file units per input unit.
+        middle: ``(3,)`` in input coordinates, what goes to the origin.
+    """
+
+    turn: Float64
+    scale: float
+    middle: Float64
+
+    @property
+    def changes(self) -> bool:
+        """Whether it is not the identity."""
+        return bool(self.scale != 1 or self.middle.any() or (self.turn != np.eye(3)).any())
+
+    def points(self, rows: Float64) -> Float64:
+        """Points ``(..., 3)`` in input coordinates → in those of the file."""
+        return self.scale * (rows - self.middle) @ self.turn.T
+
+    def directions(self, rows: NDArray[np.floating]) -> NDArray[np.floating]:
+        """Directions ``(..., 3)``, turned; their length and precision stay."""
+        return rows @ self.turn.T.astype(rows.dtype)
+
+    def home(self, similarity: Similarity) -> Similarity:
+        """Where the shape is in the file, and how large, if ``similarity`` says it of the input."""
+        x, y, z = self.points(np.asarray(similarity.center)).tolist()
+        return Similarity((x, y, z), similarity.scale * self.scale)
+
+    def node(self, origin: tuple[float, float, float]) -> dict[str, Any]:
+        """The same map as translation, rotation and scale of a glTF node, for positions relative to ``origin``."""
+        translation = (self.points(np.asarray(origin)) + 0.0).tolist()  # no negative zero
+        node: dict[str, Any] = {"translation": translation}
+        if (self.turn != np.eye(3)).any():
+            half = float(np.sqrt(0.5)) * float(np.sign(self.turn[2, 1]))  # x y z w of a quarter turn about x
+            node["rotation"] = [half, 0.0, 0.0, float(np.sqrt(0.5))]
+        if self.scale != 1:
+            node["scale"] = [self.scale] * 3
+        return node

@@ -1,0 +1,1 @@
+"""Networks: SIREN, the multiscale SDF, textures, radiance and encodings."""

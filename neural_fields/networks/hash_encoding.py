@@ -1,0 +1,167 @@
+"""Instant-NGP's multiresolution hash encoding (Müller et al. 2022), in plain PyTorch: positions as learnt features.
+
+Every level is a grid whose vertices own entries of a table: one each where the grid fits into the table (Sec. 3), or
+else the one that a spatial hash says (Eq. 4), which they share. Entries are interpolated, and levels joined.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from ..backend._checks import at_least, positive
+
+__all__ = ["HashEncoding", "check_table", "grid_resolutions", "spatial_hash", "tables_apart"]
+
+# The factors of Eq. 4; the first is 1 so that neighbours along x stay neighbours in memory.
+PRIMES = (1, 2_654_435_761, 805_459_861)
+INITIAL = 1e-4  # entries begin uniform in ±INITIAL (Sec. 4)
+CORNERS = 8
+
+
+def grid_resolutions(levels: int, coarsest: int, finest: int) -> list[int]:
+    """Cells along a side on each level, ``⌊N_min bˡ⌋`` with ``b = (N_max / N_min)^(1 / (L − 1))`` (Eqs. 2 and 3).
+
+    Example:
+        >>> grid_resolutions(4, 16, 128)
+        [16, 32, 64, 128]
+    """
+    growth = (finest / coarsest) ** (1 / max(1, levels - 1))
+    # A power that should be whole may come out a rounding error below.
+    return [math.floor(coarsest * growth**level * (1 + 1e-12)) for level in range(levels)]
+
+
+def spatial_hash(x: Tensor, y: Tensor, z: Tensor, size: int) -> Tensor:
+    """``(x π₁ ⊕ y π₂ ⊕ z π₃) mod T`` (Eq. 4) of whole coordinates that broadcast; ``size`` is T, a power of two."""
+    return (x * PRIMES[0] ^ y * PRIMES[1] ^ z * PRIMES[2]) & (size - 1)
+
+
+def check_table(table_size: int, coarsest: int, finest: int) -> None:
+    """Raise ValueError if no hash encoding has these sizes."""
+    if table_size < 1 or table_size & (table_size - 1):
+        raise ValueError(f"table_size={table_size}: expected a power of two")
+    if not 1 <= coarsest <= finest:
+        raise ValueError(f"coarsest={coarsest}, finest={finest}: expected 1 ≤ coarsest ≤ finest")
+
+
+def tables_apart(*modules: nn.Module) -> tuple[list[nn.Parameter], list[nn.Parameter]]:
+    """The tables of hash encodings among the parameters of modules, and all others: each wants a rate of its own."""
+    tables = [part.table for module in modules for part in module.modules() if isinstance(part, HashEncoding)]
+    known = {id(table) for table in tables}
+    return tables, [p for module in modules for p in module.parameters() if id(p) not in known]
+
+
+class HashEncoding(nn.Module):
+    """Features of positions, piecewise trilinear, learnt with whatever reads them.
+
+    All levels are in one table and are looked up at once. Positions outside the cube have the features of its nearest
+    point.
+
+    Args:
+        levels: grids, L in the paper.
+        table_size: most entries of a level, T; a power of two.
+        features: numbers per entry, F.
+        coarsest: cells along a side of the first grid, N_min.
+        finest: cells along a side of the last grid, N_max.
+        extent: half-edge of the cube that the grids cover.
+
+    Raises:
+        ValueError: an argument is out of range.
+
+    Example:
+        >>> import torch
+        >>> from mplicits.neural_fields.networks.hash_encoding import HashEncoding
+        >>> HashEncoding(levels=4, finest=128)(torch.zeros(5, 3)).shape
+        torch.Size([5, 8])
+    """
+
+    def __init__(
+        self,
+        *,
+        levels: int = 12,
+        table_size: int = 1 << 15,
+        features: int = 2,
+        coarsest: int = 16,
+        finest: int = 512,
+        extent: float = 1.0,
+    ) -> None:
+        super().__init__()
+        at_least(1, levels=levels, features=features)
+        check_table(table_size, coarsest, finest)
+        positive(extent=extent)
+        self.table_size, self.extent = table_size, float(extent)
+        self.resolutions = grid_resolutions(levels, coarsest, finest)
+        sizes = [min((resolution + 1) ** 3, table_size) for resolution in self.resolutions]
+        self.table = nn.Parameter(torch.empty(sum(sizes), features).uniform_(-INITIAL, INITIAL))
+        fits = [(resolution + 1) ** 3 <= table_size for resolution in self.resolutions]
+        starts = torch.tensor([0, *sizes[:-1]]).cumsum(0)
+        self.register_buffer("cells", torch.tensor(self.resolutions), persistent=False)
+        self.register_buffer("starts", starts, persistent=False)
+        self.register_buffer("own", torch.tensor(fits), persistent=False)
+        self.cells: Tensor
+        self.starts: Tensor
+        self.own: Tensor
+
+    @classmethod
+    def up_to(cls, finest: int, *, extent: float = 1.0) -> HashEncoding:
+        """One from 16 cells along a side, or fewer if the last grid has fewer, to ``finest``."""
+        return cls(coarsest=min(16, finest), finest=finest, extent=extent)
+
+    @property
+    def size(self) -> int:
+        """How many numbers a position becomes."""
+        return len(self.resolutions) * self.table.shape[1]
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Features ``(..., L F)`` of positions ``(..., 3)``; differentiable by the table and by ``x``.
+
+        In the precision of the table, under ``autocast`` too: half of it has no digits left for where in a cell of a
+        fine grid a position is.
+        """
+        with torch.autocast(x.device.type, enabled=False):
+            return self._looked_up(x.to(self.table.dtype))
+
+    def _looked_up(self, x: Tensor) -> Tensor:
+        rows = x.reshape(-1, 1, 3)
+        cells = self.cells[:, None]
+        at = (rows.clamp(-self.extent, self.extent) + self.extent) * (0.5 / self.extent) * cells  # (N, L, 3)
+        cell = torch.minimum(at.detach().floor(), cells - 1)
+        within = at - cell
+        sides = torch.stack((1 - within, within), dim=-1)  # (N, L, 3, 2)
+        weights = torch.einsum("nli,nlj,nlk->nlijk", *sides.unbind(dim=2)).flatten(-3)
+        found: Tensor = _Lookup.apply(self.table, self._entries(cell.long()), weights)  # pyright: ignore[reportAssignmentType]
+        return found.reshape(*x.shape[:-1], self.size)
+
+    def _entries(self, cell: Tensor) -> Tensor:
+        """Rows of the table ``(N, L, 8)`` of the vertices of cells ``(N, L, 3)``."""
+        both = torch.stack((cell, cell + 1), dim=-1)
+        x, y, z = both[:, :, 0, :, None, None], both[:, :, 1, None, :, None], both[:, :, 2, None, None, :]
+        edge = (self.cells + 1)[:, None, None, None]
+        shared = spatial_hash(x, y, z, self.table_size)
+        entries = torch.where(self.own[:, None, None, None], (x * edge + y) * edge + z, shared)
+        return (entries + self.starts[:, None, None, None]).flatten(-3)
+
+
+class _Lookup(torch.autograd.Function):
+    """Weighted sums of rows of a table. PyTorch's own way back takes four times as long, most of it in sorting."""
+
+    @staticmethod
+    def forward(ctx: Any, table: Tensor, entries: Tensor, weights: Tensor) -> Tensor:
+        ctx.save_for_backward(table, entries, weights)
+        rows, by_row = entries.reshape(-1, CORNERS), weights.reshape(-1, CORNERS)
+        return nn.functional.embedding_bag(rows, table, per_sample_weights=by_row, mode="sum")
+
+    @staticmethod
+    def backward(ctx: Any, *cotangents: Tensor) -> tuple[Tensor | None, ...]:
+        table, entries, weights = ctx.saved_tensors
+        (slope,) = (cotangent[:, None] for cotangent in cotangents)  # (N L, 1, F)
+        by_table = by_weights = None
+        if ctx.needs_input_grad[0]:
+            shares = (slope * weights.reshape(-1, CORNERS, 1)).flatten(0, 1)
+            by_table = torch.zeros_like(table).index_add_(0, entries.flatten(), shares)
+        if ctx.needs_input_grad[2]:
+            by_weights = (table[entries.reshape(-1, CORNERS)] * slope).sum(dim=2).reshape(weights.shape)
+        return by_table, None, by_weights

@@ -1,0 +1,385 @@
+"""A field asked in the coordinates and units of its input, in numpy or in torch."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from .fields.csg import Bounded, Difference, Intersection, Offset, Placed, Shell, Union
+from .fields.field import Field
+from .fields.function import FieldLike, as_field
+from .fields.similarity import Similarity
+from .meshing._lattice import Bounds
+from .meshing.extract import DEFAULT_BOUNDS, Mesh, extract_mesh
+from .tracing.projection import project_to_surface
+from .tracing.sphere import sphere_trace
+from .upward import upward
+
+__all__ = ["Closest", "WorldField", "WorldHits", "in_one_frame"]
+
+Points = TypeVar("Points", NDArray[np.floating], Tensor)
+
+# Points that come as arrays are evaluated so many at a time.
+BATCH = 1 << 18
+
+
+class Closest(NamedTuple):
+    """Points of a surface near given ones, as arrays or tensors.
+
+    Attributes:
+        position: ``(..., 3)`` where `WorldField.closest` ended, in input coordinates.
+        normal: ``(..., 3)`` unit normal there, outward.
+        reached: ``(...,)`` bool, whether that is on the surface.
+    """
+
+    position: Any
+    normal: Any
+    reached: Any
+
+
+class WorldHits(NamedTuple):
+    """Where rays meet a surface, as arrays or tensors, in input coordinates and units.
+
+    Attributes:
+        mask: ``(...,)`` bool, whether the ray meets it.
+        depth: ``(...,)`` along the ray, in lengths of its direction; infinite for a ray that misses.
+        position: ``(..., 3)`` the point at that depth; NaN for a ray that misses.
+        normal: ``(..., 3)`` unit normal there, outward; NaN for a ray that misses.
+    """
+
+    mask: Any
+    depth: Any
+    position: Any
+    normal: Any
+
+
+class WorldField:
+    """A signed distance in the coordinates of a scan, a scene or a map: what a fit answers.
+
+    Fields live in the unit sphere; a `Similarity` leads there. Here both are one thing: points come and distances go in
+    input coordinates and units. Arrays in, arrays out, in float64; tensors in, tensors out, in their precision, on
+    their device, and with their graph. The shift is made in float64 before anything is rounded, so that map coordinates
+    keep their digits.
+
+    Args:
+        field: three-dimensional, in its own coordinates; or a function of points ``(..., 3)`` → ``(...,)``.
+        similarity: from input to the field's coordinates; the identity if there is none.
+
+    Raises:
+        ValueError: the field is not three-dimensional; fix the time of one in space-time with `at_time`.
+
+    Example:
+        >>> import numpy as np
+        >>> from mplicits.neural_fields import Similarity, Sphere, WorldField
+        >>> ball = WorldField(Sphere(radius=0.5), Similarity((500_000.0, 0.0, 0.0), 20.0))  # of radius 10, far away
+        >>> ball.distance(np.array([[500_012.0, 0.0, 0.0]])).round(4)
+        array([2.])
+    """
+
+    def __init__(self, field: FieldLike, similarity: Similarity | None = None) -> None:
+        field = as_field(field)
+        if field.in_dim != 3:
+            raise ValueError(f"field.in_dim={field.in_dim}: expected 3 (fix the time of a field in space-time first)")
+        self.field, self.similarity = field, similarity or Similarity.identity()
+
+    def __repr__(self) -> str:
+        center = ", ".join(f"{number:.10g}" for number in self.similarity.center)
+        return f"WorldField(center=({center}), scale={self.similarity.scale:.10g}, field={self.field!r})"
+
+    def distance(self, points: Points, *, level: int = -1) -> Points:
+        """Signed distance ``(...,)`` of ``points`` ``(..., 3)``, negative inside, in input units.
+
+        Args:
+            points: in input coordinates.
+            level: of detail, 0 the coarsest, -1 the finest.
+
+        Raises:
+            ValueError: the last dimension is not 3, or there is no such level.
+        """
+        return self._ask(points, lambda unit: (self.field.value(unit, level=level).double() * self.similarity.scale,))[
+            0
+        ]
+
+    def normals(self, points: Points, *, level: int = -1) -> Points:
+        """Unit normals ``(..., 3)`` at ``points`` ``(..., 3)``: the direction in which the distance grows.
+
+        Raises:
+            ValueError: see `distance`.
+        """
+        return self._ask(points, lambda unit: (_unit(self.field.jet(unit, level=level).gradient),))[0]
+
+    def closest(self, points: Points, *, level: int = -1, steps: int = 10, tolerance: float = 1e-5) -> Closest:
+        """The points of the surface that lie down the gradient of ``points`` ``(..., 3)``.
+
+        Where the field is an exact distance that is the closest point. Tensors get no graph here.
+
+        Args:
+            points: in input coordinates.
+            level: see `distance`.
+            steps: at most so many evaluations for a point.
+            tolerance: on the distance, in units of the field.
+
+        Raises:
+            ValueError: see `distance`.
+        """
+
+        def ask(unit: Tensor) -> tuple[Tensor, ...]:
+            feet, reached = project_to_surface(self.field, unit, level=level, steps=steps, tolerance=tolerance)
+            return self._to_input(feet), _unit(self.field.jet(feet, level=level).gradient), reached
+
+        with torch.no_grad():
+            return Closest(*self._ask(points, ask))
+
+    def trace(
+        self,
+        origins: Points,
+        directions: Points,
+        *,
+        level: int = -1,
+        tolerance: float = 1e-5,
+        differentiable: bool = False,
+    ) -> WorldHits:
+        """First intersections of rays with the surface.
+
+        Args:
+            origins: ``(..., 3)`` in input coordinates.
+            directions: ``(..., 3)``, of any length but 0; broadcast with ``origins``.
+            level: see `distance`.
+            tolerance: of the depth, in units of the field.
+            differentiable: whether depths and positions of tensors carry gradients; see `sphere_trace`.
+
+        Raises:
+            ValueError: see `sphere_trace`; or one is an array and the other a tensor.
+        """
+        if isinstance(origins, Tensor) != isinstance(directions, Tensor):
+            raise ValueError("origins and directions: expected two arrays or two tensors")
+        rays = _broadcast(origins, directions)
+
+        def ask(unit: Tensor, along: Tensor) -> tuple[Tensor, ...]:
+            hits = sphere_trace(
+                self.field, unit, along, level=level, tolerance=tolerance, differentiable=differentiable
+            )
+            away = ~hits.mask[..., None]
+            normal = _unit(self.field.jet(hits.position, level=level).gradient)
+            depth = torch.where(hits.mask, hits.depth.double() * self.similarity.scale, torch.inf)
+            position = self._to_input(hits.position).masked_fill(away, torch.nan)
+            return hits.mask, depth, position, normal.masked_fill(away, torch.nan)
+
+        return WorldHits(*self._ask(rays[0], ask, rays[1]))
+
+    def mesh(
+        self, resolution: int = 256, *, level: int = -1, bounds: Bounds | None = None, normals: bool = True
+    ) -> Mesh:
+        """A triangle mesh of the surface, in input coordinates.
+
+        Args:
+            resolution: cells along the longest side of the box.
+            level: see `distance`.
+            bounds: lowest and highest corner of the box, in input coordinates; by default around the unit sphere.
+            normals: whether vertices get normals.
+
+        Raises:
+            NoSurfaceError: there is no surface in the box.
+            ValueError: see `extract_mesh`.
+        """
+        box = DEFAULT_BOUNDS
+        if bounds is not None:
+            low, high = map(self.similarity.to_unit, bounds)
+            box = ((low[0], low[1], low[2]), (high[0], high[1], high[2]))
+        mesh = extract_mesh(self.field, resolution=resolution, level=level, bounds=box, normals=normals)
+        return dataclasses.replace(mesh, vertices=self.similarity.to_input(mesh.vertices))
+
+    def render(
+        self,
+        path: str | Path | None = None,
+        *,
+        size: int | tuple[int, int] = 640,
+        level: int = -1,
+        up: str = "y",
+        azimuth: float = 30.0,
+        elevation: float = 15.0,
+    ) -> NDArray[np.uint8]:
+        """A picture of the surface, traced, with the light of ``mplicits render``.
+
+        Args:
+            path: a .png or .jpg file to write as well.
+            size: pixels along each side, or width and height.
+            level: see `distance`.
+            up: the axis that points up, "y" or "z".
+            azimuth: degrees around that axis, from the front.
+            elevation: degrees above the horizon.
+
+        Returns:
+            ``(H, W, 3)`` display RGB.
+
+        Raises:
+            InputError: there is no surface, or the file cannot be written.
+        """
+        return upward("render")(self, path, size=size, level=level, up=up, azimuth=azimuth, elevation=elevation)
+
+    def show(self, *, up: str = "y", block: bool = True, browser: bool = True) -> Any:
+        """Look at the surface: in the browser, or in a notebook as a picture.
+
+        In a script the viewer opens in the browser (it needs ``mplicits[view]``), and this returns when its page is
+        closed, or at Ctrl-C.
+
+        Args:
+            up: the axis that points up, "y" or "z".
+            block: whether to wait; otherwise the running `Viewer` is returned, for the caller to close.
+            browser: whether to open one; otherwise only the address is printed.
+
+        Returns:
+            The `Viewer`, or None once it is closed; in a notebook what shows the picture there.
+
+        Raises:
+            InputError: viser is not installed, or there is no surface.
+        """
+        return upward("show")(self, up=up, block=block, browser=browser)
+
+    def union(self, *others: WorldField, smooth: float = 0.0) -> WorldField:
+        """This solid and others as one, wherever each was fitted.
+
+        Args:
+            others: in the same input coordinates.
+            smooth: width of the blend, in input units; see `Union`.
+
+        Returns:
+            A field in a unit sphere around all of them; see `in_one_frame`.
+
+        Raises:
+            ValueError: ``smooth`` is negative.
+
+        Example:
+            >>> from mplicits.neural_fields import Similarity, Sphere, WorldField
+            >>> near, far = (WorldField(Sphere(), Similarity((x, 0.0, 0.0), 10.0)) for x in (0.0, 100.0))
+            >>> near.union(far).distance([[7.0, 0.0, 0.0], [92.0, 0.0, 0.0]]).round(4)
+            array([2., 3.])
+        """
+        fields, frame = in_one_frame([self, *others])
+        return WorldField(Union(*fields, smooth=smooth / frame.scale), frame)
+
+    def intersection(self, *others: WorldField, smooth: float = 0.0) -> WorldField:
+        """What is in this solid and in all others; see `union` and `Intersection`."""
+        fields, frame = in_one_frame([self, *others])
+        return WorldField(Intersection(*fields, smooth=smooth / frame.scale), frame)
+
+    def difference(self, *others: WorldField, smooth: float = 0.0) -> WorldField:
+        """What is in this solid and in none of the others; see `union` and `Difference`."""
+        fields, frame = in_one_frame([self, *others])
+        return WorldField(Difference(*fields, smooth=smooth / frame.scale), frame)
+
+    def offset(self, by: float) -> WorldField:
+        """This solid grown by a length in input units, or shrunk by a negative one; see `Offset`.
+
+        Raises:
+            ValueError: ``by`` is not finite.
+        """
+        fields, frame = in_one_frame([self], margin=max(by, 0.0))
+        return WorldField(Offset(*fields, by=by / frame.scale), frame)
+
+    def shell(self, *, inside: float = 0.0, outside: float = 0.0) -> WorldField:
+        """A wall that reaches so far into the solid and out of it, in input units; see `Shell`.
+
+        Raises:
+            ValueError: one is negative or not finite, or the wall has no thickness.
+        """
+        fields, frame = in_one_frame([self], margin=max(outside, 0.0))
+        return WorldField(Shell(*fields, inside=inside / frame.scale, outside=outside / frame.scale), frame)
+
+    def _ask(self, points: Any, function: Callable[..., tuple[Tensor, ...]], *others: Any) -> tuple[Any, ...]:
+        """What ``function`` says at points in the field's coordinates, in the kind and shape of the points given.
+
+        ``others`` are rows beside the points that need no change of coordinates, such as directions.
+        """
+        like = self.field.like
+        if isinstance(points, Tensor):
+            if points.ndim == 0 or points.shape[-1] != 3:
+                raise ValueError(f"points has shape {tuple(points.shape)}; expected (..., 3)")
+            kind = points.dtype if points.dtype.is_floating_point else torch.get_default_dtype()
+            found = function(self._to_unit(points).to(like), *(other.to(like) for other in others))
+            return tuple(part.to(points.device, part.dtype if part.dtype == torch.bool else kind) for part in found)
+        array = np.asarray(points, np.float64)
+        if array.ndim == 0 or array.shape[-1] != 3:
+            raise ValueError(f"points has shape {array.shape}; expected (..., 3)")
+        rows = [torch.from_numpy(np.ascontiguousarray(part, np.float64).reshape(-1, 3)) for part in (array, *others)]
+        with torch.no_grad():
+            parts = [
+                function(self._to_unit(unit).to(like), *(other.to(like) for other in beside))
+                for unit, *beside in zip(*(part.split(BATCH) for part in rows), strict=True)
+            ]
+        whole = (torch.cat(part).cpu() for part in zip(*parts, strict=True))
+        return tuple(
+            (part if part.dtype == torch.bool else part.double()).reshape((*array.shape[:-1], *part.shape[1:])).numpy()
+            for part in whole
+        )
+
+    def _to_unit(self, points: Tensor) -> Tensor:
+        center = torch.tensor(self.similarity.center, dtype=torch.float64, device=points.device)
+        return (points.double() - center) / self.similarity.scale
+
+    def _to_input(self, points: Tensor) -> Tensor:
+        center = torch.tensor(self.similarity.center, dtype=torch.float64, device=points.device)
+        return points.double() * self.similarity.scale + center
+
+
+def in_one_frame(shapes: Sequence[WorldField], *, margin: float = 0.0) -> tuple[list[Field], Similarity]:
+    """Fields of different unit spheres, brought into one that holds them all.
+
+    What was learned counts for nothing outside its own unit sphere (`Bounded`); a closed form is asked everywhere.
+
+    Args:
+        shapes: in the same input coordinates.
+        margin: room around them, in input units.
+
+    Returns:
+        The fields, and the similarity from input coordinates to theirs.
+
+    Raises:
+        ValueError: there are no shapes, or ``margin`` is negative or not finite.
+
+    Example:
+        >>> from mplicits.neural_fields import Similarity, Sphere, Union, WorldField, in_one_frame
+        >>> balls = [WorldField(Sphere(), Similarity((x, 0.0, 0.0), 1.0)) for x in (-1.0, 1.0)]
+        >>> fields, frame = in_one_frame(balls)
+        >>> frame
+        Similarity(center=(0.0, 0.0, 0.0), scale=2.0)
+        >>> both = WorldField(Union(*fields), frame)
+    """
+    if not shapes or not 0 <= margin < np.inf:
+        raise ValueError(f"{len(shapes)} shapes, margin={margin}: expected at least one, and a finite number ≥ 0")
+    centers = np.array([shape.similarity.center for shape in shapes], np.float64)
+    scales = np.array([shape.similarity.scale for shape in shapes], np.float64)
+    center = ((centers - scales[:, None]).min(axis=0) + (centers + scales[:, None]).max(axis=0)) / 2
+    if (centers == centers[0]).all():
+        center = centers[0]  # without rounding
+    scale = float((np.linalg.norm(centers - center, axis=1) + scales).max()) + margin
+    frame = Similarity((float(center[0]), float(center[1]), float(center[2])), scale)
+    return [_placed(shape, frame) for shape in shapes], frame
+
+
+def _placed(shape: WorldField, frame: Similarity) -> Field:
+    if shape.similarity == frame:
+        return shape.field
+    x, y, z = (float(c) for c in frame.to_unit(shape.similarity.center))
+    field, learned = shape.field, next(shape.field.parameters(), None) is not None
+    field = Bounded(field) if learned and not isinstance(field, Bounded) else field
+    return Placed(field, Similarity((x, y, z), shape.similarity.scale / frame.scale))
+
+
+def _unit(gradient: Tensor) -> Tensor:
+    return torch.nn.functional.normalize(gradient, dim=-1)
+
+
+def _broadcast(first: Any, second: Any) -> tuple[Any, Any]:
+    if isinstance(first, Tensor):
+        pair = torch.broadcast_tensors(first, second)
+        return pair[0], pair[1]
+    one, other = np.broadcast_arrays(np.asarray(first, np.float64), np.asarray(second, np.float64))
+    return one, other

@@ -1,0 +1,1 @@
+"""Fields of space and time: slices, velocities, flows and laws of evolution."""

@@ -1,0 +1,214 @@
+"""Tracing surfaces that move: what one frame found out says what the next ones need not look for.
+
+**Key frames** are traced as from scratch, and note for every ray where it comes within ``reach`` of the surface. Until
+the surface may have moved that far, the frames in between
+
+- leave out rays that came nowhere near it,
+- begin the others where they came near, and end those that passed where they left it again,
+- and look at once where a ray's hit is foretold to be, from its depths in the last two frames, if the key frame saw the
+  field fall evenly from there to the hit. One Newton step, or none, is then left to do.
+
+**What holds.** Key frames are those of `sphere_trace`, whatever has moved and however far; there only the place where
+a ray looks first is taken from older frames. Frames in between rest on the ``speed``, a bound on |∂f/∂t|: a point with
+f ≥ reach at the time of the key frame stays outside for ``reach / speed``. Two things they do not see before the next
+key frame: what grows out of the last stretch of an even fall, and a spike between two samples of a ray that were both
+clear of it. With ``reach=0`` every frame is a key frame, and nothing is assumed about the motion.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..fields.field import Field
+from ..tracing.cones import CONE_LIPSCHITZ, cone_ends, cone_starts
+from ..tracing.sphere import BOUNDING_RADIUS, Expected, Hits, Near, ball_points, trace_expected
+from .field import SpaceTimeSDF, TimeSlice, check_spacetime
+
+__all__ = ["DynamicTracer", "moment"]
+
+# How near a ray comes before a key frame takes note, in resolutions. More makes key frames fewer, the others dearer.
+REACH = 12.0
+# The speed is measured at those of so many points that are this near, by a difference over so long a time, and taken
+# for larger.
+SPEED_POINTS = 16384
+SPEED_NEAR = 0.1
+SPEED_INTERVAL = 1e-3
+SPEED_MARGIN = 1.25
+
+
+def moment(field: Field, t: float) -> Field:
+    """The three-dimensional field at a time: `SpaceTimeSDF.at`, where a point costs least, or else a `TimeSlice`.
+
+    Raises:
+        ValueError: the field is not four-dimensional.
+    """
+    return field.at(t) if isinstance(field, SpaceTimeSDF) else TimeSlice(field, t)
+
+
+class _Frame(NamedTuple):
+    """What is kept of a frame.
+
+    Attributes:
+        time: when.
+        depth: of the hits, infinite where there are none.
+        slope: how fast the field fell along the rays there.
+    """
+
+    time: float
+    depth: Tensor
+    slope: Tensor
+
+
+class _Key(NamedTuple):
+    """What is kept of a key frame.
+
+    Attributes:
+        time: when.
+        lasts: how long the surface takes to move by the reach.
+        near: where each ray came near the surface.
+        far: where to give up: where rays that missed had left it again.
+    """
+
+    time: float
+    lasts: float
+    near: Near
+    far: Tensor
+
+
+class DynamicTracer:
+    """First intersections of the same rays with a surface that moves, frame after frame.
+
+    Times may come in any order and at any distance; the nearer, the more frames there are between two key frames (see
+    the module for what these are, and what holds).
+
+    Args:
+        field: four-dimensional.
+        origins: ``(3,)`` or ``(..., 3)``.
+        directions: ``(..., 3)`` of unit length. The rays ``(H, W, 3)`` of an image with one origin are traced in tiles
+            first, as far as whole tiles see nothing.
+        level: whose surface to find.
+        tolerance: see `sphere_trace`.
+        resolution: see `sphere_trace`.
+        lipschitz: see `sphere_trace`.
+        radius: see `sphere_trace`.
+        reach: how near to the surface is near; by default 12 resolutions. 0 makes every frame a key frame.
+        speed: bound on |∂f/∂t| near the surface; by default a quarter more than the largest one that is measured, for
+            every key frame, at points all around it.
+
+    Raises:
+        ValueError: the field is not four-dimensional, has no such level, or a number is negative.
+
+    Example:
+        >>> import torch
+        >>> from mplicits.neural_fields import Moving, RigidMotion, Sphere
+        >>> from mplicits.neural_fields.spacetime.dynamic_tracing import DynamicTracer
+        >>> ball = Moving(Sphere(radius=0.3), RigidMotion(velocity=(0.0, 0.0, 0.5)))
+        >>> tracer = DynamicTracer(ball, torch.tensor([0.0, 0.0, -2.0]), torch.tensor([[0.0, 0.0, 1.0]]))
+        >>> [round(float(tracer.trace(t).depth), 4) for t in (0.0, 0.1, 0.2)]
+        [1.7, 1.75, 1.8]
+    """
+
+    def __init__(
+        self,
+        field: Field,
+        origins: Tensor,
+        directions: Tensor,
+        *,
+        level: int = -1,
+        tolerance: float = 1e-5,
+        resolution: float = 1e-4,
+        lipschitz: float = 1.0,
+        radius: float = BOUNDING_RADIUS,
+        reach: float | None = None,
+        speed: float | None = None,
+    ) -> None:
+        check_spacetime(field)
+        for name, number in (("reach", reach), ("speed", speed)):
+            if number is not None and number < 0:
+                raise ValueError(f"{name}={number}: expected ≥ 0")
+        self.field, self.origins, self.directions = field, origins, directions
+        self.level, self.radius = field.resolve_level(level), radius
+        self.tolerance, self.resolution, self.lipschitz = tolerance, resolution, lipschitz
+        self.reach, self.speed = REACH * resolution if reach is None else reach, speed
+        self._frames: list[_Frame] = []
+        self._key: _Key | None = None
+
+    @torch.no_grad()
+    def trace(self, t: float) -> Hits:
+        """The hits at a time.
+
+        Raises:
+            ValueError: see `sphere_trace`.
+        """
+        field, key = moment(self.field, t), self._key
+        if key is not None and abs(t - key.time) < key.lasts:
+            hits, slope, _ = self._trace(field, self._expected(t, key.near.value), key.near.clear, key.far, None)
+        else:
+            hits, slope = self._trace_key(field, t)
+        self._frames = [*self._frames[-1:], _Frame(t, torch.where(hits.mask, hits.depth, torch.inf), slope)]
+        return hits
+
+    def _trace_key(self, field: Field, t: float) -> tuple[Hits, Tensor]:
+        """A key frame."""
+        start, end = self._tiles(field)
+        unknown = torch.full_like(self.directions[..., 0], torch.inf)
+        hits, slope, near = self._trace(field, self._expected(t, unknown), start, end, self.reach)
+        lasts = 0.0
+        if self.reach:
+            speed = self._measured_speed(t) if self.speed is None else self.speed
+            lasts = self.reach / max(speed, torch.finfo(torch.float32).tiny)
+        self._key = _Key(t, lasts, near, torch.where(hits.mask, torch.inf, near.leave))
+        return hits, slope
+
+    def _trace(
+        self, field: Field, expected: Expected | None, near: Tensor | float, far: Tensor | float, reach: float | None
+    ) -> tuple[Hits, Tensor, Near]:
+        return trace_expected(
+            field,
+            self.origins,
+            self.directions,
+            expected,
+            level=self.level,
+            near=near,
+            far=far,
+            radius=self.radius,
+            tolerance=self.tolerance,
+            resolution=self.resolution,
+            lipschitz=self.lipschitz,
+            reach=reach,
+        )
+
+    def _measured_speed(self, t: float) -> float:
+        """How fast values change at this time near the surface; of a distance, that is how fast the surface moves."""
+        generator = torch.Generator().manual_seed(0)
+        points = ball_points(SPEED_POINTS, radius=self.radius, generator=generator).to(self.directions)
+        before, after = (moment(self.field, t + sign * SPEED_INTERVAL / 2).value(points, level=0) for sign in (-1, 1))
+        rate = (after - before).abs() / SPEED_INTERVAL
+        close = before.abs() < max(SPEED_NEAR, 4 * self.reach)
+        return SPEED_MARGIN * float((rate[close] if close.any() else rate).max())
+
+    def _tiles(self, field: Field) -> tuple[Tensor | float, Tensor | float]:
+        """Between which depths something may be near, as far as tiles can tell."""
+        if self.origins.shape != (3,) or self.directions.ndim != 3:
+            return 0.0, torch.inf
+        cones = {"level": self.level, "lipschitz": CONE_LIPSCHITZ * self.lipschitz, "radius": self.radius}
+        near = cone_starts(field, self.origins, self.directions, clearance=self.reach, **cones)
+        if not self._frames:
+            return near, torch.inf
+        passing = near.isfinite() & self._frames[-1].depth.isinf()
+        return near, cone_ends(field, self.origins, self.directions, passing, clearance=self.reach, **cones)
+
+    def _expected(self, t: float, value: Tensor) -> Expected | None:
+        """The last hits, moved on as they moved before; with what is known of the values where rays begin."""
+        if not self._frames:
+            return None
+        last = self._frames[-1]
+        before = self._frames[0]
+        depth = last.depth
+        if before.time != last.time:
+            moved = depth + (depth - before.depth) * ((t - last.time) / (last.time - before.time))
+            depth = torch.where(moved.isfinite(), moved, depth)
+        return Expected(depth, last.slope, value)

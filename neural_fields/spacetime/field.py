@@ -1,0 +1,310 @@
+"""Fields of space and time, and their slices, which are three-dimensional fields again.
+
+A point of space-time is (x, y, z, t) with t in [0, 1]. Whatever takes a `Field` in three dimensions (tracer, mesher,
+viewer) takes a slice, so none of them knows about time.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from ..backend._checks import at_least
+from ..fields.field import Field, Jet, SecondJet
+from ..networks.multiscale import MultiscaleSDF, levels_of
+from ..networks.siren import Siren
+
+__all__ = ["SpaceTimeJet", "SpaceTimeSDF", "TimeSlice", "at_time", "spacetime_jet"]
+
+
+class SpaceTimeJet(NamedTuple):
+    """A field at some points of space-time, with the derivatives by space and by time told apart.
+
+    Attributes:
+        position: ``(..., 3)`` where.
+        time: ``(...,)`` when.
+        value: ``(...,)`` f(x, t), negative inside.
+        gradient: ``(..., 3)`` ∇f, by space alone; not normalised.
+        rate: ``(...,)`` ∂f/∂t; the surface moves along its normal with the speed −rate / |∇f|.
+        features: ``(..., F)``.
+        hessian: ``(..., 3, 3)`` second derivatives by space, or ``(..., 0, 0)`` in a jet of order 1.
+    """
+
+    position: Tensor
+    time: Tensor
+    value: Tensor
+    gradient: Tensor
+    rate: Tensor
+    features: Tensor
+    hessian: Tensor
+
+
+def spacetime_jet(field: Field, x: Tensor, *, level: int = -1, order: int = 1) -> SpaceTimeJet:
+    """Evaluate a field of space-time at ``x`` ``(..., 4)``.
+
+    Args:
+        field: four-dimensional.
+        x: points (x, y, z, t).
+        level: as in `Field.jet`.
+        order: 1, or 2 for the second derivatives by space too (about three times the cost).
+
+    Raises:
+        ValueError: the field is not four-dimensional, a shape does not fit, or ``order`` is neither.
+    """
+    check_spacetime(field)
+    if order not in (1, 2):
+        raise ValueError(f"order={order}: expected 1 or 2")
+    if order == 1:
+        jet = field.jet(x, level=level)
+        hessian = x.new_empty((*x.shape[:-1], 0, 0))
+    else:
+        *jet, hessian = field.second_jet(x, level=level, dims=3)
+    value, gradient, features = jet
+    return SpaceTimeJet(x[..., :3], x[..., 3], value, gradient[..., :3], gradient[..., 3], features, hessian)
+
+
+def at_time(x: Tensor, t: Tensor | float) -> Tensor:
+    """Points ``(..., 3)`` at a time, or each at its own ``(...,)``, as points ``(..., 4)`` of space-time."""
+    time = (t.to(x) if isinstance(t, Tensor) else x.new_full((), t)).expand(x.shape[:-1])
+    return torch.cat((x, time[..., None]), dim=-1)
+
+
+class SpaceTimeSDF(Field):
+    """A multiscale signed distance field that moves: bands and residuals live in space-time.
+
+    It wraps a four-dimensional `MultiscaleSDF`: a base SIREN plus residual SIRENs, each one only where
+    |f_i(x, t)| < δ_i, so the band travels with the surface.
+
+    Args:
+        sdf: four-dimensional.
+
+    Raises:
+        ValueError: ``sdf`` is not four-dimensional.
+
+    Example:
+        >>> import torch
+        >>> from mplicits.neural_fields import SpaceTimeSDF, TimeSlice
+        >>> field = SpaceTimeSDF.from_widths([(64, 2), (128, 2)], omegas=[15, 30])
+        >>> TimeSlice(field, 0.5).jet(torch.zeros(7, 3)).gradient.shape
+        torch.Size([7, 3])
+    """
+
+    def __init__(self, sdf: MultiscaleSDF) -> None:
+        super().__init__()
+        check_spacetime(sdf)
+        self.sdf = sdf
+        self.in_dim, self.num_levels = 4, sdf.num_levels
+
+    @property
+    def deltas(self) -> Tensor:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Half-widths of the bands, in units of space."""
+        return self.sdf.deltas
+
+    @classmethod
+    def from_widths(
+        cls,
+        sizes: Sequence[tuple[int, int]],
+        *,
+        omegas: Sequence[float],
+        deltas: Sequence[float] | None = None,
+        taper: float = 0.0,
+        num_features: int = 0,
+        residual_gain: float = 0.1,
+        time_gain: float = 1.0,
+    ) -> SpaceTimeSDF:
+        """Untrained levels; see `MultiscaleSDF.from_widths`.
+
+        Args:
+            sizes: (width, depth) of each level.
+            omegas: ω₀ of each level.
+            deltas: half-widths of the bands.
+            taper: see `MultiscaleSDF`.
+            num_features: extra outputs of every level.
+            residual_gain: factor on the residuals' initial output weights.
+            time_gain: factor on the initial weights of t; below 1 the field starts slower in time than in space.
+        """
+        sdf = MultiscaleSDF.from_widths(
+            sizes,
+            omegas=omegas,
+            deltas=deltas,
+            taper=taper,
+            in_dim=4,
+            num_features=num_features,
+            residual_gain=residual_gain,
+        )
+        with torch.no_grad():
+            for level in sdf.levels:
+                assert isinstance(level, Siren)
+                level.layers[0].weight[:, 3] *= time_gain  # pyright: ignore[reportIndexIssue]
+        return cls(sdf)
+
+    @classmethod
+    def from_static(cls, field: Field, *, extra_width: int = 0, time_gain: float = 1.0) -> SpaceTimeSDF:
+        """A field of space-time that equals a static one at all times, ready to be trained.
+
+        The weights are copied and those of t start at zero; they learn at once, for their gradients are not zero.
+        The neurons of ``extra_width`` start with random weights but are not listened to: the rows from them to
+        the copied neurons and to the output start at zero.
+
+        Args:
+            field: a `Siren` or a `MultiscaleSDF` of them, three-dimensional. It is not changed.
+            extra_width: neurons added to every sine layer of every level.
+            time_gain: factor on the initial weights of t of the added neurons.
+
+        Raises:
+            ValueError: a field of another kind, or ``extra_width`` is negative.
+        """
+        if field.in_dim != 3:
+            raise ValueError(f"field.in_dim={field.in_dim}: expected a static field, three-dimensional")
+        at_least(0, extra_width=extra_width)
+        taper = field.taper if isinstance(field, MultiscaleSDF) else 0.0
+        lifted: list[Field] = []
+        for level in levels_of(field):
+            if not isinstance(level, Siren):
+                raise ValueError(f"a level of the field is a {type(level).__name__}; expected a Siren")
+            lifted.append(_lift(level, extra_width, time_gain))
+        return cls(_assembled(lifted, field.deltas, taper).to(field.like))
+
+    def with_level(self, residual: Field, *, delta: float) -> SpaceTimeSDF:
+        """This field with one more level inside ``|f_last| < delta``; see `MultiscaleSDF.with_level`."""
+        return SpaceTimeSDF(self.sdf.with_level(residual, delta=delta))
+
+    @torch.no_grad()
+    def at(self, t: float) -> MultiscaleSDF:
+        """The field of one moment, as a static field of its own: a frozen copy that can be saved like any other.
+
+        The time goes into the biases of the first layers, b + t W_t, so a point costs what it costs in a
+        three-dimensional field. Use `TimeSlice` where the copy must not fall behind a field in training.
+        """
+        levels = [_slice(level, t) for level in self.sdf.levels]
+        return _assembled(levels, self.sdf.deltas, self.sdf.taper).requires_grad_(False)
+
+    def value(self, x: Tensor, *, level: int = -1) -> Tensor:
+        """See `Field.value`; ``x`` is ``(..., 4)``."""
+        return self.sdf.value(x, level=level)
+
+    def jet(self, x: Tensor, *, level: int = -1) -> Jet:
+        """See `Field.jet`; the last entry of the gradient is ∂f/∂t."""
+        return self.sdf.jet(x, level=level)
+
+    def second_jet(self, x: Tensor, *, level: int = -1, dims: int | None = None) -> SecondJet:
+        """See `Field.second_jet`."""
+        return self.sdf.second_jet(x, level=level, dims=dims)
+
+    def level_values(self, x: Tensor, *, level: int = -1) -> list[Tensor]:
+        """See `Field.level_values`."""
+        return self.sdf.level_values(x, level=level)
+
+
+class TimeSlice(Field):
+    """The three-dimensional field f(·, t) of a field of space-time, at one time.
+
+    It follows its field: train that, and the slice has changed. Gradients reach the field, and a time that is a
+    tensor.
+
+    Args:
+        field: four-dimensional; shared, not copied.
+        t: a number or a scalar tensor.
+
+    Raises:
+        ValueError: the field is not four-dimensional, or ``t`` is not one number.
+    """
+
+    defined_by = ("t",)
+
+    def __init__(self, field: Field, t: Tensor | float) -> None:
+        super().__init__()
+        check_spacetime(field)
+        if isinstance(t, Tensor) and t.ndim:
+            raise ValueError(f"t has shape {tuple(t.shape)}; expected one number")
+        self.field, self.t = field, t
+        self.in_dim, self.num_levels = 3, field.num_levels
+
+    @property
+    def deltas(self) -> Tensor:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Half-widths of the bands, those of the whole field."""
+        return self.field.deltas
+
+    def value(self, x: Tensor, *, level: int = -1) -> Tensor:
+        """See `Field.value`."""
+        return self.field.value(self._lifted(x), level=level)
+
+    def jet(self, x: Tensor, *, level: int = -1) -> Jet:
+        """See `Field.jet`; the gradient is that by space (see `time_derivative` for the rest)."""
+        value, gradient, features = self.field.jet(self._lifted(x), level=level)
+        return Jet(value, gradient[..., :3], features)
+
+    def second_jet(self, x: Tensor, *, level: int = -1, dims: int | None = None) -> SecondJet:
+        """See `Field.second_jet`."""
+        dims = self.resolve_dims(dims)
+        value, gradient, features, hessian = self.field.second_jet(self._lifted(x), level=level, dims=dims)
+        return SecondJet(value, gradient[..., :3], features, hessian)
+
+    def level_values(self, x: Tensor, *, level: int = -1) -> list[Tensor]:
+        """See `Field.level_values`."""
+        return self.field.level_values(self._lifted(x), level=level)
+
+    def time_derivative(self, x: Tensor, *, level: int = -1) -> Tensor:
+        """∂f/∂t at ``x`` ``(..., 3)`` → ``(...,)``."""
+        return self.field.jet(self._lifted(x), level=level).gradient[..., 3]
+
+    def spacetime_jet(self, x: Tensor, *, level: int = -1, order: int = 1) -> SpaceTimeJet:
+        """Everything at ``x`` ``(..., 3)``; see `spacetime_jet`."""
+        return spacetime_jet(self.field, self._lifted(x), level=level, order=order)
+
+    def _lifted(self, x: Tensor) -> Tensor:
+        return at_time(self.check_points(x), self.t)
+
+
+def check_spacetime(field: Field) -> None:
+    """Refuse a field that is not four-dimensional.
+
+    Raises:
+        ValueError: it is not.
+    """
+    if field.in_dim != 4:
+        raise ValueError(f"field.in_dim={field.in_dim}: expected a field of space-time, four-dimensional")
+
+
+def _assembled(levels: list[Field], deltas: Tensor, taper: float) -> MultiscaleSDF:
+    sdf = MultiscaleSDF(levels[0], levels[1:], deltas, taper=taper)
+    sdf.deltas = deltas.clone()  # in its own precision and place
+    return sdf
+
+
+def _slice(field: Field, t: float) -> Field:
+    """A frozen copy of one level with its time fixed."""
+    if not isinstance(field, Siren):
+        return TimeSlice(copy.deepcopy(field), t)
+    # A copy whose first layer is cut down: building a new one would draw random numbers only to overwrite them.
+    siren = copy.deepcopy(field)
+    first = siren.layers[0]
+    assert isinstance(first, nn.Linear)
+    weight, bias = first.weight, first.bias
+    first.bias = nn.Parameter(bias + t * weight[:, 3])
+    first.weight = nn.Parameter(weight[:, :3].clone())
+    first.in_features = siren.in_dim = 3
+    return siren
+
+
+@torch.no_grad()
+def _lift(siren: Siren, extra: int, time_gain: float) -> Siren:
+    """The same function of (x, y, z, t), with unheard neurons added to its layers."""
+    siren, width = copy.deepcopy(siren), siren.width
+    siren.set_units()
+    lifted = Siren(width + extra, siren.depth, omega=siren.omega, in_dim=4, num_features=siren.num_features)
+    pairs = zip([*lifted.layers, lifted.output], [*siren.layers, siren.output], strict=True)
+    for index, (new, old) in enumerate(pairs):
+        assert isinstance(new, nn.Linear)
+        assert isinstance(old, nn.Linear)
+        known = len(old.weight)
+        if index == 0:
+            new.weight[:, 3] *= time_gain
+        new.weight[:known] = 0
+        new.weight[:known, : old.in_features] = old.weight
+        new.bias[:known] = old.bias
+    return lifted

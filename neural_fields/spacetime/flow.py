@@ -1,0 +1,390 @@
+"""Points that ride along: ordinary differential equations through vector fields and through moving surfaces.
+
+Two equations, both solved by torchdiffeq:
+
+- `flow` follows dx/dt = V(x, t). A field carried by V keeps its value along that path, f(x(t), t) = f(x(0), 0), which
+  gives exact targets for training and an exact measure of error.
+- `track` follows a point of a moving surface along its normal, dx/dt = −∂f/∂t ∇f / |∇f|², so that colours and
+  correspondences ride along with a field that knows nothing about points.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+import torch
+from torch import Tensor, nn
+
+from ..backend._checks import at_least, positive
+from ..fields.field import Field
+from ..tracing.projection import project_to_surface
+from .evolution import VectorField
+from .field import TimeSlice, at_time
+
+__all__ = [
+    "IntegrationError",
+    "Solver",
+    "Tracks",
+    "flow",
+    "flow_jacobian",
+    "integrate_rows",
+    "track",
+    "trajectories",
+    "transport_error",
+]
+
+ADAPTIVE = ("dopri5", "dopri8", "bosh3", "fehlberg2", "adaptive_heun")
+FIXED = ("rk4", "heun3", "heun2", "midpoint", "euler")
+
+
+class IntegrationError(RuntimeError):
+    """An integration that did not reach its end.
+
+    Attributes:
+        time: the time reached, a scalar, or one for each point where each had its own.
+        points: ``(N, 3)`` where the points were then.
+    """
+
+    def __init__(self, reason: str, time: Tensor, points: Tensor) -> None:
+        when = f"{float(time):.6g}" if not time.ndim else f"{float(time.min()):.6g} to {float(time.max()):.6g}"
+        super().__init__(f"{reason}; reached time {when}")
+        self.time, self.points = time, points
+
+
+@dataclass(frozen=True)
+class Solver:
+    """How to integrate.
+
+    Attributes:
+        method: adaptive ("dopri5", "dopri8", "bosh3", "fehlberg2", "adaptive_heun") or of a fixed step ("rk4", "heun3",
+            "heun2", "midpoint", "euler").
+        rtol: relative tolerance on every coordinate of every point, adaptive methods only.
+        atol: absolute tolerance, likewise; in float32 not below about 1e-6.
+        step: step of the fixed methods, in units of time.
+        min_step: an adaptive step this small is taken whatever its error. A stiff field, as near a change of topology,
+            would have the steps shrink to nothing; this trades accuracy there for an end. 0 fails instead.
+        max_steps: give up after so many steps, rejected ones included.
+        adjoint: let gradients come from integrating backward (memory does not grow with the steps) instead of from the
+            recorded steps. Neither costs anything under ``torch.no_grad()`` or where nothing requires gradients.
+
+    Raises:
+        ValueError: there is no such method, or a number is out of range.
+    """
+
+    method: str = "dopri5"
+    rtol: float = 1e-5
+    atol: float = 1e-6
+    step: float = 0.01
+    min_step: float = 0.0
+    max_steps: int = 2000
+    adjoint: bool = False
+
+    def __post_init__(self) -> None:
+        if self.method not in ADAPTIVE + FIXED:
+            raise ValueError(f"method={self.method!r}: expected one of {', '.join(ADAPTIVE + FIXED)}")
+        positive(rtol=self.rtol, atol=self.atol, step=self.step, max_steps=self.max_steps)
+        at_least(0, min_step=self.min_step)
+
+
+class Tracks(NamedTuple):
+    """Points that followed a surface.
+
+    Attributes:
+        points: ``(T, N, 3)`` where each of them is at each time.
+        distance: ``(T, N)`` |f| / |∇f| there, about how far from the surface; after the projection if there was one.
+    """
+
+    points: Tensor
+    distance: Tensor
+
+
+def flow(
+    velocity: VectorField,
+    points: Tensor,
+    start: Tensor | float,
+    end: Tensor | float,
+    *,
+    solver: Solver | None = None,
+) -> Tensor:
+    """Where the points of one time are at another: dx/dt = V(x, t) from ``start`` to ``end``.
+
+    Both may be one number, or one for each point: ``flow(V, x, t, 0.0)`` takes samples of space-time, each at its own
+    time, back to where they came from, in one integration.
+
+    Args:
+        velocity: V, of positions ``(N, 3)`` and times ``(N,)``; an ``nn.Module`` if it has parameters.
+        points: ``(N, 3)``.
+        start: a number or ``(N,)``.
+        end: a number or ``(N,)``, before or after ``start``.
+        solver: the method, its tolerances and its limits.
+
+    Returns:
+        Points ``(N, 3)``.
+
+    Raises:
+        ValueError: shapes do not fit.
+        IntegrationError: the steps became too small or too many, or V is not finite.
+
+    Example:
+        >>> import torch
+        >>> from mplicits.neural_fields import RigidMotion, Solver, flow
+        >>> turn = RigidMotion(angle=torch.pi)
+        >>> there = flow(turn.velocity, torch.tensor([[1.0, 0.0, 0.5]]), 0.0, 1.0)
+        >>> bool((there - torch.tensor([[-1.0, 0.0, 0.5]])).abs().max() < 1e-4)
+        True
+    """
+    start, end = _ends(points, start, end)
+    _check_points(points)
+    return integrate_rows(velocity, points, start, end, solver or Solver())
+
+
+class VelocityWithJacobian(Protocol):
+    """A vector field that knows its derivatives, as `mplicits.neural_fields.Velocity`."""
+
+    def jet(self, x: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """V ``(N, 3)``, ∂V/∂x ``(N, 3, 3)`` and ∂V/∂t ``(N, 3)``."""
+        ...
+
+
+def flow_jacobian(
+    velocity: VelocityWithJacobian,
+    points: Tensor,
+    start: Tensor | float,
+    end: Tensor | float,
+    *,
+    solver: Solver | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Where the points of one time are at another, and how their neighbourhoods are strained on the way.
+
+    With φ the map from ``start`` to ``end`` and M = ∂φ/∂x, both are followed together: dM/dt = ∂V/∂x M, M = I at first
+    (the equation of variation). det M says how volume grows; Mᵀ∇f is the gradient of f∘φ.
+
+    Args:
+        velocity: V with its derivatives.
+        points: ``(N, 3)``.
+        start: a number or ``(N,)``.
+        end: a number or ``(N,)``.
+        solver: as in `flow`; tolerances hold for the entries of M too.
+
+    Returns:
+        Points ``(N, 3)`` and M, ``(N, 3, 3)``.
+
+    Raises:
+        ValueError: shapes do not fit.
+        IntegrationError: as in `flow`.
+    """
+    _check_points(points)
+    start, end = _ends(points, start, end)
+
+    def both(state: Tensor, t: Tensor) -> Tensor:
+        value, jacobian, _ = velocity.jet(state[:, :3], t)
+        return torch.cat((value, (jacobian @ state[:, 3:].reshape(-1, 3, 3)).flatten(1)), dim=1)
+
+    identity = torch.eye(3, dtype=points.dtype, device=points.device).reshape(1, 9).expand(len(points), -1)
+    moved = integrate_rows(both, torch.cat((points, identity), dim=1), start, end, solver or Solver())
+    return moved[:, :3], moved[:, 3:].reshape(-1, 3, 3)
+
+
+def trajectories(
+    velocity: VectorField, points: Tensor, times: Sequence[float] | Tensor, *, solver: Solver | None = None
+) -> Tensor:
+    """Paths of points through a vector field, ``(T, N, 3)``, from ``points`` at ``times[0]``; see `flow`.
+
+    Raises:
+        ValueError: shapes do not fit, or the times do not run one way.
+        IntegrationError: as in `flow`.
+    """
+    _check_points(points)
+    moments = _moments(times, points)
+    path = [points]
+    for start, end in itertools.pairwise(moments):
+        path.append(integrate_rows(velocity, path[-1], start, end, solver or Solver()))
+    return torch.stack(path)
+
+
+def transport_error(
+    field: Field,
+    initial: Field,
+    velocity: VectorField,
+    points: Tensor,
+    times: Sequence[float] | Tensor,
+    *,
+    solver: Solver | None = None,
+) -> Tensor:
+    """``|f(x(t), t) − f_0(x_0)|`` along characteristics, ``(T, N)``: how far a field is from having been carried by V.
+
+    With points of the surface of f_0 it measures the surface alone, which is all that a law with ``extend=True`` asks
+    for; with any points it measures the solution of ∂f/∂t + ⟨∇f, V⟩ = 0.
+
+    Args:
+        field: f, four-dimensional.
+        initial: f_0, three-dimensional, the shape at ``times[0]``.
+        velocity: V.
+        points: x_0, ``(N, 3)``.
+        times: the moments, ``(T,)``.
+        solver: as in `flow`.
+    """
+    path = trajectories(velocity, points, times, solver=solver)
+    moments = _moments(times, points)
+    return (field.value(at_time(path, moments[:, None])) - initial.value(points)).abs()
+
+
+def track(
+    field: Field,
+    points: Tensor,
+    times: Sequence[float] | Tensor,
+    *,
+    level: int = -1,
+    project: bool = True,
+    least_slope: float = 0.1,
+    solver: Solver | None = None,
+) -> Tracks:
+    """Follow points of a moving surface by its normal velocity, dx/dt = −∂f/∂t ∇f / |∇f|².
+
+    The velocity has no part along the surface: of all the ways in which points could ride along this is the one
+    that a level set defines. A turning sphere, which looks the same at all times, leaves its points where they are.
+
+    Args:
+        field: four-dimensional.
+        points: ``(N, 3)``, on the surface at ``times[0]``.
+        times: increasing or decreasing, ``(T,)``.
+        level: whose surface.
+        project: after each time, move the points along ∇f back to the surface, and go on from there. What the
+            integration has missed does not add up then. No gradients flow through a projection.
+        least_slope: |∇f| is taken for at least this much, which bounds the velocity where a surface is
+            torn or vanishes.
+        solver: the method, its tolerances and its limits.
+
+    Raises:
+        ValueError: shapes do not fit, or the times do not run one way.
+        IntegrationError: as in `flow`.
+
+    Example:
+        >>> import torch
+        >>> from mplicits.neural_fields import ShrinkingSphere, track
+        >>> tracks = track(ShrinkingSphere(radius=0.8, alpha=0.12), torch.tensor([[0.8, 0.0, 0.0]]), [0.0, 0.5, 1.0])
+        >>> [round(float(x), 4) for x in tracks.points[:, 0, 0]]
+        [0.8, 0.6325, 0.4]
+    """
+    _check_points(points)
+    moments = _moments(times, points)
+    velocity = _NormalVelocity(field, level, least_slope)
+    path = [points]
+    for start, end in itertools.pairwise(moments):
+        moved = integrate_rows(velocity, path[-1], start, end, solver or Solver())
+        path.append(project_to_surface(TimeSlice(field, end), moved, level=level)[0] if project else moved)
+    walked = torch.stack(path)
+    value, gradient, _ = field.jet(at_time(walked, moments[:, None]), level=level)
+    return Tracks(walked, value.abs() / gradient[..., :3].norm(dim=-1).clamp(min=least_slope))
+
+
+class _NormalVelocity(nn.Module):
+    """−∂f/∂t ∇f / |∇f|²; a module, so that the adjoint finds the parameters of the field."""
+
+    def __init__(self, field: Field, level: int, least_slope: float) -> None:
+        super().__init__()
+        self.field, self.level, self.least_slope = field, level, least_slope
+
+    def forward(self, x: Tensor, t: Tensor) -> Tensor:
+        gradient = self.field.jet(at_time(x, t), level=self.level).gradient
+        space, rate = gradient[..., :3], gradient[..., 3:]
+        return -rate * space / space.square().sum(dim=-1, keepdim=True).clamp(min=self.least_slope**2)
+
+
+class _GaveUpError(Exception):
+    """Out of steps, or out of numbers; becomes an `IntegrationError` with what was reached."""
+
+
+class _Progress(nn.Module):
+    """dx/ds = (t₁ − t₀) V(x, t₀ + s (t₁ − t₀)) for s in [0, 1], which lets every point have its own times.
+
+    It also remembers where the last step began, for the report of a failure.
+    """
+
+    def __init__(self, velocity: VectorField, start: Tensor, end: Tensor, points: Tensor, max_steps: int) -> None:
+        super().__init__()
+        self.velocity, self.start, self.span = velocity, start, end - start
+        self.reached, self.points, self.finite = torch.zeros(()), points.detach(), True
+        self.steps, self.max_steps = 0, max_steps
+
+    def forward(self, s: Tensor, x: Tensor) -> Tensor:
+        time = self.start + s * self.span
+        velocity = self.span.expand(len(x))[:, None] * self.velocity(x, time.expand(len(x)))
+        self.finite = self.finite and bool(torch.isfinite(velocity).all())
+        return velocity
+
+    def callback_step(self, s: Tensor, x: Tensor, ds: Tensor) -> None:
+        """Called by torchdiffeq before each step."""
+        if not bool(torch.isfinite(x).all()):
+            raise _GaveUpError("the velocity is not finite")
+        self.reached, self.points, self.steps = s.detach(), x.detach(), self.steps + 1
+        if self.steps > self.max_steps:
+            raise _GaveUpError(f"more than {self.max_steps} steps")
+
+    def reached_time(self) -> Tensor:
+        """When the last step began, for all points or for each."""
+        return (self.start + self.reached.to(self.start) * self.span).detach()
+
+
+def integrate_rows(velocity: VectorField, points: Tensor, start: Tensor, end: Tensor, solver: Solver) -> Tensor:
+    """`flow` of rows ``(N, n)`` that hold anything that follows an equation of its own; unchecked."""
+    import torchdiffeq  # here, so that the package can be imported without it
+
+    longest = float((end - start).detach().abs().max()) if len(points) else 0.0
+    if longest == 0:
+        return points.clone()
+    progress = _Progress(velocity, start, end, points, solver.max_steps)
+    interval = torch.tensor([0.0, 1.0], dtype=points.dtype, device=points.device)
+    options: dict[str, object]
+    if solver.method in ADAPTIVE:
+        options = {
+            "min_step": solver.min_step / longest,
+            # The largest error of all, not their root mean square: one point in trouble is not outvoted by the others.
+            "norm": lambda error: error.abs().max(),
+            # Land on both ends (the adjoint comes back): stepping over them would interpolate, to a lower order.
+            "step_t": interval,
+        }
+    else:
+        # The longest way is divided evenly, into steps of at most the given size (but for rounding).
+        count = max(1, math.ceil(longest / solver.step - 1e-6))
+        options = {"grid_constructor": lambda _function, _points, s: torch.linspace(s[0], s[-1], count + 1).to(s)}
+    integrate = torchdiffeq.odeint_adjoint if solver.adjoint else torchdiffeq.odeint
+    try:
+        path: Any = integrate(
+            progress, points, interval, rtol=solver.rtol, atol=solver.atol, method=solver.method, options=options
+        )
+        moved: Tensor = path[-1]
+        if not bool(torch.isfinite(moved).all()):
+            raise _GaveUpError("the velocity is not finite")
+    except _GaveUpError as error:
+        raise IntegrationError(str(error), progress.reached_time(), progress.points) from None
+    except AssertionError as error:
+        reason = "steps became too small (see min_step)" if progress.finite else "the velocity is not finite"
+        raise IntegrationError(reason, progress.reached_time(), progress.points) from error
+    return moved
+
+
+def _check_points(points: Tensor) -> None:
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise ValueError(f"points has shape {tuple(points.shape)}; expected (N, 3)")
+
+
+def _ends(points: Tensor, start: Tensor | float, end: Tensor | float) -> tuple[Tensor, Tensor]:
+    """Both as tensors, each of one number or of one for each point."""
+    times = tuple(torch.as_tensor(t, dtype=points.dtype, device=points.device) for t in (start, end))
+    for name, time in zip(("start", "end"), times, strict=True):
+        if time.shape not in ((), points.shape[:1]):
+            raise ValueError(f"{name} has shape {tuple(time.shape)}; expected one number, or ({len(points)},)")
+    return times[0], times[1]
+
+
+def _moments(times: Sequence[float] | Tensor, points: Tensor) -> Tensor:
+    moments = torch.as_tensor(times, dtype=points.dtype, device=points.device)
+    steps = moments.diff()
+    if moments.ndim != 1 or not len(moments) or not (bool((steps > 0).all()) or bool((steps < 0).all())):
+        raise ValueError(f"times={moments.tolist()}: expected at least one number, all increasing or all decreasing")
+    return moments

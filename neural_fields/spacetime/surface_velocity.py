@@ -1,0 +1,95 @@
+"""A velocity for the points of a moving surface: along with the shape as a whole, and along the normal for the rest.
+
+A level set defines only the normal speed v_n = −∂f/∂t / |∇f| of its points. Going by that alone (see `track`), the
+points of a ball that travels slide to its rear. Any velocity along the surface may be added, and the natural one is
+that of the motion u(x) = a + b × x + c x (travel, turn and growth) that explains the normal speeds best,
+
+    min over a, b, c of Σ (⟨n, u(x)⟩ − v_n(x))²  over points of the surface,   V = u + (v_n − ⟨n, u⟩) n.
+
+Rigid motions are carried exactly, as far as a surface shows them: a sphere that turns looks at rest.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ..backend._checks import at_least
+from ..fields.field import Field
+from ..tracing.projection import project_to_surface
+from ..tracing.sphere import BOUNDING_RADIUS, ball_points
+from .dynamic_tracing import moment
+from .field import at_time
+
+__all__ = ["CarriedVelocity"]
+
+# Motions that normals hardly show, as turns of a sphere, are left out: singular values below this share of the largest.
+LEAST_SHOWN = 3e-2
+
+
+class CarriedVelocity:
+    """V(x, t) on a moving surface, for `flow`: the best motion as a whole, and the normal speed that it leaves.
+
+    Args:
+        field: four-dimensional.
+        level: whose surface.
+        nodes: times at which the motion as a whole is found; in between it is interpolated.
+        samples: points of the surface for that, drawn near it at random.
+        least_slope: |∇f| is taken for at least this much, which bounds the velocity where a surface is torn.
+        seed: of the points.
+
+    Raises:
+        ValueError: the field is not four-dimensional, has no such level, or there are fewer than 2 nodes.
+
+    Example:
+        >>> import torch
+        >>> from mplicits.neural_fields import Moving, RigidMotion, Sphere, flow
+        >>> from mplicits.neural_fields.spacetime.surface_velocity import CarriedVelocity
+        >>> ball = Moving(Sphere(radius=0.3), RigidMotion(velocity=(0.5, 0.0, 0.0)))
+        >>> there = flow(CarriedVelocity(ball), torch.tensor([[0.0, 0.3, 0.0]]), 0.0, 1.0)
+        >>> bool((there - torch.tensor([[0.5, 0.3, 0.0]])).abs().max() < 1e-3)
+        True
+    """
+
+    def __init__(
+        self,
+        field: Field,
+        *,
+        level: int = -1,
+        nodes: int = 17,
+        samples: int = 2048,
+        least_slope: float = 0.1,
+        seed: int = 0,
+    ) -> None:
+        at_least(2, nodes=nodes)
+        self.field, self.level, self.least_slope = field, field.resolve_level(level), least_slope
+        generator = torch.Generator().manual_seed(seed)
+        points = ball_points(samples, radius=1.0, generator=generator)
+        parts = [self._whole(points.to(field.like), t) for t in torch.linspace(0, 1, nodes).tolist()]
+        self.parts = torch.stack(parts)  # (nodes, 7)
+
+    def __call__(self, x: Tensor, t: Tensor) -> Tensor:
+        """Velocities ``(N, 3)`` of points ``(N, 3)`` at times ``(N,)``."""
+        normal, speed = self._normal_speed(x, t)
+        place = t.clamp(0, 1) * (len(self.parts) - 1)
+        before = place.floor().long().clamp(max=len(self.parts) - 2)
+        part = torch.lerp(self.parts[before].to(x), self.parts[before + 1].to(x), (place - before)[:, None])
+        whole = part[:, :3] + torch.linalg.cross(part[:, 3:6], x) + part[:, 6:] * x
+        return whole + (speed - (normal * whole).sum(dim=-1))[:, None] * normal
+
+    def _normal_speed(self, x: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
+        gradient = self.field.jet(at_time(x, t), level=self.level).gradient
+        slope = gradient[..., :3].norm(dim=-1).clamp(min=self.least_slope)
+        return gradient[..., :3] / slope[:, None], -gradient[..., 3] / slope
+
+    @torch.no_grad()
+    def _whole(self, points: Tensor, t: float) -> Tensor:
+        """(a, b, c) ``(7,)`` at a time; zero without a surface."""
+        still = moment(self.field, t)
+        moved, arrived = project_to_surface(still, points, level=self.level)
+        moved = moved[arrived & (moved.norm(dim=-1) <= BOUNDING_RADIUS)]
+        normal, speed = self._normal_speed(moved, moved.new_full((len(moved),), t))
+        growth = (normal * moved).sum(dim=-1, keepdim=True)
+        system = torch.cat((normal, torch.linalg.cross(moved, normal), growth), dim=-1).double()
+        least = torch.linalg.pinv(system.T @ system, rtol=LEAST_SHOWN**2, hermitian=True)
+        return (least @ (system.T @ speed.double())).to(points)

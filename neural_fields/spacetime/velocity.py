@@ -1,0 +1,179 @@
+"""A velocity field that is learnt, and shapes that it carries: motion with correspondences.
+
+A surface that is carried by v(x, t) is f(x, t) = f_k(φ_{t→t_k}(x)): φ follows the characteristic dx/dt = v from time
+t to the time of a shape that is known. `CarriedKeyframes` blends what the shape before and the shape after say. Where
+v carries the first onto the second both say the same, and the surface is moved and nothing else: no part can come off,
+since φ is a diffeomorphism. Only where they differ, as at a change of topology, is there a blend.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Protocol
+
+import torch
+from torch import Tensor, nn
+
+from ..fields.field import Jet, OneLevelField
+from ..networks.siren import Siren, plain_jet
+from .field import at_time
+from .flow import Solver, integrate_rows
+from .moving import Keyframes
+
+__all__ = ["CarriedKeyframes", "Velocity", "VelocityJet", "VelocitySiren"]
+
+
+class VelocityJet(NamedTuple):
+    """A velocity and its first derivatives.
+
+    Attributes:
+        value: v, ``(..., 3)``.
+        jacobian: ∂v_i/∂x_j, ``(..., 3, 3)``.
+        rate: ∂v/∂t, ``(..., 3)``.
+    """
+
+    value: Tensor
+    jacobian: Tensor
+    rate: Tensor
+
+    @property
+    def divergence(self) -> Tensor:
+        """``tr ∂v/∂x``, ``(...,)``: how fast a small volume grows."""
+        return self.jacobian.diagonal(dim1=-2, dim2=-1).sum(dim=-1)
+
+    @property
+    def killing(self) -> Tensor:
+        """``‖J + Jᵀ‖²``, ``(...,)``: 0 for rigid motions, and for no others (Killing's equation)."""
+        return (self.jacobian + self.jacobian.transpose(-1, -2)).square().sum(dim=(-2, -1))
+
+
+class Velocity(Protocol):
+    """A velocity that knows its derivatives."""
+
+    def __call__(self, x: Tensor, t: Tensor) -> Tensor:
+        """Velocities ``(..., 3)`` at positions ``(..., 3)`` and times ``(...,)``."""
+        ...
+
+    def jet(self, x: Tensor, t: Tensor) -> VelocityJet:
+        """The same with the derivatives."""
+        ...
+
+
+class VelocitySiren(nn.Module):
+    """v(x, t) as one SIREN with three outputs, whose Jacobian comes from three sweeps back in one matrix.
+
+    Args:
+        width: neurons in each sine layer.
+        depth: number of sine layers.
+        omega: the frequency ω₀. Low ones are the prior that neighbours move alike.
+        gain: factor on the initial outputs; training starts from almost standing still.
+
+    Example:
+        >>> import torch
+        >>> jet = VelocitySiren(16, 2).jet(torch.zeros(5, 3), torch.zeros(5))
+        >>> jet.value.shape, jet.jacobian.shape, jet.killing.shape
+        (torch.Size([5, 3]), torch.Size([5, 3, 3]), torch.Size([5]))
+    """
+
+    def __init__(self, width: int = 64, depth: int = 2, *, omega: float = 3.0, gain: float = 0.01) -> None:
+        super().__init__()
+        self.siren = Siren(width, depth, omega=omega, in_dim=4, num_features=2, output_gain=gain, feature_gain=gain)
+
+    def forward(self, x: Tensor, t: Tensor) -> Tensor:
+        """Velocities ``(..., 3)`` at positions ``(..., 3)`` and times ``(...,)``."""
+        first, others = self.siren.value_features(at_time(x, t))
+        return torch.cat((first[..., None], others), dim=-1)
+
+    def jet(self, x: Tensor, t: Tensor) -> VelocityJet:
+        """Velocities with all first derivatives; differentiable any number of times."""
+        points = self.siren.check_points(at_time(x, t))
+        value, jacobian = plain_jet(points.reshape(-1, 4), self.siren.folded(), 3)
+        jacobian = jacobian.reshape(*points.shape[:-1], 3, 4)
+        return VelocityJet(value.reshape(*points.shape[:-1], 3), jacobian[..., :3], jacobian[..., 3])
+
+
+class CarriedKeyframes(OneLevelField):
+    """Shapes at given times, carried by a velocity: f(x, t) = Σ_k w_k(t) f_k(φ_{t→t_k}(x)), w_k hat functions.
+
+    With v = 0 it is `Keyframes`. At the key times it is the shapes themselves, whatever v. In between values are no
+    distances where v strains; sign and zero set are what counts.
+
+    Args:
+        keys: the shapes and their times; shared, not copied.
+        velocity: v, as `VelocitySiren` or anything with ``jet``; registered if it is a module.
+        steps: of Runge-Kutta 4 from each moment to each of its two keys. All points take as many, so that what is
+            found at a point does not depend on the others.
+
+    Raises:
+        ValueError: ``steps`` is not positive.
+    """
+
+    defined_by = ("steps",)
+
+    def __init__(self, keys: Keyframes, velocity: Velocity, *, steps: int = 8) -> None:
+        super().__init__(in_dim=4)
+        if steps < 1:
+            raise ValueError(f"steps={steps}: expected at least 1")
+        self.keys, self.velocity, self.steps = keys, velocity, steps
+
+    def home(self, x: Tensor, t: Tensor, index: int) -> Tensor:
+        """φ_{t→t_k}: where points ``(N, 3)`` of times ``(N,)`` are at the time of key ``index``."""
+        span = _Span(self.velocity, t, self.keys.times[index])
+        return integrate_rows(span, x, x.new_zeros(()), x.new_ones(()), self._solver)
+
+    def value(self, x: Tensor, *, level: int = -1) -> Tensor:
+        """See `Field.value`; points are followed only to keys that have a weight."""
+        self.resolve_level(level)
+        rows = self.check_points(x).reshape(-1, 4)
+        value = rows.new_zeros(len(rows))
+        for index in range(len(self.keys.times)):
+            weight, _ = self.keys.weight(index, rows[:, 3])
+            heard = weight.nonzero()[:, 0]
+            home = self.home(rows[heard, :3], rows[heard, 3], index)
+            value = value.index_add(0, heard, weight[heard] * self.keys.key(index).value(home))
+        return value.reshape(x.shape[:-1])
+
+    def jet(self, x: Tensor, *, level: int = -1) -> Jet:
+        """See `Field.jet`; the derivatives of f_k∘φ are ∇f_k times those of φ, which are integrated with it."""
+        self.resolve_level(level)
+        rows = self.check_points(x).reshape(-1, 4)
+        value, gradient = rows.new_zeros(len(rows)), torch.zeros_like(rows)
+        for index in range(len(self.keys.times)):
+            weight, slope = self.keys.weight(index, rows[:, 3])
+            heard = ((weight != 0) | (slope != 0)).nonzero()[:, 0]
+            position, time = rows[heard, :3], rows[heard, 3]
+            span = _Span(self.velocity, time, self.keys.times[index])
+            still = torch.eye(3, 4, dtype=x.dtype, device=x.device).reshape(1, 12).expand(len(heard), -1)
+            begin = torch.cat((position, still), dim=1)
+            state = integrate_rows(span.with_derivatives, begin, x.new_zeros(()), x.new_ones(()), self._solver)
+            jet = self.keys.key(index).jet(state[:, :3])
+            carried = (state[:, 3:].reshape(-1, 3, 4) * jet.gradient[:, :, None]).sum(dim=1)
+            blend = torch.nn.functional.pad((slope[heard] * jet.value)[:, None], (3, 0))
+            value = value.index_add(0, heard, weight[heard] * jet.value)
+            gradient = gradient.index_add(0, heard, weight[heard, None] * carried + blend)
+        return Jet(value.reshape(x.shape[:-1]), gradient.reshape(x.shape), x.new_empty((*x.shape[:-1], 0)))
+
+    @property
+    def _solver(self) -> Solver:
+        return Solver(method="rk4", step=1 / self.steps)
+
+
+class _Span:
+    """v in a time s of each point's own, which runs from 0 to 1 while t runs from ``start`` to ``end``."""
+
+    def __init__(self, velocity: Velocity, start: Tensor, end: float) -> None:
+        self.velocity, self.start, self.span = velocity, start, end - start
+
+    def __call__(self, x: Tensor, s: Tensor) -> Tensor:
+        return self.span[:, None] * self.velocity(x, self.start + s * self.span)
+
+    def with_derivatives(self, state: Tensor, s: Tensor) -> Tensor:
+        """The rate of rows ``(N, 15)``: a point, and its derivatives ``(3, 4)`` by where and when it started.
+
+        The exact flow has ∂φ/∂t = −M v(x, t) with M = ∂φ/∂x. Integrated it is the derivative of what is computed, not
+        only up to the error of the steps.
+        """
+        value, jacobian, rate = self.velocity.jet(state[:, :3], self.start + s * self.span)
+        change = self.span[:, None, None] * (jacobian @ state[:, 3:].reshape(-1, 3, 4))
+        late = (self.span * (1 - s))[:, None] * rate - value
+        change = change + torch.nn.functional.pad(late[:, :, None], (3, 0))
+        return torch.cat((self.span[:, None] * value, change.flatten(1)), dim=1)

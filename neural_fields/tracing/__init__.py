@@ -1,0 +1,1 @@
+"""Sphere tracing of fields, on the host and on accelerators."""

@@ -1,0 +1,365 @@
+"""The loops behind `sphere_trace`: rays that march together, and are dropped one by one as they end.
+
+Every pass evaluates the field once for each ray still under way, whether it is striding out, stepping back or closing
+in on a change of sign, so that passes are few and batches large.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..fields.field import Field
+
+__all__ = ["PATIENCE", "Expected", "Found", "Near", "Rays", "Rule", "Stand", "look", "march", "march_budget"]
+
+# Steps at a gap of one `resolution`, before it doubles: few rays need as many, and none may need thousands.
+PATIENCE = 16
+# How far a step may reach into a band unseen, in δ: stepping to its edge and no further would never arrive.
+BAND_ENTRY = 0.5
+# Share of the widest step that two tangent balls on a plane allow; less than 1 lets surfaces bend towards the ray.
+BOLDNESS = 0.9
+# A ray that leaves the surface faster than this may not stride out any further for it.
+STEEPEST_RISE = 0.6
+# A fall slower than this is not reckoned with: such a ray grazes the surface.
+LEAST_FALL = 0.1
+# A ray that expects a hit looks first a little nearer to its start than it would have to.
+FORESIGHT = 1.2
+# Values this many rounding errors from zero are zero: no step would bring them nearer.
+FLOOR = 8
+# The field falls steadily to a hit if the way there is at most this many times as long as its fall on it tells.
+STEADY = 1.5
+
+
+class Expected(NamedTuple):
+    """What is expected of rays; it says where to look first, and nothing about what is there.
+
+    Attributes:
+        depth: ``(...,)`` of their hits, infinite for no idea.
+        slope: ``(...,)`` how fast the field falls along the ray there, positive.
+        value: ``(...,)`` of the field where the ray begins, if that is known; infinite elsewhere. Where it is the fall
+            of an even slope, the ray looks at its hit at once.
+    """
+
+    depth: Tensor
+    slope: Tensor
+    value: Tensor
+
+
+class Near(NamedTuple):
+    """Which part of each ray comes near the surface, ``(...,)`` each.
+
+    Attributes:
+        clear: the last depth that was looked at before it; infinite for rays that never come near.
+        value: there, infinite where the ray begins near the surface.
+        leave: the first depth that was looked at behind it, infinite if there is none.
+    """
+
+    clear: Tensor
+    value: Tensor
+    leave: Tensor
+
+
+class Found:
+    """Results for every ray of a call, filled in as rays end."""
+
+    def __init__(self, depth: Tensor) -> None:
+        self.depth = depth.clone()
+        self.mask = torch.zeros_like(depth, dtype=torch.bool)
+        self.level = torch.zeros_like(depth, dtype=torch.int64)
+        self.steps = torch.zeros_like(self.level)
+        self.slope = torch.ones_like(self.depth)
+        unknown = torch.full_like(depth, torch.inf)
+        self.near = Near(unknown, unknown.clone(), unknown.clone())
+
+    def record(self, index: Tensor, *, mask: Tensor, depth: Tensor, level: Tensor | int, steps: Tensor | int) -> None:
+        self.mask[index], self.depth[index], self.level[index], self.steps[index] = mask, depth, level, steps
+
+    def record_slope(self, index: Tensor, slope: Tensor) -> None:
+        """How fast the field fell along the rays at their last step."""
+        self.slope[index] = slope
+
+    def record_near(self, rays: Rays, close: Tensor, there: Tensor | None = None) -> None:
+        """Note where rays come near the surface and leave it again, before they take in what they see.
+
+        Of those that are not ``there``, ``(K,)`` bool, nothing is noted.
+        """
+        clear, value, leave = (column[rays.ray] for column in self.near)
+        first = close & clear.isinf()
+        left = torch.where(clear.isfinite(), torch.minimum(leave, rays.depth), torch.inf)
+        noted = (
+            torch.where(first, rays.low, clear),
+            torch.where(first, rays.low_value, value),
+            torch.where(close, torch.inf, left),
+        )
+        for column, new, old in zip(self.near, noted, (clear, value, leave), strict=True):
+            column[rays.ray] = new if there is None else torch.where(there, new, old)
+
+
+class Rays(NamedTuple):
+    """The rays still under way, one row each.
+
+    Attributes:
+        ray: ``(K,)`` which ray of the call it is.
+        origin: ``(K, 3)``.
+        direction: ``(K, 3)``.
+        depth: ``(K,)`` where to look next.
+        entry: ``(K,)`` where the search may begin, at most ``depth``.
+        far: ``(K,)`` where to give up.
+        sign: ``(K,)`` −1 for a ray that began inside, else 1; values are multiplied by it.
+        low: ``(K,)`` the last depth known to be in front of the surface.
+        low_value: ``(K,)`` the value there, infinite before the first.
+        free: ``(K,)`` radius of the empty ball there.
+        gap: ``(K,)`` how much of the step from there may lie outside both its balls.
+        high: ``(K,)`` a depth known to be behind the surface, infinite if there is none yet.
+        high_value: ``(K,)`` the value there, negative.
+        boldness: ``(K,)`` share of the widest step that is taken.
+        expected: ``(K,)`` depth of the hit that is expected, infinite for no idea.
+        fall: ``(K,)`` how fast the field is expected to fall there.
+    """
+
+    ray: Tensor
+    origin: Tensor
+    direction: Tensor
+    depth: Tensor
+    entry: Tensor
+    far: Tensor
+    sign: Tensor
+    low: Tensor
+    low_value: Tensor
+    free: Tensor
+    gap: Tensor
+    high: Tensor
+    high_value: Tensor
+    boldness: Tensor
+    expected: Tensor
+    fall: Tensor
+
+    @classmethod
+    def begin(cls, origins: Tensor, directions: Tensor, entries: Tensor, starts: Tensor, ends: Tensor) -> Rays:
+        index = (starts < ends).nonzero()[:, 0]
+        depth, far = starts[index], ends[index]
+        zero, infinite = torch.zeros_like(depth), torch.full_like(depth, torch.inf)
+        return cls(
+            ray=index,
+            origin=origins[index],
+            direction=directions[index],
+            depth=depth,
+            entry=entries[index],
+            far=far,
+            sign=zero + 1,
+            low=depth,
+            low_value=infinite,
+            free=zero,
+            gap=infinite,
+            high=infinite,
+            high_value=zero,
+            boldness=zero + BOLDNESS,
+            expected=infinite,
+            fall=zero + 1,
+        )
+
+    def expecting(self, expected: Expected, rule: Rule) -> Rays:
+        """The same rays, each looking first where its ball is to reach back to the start if all is as expected."""
+        depth, fall, value = (column[self.ray] for column in expected)
+        known = depth.isfinite() & (depth > self.depth) & (depth < self.far)
+        steady = known & value.isfinite() & (fall * (depth - self.depth) <= STEADY * value)
+        fall = fall.clamp(LEAST_FALL, 1)
+        way = torch.where(known, depth - self.depth, 0)
+        ahead = torch.zeros_like(way)
+        for _ in range(len(rule.deltas) + 1):  # a ball outside a band is smaller by its δ, so its middle is further off
+            delta = rule.band(fall * ahead)[1]
+            reach = way - rule.resolution + delta / rule.lipschitz
+            ahead = (reach / (1 + fall / rule.lipschitz)).clamp(min=0)
+        ahead = torch.minimum(FORESIGHT * ahead, way)
+        ahead = torch.where(steady, 0, ahead)
+        return self._replace(
+            depth=torch.where(known, depth - ahead, self.depth),
+            low_value=torch.where(steady, value, self.low_value),
+            gap=torch.where(known & (ahead < way) & ~steady, rule.resolution, self.gap),
+            expected=torch.where(known, depth, torch.inf),
+            fall=fall,
+        )
+
+    def is_fresh(self) -> Tensor:
+        """Which rays are at their start, where nothing is known yet."""
+        return self.low_value.isinf() & (self.depth == self.low)
+
+    def looked_too_far(self, value: Tensor, rule: Rule) -> Tensor:
+        """Which rays looked ahead, and are behind the surface there, at their first ``value``."""
+        # Where the hit itself was looked at, half of all that found it are behind it by less than the tolerance.
+        found = (value >= -rule.tolerance * self.fall) & (self.expected - self.depth <= rule.resolution)
+        # A ray that knows the value at its start has the surface between the two.
+        return (self.depth > self.low) & (value < 0) & ~found & self.low_value.isinf()
+
+    def began_behind(self, value: Tensor) -> Tensor:
+        """Which rays are at their start, behind the surface, and may begin earlier."""
+        return (value < 0) & (self.depth > self.entry) & self.is_fresh()
+
+    def only(self, rows: Tensor) -> Rays:
+        return Rays(*(column[rows] for column in self))
+
+    def points(self) -> Tensor:
+        return torch.addcmul(self.origin, self.depth[:, None], self.direction)
+
+
+class Rule(NamedTuple):
+    """The numbers that say what a value allows."""
+
+    deltas: Tensor
+    tolerance: float
+    resolution: float
+    lipschitz: float
+
+    def band(self, size: Tensor) -> tuple[Tensor, Tensor]:
+        """How many bands |f| = ``size`` is inside of, and the δ of the first that it is not, 0 after the last."""
+        if not len(self.deltas):
+            return torch.zeros_like(size, dtype=torch.int64), torch.zeros_like(size)
+        inside = (size[:, None] < self.deltas).cumprod(dim=1).sum(dim=1)
+        return inside, torch.cat((self.deltas, self.deltas.new_zeros(1)))[inside]
+
+
+def march(
+    field: Field, level: int, rays: Rays, found: Found, rule: Rule, max_steps: int, reach: float | None = None
+) -> None:
+    """The adaptive mode: one evaluation of every ray under way, then see where each one stands.
+
+    With a ``reach`` it is noted where each ray comes so near to the surface, and where it leaves it.
+    """
+    for count in range(1, max_steps + 1):
+        if not len(rays.ray):
+            return
+        value = field.value(rays.points(), level=level)
+        if count == 1:
+            rays, value = _from_the_start(field, level, rays, value, rule)
+        if count <= 2:  # a ray that looked ahead in vain is at its start now
+            rays, value = _from_the_front(field, level, rays, value)
+            rays = rays._replace(sign=torch.where(rays.is_fresh() & (value < 0), -1.0, rays.sign))
+        if reach is not None:
+            found.record_near(rays, (value * rays.sign < reach) | (rays.sign < 0))
+        gap = rule.resolution * 2.0 ** ((count - 1) // PATIENCE)
+        rays, stand = look(rays, value * rays.sign, rule, gap)
+        ended = stand.hit | stand.passed if count < max_steps else torch.ones_like(stand.hit)
+        rows = ended.nonzero()[:, 0]
+        found.record(
+            rays.ray[rows], mask=stand.hit[rows], depth=stand.depth[rows], level=stand.level[rows], steps=count
+        )
+        found.record_slope(rays.ray[rows], stand.slope[rows])
+        rays = rays.only((~ended).nonzero()[:, 0])
+
+
+def _from_the_start(field: Field, level: int, rays: Rays, value: Tensor, rule: Rule) -> tuple[Rays, Tensor]:
+    """Send rays that looked ahead, and are behind the surface there, back to their start; with the values there."""
+    behind = rays.looked_too_far(value, rule).nonzero()[:, 0]
+    if not len(behind):
+        return rays, value
+    rays = rays._replace(depth=rays.depth.index_copy(0, behind, rays.low[behind]))
+    return rays, value.index_copy(0, behind, field.value(rays.only(behind).points(), level=level))
+
+
+def _from_the_front(field: Field, level: int, rays: Rays, value: Tensor) -> tuple[Rays, Tensor]:
+    """Send rays whose start is behind the surface back to where they may begin; with the values there."""
+    behind = rays.began_behind(value).nonzero()[:, 0]
+    if not len(behind):
+        return rays, value
+    depth = rays.depth.index_copy(0, behind, rays.entry[behind])
+    rays = rays._replace(depth=depth, low=depth)
+    return rays, value.index_copy(0, behind, field.value(rays.only(behind).points(), level=level))
+
+
+class Stand(NamedTuple):
+    """Where rays stand after a look at their values, ``(K,)`` each."""
+
+    hit: Tensor
+    passed: Tensor
+    depth: Tensor
+    level: Tensor
+    slope: Tensor
+
+
+def look(rays: Rays, value: Tensor, rule: Rule, resolution: Tensor | float) -> tuple[Rays, Stand]:
+    """Take in the ``value`` at ``rays.depth``, and say where to look next."""
+    level, delta = rule.band(value.abs())
+    free = ((value.abs() - delta) / rule.lipschitz).clamp(min=0)
+    # Before there are two values: a hit that is expected ahead says how steep the way there is, or else it is head-on.
+    way = rays.expected - rays.depth
+    foretold = torch.where(way > resolution, -value / way, -rays.fall)
+    foretold = torch.where(rays.expected.isfinite(), foretold, -1.0)
+    slope = torch.where(rays.low_value.isfinite(), (value - rays.low_value) / (rays.depth - rays.low), foretold)
+    enclosed = rays.high.isfinite()
+    sound = enclosed | (rays.depth - rays.low - rays.free - free <= rays.gap)
+    before, behind = sound & (value > 0), sound & (value <= 0)
+    low, high = torch.where(before, rays.depth, rays.low), torch.where(behind, rays.depth, rays.high)
+    low_value, high_value = torch.where(before, value, rays.low_value), torch.where(behind, value, rays.high_value)
+
+    # Before a change of sign: as far as two tangent balls on a plane reach, or over a gap that may be left.
+    gap = torch.maximum(BAND_ENTRY * delta, torch.as_tensor(resolution, dtype=delta.dtype))
+    s = slope.clamp(-1, STEEPEST_RISE)
+    widest = rays.boldness * free * (1 + s) / (1 - s)
+    zero = torch.where(s < 0, value / -s, torch.inf)
+    ahead = rays.depth + free + torch.maximum(widest, torch.minimum(gap, zero - free))
+    # A step that left too wide a gap is taken back, and the next ones are less bold.
+    ahead = torch.where(before, ahead, rays.low + rays.free)
+    # After it: the secant, or the middle where the secant did not halve the interval.
+    width = high - low
+    chord = low + width * low_value / (low_value - high_value)
+    halved = ~enclosed | (2 * width <= rays.high - rays.low)
+    closing = torch.where(halved, chord, low + width / 2)
+
+    closed = high.isfinite()
+    steep = slope.abs().clamp(max=1)
+    floor = FLOOR * torch.finfo(value.dtype).eps
+    near = sound & (delta == 0) & (value.abs() <= (rule.tolerance * steep).clamp(min=floor))
+    pinned = closed & (width <= rule.tolerance)
+    landing = rays.depth + (value / steep).clamp(-rule.tolerance, rule.tolerance)
+    passed = before & ~closed & (rays.depth + free + gap >= rays.far)
+    stand = Stand(
+        hit=near | pinned,
+        passed=passed & ~near,
+        depth=torch.where(near, landing, torch.where(pinned, chord, rays.depth)),
+        level=level,
+        slope=steep,
+    )
+    rays = rays._replace(
+        depth=torch.minimum(torch.where(closed, closing, ahead), rays.far),
+        low=low,
+        low_value=low_value,
+        free=torch.where(before, free, rays.free),
+        gap=gap,
+        high=high,
+        high_value=high_value,
+        boldness=torch.where(sound | rays.low_value.isinf(), rays.boldness, rays.boldness / 2),
+    )
+    return rays, stand
+
+
+def march_budget(
+    field: Field, rays: Rays, found: Found, budget: Sequence[int], tolerance: float, capture: float
+) -> None:
+    """The paper's mode: a number of steps towards the edge of each band, then towards the surface."""
+    level = len(budget) - 1
+    edges = [*field.deltas[:level].tolist(), 0.0]
+    value, steps = torch.full_like(rays.depth, torch.inf), torch.zeros_like(rays.ray)
+    for current, (count, edge) in enumerate(zip(budget, edges, strict=True)):
+        moving = torch.arange(len(rays.ray), device=rays.ray.device)
+        for _ in range(count):
+            here = rays.only(moving)
+            value[moving] = field.value(here.points(), level=current)
+            step = value[moving] - edge
+            rays.depth[moving] += step
+            steps[moving] += 1
+            moving = moving[(step.abs() > tolerance) & (rays.depth[moving] < rays.far[moving])]
+        inside = (rays.depth < rays.far).nonzero()[:, 0]
+        gone = (rays.depth >= rays.far).nonzero()[:, 0]
+        found.record(
+            rays.ray[gone],
+            mask=torch.zeros_like(gone, dtype=torch.bool),
+            depth=rays.depth[gone],
+            level=current,
+            steps=steps[gone],
+        )
+        rays, value, steps = rays.only(inside), value[inside], steps[inside]
+    found.record(rays.ray, mask=value.abs() < capture, depth=rays.depth, level=level, steps=steps)

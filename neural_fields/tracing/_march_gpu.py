@@ -1,0 +1,126 @@
+"""The loop behind `sphere_trace` for devices that work behind the host's back: it looks at them once in many passes.
+
+`march` drops rays as they end, and so has to know after each pass which did. Here rays stay for a while after they have
+ended: `PASSES` passes are asked for at once, and only then the host reads how many rays are left. Bands have room for a
+number of rays that the passes before suggest (`fixed_shapes`). A ray that finds no room stands still for a
+pass, which changes nothing about its way: every ray sees the values that it would see in `march`, and ends where it
+would end there, but for what rounding does to a product of matrices when it has other rows beside it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from ..backend.fixed_shapes import first_rows, fixed_shapes
+from ..fields.csg import Combined
+from ..fields.field import Field
+from ..fields.primitives import ClosedForm
+from ..networks.multiscale import MultiscaleSDF
+from ..networks.siren import Siren
+from ..spacetime.field import SpaceTimeSDF, TimeSlice
+from ._march import PATIENCE, Found, Rays, Rule, Stand, look
+
+__all__ = ["march_ahead"]
+
+# Passes before the first look, when many rays are about to leave, and between later ones.
+FIRST_PASSES, PASSES = 8, 16
+# Room in a band while nobody knows better: for all of a few rays, for a share of many.
+FEW, SHARE = 4096, 0.25
+# Room beyond what the passes before have asked for.
+SPARE, LEAST_ROOM = 1.25, 256
+# More doublings of the resolution than any ray sees; a shift by more would overflow.
+MOST_DOUBLINGS = 60
+
+
+def march_ahead(
+    field: Field, level: int, rays: Rays, found: Found, rule: Rule, max_steps: int, reach: float | None = None
+) -> None:
+    """What `march` does, with one wait after the first `FIRST_PASSES` passes, and then every `PASSES`."""
+    count = torch.zeros_like(rays.ray)
+    capacity = [max(FEW, int(SHARE * len(rays.ray)))] * level
+    passes = FIRST_PASSES
+    while len(rays.ray) and max_steps > 0:
+        chunk = _Chunk(field, level, rays, count, rule, max_steps)
+        demand = chunk.run(passes, found, reach, capacity)
+        left, *asked = torch.stack([(~chunk.ended).sum(), *demand]).tolist()  # the host waits here, and nowhere else
+        rows = first_rows(~chunk.ended, left)
+        rays, count = chunk.rays.only(rows), chunk.count[rows]
+        capacity = [max(LEAST_ROOM, int(SPARE * number)) for number in asked]
+        passes = PASSES
+
+
+def _asks_at_all_points(field: Field) -> bool:
+    """Whether every `MultiscaleSDF` inside is asked at the very points that ``field`` is asked at, in their order."""
+    if isinstance(field, Combined):
+        return all(map(_asks_at_all_points, field.fields))
+    if isinstance(field, TimeSlice):
+        return _asks_at_all_points(field.field)
+    return isinstance(field, MultiscaleSDF | SpaceTimeSDF | Siren | ClosedForm)
+
+
+class _Chunk:
+    """Some passes of rays, none of which leaves.
+
+    Attributes:
+        rays: see `Rays`; those that have ended are where they were.
+        count: ``(K,)`` how often each has looked.
+        ended: ``(K,)`` bool.
+        stand: where each stood when it ended.
+    """
+
+    def __init__(self, field: Field, level: int, rays: Rays, count: Tensor, rule: Rule, max_steps: int) -> None:
+        self.field, self.level, self.rule, self.max_steps = field, level, rule, max_steps
+        self.rays, self.count = rays, count
+        self.ended = torch.zeros_like(count, dtype=torch.bool)
+        self.stand = Stand(self.ended, self.ended, rays.depth, count, torch.ones_like(rays.depth))
+
+    def run(self, passes: int, found: Found, reach: float | None, capacity: Sequence[int]) -> list[Tensor]:
+        """So many passes; then what the rays that ended have found is noted → how much room bands were asked for."""
+        demand: list[Tensor] = []
+        if _asks_at_all_points(self.field):
+            with fixed_shapes(capacity) as shapes:
+                for _ in range(passes):
+                    shapes.wanted = ~self.ended
+                    value = self._values()
+                    self._pass(
+                        value, shapes.wanted if shapes.lost is None else shapes.wanted & ~shapes.lost, found, reach
+                    )
+            demand = shapes.demand
+        else:  # who asks another field at fewer points could not say who found no room
+            for _ in range(passes):
+                self._pass(self._values(), ~self.ended, found, reach)
+        ray, stand = self.rays.ray, self.stand
+        found.record(ray, mask=stand.hit, depth=stand.depth, level=stand.level, steps=self.count)
+        found.record_slope(ray, stand.slope)
+        return demand
+
+    def _values(self) -> Tensor:
+        return self.field.value(self.rays.points(), level=self.level)
+
+    def _pass(self, value: Tensor, there: Tensor, found: Found, reach: float | None) -> None:
+        """Let the rays that are ``there`` take in their values."""
+        rays = self.rays
+        # Who is behind the surface where it began goes back, and looks again in the next pass as if for the first time.
+        back = there & (self.count == 0) & rays.looked_too_far(value, self.rule)
+        early = there & (self.count <= 1) & ~back
+        front = early & rays.began_behind(value)
+        low = torch.where(front, rays.entry, rays.low)
+        rays = rays._replace(depth=torch.where(back | front, low, rays.depth), low=low)
+        there = there & ~back & ~front
+        sign = torch.where(early & there & rays.is_fresh() & (value < 0), -1.0, rays.sign)
+        rays = rays._replace(sign=sign)
+        if reach is not None:
+            found.record_near(rays, (value * sign < reach) | (sign < 0), there)
+        doublings = (self.count // PATIENCE).clamp(max=MOST_DOUBLINGS)
+        gap = self.rule.resolution * torch.bitwise_left_shift(torch.ones_like(doublings), doublings).to(value.dtype)
+        moved, stand = look(rays, value * sign, self.rule, gap)
+        self.count = self.count + there
+        ends = there & (stand.hit | stand.passed | (self.count >= self.max_steps))
+        self.stand = Stand(*(torch.where(ends, new, old) for new, old in zip(stand, self.stand, strict=True)))
+        self.ended = self.ended | ends
+        self.rays = Rays(
+            *(old if new is old else torch.where(there, new, old) for new, old in zip(moved, rays, strict=True))
+        )

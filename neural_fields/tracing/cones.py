@@ -1,0 +1,262 @@
+"""Cones for tiles of an image: how far whole tiles see nothing, before any ray is traced."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..backend.devices import makes_wait
+from ..backend.fixed_shapes import first_rows
+from ..fields.field import Field
+from ..fields.function import FieldLike, as_field
+from ..networks.multiscale import choose_levels, levels_of
+from ..networks.siren import Siren
+from ._march_gpu import FIRST_PASSES, PASSES
+from .sphere import BOUNDING_RADIUS, ball_crossing, check_rays, unit_directions
+
+__all__ = ["CONE_LIPSCHITZ", "CONE_STEPS", "TILES", "cone_ends", "cone_starts"]
+
+# Networks are a little steeper than a distance here and there, and a cone that goes too far loses thin parts.
+CONE_LIPSCHITZ = 1.15
+# Sides of the tiles of pixels that get a cone, each a multiple of the next.
+TILES = (16, 4)
+# Of each cone; those that have not stopped by then leave the rest to their rays.
+CONE_STEPS = 64
+
+Columns = tuple[Tensor, ...]
+
+
+@torch.no_grad()
+def cone_starts(
+    field: FieldLike,
+    origin: Tensor,
+    directions: Tensor,
+    *,
+    level: int = -1,
+    tiles: Sequence[int] = TILES,
+    lipschitz: float = 1.0,
+    radius: float = BOUNDING_RADIUS,
+    max_steps: int = CONE_STEPS,
+    clearance: float = 0.0,
+) -> Tensor:
+    """Depths up to which whole tiles of an image see nothing, by marching one cone for each tile on level 0.
+
+    A cone of spread σ (the largest distance between the directions of a tile and its middle one) holds every point of
+    the tile's rays at depth t within tσ of its axis, so with v = |f_0| on the axis the tile is empty up to
+    t + ((v − δ_0)/L − tσ) / (1 + σ). Tiles are marched from large to small, each starting where the larger one ended.
+
+    Args:
+        field: what to trace, three-dimensional; or any function of points.
+        origin: ``(3,)`` the common origin of all rays.
+        directions: ``(H, W, 3)`` of any length but 0.
+        level: the level that will be traced from there.
+        tiles: sides of the tiles in pixels, each a multiple of the next.
+        lipschitz: see `sphere_trace`.
+        radius: see `sphere_trace`.
+        max_steps: of each cone.
+        clearance: the tiles keep this far from the surface.
+
+    Returns:
+        ``(H, W)`` depths for ``near`` of `sphere_trace`; infinite where there is nothing to be seen.
+
+    Raises:
+        ValueError: shapes do not fit, or the field is not three-dimensional.
+    """
+    field = as_field(field)
+    level = field.resolve_level(level)
+    _check_image(field, origin, directions, lipschitz)
+    directions, length = unit_directions(directions)
+    depth = torch.zeros_like(length)
+    for tile in tiles:
+        cones = _Cones.of(directions, tile)
+        starts = depth[::tile, ::tile].reshape(-1)
+        free = _march_cones(field, origin, cones, starts, level, lipschitz, radius, max_steps, clearance)
+        depth = free[cones.of_pixel]
+    return depth / length
+
+
+@torch.no_grad()
+def cone_ends(
+    field: FieldLike,
+    origin: Tensor,
+    directions: Tensor,
+    wanted: Tensor,
+    *,
+    level: int = -1,
+    tiles: Sequence[int] = (32, 8),
+    lipschitz: float = 1.0,
+    radius: float = BOUNDING_RADIUS,
+    max_steps: int = CONE_STEPS,
+    clearance: float = 0.0,
+) -> Tensor:
+    """Depths from which on whole tiles of an image see nothing: `cone_starts` from the other side.
+
+    Rays that pass a shape closely would take many steps to get away from it again. From behind, with v = |f_0| at depth
+    t on the axis, the tile is empty from (t − (v − δ_0)/L) / (1 − σ) on.
+
+    Args:
+        field: see `cone_starts`.
+        origin: see there.
+        directions: see there.
+        wanted: ``(H, W)`` bool; tiles without such a pixel are left out.
+        level: see there.
+        tiles: see there.
+        lipschitz: see there.
+        radius: see there.
+        max_steps: see there.
+        clearance: see there.
+
+    Returns:
+        ``(H, W)`` depths for ``far`` of `sphere_trace`, infinite in tiles that were left out.
+
+    Raises:
+        ValueError: shapes do not fit, or the field is not three-dimensional.
+    """
+    field = as_field(field)
+    level = field.resolve_level(level)
+    _check_image(field, origin, directions, lipschitz)
+    directions, length = unit_directions(directions)
+    reach = origin.norm() + radius
+    depth = torch.full_like(length, torch.inf)
+    delta = _margin(field, level, directions, clearance)
+
+    def advance(fixed: Columns, moving: Columns, on: Tensor) -> tuple[Columns, Tensor]:
+        (axis, sigma, entry), (end,) = fixed, moving
+        t = torch.where(on, end, 0)  # those that are left out may be infinite
+        value = field.value(origin + t[:, None] * axis, level=0)
+        closer = (t - ((value.abs() - delta) / lipschitz).clamp(min=0)) / (1 - sigma)
+        return (torch.minimum(t, closer),), (t - closer > t * sigma) & (closer > entry)
+
+    for tile in tiles:
+        cones = _Cones.of(directions, tile)
+        asked = wanted.new_zeros(len(cones.axis), dtype=torch.uint8)
+        asked = asked.scatter_reduce(0, cones.of_pixel.flatten(), wanted.flatten().to(torch.uint8), "amax").bool()
+        entry, leave = ball_crossing(origin.expand_as(cones.axis), cones.axis, radius + cones.spread * reach)
+        ends = torch.minimum(depth[::tile, ::tile].reshape(-1), leave / (1 - cones.spread))
+        fixed = (cones.axis, cones.spread, entry)
+        (ends,) = _until_all_stop(fixed, (ends,), asked & (ends > entry), advance, max_steps)
+        depth = torch.where(asked, ends, torch.inf)[cones.of_pixel]
+    return depth / length
+
+
+def _march_cones(
+    field: Field,
+    origin: Tensor,
+    cones: _Cones,
+    starts: Tensor,
+    level: int,
+    lipschitz: float,
+    radius: float,
+    max_steps: int,
+    clearance: float,
+) -> Tensor:
+    """How far each cone is empty; infinite where it leaves the ball of ``radius`` untouched."""
+    axis, spread = cones.axis, cones.spread
+    delta = _margin(field, level, axis, clearance)
+    # A ray of the cone may be in the ball where its axis is not; spread · reach is the most that they are apart.
+    reach = origin.norm() + radius
+    entry, leave = ball_crossing(origin.expand_as(axis), axis, radius + spread * reach)
+    depth = torch.maximum(starts, entry).clamp(min=0)
+    depth = torch.where(depth >= leave, torch.inf, depth)
+    network = levels_of(field)[0]
+    if isinstance(network, Siren) and choose_levels((network,), axis, jet=False).fused:
+        from ..backend.kernels.cones import march_cones
+        from ..backend.kernels.packing import packed
+
+        return march_cones(packed(network), (origin, axis, spread, leave, depth), delta, lipschitz, max_steps)
+
+    def advance(fixed: Columns, moving: Columns, on: Tensor) -> tuple[Columns, Tensor]:
+        (axis, sigma, leave), (depth, before, value_before) = fixed, moving
+        t = torch.where(on, depth, 0)  # those that have left are at infinity
+        value = field.value(origin + t[:, None] * axis, level=0)
+        # Behind the surface? Then the field is steeper than it was said to be: back, and leave it to the rays.
+        passed = value * value_before < 0
+        step = ((value.abs() - delta) / lipschitz - t * sigma) / (1 + sigma)
+        ahead = torch.where(passed, before, t + step.clamp(min=0))
+        # Once a step is shorter than the cone is wide, smaller cones get on better.
+        goes_on = (step > t * sigma) & (ahead < leave) & ~passed
+        return (torch.where(ahead >= leave, torch.inf, ahead), t, value), goes_on
+
+    moving = (depth, depth, torch.full_like(depth, torch.nan))
+    return _until_all_stop((axis, spread, leave), moving, depth.isfinite(), advance, max_steps)[0]
+
+
+def _margin(field: Field, level: int, like: Tensor, clearance: float) -> Tensor:
+    """How far cones keep from the surface of level 0, a number on the device of ``like``."""
+    return clearance + (field.deltas[0].to(like) if level else like.new_zeros(()))
+
+
+def _until_all_stop(
+    fixed: Columns,
+    moving: Columns,
+    going: Tensor,
+    advance: Callable[[Columns, Columns, Tensor], tuple[Columns, Tensor]],
+    max_steps: int,
+) -> Columns:
+    """Advance the rows that are ``going`` until none is, or so often.
+
+    A CPU looks after each step, and leaves out who has stopped; what works behind the host's back is looked at as in
+    `_march_gpu`.
+
+    Args:
+        fixed: what is known of each row, ``(K, …)`` each.
+        moving: what changes.
+        going: ``(K,)`` bool.
+        advance: from fixed, moving and going to the next moving, and to who goes on, of those that were going.
+        max_steps: of each row.
+    """
+    looked, steps = not makes_wait(going.device), 0
+    chunk, left = (1, int(going.sum())) if looked else (FIRST_PASSES, len(going))
+    while left and steps < max_steps:
+        rows = going.nonzero()[:, 0] if looked else first_rows(going, left)
+        if left == len(going):
+            rows = torch.arange(left, device=going.device)
+        here, part, on = tuple(column[rows] for column in fixed), tuple(column[rows] for column in moving), going[rows]
+        for _ in range(min(chunk, max_steps - steps)):
+            moved, goes_on = advance(here, part, on)
+            part = tuple(torch.where(on, new, old) for new, old in zip(moved, part, strict=True))
+            on = on & goes_on
+        moving = tuple(column.index_copy(0, rows, new) for column, new in zip(moving, part, strict=True))
+        going = going.index_copy(0, rows, on)
+        steps, left = steps + chunk, int(on.sum())
+        chunk = 1 if looked else PASSES
+    return moving
+
+
+class _Cones(NamedTuple):
+    """The tiles of an image, ``C`` of them.
+
+    Attributes:
+        axis: ``(C, 3)`` the direction of the middle pixel of each.
+        spread: ``(C,)`` the largest distance of the directions of its pixels from that.
+        of_pixel: ``(H, W)`` which tile each pixel is in.
+    """
+
+    axis: Tensor
+    spread: Tensor
+    of_pixel: Tensor
+
+    @classmethod
+    def of(cls, directions: Tensor, tile: int) -> _Cones:
+        height, width = directions.shape[:2]
+        rows, columns = (torch.arange(count, device=directions.device) for count in (height, width))
+        across = -(-width // tile)
+        of_pixel = (rows[:, None] // tile) * across + columns // tile
+        middle_row, middle_column = (
+            (count // tile * tile + tile // 2).clamp(max=len(count) - 1) for count in (rows, columns)
+        )
+        axis = directions[middle_row[::tile]][:, middle_column[::tile]].reshape(-1, 3)
+        away = (directions - directions[middle_row][:, middle_column]).norm(dim=-1)
+        spread = away.new_zeros(len(axis)).scatter_reduce(0, of_pixel.flatten(), away.flatten(), "amax")
+        return cls(axis, spread, of_pixel)
+
+
+def _check_image(field: Field, origin: Tensor, directions: Tensor, lipschitz: float) -> None:
+    if origin.shape != (3,) or directions.ndim != 3:
+        raise ValueError(
+            f"origin {tuple(origin.shape)}, directions {tuple(directions.shape)}: expected (3,), (H, W, 3)"
+        )
+    check_rays(field, origin, directions, lipschitz=lipschitz)

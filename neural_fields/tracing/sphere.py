@@ -1,0 +1,378 @@
+"""Sphere tracing of any field, with coarse levels leading fine ones (paper Sec. 3 and suppl. "Rendering").
+
+Let v = |f(p)| at a point of a ray. The ball around p that holds no zero of f has the radius
+
+    r = (v − δ_j) / L,
+
+with δ_j the half-width of the first band that v is not inside of (0 inside all of them) and L the Lipschitz constant:
+outside band j the value is that of level j, and the surface lies where |f_j| < δ_j. So one rule serves all levels,
+and the field itself sees to it that a residual is evaluated only inside its band.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..backend._checks import positive
+from ..backend.devices import makes_wait
+from ..fields.field import Field
+from ..fields.function import FieldLike, as_field
+from ..networks.multiscale import as_levels, choose_levels, levels_of
+from ..volume.weights import ball_chord
+from ._march import (
+    BAND_ENTRY,
+    BOLDNESS,
+    FLOOR,
+    PATIENCE,
+    STEEPEST_RISE,
+    Expected,
+    Found,
+    Near,
+    Rays,
+    Rule,
+    march,
+    march_budget,
+)
+from ._march_gpu import march_ahead
+
+__all__ = [
+    "BOUNDING_RADIUS",
+    "MAX_STEPS",
+    "Expected",
+    "Hits",
+    "Near",
+    "ball_crossing",
+    "ball_points",
+    "check_rays",
+    "march_constants",
+    "sphere_trace",
+    "trace_expected",
+    "unit_directions",
+]
+
+# Fields live in the unit sphere; their surfaces may pass it by a little.
+BOUNDING_RADIUS = 1.05
+# Evaluations of a ray after which it ends as a miss.
+MAX_STEPS = 512
+
+
+class Hits(NamedTuple):
+    """Where rays meet a surface.
+
+    Attributes:
+        mask: ``(...,)`` bool, whether the ray meets it.
+        depth: ``(...,)`` along the ray, in lengths of its direction (a distance where that is 1): the point is
+            origin + depth · direction. For a ray that misses, where its search ended.
+        position: ``(..., 3)`` the point at that depth.
+        level: ``(...,)`` int64, the finest level that had a say in the last step.
+        steps: ``(...,)`` int64, how often the field was evaluated on the ray.
+    """
+
+    mask: Tensor
+    depth: Tensor
+    position: Tensor
+    level: Tensor
+    steps: Tensor
+
+
+def sphere_trace(
+    field: FieldLike,
+    origins: Tensor,
+    directions: Tensor,
+    *,
+    level: int = -1,
+    near: Tensor | float = 0.0,
+    far: Tensor | float = torch.inf,
+    tolerance: float = 1e-5,
+    resolution: float = 1e-4,
+    lipschitz: float = 1.0,
+    radius: float | None = BOUNDING_RADIUS,
+    max_steps: int = MAX_STEPS,
+    budget: Sequence[int] | None = None,
+    capture: float = 2e-3,
+    differentiable: bool = False,
+) -> Hits:
+    """First intersections of rays with the zero set of a level.
+
+    The default mode runs until the depth of every ray is known to ``tolerance``. Steps are the widest that still
+    leave no gap between the balls around two neighbouring samples if the surface is a plane (Bálint and Valasek
+    2018, from the last two values); where a gap opens after all, the step is taken back. Two crossings closer
+    to each other than ``resolution`` may be overlooked, which is what lets a ray go on along a surface that it
+    nearly touches; rays that need more than 16 steps are given twice the resolution, and again after every 16.
+    A change of sign is closed in on by the secant rule and bisection in turn. Rays are dropped as they end.
+
+    With a ``budget``, the paper's mode: so many steps ``t ← t + f_j − δ_j`` on each level (20, 5, 5 in its Tab. 4),
+    after which |f| < ``capture`` is a hit.
+
+    A ray that starts inside the surface looks for the way out.
+
+    Depth and position have no graph, unless the trace is to be ``differentiable``. Then they carry the derivatives of
+    the implicit function f(o + t d) = 0 with respect to origins, directions and parameters, by one Newton step on the
+    graph whose slope is held fixed,
+
+        t ← t − f(o + t d) / ⟨∇f, d⟩,
+
+    so that dt = −(df + ⟨∇f, do + t dd⟩) / ⟨∇f, d⟩. They grow without bound where rays graze the surface.
+
+    Args:
+        field: what to trace, three-dimensional; or any function of points ``(..., 3)`` → ``(...,)``.
+        origins: ``(..., 3)``.
+        directions: ``(..., 3)`` of any length but 0; broadcast with ``origins``.
+        level: whose surface to find.
+        near: depth at which to start, a number or a tensor that broadcasts to ``(...,)``: up to there nothing is
+            expected (see `cone_starts`). A ray that is behind the surface there starts from the beginning instead.
+        far: depth at which to give up.
+        tolerance: of the depth, in the field's units. The precision of the numbers sets a limit of its own.
+        resolution: two crossings nearer to each other than this may be overlooked.
+        lipschitz: bound L on the slope of the field.
+        radius: the surface lies in the ball of this radius around the origin; None where it may lie anywhere.
+        max_steps: rays that need more end as misses.
+        budget: steps on each level up to ``level``, for the fixed mode.
+        capture: the |f| that the fixed mode takes for a hit.
+        differentiable: whether depth and position of the hits carry gradients.
+
+    Raises:
+        ValueError: shapes do not fit, the field is not three-dimensional, a number is out of range, or a ``budget`` is
+            for a level without a band.
+
+    Example:
+        >>> import torch
+        >>> from mplicits.neural_fields import Sphere, sphere_trace
+        >>> hits = sphere_trace(Sphere(radius=0.5), torch.tensor([0.0, 0.0, -2.0]), torch.tensor([0.0, 0.0, 1.0]))
+        >>> bool(hits.mask), round(float(hits.depth), 4)
+        (True, 1.5)
+    """
+    field = as_field(field)
+    if budget is None:
+        hits, _, _ = trace_expected(
+            field,
+            origins,
+            directions,
+            None,
+            level=level,
+            near=near,
+            far=far,
+            tolerance=tolerance,
+            resolution=resolution,
+            lipschitz=lipschitz,
+            radius=radius,
+            max_steps=max_steps,
+        )
+    else:
+        check_rays(field, origins, directions, tolerance=tolerance, resolution=resolution, lipschitz=lipschitz)
+        hits = _trace_budget(field, origins, directions, budget, level, near, far, tolerance, radius, capture)
+    return _on_graph(field, origins, directions, level, hits) if differentiable else hits
+
+
+def _on_graph(field: Field, origins: Tensor, directions: Tensor, level: int, hits: Hits) -> Hits:
+    """Hits whose depth and position carry the derivatives of the implicit function."""
+    origins, directions = torch.broadcast_tensors(origins, directions)
+    rows = hits.mask.reshape(-1).nonzero()[:, 0]
+    o, d, depth = origins.reshape(-1, 3)[rows], directions.reshape(-1, 3)[rows], hits.depth.reshape(-1)
+    jet = field.jet(o + depth[rows, None] * d, level=level)
+    slope = (jet.gradient * d).sum(dim=-1).detach()
+    slope = torch.where(slope == 0, torch.finfo(slope.dtype).eps, slope)
+    # The value itself is left out: where the trace ended is known better than one step from there.
+    depth = depth.index_add(0, rows, (jet.value.detach() - jet.value) / slope).reshape(hits.depth.shape)
+    return hits._replace(depth=depth, position=origins + depth[..., None] * directions)
+
+
+@torch.no_grad()
+def _trace_budget(
+    field: Field,
+    origins: Tensor,
+    directions: Tensor,
+    budget: Sequence[int],
+    level: int,
+    near: Tensor | float,
+    far: Tensor | float,
+    tolerance: float,
+    radius: float | None,
+    capture: float,
+) -> Hits:
+    """The paper's mode of `sphere_trace`."""
+    level = field.resolve_level(level)
+    if len(budget) != level + 1:
+        raise ValueError(f"budget={list(budget)}: expected {level + 1} number(s) of steps, one for each level")
+    if bool((field.deltas[:level].isinf().cpu() & (torch.tensor(budget[:level]) > 0)).any()):
+        raise ValueError(f"budget={list(budget)}: a level without a band leads to no other; give it 0 steps")
+    directions, length = unit_directions(directions)
+    spans, found = _begin(origins, directions, length, near, far, radius)
+    march_budget(field, Rays.begin(*spans), found, budget, tolerance, capture)
+    return _hits(found, origins, directions, length)
+
+
+@torch.no_grad()
+def trace_expected(
+    field: Field,
+    origins: Tensor,
+    directions: Tensor,
+    expected: Expected | None,
+    *,
+    level: int = -1,
+    near: Tensor | float = 0.0,
+    far: Tensor | float = torch.inf,
+    tolerance: float = 1e-5,
+    resolution: float = 1e-4,
+    lipschitz: float = 1.0,
+    radius: float | None = BOUNDING_RADIUS,
+    max_steps: int = MAX_STEPS,
+    reach: float | None = None,
+) -> tuple[Hits, Tensor, Near]:
+    """`sphere_trace` in the default mode, with an idea of where the hits will be.
+
+    A ray that expects a hit looks first at a point so near to it that the ball there just reaches back to ``near``, if
+    the field falls as it is said to, and steps from there as if it did. Where it does not, the ray finds a gap between
+    its balls, or itself behind the surface, and goes back. A wrong depth or slope costs steps, and changes nothing
+    else. But a ``value`` of an expectation is believed: where it says that the field falls evenly from ``near`` to the
+    hit, nothing else is looked for in between.
+
+    Args:
+        field: see `sphere_trace`.
+        origins: see there.
+        directions: see there.
+        expected: depths and slopes ``(...,)`` of the hits, and values at ``near``; None for no idea.
+        level: see there.
+        near: see there.
+        far: see there.
+        tolerance: see there.
+        resolution: see there.
+        lipschitz: see there.
+        radius: see there.
+        max_steps: see there.
+        reach: note where rays come nearer than this to the surface; None does not.
+
+    Returns:
+        The hits, how fast the field fell along each ray at its last step ``(...,)``, to be expected the next time,
+        and where the ray came within ``reach`` of the surface.
+
+    Raises:
+        ValueError: see `sphere_trace`.
+    """
+    level = field.resolve_level(level)
+    check_rays(field, origins, directions, tolerance=tolerance, resolution=resolution, lipschitz=lipschitz)
+    rule = Rule(field.deltas[:level].to(directions), tolerance, resolution, lipschitz)
+    directions, length = unit_directions(directions)
+    spans, found = _begin(origins, directions, length, near, far, radius)
+    shape = torch.broadcast_shapes(origins.shape, directions.shape)[:-1]
+    if expected is None and reach is None and choose_levels(levels_of(field)[: level + 1], directions, jet=False).fused:
+        _march_fused(field, level, spans, found, rule, max_steps)
+        unknown = Near(*(column.reshape(shape) for column in found.near))
+        return _hits(found, origins, directions, length), found.slope.reshape(shape), unknown
+    rays = Rays.begin(*spans)
+    if expected is not None:
+        depth, slope, value = (part.to(directions).broadcast_to(shape) for part in expected)
+        flat = Expected((depth * length).reshape(-1), slope.reshape(-1), value.reshape(-1))
+        rays = rays.expecting(flat, rule)
+    go = march_ahead if makes_wait(directions.device) else march
+    go(field, level, rays, found, rule, max_steps, reach)
+    clear, value, leave = (column.reshape(shape) for column in found.near)
+    near_surface = Near(clear / length, value, leave / length)
+    return _hits(found, origins, directions, length), found.slope.reshape(shape), near_surface
+
+
+def march_constants(dtype: torch.dtype) -> dict[str, float]:
+    """The numbers of `_march` that the fused kernels are compiled for."""
+    return {
+        "PATIENCE": PATIENCE,
+        "BOLDNESS": BOLDNESS,
+        "STEEPEST_RISE": STEEPEST_RISE,
+        "BAND_ENTRY": BAND_ENTRY,
+        "FLOOR": FLOOR * torch.finfo(dtype).eps,
+    }
+
+
+def _march_fused(field: Field, level: int, spans: tuple[Tensor, ...], found: Found, rule: Rule, max_steps: int) -> None:
+    """What `march` does, by the fused kernels; what they find has the same bounds, and not the same last bits."""
+    from ..backend.kernels.paths import march_levels
+    from ..backend.kernels.tracing import IN_REGISTERS, Marched, Queue, RayTensors, march_rays
+
+    origins, directions, entries, starts, ends = (column.contiguous() for column in spans)
+    if not len(starts):
+        return
+    levels = as_levels(field, level)
+    marched, queue = Marched.nothing(found.depth), Queue.of(starts, ends)
+    numbers = starts.new_tensor([rule.tolerance, rule.resolution, rule.lipschitz])
+    alone = len(levels.networks) == 1 and levels.networks[0].shape.width <= IN_REGISTERS
+    go = march_rays if alone else march_levels
+    rays = RayTensors(origins, directions, starts, entries, ends)
+    go(levels, rays, queue, marched, numbers, max_steps=max_steps, constants=march_constants(starts.dtype))
+    mask, depth, steps, slope, own = marched.in_own_types()
+    found.mask, found.depth, found.level, found.steps, found.slope = mask, depth, own, steps, slope
+
+
+def _begin(
+    origins: Tensor,
+    directions: Tensor,
+    length: Tensor,
+    near: Tensor | float,
+    far: Tensor | float,
+    radius: float | None,
+) -> tuple[tuple[Tensor, Tensor, Tensor, Tensor, Tensor], Found]:
+    """Flat rays, as `Rays.begin` takes them, inside the ball of ``radius``; and memory for what they find.
+
+    The directions are of unit length; ``near`` and ``far`` count in the ``length`` that they had.
+    """
+    origins, directions = torch.broadcast_tensors(origins, directions)
+    shape = directions.shape[:-1]
+    starts, ends = ((_like(depth, directions).broadcast_to(shape) * length).reshape(-1) for depth in (near, far))
+    origins, directions = origins.reshape(-1, 3), directions.reshape(-1, 3)
+    entries = torch.zeros_like(starts)
+    if radius is not None:
+        entry, leave = ball_crossing(origins, directions, radius)
+        entries, ends = entry.clamp(min=0), torch.minimum(ends, leave)
+    return (origins, directions, entries, torch.maximum(starts, entries), ends), Found(starts)
+
+
+def _like(number: Tensor | float, other: Tensor) -> Tensor:
+    """A number where ``other`` is, and as precise; one of the host's is filled in there, which nobody waits for."""
+    return number.to(other) if isinstance(number, Tensor) else other.new_full((), number)
+
+
+def _hits(found: Found, origins: Tensor, directions: Tensor, length: Tensor) -> Hits:
+    """What was found, in the shape of the rays; see `_begin`."""
+    shape = torch.broadcast_shapes(origins.shape, directions.shape)[:-1]
+    depth = found.depth.reshape(shape)
+    position = origins + depth[..., None] * directions
+    return Hits(
+        found.mask.reshape(shape), depth / length, position, found.level.reshape(shape), found.steps.reshape(shape)
+    )
+
+
+def check_rays(field: Field, origins: Tensor, directions: Tensor, **numbers: float) -> None:
+    """Refuse a field that is not three-dimensional, rays that are not, and numbers that are not positive.
+
+    Raises:
+        ValueError: names what came.
+    """
+    if field.in_dim != 3:
+        raise ValueError(f"field.in_dim={field.in_dim}: rays are traced in three dimensions; take a TimeSlice")
+    for name, rows in (("origins", origins), ("directions", directions)):
+        if rows.ndim == 0 or rows.shape[-1] != 3:
+            raise ValueError(f"{name} has shape {tuple(rows.shape)}; expected (..., 3)")
+    positive(**numbers)
+
+
+def unit_directions(directions: Tensor) -> tuple[Tensor, Tensor]:
+    """Directions of length 1 and the lengths they had; those that are 1 but for rounding stay as they are."""
+    length = directions.norm(dim=-1)
+    rounding = 8 * torch.finfo(length.dtype).eps  # of a normalised vector: half a unit for each operation
+    length = torch.where(((length - 1).abs() <= rounding) | (length == 0), torch.ones_like(length), length)
+    return directions / length[..., None], length
+
+
+def ball_crossing(origins: Tensor, directions: Tensor, radius: float | Tensor) -> tuple[Tensor, Tensor]:
+    """Depths at which rays enter and leave the ball around 0; those that miss it enter after they leave."""
+    middle, half = ball_chord(origins, directions, radius)
+    missed = half == 0
+    return torch.where(missed, torch.inf, middle - half), torch.where(missed, -torch.inf, middle + half)
+
+
+def ball_points(count: int, *, radius: float, generator: torch.Generator) -> Tensor:
+    """Points ``(count, 3)`` uniform in the ball around 0."""
+    directions = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1)
+    return radius * torch.rand(count, 1, generator=generator) ** (1 / 3) * directions

@@ -1,0 +1,1 @@
+"""Volume rendering of signed distance fields (NeuS)."""

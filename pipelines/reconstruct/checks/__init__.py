@@ -1,0 +1,1 @@
+"""Whether posed photographs can be right."""

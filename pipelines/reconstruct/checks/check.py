@@ -1,0 +1,328 @@
+"""Whether posed photographs can be right: figures of their cameras, and warnings about what is usually wrong.
+
+All lengths are in radii of the region of interest, because cameras are moved into its unit sphere first.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ....datasets import read_cameras, srgb_to_linear
+from ....datasets.cameras import Camera
+from ....datasets.clouds.cleaning.orientation import fibonacci_directions
+from ....datasets.views.formats.depth_maps import DepthSource
+from ....datasets.views.images import PosedImage, PosedImages, read_posed_images
+from ....neural_fields import InputError, Similarity
+from ...mesh.files import write_mesh
+from ..data.silhouettes import Agreement, named
+from .depth_check import DepthCheck, check_depths
+from .frustums import camera_mesh
+
+__all__ = ["CameraCheck", "check_cameras", "check_files", "format_check"]
+
+Float64 = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+
+WIDTH = 320  # pixels across an image; more would add nothing to the figures
+SPHERE_POINTS = 2000
+MASK_PIXELS = 64  # across an image, for rays through masks
+OUT_OF_VIEW = 0.25  # share of the views that may miss the middle of the region
+SAME_PLACE = 0.02  # spread of the eyes, as a share of their distance: about one degree of parallax
+ROUNDING = 1e-7  # that of the float32 numbers that files of cameras hold
+APART = 0.5  # median distance of the axes from where they meet best, as a share of the eyes' distance from there
+EMPTY, FULL = 1e-3, 0.999  # shares of a mask
+PAST_REGION = 0.05  # share of the object's pixels that may see past the region
+EXPOSURE = 4.0  # times brighter or darker than the median of the views: two stops
+
+
+@dataclass(frozen=True, eq=False)
+class CameraCheck:
+    """Figures of cameras around a region of interest.
+
+    Attributes:
+        fields_of_view: ``(V, 2)`` full angles across and down, degrees.
+        distances: ``(V,)`` from the eyes to the middle of the region, in its radii.
+        in_view: ``(V,)`` share of the region's sphere that falls into the image.
+        points_inside: share of the sparse points that lie in the region; None without points.
+        mask_inside: share of the object's pixels whose rays meet the region, in the median view; None without masks.
+        depths: what is known of the depth maps; None without any.
+        warnings: one line each.
+    """
+
+    fields_of_view: Float64
+    distances: Float64
+    in_view: Float64
+    points_inside: float | None
+    mask_inside: float | None
+    depths: DepthCheck | None
+    warnings: tuple[str, ...]
+
+    def record(self) -> dict[str, Any]:
+        """As numbers and lists, for JSON."""
+        return {
+            "fields_of_view_degrees": self.fields_of_view.tolist(),
+            "distances_in_radii": self.distances.tolist(),
+            "share_of_sphere_in_view": self.in_view.tolist(),
+            "share_of_sparse_points_inside": self.points_inside,
+            "share_of_masks_inside": self.mask_inside,
+            "depth_maps": None if self.depths is None else self.depths.record(),
+            "warnings": list(self.warnings),
+        }
+
+
+def check_files(
+    path: str | Path, out: Path | None = None, depths: DepthSource | None = None
+) -> tuple[PosedImages, CameraCheck, str]:
+    """Check a data set, and write what it looks like.
+
+    Args:
+        path: as for `read_posed_images`.
+        out: ``.glb`` or ``.ply`` file for `camera_mesh`, in world coordinates.
+        depths: as for `read_posed_images`.
+
+    Returns:
+        The images (made small), the figures, and both in words.
+
+    Raises:
+        InputError: the data set cannot be read, or the file not be written.
+    """
+    cameras = [camera for _, camera in read_cameras(path)]
+    images, trouble = _read(path, cameras, depths)
+    check = check_cameras(images)
+    check = replace(check, warnings=(*check.warnings, *trouble))
+    sizes = [(camera.width, camera.height) for camera in cameras]
+    if out is not None:
+        write_mesh(out, camera_mesh(images), images.similarity)
+    return images, check, format_check(images, check, sizes)
+
+
+def _read(
+    path: str | Path, cameras: Sequence[Camera], depths: DepthSource | None
+) -> tuple[PosedImages, tuple[str, ...]]:
+    """The images, around a guessed region where none can be found: that is when cameras most need to be looked at."""
+    try:
+        return read_posed_images(path, width=WIDTH, depths=depths), ()
+    except InputError as error:
+        try:
+            images = read_posed_images(path, width=WIDTH, region=_guess(cameras), depths=depths)
+        except InputError:
+            raise error from None  # it was not the region, then
+        return replace(images, region="a guess"), (f"there is no region of interest but a guess: {error}",)
+
+
+def _guess(cameras: Sequence[Camera]) -> Similarity:
+    """A sphere where the axes of view meet, a third as wide as the eyes are far; of radius 1 if they do not differ."""
+    eyes, forward = _eyes_and_axes(cameras)
+    middle = eyes.mean(axis=0)
+    center = middle + _meeting_point(eyes - middle, forward)
+    distance = float(np.median(np.linalg.norm(eyes - center, axis=1)))
+    spread = float(np.median(np.linalg.norm(eyes - middle, axis=1)))
+    differ = spread > ROUNDING * float(np.linalg.norm(middle))
+    return Similarity((float(center[0]), float(center[1]), float(center[2])), distance / 3 if differ else 1.0)
+
+
+def _eyes_and_axes(cameras: Sequence[Camera]) -> tuple[Float64, Float64]:
+    """Where cameras stand ``(V, 3)`` and the unit directions in which they look ``(V, 3)``."""
+    eyes, forward = (torch.stack([getattr(camera, name) for camera in cameras]).numpy() for name in ("eye", "forward"))
+    return eyes, forward
+
+
+def check_cameras(images: PosedImages) -> CameraCheck:
+    """Work out the figures, and what they warn of."""
+    cameras = [view.camera.moved(images.similarity) for view in images.views]
+    eyes, forward = _eyes_and_axes(cameras)
+    sphere = fibonacci_directions(SPHERE_POINTS)
+    in_view = np.array([_inside_image(camera, sphere).mean() for camera in cameras])
+    middle = np.array([_inside_image(camera, np.zeros((1, 3)))[0] for camera in cameras])
+    points = None if images.points is None else images.similarity.to_unit(images.points)
+    mask_inside = _mask_inside(images.views, cameras)
+    warnings = list(_placement(eyes, forward, middle))
+    depths = check_depths(images)
+    # Where the cameras are wrong, what the masks and depth maps see of the region says nothing.
+    warnings += [
+        *_masks(images.views, None if warnings else mask_inside),
+        *([] if warnings else _silhouettes(images)),
+        *([] if warnings or depths is None else depths.warnings),
+        *_exposure(images.views),
+    ]
+    return CameraCheck(
+        np.array([_field_of_view(camera) for camera in cameras]),
+        np.linalg.norm(eyes, axis=1),
+        in_view,
+        None if points is None or not len(points) else float((np.linalg.norm(points, axis=1) <= 1).mean()),
+        mask_inside,
+        depths,
+        tuple(warnings),
+    )
+
+
+def format_check(images: PosedImages, check: CameraCheck, sizes: Sequence[tuple[int, int]]) -> str:
+    """The figures in words, a line for each.
+
+    Args:
+        images: what was checked.
+        check: its figures.
+        sizes: widths and heights of the images as they are on disk.
+    """
+    distinct = list(dict.fromkeys(sizes))
+    size = f"{distinct[0][0]} × {distinct[0][1]}" if len(distinct) == 1 else f"{len(distinct)} sizes"
+    scale = images.similarity.scale
+    digits = max(0, 3 - math.floor(math.log10(scale)))  # to a thousandth of the radius, or finer
+    center = ", ".join(f"{round(number, digits) + 0.0:.{digits}f}" for number in images.similarity.center)
+    across, down = check.fields_of_view.T
+    lines = [
+        f"{len(images.views)} views of {size} pixels, from {images.source}",
+        f"region of interest: centre ({center}), radius {scale:.{digits}f}; from {images.region}",
+        f"field of view: {_range(across, '.1f', '°')} across, {_range(down, '.1f', '°')} down",
+        f"eyes: {_range(check.distances, '.2f')} radii from the centre",
+        f"share of the region's sphere in view: {_range(100 * check.in_view, '.0f', ' %')}",
+    ]
+    if images.points is not None and check.points_inside is not None:
+        lines.append(f"sparse points: {len(images.points):,}, {100 * check.points_inside:.0f} % of them in the region")
+    if check.mask_inside is not None:
+        lines.append(f"masks: {100 * check.mask_inside:.1f} % of the object's pixels see into the region")
+    if check.depths is not None:
+        lines.append(check.depths.in_words(len(images.views)))
+    return "\n".join(lines)
+
+
+def _range(values: Float64, form: str, unit: str = "") -> str:
+    low, high = f"{values.min():{form}}", f"{values.max():{form}}"
+    return f"{low}{unit}" if low == high else f"{low} to {high}{unit} (median {np.median(values):{form}}{unit})"
+
+
+def _field_of_view(camera: Camera) -> tuple[float, float]:
+    lens = camera.intrinsics.numpy()
+    sides = [
+        (lens[k, 2] + 0.5, size - 0.5 - lens[k, 2], lens[k, k]) for k, size in enumerate((camera.width, camera.height))
+    ]
+    across, down = (float(np.degrees(np.arctan(low / focal) + np.arctan(high / focal))) for low, high, focal in sides)
+    return across, down
+
+
+def _inside_image(camera: Camera, points: Float64) -> Bool:
+    """Whether points ``(N, 3)`` fall into the image ``(N,)``; what hides behind what is not asked."""
+    pixels, z = camera.project(torch.from_numpy(points))
+    corner = pixels.new_tensor([camera.width, camera.height]) - 0.5
+    return ((z > 0) & ((pixels >= -0.5) & (pixels <= corner)).all(dim=1)).numpy()
+
+
+def _placement(eyes: Float64, forward: Float64, middle: Bool) -> Iterator[str]:
+    """Warnings about where cameras stand and look."""
+    count, distance = len(eyes), np.linalg.norm(eyes, axis=1)
+    if count == 1:
+        yield "there is a single view; a shape needs several, from all sides"
+        return
+    spread = np.linalg.norm(eyes - eyes.mean(axis=0), axis=1).max()
+    if spread < SAME_PLACE * max(1.0, float(np.median(distance))):
+        yield "all cameras stand at one place, so nothing tells depth; are the poses really camera-to-world?"
+        return
+    offset = _meeting_point(eyes, forward) - eyes
+    apart = np.linalg.norm(np.cross(offset, forward), axis=1)
+    if np.median(apart) > APART * np.median(np.linalg.norm(offset, axis=1)):
+        yield "the cameras look at no common place; are the poses really camera-to-world?"
+        return
+    away = ((offset * forward).sum(axis=1) < 0) | ((eyes * forward).sum(axis=1) > 0)
+    if 2 * away.sum() > count:
+        yield (
+            f"the cameras look away: {int(away.sum())} of {count} have their backs to the region of interest, or to "
+            "where their axes meet; is the file in OpenGL or OpenCV convention?"
+        )
+        return
+    inside = int((distance < 1).sum())
+    if inside:
+        yield f"{inside} of {count} cameras stand inside the region of interest; is the region right?"
+    missing = int((~middle).sum())
+    if missing > OUT_OF_VIEW * count:
+        yield f"the middle of the region of interest is out of view in {missing} of {count}; is the region right?"
+
+
+def _meeting_point(eyes: Float64, forward: Float64) -> Float64:
+    """The point ``(3,)`` nearest to all optical axes, by least squares: Σ (I − dᵢ dᵢᵀ)(p − eᵢ) = 0.
+
+    Of parallel axes, the one of least length: a point opposite the middle of the region.
+    """
+    across = np.eye(3) - forward[:, :, None] * forward[:, None, :]  # (V, 3, 3)
+    return np.linalg.lstsq(across.sum(axis=0), (across @ eyes[:, :, None]).sum(axis=0)[:, 0], rcond=1e-9)[0]
+
+
+def _masks(views: Sequence[PosedImage], inside: float | None) -> Iterator[str]:
+    """Warnings about masks."""
+    shares = {view.name: float(view.mask.mean()) for view in views if view.mask is not None}
+    empty = [name for name, share in shares.items() if share < EMPTY]
+    full = [name for name, share in shares.items() if share > FULL]
+    if empty:
+        yield f"{len(empty)} of {len(shares)} masks are empty: {named(empty)}"
+    if full:
+        yield f"{len(full)} of {len(shares)} masks are full: {named(full)}; they tell nothing from its background"
+    if inside is not None and inside < 1 - PAST_REGION and len(full) < len(shares):
+        past = 100 * (1 - inside)
+        yield f"{past:.0f} % of the object's pixels see past the region of interest, which cuts it; enlarge it"
+
+
+def _silhouettes(images: PosedImages) -> Iterator[str]:
+    """Warnings about masks that contradict each other."""
+    views = [view for view in images.views if view.mask is not None and EMPTY <= view.mask.mean() <= FULL]
+    if not views:
+        return
+    agreement = Agreement.of(views, images.similarity)
+    inverted, odd = agreement.contradictions()
+    if inverted:
+        yield "the masks cover the borders of the pictures and not their middles: they look inverted; white is object"
+    elif turned := agreement.how_turned():
+        yield f"the silhouettes contradict each other, and would not if the pictures were not {turned}"
+    else:
+        if odd:
+            names = named([view.name for view in odd])
+            yield (
+                f"{len(odd)} of {len(views)} silhouettes contradict the others: {names}; is that the right picture, "
+                "the right way round, and its pose and mask right?"
+            )
+        if torn := agreement.holes():
+            names = named([views[index].name for index in torn])
+            yield f"{len(torn)} of {len(views)} masks have a hole where all others see object: {names}; fill it"
+
+
+def _mask_inside(views: Sequence[PosedImage], cameras: Sequence[Camera]) -> float | None:
+    """Share of the masked pixels whose rays meet the unit sphere, in the median of the views that have any."""
+    shares = []
+    for view, camera in zip(views, cameras, strict=True):
+        if view.mask is None or not view.mask.any():
+            continue
+        step = max(1, max(view.mask.shape) // MASK_PIXELS)
+        size = (max(1, camera.width // step), max(1, camera.height // step))
+        weight = cv2.resize(view.mask, size, interpolation=cv2.INTER_AREA).reshape(size[::-1])
+        eye, directions = (x.numpy() for x in camera.resized(*size).rays(dtype=torch.float64))
+        depth = np.maximum(-(directions @ eye), 0)  # of the nearest point to the middle
+        meets = np.linalg.norm(eye + depth[..., None] * directions, axis=-1) <= 1
+        shares.append(float(weight[meets].sum() / weight.sum()))
+    return float(np.median(shares)) if shares else None
+
+
+def _exposure(views: Sequence[PosedImage]) -> Iterator[str]:
+    """A warning about images that are far brighter or darker than the others."""
+    light = np.array([_brightness(view) for view in views])
+    usual = np.median(light)
+    odd = [
+        view.name
+        for view, level in zip(views, light, strict=True)
+        if level > EXPOSURE * usual or EXPOSURE * level < usual
+    ]
+    if odd:
+        yield f"{len(odd)} of {len(views)} images are two stops or more off the others' brightness: {named(odd)}"
+
+
+def _brightness(view: PosedImage) -> float:
+    """Mean linear light of the object, or of the image where nothing says which that is."""
+    light = srgb_to_linear(view.color).mean(axis=-1)
+    weight = np.ones_like(light) if view.mask is None or not view.mask.any() else view.mask
+    return float((light * weight).sum() / weight.sum())

@@ -1,0 +1,1 @@
+"""What photographs offer to a reconstruction: depths, silhouettes, visibility."""

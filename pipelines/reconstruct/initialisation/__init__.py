@@ -1,0 +1,1 @@
+"""The geometry that a reconstruction begins with."""

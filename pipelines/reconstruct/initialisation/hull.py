@@ -1,0 +1,210 @@
+"""A start of the geometry, carved out of a grid: what all masks take for object, and no measured ray passes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation, distance_transform_edt
+from torch import Tensor, nn
+
+from ....datasets.views.images import PosedImage, PosedImages
+from ....neural_fields import InputError, MultiscaleSDF, Similarity, Siren
+from ....neural_fields.fields.losses import data_loss, eikonal_loss
+from ....neural_fields.networks.value_grid import ValueGrid
+from ...training.settings import ReconstructConfig
+from ...training.trainer import seeded
+from ..data.measured import MeasuredDepths
+from ..data.silhouettes import Agreement, grid_in_ball, silhouettes
+from ..model.model import SceneModel
+from .free_space import seen_through
+
+__all__ = ["begin", "carve", "fitting_resolution", "start_at_hull"]
+
+RESOLUTION = 48  # cells along the grid that measured rays carve
+# Cells along that which silhouettes carve: doubled until they are of a pixel's size, nearly, or the coarse level could
+# not follow.
+COARSEST, FINEST, PIXELS = 32, 128, 1.5
+AGREE = 0.99  # share of the views that must take a point for object: through a gap often one camera looks alone
+SEEING = 0.25  # of all views that must see it
+ROOM = 3.0  # edges of a cell within which a coarse vertex must see object, to have finer ones tried
+LEAST, MOST = 1e-3, 0.5  # shares of the unit ball that a hull fills; others are no start
+MOST_UNSEEN = 0.9  # the same of what no measured ray passes: of a scene that is seen from one side, much is not seen
+STEPS, BATCH, RATE = 250, 1024, 2e-3
+DATA_WEIGHT, EIKONAL_WEIGHT = 100.0, 0.1
+
+
+def begin(
+    model: SceneModel,
+    views: Sequence[PosedImage],
+    images: PosedImages,
+    config: ReconstructConfig,
+    measured: MeasuredDepths | None = None,
+    agreement: Agreement | None = None,
+) -> str:
+    """Give an untrained scene the start that its settings ask for; it is a sphere already.
+
+    Args:
+        model: its geometry is trained in place.
+        views: those that are trained on.
+        images: of which these are a part; for the coordinates and the name.
+        config: ``start``, ``geometry`` and ``seed`` are used.
+        measured: depths of these views, if there are any.
+        agreement: of these views, if it is known.
+
+    Returns:
+        What it is now: "hull", "depths" (what no measured ray passes) or "sphere". A hull is carved by measured rays
+        too, unless it was asked for by name.
+
+    Raises:
+        InputError: a start was asked for that there is not.
+    """
+    base = model.geometry.base if isinstance(model.geometry, MultiscaleSDF) else None
+    masked = all(view.mask is not None for view in views) and config.start != "depths"
+    carving = None if config.start == "hull" else measured
+    if config.start != "sphere" and isinstance(base, Siren) and (masked or carving is not None):
+        empty = None if carving is None else seen_through(carving, RESOLUTION).numpy()
+        carved = (agreement or Agreement.of(views, images.similarity)).trusted() if masked else ()
+        distances = carve(carved, images.similarity, empty=empty)
+        if distances is not None:
+            start_at_hull(base, distances, seed=config.seed)
+            return "hull" if masked else "depths"
+    if config.start in ("hull", "depths"):
+        wants = {
+            "hull": "visual hull to begin with, which wants masks on all pictures that leave a part of the region",
+            "depths": "start by measured depths, which wants depth maps in the cameras' units or COLMAP's points",
+        }
+        raise InputError(
+            f"{images.source}: no {wants[config.start]}, and --geometry multiscale; see `mplicits check-cameras`, or "
+            "take --start sphere"
+        )
+    return "sphere"
+
+
+def carve(
+    views: Sequence[PosedImage],
+    similarity: Similarity,
+    *,
+    resolution: int | None = None,
+    empty: NDArray[np.bool_] | None = None,
+) -> NDArray[np.float64] | None:
+    """Signed distances to what is left of the unit ball at the vertices of a grid over [−1, 1]³, negative inside.
+
+    A vertex of the unit ball is inside where AGREE of the views that see it find object within half a cell around it.
+    So the hull is up to a cell too large, and thin parts stay. Grids of half as many cells come first, which see object
+    from further around, so that most vertices are decided by a few.
+
+    Args:
+        views: pictures with masks; none leaves all that is not empty.
+        similarity: from world to unit-sphere coordinates.
+        resolution: cells along an edge; None takes `fitting_resolution`, or that of ``empty`` where there are no views.
+        empty: ``(E, E, E)`` vertices of a grid over the same cube that are known to be outside.
+
+    Returns:
+        ``(resolution + 1,) * 3`` distances by x, y and z, exact to about a cell; or None where less than LEAST or more
+        than MOST of the ball is left, as by empty and full masks.
+    """
+    if resolution is None:
+        resolution = fitting_resolution(views, similarity) if views or empty is None else len(empty) - 1
+    solid, ball = _object_vertices(views, similarity, resolution)
+    if empty is not None:
+        solid &= ~_all_around(empty, resolution)
+    if not LEAST < solid.sum() / ball < (MOST if views else MOST_UNSEEN):
+        return None
+    # The surface lies half a cell from the outermost vertices inside.
+    outer, inner = (np.asarray(distance_transform_edt(part), dtype=np.float64) for part in (~solid, solid))
+    return 2 / resolution * np.where(solid, 0.5 - inner, outer - 0.5)
+
+
+def fitting_resolution(views: Sequence[PosedImage], similarity: Similarity) -> int:
+    """Cells along an edge of [−1, 1]³ that are hardly larger than what a pixel sees in its middle."""
+    cameras = [view.camera.moved(similarity) for view in views]
+    pixel = float(np.median([float(camera.eye.norm() / camera.intrinsics[0, 0]) for camera in cameras] or [1.0]))
+    resolution = COARSEST
+    while resolution < FINEST and 2 / resolution > PIXELS * pixel:
+        resolution *= 2
+    return resolution
+
+
+def _object_vertices(
+    views: Sequence[PosedImage], similarity: Similarity, resolution: int
+) -> tuple[NDArray[np.bool_], int]:
+    """Vertices that AGREE of the views that see them take for object ``(resolution + 1,) * 3``, and how many are asked.
+
+    Those in the unit ball are; without views all of them are object.
+    """
+    ball, sizes = 0, [resolution]
+    while views and sizes[0] > COARSEST and sizes[0] % 2 == 0:
+        sizes.insert(0, sizes[0] // 2)
+    solid = np.ones(3 * (sizes[0] + 1,), dtype=bool)
+    for size in sizes:
+        count = size + 1
+        points, places = grid_in_ball(size)
+        ball = len(places)
+        if count > len(solid):
+            # Beside a vertex that is object there is one of the coarser grid that is, with room to spare.
+            near = binary_dilation(solid, np.ones((3, 3, 3)))
+            for axis in range(3):
+                near = near.repeat(2, axis=axis)
+            among = torch.from_numpy(near[:count, :count, :count].reshape(-1))[places]
+            points, places = points[among], places[among]
+        if views:
+            places = places[_agreed(views, similarity, points, 2 / size * (1 if size == resolution else ROOM))]
+        solid = np.zeros(count**3, dtype=bool)
+        solid[places.numpy()] = True
+        solid = solid.reshape(count, count, count)
+    return solid, ball
+
+
+def _agreed(views: Sequence[PosedImage], similarity: Similarity, points: Tensor, edge: float) -> Tensor:
+    """Which points ``(N, 3)`` are object for AGREE of the views that see them, if enough do ``(N,)``."""
+    seen, object_in = torch.zeros(len(points)), torch.zeros(len(points))
+    for sees, objects in silhouettes([view for view in views if view.mask is not None], similarity, points, edge):
+        seen += sees
+        object_in += objects
+    return (object_in >= AGREE * seen) & (seen >= max(1.0, SEEING * len(views)))
+
+
+def _all_around(empty: NDArray[np.bool_], resolution: int) -> NDArray[np.bool_]:
+    """Vertices of another grid over the same cube whose neighbours in this one are all empty."""
+    for axis in range(3):
+        place = np.linspace(0, empty.shape[axis] - 1, resolution + 1)
+        below, above = (np.take(empty, end(place).astype(int), axis=axis) for end in (np.floor, np.ceil))
+        empty = below & above
+    return empty
+
+
+def start_at_hull(network: Siren, distances: NDArray[np.float64], *, seed: int = 0, steps: int = STEPS) -> None:
+    """Train a SIREN in place to signed distances on a grid, smoothed as far as it cannot follow them.
+
+    Args:
+        network: the coarse level, on any device.
+        distances: as `carve` returns them.
+        seed: of the points.
+        steps: of Adam, its rate falling linearly.
+    """
+    place = network.output.weight
+    grid = ValueGrid(len(distances) - 1, place.device)
+    grid.kept.copy_(torch.from_numpy(distances).to(place))
+    units = network.units
+    network.set_units()
+    adam = torch.optim.Adam(network.parameters(), lr=RATE, betas=(0.9, 0.99))
+    with seeded(seed):
+        for step in range(steps):
+            points = _in_ball(BATCH).to(place)
+            jet = network.jet(points)
+            loss = DATA_WEIGHT * data_loss(jet.value, grid(points)) + EIKONAL_WEIGHT * eikonal_loss(jet.gradient)
+            for group in adam.param_groups:
+                group["lr"] = RATE * (1 - step / steps)
+            adam.zero_grad(set_to_none=True)
+            loss.mean().backward()
+            adam.step()
+    network.set_units(*units)
+
+
+def _in_ball(count: int) -> Tensor:
+    """Points ``(count, 3)``, evenly spread in the unit ball."""
+    directions = nn.functional.normalize(torch.randn(count, 3), dim=1)
+    return torch.rand(count, 1) ** (1 / 3) * directions

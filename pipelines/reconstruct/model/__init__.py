@@ -1,0 +1,1 @@
+"""The scene that is trained, its loss, and its steps."""

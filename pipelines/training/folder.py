@@ -1,0 +1,530 @@
+"""Run directories: what an argument ``RUN|FILE`` means, and what a training writes and finds again.
+
+All files of a directory belong to one run, whose *generation*, a random name, is in each of them. A checkpoint replaces
+them all at once (`swap`), so that a kill leaves the one before or this one; the first checkpoint of a new run replaces
+those of an old one, which is whole until then. The record has the SHA-256 of the others, and the tensors in each have
+one of their own.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import secrets
+import time
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from safetensors import safe_open
+from safetensors.torch import save
+from torch import Tensor
+
+from ...neural_fields import Field, InputError, SavedField, Similarity, load_field
+from ...neural_fields.backend.files import check_place, damage, json_bytes, write_whole
+from ...neural_fields.checkpoint import checksum_of, field_bytes
+from ...neural_fields.spacetime.dynamic_tracing import moment
+from .config import load_config
+from .lock import check_unlocked, locked
+from .swap import is_scratch, settled, swap, sweep
+from .team import is_leader
+
+__all__ = [
+    "CLOUD_FILE",
+    "FIELD_FILE",
+    "MAY_CHANGE",
+    "MERGED_FILE",
+    "RADIANCE_FILE",
+    "RECORD_FILE",
+    "STATE_FILE",
+    "SUPPORT_FILE",
+    "TEXTURE_FILE",
+    "RunFolder",
+    "check_new_run",
+    "chosen_level",
+    "digest_of",
+    "find_field",
+    "fitted_cloud",
+    "is_field",
+    "is_fitted",
+    "kept_cloud",
+    "load_state",
+    "load_still",
+    "named_cloud",
+    "read_record",
+    "resumes_with",
+    "save_state",
+    "state_bytes",
+    "texture_state_file",
+    "write_texture",
+]
+
+C = TypeVar("C")
+
+FIELD_FILE = "field.safetensors"
+RECORD_FILE = "run.json"
+STATE_FILE = "resume.safetensors"
+TEXTURE_FILE = "texture.safetensors"
+RADIANCE_FILE = "radiance.safetensors"
+SUPPORT_FILE = "support.safetensors"
+CLOUD_FILE = "cloud.ply"  # what was made of depth maps
+MERGED_FILE = "merged_cloud.npz"  # of a large cloud, made again where it is missing
+# What a resumed run may do otherwise than it began; all else would make another run of it.
+MAY_CHANGE = ("device", "time_budget")
+LOOKS = 20  # at files that are being replaced
+# What is in the record alone: too long for the head of a field's file.
+LONG = ("checks", "held_out")
+
+
+def find_field(path: str | Path) -> Path:
+    """The checkpoint that ``RUN|FILE`` names.
+
+    What a kill has left half done in a run directory is done now.
+
+    Raises:
+        InputError: there is nothing there, it is neither a run directory with a field nor a .safetensors file, or the
+            field is not the one of the run's record.
+    """
+    path = Path(path)
+    if path.is_dir():
+        field = path / FIELD_FILE
+        _check_whole(path)
+        if field.is_file():
+            return field
+        if (path / RECORD_FILE).is_file():
+            raise InputError(
+                f"{path}: holds no {FIELD_FILE}; begin again with --force of the command that began it "
+                "(mplicits fit, evolve or reconstruct)"
+            )
+        raise InputError(f"{path}: not a run directory (no {FIELD_FILE}); make one with `mplicits fit CLOUD -o {path}`")
+    if not path.exists():
+        raise InputError(f"{path}: no such run directory or file")
+    if path.suffix.lower() != ".safetensors":
+        raise InputError(f"{path}: expected a run directory or a .safetensors file")
+    return path
+
+
+def is_field(path: str | Path) -> bool:
+    """Whether ``path`` is meant as a run or a checkpoint rather than as a mesh or a cloud."""
+    return Path(path).is_dir() or Path(path).suffix.lower() == ".safetensors"
+
+
+def load_still(path: str | Path, time: float | None = None, *, device: torch.device | str = "cpu") -> SavedField:
+    """The field of a run as it is, or that of one moment if it moves.
+
+    Args:
+        path: run directory or .safetensors file.
+        time: the moment, in [0, 1]; None for a field that does not move.
+        device: where to put it.
+
+    Raises:
+        InputError: there is no such run; it moves and no time is given, or the other way round; or the time is not
+            from 0 to 1.
+    """
+    file = find_field(path)
+    saved = load_field(file, device=device)
+    if time is None:
+        if saved.field.in_dim != 3:
+            raise InputError(f"{file}: a surface that moves; say when with --time T, from 0 to 1")
+        return saved
+    if saved.field.in_dim == 3:
+        raise InputError(f"--time {time:g}: {file} does not move; leave it out")
+    if not 0 <= time <= 1:
+        raise InputError(f"--time {time:g}: expected a time from 0 to 1")
+    return saved._replace(field=moment(saved.field, time))
+
+
+def chosen_level(field: Field, file: Path, level: int | None, *, otherwise: int = -1, flag: str = "--level") -> int:
+    """A level of the field in ``file``, counted from 0, or ``otherwise``, by default the finest, where it is None.
+
+    Raises:
+        InputError: the field has no such level; the message names the ``flag``.
+    """
+    if level is None:
+        return field.resolve_level(otherwise)
+    if not 0 <= level < field.num_levels:
+        raise InputError(f"{flag} {level}: {file} has levels 0 to {field.num_levels - 1}")
+    return level
+
+
+def is_fitted(run: Path) -> bool:
+    """Whether the training in a directory went to its end."""
+    settled(run)
+    if not (run / FIELD_FILE).is_file() or not (run / RECORD_FILE).is_file() or (run / STATE_FILE).is_file():
+        return False
+    return bool(read_record(run).get("finished"))
+
+
+def kept_cloud(run: Path) -> Path:
+    """The file of the cloud that was made of the depth maps of a run.
+
+    Raises:
+        InputError: the run was not fitted to depth maps.
+    """
+    kept = run / CLOUD_FILE
+    if not kept.is_file():
+        raise InputError(f"{run}: holds no {CLOUD_FILE}, so it was not fitted to depth maps; name its own cloud")
+    return kept
+
+
+def named_cloud(source: str, run: Path | None) -> dict[str, str]:
+    """Where a cloud is, for a record: so that `fitted_cloud` finds it from any folder.
+
+    Args:
+        source: its file; what else it may be called stays as it is.
+        run: directory of the run, if there is one.
+
+    Returns:
+        ``cloud``, the absolute path, and ``cloud_from_run``, the path from the run's directory, which holds when both
+        are moved together.
+    """
+    file = Path(source)
+    if not file.is_file() and (run is None or file != run / CLOUD_FILE):  # that one comes with the first checkpoint
+        return {"cloud": source}
+    named = {"cloud": str(file.absolute())}
+    if run is not None:
+        with suppress(ValueError):  # Windows: they are on two drives
+            named["cloud_from_run"] = os.path.relpath(file.resolve(), run.resolve())
+    return named
+
+
+def fitted_cloud(file: Path, metadata: Mapping[str, Any], *, remedy: str) -> Path:
+    """The file of the cloud that a field was fitted to.
+
+    Args:
+        file: the field's checkpoint.
+        metadata: what is in it.
+        remedy: what to do where it is not found, for the message.
+
+    Raises:
+        InputError: it is in neither of the places that `named_cloud` noted.
+    """
+    record = metadata.get("run", {})
+    source, from_run = record.get("cloud"), record.get("cloud_from_run")
+    if not source:
+        raise InputError(f"{file}: was not fitted to a cloud; {remedy}")
+    places = [Path(source)] + ([] if from_run is None else [file.parent / from_run])
+    for place in places:
+        if place.is_file():
+            return place
+    raise InputError(f"{file}: its cloud {source} is not to be found; {remedy}")
+
+
+def texture_state_file(texture: Path) -> Path:
+    """Where the training of the texture that will be written to ``texture`` is kept."""
+    return texture.with_suffix(".resume.safetensors")
+
+
+def check_new_run(path: str | Path, *, resume: bool, force: bool) -> Path:
+    """The directory of a run to be written, if nothing there would be lost.
+
+    Raises:
+        InputError: it cannot be made, is being written, holds something already, or with ``resume`` holds nothing to
+            resume.
+    """
+    path = Path(path)
+    if path.exists() and not path.is_dir():
+        raise InputError(f"{path}: is a file; name a directory for the run")
+    check_place(path)
+    check_unlocked(path)
+    settled(path)
+    if resume:
+        if not (path / STATE_FILE).is_file():
+            finished = (path / FIELD_FILE).is_file()
+            reason = "is finished" if finished else "holds no interrupted run"
+            raise InputError(f"{path}: {reason}, so there is nothing to resume; leave out --resume")
+        return path
+    if path.is_dir() and not force and not all(is_scratch(file) or file.name == MERGED_FILE for file in path.iterdir()):
+        hint = " --resume continues it," if (path / STATE_FILE).is_file() else ""
+        raise InputError(f"{path}: exists and is not empty;{hint} --force overwrites it, or choose another -o")
+    return path
+
+
+def resumes_with(run: Path, record: Mapping[str, Any]) -> str | None:
+    """The command that ends what an interrupted training in a directory began; None if nothing of one is there."""
+    if not (run / STATE_FILE).is_file():
+        return None
+    if "shapes" in record:
+        return f"mplicits evolve -o {run} --resume"
+    if "data" in record:
+        return f"mplicits reconstruct {record['data']} -o {run} --resume"
+    return f"mplicits fit {record.get('cloud', 'CLOUD')} -o {run} --resume"
+
+
+class RunFolder:
+    """What a training writes: its record, a field that is usable at any time, and what it can be resumed from.
+
+    Args:
+        path: the directory; None keeps nothing.
+        resume: whether the interrupted run there is continued.
+
+    Attributes:
+        out: where to write, ``path``; None where nothing is kept, or another process of a team writes.
+
+    Raises:
+        InputError: there is no directory to resume from.
+    """
+
+    def __init__(self, path: str | Path | None, *, resume: bool = False) -> None:
+        if resume and path is None:
+            raise InputError("resume: needs the run directory (out=...)")
+        self.path, self.resume = None if path is None else Path(path), resume
+        self.out = self.path if is_leader() else None
+        self._found = None if self.path is None else _generation_in(self.path)
+        self._generation = secrets.token_hex(8)
+        self._gone: set[str] = set()  # of an older run, until the next checkpoint
+        self._kept: dict[str, bytes | Path] = {}  # for the next checkpoint
+        self._digests: dict[str, str] = {}  # of what the files of this run hold
+
+    def config(self, kind: type[C], given: C | None) -> C:
+        """Settings of the run: its own if it is resumed, else those given, else the defaults.
+
+        Raises:
+            InputError: the record of the run is missing, damaged, or not as the run began.
+        """
+        if not self.resume or self.path is None:
+            return given or kind()
+        record, progress = read_record(self.path), load_state(self.path, tensors=False)[1]
+        if progress.get("generation") != record.get("generation"):  # older runs have none
+            raise InputError(f"{self.path}: {RECORD_FILE} and {STATE_FILE} are of two runs; begin again with --force")
+        if "config" in progress:
+            _check_unchanged(self.path, record["config"], progress["config"])
+        return load_config(kind, None, record["config"])
+
+    @contextmanager
+    def writing(self, *also: str) -> Iterator[None]:
+        """Make the directory and be its only writer; unless it is resumed, forget the run that was there.
+
+        That one stays until the first checkpoint. Then what would be resumed into the new run, or colour it, is removed
+        with it, and the files named ``also``.
+
+        Raises:
+            InputError: somebody else writes there, or has written since this was made.
+        """
+        if self.out is None:
+            yield
+            return
+        self.out.mkdir(parents=True, exist_ok=True)
+        with locked(self.out):
+            sweep(self.out)
+            if _generation_in(self.out) != self._found:
+                raise InputError(
+                    f"{self.out}: another run was written there meanwhile; look at it, or choose another -o"
+                )
+            if self.resume:
+                record = read_record(self.out)
+                self._generation = record.get("generation", self._generation)
+                self._digests = dict(record.get("files", {}))
+            else:
+                self._gone = {SUPPORT_FILE, CLOUD_FILE, *also}
+            yield
+
+    @property
+    def has_checkpoint(self) -> bool:
+        """Whether what lies in the directory is of this run."""
+        return self.resume or not self._gone
+
+    def keep(self, name: str, content: bytes | Path) -> None:
+        """Have a file in the directory from the next checkpoint on: bytes, or a file there that is renamed."""
+        if self.out is not None:
+            self._kept[name] = content
+
+    def keep_tensors(self, name: str, tensors: Mapping[str, Tensor]) -> None:
+        """Have tensors in a file of the directory from the next checkpoint on; `load_state` reads them."""
+        self.keep(name, state_bytes(tensors, {"generation": self._generation}))
+
+    def save(
+        self,
+        field: Field,
+        similarity: Similarity,
+        record: Mapping[str, Any],
+        tensors: Mapping[str, Tensor],
+        progress: Mapping[str, Any],
+    ) -> None:
+        """Write a checkpoint: a usable field, and the ``tensors`` and ``progress`` (JSON) that `restore` returns."""
+        if self.out is not None:
+            about = {**progress, "config": record["config"], "generation": self._generation}
+            self.keep(STATE_FILE, state_bytes(tensors, about))
+            self._swap(self.out, field, similarity, record)
+
+    def finish(
+        self, field: Field, similarity: Similarity, record: Mapping[str, Any], *, gone: Iterable[str] = ()
+    ) -> dict[str, Any]:
+        """Write field and record of a finished run → the record; what was to be resumed, and ``gone``, go."""
+        if self.out is None:
+            return dict(record)
+        self._gone |= {STATE_FILE, *gone}
+        return self._swap(self.out, field, similarity, record)
+
+    def _swap(self, out: Path, field: Field, similarity: Similarity, record: Mapping[str, Any]) -> dict[str, Any]:
+        """Replace all that is in the directory by what this run has come to; colours are never those of a new field."""
+        record = {"generation": self._generation, **record}
+        short = {name: value for name, value in record.items() if name not in LONG}
+        files = {**self._kept, FIELD_FILE: field_bytes(field, similarity=similarity, metadata={"run": short})}
+        gone = {*self._gone, TEXTURE_FILE, RADIANCE_FILE, texture_state_file(Path(TEXTURE_FILE)).name} - {*files}
+        if record.get("cloud") == str((out / CLOUD_FILE).absolute()):
+            gone.discard(CLOUD_FILE)  # it is what is fitted
+        digests = {name: old for name, old in self._digests.items() if name not in gone}
+        digests |= {name: _digest(content) for name, content in files.items()}
+        record = {**record, "files": digests}
+        swap(out, {**files, RECORD_FILE: json_bytes(record)}, gone)
+        self._kept, self._gone, self._digests = {}, set(), digests
+        return record
+
+    def restore(self, fingerprint: str, mismatch: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        """The tensors and the progress that `save` was given last.
+
+        Args:
+            fingerprint: of what the run learns from; it is in the progress.
+            mismatch: what to say if the run began with another.
+
+        Raises:
+            InputError: there is nothing to resume, it is damaged, or the fingerprint is another.
+        """
+        assert self.path is not None
+        tensors, progress = load_state(self.path)
+        if progress.get("fingerprint") != fingerprint:
+            raise InputError(f"{mismatch}, or leave out --resume and choose a new -o")
+        return tensors, progress
+
+
+def write_texture(run: Path, content: bytes, record: Mapping[str, Any], *, finished: bool) -> None:
+    """Write a texture, and what the record of its run says of it, at once; to be called by who has the run's lock.
+
+    Args:
+        run: the directory; without a record, only the texture is written.
+        content: of the file.
+        record: kept as ``texture``.
+        finished: whether its training may be forgotten.
+
+    Raises:
+        InputError: the directory cannot be written, or its record is damaged.
+    """
+    files: dict[str, bytes | Path] = {TEXTURE_FILE: content}
+    if (run / RECORD_FILE).is_file():
+        whole = read_record(run)
+        digests = {**whole.get("files", {}), TEXTURE_FILE: _digest(content)}
+        files[RECORD_FILE] = json_bytes({**whole, "texture": dict(record), "files": digests})
+    swap(run, files, [texture_state_file(Path(TEXTURE_FILE)).name] * finished)
+
+
+def _check_unchanged(run: Path, config: Mapping[str, Any], began: Mapping[str, Any]) -> None:
+    for name in sorted({*config, *began} - {*MAY_CHANGE}):
+        if config.get(name) != began.get(name):
+            raise InputError(
+                f"{run / RECORD_FILE}: says {name} {config.get(name)}, but the run began with {began.get(name)}; put "
+                f"it back (only {' and '.join(MAY_CHANGE)} may change at a resume), or begin again with --force"
+            )
+
+
+def _generation_in(run: Path) -> object:
+    """What tells the run in a directory from any other; None where there is none."""
+    settled(run)
+    if not (run / RECORD_FILE).is_file():
+        return None
+    try:
+        record = json.loads((run / RECORD_FILE).read_text(encoding="utf-8"))
+        return record.get("generation", "older") if isinstance(record, dict) else "damaged"
+    except (OSError, ValueError, RecursionError):
+        return "damaged"  # whoever reads it says so
+
+
+def _check_whole(run: Path) -> None:
+    """Refuse a run whose field is not that of its record; a writer who is at it is waited for.
+
+    Raises:
+        InputError: they do not belong together.
+    """
+    for _ in range(LOOKS):
+        settled(run)
+        try:
+            digest = json.loads((run / RECORD_FILE).read_text(encoding="utf-8"))["files"][FIELD_FILE]
+            held = (run / FIELD_FILE).read_bytes()
+        except (OSError, ValueError, KeyError, TypeError, RecursionError):
+            return  # an older run, or a field without a record; what is damaged is said by who reads it
+        if _digest(held) == digest:
+            return
+        time.sleep(0.05)  # replaced between two looks
+    raise InputError(
+        f"{run}: {FIELD_FILE} is damaged, or not the one that {RECORD_FILE} was written with; bring back both, or "
+        "begin again with --force"
+    )
+
+
+def _digest(content: bytes | Path) -> str:
+    return hashlib.sha256(content if isinstance(content, bytes) else content.read_bytes()).hexdigest()
+
+
+def digest_of(arrays: Iterable[NDArray[Any]]) -> str:
+    """SHA-256 of what is in the arrays, one after the other: tells whether a resumed run sees the same data."""
+    digest = hashlib.sha256()
+    for array in arrays:
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
+
+
+def read_record(directory: Path) -> dict[str, Any]:
+    """Read ``run.json``.
+
+    Raises:
+        InputError: there is none, or it is damaged.
+    """
+    path = directory / RECORD_FILE
+    with damage(path, "fit again into a new directory"):
+        try:
+            record = json.loads(path.read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            raise InputError(f"{path}: no such file; expected a run of mplicits fit, evolve or reconstruct") from None
+        if not isinstance(record["config"], dict):
+            raise TypeError("config is not a mapping")
+    return record
+
+
+def state_bytes(tensors: Mapping[str, Tensor], progress: Mapping[str, Any]) -> bytes:
+    """What `load_state` reads: tensors, and JSON."""
+    plain = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in tensors.items()}
+    about = {**progress, "checksum": _checksum(plain, progress)}
+    return save(plain, metadata={"progress": json.dumps(about)})
+
+
+def save_state(
+    directory: Path, tensors: Mapping[str, Tensor], progress: Mapping[str, Any], *, name: str = STATE_FILE
+) -> None:
+    """Write the resume file, whole or not at all; ``progress`` is JSON."""
+    write_whole(directory / name, state_bytes(tensors, progress))
+
+
+def load_state(
+    directory: Path, *, name: str = STATE_FILE, tensors: bool = True
+) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Read what `save_state` wrote.
+
+    Args:
+        directory: holds it.
+        name: of the file.
+        tensors: whether to read them, too; there are none else.
+
+    Raises:
+        InputError: there is no resume file, or it is damaged.
+    """
+    path = directory / name
+    if not path.is_file():
+        raise InputError(f"{path}: no such file, so there is nothing to resume; leave out --resume and choose a new -o")
+    with damage(path, "begin again without --resume"), safe_open(path, framework="pt") as file:
+        progress = json.loads(file.metadata()["progress"])
+        checksum = progress.pop("checksum", None)  # older ones have none
+        held = {name: file.get_tensor(name) for name in file.keys()} if tensors else {}  # noqa: SIM118
+        if tensors and checksum not in (None, _checksum(held, progress)):
+            raise InputError(
+                f"{path}: damaged (its numbers are not those that were written); begin again without --resume"
+            )
+        return held, progress
+
+
+def _checksum(tensors: Mapping[str, Tensor], progress: Mapping[str, Any]) -> str:
+    return hashlib.sha256((checksum_of(tensors) + json.dumps(dict(progress))).encode()).hexdigest()

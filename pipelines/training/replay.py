@@ -1,0 +1,144 @@
+"""Steps of a training as CUDA graphs: all their operations in one launch, with nothing for the host to do in between.
+
+A training step of small networks is a thousand operations of microseconds, and the host takes longer to ask for them
+than a GPU to do them. Steps of one kind ask for the same ones: the first is done as usual, in fixed shapes, the second
+is recorded, and from then on it is replayed. What the host knows, random numbers, rates, comes through a `Supply`.
+"""
+
+from __future__ import annotations
+
+import threading
+from abc import ABC, abstractmethod
+from collections import OrderedDict
+from collections.abc import Callable, Hashable, Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ...neural_fields.backend.devices import Supply
+
+__all__ = ["Again", "CudaGraphs", "Recorder", "Replays", "Results", "Work"]
+
+# Recorded kinds of steps that are kept: each holds memory for all its intermediate results.
+KEPT = 12
+
+Results = Mapping[str, Tensor]
+Work = Callable[[], Results]
+
+
+class Recorder(ABC):
+    """How a work is recorded."""
+
+    @abstractmethod
+    def record(self, work: Work) -> tuple[Callable[[], None], Results]:
+        """A function that does ``work`` again, and where its results are found afterwards; nothing is done yet."""
+
+
+# PyTorch waits for the whole device before it records, which nobody else may be doing then.
+_recording = threading.Lock()
+
+
+class CudaGraphs(Recorder):
+    """CUDA's graphs; all of them share their memory, because one is replayed at a time."""
+
+    def __init__(self) -> None:
+        self._pool = torch.cuda.graph_pool_handle()
+
+    def record(self, work: Work) -> tuple[Callable[[], None], Results]:
+        """See `Recorder.record`."""
+        graph, stream = torch.cuda.CUDAGraph(), torch.cuda.current_stream()
+        # The default stream cannot be recorded; PyTorch has one for that. One of `run_streams` can.
+        own = None if stream == torch.cuda.default_stream() else stream
+        # Others, as one that draws progress, may talk to the device meanwhile.
+        with _recording, torch.cuda.graph(graph, pool=self._pool, stream=own, capture_error_mode="thread_local"):
+            results = work()
+        return graph.replay, results
+
+
+class Again(Recorder):
+    """The work itself, for devices without graphs: what is recorded and replayed can be compared with what is not."""
+
+    def record(self, work: Work) -> tuple[Callable[[], None], Results]:
+        """See `Recorder.record`."""
+        results: dict[str, Tensor] = {}
+
+        def replay() -> None:
+            results.update(work())
+
+        return replay, results
+
+
+@dataclass
+class _Kind:
+    """A kind of step.
+
+    Attributes:
+        supply: of what the host hands over.
+        replay: does it again; None until it is recorded.
+        results: of the last time.
+    """
+
+    supply: Supply
+    replay: Callable[[], None] | None
+    results: Results
+
+
+class Replays:
+    """Works by their kinds: done once, recorded, and then replayed.
+
+    Where recording fails, as it may with another version of PyTorch or no memory left, works are done as they are.
+
+    Args:
+        device: where they are done.
+        recorder: how they are recorded.
+
+    Attributes:
+        recorded: how many times something was.
+        refused: why nothing is recorded any more; empty as long as it is.
+    """
+
+    def __init__(self, device: torch.device, recorder: Recorder) -> None:
+        self.device, self.recorder, self.recorded, self.refused = device, recorder, 0, ""
+        self._kinds: OrderedDict[Hashable, _Kind] = OrderedDict()
+
+    def do(self, kind: Hashable, work: Work) -> Results:
+        """Do a work, as it is or by replay.
+
+        Args:
+            kind: works of the same kind ask for the same operations, on the same memory but for what they make.
+            work: made of operations of the device alone; what it needs of the host is `handed` to it. The results are
+                overwritten when a work of the kind is done again.
+        """
+        if self.refused:
+            return work()
+        known = self._kinds.get(kind)
+        if known is None:
+            return self._first(kind, work)
+        self._kinds.move_to_end(kind)
+        known.supply.renew()
+        if known.replay is None:
+
+            def supplied() -> Results:
+                with known.supply.supplied():
+                    return work()
+
+            try:
+                known.replay, known.results = self.recorder.record(supplied)
+            except RuntimeError as error:
+                self.refused = str(error).partition("\n")[0]
+                self._kinds.clear()
+                return work()
+            self.recorded += 1
+        known.replay()
+        return known.results
+
+    def _first(self, kind: Hashable, work: Work) -> Results:
+        """Do a work for the first time."""
+        supply = Supply(self.device)
+        with supply.noting():
+            results = work()
+        self._kinds[kind] = _Kind(supply, None, results)
+        if len(self._kinds) > KEPT:
+            self._kinds.popitem(last=False)
+        return results

@@ -1,0 +1,350 @@
+"""The loop that every training goes through: Adam on a schedule, reports, checkpoints, a time budget, a way to stop."""
+
+from __future__ import annotations
+
+import math
+import signal
+import threading
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+from pathlib import Path
+from types import FrameType
+from typing import Any, Generic, NamedTuple, TypeVar
+
+import torch
+from torch import Tensor, nn
+
+from ...neural_fields.backend.devices import precise
+from .report import Progress, Report, silent
+from .team import agreed, as_the_leader, average_gradients, is_alone
+
+__all__ = [
+    "Group",
+    "Interrupted",
+    "Objective",
+    "Progress",
+    "Report",
+    "StopFlag",
+    "Trainer",
+    "checkpoint_of",
+    "load_compiler",
+    "parameter_count",
+    "restore_frozen",
+    "seeded",
+    "shared_flag",
+    "stop_on_signals",
+    "warm_cosine",
+    "without_prefix",
+]
+
+Rate = Callable[[float], float]
+
+
+class Interrupted(Exception):  # noqa: N818  what happened is no error
+    """Training was asked to stop, and a usable checkpoint was written.
+
+    Attributes:
+        directory: the run directory, for ``--resume``; None if the fit had none.
+    """
+
+    def __init__(self, directory: Path | None) -> None:
+        super().__init__("interrupted" if directory is None else f"interrupted; checkpoint in {directory}")
+        self.directory = directory
+
+
+class StopFlag:
+    """Whether somebody has asked the training to stop after the step under way."""
+
+    def __init__(self) -> None:
+        self.requested = False
+
+
+@contextmanager
+def stop_on_signals() -> Iterator[StopFlag]:
+    """Turn the first Ctrl-C or SIGTERM into a flag that is read between two steps; a second one acts at once.
+
+    Signals belong to the main thread. Elsewhere it is the flag of `shared_flag`, or one that is never raised.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield _shared.get() or StopFlag()
+        return
+    flag = StopFlag()
+    signals = (signal.SIGINT, signal.SIGTERM)
+    before = {number: signal.getsignal(number) for number in signals}
+
+    def request(number: int, frame: FrameType | None) -> None:
+        flag.requested = True
+        for other in signals:
+            signal.signal(other, before[other])
+
+    for number in signals:
+        signal.signal(number, request)
+    try:
+        yield flag
+    finally:
+        for number in signals:
+            signal.signal(number, before[number])
+
+
+_shared: ContextVar[StopFlag | None] = ContextVar("shared", default=None)
+
+
+@contextmanager
+def shared_flag(flag: StopFlag) -> Iterator[None]:
+    """In a thread, inside this, `stop_on_signals` gives the flag of the main thread, which hears the signals."""
+    token = _shared.set(flag)
+    try:
+        yield
+    finally:
+        _shared.reset(token)
+
+
+def load_compiler() -> None:
+    """Load PyTorch's compiler, as its first optimiser does; it takes two seconds.
+
+    Loaded before the first stage, they count neither as a step's nor against the share of a level in a time budget.
+    """
+    torch.optim.Adam([torch.zeros(1, requires_grad=True)])
+
+
+def parameter_count(*modules: nn.Module) -> int:
+    """How many numbers of them are trained, all together."""
+    return sum(parameter.numel() for module in modules for parameter in module.parameters())
+
+
+_seeding = threading.RLock()
+
+
+@contextmanager
+def seeded(seed: int) -> Iterator[None]:
+    """A block whose random numbers follow from ``seed``, and leave no trace in the state of torch's.
+
+    That state belongs to all threads, so that they wait for each other.
+    """
+    with _seeding, torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        yield
+
+
+def warm_cosine(peak: float) -> Rate:
+    """Learning rates for a schedule done to a fraction in [0, 1]: a warm-up to ``peak``, then a cosine to 0.
+
+    Adam's first steps are as long as its later ones, whatever the gradient: warm up over 2 % of the schedule.
+    """
+    return lambda done: peak * min(1.0, (done + 0.001) / 0.02) * 0.5 * (1 + math.cos(math.pi * done))
+
+
+class Group(NamedTuple):
+    """Parameters that are trained at a rate of their own.
+
+    Attributes:
+        parameters: the tensors.
+        rate: learning rate for a schedule done to a fraction in [0, 1].
+    """
+
+    parameters: Sequence[nn.Parameter]
+    rate: Rate
+
+
+class Objective(ABC):
+    """What a `Trainer` minimises: a network, its loss, and the random numbers that draw the batches.
+
+    Attributes:
+        network: saved with the training, whole.
+        groups: those of its parameters that are trained.
+        generator: CPU generator that draws the batches.
+        kept: other tensors that later steps depend on, by name; saved with the training.
+    """
+
+    def __init__(
+        self,
+        network: nn.Module,
+        groups: Sequence[Group],
+        generator: torch.Generator,
+        kept: Mapping[str, Tensor] | None = None,
+    ) -> None:
+        self.network, self.groups, self.generator = network, groups, generator
+        self.kept = dict(kept or {})
+
+    @abstractmethod
+    def losses(self, step: int, done: float) -> tuple[dict[str, Tensor], Tensor]:
+        """The terms of one fresh batch, unweighted and by name, and their weighted sum.
+
+        Args:
+            step: steps done.
+            done: fraction of the schedule that is done, in [0, 1).
+        """
+
+
+O = TypeVar("O", bound=Objective)  # noqa: E741
+F = TypeVar("F", bound=nn.Module)
+
+
+class Trainer(Generic[O]):
+    """Minimises an objective with Adam; interruptible, resumable, and by several processes where there is a team.
+
+    Args:
+        objective: what is minimised.
+        stage: what progress displays call it.
+        steps: how many steps.
+        seconds: end the schedule after this long even if steps remain; None for no limit.
+        clip: largest norm of the whole gradient; None for any.
+        network_name: what the network is called in `state`.
+        betas: of Adam.
+        eps: of Adam.
+        amsgrad: of Adam: second moments never fall.
+    """
+
+    def __init__(
+        self,
+        objective: O,
+        *,
+        stage: str,
+        steps: int,
+        seconds: float | None = None,
+        clip: float | None = None,
+        network_name: str = "network",
+        betas: tuple[float, float] = (0.9, 0.99),
+        eps: float = 1e-8,
+        amsgrad: bool = False,
+    ) -> None:
+        self.objective, self.stage, self.steps, self.seconds, self.clip = objective, stage, steps, seconds, clip
+        groups = [list(group.parameters) for group in objective.groups]
+        self.trained = [parameter for group in groups for parameter in group]
+        self.adam = torch.optim.Adam(
+            [{"params": group} for group in groups], betas=betas, eps=eps, amsgrad=amsgrad, fused=True
+        )
+        self.step, self.elapsed = 0, 0.0
+        self.losses: dict[str, float] = {}
+        self._name = f"{network_name}."
+
+    @property
+    def fraction(self) -> float:
+        """How much of the schedule is done, by steps or by time, whichever is further."""
+        by_time = self.elapsed / self.seconds if self.seconds else 0.0
+        return min(1.0, max(self.step / self.steps if self.steps else 1.0, by_time))
+
+    @property
+    def ended_early(self) -> bool:
+        """Whether steps remain."""
+        return self.step < self.steps
+
+    @property
+    def progress(self) -> Progress:
+        """How far the training is, with the losses of the last report."""
+        return Progress(self.stage, self.step, self.steps, self.fraction, self.losses)
+
+    def run(
+        self,
+        flag: StopFlag | None = None,
+        *,
+        report: Report | None = None,
+        save: Callable[[], None] | None = None,
+        report_every: int = 20,
+        report_seconds: float = 1.0,
+        save_every: float = 20.0,
+    ) -> bool:
+        """Train until the schedule ends → True, or until somebody asks to stop → False.
+
+        Args:
+            flag: see `stop_on_signals`.
+            report: called at the beginning and, with fresh losses, every ``report_every`` steps, every
+                ``report_seconds``, and at the end.
+            save: called every ``save_every`` seconds, and before a stop.
+            report_every: steps between reports; reading the losses makes a GPU wait.
+            report_seconds: no more than about so many seconds between reports.
+            save_every: seconds between checkpoints.
+        """
+        flag, report, save = flag or StopFlag(), report or silent, save or (lambda: None)
+        start, saved = time.monotonic() - self.elapsed, time.monotonic()
+        told = saved
+        device = self.trained[0].device
+        as_the_leader(self.trained)
+        stop, self.elapsed = agreed(flag.requested, self.elapsed, device)
+        if self.fraction < 1:
+            report(self.progress)  # so that displays know when it began
+        while self.fraction < 1:
+            if stop:
+                save()
+                return False
+            terms = self._step()
+            # A team agrees here, so that its clocks tell all alike whether this was the last step.
+            stop, self.elapsed = agreed(flag.requested, time.monotonic() - start, device)
+            late = time.monotonic() - told > report_seconds
+            if self.step % report_every == 0 or self.fraction >= 1 or late:
+                read = torch.stack([term.to(precise(device)) for term in terms.values()]).tolist()  # one wait for all
+                self.losses = dict(zip(terms, read, strict=True))
+                report(self.progress)
+                told = time.monotonic()
+            if time.monotonic() - saved > save_every:
+                save()
+                saved = time.monotonic()
+            stop = stop or (is_alone() and flag.requested)
+        return True
+
+    def _step(self) -> dict[str, Tensor]:
+        done = self.fraction
+        for group, (_, rate) in zip(self.adam.param_groups, self.objective.groups, strict=True):
+            group["lr"] = rate(done)
+        terms, total = self.objective.losses(self.step, done)
+        self.descend(total)
+        self.step += 1
+        return {name: term.detach() for name, term in terms.items()}
+
+    def descend(self, total: Tensor) -> None:
+        """One step of Adam down the gradient of ``total``."""
+        self.adam.zero_grad(set_to_none=True)
+        total.backward()
+        average_gradients(self.trained)
+        if self.clip is not None:
+            nn.utils.clip_grad_norm_(self.trained, self.clip)
+        self.adam.step()
+
+    def state(self) -> dict[str, Tensor]:
+        """All that `restore` needs to continue as if nothing had happened."""
+        objective = self.objective
+        state = _prefixed(self._name, objective.network.state_dict())
+        for index, parameter in enumerate(objective.network.parameters()):
+            state |= _prefixed(f"adam.{index}.", self.adam.state.get(parameter, {}))
+        state["generator"] = objective.generator.get_state()
+        state["progress"] = torch.tensor([self.step, self.elapsed], dtype=torch.float64)
+        return state | objective.kept
+
+    def restore(self, state: Mapping[str, Tensor]) -> None:
+        """Continue from what `state` returned."""
+        objective = self.objective
+        objective.network.load_state_dict(without_prefix(self._name, state))
+        for index, parameter in enumerate(objective.network.parameters()):
+            # Adam counts its steps on the CPU, or beside the parameter where the kernel is fused.
+            moments = without_prefix(f"adam.{index}.", state)
+            if moments:
+                self.adam.state[parameter] = {name: tensor.to(parameter.device) for name, tensor in moments.items()}
+        objective.generator.set_state(state["generator"].cpu())
+        # What an older version did not keep begins anew.
+        objective.kept = {name: state.get(name, tensor).to(tensor) for name, tensor in objective.kept.items()}
+        self.step, self.elapsed = int(state["progress"][0]), float(state["progress"][1])
+
+
+def checkpoint_of(frozen: nn.Module | None, trainer: Trainer[Any] | None) -> dict[str, Tensor]:
+    """What a training level by level keeps: the levels that are done, and the one under way."""
+    tensors = {} if trainer is None else _prefixed("trainer.", trainer.state())
+    return tensors if frozen is None else tensors | _prefixed("frozen.", frozen.state_dict())
+
+
+def restore_frozen(field: F, tensors: Mapping[str, Tensor]) -> F:
+    """Give ``field`` the levels that are done, of what `checkpoint_of` kept; they are not trained any more."""
+    field.load_state_dict(without_prefix("frozen.", tensors))
+    return field.requires_grad_(False)
+
+
+def _prefixed(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The tensors, with ``prefix`` before every name."""
+    return {prefix + name: tensor for name, tensor in tensors.items()}
+
+
+def without_prefix(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Those whose names begin with ``prefix``, without it."""
+    return {name.removeprefix(prefix): tensor for name, tensor in tensors.items() if name.startswith(prefix)}

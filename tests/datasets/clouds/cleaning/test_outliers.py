@@ -1,0 +1,167 @@
+"""Strays and flipped normals, on surfaces where it is known which they are."""
+
+import numpy as np
+import pytest
+import torch
+from mplicits.datasets import (
+    PointCloud,
+    add_noise,
+    add_outliers,
+    prepare_cloud,
+    sample_sphere,
+    sample_surface,
+    sample_torus,
+)
+from mplicits.datasets.clouds.cleaning.outliers import agreement, inspect_points
+from mplicits.neural_fields import Box, Torus
+
+
+def inspected(cloud: PointCloud, **settings):
+    assert cloud.normals is not None
+    return inspect_points(cloud.points, cloud.normals.astype(np.float64), **settings)
+
+
+def thin_box(count: int = 8000, *, thickness: float = 0.02) -> PointCloud:
+    """A sheet with opposite normals close by."""
+    return sample_surface(Box(half_size=(0.7, 0.5, thickness / 2)), count, shell=0.002)
+
+
+CLEAN = {
+    "sphere": lambda: sample_sphere(6000),
+    "torus": lambda: sample_torus(8000),
+    "thin box": thin_box,
+    "box thinner than its points are spaced": lambda: thin_box(2000, thickness=0.01),
+    "noisy sphere": lambda: add_noise(sample_sphere(6000), 0.01),
+}
+
+
+@pytest.mark.parametrize("shape", CLEAN)
+def test_a_clean_cloud_loses_nothing(shape):
+    found = inspected(CLEAN[shape](), isolation=30.0)
+    assert not found.isolated.any()
+    assert not found.outliers.any()
+    # Thinner than the points are spaced, a box's two sides are told apart by hardly anything.
+    assert found.flipped.mean() <= (0.03 if "thinner" in shape else 0)
+
+
+@pytest.mark.parametrize("fraction", [0.001, 0.01, 0.05])
+@pytest.mark.parametrize("given", [True, False])
+def test_strays_are_found_but_for_those_that_touch_the_surface(fraction, given):
+    """Where the spacing of the points is 0.02, those further away than three times that."""
+    clean = sample_sphere(8000)
+    cloud = add_outliers(clean, fraction, seed=3)
+    assert cloud.normals is not None
+    normals = cloud.normals.astype(np.float64) if given else None
+    found = inspect_points(cloud.points, normals)
+    assert not found.outliers[:8000].any()
+    away = np.abs(np.linalg.norm(cloud.points[8000:], axis=1) - 0.5)
+    assert found.outliers[8000:][away > 0.06].mean() > (0.96 if given else 0.9)
+    assert found.outliers[8000:].mean() > (0.9 if given else 0.85)
+
+
+def test_strays_around_a_thin_box():
+    cloud = add_outliers(thin_box(), 0.05)
+    found = inspected(cloud)
+    assert not found.outliers[:8000].any()
+    assert found.outliers[8000:].mean() > 0.95
+
+
+def test_a_point_beside_a_plane_and_one_with_another_normal():
+    side = np.stack(np.meshgrid(np.arange(20.0), np.arange(20.0)), axis=-1).reshape(-1, 2)
+    points = np.column_stack((side, np.zeros(400)))
+    points = np.concatenate((points, [[9.4, 9.6, 1.5], [5.5, 5.5, 0.0]]))
+    normals = np.tile([0.0, 0, 1], (402, 1))
+    normals[401] = [1, 0, 0]
+    assert np.flatnonzero(inspect_points(points, normals).outliers).tolist() == [400, 401]
+
+
+def test_small_clusters_apart_are_dropped_unless_they_hold_together():
+    sphere = sample_sphere(20_000)
+    random = np.random.default_rng(0)
+    clump = random.normal(size=(15, 3)) * 0.004 + [0.9, 0, 0]
+    spray = random.normal(size=(15, 3))
+    ball = sample_sphere(15, radius=0.01, seed=5)
+    assert sphere.normals is not None
+    assert ball.normals is not None
+    points = np.concatenate((sphere.points, clump, ball.points - [0.9, 0, 0]))
+    normals = np.concatenate((sphere.normals, spray / np.linalg.norm(spray, axis=1, keepdims=True), ball.normals))
+    found = inspect_points(points, normals.astype(np.float64)).outliers
+    assert not found[:20_000].any()
+    assert found[20_000:20_015].sum() >= 13
+    assert not found[20_015:].any()
+
+
+@pytest.mark.parametrize("fraction", [0.05, 0.1, 0.2])
+@pytest.mark.parametrize("shape", ["sphere", "torus", "thin box"])
+def test_flipped_normals_are_found(shape, fraction):
+    cloud = CLEAN[shape]()
+    assert cloud.normals is not None
+    flipped = np.random.default_rng(1).random(len(cloud)) < fraction
+    found = inspect_points(cloud.points, np.where(flipped[:, None], -cloud.normals, cloud.normals).astype(np.float64))
+    assert found.outliers.mean() < 0.002
+    assert found.flipped[flipped].mean() > (0.9 if fraction <= 0.1 else 0.7)
+    assert (found.flipped & ~flipped).sum() <= 2
+
+
+def test_two_sheets_in_one_place_are_left_alone():
+    """Opposite normals at every place: nobody is right."""
+    random = np.random.default_rng(0)
+    points = np.column_stack((random.uniform(0, 1, (4000, 2)), np.zeros(4000)))
+    normals = np.zeros((4000, 3))
+    normals[:, 2] = np.where(np.arange(4000) % 2, 1.0, -1.0)
+    found = inspect_points(points, normals)
+    assert found.flipped.mean() < 0.05
+    assert not found.outliers.any()
+
+
+def test_a_sparser_part_is_not_isolated_but_a_stray_is():
+    """Fifty times as sparse as the rest, on its own: with company, it stays."""
+    dense, sparse = sample_sphere(60_000, radius=0.1), sample_sphere(600, radius=0.5)
+    assert dense.normals is not None
+    assert sparse.normals is not None
+    points = np.concatenate((dense.points, sparse.points + np.array([2.0, 0, 0]), [[0.0, 6.0, 0.0]]))
+    normals = np.concatenate((dense.normals, sparse.normals, [[0.0, 0.6, 0.8]])).astype(np.float64)
+    found = inspect_points(points, normals, isolation=30.0)
+    assert np.flatnonzero(found.isolated).tolist() == [60_600]
+    assert not found.outliers.any()
+
+
+def test_agreement_of_few_points():
+    cloud = sample_torus(4000)
+    assert cloud.normals is not None
+    normals = cloud.normals.astype(np.float64)
+    normals[7] *= -1
+    support, means = agreement(cloud.points, normals, np.array([7, 100]))
+    assert support[0] < 0.1 < 0.9 < support[1]
+    assert (means[0] * normals[7]).sum() < -0.9
+    few, _ = agreement(cloud.points[:10], normals[:10], np.arange(10))
+    assert (few == 1).all()
+
+
+def test_prepared_clouds_count_what_was_done():
+    torus = Torus(major=0.5, minor=0.2)
+    clean = sample_torus(8000)
+    cloud = add_outliers(clean, 0.02, seed=1)
+    assert cloud.normals is not None
+    normals = cloud.normals.copy()
+    normals[:800] *= -1
+    prepared = prepare_cloud(PointCloud(cloud.points, normals), drop_outliers=True, turn_normals=True)
+    report = prepared.report
+    assert report.dropped_isolated + report.dropped_outliers > 0.9 * 160
+    assert 760 < report.turned_normals < 810
+    assert f"{report.dropped_outliers} outliers" in report.summary()
+    assert f"{report.turned_normals} normals turned round" in report.summary()
+    places = prepared.similarity.to_input(prepared.points)
+    assert prepared.similarity.scale == pytest.approx(np.linalg.norm([0.7, 0.0]), rel=0.01)  # that of the torus alone
+    gradient = torch.nn.functional.normalize(torus.jet(torch.from_numpy(places)).gradient, dim=1).numpy()
+    assert ((gradient * prepared.normals).sum(axis=1) > 0).mean() > 0.995
+    kept = prepare_cloud(PointCloud(cloud.points, normals), normals="file", turn_normals=True, isolation=None)
+    assert kept.report.turned_normals == kept.report.dropped_outliers == 0
+
+
+@pytest.mark.parametrize("count", [4, 10, 30])
+def test_tiny_clouds(count):
+    cloud = sample_sphere(count)
+    found = inspected(cloud, isolation=30.0)
+    assert not found.outliers.any()
+    assert len(found.flipped) == count

@@ -1,0 +1,363 @@
+"""``read_cloud``: every format gives back what was written, and bad files give one line."""
+
+import re
+import struct
+
+import numpy as np
+import pytest
+import trimesh
+from mplicits.datasets import PointCloud, read_cloud, write_cloud_ply
+from mplicits.datasets.clouds.readers.reading import open_stream
+from mplicits.neural_fields import InputError
+
+COUNT = 12
+
+
+@pytest.fixture
+def cloud():
+    random = np.random.default_rng(3)
+    normals = random.normal(size=(COUNT, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    points = random.normal(size=(COUNT, 3)) + np.array((431234.5678, 5412345.6789, 250.0))
+    return PointCloud(points, normals, random.integers(0, 256, (COUNT, 3)) / np.float32(255), "made up")
+
+
+def same(read, expected, *, points=0.0, normals=1e-7, colors=1e-6):
+    assert np.abs(read.points - expected.points).max() <= points
+    assert (read.normals is None) == (expected.normals is None)
+    assert (read.colors is None) == (expected.colors is None)
+    if expected.normals is not None:
+        assert np.abs(read.normals - expected.normals).max() <= normals
+    if expected.colors is not None:
+        assert np.abs(read.colors - expected.colors).max() <= colors
+
+
+def tetrahedron():
+    vertices = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+    return vertices, faces
+
+
+def octasphere():
+    """A sphere: mesh normals of its vertices are close to the vertices themselves, and outward."""
+    mesh = trimesh.creation.icosphere(subdivisions=2)
+    return np.asarray(mesh.vertices), np.asarray(mesh.faces)
+
+
+def test_written_ply_is_read_back_exactly(tmp_path, cloud):
+    path = tmp_path / "cloud.ply"
+    write_cloud_ply(path, cloud)
+    same(read_cloud(path), cloud)
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian", "binary_big_endian"])
+@pytest.mark.parametrize("kind", ["float", "double"])
+@pytest.mark.parametrize("faces", [False, True])
+def test_ply_with_lists_and_elements_around_the_vertices(tmp_path, cloud, encoding, kind, faces):
+    """Ragged list elements before, mixed polygons after, a list inside the vertex, shuffled properties."""
+    order = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}[encoding]
+    points = cloud.points - cloud.points.mean(axis=0)
+    colors = np.rint(cloud.colors * 255).astype(int)
+    header = ["ply", f"format {encoding} 1.0", "comment x y z", "element strip 2", "property list uchar int ids"]
+    header += [f"element vertex {COUNT}", f"property {kind} z", "property uchar red", "property uchar green"]
+    header += ["property uchar blue", f"property {kind} x", f"property {kind} y", "property list uchar short tags"]
+    header += ["property float nx", "property float ny", "property float nz"]
+    rows = [("BII", 2, 7, 8), ("BI", 1, 9)]
+    letter = kind[0]
+    for p, c, n in zip(points, colors, cloud.normals, strict=True):
+        rows.append((f"{letter}BBB{letter}{letter}Bhh3f", p[2], *c, p[0], p[1], 2, -5, 6, *n))
+    if faces:
+        header += ["element face 2", "property list uchar int vertex_indices"]
+        rows += [("B3i", 3, 0, 1, 2), ("B4i", 4, 0, 1, 2, 3)]
+    head = "\n".join([*header, "end_header\n"]).encode()
+    if encoding == "ascii":
+        body = "\n".join(" ".join(repr(float(v)) if isinstance(v, float) else str(v) for v in r[1:]) for r in rows)
+        body = body.encode()
+    else:
+        body = b"".join(struct.pack(order + row[0], *row[1:]) for row in rows)
+    path = tmp_path / "cloud.ply"
+    path.write_bytes(head + body)
+    expected = PointCloud(points, cloud.normals, cloud.colors)
+    same(read_cloud(path), expected, points=0 if kind == "double" else 1e-6)
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary"])
+def test_ply_mesh_without_normals_becomes_an_oriented_cloud(tmp_path, encoding):
+    vertices, faces = octasphere()
+    path = tmp_path / "sphere.ply"
+    path.write_bytes(trimesh.Trimesh(vertices, faces, process=False).export(file_type="ply", encoding=encoding))
+    read = read_cloud(path)
+    assert read.normals_source == "mesh"
+    assert len(read) == len(vertices)
+    assert (read.normals * vertices).sum(axis=1).min() > 0.99
+
+
+def test_polygons_are_fans_of_triangles(tmp_path):
+    """A unit square and a triangle above it: the quad counts with its whole area."""
+    corners = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), *((i, 5, 0) for i in range(8))]
+    text = "ply\nformat ascii 1.0\nelement vertex 12\nproperty float x\nproperty float y\nproperty float z\n"
+    text += "element face 2\nproperty list uchar int vertex_index\nend_header\n"
+    text += "\n".join(" ".join(map(str, c)) for c in corners) + "\n4 0 1 2 3\n3 4 5 0\n"
+    path = tmp_path / "quad.ply"
+    path.write_text(text)
+    normals = read_cloud(path).normals
+    assert np.allclose(normals[1:4], (0, 0, 1))
+    assert np.allclose(normals[6:], 0)
+
+
+def test_stl_corners_are_merged(tmp_path):
+    vertices, faces = octasphere()
+    path = tmp_path / "sphere.stl"
+    path.write_bytes(trimesh.Trimesh(vertices, faces, process=False).export(file_type="stl"))
+    read = read_cloud(path)
+    assert len(read) == len(vertices)
+    assert (read.normals * read.points).sum(axis=1).min() > 0.99
+
+
+def test_off_with_and_without_faces(tmp_path):
+    vertices, faces = octasphere()
+    path = tmp_path / "sphere.off"
+    path.write_text(trimesh.Trimesh(vertices, faces, process=False).export(file_type="off", digits=17))
+    read = read_cloud(path)
+    assert np.abs(read.points - vertices).max() < 1e-12
+    assert (read.normals * vertices).sum(axis=1).min() > 0.99
+    path.write_text(f"OFF\n{len(vertices)} 0 0\n" + "\n".join(" ".join(map(repr, map(float, v))) for v in vertices))
+    assert read_cloud(path).normals is None
+
+
+def test_obj_normals_seams_and_colors(tmp_path, cloud):
+    """A vertex used with two normals gets their sum; indices may count back; polygons may mix."""
+    lines = [f"v {' '.join(map(repr, map(float, [*p, *c])))}" for p, c in zip(cloud.points, cloud.colors, strict=True)]
+    lines += ["vt 0 0", "vn 0 0 1", "vn 1 0 0", "f 1/1/1 2/1/1 3/1/1 4/1/1", "f -12/1/2 5/1/2 6/1/2 # last"]
+    path = tmp_path / "mesh.obj"
+    path.write_text("mtllib none.mtl\n" + "\n".join(lines) + "\n")
+    read = read_cloud(path)
+    assert np.array_equal(read.points, cloud.points)
+    assert np.abs(read.colors - cloud.colors).max() < 1e-6
+    assert read.normals[0].tolist() == [1, 0, 1]
+    assert read.normals[1].tolist() == [0, 0, 1]
+    assert read.normals[4].tolist() == [1, 0, 0]
+    assert read.normals[7].tolist() == [0, 0, 0]
+
+
+def test_obj_mesh_without_normals(tmp_path):
+    vertices, faces = octasphere()
+    lines = ["v " + " ".join(map(repr, map(float, v))) for v in vertices]
+    lines += [f"f {a + 1}/1 {b + 1}/1 {c + 1}/1" for a, b, c in faces]
+    path = tmp_path / "sphere.obj"
+    path.write_text("\n".join(lines))
+    read = read_cloud(path)
+    assert read.normals_source == "mesh"
+    assert (read.normals * vertices).sum(axis=1).min() > 0.99
+
+
+@pytest.mark.parametrize("separator", [" ", ",", ", ", ";", "\t", "   "])
+@pytest.mark.parametrize("columns", [3, 6, 9])
+@pytest.mark.parametrize("header", ["", "# a comment\n\n", "X Y Z and more\n"])
+def test_text_tables(tmp_path, cloud, separator, columns, header):
+    table = np.concatenate((cloud.points, cloud.normals.astype(float), np.rint(cloud.colors * 255)), axis=1)[
+        :, :columns
+    ]
+    path = tmp_path / "cloud.txt"
+    path.write_text(header + "\n".join(separator.join(map(repr, map(float, row))) for row in table) + "\n\n# end\n")
+    same(
+        read_cloud(path),
+        PointCloud(cloud.points, cloud.normals if columns > 3 else None, cloud.colors if columns > 6 else None),
+    )
+
+
+def test_six_columns_of_colors_are_told_from_normals(tmp_path, cloud):
+    path = tmp_path / "cloud.xyz"
+    np.savetxt(path, np.concatenate((cloud.points, np.rint(cloud.colors * 255)), axis=1), fmt="%.17g")
+    same(read_cloud(path), PointCloud(cloud.points, None, cloud.colors))
+
+
+def test_named_columns_may_come_in_any_order(tmp_path, cloud):
+    path = tmp_path / "cloud.csv"
+    table = np.concatenate((np.rint(cloud.colors * 255), np.ones((COUNT, 1)), cloud.points[:, ::-1]), axis=1)
+    header = "red,green,blue,intensity,z,y,x"
+    np.savetxt(path, table, fmt="%.17g", delimiter=",", header=header, comments="")
+    same(read_cloud(path), PointCloud(cloud.points, None, cloud.colors))
+
+
+def test_decimal_commas_and_a_count_in_the_first_line(tmp_path, cloud):
+    path = tmp_path / "cloud.txt"
+    rows = "\n".join(";".join(map(repr, map(float, row))) for row in cloud.points)
+    path.write_text(f"{COUNT}\n" + rows.replace(".", ","))
+    same(read_cloud(path), PointCloud(cloud.points))
+
+
+def test_npy_and_npz(tmp_path, cloud):
+    np.save(tmp_path / "a.npy", np.concatenate((cloud.points, cloud.normals), axis=1))
+    same(read_cloud(tmp_path / "a.npy"), PointCloud(cloud.points, cloud.normals))
+    colors = np.rint(cloud.colors * 255).astype(np.uint8)
+    np.savez(tmp_path / "b.npz", points=cloud.points, normals=cloud.normals, colors=colors, scan=np.zeros(3))
+    same(read_cloud(tmp_path / "b.npz"), cloud)
+    for kind, error in ((np.int16, 1 / 32767), (np.int8, 1 / 127)):
+        stored = np.rint(cloud.normals * np.iinfo(kind).max).astype(kind)
+        np.savez(tmp_path / "c.npz", points=cloud.points, normals=stored)
+        same(read_cloud(tmp_path / "c.npz"), PointCloud(cloud.points, cloud.normals), normals=error)
+
+
+@pytest.mark.parametrize("extension", ["las", "laz"])
+def test_las(tmp_path, cloud, extension):
+    laspy = pytest.importorskip("laspy")
+    header = laspy.LasHeader(point_format=3, version="1.2")
+    header.scales, header.offsets = [1e-4] * 3, cloud.points.min(axis=0)
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = cloud.points.T
+    las.red, las.green, las.blue = np.rint(cloud.colors.T * 65535).astype(np.uint16)
+    path = tmp_path / f"cloud.{extension}"
+    las.write(path)
+    same(read_cloud(path), PointCloud(cloud.points, None, cloud.colors), points=1e-4, colors=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("at", "form", "value", "said"),
+    [
+        (94, "<H", 60_000, "byte 94: a header of 60000 bytes"),
+        (96, "<I", 2**31, "byte 94: a header of 375 bytes before points at 2147483648"),
+        (100, "<I", 2**30, "byte 100: 1073741824 records in 0 bytes"),
+        (105, "<H", 3, "byte 105: points of 3 bytes"),
+        (235, "<Q", 2**60, "byte 243: 1 records after the points, from byte 1152921504606846976"),
+        (247, "<Q", 2**40, "1099511627776 points in 1200 bytes"),
+    ],
+)
+def test_las_headers_that_claim_more_than_the_file_holds(tmp_path, at, form, value, said):
+    laspy = pytest.importorskip("laspy")
+    las = laspy.LasData(laspy.LasHeader(point_format=6, version="1.4"))
+    las.x = las.y = las.z = np.arange(40.0)
+    path = tmp_path / "cloud.las"
+    las.write(path)
+    data = bytearray(path.read_bytes())
+    assert struct.unpack_from("<HI", data, 94) == (375, 375)
+    struct.pack_into("<I", data, 243, 1 if at == 235 else 0)
+    struct.pack_into(form, data, at, value)
+    path.write_bytes(data)
+    for read in (read_cloud, open_stream):
+        with pytest.raises(InputError, match=re.escape(said)):
+            read(path)
+
+
+def test_a_dense_laz_is_no_wrong_claim(tmp_path):
+    laspy = pytest.importorskip("laspy")
+    las = laspy.LasData(laspy.LasHeader(point_format=3, version="1.2"))
+    x, y = (axis.ravel() for axis in np.mgrid[:300, :300])
+    las.x, las.y, las.z = x, y, np.zeros(len(x))
+    las.write(tmp_path / "plane.laz")
+    assert len(read_cloud(tmp_path / "plane.laz")) == 90_000
+
+
+def test_missing_laspy_names_the_extra(tmp_path, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "laspy", None)
+    path = tmp_path / "cloud.las"
+    path.write_bytes(b"LASF")
+    with pytest.raises(InputError, match=r"pip install mplicits\[las\]"):
+        read_cloud(path)
+
+
+HEADER = b"ply\nformat binary_little_endian 1.0\nelement vertex 20\n"
+XYZ = b"property float x\nproperty float y\nproperty float z\n"
+GRID = "\n".join(f"{i} {i * i} 1" for i in range(20))
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("a.plx", b"x", r"unknown extension '\.plx'; did you mean \.ply\?"),
+        ("a.ply", b"", "the file is empty"),
+        ("a.ply", b"solid thing", "not a PLY file"),
+        ("a.ply", b"ply\nformat ascii 1.0\n", "end_header is missing"),
+        ("a.ply", HEADER + XYZ + b"end_header\n" + bytes(100), "vertex: the file ends before its 20 rows"),
+        ("a.ply", HEADER + XYZ.replace(b"x", b"u") + b"end_header\n" + bytes(240), "vertex: property x is missing"),
+        ("a.ply", b"ply\nformat ascii 1.0\nelement vertex many\nend_header\n", "header line 3: 'element vertex many'"),
+        ("a.ply", b"ply\nelement vertex 1\n" + XYZ + b"end_header\n", "format: missing"),
+        (
+            "a.ply",
+            b"ply\nformat ascii 1.0\nelement face 0\nend_header\n",
+            "vertex: the header declares no such element",
+        ),
+        (
+            "a.ply",
+            b"ply\nformat ascii 1.0\nelement vertex 1\n" + XYZ + b"end_header\n1 2 oops",
+            "'oops' is not a number",
+        ),
+        ("a.ply", b"ply\nformat ascii 1.0\nelement vertex 0\n" + XYZ + b"end_header\n", "points: none"),
+        ("a.obj", b"hello", "no vertex lines"),
+        ("a.obj", b"v 1 2 3\nv 1 2\n", "vertex 2: 2 columns"),
+        ("a.obj", b"v 1 2 3\nf 1 2 3\n", "names a v beyond the 1"),
+        ("a.off", b"garbage", "not a readable OFF"),
+        ("a.stl", b"garbage", "no vertices|not a readable"),
+        ("a.xyz", b"1 2 3\n4 5 6\n7 8\n", "line 3: 2 columns where there were 3"),
+        ("a.xyz", GRID.replace("25 1", "25 one").encode(), "line 6: 'one' is not a number"),
+        ("a.xyz", b"1 2 3 4\n5 6 7 8\n", "line 1: 4 columns; expected 3"),
+        ("a.xyz", b"\x00\x01\x02", "binary data"),
+        ("a.xyz", b"# only\n\n# comments\n", "only comments"),
+        ("a.xyz", b"x y z\n", "no numbers"),
+        ("a.xyz", b"nan nan nan\n" * 20, "none with finite coordinates among 20"),
+        ("a.xyz", b"1 2 3\n" * 20, "all 20 coincide"),
+        ("a.xyz", b"1 2 3\n4 5 6\n", "points: 2 with finite coordinates; at least 10"),
+        ("a.npy", b"not numpy at all", "damaged or not a NumPy file"),
+        ("a.npz", b"PK\x03\x04 broken", "damaged or not a NumPy file"),
+        ("a.las", b"garbage", "not a readable LAS|pip install"),
+    ],
+)
+def test_bad_files_give_one_line(tmp_path, name, content, message):
+    path = tmp_path / name
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=message) as caught:
+        read_cloud(path)
+    assert "\n" not in str(caught.value)
+    assert str(path) in str(caught.value)
+
+
+def test_missing_files_and_directories(tmp_path):
+    with pytest.raises(InputError, match="no such file"):
+        read_cloud(tmp_path / "a.ply")
+    with pytest.raises(InputError, match="is a directory"):
+        read_cloud(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"xyz": np.zeros((20, 3))}, "points: no such array"),
+        ({"points": np.zeros((20, 2))}, r"points: shape \(20, 2\)"),
+        ({"points": np.zeros((20, 3)), "normals": np.zeros((19, 3))}, r"normals: shape \(19, 3\); expected \(20, 3\)"),
+        ({"points": np.full((20, 3), None)}, "points: holds Python objects"),
+        ({"points": np.full((20, 3), "a")}, "points: type <U1; expected numbers"),
+    ],
+)
+def test_bad_npz(tmp_path, arrays, message):
+    np.savez(tmp_path / "a.npz", **arrays)
+    with pytest.raises(InputError, match=message):
+        read_cloud(tmp_path / "a.npz")
+
+
+def test_bad_npy(tmp_path):
+    np.save(tmp_path / "a.npy", np.full((20, 3), None), allow_pickle=True)
+    with pytest.raises(InputError, match="Python objects"):
+        read_cloud(tmp_path / "a.npy")
+    np.save(tmp_path / "b.npy", np.zeros((20, 4)))
+    with pytest.raises(InputError, match=r"shape \(20, 4\): 4 columns"):
+        read_cloud(tmp_path / "b.npy")
+
+
+def test_failed_write_leaves_nothing(tmp_path, cloud):
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match="cannot be written"):
+        write_cloud_ply(tmp_path / "file" / "cloud.ply", cloud)
+    (tmp_path / "taken").mkdir()
+    with pytest.raises(InputError, match="cannot be written"):
+        write_cloud_ply(tmp_path / "taken", cloud)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "taken"]
+
+
+def test_point_cloud_checks_its_shapes():
+    with pytest.raises(ValueError, match=r"points has shape \(3,\)"):
+        PointCloud(np.zeros(3))
+    with pytest.raises(ValueError, match="normals has shape"):
+        PointCloud(np.zeros((4, 3)), np.zeros((3, 3)))
+    with pytest.raises(ValueError, match="colors: expected"):
+        PointCloud(np.zeros((4, 3)), None, np.full((4, 3), 2.0))

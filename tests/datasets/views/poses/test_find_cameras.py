@@ -1,0 +1,190 @@
+"""Cameras found by COLMAP against those that drew the pictures; what can be read, continued and refused."""
+
+import math
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from mplicits.datasets import look_at, read_cameras
+from mplicits.datasets.synthetic.scenes import Scene, render_view
+from mplicits.datasets.views.poses import colmap_process
+from mplicits.datasets.views.poses import find_cameras as module
+from mplicits.datasets.views.poses.find_cameras import FoundCameras, find_cameras
+from mplicits.neural_fields import InputError, Sphere
+
+VIEWS, SIZE, DISTANCE = 6, 240, 2.4
+FOV = math.degrees(2 * math.atan(0.5 / 1.2))  # of a lens as COLMAP expects it: six small pictures say little of theirs
+SPECKLES = np.random.default_rng(0).uniform(0, 1, (64, 64, 64, 3))
+
+
+def speckled(points: np.ndarray) -> np.ndarray:
+    return SPECKLES[tuple(np.floor((points + 2) * 14).astype(int).T % 64)]
+
+
+def eye(number: int) -> tuple[float, float, float]:
+    angle = math.radians(9 * number)
+    return DISTANCE * math.cos(angle), 0.6 * math.sin(2 * angle), DISTANCE * math.sin(angle)
+
+
+def write(path: Path, picture: np.ndarray) -> None:
+    path.write_bytes(cv2.imencode(".png", (picture[..., ::-1] * 255).round().astype(np.uint8))[1].tobytes())
+
+
+@pytest.fixture(scope="module")
+def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("photographs")
+    scene = Scene("speckled", Sphere(radius=0.8), speckled, 0.85)
+    for number in range(VIEWS):
+        camera = look_at(eye(number), (0, 0, 0), fov=FOV, width=SIZE, height=SIZE)
+        write(folder / f"{number}.png", render_view(scene, camera, samples=2)[0])
+    return folder
+
+
+@pytest.fixture
+def solved(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
+    """COLMAP's place is taken by somebody who places all but the last photograph, and notes what was asked."""
+    asked: list[dict[str, Any]] = []
+
+    def solve(project: Path, job: Any, *, photographs: int, pairs: int, report: Any) -> dict[str, Any]:
+        asked.append({"project": project, "count": photographs, "pairs": pairs, **job.keywords})
+        names = sorted(file.name for file in (project / "images").iterdir())
+        return {"names": names[:-1], "points": 7, "error": 0.25}
+
+    monkeypatch.setattr(module, "solve", solve)
+    monkeypatch.setattr(module, "check_colmap", lambda: None)
+    return asked
+
+
+def test_found_cameras_stand_where_the_pictures_were_drawn_from(photographs: Path, tmp_path: Path) -> None:
+    pytest.importorskip("pycolmap")
+    stages: list[tuple[str, int, int]] = []
+    found = find_cameras(photographs, tmp_path / "project", report=lambda *said: stages.append(said))
+    assert (found.photographs, found.left_out) == (VIEWS, ())
+    assert found.error < 1  # half a pixel's rounding in each direction is 0.4 in the mean
+    assert {stage for stage, _, _ in stages} <= {colmap_process.FEATURES, colmap_process.MATCHING, module.PLACING}
+    assert all(0 <= done <= total for _, done, total in stages)
+    cameras = dict(read_cameras(tmp_path / "project"))
+    ours = np.array([cameras[f"{number}.png"].eye.numpy() for number in range(VIEWS)])
+    truth = np.array([eye(number) for number in range(VIEWS)])
+    # The similarity between them by Procrustes. A pixel is 0.5 % of the distance; features are found to one or so.
+    a, b = ours - ours.mean(axis=0), truth - truth.mean(axis=0)
+    u, sizes, v = np.linalg.svd(a.T @ b)
+    assert np.linalg.det(u @ v) > 0  # not mirrored
+    off = sizes.sum() / (a * a).sum() * a @ u @ v - b
+    assert np.abs(off).max() < 0.03 * DISTANCE
+    assert len({camera.width for camera in cameras.values()}) == 1
+
+
+@pytest.mark.slow
+def test_nothing_to_see_is_said(tmp_path: Path) -> None:
+    pytest.importorskip("pycolmap")
+    (tmp_path / "grey").mkdir()
+    for number in range(3):
+        write(tmp_path / "grey" / f"{number}.png", np.full((40, 60, 3), 0.5))
+    with pytest.raises(InputError, match="no photographs could be placed"):
+        find_cameras(tmp_path / "grey", tmp_path / "project")
+
+
+def test_what_is_found_is_kept_and_not_sought_again(
+    photographs: Path, tmp_path: Path, solved: list[dict[str, Any]]
+) -> None:
+    first = find_cameras(photographs, tmp_path / "project")
+    assert first == FoundCameras(tmp_path / "project", VIEWS, (f"{VIEWS - 1}.png",), 7, 0.25)
+    assert find_cameras(photographs, tmp_path / "project") == first
+    assert [(asked["count"], asked["one"], asked["film"]) for asked in solved] == [(VIEWS, True, False)]
+    with pytest.raises(InputError, match="of other settings"):
+        find_cameras(photographs, tmp_path / "project", lens="each")
+    assert len(solved) == 1
+
+
+def test_an_interrupted_search_goes_on(
+    photographs: Path, tmp_path: Path, solved: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "solve", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            find_cameras(photographs, tmp_path / "project")
+    assert find_cameras(photographs, tmp_path / "project").photographs == VIEWS
+    assert len(solved) == 1
+
+
+def interrupted(*_: Any, **__: Any) -> None:
+    raise KeyboardInterrupt
+
+
+def test_photographs_of_two_sizes_have_lenses_of_their_own(
+    photographs: Path, tmp_path: Path, solved: list[dict[str, Any]]
+) -> None:
+    mixed = tmp_path / "mixed"
+    mixed.mkdir()
+    for number in range(3):
+        write(mixed / f"{number}.png", np.zeros((20, 20 + number // 2, 3)))
+    find_cameras(mixed, tmp_path / "a")
+    find_cameras(mixed, tmp_path / "b", lens="one")
+    assert [asked["one"] for asked in solved] == [False, True]
+
+
+def test_the_sharpest_frames_of_a_film_are_taken(tmp_path: Path, solved: list[dict[str, Any]]) -> None:
+    film, frames, size = tmp_path / "film.avi", 12, 64
+    random = np.random.default_rng(1)
+    writer = cv2.VideoWriter(str(film), cv2.VideoWriter.fourcc(*"MJPG"), 10, (size, size))
+    if not writer.isOpened():
+        pytest.skip("this OpenCV writes no films")
+    sharp = (1, 4, 11)  # one in each third
+    for index in range(frames):
+        noise = random.integers(0, 256, (size, size, 1), np.uint8).repeat(3, axis=2)
+        frame = noise if index in sharp else cv2.GaussianBlur(noise, (0, 0), 4)
+        frame[:8, :8] = 20 * index  # its number, in brightness
+        writer.write(frame)
+    writer.release()
+    found = find_cameras(film, tmp_path / "project", frames=3)
+    pictures = sorted((tmp_path / "project" / "images").iterdir())
+    numbers = [round(cv2.imdecode(np.fromfile(file, np.uint8), 0)[2:6, 2:6].mean() / 20) for file in pictures]
+    assert tuple(numbers) == sharp
+    assert found.photographs == 3
+    assert (solved[0]["one"], solved[0]["film"]) == (True, True)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda path: None, "no such file or folder"),
+        (lambda path: path.mkdir(), "0 photographs"),
+        (lambda path: path.write_bytes(b"x"), "neither a folder of photographs nor a film"),
+    ],
+)
+def test_sources_that_are_none(tmp_path: Path, solved: Any, make: Callable[[Path], None], message: str) -> None:
+    make(tmp_path / "source")
+    with pytest.raises(InputError, match=message):
+        find_cameras(tmp_path / "source", tmp_path / "project")
+    assert not (tmp_path / "project").exists()
+
+
+def test_a_film_that_is_none(tmp_path: Path, solved: Any) -> None:
+    (tmp_path / "film.mp4").write_bytes(b"not a film")
+    with pytest.raises(InputError, match=r"film\.mp4: not a film that can be read"):
+        find_cameras(tmp_path / "film.mp4", tmp_path / "project")
+
+
+def test_folders_of_others_are_left_alone(photographs: Path, tmp_path: Path, solved: Any) -> None:
+    (tmp_path / "mine.txt").write_text("mine")
+    with pytest.raises(InputError, match="is not empty"):
+        find_cameras(photographs, tmp_path)
+    with pytest.raises(InputError, match="is a file"):
+        find_cameras(photographs, tmp_path / "mine.txt")
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "cameras.json").write_text("[")
+    with pytest.raises(InputError, match=r"cameras\.json: damaged"):
+        find_cameras(photographs, tmp_path / "mine")
+
+
+def test_without_pycolmap_the_extra_is_named(
+    photographs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    with pytest.raises(InputError, match=r"pip install 'mplicits\[poses\]'"):
+        find_cameras(photographs, tmp_path / "project")

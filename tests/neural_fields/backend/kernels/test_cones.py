@@ -1,0 +1,67 @@
+"""Cones by one launch for each size of tiles, against PyTorch's."""
+
+from collections.abc import Callable
+from typing import Any
+
+import mplicits.neural_fields.backend.kernels.cones as fused
+import pytest
+import torch
+from mplicits.neural_fields import MultiscaleSDF, Siren, cone_starts, sphere_trace
+from mplicits.neural_fields.networks.sphere_init import solve_sphere
+from torch import Tensor
+from torch.nn.functional import normalize
+
+
+@pytest.fixture
+def counted(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """How many cones were marched each time."""
+    counts: list[int] = []
+    original: Callable[..., Any] = fused.march_cones
+
+    def call(network: Any, cones: Any, *arguments: Any) -> Any:
+        counts.append(len(cones[1]))
+        return original(network, cones, *arguments)
+
+    monkeypatch.setattr(fused, "march_cones", call)
+    return counts
+
+
+def picture(place: torch.device, size: int = 16) -> tuple[Tensor, Tensor]:
+    """A pinhole's rays, of which those at the edge miss the ball of the surface."""
+    across = torch.linspace(-0.6, 0.6, size)
+    rows, columns = torch.meshgrid(across, across, indexing="ij")
+    directions = normalize(torch.stack((columns, rows, torch.ones_like(rows)), dim=-1), dim=-1)
+    return torch.tensor([0.1, 0.0, -2.2]).to(place), directions.to(place)
+
+
+def test_cones_end_where_pytorchs_do(place: torch.device, counted: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those of a field with a band keep out of it, and of the surface of the level behind it."""
+    base = Siren(16, 2, omega=8.0)
+    solve_sphere(base, radius=0.5)
+    field = MultiscaleSDF(base, [Siren(8, 1, output_gain=0.01)], [0.05]).to(place).requires_grad_(False)
+    origin, directions = picture(place)
+    options: Any = {"tiles": (8, 2), "lipschitz": 1.3}
+    ours = cone_starts(field, origin, directions, **options)
+    assert counted == [4, 64]
+    with monkeypatch.context() as patch:
+        patch.setenv("MPLICITS_KERNELS", "off")
+        theirs = cone_starts(field, origin, directions, **options)
+        hits = sphere_trace(field, origin, directions, lipschitz=1.3)
+    assert len(counted) == 2
+    # Rounding may make a cone stop one step sooner or later, which is as good.
+    same = (ours - theirs).abs() <= 1e-4
+    assert float((same | (ours == theirs)).float().mean()) > 0.95
+    assert 0 < int(ours.isinf().sum()) < ours.numel()
+    assert bool((ours <= hits.depth)[hits.mask].all())
+    assert not bool(hits.mask[ours.isinf()].any())
+
+
+def test_cones_stop_after_so_many_steps(place: torch.device, counted: list[int]) -> None:
+    base = Siren(16, 1, omega=8.0)
+    solve_sphere(base, radius=0.5)
+    base.to(place).requires_grad_(False)
+    origin, directions = picture(place)
+    once, often = (cone_starts(base, origin, directions, tiles=(8,), max_steps=n) for n in (1, 64))
+    assert counted == [4, 4]
+    assert bool((once <= often).all())
+    assert bool((once < often).any())

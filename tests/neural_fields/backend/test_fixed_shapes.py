@@ -1,0 +1,155 @@
+"""Evaluations of fixed shape: the usual results, no waits, and who found no room."""
+
+import copy
+
+import pytest
+import standin
+import torch
+from bounds import assert_within, rounding
+from fields import small_multiscale, small_spacetime
+from mplicits.neural_fields import (
+    Field,
+    FixedShapes,
+    MultiscaleSDF,
+    Placed,
+    Similarity,
+    Sphere,
+    TimeSlice,
+    Union,
+    fixed_shapes,
+)
+from mplicits.neural_fields.backend.fixed_shapes import first_rows
+from torch import Tensor
+
+
+def points(count: int = 400) -> Tensor:
+    return 2 * torch.rand(count, 3, dtype=torch.float64) - 1
+
+
+def sdf(taper: float = 0.3) -> MultiscaleSDF:
+    return small_multiscale(taper).double()
+
+
+@pytest.mark.parametrize("taper", [0.0, 0.3])
+@pytest.mark.parametrize("capacity", [None, [400, 400], [300]])
+def test_results_are_the_usual_ones(taper: float, capacity: list[int] | None) -> None:
+    field, x = sdf(taper), points()
+    usual = field.second_jet(x)
+    with fixed_shapes(capacity) as shapes:
+        fixed = field.second_jet(x)
+        values, value = field.level_values(x), field.value(x.reshape(4, 100, 3))
+    assert shapes.lost is None or not bool(shapes.lost.any())
+    bounds = rounding(field, x, lambda field, x: field.second_jet(x))
+    for a, b, bound in zip(fixed, usual, bounds, strict=True):
+        assert_within(a, b, 2 * bound)
+    assert_within(value.flatten(), usual.value, 2 * bounds[0])
+    assert_within(values[-1], usual.value, 2 * bounds[0])
+    inside = field.level_values(x)[0].abs() < field.deltas[0]
+    assert 0 < int(shapes.demand[0]) == int(inside.sum()) < len(x)
+
+
+def test_gradients_are_the_usual_ones() -> None:
+    x, grown = points(), []
+    for shaped in (False, True):
+        torch.manual_seed(0)
+        field, y = sdf(), x.clone().requires_grad_()
+        with fixed_shapes([350, 400]) if shaped else torch.enable_grad():
+            jet = field.jet(y)
+        (jet.value.square().sum() + jet.gradient.square().sum() + jet.features.sum()).backward()
+        grown.append([y.grad, *(parameter.grad for parameter in field.parameters())])
+    for a, b in zip(*grown, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-10, atol=1e-10)  # float64 sums of a few hundred numbers
+
+
+@pytest.mark.parametrize("room", [0, 1, 17])
+def test_who_finds_no_room_has_the_value_of_the_level_before(room: int) -> None:
+    field, x = sdf(), points()
+    values = field.level_values(x)
+    inside = values[0].abs() < field.deltas[0]
+    with fixed_shapes([room]) as shapes:
+        found = field.value(x, level=1)
+    admitted = inside & (inside.cumsum(0) <= room)
+    assert int(admitted.sum()) == room
+    assert torch.equal(shapes.lost, inside & ~admitted)
+    bound = rounding(field, x, lambda field, x: field.jet(x, level=1))[0]
+    assert_within(found, torch.where(admitted, values[1], values[0]), 2 * bound)
+
+
+def test_points_that_nobody_wants_stay_coarse() -> None:
+    field, x = sdf(), points()
+    wanted = torch.arange(len(x)) % 2 == 0
+    with fixed_shapes() as shapes:
+        shapes.wanted = wanted
+        found = field.value(x)
+    usual = field.level_values(x)
+    bound = rounding(field, x, lambda field, x: field.jet(x))[0]
+    assert_within(found, torch.where(wanted, usual[-1], usual[0]), 2 * bound)
+
+
+def test_the_outermost_is_not_touched_by_those_inside() -> None:
+    field, x = sdf(), points()
+    with fixed_shapes() as outer:
+        with fixed_shapes() as inner:
+            field.value(x)
+        assert inner.demand
+        assert not outer.demand
+    assert isinstance(outer, FixedShapes)
+
+
+@pytest.mark.parametrize("count", [0, 1, 5])
+def test_few_points(count: int) -> None:
+    field, x = sdf(), points(count)
+    with fixed_shapes([3, 3]):
+        jet = field.jet(x)
+    assert jet.gradient.shape == (count, 3)
+
+
+@pytest.mark.parametrize("count", [0, 1, 40, 100])
+def test_first_rows_are_those_of_nonzero(count: int) -> None:
+    mask = torch.rand(100) < 0.4
+    expected = torch.cat((mask.nonzero()[:, 0], torch.full((100,), 100)))[:count]
+    assert torch.equal(first_rows(mask, count), expected)
+    assert torch.equal(first_rows(mask[:0], count), torch.zeros(count, dtype=torch.int64))
+
+
+@standin.needed
+@pytest.mark.parametrize("capacity", [None, [50, 20]])
+def test_nobody_waits_and_the_kernels_are_the_same_for_any_points(capacity: list[int] | None) -> None:
+    field = copy.deepcopy(sdf()).to(standin.NAME)
+    launched = []
+    for x in (points(), 3 * points()):  # in the bands, and far from them
+        x = x.to(standin.NAME)
+        with standin.counted() as book, fixed_shapes(capacity):
+            field.value(x)
+            field.jet(x)
+        assert book.synchronisations == 0, book.report()
+        launched.append(book.launches)
+    assert launched[0] == launched[1]
+
+
+def composed(name: str) -> Field:
+    """Fields of fields of levels, whose bands are those of their parts."""
+    if name == "slice":
+        return TimeSlice(small_spacetime(0.4), 0.3).double().requires_grad_(False)
+    other = Placed(small_multiscale(0.3), Similarity((0.3, 0.0, 0.1), 1.1))
+    return Union(sdf(), other, Sphere(radius=0.3)).double().requires_grad_(False)
+
+
+@pytest.mark.parametrize("capacity", [None, [60, 20]])
+@standin.needed
+@pytest.mark.parametrize("name", ["union", "slice"])
+def test_fields_of_fields_need_no_wait_either(name: str, capacity: list[int] | None) -> None:
+    field, x = composed(name), points()
+    usual = field.jet(x)
+    with fixed_shapes(capacity) as shapes:
+        found = field.jet(x)
+    there = torch.ones(len(x), dtype=torch.bool) if shapes.lost is None else ~shapes.lost
+    assert (int(there.sum()) < len(x)) == (capacity is not None)
+    for a, b in zip(found, usual, strict=True):
+        # The same products with other rows beside them, of 16 terms in float64.
+        assert_within(a[there], b[there], 1e-11)
+    on_device, there = copy.deepcopy(field).to(standin.NAME), x.to(standin.NAME)
+    with standin.counted() as book, fixed_shapes(capacity):
+        on_device.value(there)
+        on_device.jet(there)
+    assert book.synchronisations == 0, book.report()

@@ -1,0 +1,43 @@
+"""Loss terms against numbers worked out by hand."""
+
+import math
+
+import pytest
+import torch
+from mplicits.neural_fields.fields.losses import data_loss, eikonal_loss, normal_loss, pseudo_huber
+
+
+def test_data_loss() -> None:
+    assert data_loss(torch.tensor([0.3, -0.2])).allclose(torch.tensor([0.09, 0.04]))
+    assert data_loss(torch.tensor([0.5]), torch.tensor([0.2])).allclose(torch.tensor([0.09]))
+
+
+def test_normal_loss_is_the_angle_only() -> None:
+    gradient = torch.tensor([[2.0, 0.0, 0.0], [0.0, 3.0, 0.0], [-1.0, 0.0, 0.0]])
+    normal = torch.tensor([[1.0, 0.0, 0.0]]).expand(3, 3)
+    assert normal_loss(gradient, normal).allclose(torch.tensor([0.0, 1.0, 2.0]))
+
+
+def test_eikonal_loss() -> None:
+    gradient = torch.tensor([[0.0, 0.6, 0.8], [3.0, 0.0, 0.0]])
+    assert eikonal_loss(gradient).allclose(torch.tensor([0.0, 4.0]), atol=1e-6)
+
+
+def test_pseudo_huber_is_a_square_of_small_angles_and_linear_in_large_ones() -> None:
+    scale = 1e-3
+    # √(1 + 2c/s) is 1, 2, 3 and 9 at these.
+    loss = torch.tensor([0.0, 1.5, 4.0, 40.0], dtype=torch.float64) * scale
+    assert pseudo_huber(loss, scale).allclose(torch.tensor([0.0, 1.0, 2.0, 8.0], dtype=torch.float64) * scale)
+    assert pseudo_huber(loss, math.inf) is loss
+    angle = torch.tensor([1e-4, 1.0], dtype=torch.float64, requires_grad=True)
+    pseudo_huber(angle.square() / 2, scale).sum().backward()
+    assert angle.grad is not None
+    assert float(angle.grad[0]) == pytest.approx(1e-4, rel=1e-5)  # a
+    assert float(angle.grad[1]) == pytest.approx(scale**0.5, rel=scale)  # √s, less s/2 of it
+
+
+def test_derivatives_stay_finite_at_a_vanishing_gradient() -> None:
+    gradient = torch.zeros(1, 3, requires_grad=True)
+    (eikonal_loss(gradient) + normal_loss(gradient, torch.tensor([[0.0, 0.0, 1.0]]))).sum().backward()
+    assert gradient.grad is not None
+    assert torch.isfinite(gradient.grad).all()

@@ -1,0 +1,125 @@
+"""The hash encoding: the published grid and hash, functions that it must reproduce, and both its derivatives."""
+
+import pytest
+import torch
+from mplicits.neural_fields.networks.hash_encoding import HashEncoding, grid_resolutions, spatial_hash, tables_apart
+
+from benchmarks.peers import HashGridSDF
+
+
+def small(**options: int) -> HashEncoding:
+    """A level that has its own entries and two that share theirs, all of them of unit size, in float64."""
+    encoding = HashEncoding(**{"levels": 3, "table_size": 512, "coarsest": 4, "finest": 16} | options).double()
+    torch.nn.init.uniform_(encoding.table, -1, 1)
+    return encoding
+
+
+def in_cube(count: int) -> torch.Tensor:
+    return 2 * torch.rand(count, 3, dtype=torch.float64) - 1
+
+
+def test_resolutions_grow_geometrically() -> None:
+    assert grid_resolutions(16, 16, 2048)[:4] == [16, 22, 30, 42]
+    assert grid_resolutions(16, 16, 2048)[-1] == 2048
+    assert grid_resolutions(8, 16, 2048) == [16, 32, 64, 128, 256, 512, 1024, 2048]
+    assert grid_resolutions(1, 7, 7) == [7]
+
+
+def test_hash_is_the_published_one() -> None:
+    """On the low 19 bits: π₂ = 0x9E3779B1 and π₃ = 0x30025795."""
+    x, y, z = torch.tensor([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1], [1234, 777, 2048]]).unbind(dim=1)
+    last = (1234 ^ (777 * 0x9E3779B1 % 2**32) ^ (2048 * 0x30025795 % 2**32)) % 2**19
+    assert spatial_hash(x, y, z, 1 << 19).tolist() == [1, 0x779B1, 0x25795, 0x779B1 ^ 0x25795 ^ 1, last]
+
+
+def test_features_are_those_of_the_hash_grid() -> None:
+    """Of `HashGridSDF`, whose network here sums the features of all levels: relu(t) − relu(−t)."""
+    encoding = small(features=1)
+    field = HashGridSDF(levels=3, table_size=512, features=1, coarsest=4, finest=16, width=2, depth=1, extent=1.0)
+    field = field.double()
+    with torch.no_grad():
+        for table, entries in zip(
+            field.tables, encoding.table.split([len(table) for table in field.tables]), strict=True
+        ):
+            table.copy_(entries)
+        hidden, last = field.linear()
+        hidden.weight.copy_(torch.tensor([[1.0] * 3, [-1.0] * 3]))
+        last.weight.copy_(torch.tensor([[1.0, -1.0]]))
+        hidden.bias.zero_()
+        last.bias.zero_()
+    x = in_cube(300)
+    torch.testing.assert_close(encoding(x).sum(dim=-1), field.value(x))
+
+
+def test_linear_functions_are_reproduced() -> None:
+    encoding = HashEncoding(levels=2, table_size=128, features=2, coarsest=2, finest=4, extent=1.5).double()
+    slopes, x = torch.tensor([[0.3, -0.7, 0.5], [1.0, 0.2, -0.1]], dtype=torch.float64), 1.5 * in_cube(200)
+    lattices = []
+    for cells in (2, 4):
+        line = torch.linspace(-1.5, 1.5, cells + 1, dtype=torch.float64)
+        lattices.append(torch.cartesian_prod(line, line, line))
+    with torch.no_grad():
+        encoding.table.copy_(torch.cat(lattices) @ slopes.T)
+    torch.testing.assert_close(encoding(x), (x @ slopes.T).repeat(1, 2))
+
+
+def test_both_derivatives_are_those_of_finite_differences() -> None:
+    encoding, x = small(), in_cube(6).requires_grad_()
+    table = encoding.table.detach().clone().requires_grad_()
+
+    def features(entries: torch.Tensor, at: torch.Tensor) -> torch.Tensor:
+        return torch.func.functional_call(encoding, {"table": entries}, (at,))
+
+    assert torch.autograd.gradcheck(features, (table, x))
+    assert torch.autograd.gradgradcheck(lambda at: features(table.detach(), at).square(), x)
+
+
+def test_outside_the_cube_the_nearest_point_counts() -> None:
+    encoding, x = small(), torch.tensor([[1.5, 0.3, -0.2], [-4.0, 2.0, 1.0]], dtype=torch.float64)
+    torch.testing.assert_close(encoding(x), encoding(x.clamp(-1, 1)))
+
+
+def test_any_leading_shape_and_any_device(device: torch.device) -> None:
+    encoding, x = small().float(), in_cube(24).float()
+    expected = encoding(x)
+    moved = encoding.to(device)
+    found = moved(x.reshape(2, 3, 4, 3).to(device))
+    assert found.shape == (2, 3, 4, encoding.size)
+    torch.testing.assert_close(found.reshape(24, -1).cpu(), expected)
+    assert moved(x[:0].to(device)).shape == (0, encoding.size)
+
+
+def test_under_autocast_features_are_those_of_full_precision() -> None:
+    encoding, x = small().float(), in_cube(24).float()
+    expected = encoding(x)
+    (slope,) = torch.autograd.grad(expected.square().sum(), encoding.table)
+    with torch.autocast("cpu", torch.bfloat16):
+        found, of_half = encoding(x), encoding(x.bfloat16())
+    assert torch.equal(found, expected)
+    assert of_half.dtype == torch.float32
+    assert torch.equal(torch.autograd.grad(found.square().sum(), encoding.table)[0], slope)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"table_size": 100}, "expected a power of two"),
+        ({"coarsest": 32}, "expected 1 ≤ coarsest ≤ finest"),
+        ({"levels": 0}, "expected at least 1"),
+        ({"features": 0}, "expected at least 1"),
+        ({"extent": 0}, "expected"),
+    ],
+)
+def test_sizes_out_of_range_are_refused(options: dict[str, int], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        HashEncoding(**{"finest": 16} | options)
+
+
+def test_tables_are_told_from_all_other_parameters() -> None:
+    encodings = [HashEncoding.up_to(finest) for finest in (8, 32)]
+    assert [encoding.resolutions[0] for encoding in encodings] == [8, 16]
+    assert [encoding.resolutions[-1] for encoding in encodings] == [8, 32]
+    readers = [torch.nn.Sequential(encoding, torch.nn.Linear(encoding.size, 3)) for encoding in encodings]
+    tables, others = tables_apart(*readers)
+    assert all(found is encoding.table for found, encoding in zip(tables, encodings, strict=True))
+    assert [tuple(parameter.shape) for parameter in others] == 2 * [(3, encodings[0].size), (3,)]

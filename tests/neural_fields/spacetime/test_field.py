@@ -1,0 +1,325 @@
+"""Fields of space-time: slices, embedding of static fields, moving fields in closed form, second derivatives."""
+
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from bounds import assert_within, rounding, unit_roundoff
+from fields import FIELDS, SCREW, small_multiscale, small_spacetime
+from mplicits.neural_fields import (
+    Box,
+    Field,
+    Keyframes,
+    Moving,
+    MultiscaleSDF,
+    Plane,
+    RigidMotion,
+    ShrinkingSphere,
+    Siren,
+    SpaceTimeSDF,
+    Sphere,
+    TimeSlice,
+    Torus,
+    at_time,
+    extract_mesh,
+    load_field,
+    save_field,
+    spacetime_jet,
+    sphere_trace,
+)
+from torch import Tensor
+
+TRAVEL = RigidMotion(velocity=(0.4, 0.2, 0.0), center=(-0.2, 0.0, 0.1), angle=2.0)
+
+
+def box_points(count: int, dim: int = 3) -> Tensor:
+    return 2 * torch.rand(count, dim, dtype=torch.float64) - 1
+
+
+# Slices
+
+
+@pytest.mark.parametrize("name", ["spacetime", "spacetime-tapered", "moving-multiscale", "keyframes"])
+def test_a_slice_is_the_field_at_its_time(name: str) -> None:
+    field = FIELDS[name]().double()
+    x = box_points(500)
+    whole = at_time(x, 0.3)
+    part = TimeSlice(field, 0.3)
+    for level in range(field.num_levels):
+        jet, expected = part.jet(x, level=level), field.jet(whole, level=level)
+        assert torch.equal(part.value(x, level=level), field.value(whole, level=level))
+        assert torch.equal(jet.gradient, expected.gradient[:, :3])
+        assert torch.equal(part.time_derivative(x, level=level), expected.gradient[:, 3])
+        assert torch.equal(part.in_band(x, level=level), field.in_band(whole, level=level))
+    both = part.spacetime_jet(x)
+    assert torch.equal(both.position, x)
+    assert bool((both.time == 0.3).all())
+    assert torch.equal(both.rate, part.time_derivative(x))
+    assert both.hessian.shape == (500, 0, 0)
+
+
+def test_a_slice_follows_its_field_and_passes_gradients_to_the_time() -> None:
+    field = small_spacetime(0.4).double()
+    x, t = box_points(50), torch.tensor(0.4, dtype=torch.float64, requires_grad=True)
+    part = TimeSlice(field, t)
+    part.value(x).sum().backward()
+    assert t.grad is not None
+    torch.testing.assert_close(t.grad, part.time_derivative(x).sum())
+    with torch.no_grad():
+        before = part.value(x)
+        field.sdf.base.output.bias += 1  # pyright: ignore
+        assert float((part.value(x) - before).abs().max()) > 0.5
+
+
+@pytest.mark.parametrize("taper", [0.0, 0.4])
+def test_the_time_folds_into_the_biases(taper: float, dtype: torch.dtype) -> None:
+    field = small_spacetime(taper).to(dtype)
+    x = box_points(2000).to(dtype)
+    state = torch.random.get_rng_state()
+    frozen = field.at(0.37)
+    assert torch.equal(torch.random.get_rng_state(), state)
+    assert isinstance(frozen.base, Siren)
+    assert frozen.base.in_dim == 3
+    assert not any(p.requires_grad for p in frozen.parameters())
+    part = TimeSlice(field, 0.37)
+    keep = torch.ones(len(x), dtype=torch.bool)
+    for level in range(3):  # rounding may put a point on either side of a hard gate
+        keep &= frozen.in_band(x, level=level) == part.in_band(x, level=level)
+    assert float(keep.double().mean()) > 0.999
+    x = x[keep]
+    off = rounding(part, x, lambda field, x: field.jet(x))
+    for ours, expected, bound in zip(frozen.jet(x), part.jet(x), off, strict=True):
+        assert_within(ours, expected, 2 * bound)
+    assert_within(frozen.value(x), part.value(x), 2 * off[0])
+
+
+def test_a_moment_is_saved_as_a_static_field(tmp_path: Path) -> None:
+    frozen = small_spacetime(0.2).at(0.6)
+    save_field(tmp_path / "frame.safetensors", frozen)
+    x = torch.rand(100, 3)
+    assert torch.equal(load_field(tmp_path / "frame.safetensors").field.value(x), frozen.value(x))
+
+
+def test_levels_that_are_no_sirens_are_sliced_too() -> None:
+    sdf = MultiscaleSDF(Moving(Sphere(), TRAVEL), [Siren(16, 1, omega=5.0, in_dim=4)], [0.2])
+    part, x = TimeSlice(SpaceTimeSDF(sdf).double(), 0.8), box_points(300)
+    off = rounding(part, x, lambda field, x: [field.value(x)])[0]
+    assert_within(SpaceTimeSDF(sdf).at(0.8).value(x), part.value(x), 2 * off)
+
+
+@pytest.mark.parametrize("t", [0.0, 0.5, 1.0])
+def test_slices_are_traced(t: float) -> None:
+    part = TimeSlice(Moving(Sphere(radius=0.3), TRAVEL), t)
+    center = TRAVEL.forward(torch.zeros(3), t)
+    offsets = 0.5 * torch.rand(400, 2) - 0.25
+    origins = torch.cat((center[:2] + offsets, torch.full((400, 1), -3.0)), dim=1)
+    hits = sphere_trace(part, origins, torch.tensor([0.0, 0.0, 1.0]), radius=None)
+    squared = 0.3**2 - offsets.square().sum(dim=-1)
+    assert torch.equal(hits.mask, squared > 0)
+    depth = 3 + center[2] - squared[hits.mask].sqrt()
+    torch.testing.assert_close(hits.depth[hits.mask], depth, rtol=0, atol=2e-5)
+
+
+def test_slices_are_meshed() -> None:
+    mesh = extract_mesh(TimeSlice(Moving(Sphere(radius=0.4), TRAVEL), 0.6), resolution=48)
+    center = TRAVEL.forward(torch.zeros(3, dtype=torch.float64), 0.6).numpy()
+    distance = ((mesh.vertices - center) ** 2).sum(axis=1) ** 0.5
+    assert abs(distance - 0.4).max() < 3e-4
+    a, b, c = (mesh.vertices[mesh.faces[:, k]] - center for k in range(3))
+    volume = (a * torch.linalg.cross(torch.from_numpy(b), torch.from_numpy(c)).numpy()).sum() / 6
+    assert volume == pytest.approx(4 / 3 * math.pi * 0.4**3, rel=0.01)
+
+
+# Embedding
+
+
+@pytest.mark.parametrize("extra", [0, 8])
+@pytest.mark.parametrize("taper", [0.0, 0.4])
+def test_a_static_field_is_embedded_exactly(extra: int, taper: float) -> None:
+    static = small_multiscale(taper).double().requires_grad_(False)
+    field = SpaceTimeSDF.from_static(static, extra_width=extra)
+    assert torch.equal(field.deltas, static.deltas)
+    x = box_points(1000)
+    for t in (0.0, 0.4, 1.0):
+        for level in range(3):
+            jet, expected = field.jet(at_time(x, t), level=level), static.jet(x, level=level)
+            off = rounding(static, x, lambda field, x, level=level: field.jet(x, level=level))
+            for ours, theirs, bound in zip(jet, expected, off, strict=True):
+                assert_within(ours[..., : theirs.shape[-1]], theirs, 2 * bound)
+            assert not bool(jet.gradient[:, 3].any())
+
+
+def test_an_embedded_field_starts_to_move_at_once() -> None:
+    field = SpaceTimeSDF.from_static(Siren(16, 2, omega=5.0), extra_width=8)
+    field.value(torch.rand(100, 4)).square().sum().backward()
+    for layer in [*field.sdf.base.layers, field.sdf.base.output]:  # pyright: ignore
+        assert bool((layer.weight.grad != 0).any(dim=1).all() or layer.out_features == 24)
+    first = field.sdf.base.layers[0].weight.grad  # pyright: ignore
+    assert bool((first[:16, 3] != 0).all())
+    output = field.sdf.base.output.weight.grad  # pyright: ignore
+    assert bool((output != 0).all())
+
+
+def test_time_gain_slows_the_start_down() -> None:
+    torch.manual_seed(0)
+    fast = SpaceTimeSDF.from_widths([(32, 2)], omegas=[10])
+    torch.manual_seed(0)
+    slow = SpaceTimeSDF.from_widths([(32, 2)], omegas=[10], time_gain=0.25)
+    a, b = (field.sdf.base.layers[0].weight for field in (fast, slow))  # pyright: ignore
+    assert torch.equal(a[:, :3], b[:, :3])
+    torch.testing.assert_close(0.25 * a[:, 3], b[:, 3])
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: SpaceTimeSDF(small_multiscale()), "field.in_dim=3: expected a field of space-time"),
+        (lambda: TimeSlice(Sphere(), 0.5), "field.in_dim=3: expected a field of space-time"),
+        (lambda: TimeSlice(small_spacetime(), torch.rand(2)), r"t has shape \(2,\)"),
+        (lambda: SpaceTimeSDF.from_static(Sphere()), "a level of the field is a Sphere"),
+        (lambda: SpaceTimeSDF.from_static(small_spacetime()), "expected a static field"),
+        (lambda: SpaceTimeSDF.from_static(small_multiscale(), extra_width=-1), "extra_width=-1"),
+        (lambda: spacetime_jet(small_spacetime(), torch.rand(2, 4), order=3), "order=3"),
+        (lambda: Keyframes([0.0, 0.0], [Sphere(), Sphere()]), "expected increasing numbers"),
+        (lambda: Keyframes([0.0], []), "1 times for 0 fields"),
+        (lambda: Keyframes([0.0], [small_spacetime()]), r"fields\[0\].in_dim=4"),
+        (lambda: Moving(small_spacetime(), SCREW), "expected a static field"),
+        (lambda: RigidMotion(axis=(0.0, 0.0, 0.0)), "non-zero length"),
+        (lambda: ShrinkingSphere(radius=0.5, alpha=0.1), "radius² > 4 alpha"),
+        (lambda: Sphere().second_jet(torch.rand(2, 3), dims=4), "dims=4: expected 1 to 3"),
+    ],
+)
+def test_bad_arguments(make: object, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make()  # pyright: ignore[reportCallIssue]
+
+
+# Moving fields in closed form
+
+
+def test_a_quarter_turn_and_a_step() -> None:
+    motion = RigidMotion(axis=(0, 0, 2), angle=math.pi / 2, center=(1.0, 0.0, 0.0), velocity=(0.0, 0.0, 3.0))
+    x = torch.tensor([[2.0, 0.0, 0.5]], dtype=torch.float64)
+    torch.testing.assert_close(motion.forward(x, 1.0), torch.tensor([[1.0, 1.0, 3.5]], dtype=torch.float64))
+    torch.testing.assert_close(motion.inverse(motion.forward(x, 0.7), 0.7), x)
+
+
+def test_the_velocity_of_a_motion_is_its_derivative() -> None:
+    x, t = box_points(100), torch.rand(100, dtype=torch.float64, requires_grad=True)
+    moved = SCREW.forward(x, t)
+    tangent = torch.stack([torch.autograd.grad(moved[:, k].sum(), t, retain_graph=True)[0] for k in range(3)], dim=-1)
+    torch.testing.assert_close(SCREW.velocity(SCREW.forward(x, t), t), tangent)
+
+
+def test_a_moving_field_keeps_its_values() -> None:
+    static = Torus(major=0.5, minor=0.2)
+    x, t = box_points(500), torch.rand(500, dtype=torch.float64)
+    torch.testing.assert_close(Moving(static, SCREW).value(at_time(SCREW.forward(x, t), t)), static.value(x))
+
+
+def test_both_shrinking_spheres_have_the_radius_of_the_formula() -> None:
+    direction = torch.nn.functional.normalize(box_points(100), dim=-1)
+    t = torch.rand(100, dtype=torch.float64)
+    surface = direction * (0.8**2 - 4 * 0.12 * t).sqrt()[:, None]
+    for exact_law in (False, True):
+        field = ShrinkingSphere(radius=0.8, alpha=0.12, exact_law=exact_law)
+        # Lengths, roots and their difference, of numbers below 1.
+        assert float(field.value(at_time(surface, t)).abs().max()) < 16 * unit_roundoff(torch.float64)
+        assert torch.equal(field.value(at_time(surface, 0.0)), surface.norm(dim=-1) - 0.8) or exact_law
+
+
+def test_keyframes_meet_their_keys_and_blend_in_between() -> None:
+    keys: list[Field] = [Sphere(radius=0.3), Box(), Torus()]
+    frames = Keyframes([0.0, 0.25, 1.0], keys)
+    x = box_points(300)
+    for time, key in zip(frames.times, keys, strict=True):
+        assert torch.equal(frames.value(at_time(x, time)), key.value(x))
+    third = frames.jet(at_time(x, 0.5))
+    torch.testing.assert_close(third.value, (2 * keys[1].value(x) + keys[2].value(x)) / 3)
+    torch.testing.assert_close(third.gradient[:, 3], (keys[2].value(x) - keys[1].value(x)) / 0.75)
+    outside = frames.jet(at_time(x, 1.5))
+    torch.testing.assert_close(outside.value, keys[2].value(x))
+    assert not bool(outside.gradient[:, 3].any())
+    assert torch.equal(frames.jet(at_time(x, 0.0)).gradient[:, 3], (keys[1].value(x) - keys[0].value(x)) / 0.25)
+
+
+# Second derivatives
+
+
+def autograd_hessian(field: Field, x: Tensor, level: int) -> Tensor:
+    x = x.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(field.value(x, level=level).sum(), x, create_graph=True)
+    columns = [torch.autograd.grad(gradient[:, k].sum(), x, retain_graph=True)[0] for k in range(field.in_dim)]
+    return torch.stack(columns, dim=-1)
+
+
+SIRENS = {
+    "one layer": lambda: Siren(12, 1, omega=4.0),
+    "two layers": lambda: Siren(12, 2, omega=4.0, num_features=2),
+    "four layers": lambda: Siren(10, 4, omega=4.0, in_dim=4),
+}
+
+
+@pytest.mark.parametrize("name", SIRENS)
+def test_hessian_of_a_siren(name: str) -> None:
+    network = SIRENS[name]().double()
+    x = box_points(50, network.in_dim)
+    second = network.second_jet(x)
+    off = rounding(network, x, lambda field, x: field.second_jet(x))
+    with torch.inference_mode():
+        again = network.second_jet(x)
+    for others in (again, (*network.jet(x), autograd_hessian(network, x, -1))):
+        for ours, expected, bound in zip(second, others, off, strict=True):
+            assert_within(ours, expected, 2 * bound)
+    assert_within(network.second_jet(x, dims=2).hessian, second.hessian[:, :2, :2], 2 * off[3][:, :2, :2])
+
+
+@pytest.mark.parametrize("name", ["multiscale", "multiscale-tapered", "multiscale-over-sphere", "spacetime-tapered"])
+def test_hessian_of_a_multiscale_field(name: str) -> None:
+    """Against the default, which differentiates the gradient that the contract tests have checked."""
+    field = FIELDS[name]().double()
+    x = box_points(400, field.in_dim)
+    for level in range(field.num_levels):
+        ours, expected = field.second_jet(x, level=level), Field.second_jet(field, x, level=level)
+        off = rounding(field, x, lambda field, x, level=level: field.second_jet(x, level=level))
+        for a, b, bound in zip(ours, expected, off, strict=True):
+            assert_within(a, b, 2 * bound)
+
+
+def test_derivatives_of_the_hessian() -> None:
+    network = Siren(5, 2, omega=3.0).double()
+    x = box_points(3).requires_grad_()
+    assert torch.autograd.gradcheck(lambda x, *_: network.second_jet(x).hessian, (x, *network.parameters()))
+
+
+def test_hessians_of_closed_forms() -> None:
+    x = box_points(200)
+    length = x.norm(dim=-1)
+    normal = x / length[:, None]
+    expected = (torch.eye(3, dtype=x.dtype) - normal[:, :, None] * normal[:, None, :]) / length[:, None, None]
+    torch.testing.assert_close(Sphere().second_jet(x).hessian, expected)
+    assert not Sphere().second_jet(x).hessian.requires_grad
+    assert Sphere().second_jet(x.clone().requires_grad_()).hessian.requires_grad
+    with torch.inference_mode():
+        torch.testing.assert_close(Sphere().second_jet(x).hessian, expected)
+    assert float(Plane().second_jet(x).hessian.abs().max()) == 0
+    sliced = TimeSlice(Moving(Sphere(), TRAVEL), 0.5).second_jet(TRAVEL.forward(x, 0.5)).hessian
+    torch.testing.assert_close(sliced.diagonal(dim1=1, dim2=2).sum(dim=1), 2 / length)
+
+
+@pytest.mark.parametrize("shape", [(), (0,), (2, 3)])
+def test_second_jets_follow_the_shape_of_the_input(shape: tuple[int, ...]) -> None:
+    for name in ("siren", "multiscale-tapered", "sphere", "spacetime", "slice", "keyframes"):
+        field = FIELDS[name]()
+        jet = field.second_jet(torch.rand(*shape, field.in_dim), dims=3)
+        assert jet.hessian.shape == (*shape, 3, 3)
+        assert jet.gradient.shape == (*shape, field.in_dim)
+
+
+def test_blocks_do_not_change_the_hessian(monkeypatch: pytest.MonkeyPatch) -> None:
+    network, x = Siren(32, 3).double().requires_grad_(False), box_points(1000)
+    whole = network.second_jet(x).hessian
+    monkeypatch.setattr("mplicits.neural_fields.networks.siren.BLOCK_FLOATS", 32 * 256)
+    off = rounding(network, x, lambda field, x: [field.second_jet(x).hessian])[0]
+    assert_within(network.second_jet(x).hessian, whole, 2 * off)

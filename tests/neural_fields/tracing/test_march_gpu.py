@@ -1,0 +1,115 @@
+"""The march that runs ahead of the host, on the CPU, against the one that looks after every pass."""
+
+import pytest
+import torch
+from fields import FIELDS, small_multiscale
+from mplicits.neural_fields import Field, Sphere, Torus, sphere_trace
+from mplicits.neural_fields.tracing import _march_gpu as _ahead
+from mplicits.neural_fields.tracing import sphere as tracing
+from mplicits.neural_fields.tracing.sphere import Expected, trace_expected
+from torch import Tensor
+from waits import some_rays, three_levels
+
+CLOSED = {"sphere": Sphere(radius=0.5), "torus": Torus(major=0.5, minor=0.2)}
+
+
+@pytest.fixture
+def both(monkeypatch: pytest.MonkeyPatch):
+    """Call a function with the one march and with the other."""
+
+    def call(work, *arguments, **options):
+        found = []
+        for ahead in (False, True):
+            with monkeypatch.context() as patch:
+                patch.setattr(tracing, "makes_wait", lambda _, ahead=ahead: ahead)
+                found.append(work(*arguments, **options))
+        return found
+
+    return call
+
+
+def rays(dtype: torch.dtype, count: int = 200) -> tuple[Tensor, Tensor]:
+    origins, directions = some_rays(count)
+    return origins.to(dtype), directions.to(dtype)
+
+
+def assert_same_bits(first, second) -> None:
+    for a, b in zip(first, second, strict=True):
+        assert torch.equal(a, b)
+
+
+@pytest.mark.parametrize("name", CLOSED)
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"near": 1.0, "far": 2.2},
+        {"near": 2.0},  # behind the surface, for many
+        {"max_steps": 3},
+        {"max_steps": 1},
+        {"max_steps": 0},
+        {"resolution": 0.3, "lipschitz": 1.3},
+        {"radius": None, "far": 5.0},
+        {"tolerance": 1e-3},
+    ],
+)
+def test_closed_forms_agree_to_the_last_bit(name: str, options: dict, dtype: torch.dtype, both) -> None:
+    """Depths, levels, numbers of steps: every ray sees the same values."""
+    field, (origins, directions) = CLOSED[name].to(dtype), rays(dtype)
+    assert_same_bits(*both(sphere_trace, field, origins, directions, **options))
+    inside = sphere_trace(field, origins * 0.1, directions, **options)
+    assert inside.mask.shape == (200,)
+    assert_same_bits(*both(sphere_trace, field, origins * 0.1, directions, **options))
+
+
+@pytest.mark.parametrize("off", [0.0, 0.02, -0.02, 0.4])
+def test_expectations_right_and_wrong(off: float, both) -> None:
+    field, (origins, directions) = CLOSED["torus"].double(), rays(torch.float64)
+    hits, slope, _ = trace_expected(field, origins, directions, None)
+    unknown = torch.full_like(hits.depth, torch.inf)
+    for value in (unknown, field.value(origins)):
+        expected = Expected(torch.where(hits.mask, hits.depth + off, torch.inf), slope, value)
+        (first, *columns), (second, *others) = both(trace_expected, field, origins, directions, expected, reach=0.1)
+        assert_same_bits(first, second)
+        assert torch.equal(columns[0], others[0])
+        for a, b in zip(columns[1], others[1], strict=True):
+            assert torch.equal(a, b)
+
+
+@pytest.mark.parametrize("few", [_ahead.FEW, 20], ids=["room", "little-room"])
+def test_levels_agree_within_the_tolerance(few: int, both, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With little room rays stand still until there is some, and end where they would have ended.
+
+    Products of matrices with other rows beside them round otherwise, so that depths may differ, but each is known to
+    the tolerance; in float64 roundings are far below what would make it another hit.
+    """
+    monkeypatch.setattr(_ahead, "FEW", few)
+    monkeypatch.setattr(_ahead, "SHARE", 0.01)
+    monkeypatch.setattr(_ahead, "LEAST_ROOM", 5)
+    monkeypatch.setattr(_ahead, "SPARE", 0.6)
+    origins, directions = rays(torch.float64)
+    for field in (three_levels().double(), small_multiscale(0.3).double()):
+        first, second = both(sphere_trace, field, origins, directions, tolerance=1e-7)
+        assert torch.equal(first.mask, second.mask)
+        assert int(first.mask.sum()) > 20
+        assert float((first.depth - second.depth)[first.mask].abs().max()) < 2e-7
+        assert torch.equal(first.level[first.mask], second.level[second.mask])
+
+
+@pytest.mark.parametrize("few", [_ahead.FEW, 5], ids=["room", "little-room"])
+@pytest.mark.parametrize("name", ["union", "placed", "difference-of-multiscale", "slice"])
+def test_fields_of_fields(name: str, few: int, both, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_ahead, "FEW", few)
+    monkeypatch.setattr(_ahead, "LEAST_ROOM", few)
+    field: Field = FIELDS[name]().double()
+    origins, directions = rays(torch.float64, 60)
+    first, second = both(sphere_trace, field, origins, directions, max_steps=64)
+    assert torch.equal(first.mask, second.mask)
+    assert float((first.depth - second.depth)[first.mask].abs().max()) < 2e-5
+
+
+def test_no_rays(both) -> None:
+    nothing = torch.zeros(0, 3)
+    assert_same_bits(*both(sphere_trace, CLOSED["sphere"].float(), nothing, nothing))
+    away = torch.tensor([[0.0, 0.0, 3.0]])
+    assert_same_bits(*both(sphere_trace, CLOSED["sphere"].float(), away, away))

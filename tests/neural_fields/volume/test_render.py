@@ -1,0 +1,354 @@
+"""Rendered rays against exact surfaces, a loop over rays and samples, and every kind of field."""
+
+from typing import Any
+
+import pytest
+import torch
+from fields import FIELDS
+from mplicits.neural_fields import (
+    Jet,
+    MultiscaleSDF,
+    OneLevelField,
+    Rendered,
+    Sampling,
+    Siren,
+    Sphere,
+    ViewColor,
+    fixed_shapes,
+    render_volume,
+)
+from mplicits.neural_fields.fields.function import as_field
+from mplicits.neural_fields.networks.radiance import Outside
+from mplicits.neural_fields.networks.value_grid import ValueGrid
+from mplicits.neural_fields.volume.render import sample_depths
+from mplicits.neural_fields.volume.weights import sphere_span
+from torch import Tensor
+
+from benchmarks.costs.speed import counted
+
+
+def rays(count: int, *, seed: int = 0) -> tuple[Tensor, Tensor]:
+    """Rays from distance 2 towards points near the centre."""
+    generator = torch.Generator().manual_seed(seed)
+    origins = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=1) * 2
+    targets = (torch.rand(count, 3, generator=generator) - 0.5) * 0.8
+    return origins, torch.nn.functional.normalize(targets - origins, dim=1)
+
+
+def position_color(x: Tensor, direction: Tensor, jet: Jet) -> Tensor:
+    """A colour in closed form."""
+    return 0.5 + 0.5 * x
+
+
+def test_a_sharp_sphere_is_seen_where_it_is() -> None:
+    sphere = Sphere(radius=0.5)
+    origins, directions = rays(200)
+    seen = render_volume(sphere, position_color, origins, directions, inv_std=2000.0, background=torch.ones(3))
+    near, far = sphere_span(origins, directions, radius=0.5)
+    hit = (far - near) > 0.2
+    assert int(hit.sum()) > 50
+    point = origins + near[:, None] * directions
+    torch.testing.assert_close(seen.depth[hit], near[hit], atol=2e-3, rtol=0)
+    torch.testing.assert_close(seen.color[hit], 0.5 + 0.5 * point[hit], atol=2e-3, rtol=0)
+    torch.testing.assert_close(seen.normal[hit], point[hit] / 0.5, atol=6e-3, rtol=0)
+    assert float(seen.opacity[hit].min()) > 0.999
+    missed = sphere.value(origins - (origins * directions).sum(1, keepdim=True) * directions) > 0.02
+    assert float(seen.opacity[missed].max()) < 1e-6
+    torch.testing.assert_close(seen.color[missed], torch.ones(int(missed.sum()), 3))
+
+
+def test_agrees_with_a_loop_over_rays_and_samples() -> None:
+    field = Siren(24, 2, omega=4.0).double().requires_grad_(False)
+    origins, directions = (part.double() for part in rays(5))
+    sampling = Sampling(uniform=12, importance=8, rounds=2)
+    seen = render_volume(field, position_color, origins, directions, inv_std=20.0, sampling=sampling)
+    near, far = sphere_span(origins, directions)
+    edges = sample_depths(field, origins, directions, near, far, sampling)
+    for ray in range(5):
+        light, color, depth = 1.0, torch.zeros(3, dtype=torch.float64), 0.0
+        for start, end in zip(edges[ray, :-1], edges[ray, 1:], strict=True):
+            t = (start + end) / 2
+            x = (origins[ray] + t * directions[ray]).requires_grad_()
+            f = field.value(x)
+            slope = float(torch.autograd.grad(f, x)[0] @ directions[ray])
+            f = f.detach()
+            step = min(slope, 0.0) * float(end - start) / 2
+            entering, leaving = (torch.sigmoid(20 * (f - sign * step)) for sign in (1, -1))
+            alpha = float(1 - leaving / entering)
+            color, depth = color + light * alpha * (0.5 + 0.5 * x.detach()), depth + light * alpha * float(t)
+            light *= 1 - alpha
+        torch.testing.assert_close(seen.color[ray], color)
+        assert float(seen.depth[ray]) == pytest.approx(depth, abs=1e-9)
+        assert float(seen.opacity[ray]) == pytest.approx(1 - light, abs=1e-9)
+
+
+@pytest.mark.parametrize("name", [name for name in FIELDS if FIELDS[name]().in_dim == 3])
+def test_every_field_renders_and_trains(name: str) -> None:
+    field = FIELDS[name]()
+    features = field.jet(torch.zeros(1, 3)).features.shape[-1]
+    color, inv_std = ViewColor(features, width=16, depth=1), torch.tensor(20.0, requires_grad=True)
+    sampling = Sampling(uniform=8, importance=4, rounds=2)
+    seen = render_volume(field, color, *rays(6), inv_std=inv_std, sampling=sampling)
+    assert seen.color.shape == (6, 3)
+    assert seen.weights.shape == seen.depths.shape == (6, 13)
+    (seen.color.sum() + seen.jet.gradient.square().sum()).backward()
+    assert inv_std.grad is not None
+    trained = [p for p in (*field.parameters(), *color.parameters()) if p.requires_grad]
+    for parameter in trained:
+        assert parameter.grad is not None
+        assert bool(parameter.grad.isfinite().all())
+
+
+@pytest.mark.parametrize("spare", [None, 0, 7, -1])
+def test_in_fixed_shapes_rays_see_the_same_if_there_is_room(spare: int | None) -> None:
+    torch.manual_seed(0)
+    field = MultiscaleSDF.from_widths([(16, 1), (16, 1)], omegas=[4, 8], deltas=[0.02], taper=0.5, num_features=3)
+    color, around = ViewColor(3, width=8, depth=1), Outside(width=8, depth=1)
+    field, color, around = field.double(), color.double(), around.double()
+    parameters = [*field.parameters(), *color.parameters(), *around.parameters()]
+    origins, directions = (part.double() for part in rays(40))
+
+    def render() -> list[Tensor]:
+        seen = render_volume(
+            field, color, origins, directions, inv_std=300.0, sampling=Sampling(12, 8, 2), outside=around,
+            least_weight=0.05, skip=0.05,
+        )  # fmt: skip
+        loss = seen.color.square().sum() + (seen.counts * seen.jet.gradient.square().sum(dim=-1)).sum()
+        grown = torch.autograd.grad(loss, parameters, allow_unused=True, materialize_grads=True)
+        return [seen.color, seen.counts, seen.opacity, seen.depth, seen.normal, seen.weights, *seen.jet, *grown]
+
+    usual = render()
+    with fixed_shapes() as shapes:
+        fixed = render()
+    asked = {name: int(number) for name, number in shapes.asked.items()}
+    assert asked["sections"] == int((usual[1] > 0).sum()) < usual[1].numel()
+    assert 0 < asked["colors"] < asked["sections"]
+    assert 0 < asked["outside"] < 40
+    (band,) = (int(number) for number in shapes.demand)
+    assert 0 < band < asked["sections"]
+    if spare is not None:
+        with fixed_shapes([band + spare], rooms={name: room + spare for name, room in asked.items()}) as shapes:
+            fixed = render()
+        if spare < 0:  # they are told, and one has nothing in a section in which others have
+            assert int(shapes.asked["sections"]) == asked["sections"]
+            assert not torch.equal(fixed[0], usual[0])
+            return
+    for one, same in zip(usual, fixed, strict=True):
+        torch.testing.assert_close(same, one, rtol=1e-10, atol=1e-10)  # float64 sums of some hundred numbers
+
+
+def test_no_rays_are_legal() -> None:
+    seen = render_volume(Sphere(), position_color, torch.empty(0, 3), torch.empty(0, 3), inv_std=10.0)
+    assert seen.color.shape == (0, 3)
+
+
+def test_rays_of_other_shapes_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"origins \(3,\).*expected \(R, 3\)"):
+        render_volume(Sphere(), position_color, torch.zeros(3), torch.zeros(3), inv_std=10.0)
+
+
+class TestBands:
+    def field(self) -> MultiscaleSDF:
+        return MultiscaleSDF(Sphere(radius=0.5), [Siren(16, 2, omega=5.0, output_gain=0.01)], [0.05], taper=0.3)
+
+    def test_samples_outside_the_band_never_reach_the_residual(self) -> None:
+        field = self.field()
+        wrapped, (base, residual) = counted(field)
+        origins, directions = rays(100)
+        seen = render_volume(wrapped, position_color, origins, directions, inv_std=100.0)
+        points = origins[:, None] + seen.depths[..., None] * directions[:, None]
+        inside = int((field.value(points, level=0).abs() < 0.05).sum())
+        assert 0 < inside < 0.7 * seen.depths.numel()
+        assert residual.jets == inside
+        assert residual.values == 0
+        assert base.jets == seen.depths.numel()
+
+    def test_a_level_costs_nothing_when_a_coarser_one_is_rendered(self) -> None:
+        wrapped, (_, residual) = counted(self.field())
+        render_volume(wrapped, position_color, *rays(10), inv_std=100.0, level=0)
+        assert residual.jets == residual.values == 0
+
+    def test_samples_cover_the_band_where_the_finer_surface_may_lie(self) -> None:
+        # Were the guide as sharp as it gets, all samples would sit on the coarse surface.
+        origins, directions = rays(50)
+        near, far = sphere_span(origins, directions)
+        edges = sample_depths(self.field(), origins, directions, near, far, Sampling(importance=64, sharpness=1e4))
+        values = Sphere(radius=0.5).value(origins[:, None] + edges[..., None] * directions[:, None])
+        hit = (values < 0).any(dim=1)
+        assert float((values[hit].abs() < 0.04).float().mean()) > 0.3
+        assert float((values[hit].abs() < 0.001).float().mean()) < 0.2
+
+    def test_light_samples_get_no_colour(self) -> None:
+        asked: list[int] = []
+
+        def color(x: Tensor, direction: Tensor, jet: Jet) -> Tensor:
+            asked.append(len(x))
+            return position_color(x, direction, jet)
+
+        field = self.field()
+        everywhere = render_volume(field, color, *rays(50), inv_std=200.0)
+        only = render_volume(field, color, *rays(50), inv_std=200.0, least_weight=1e-4)
+        assert asked[1] < 0.6 * asked[0]
+        torch.testing.assert_close(only.color, everywhere.color, atol=1e-4 * 129, rtol=0)
+        assert float((only.color - everywhere.color).detach().abs().max()) > 0
+
+
+def red(x: Tensor, direction: Tensor, jet: Jet) -> Tensor:
+    return torch.tensor([1.0, 0, 0]).expand_as(x)
+
+
+def test_the_outside_is_seen_past_the_sphere_only() -> None:
+    def fog(inverted: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
+        assert inverted.shape[-1] == 4
+        return torch.full(inverted.shape[:1], 1e3), torch.tensor([0.0, 1.0, 0.0]).expand(len(inverted), 3)
+
+    origins = torch.tensor([[0.0, 0, 2], [1.5, 0, 2]])
+    ahead = torch.tensor([0.0, 0, -1]).expand(2, 3)
+
+    seen = render_volume(Sphere(radius=0.5), red, origins, ahead, inv_std=1000.0, outside=fog)
+    torch.testing.assert_close(seen.color, torch.tensor([[1.0, 0, 0], [0, 1, 0]]), atol=1e-3, rtol=0)
+
+
+@pytest.mark.parametrize("skip", [0.0, 1e-3])
+def test_sections_of_rays_that_miss_the_sphere_stand_for_nothing(skip: float) -> None:
+    def fog(inverted: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
+        return torch.full(inverted.shape[:1], 1e3), inverted[:, :3].abs()
+
+    # Through the middle, past the sphere, and away from it.
+    origins = torch.tensor([[0.0, 0.0, 2.0], [1.5, 0.0, 2.0], [0.0, 0.0, 2.0]])
+    along = torch.tensor([[0.0, 0.0, -1.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    options = {"inv_std": 50.0, "outside": fog, "skip": skip, "skip_share": 0.5}
+    field = MultiscaleSDF.from_widths([(8, 1), (8, 1)], omegas=[5, 10], deltas=[0.2])
+
+    def seen(rows: list[int]) -> Rendered:
+        generator = torch.Generator().manual_seed(0)
+        return render_volume(field, red, origins[rows], along[rows], generator=generator, **options)
+
+    both = seen([0, 1, 2])
+    assert (both.counts > 0).any(dim=1).tolist() == [True, False, False]
+    assert both.opacity[1:].tolist() == [0.0, 0.0]
+    nothing = seen([1, 2])  # no section at all is evaluated
+    assert not nothing.counts.any()
+    assert bool(torch.isfinite(nothing.color).all())
+    nothing.color.sum().backward()
+
+
+def test_what_is_behind_something_opaque_is_not_asked_for() -> None:
+    asked = []
+
+    def fog(inverted: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
+        asked.append(direction)
+        return torch.ones(len(inverted)), torch.ones(len(inverted), 3)
+
+    origins = torch.tensor([[0.0, 0.0, 2.0], [0.9, 0.0, 2.0], [0.0, 0.0, 2.0]])
+    ahead = torch.tensor([[0.0, 0.0, -1.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    sampling, options = Sampling(outside=4), {"inv_std": 1000.0, "outside": fog, "background": torch.zeros(3)}
+    seen = render_volume(Sphere(radius=0.5), red, origins, ahead, sampling=sampling, least_weight=1e-4, **options)
+    assert torch.equal(asked[0], ahead[1:].repeat_interleave(4, dim=0))
+    expected = render_volume(Sphere(radius=0.5), red, origins, ahead, sampling=sampling, **options)
+    # A ray of S sections loses 1e-4 of each at most, and of the light that is left.
+    torch.testing.assert_close(seen.color, expected.color, rtol=0, atol=1e-4 * (expected.weights.shape[1] + 1))
+
+
+@pytest.mark.parametrize(
+    "setting", [{"uniform": 1}, {"importance": -1}, {"rounds": 0}, {"sharpness": 0.0}, {"outside": 0}]
+)
+def test_sampling_refuses(setting: dict[str, int]) -> None:
+    with pytest.raises(ValueError, match=next(iter(setting))):
+        Sampling(**setting)
+
+
+def test_gradients_reach_the_field_through_the_weights() -> None:
+    # Growing the sphere brings its surface nearer: ∂depth/∂bias of f = |x| − r is +1 along the axis.
+    class Shifted(OneLevelField):
+        def __init__(self) -> None:
+            super().__init__()
+            self.bias = torch.nn.Parameter(torch.tensor(0.0, dtype=torch.float64))
+            self.sphere = Sphere(radius=0.5).double()
+
+        def value(self, x: Tensor, *, level: int = -1) -> Tensor:
+            return self.sphere.value(x) + self.bias
+
+        def jet(self, x: Tensor, *, level: int = -1) -> Jet:
+            value, gradient, features = self.sphere.jet(x)
+            return Jet(value + self.bias, gradient, features)
+
+    field, eye = Shifted(), torch.tensor([[0.0, 0, 2]], dtype=torch.float64)
+    seen = render_volume(
+        field, position_color, eye, -eye / 2, inv_std=100.0, sampling=Sampling(uniform=256, importance=256)
+    )
+    (slope,) = torch.autograd.grad(seen.depth.sum(), field.bias)
+    assert float(slope) == pytest.approx(1, abs=0.02)
+
+
+class TestSkipping:
+    """Sections without weight get no jet; the full sum is what all of it is held against."""
+
+    def field(self) -> MultiscaleSDF:
+        """The finer surface lies 0.01 inside the coarser one, where the weights are estimated."""
+        return MultiscaleSDF(
+            Sphere(radius=0.5).double(), [as_field(lambda x: 0.01 + 0 * x[..., 0])], [0.08], taper=0.3
+        ).double()
+
+    def seen(self, **options: Any) -> Rendered:
+        origins, directions = (part.double() for part in rays(300))
+        white = torch.ones(3, dtype=torch.float64)
+        return render_volume(
+            self.field(), position_color, origins, directions, inv_std=150.0, background=white, **options
+        )
+
+    @pytest.mark.parametrize("skip", [1e-2, 1e-4])
+    def test_colours_are_off_by_the_skipped_weight_at_most(self, skip: float) -> None:
+        full, some = self.seen(), self.seen(skip=skip)
+        assert torch.equal(full.depths, some.depths)
+        skipped = some.counts == 0
+        lost = (full.weights * skipped).sum(dim=1)
+        assert float(skipped.double().mean()) > 0.3
+        assert float(lost.max()) > 0
+        error = (some.color - full.color).abs().amax(dim=1)
+        assert bool((error <= lost + 1e-12).all())
+        torch.testing.assert_close(some.weights.sum(dim=1) + (1 - some.opacity), torch.ones(300).double())
+        assert float(some.weights[skipped].abs().max()) == 0
+        # Each neighbourhood that was found light has less than its estimate; 129 sections are on a ray.
+        assert float(lost.max()) < 129 * skip
+
+    def test_nothing_changes_where_nothing_is_skipped(self) -> None:
+        full = self.seen(generator=torch.Generator().manual_seed(1))
+        every = self.seen(skip=1e-3, skip_share=1.0, generator=torch.Generator().manual_seed(1))
+        assert bool((full.counts == 1).all())
+        assert bool((every.counts == 1).all())
+        torch.testing.assert_close(every.color, full.color, atol=1e-12, rtol=0)
+        torch.testing.assert_close(every.jet.gradient, full.jet.gradient, atol=1e-12, rtol=0)
+
+    def test_those_kept_by_chance_stand_for_the_others(self) -> None:
+        counts = self.seen(skip=1e-3, skip_share=0.25, generator=torch.Generator().manual_seed(1)).counts
+        assert {*counts.unique().tolist()} == {0.0, 1.0, 4.0}
+        light = counts[counts != 1]
+        # Each is 4 with a probability of 1/4, so of n the mean is 1 with a variance of 3/n.
+        assert abs(float(light.mean()) - 1) < 5 * (3 / len(light)) ** 0.5
+        assert {*self.seen(skip=1e-3, skip_share=0.25).counts.unique().tolist()} == {0.0, 1.0}  # no generator
+
+    def test_rays_that_miss_keep_where_they_come_nearest(self) -> None:
+        field, origins = Sphere(radius=0.5), torch.tensor([[0.0, 0.7, 2.0], [0.0, 0.9, 2.0]])
+        seen = render_volume(
+            field, position_color, origins, torch.tensor([[0.0, 0, -1]]).expand(2, 3), inv_std=1e3, skip=1e-3
+        )
+        assert (seen.counts == 1).sum(dim=1).tolist() == [1, 1]
+        assert bool((seen.depths[seen.counts == 1] - 2.0).abs().max() < 0.05)
+
+    def test_a_guide_saves_the_march_its_network(self) -> None:
+        field = self.field().float()
+        wrapped, (base, residual) = counted(field)
+        origins, directions = rays(100)
+        grid = ValueGrid(48)
+        grid.refresh(field)
+        guided = render_volume(wrapped, position_color, origins, directions, inv_std=150.0, skip=1e-4, guide=grid)
+        assert base.values == residual.values == 0
+        assert base.jets == int((guided.counts > 0).sum())
+        full = render_volume(field, position_color, origins, directions, inv_std=150.0)
+        # Both place sections of their own around the same surface: 1/s is what they may differ by in depth.
+        assert float((guided.color - full.color).abs().max()) < 1 / 150
+
+    def test_shares_out_of_range_are_refused(self) -> None:
+        with pytest.raises(ValueError, match=r"skip_share=1\.5"):
+            self.seen(skip=0.1, skip_share=1.5)

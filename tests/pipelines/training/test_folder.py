@@ -1,0 +1,236 @@
+"""What a training keeps in its run directory, and what it finds again."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+from mplicits.neural_fields import InputError, Similarity, Siren, load_field, save_field
+from mplicits.pipelines.training.folder import (
+    MAY_CHANGE,
+    RunFolder,
+    check_new_run,
+    find_field,
+    fitted_cloud,
+    is_fitted,
+    load_state,
+    named_cloud,
+    read_record,
+    write_texture,
+)
+from mplicits.pipelines.training.settings import FitConfig, TextureConfig
+from safetensors.torch import save_file
+
+BALL, HERE = Siren(8, 1), Similarity((1.0, 2.0, 3.0), 4.0)
+RECORD = {"finished": False, "config": {"width": 8}, "checks": {"ends": []}}
+
+
+def kept(path: Path) -> RunFolder:
+    """A run that was interrupted."""
+    folder = RunFolder(path)
+    with folder.writing():
+        folder.save(BALL, HERE, RECORD, {"network.a": torch.arange(3)}, {"fingerprint": "f", "stages": [1]})
+    return folder
+
+
+def names(path: Path) -> list[str]:
+    return sorted(file.name for file in path.iterdir())
+
+
+def test_a_checkpoint_is_a_usable_field_and_what_a_resumed_run_finds(tmp_path: Path) -> None:
+    kept(tmp_path / "run")
+    assert names(tmp_path / "run") == ["field.safetensors", "resume.safetensors", "run.json"]
+    _, similarity, metadata = load_field(tmp_path / "run" / "field.safetensors")
+    assert similarity == HERE
+    record = read_record(tmp_path / "run")
+    short = {"generation": record["generation"], "finished": False, "config": {"width": 8}}
+    assert metadata["run"] == short  # figures are in the record alone
+    assert set(record.pop("files")) == {"field.safetensors", "resume.safetensors"}
+    assert record == short | RECORD
+    assert not is_fitted(tmp_path / "run")
+    again = RunFolder(tmp_path / "run", resume=True)
+    assert again.config(TextureConfig, TextureConfig(width=9)) == TextureConfig(width=8)
+    with again.writing():
+        tensors, progress = again.restore("f", "other data")
+    assert tensors["network.a"].tolist() == [0, 1, 2]
+    about = {"config": {"width": 8}, "generation": record["generation"]}
+    assert progress == {"fingerprint": "f", "stages": [1], **about}
+    with pytest.raises(InputError, match=r"^other data, or leave out --resume and choose a new -o$"):
+        again.restore("g", "other data")
+
+
+def test_a_finished_run_has_nothing_to_resume(tmp_path: Path) -> None:
+    folder = kept(tmp_path)
+    folder.finish(BALL, HERE, RECORD | {"finished": True})
+    assert names(tmp_path) == ["field.safetensors", "run.json"]
+    assert is_fitted(tmp_path)
+    with pytest.raises(InputError, match="is finished, so there is nothing to resume"):
+        check_new_run(tmp_path, resume=True, force=False)
+    with pytest.raises(InputError, match="nothing to resume"):
+        RunFolder(tmp_path, resume=True).restore("f", "")
+
+
+def test_an_old_run_stays_until_the_first_checkpoint_of_the_new_one(tmp_path: Path) -> None:
+    kept(tmp_path)
+    old = read_record(tmp_path)
+    others = ("support.safetensors", "texture.safetensors", "texture.resume.safetensors", "held_out.png", "mesh.ply")
+    for name in others:
+        (tmp_path / name).touch()
+    new = RunFolder(tmp_path)
+    with new.writing("held_out.png"):
+        assert len(names(tmp_path)) == 3 + len(others) + 1  # with the lock
+        assert find_field(tmp_path).is_file()
+        assert read_record(tmp_path) == old
+        assert not new.has_checkpoint
+        new.keep_tensors("support.safetensors", {"points": torch.zeros(2, 3)})
+        new.save(BALL, HERE, RECORD, {}, {})
+        assert new.has_checkpoint
+    assert names(tmp_path) == ["field.safetensors", "mesh.ply", "resume.safetensors", "run.json", "support.safetensors"]
+    record = read_record(tmp_path)
+    assert record["generation"] != old["generation"]
+    assert load_state(tmp_path, name="support.safetensors")[1] == {"generation": record["generation"]}
+    assert set(record["files"]) == {"field.safetensors", "resume.safetensors", "support.safetensors"}
+
+
+def test_what_came_before_the_first_checkpoint_is_nothing_that_could_be_lost(tmp_path: Path) -> None:
+    with RunFolder(tmp_path).writing():
+        (tmp_path / ".next").mkdir()
+        (tmp_path / ".next" / "field.safetensors").write_bytes(b"half")
+        (tmp_path / "merged_cloud.npz").touch()
+    assert check_new_run(tmp_path, resume=False, force=False) == tmp_path
+    with pytest.raises(InputError, match="holds no interrupted run, so there is nothing to resume; leave out --resume"):
+        check_new_run(tmp_path, resume=True, force=False)
+    with pytest.raises(InputError, match=r"not a run directory .* make one with `mplicits fit"):
+        find_field(tmp_path)
+    with RunFolder(tmp_path).writing():
+        assert names(tmp_path) == ["merged_cloud.npz", "run.lock"]
+
+
+def test_files_of_two_runs_are_refused(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        kept(tmp_path / name)
+    shutil.copy(tmp_path / "a" / "resume.safetensors", tmp_path / "b")
+    with pytest.raises(InputError, match=r"b: run\.json and resume\.safetensors are of two runs; begin again with --f"):
+        RunFolder(tmp_path / "b", resume=True).config(TextureConfig, None)
+    save_field(tmp_path / "a" / "field.safetensors", Siren(8, 2))
+    with pytest.raises(InputError, match=r"a: field\.safetensors is damaged, or not the one that run\.json"):
+        find_field(tmp_path / "a")
+    assert find_field(tmp_path / "a" / "field.safetensors").is_file()  # whoever names it may have it
+
+
+@pytest.mark.parametrize("name", ["field.safetensors", "resume.safetensors"])
+def test_inverted_bytes_are_found(tmp_path: Path, name: str) -> None:
+    kept(tmp_path)
+    content = bytearray((tmp_path / name).read_bytes())
+    content[-1] ^= 0x01
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(InputError, match=r"damaged .*numbers are not those that were written"):
+        load_field(tmp_path / name) if name == "field.safetensors" else load_state(tmp_path)
+
+
+def test_settings_that_were_edited_are_refused_but_for_those_that_may_change(tmp_path: Path) -> None:
+    kept(tmp_path)
+    record = read_record(tmp_path)
+    assert MAY_CHANGE == ("device", "time_budget")
+    for name, value in (("device", "cpu"), ("time_budget", 3.0)):
+        record["config"][name] = value
+    (tmp_path / "run.json").write_text(json.dumps(record))
+    config = RunFolder(tmp_path, resume=True).config(TextureConfig, None)
+    assert (config.device, config.time_budget, config.width) == ("cpu", 3.0, 8)
+    for name, value in (("width", 9), ("seed", 1)):
+        changed = record | {"config": record["config"] | {name: value}}
+        (tmp_path / "run.json").write_text(json.dumps(changed))
+        with pytest.raises(InputError, match=rf"run\.json: says {name} {value}, but the run began with .* put it back"):
+            RunFolder(tmp_path, resume=True).config(TextureConfig, None)
+
+
+def test_runs_of_before_are_read_and_resumed(tmp_path: Path) -> None:
+    """What was written without generation, digests and checksums."""
+    save_field(tmp_path / "field.safetensors", BALL, similarity=HERE, metadata={"run": RECORD})
+    (tmp_path / "run.json").write_text(json.dumps(RECORD))
+    progress = json.dumps({"fingerprint": "f"})
+    save_file({"a": torch.arange(3)}, tmp_path / "resume.safetensors", metadata={"progress": progress})
+    assert load_field(find_field(tmp_path)).similarity == HERE
+    folder = RunFolder(tmp_path, resume=True)
+    assert folder.config(TextureConfig, None).width == 8
+    with folder.writing():
+        assert folder.restore("f", "")[0]["a"].tolist() == [0, 1, 2]
+        folder.save(BALL, HERE, RECORD, {}, {"fingerprint": "f"})
+    assert RunFolder(tmp_path, resume=True).config(TextureConfig, None).width == 8
+    assert "generation" in read_record(tmp_path)
+
+
+def test_a_run_that_came_meanwhile_is_not_replaced(tmp_path: Path) -> None:
+    slow = RunFolder(tmp_path)
+    kept(tmp_path)
+    with pytest.raises(InputError, match="another run was written there meanwhile"), slow.writing():
+        pytest.fail("both would have been written")
+
+
+def test_colours_never_stay_beside_a_new_field(tmp_path: Path) -> None:
+    folder = kept(tmp_path)
+    write_texture(tmp_path, b"colours", {"finished": True}, finished=True)
+    record = read_record(tmp_path)
+    assert record["texture"] == {"finished": True}
+    assert set(record["files"]) == {"field.safetensors", "resume.safetensors", "texture.safetensors"}
+    folder.finish(BALL, HERE, RECORD | {"finished": True})
+    assert names(tmp_path) == ["field.safetensors", "run.json"]
+    assert set(read_record(tmp_path)["files"]) == {"field.safetensors"}
+
+
+def test_without_a_directory_nothing_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    folder = RunFolder(None)
+    assert folder.config(FitConfig, None) == FitConfig()
+    with folder.writing():
+        folder.save(BALL, HERE, RECORD, {}, {})
+        folder.finish(BALL, HERE, RECORD)
+    assert names(tmp_path) == []
+    with pytest.raises(InputError, match="resume: needs the run directory"):
+        RunFolder(None, resume=True)
+
+
+def test_missing_folders_above_a_run_are_made(tmp_path: Path) -> None:
+    path = tmp_path / "runs" / "today" / "ball"
+    assert check_new_run(path, resume=False, force=False) == path
+    assert names(tmp_path) == []  # asking makes nothing
+    kept(path)
+    assert read_record(path)["config"] == RECORD["config"]
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(InputError, match="file is no folder; choose another place"):
+        check_new_run(tmp_path / "file" / "ball", resume=False, force=False)
+
+
+def test_the_cloud_of_a_run_is_found_from_any_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By its own path when the run is moved, and by the way from the run when both are."""
+    scans, field = tmp_path / "a" / "scans", tmp_path / "a" / "runs" / "ball" / "field.safetensors"
+    for folder in (scans, field.parent, tmp_path / "elsewhere"):
+        folder.mkdir(parents=True)
+    (scans / "ball.ply").write_text("points")
+    monkeypatch.chdir(scans)
+    named = {"run": named_cloud("ball.ply", field.parent)}
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    assert fitted_cloud(field, named, remedy="") == scans / "ball.ply"
+    assert fitted_cloud(tmp_path / "field.safetensors", named, remedy="") == scans / "ball.ply"  # moved alone
+    shutil.move(tmp_path / "a", tmp_path / "b")
+    moved = tmp_path / "b" / "runs" / "ball" / "field.safetensors"
+    assert fitted_cloud(moved, named, remedy="").samefile(tmp_path / "b" / "scans" / "ball.ply")
+    with pytest.raises(InputError, match=r"its cloud .*ball\.ply is not to be found; name it$"):
+        fitted_cloud(field, named, remedy="name it")
+
+
+def test_a_cloud_that_is_no_file_keeps_its_name(tmp_path: Path) -> None:
+    named = named_cloud("torus", tmp_path)
+    assert named == {"cloud": "torus"}
+    with pytest.raises(InputError, match="its cloud torus is not to be found"):
+        fitted_cloud(tmp_path / "field.safetensors", {"run": named}, remedy="name it")
+    with pytest.raises(InputError, match="was not fitted to a cloud; name one"):
+        fitted_cloud(tmp_path / "field.safetensors", {"run": {}}, remedy="name one")
+
+
+@pytest.mark.parametrize("text", ["{", "[]", json.dumps({"finished": True}), json.dumps({"config": 3})])
+def test_a_damaged_record_is_an_input_error(tmp_path: Path, text: str) -> None:
+    (tmp_path / "run.json").write_text(text)
+    with pytest.raises(InputError, match=r"run\.json: damaged"):
+        read_record(tmp_path)

@@ -1,0 +1,79 @@
+"""What is printed of a progress, with and without a terminal."""
+
+import io
+import subprocess
+import sys
+
+import pytest
+from mplicits.pipelines.training import progress as module
+from mplicits.pipelines.training.progress import Lines, counter_bar, progress_bars, seconds_left, time_words
+from mplicits.pipelines.training.report import Progress
+from rich.console import Console
+
+
+def test_times_in_words() -> None:
+    said = [time_words(seconds) for seconds in (0.2, 59.4, 59.6, 65.1, 594.0, 596.0, 3599.0, 7260.0)]
+    assert said == ["0 s", "59 s", "1 min", "1 min 10 s", "9 min 50 s", "10 min", "1 h 00 min", "2 h 01 min"]
+
+
+def test_lines_now_and_then(capsys: pytest.CaptureFixture[str]) -> None:
+    """A line for each stage that ends, and one for each half minute between, with the time left of the stage."""
+    now = [0.0]
+    lines = Lines(clock=lambda: now[0])
+    for second in (0, 10):
+        now[0] = float(second)
+        lines(Progress("samples", 0, 0, second / 10, {}))
+    for second in range(191):
+        now[0] = 10.0 + second
+        lines(Progress("level 0", second, 190, second / 190, {"data": 1e-3}))
+    said = capsys.readouterr().err.splitlines()
+    assert said[0] == "samples: done in 10 s"
+    assert said[1] == "level 0: 16%; about 2 min 40 s left"
+    assert said[-1] == "level 0: 190 steps in 3 min 10 s; data 1.0e-03"
+    assert len(said) == 1 + 190 // 30 + 1
+
+
+def test_the_time_left_of_a_resumed_stage_follows_from_the_steps_since() -> None:
+    assert seconds_left(0.0, 0.6, 0.6) is None
+    assert seconds_left(40.0, 0.6, 0.8) == pytest.approx(40.0)
+
+
+def interrupted(now: list[float]) -> None:
+    with progress_bars(clock=lambda: now[0]) as report:
+        report(Progress("preparing", 0, 0, 0.0, {}))
+        report(Progress("preparing", 0, 0, 1.0, {}))
+        report(Progress("level 0", 0, 100, 0.0, {}))
+        now[0] = 45.0
+        report(Progress("level 0", 50, 100, 0.5, {"data": 1e-3}))
+        now[0] = 55.0
+        raise KeyboardInterrupt
+
+
+def test_bars_show_elapsed_time_and_time_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where messages are further apart than rich remembers."""
+    screen, now = io.StringIO(), [0.0]
+    console = Console(file=screen, force_terminal=True, width=100, color_system=None)
+    monkeypatch.setattr(module, "Console", lambda **_: console)
+    with pytest.raises(KeyboardInterrupt):
+        interrupted(now)  # the last that is drawn is the state in between
+    lines = screen.getvalue().splitlines()[-4:]
+    assert "preparing" in lines[0]
+    assert "100%" in lines[0]
+    assert "level 0" in lines[1]
+    assert "55 s, about 35 s left" in lines[1]
+    assert "data 1.0e-03" in lines[2]
+
+
+def test_a_counter_without_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    now = [0.0]
+    with counter_bar("scan", clock=lambda: now[0]) as count:
+        for done in range(5):
+            count(done, 4)
+            now[0] += 20.0
+    assert capsys.readouterr().err.splitlines() == ["scan: 50%; about 40 s left"]
+
+
+def test_no_torch() -> None:
+    """A bar may be shown before anything heavy is loaded."""
+    code = "import sys, mplicits.pipelines.training.progress; assert not {'torch', 'numpy'} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True)

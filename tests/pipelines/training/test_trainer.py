@@ -1,0 +1,123 @@
+"""The one loop: its schedule, when it reports, saves and stops, and that it continues to the same bits."""
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from mplicits.pipelines.training.trainer import Group, Objective, Progress, StopFlag, Trainer, warm_cosine
+from torch import Tensor, nn
+
+STEPS = 50
+WARM = warm_cosine(0.1)
+
+
+class Guess(Objective):
+    """Numbers that shall be 1, drawn a few at a time; the last batch pulls on the next."""
+
+    def __init__(self, seed: int = 0, rate: Callable[[float], float] = WARM) -> None:
+        self.numbers = nn.Parameter(torch.zeros(8))
+        network = nn.ParameterList([self.numbers, nn.Parameter(torch.zeros(1))])  # the second is not trained
+        generator = torch.Generator().manual_seed(seed)
+        super().__init__(network, [Group([self.numbers], rate)], generator, {"last": torch.zeros(3)})
+        self.seen: list[tuple[int, float]] = []
+
+    def losses(self, step: int, done: float) -> tuple[dict[str, Tensor], Tensor]:
+        self.seen.append((step, done))
+        batch = self.numbers[torch.randint(8, (3,), generator=self.generator)]
+        apart, moved = (batch - 1).square().sum(), (batch - self.kept["last"]).square().sum()
+        self.kept["last"] = batch.detach()
+        return {"apart": apart, "moved": moved}, apart + 0.1 * moved
+
+
+def guess(**options: object) -> Trainer[Guess]:
+    return Trainer(Guess(), stage="guess", steps=STEPS, **options)  # pyright: ignore[reportArgumentType]
+
+
+def stop_at(step: int, flag: StopFlag) -> Callable[[Progress], None]:
+    def report(progress: Progress) -> None:
+        flag.requested = progress.step == step
+
+    return report
+
+
+def test_the_rate_warms_up_and_falls_as_a_cosine() -> None:
+    rate = warm_cosine(2.0)
+    assert rate(0.0) == pytest.approx(2.0 * 0.05)
+    assert rate(0.02) == pytest.approx(2.0, rel=0.01)
+    assert rate(0.5) == pytest.approx(1.0)
+    assert rate(1.0) == pytest.approx(0.0, abs=1e-12)
+
+
+def test_the_rate_of_every_step_is_that_of_the_schedule() -> None:
+    trainer = Trainer(Guess(rate=lambda done: 1e-3 * (1 + done)), stage="guess", steps=4)
+    rates: list[float] = []
+    trainer.run(report=lambda _: rates.append(trainer.adam.param_groups[0]["lr"]), report_every=1)
+    assert rates[1:] == pytest.approx([1e-3, 1.25e-3, 1.5e-3, 1.75e-3])  # the first report comes before any step
+    assert trainer.objective.seen == [(0, 0.0), (1, 0.25), (2, 0.5), (3, 0.75)]
+
+
+def test_reports_come_at_the_beginning_every_so_many_steps_and_at_the_end() -> None:
+    trainer, seen = guess(), []
+    assert trainer.run(report=seen.append, report_every=20)
+    assert [(progress.stage, progress.step, progress.fraction) for progress in seen] == [
+        ("guess", 0, 0.0),
+        ("guess", 20, 0.4),
+        ("guess", 40, 0.8),
+        ("guess", 50, 1.0),
+    ]
+    assert seen[1].losses["apart"] > seen[-1].losses["apart"]
+    assert trainer.losses == seen[-1].losses
+    assert not trainer.ended_early
+
+
+def test_checkpoints_come_by_the_clock_and_before_a_stop() -> None:
+    trainer, saved, flag = guess(), [], StopFlag()
+    assert not trainer.run(
+        flag, report=stop_at(5, flag), save=lambda: saved.append(trainer.step), report_every=1, save_every=0.0
+    )
+    assert saved == [1, 2, 3, 4, 5, 5]  # it stops after the step under way, also when asked during its report
+    assert not trainer.run(flag, save=lambda: saved.append(trainer.step))
+    assert saved[-2:] == [5, 5]  # nothing more is done while the flag stands
+
+
+def test_a_time_budget_ends_the_schedule() -> None:
+    trainer = Trainer(Guess(), stage="guess", steps=10**9, seconds=0.2)
+    last: list[Progress] = []
+    assert trainer.run(report=last.append, report_every=10**9)
+    assert trainer.ended_early
+    assert 0.2 <= trainer.elapsed < 5
+    assert [progress.fraction for progress in last] == [0.0, 1.0]
+
+
+def test_no_steps_change_nothing() -> None:
+    trainer = Trainer(Guess(), stage="guess", steps=0)
+    assert trainer.run()
+    assert trainer.objective.numbers.eq(0).all()
+
+
+@pytest.mark.parametrize("without", [None, "adam.0.exp_avg", "generator", "last", "network.0"])
+def test_a_stopped_training_continues_to_the_same_bits_but_not_without_a_part_of_its_state(without: str | None) -> None:
+    whole, first, second = (
+        guess(clip=1.0),
+        guess(clip=1.0),
+        Trainer(Guess(seed=7), stage="guess", steps=STEPS, clip=1.0),
+    )
+    fresh, flag = second.state(), StopFlag()
+    fresh |= {"adam.0.exp_avg": torch.zeros(8)}
+    whole.run()
+    first.run(flag, report=stop_at(20, flag))
+    state = {name: tensor.clone() for name, tensor in first.state().items()}
+    assert set(state) == {
+        *("network.0", "network.1", "adam.0.step", "adam.0.exp_avg", "adam.0.exp_avg_sq"),
+        *("generator", "progress", "last"),
+    }
+    if without is not None:
+        state[without] = fresh[without]
+    second.restore(state)
+    assert (second.step, second.elapsed) == (20, first.elapsed)
+    second.run()
+    assert torch.equal(second.objective.numbers, whole.objective.numbers) is (without is None)
+
+
+def test_a_network_may_have_another_name_in_the_state() -> None:
+    assert "model.0" in guess(network_name="model").state()
