@@ -24,7 +24,7 @@ from ..render.picture import Image, contact_sheet, in_rows, write_picture
 from ..render.shade import ShadeOptions, compose, downsample, shade
 from ..render.subject import Orbit, orbit_cameras, traced_part
 from ..render.trace import RESOLUTION, TOLERANCE, fine_strips, pixel_size, see_hits
-from ..texture.riding import Colors, RidingColors, borrowed_texture, pinned_texture, start_texture
+from ..texture.transport import Colors, TransportedColors, borrowed_texture, pinned_texture, start_texture
 from ..training.folder import FIELD_FILE, RECORD_FILE, chosen_level, find_field, read_record
 from ..training.machine import choose_device
 from ..training.motion import load_motion
@@ -152,7 +152,7 @@ def animate_run(
 
 def _riding(
     file: Path, field: Field, similarity: Similarity, level: int, options: SequenceOptions
-) -> RidingColors | None:
+) -> TransportedColors | None:
     """The colours that ride along, if there are any."""
     if options.no_colors:
         return None
@@ -168,7 +168,7 @@ def _riding(
         raise InputError(f"--last-colors: {file} has no colours at the start; name the first shape's run with --colors")
     if texture is None:
         return None
-    return RidingColors(field, texture, placed=placed, last=last, level=level, motion=motion)
+    return TransportedColors(field, texture, placed=placed, last=last, level=level, motion=motion)
 
 
 def last_colors(run: str | Path, file: Path, field: Field) -> Colors:
@@ -189,7 +189,7 @@ def last_colors(run: str | Path, file: Path, field: Field) -> Colors:
 def film_frames(
     file: Path,
     field: Field,
-    riding: RidingColors | None,
+    riding: TransportedColors | None,
     level: int,
     options: SequenceOptions,
     progress: Tell | None = None,
@@ -248,7 +248,7 @@ def _write_series(
     folder: Path,
     file: Path,
     field: Field,
-    riding: RidingColors | None,
+    riding: TransportedColors | None,
     similarity: Similarity,
     level: int,
     options: SequenceOptions,
@@ -281,7 +281,7 @@ def _write_moving_mesh(
     out: Path,
     file: Path,
     field: Field,
-    riding: RidingColors | None,
+    riding: TransportedColors | None,
     similarity: Similarity,
     level: int,
     options: SequenceOptions,

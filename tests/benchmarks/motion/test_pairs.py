@@ -10,7 +10,6 @@ from mplicits.pipelines.evolve import deform
 from mplicits.pipelines.evolve.shapes import read_shape
 from mplicits.pipelines.mesh.files import write_mesh
 from mplicits.pipelines.render.subject import Orbit, orbit_cameras
-from mplicits.pipelines.surface.surface import from_mesh
 from mplicits.pipelines.texture import riding
 from torch import Tensor
 
@@ -51,7 +50,7 @@ def test_a_rigid_motion_has_no_jumps(tmp_path: Path):
 
 
 def test_steps_are_those_of_the_places_at_the_start():
-    mesh = from_mesh(extract_mesh(Sphere(radius=0.5), resolution=RESOLUTION))
+    mesh = extract_mesh(Sphere(radius=0.5), resolution=RESOLUTION)
     (camera,) = orbit_cameras(mesh.vertices, Orbit(), size=(48, 48), frames=1)
     still = color_jumps(mesh, lambda points: points, camera)
     assert len(still) > 500
