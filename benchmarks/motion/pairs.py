@@ -235,8 +235,8 @@ def measure_pair(
     cameras = orbit_cameras(
         np.concatenate([mesh.vertices for mesh in seen]), Orbit(), size=(PIXELS, PIXELS), frames=VIEWS
     )
-    riding = TransportedColors(field, paint(0), last=paint(1), motion=velocity)
-    colors = [_carried(riding, time) for time in times]
+    transported = TransportedColors(field, paint(0), last=paint(1), motion=velocity)
+    colors = [_carried(transported, time) for time in times]
     steps = [
         None if mesh is None or at is None else np.concatenate([color_jumps(mesh, at, camera) for camera in cameras])
         for mesh, at in zip(meshes, colors, strict=True)
@@ -303,10 +303,10 @@ def color_jumps(mesh: Mesh, colors: Colors, camera: Camera) -> Float64:
     return np.linalg.norm(found[first[near]] - found[second[near]], axis=1)
 
 
-def _carried(riding: TransportedColors, time: float) -> Colors | None:
+def _carried(transported: TransportedColors, time: float) -> Colors | None:
     """None where colours cannot be carried."""
     try:
-        return riding.at(time)
+        return transported.at(time)
     except InputError:
         return None
 

@@ -283,11 +283,11 @@ def test_a_mesh_is_not_followed_through_a_merger(speed, when):
 def test_colours_ride_along_with_a_rigid_motion(run):
     field = load_field(run / "field.safetensors").field
     texture = load_texture(run / "texture.safetensors", moment(field, 0.0))
-    riding = TransportedColors(field, texture)
+    transported = TransportedColors(field, texture)
     points = torch.from_numpy(extract_mesh(moment(field, 0.0), resolution=16).vertices).float()
     there = torch.from_numpy(extract_mesh(moment(field, 1.0), resolution=16).vertices).float()
-    torch.testing.assert_close(riding.at(0.0)(points), texture.colors(points))
-    torch.testing.assert_close(riding.at(1.0)(there), texture.colors(there - DRIFT), atol=0.01, rtol=0)
+    torch.testing.assert_close(transported.at(0.0)(points), texture.colors(points))
+    torch.testing.assert_close(transported.at(1.0)(there), texture.colors(there - DRIFT), atol=0.01, rtol=0)
 
 
 def test_colours_ride_along_a_velocity_that_was_learnt(run):
@@ -372,11 +372,11 @@ def test_colours_of_both_ends_fade_into_each_other():
     """On a sphere that a velocity turns: a point of time t was elsewhere t before, and will be 1 − t after."""
     field = Keyframes([0.0, 1.0], [Sphere(radius=0.5), Sphere(radius=0.5)])
     turn = RigidMotion(angle=1.0)
-    riding = TransportedColors(field, lambda x: 0.5 + x, last=lambda x: 0.5 - x, motion=turn.velocity)
+    transported = TransportedColors(field, lambda x: 0.5 + x, last=lambda x: 0.5 - x, motion=turn.velocity)
     points = 0.5 * torch.nn.functional.normalize(torch.randn(100, 3), dim=-1)
     for t in (0.0, 0.25, 1.0):
         before, after = turn.inverse(points, t), turn.forward(points, 1 - t)
-        torch.testing.assert_close(riding.at(t)(points), 0.5 + (1 - t) * before - t * after, atol=1e-5, rtol=0)
+        torch.testing.assert_close(transported.at(t)(points), 0.5 + (1 - t) * before - t * after, atol=1e-5, rtol=0)
 
 
 def test_colours_do_not_tear_where_points_leave_the_surface():
