@@ -61,12 +61,7 @@ __all__ = [
 
 # A band at least this wide (in units of the field) holds decimated meshes, and the surfaces of small networks.
 LEAST_DELTA = 0.02
-# The default for a field of one level, which has no band of its own that says how near it is to its points.
-SINGLE_LEVEL_DELTA = 0.05
-LEAST_SHARE = 0.1  # of a time budget, that the steps get in any case
-FEWEST = 2_000  # points that are left where time is short
-# Points of the pool at which the final error is measured.
-JUDGED = 100_000
+FEWEST_COLORED = 2_000  # points that are left where time is short
 
 
 @dataclass(frozen=True)
@@ -147,14 +142,14 @@ def fit_texture(
     def part(count: int) -> tuple[PointCloud, int]:
         """So many of the points, and as large a part of the band's."""
         share = count / max(len(cloud), 1)
-        return _thinned(cloud, share, config.seed), max(int(share * band_samples), FEWEST)
+        return _thinned(cloud, share, config.seed), max(int(share * band_samples), FEWEST_COLORED)
 
     generator = torch.Generator()
     with reported(progress, "texture: samples"):
         left = budget.left()
         if left is not None:
             seconds = SAMPLING_SHARE * left
-            count = affordable(lambda count: made(*part(count)), len(cloud), seconds, fewest=FEWEST)
+            count = affordable(lambda count: made(*part(count)), len(cloud), seconds, fewest=FEWEST_COLORED)
             if count < len(cloud):
                 cloud, band_samples = part(count)
                 note = f"learns from {len(cloud):,} points and {band_samples:,} of the band, for want of time"
@@ -166,7 +161,8 @@ def fit_texture(
     sampling_seconds = time.monotonic() - started
     left, seconds = budget.left(), None
     if left is not None and config.time_budget is not None:
-        seconds = max(left, LEAST_SHARE * config.time_budget)
+        # The steps get a tenth of a time budget in any case.
+        seconds = max(left, 0.1 * config.time_budget)
     objective = TextureObjective(network, samples, band, config, delta=delta, generator=generator)
     trainer = Trainer(objective, stage="texture", steps=config.steps, seconds=seconds)
     if state is not None:
@@ -268,8 +264,8 @@ def texture_run(
 
 
 def _thinned(cloud: PointCloud, share: float, seed: int) -> PointCloud:
-    """That share of the points, but at least `FEWEST`, drawn by the seed."""
-    count = min(len(cloud), max(int(share * len(cloud)), FEWEST))
+    """That share of the points, but at least `FEWEST_COLORED`, drawn by the seed."""
+    count = min(len(cloud), max(int(share * len(cloud)), FEWEST_COLORED))
     kept = np.sort(np.random.default_rng(seed).permutation(len(cloud))[:count])
     normals, colors = (None if rows is None else rows[kept] for rows in (cloud.normals, cloud.colors))
     return dataclasses.replace(cloud, points=cloud.points[kept], normals=normals, colors=colors)
@@ -317,7 +313,7 @@ def texture_of(run: str | Path, geometry: Field) -> TextureField | None:
 def default_delta(geometry: Field) -> float:
     """The band that holds the surfaces of all levels, in units of the field."""
     if geometry.num_levels == 1:
-        return SINGLE_LEVEL_DELTA
+        return 0.05  # it has no band of its own that says how near it is to its points
     return max(LEAST_DELTA, float(geometry.deltas.max()))
 
 
@@ -362,6 +358,6 @@ class TextureObjective(Objective):
 @torch.no_grad()
 def _psnr(network: ColorSiren, samples: ColorSamples, generator: torch.Generator) -> float:
     """Peak signal-to-noise ratio of the colours at points that were trained on, in dB."""
-    index = torch.randperm(len(samples.points), generator=generator)[:JUDGED].to(samples.points.device)
+    index = torch.randperm(len(samples.points), generator=generator)[:100_000].to(samples.points.device)
     error = color_loss(network.value(samples.points[index]).clamp(0, 1), samples.colors[index]).mean()
     return round(-10 * math.log10(max(float(error), 1e-12)), 3)
