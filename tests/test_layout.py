@@ -25,7 +25,15 @@ from mplicits.pipelines.training.machine import environment
 ROOT = Path(__file__).parent.parent
 # From the ground up. A room imports from those above it in this list, never from those below.
 ROOMS = (
+    "neural_fields/backend",
+    "neural_fields/fields",
+    "neural_fields/networks",
+    "neural_fields/volume",
+    "neural_fields/tracing",
+    "neural_fields/meshing",
+    "neural_fields/spacetime",
     "neural_fields",
+    "neural_fields/hosts",
     "datasets",
     "pipelines/training",
     "pipelines/surface",

@@ -50,6 +50,11 @@ class Combined(Field):
         return tuple(self.parts)  # pyright: ignore[reportReturnType]
 
     @property
+    def same_rows(self) -> bool:
+        """Whether it holds for every part."""
+        return all(field.same_rows for field in self.fields)
+
+    @property
     def deltas(self) -> Tensor:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Half-widths of the bands: the widest of the parts at each level, and what the combination adds to it."""
         bands = [field.deltas for field in self.fields]

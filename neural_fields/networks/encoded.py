@@ -57,6 +57,11 @@ class EncodedField(Field):
         self.grid = grid
 
     @property
+    def same_rows(self) -> bool:
+        """Whether it holds for the field that is encoded."""
+        return self.field.same_rows
+
+    @property
     def deltas(self) -> Tensor:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Half-widths of the bands, the field's own."""
         return self.field.deltas
