@@ -11,8 +11,8 @@ import trimesh
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ...neural_fields import Field, Mesh, Placement, Similarity, project_to_surface
-from ...neural_fields.meshing.placement import FRAMES
+from ...neural_fields import Field, Mesh, Similarity, project_to_surface
+from ...neural_fields.meshing.placement import FRAMES, Placement
 from ..surface.surface import components, sample_points
 
 __all__ = ["PrintReport", "Thickness", "format_report", "print_report", "thickness"]

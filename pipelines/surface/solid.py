@@ -6,7 +6,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...neural_fields import Jet, Mesh, OneLevelField
+from ...neural_fields import Jet, Mesh
+from ...neural_fields.fields.field import OneLevelField
 from .distance import MeshDistance
 from .surface import is_closed
 
