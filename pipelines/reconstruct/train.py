@@ -156,9 +156,9 @@ class _Reconstruction:
             agreement = agreement.without(self.odd)
             self.train_views = [*agreement.views]
         self.model = build_scene(config, has_masks=has_masks, views=len(self.train_views)).to(device)
-        whole, flat = self.model.outside is not None, config.smooth_weight > 0
+        whole = self.model.outside is not None
         self.holes = agreement.holes() if agreement else {}
-        pool = RayPool(self.train_views, images.similarity, device, whole=whole, flat=flat, left_out=self.holes)
+        pool = RayPool(self.train_views, images.similarity, device, whole=whole, left_out=self.holes)
         measured = MeasuredDepths(self.train_views, images, device, seed=config.seed) if config.depth_weight else None
         self.measured = measured or None
         with reported(report, "a surface to begin with"):

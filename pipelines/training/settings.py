@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import itertools
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 from .config import Settings, setting
 
@@ -132,6 +132,8 @@ class TextureConfig(TrainingSettings):
 class ReconstructConfig(TrainingSettings):
     """Settings of ``reconstruct``; the defaults are the ``default`` preset."""
 
+    gone: ClassVar = {"smooth_weight": "it had no gain on shapes that it was not made for; leave it out"}
+
     geometry: Literal["multiscale", "neus"] = setting(
         "multiscale", "a coarse SIREN and residuals in bands, or the 8 x 256 softplus network"
     )
@@ -190,11 +192,6 @@ class ReconstructConfig(TrainingSettings):
     grid_rate: float = setting(2.5, "learning rate of the hash encoding, over the colours'", above=0)
     sharpening: float = setting(24.0, "learning rate of the surface's uncertainty, over the geometry's", above=0)
     eikonal_weight: float = setting(0.05, "weight of (|grad f| - 1)^2", at_least=0)
-    smooth_weight: float = setting(
-        0.0,
-        "weight of how unevenly normals turn where the photographs show no detail; 1 is for things of plain colours",
-        at_least=0,
-    )
     mask_weight: float = setting(0.1, "weight of the masks' cross-entropy, where there are masks", at_least=0)
     depth_weight: float = setting(0.5, "weight of measured depths (depth maps, COLMAP's points); 0: unused", at_least=0)
     anneal: float = setting(0.2, "share of the training with annealed slopes", at_least=0, at_most=1)

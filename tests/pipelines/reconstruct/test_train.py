@@ -384,7 +384,8 @@ def test_a_picture_that_the_others_contradict_is_not_learnt_from(
 def test_what_is_behind_holes_of_masks_is_not_learnt(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(silhouettes, "FEW", 4)
+    limits = silhouettes.Limits(few=4)
+    monkeypatch.setattr(silhouettes, "Limits", lambda: limits)
     torn = with_fault(render_scene(SCENES["painted-sphere"](), views=6, size=24, samples=1), "holes")
     write_neus(tmp_path / "torn", torn)
     assert main(f"reconstruct {tmp_path / 'torn'} -o {tmp_path / 'run'} {FLAGS} --texture-steps 0".split()) == 0
