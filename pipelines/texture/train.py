@@ -135,7 +135,7 @@ def fit_texture(
     device = choose_device(config.device)
     level = geometry.resolve_level(level)
     delta = config.delta or default_delta(geometry)
-    budget, band_samples = Budget(config.time_budget, device, started=started), config.samples // 2
+    budget, band_samples = Budget(config.time_budget, started=started), config.samples // 2
     home = geometry.like.device
     geometry = geometry.to(device)
 

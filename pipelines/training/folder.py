@@ -32,7 +32,6 @@ from ...neural_fields.spacetime.dynamic_tracing import moment
 from .config import load_config
 from .lock import check_unlocked, locked
 from .swap import is_scratch, settled, swap, sweep
-from .team import is_leader
 
 __all__ = [
     "CLOUD_FILE",
@@ -228,6 +227,8 @@ def check_new_run(path: str | Path, *, resume: bool, force: bool) -> Path:
             resume.
     """
     path = Path(path)
+    if int(os.environ.get("WORLD_SIZE", "1")) > 1:  # set by torchrun
+        raise InputError("torchrun: a training runs in one process; start mplicits without it")
     if path.exists() and not path.is_dir():
         raise InputError(f"{path}: is a file; name a directory for the run")
     check_place(path)
@@ -264,7 +265,7 @@ class RunFolder:
         resume: whether the interrupted run there is continued.
 
     Attributes:
-        out: where to write, ``path``; None where nothing is kept, or another process of a team writes.
+        out: where to write, ``path``; None where nothing is kept, nothing.
 
     Raises:
         InputError: there is no directory to resume from.
@@ -274,7 +275,7 @@ class RunFolder:
         if resume and path is None:
             raise InputError("resume: needs the run directory (out=...)")
         self.path, self.resume = None if path is None else Path(path), resume
-        self.out = self.path if is_leader() else None
+        self.out = self.path
         self._found = None if self.path is None else _generation_in(self.path)
         self._generation = secrets.token_hex(8)
         self._gone: set[str] = set()  # of an older run, until the next checkpoint

@@ -234,3 +234,9 @@ def test_a_damaged_record_is_an_input_error(tmp_path: Path, text: str) -> None:
     (tmp_path / "run.json").write_text(text)
     with pytest.raises(InputError, match=r"run\.json: damaged"):
         read_record(tmp_path)
+
+
+def test_torchrun_is_refused_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    with pytest.raises(InputError, match="torchrun: a training runs in one process"):
+        check_new_run(tmp_path / "run", resume=False, force=False)
