@@ -139,7 +139,7 @@ def fit_moved(file: Path, config: FitConfig, *, out: Path, name: str, progress: 
         file: the cloud.
         config: settings.
         out: run directory.
-        name: what the file is called there from the first checkpoint on; until then that may be another run's.
+        name: of its copy there, from the first checkpoint on.
         progress: see `fit`.
 
     Raises:
@@ -147,7 +147,7 @@ def fit_moved(file: Path, config: FitConfig, *, out: Path, name: str, progress: 
         Interrupted: see `fit`.
     """
     folder = RunFolder(out)
-    folder.keep(name, file)
+    folder.keep(name, file.read_bytes())
     return _fit(folder, file, config, source=str(out / name), progress=progress)
 
 
