@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from mplicits.datasets.cameras import Camera
-from mplicits.neural_fields import Field, InputError, cone_starts, sphere_trace
+from mplicits.neural_fields import Field, InputError, sphere_trace
 from mplicits.neural_fields.meshing.extract import Mesh, NoSurfaceError, extract_mesh
+from mplicits.neural_fields.tracing.cones import cone_starts
 from mplicits.pipelines.render.rasterise import mesh_view
 from mplicits.pipelines.render.shade import shade
 from mplicits.pipelines.render.trace import Seen

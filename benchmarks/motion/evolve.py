@@ -17,7 +17,6 @@ from mplicits.neural_fields import (
     Moving,
     NoSurfaceError,
     RigidMotion,
-    ShrinkingSphere,
     Sphere,
     TimeSlice,
     Torus,
@@ -25,6 +24,7 @@ from mplicits.neural_fields import (
     extract_mesh,
     load_field,
 )
+from mplicits.neural_fields.spacetime.moving import ShrinkingSphere
 from mplicits.pipelines.evolve.checks import slope_figures
 from mplicits.pipelines.evolve.shapes import Placed, Placement
 from mplicits.pipelines.evolve.train import evolve

@@ -21,17 +21,15 @@ from mplicits.datasets.synthetic.scanner import simulate_scan
 from mplicits.neural_fields import (
     Field,
     InputError,
-    IntegrationError,
-    Keyframes,
     NoSurfaceError,
     Similarity,
-    Solver,
     TimeSlice,
     extract_mesh,
     project_to_surface,
-    trajectories,
 )
 from mplicits.neural_fields.spacetime.evolution import VectorField
+from mplicits.neural_fields.spacetime.flow import IntegrationError, Solver, trajectories
+from mplicits.neural_fields.spacetime.moving import Keyframes
 from mplicits.neural_fields.spacetime.surface_velocity import CarriedVelocity
 from mplicits.pipelines.evolve.checks import volume
 from mplicits.pipelines.evolve.problem import build_problem

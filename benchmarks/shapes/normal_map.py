@@ -12,8 +12,9 @@ from typing import Any
 
 import torch
 from mplicits.datasets import Camera, turntable
-from mplicits.neural_fields import Field, InputError, levels_of, load_field
+from mplicits.neural_fields import Field, InputError, load_field
 from mplicits.neural_fields.meshing.extract import NoSurfaceError, extract_mesh, map_normals
+from mplicits.neural_fields.networks.multiscale import levels_of
 from mplicits.pipelines.render.picture import check_picture_path, contact_sheet, write_picture
 from mplicits.pipelines.render.rasterise import mesh_view
 from mplicits.pipelines.render.shade import ShadeOptions, compose, shade

@@ -24,9 +24,10 @@ from ...datasets import (
     write_cloud_ply,
 )
 from ...datasets.synthetic.samples import feet_and_normals
-from ...neural_fields import Field, InputError, Placement, Similarity
+from ...neural_fields import Field, InputError, Similarity
 from ...neural_fields.backend.files import check_place
 from ...neural_fields.meshing.extract import Mesh, NoSurfaceError, extract_mesh
+from ...neural_fields.meshing.placement import Placement
 from ..fit.train import Run, fit
 from ..mesh.files import write_mesh
 from ..render.picture import Image, contact_sheet, write_picture

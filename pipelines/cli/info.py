@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from ...neural_fields import Siren, levels_of, load_field
+from ...neural_fields import Siren, load_field
+from ...neural_fields.networks.multiscale import levels_of
 from ..surface.surface import Surface, components, is_closed, read_surface
 from ..training.folder import RECORD_FILE, find_field, is_field, read_record, resumes_with
 from ..training.trainer import parameter_count

@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ...datasets.cameras import Camera
-from ...neural_fields import Field, InputError, Placement, Similarity, load_field
+from ...neural_fields import Field, InputError, Similarity, load_field
 from ...neural_fields.backend.files import check_place
 from ...neural_fields.meshing.extract import NoSurfaceError, extract_mesh
+from ...neural_fields.meshing.placement import Placement
 from ...neural_fields.spacetime.dynamic_tracing import DynamicTracer, moment
 from ..mesh.files import write_mesh, write_moving
 from ..render.film import ANIMATIONS, write_animation

@@ -10,9 +10,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ...neural_fields import Field, InputError, IntegrationError, Solver, flow, project_to_surface
+from ...neural_fields import Field, InputError, flow, project_to_surface
 from ...neural_fields.meshing.extract import NoSurfaceError, extract_mesh
 from ...neural_fields.spacetime.dynamic_tracing import moment
+from ...neural_fields.spacetime.flow import IntegrationError, Solver
 from ...neural_fields.spacetime.surface_velocity import CarriedVelocity
 from .topology import surface_of, topology_of
 

@@ -12,23 +12,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...neural_fields import (
-    Field,
-    InputError,
-    IntegrationError,
-    Keyframes,
-    Law,
-    RigidMotion,
-    Similarity,
-    VelocitySiren,
-    at_time,
-    flow,
-    mean_curvature,
-    normal_speed,
-    trajectories,
-    transport,
-)
-from ...neural_fields.spacetime.evolution import VectorField
+from ...neural_fields import Field, InputError, RigidMotion, Similarity, at_time, flow
+from ...neural_fields.spacetime.evolution import Law, VectorField, mean_curvature, normal_speed, transport
+from ...neural_fields.spacetime.flow import IntegrationError, trajectories
+from ...neural_fields.spacetime.moving import Keyframes
+from ...neural_fields.spacetime.velocity import VelocitySiren
 from ..training.budget import SAMPLING_SHARE, Budget, affordable
 from ..training.report import Report
 from ..training.settings import EvolveConfig

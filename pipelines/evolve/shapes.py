@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ...neural_fields import (
-    Bounded,
     Box,
     Capsule,
     Field,
@@ -30,6 +29,7 @@ from ...neural_fields import (
     load_field,
     project_to_surface,
 )
+from ...neural_fields.fields.csg import Bounded
 from ..surface.surface import Surface, from_mesh, sample_points
 from ..training.folder import find_field
 

@@ -29,7 +29,10 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from torch import Tensor
 
-from ...neural_fields import CarriedKeyframes, Field, Jet, Keyframes, Solver, Velocity, flow
+from ...neural_fields import Field, Jet, flow
+from ...neural_fields.spacetime.flow import Solver
+from ...neural_fields.spacetime.moving import Keyframes
+from ...neural_fields.spacetime.velocity import CarriedKeyframes, Velocity
 from .samples import values_at
 
 __all__ = ["Pace", "PacedKeyframes", "pace_of"]

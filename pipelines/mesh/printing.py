@@ -10,9 +10,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ...neural_fields import Field, Placement, Similarity, project_to_surface
+from ...neural_fields import Field, Similarity, project_to_surface
 from ...neural_fields.meshing.extract import Mesh
-from ...neural_fields.meshing.placement import FRAMES
+from ...neural_fields.meshing.placement import FRAMES, Placement
 from ..surface.surface import Surface, component_of_faces, face_normals, sample_points
 
 __all__ = ["PrintReport", "Shells", "Thickness", "format_report", "overhang", "print_report", "shells", "thickness"]

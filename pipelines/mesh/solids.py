@@ -14,7 +14,6 @@ import torch
 from numpy.typing import NDArray
 
 from ...neural_fields import (
-    Bounded,
     Difference,
     Field,
     InputError,
@@ -24,11 +23,12 @@ from ...neural_fields import (
     Similarity,
     Union,
     WorldField,
-    in_one_frame,
     save_field,
 )
+from ...neural_fields.fields.csg import Bounded
 from ...neural_fields.meshing.extract import Mesh, NoSurfaceError, extract_mesh
 from ...neural_fields.meshing.placement import METRES, Placement
+from ...neural_fields.shape import in_one_frame
 from ..surface.solid import MeshField
 from ..surface.surface import Surface, from_mesh, is_closed, read_surface
 from ..surface.trim import Support, drop_unsupported, read_support

@@ -6,7 +6,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...neural_fields import Jet, OneLevelField
+from ...neural_fields import Jet
+from ...neural_fields.fields.field import OneLevelField
 from .distance import MeshDistance
 from .surface import Surface, is_closed
 

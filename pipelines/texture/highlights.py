@@ -19,7 +19,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ...neural_fields import ColorSiren, Field, Jet, Mesh, TextureField, ViewColor, project_to_surface, sphere_trace
+from ...neural_fields import Field, Jet, Mesh, TextureField, ViewColor, project_to_surface, sphere_trace
+from ...neural_fields.networks.texture import ColorSiren
 from ..surface.surface import from_mesh, sample_points
 from ..training.report import Report
 from ..training.trainer import Group, Interrupted, Objective, Trainer, seeded, stop_on_signals, warm_cosine

@@ -19,21 +19,11 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from ...neural_fields import (
-    Field,
-    InputError,
-    IntegrationError,
-    Similarity,
-    Solver,
-    TextureField,
-    extract_mesh,
-    flow,
-    load_field,
-    map_colors,
-)
+from ...neural_fields import Field, InputError, Similarity, TextureField, extract_mesh, flow, load_field, map_colors
 from ...neural_fields.meshing.extract import NoSurfaceError
 from ...neural_fields.spacetime.dynamic_tracing import moment
 from ...neural_fields.spacetime.evolution import VectorField
+from ...neural_fields.spacetime.flow import IntegrationError, Solver
 from ...neural_fields.spacetime.surface_velocity import CarriedVelocity
 from ...neural_fields.tracing.projection import project_to_surface
 from ..training.folder import find_field

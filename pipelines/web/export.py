@@ -12,18 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...datasets.cameras import turntable
-from ...neural_fields import (
-    Field,
-    InputError,
-    MultiscaleSDF,
-    SavedField,
-    Siren,
-    TextureField,
-    extract_mesh,
-    load_field,
-    load_radiance,
-)
+from ...neural_fields import Field, InputError, MultiscaleSDF, Siren, TextureField, extract_mesh, load_field
 from ...neural_fields.backend.files import damage, write_whole
+from ...neural_fields.checkpoint import SavedField, load_radiance
 from ...neural_fields.meshing.extract import NoSurfaceError
 from ...neural_fields.networks.multiscale import levels_of
 from ...neural_fields.spacetime.field import SpaceTimeSDF

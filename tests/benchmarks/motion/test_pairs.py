@@ -5,7 +5,9 @@ from pathlib import Path
 
 import pytest
 from evolutions import QUICK, fails, few_points
-from mplicits.neural_fields import Box, Keyframes, Moving, RigidMotion, Similarity, Solver, Sphere, extract_mesh
+from mplicits.neural_fields import Box, Moving, RigidMotion, Similarity, Sphere, extract_mesh
+from mplicits.neural_fields.spacetime.flow import Solver
+from mplicits.neural_fields.spacetime.moving import Keyframes
 from mplicits.pipelines.evolve import deform
 from mplicits.pipelines.evolve.shapes import read_shape
 from mplicits.pipelines.mesh.files import write_mesh

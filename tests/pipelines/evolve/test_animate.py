@@ -14,12 +14,9 @@ import torch
 import trimesh
 from mplicits.datasets import linear_to_srgb
 from mplicits.neural_fields import (
-    ColorSiren,
     InputError,
-    Keyframes,
     Moving,
     RigidMotion,
-    ShrinkingSphere,
     Similarity,
     Siren,
     SpaceTimeSDF,
@@ -31,9 +28,11 @@ from mplicits.neural_fields import (
     load_field,
     load_texture,
     save_field,
-    save_texture,
 )
+from mplicits.neural_fields.checkpoint import save_texture
+from mplicits.neural_fields.networks.texture import ColorSiren
 from mplicits.neural_fields.spacetime.dynamic_tracing import moment
+from mplicits.neural_fields.spacetime.moving import Keyframes, ShrinkingSphere
 from mplicits.neural_fields.tracing.projection import project_to_surface
 from mplicits.pipelines.cli.draw import ANIMATE as COMMAND
 from mplicits.pipelines.evolve.animate import (

@@ -15,10 +15,8 @@ from mplicits.neural_fields import (
     Moving,
     MultiscaleSDF,
     RigidMotion,
-    ShrinkingSphere,
     Similarity,
     Siren,
-    Solver,
     SpaceTimeSDF,
     Sphere,
     Torus,
@@ -26,9 +24,10 @@ from mplicits.neural_fields import (
     at_time,
     extract_mesh,
     save_field,
-    spacetime_jet,
-    trajectories,
 )
+from mplicits.neural_fields.spacetime.field import spacetime_jet
+from mplicits.neural_fields.spacetime.flow import Solver, trajectories
+from mplicits.neural_fields.spacetime.moving import ShrinkingSphere
 from mplicits.pipelines.evolve import problem as evolve_problem
 from mplicits.pipelines.evolve.objective import EvolveObjective
 from mplicits.pipelines.evolve.problem import between, build_problem, velocity_field

@@ -3,17 +3,9 @@
 import numpy as np
 import pytest
 import torch
-from mplicits.neural_fields import (
-    Capsule,
-    CarriedKeyframes,
-    Field,
-    Keyframes,
-    Sphere,
-    TimeSlice,
-    Union,
-    VelocitySiren,
-    at_time,
-)
+from mplicits.neural_fields import Capsule, Field, Sphere, TimeSlice, Union, at_time
+from mplicits.neural_fields.spacetime.moving import Keyframes
+from mplicits.neural_fields.spacetime.velocity import CarriedKeyframes, VelocitySiren
 from mplicits.pipelines.evolve.source import Pace, PacedKeyframes, _progress, pace_of
 from mplicits.pipelines.evolve.topology import surface_of, topology_of
 from torch import Tensor

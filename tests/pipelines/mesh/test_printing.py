@@ -5,7 +5,8 @@ import math
 import numpy as np
 import pytest
 import trimesh
-from mplicits.neural_fields import Box, FunctionField, Mesh, Placement, Similarity, Sphere, Torus, extract_mesh
+from mplicits.neural_fields import Box, FunctionField, Mesh, Similarity, Sphere, Torus, extract_mesh
+from mplicits.neural_fields.meshing.placement import Placement
 from mplicits.pipelines.mesh.printing import format_report, overhang, print_report, shells, thickness
 from mplicits.pipelines.surface.surface import Surface
 

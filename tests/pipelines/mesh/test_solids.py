@@ -181,7 +181,8 @@ def test_one_line_says_what_is_wrong(balls: Path, capsys: pytest.CaptureFixture[
 
 def test_blobs_are_not_joined(tmp_path: Path) -> None:
     """What no points of a run support is left out of the union, unless the mesh beside it reaches there."""
-    from mplicits.neural_fields import WorldField, in_one_frame
+    from mplicits.neural_fields import WorldField
+    from mplicits.neural_fields.shape import in_one_frame
     from mplicits.pipelines.mesh import solids
     from mplicits.pipelines.surface.trim import Support
 

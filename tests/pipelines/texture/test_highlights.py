@@ -3,19 +3,9 @@
 import numpy as np
 import pytest
 import torch
-from mplicits.neural_fields import (
-    ColorSiren,
-    Jet,
-    Mesh,
-    MultiscaleSDF,
-    Siren,
-    Sphere,
-    TextureField,
-    Union,
-    ViewColor,
-    extract_mesh,
-    solve_sphere,
-)
+from mplicits.neural_fields import Jet, Mesh, MultiscaleSDF, Siren, Sphere, TextureField, Union, ViewColor, extract_mesh
+from mplicits.neural_fields.networks.sphere_init import solve_sphere
+from mplicits.neural_fields.networks.texture import ColorSiren
 from mplicits.pipelines.texture import highlights
 from mplicits.pipelines.texture.highlights import FACING, LOOKS, fit_highlights
 from mplicits.pipelines.training.trainer import StopFlag

@@ -7,17 +7,10 @@ import numpy as np
 import pytest
 import torch
 from mplicits.datasets.cameras import turntable
-from mplicits.neural_fields import (
-    ColorSiren,
-    MultiscaleSDF,
-    Radiance,
-    TextureField,
-    ViewColor,
-    extract_mesh,
-    save_field,
-    save_radiance,
-    save_texture,
-)
+from mplicits.neural_fields import MultiscaleSDF, TextureField, ViewColor, extract_mesh, save_field
+from mplicits.neural_fields.checkpoint import save_radiance, save_texture
+from mplicits.neural_fields.networks.radiance import Radiance
+from mplicits.neural_fields.networks.texture import ColorSiren
 from mplicits.pipelines.texture.highlights import fit_highlights
 from mplicits.pipelines.web import export
 from mplicits.pipelines.web.export import WebOptions, pack_run, web_run

@@ -5,7 +5,8 @@ import math
 import numpy as np
 import pytest
 import torch
-from mplicits.neural_fields import Box, Capsule, Field, Siren, Sphere, as_field
+from mplicits.neural_fields import Box, Capsule, Field, Siren, Sphere
+from mplicits.neural_fields.fields.function import as_field
 from mplicits.neural_fields.networks.sphere_init import fit_sphere
 from mplicits.pipelines.reconstruct.model.smoothness import (
     ALIKE,
