@@ -22,6 +22,7 @@ from ...neural_fields.checkpoint import texture_bytes
 from ...neural_fields.fields.losses import color_loss, tangential_loss
 from ...neural_fields.networks.texture import ColorSiren
 from ...neural_fields.spacetime.dynamic_tracing import moment
+from ..training.atomic import prune
 from ..training.budget import SAMPLING_SHARE, Budget, affordable, step_seconds
 from ..training.config import load_config
 from ..training.folder import (
@@ -39,7 +40,6 @@ from ..training.machine import choose_device, environment
 from ..training.report import Report, reported
 from ..training.result import Run
 from ..training.settings import TextureConfig
-from ..training.swap import sweep
 from ..training.trainer import Group, Objective, Trainer, parameter_count, seeded, stop_on_signals, warm_cosine
 from .samples import BandSamples, ColorSamples, band_directions, match_colors, read_colors
 
@@ -127,7 +127,7 @@ def fit_texture(
     device = choose_device(config.device)
     level = geometry.resolve_level(level)
     delta = config.delta or default_delta(geometry)
-    budget, band_samples = Budget(config.time_budget, device, started=started), config.samples // 2
+    budget, band_samples = Budget(config.time_budget, started=started), config.samples // 2
     home = geometry.like.device
     geometry = geometry.to(device)
 
@@ -221,7 +221,7 @@ def texture_run(
     state_file = texture_state_file(target)
     with locked(file.parent if beside else target):
         if beside:
-            sweep(file.parent)
+            prune(file.parent)
         before = _interrupted(state_file) if resume else None
         if before is not None:
             config, level = before.config, before.level
