@@ -127,7 +127,7 @@ def test_a_run_keeps_its_motion_and_resumes_to_the_same_bits(tmp_path: Path, mon
 
 
 def test_a_time_budget_shortens_the_motion():
-    budget = Budget(1.0, torch.device("cpu"))
+    budget = Budget(1.0)
     config = EvolveConfig(kind="deform", shapes=(LEFT, RIGHT), motion_steps=10**6)
     started = time.monotonic()
     learn_motion([read_shape(text) for text in config.shapes], (0.0, 1.0), config, budget=budget)
