@@ -15,19 +15,12 @@ import torch
 from torch import Tensor
 
 from ...datasets import PointCloud
-from ...neural_fields import (
-    ColorSiren,
-    Field,
-    InputError,
-    Similarity,
-    TextureField,
-    load_field,
-    load_texture,
-)
+from ...neural_fields import Field, InputError, Similarity, TextureField, load_field, load_texture
 from ...neural_fields.backend.devices import upload
 from ...neural_fields.backend.files import write_whole
 from ...neural_fields.checkpoint import texture_bytes
 from ...neural_fields.fields.losses import color_loss, tangential_loss
+from ...neural_fields.networks.texture import ColorSiren
 from ...neural_fields.spacetime.dynamic_tracing import moment
 from ..training.budget import SAMPLING_SHARE, Budget, affordable, step_seconds
 from ..training.config import load_config

@@ -12,10 +12,9 @@ from torch import Tensor
 
 from ....datasets.cameras import Camera
 from ....datasets.views.pictures import shrink
-from ....neural_fields import Field, sphere_trace
+from ....neural_fields import Field, Mesh, sphere_trace
 from ...render.rasterise import mesh_view
 from ...render.studio import sees
-from ...surface.surface import Surface
 from .silhouettes import OBJECT
 
 __all__ = ["SeenFrom", "count_views", "seen_points"]
@@ -77,7 +76,7 @@ def _coarse(camera: Camera, pixels: int) -> Camera:
 
 def count_views(
     cameras: Sequence[Camera],
-    surface: Surface,
+    surface: Mesh,
     points: NDArray[np.float64],
     *,
     finest: int = 1024,

@@ -10,9 +10,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ....neural_fields import fixed_shapes
 from ....neural_fields.backend.devices import handed
-from ....neural_fields.backend.fixed_shapes import FixedShapes
+from ....neural_fields.backend.fixed_shapes import FixedShapes, fixed_shapes
 from ...training.replay import CudaGraphs, Recorder, Replays
 from ...training.settings import ReconstructConfig
 from ...training.team import is_alone
