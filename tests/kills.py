@@ -130,7 +130,7 @@ def prepare(place: Path) -> None:
     write_mesh(place / "sphere.ply", extract_mesh(Sphere(radius=0.5), resolution=12))
     write_neus(place / "views", render_scene(SCENES["painted-sphere"](), views=6, size=12, samples=2))
     problem.END_POINTS, problem.REACH_POINTS, checks.END_RESOLUTION = 500, 100, 16
-    reconstructing.TEXTURE_SAMPLES, reconstructing.TEXTURE_RESOLUTION = 500, 24
+    reconstructing.FINISH = reconstructing.FinishOptions(texture_samples=500, texture_resolution=24)
     assert Trainer.run.__kwdefaults__ is not None
     Trainer.run.__kwdefaults__["save_every"] = 0.05
 

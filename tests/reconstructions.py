@@ -37,7 +37,7 @@ def small_reconstructions(patch: pytest.MonkeyPatch) -> None:
     """
     patch.setattr(scene_model, "fit_sphere", solve_sphere)
     patch.setitem(inspect.unwrap(hull.start_at_hull).__kwdefaults__, "steps", 50)
-    patch.setattr(reconstruct_texture, "TEXTURE_SAMPLES", 2000)
-    patch.setattr(reconstruct_texture, "TEXTURE_RESOLUTION", 32)
+    finish = reconstruct_texture.FinishOptions(texture_samples=2000, texture_resolution=32)
+    patch.setattr(reconstruct_texture, "FINISH", finish)
     small = partial(TextureConfig, samples=2000, width=16, depth=1, batch=256, band_batch=256)
     patch.setattr(reconstruct_texture, "TextureConfig", small)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
@@ -10,13 +11,19 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mplicits.pipelines.cli.common import add_flags, positive, typed, whole, write_json
+from mplicits.pipelines.cli.common import add_flags, positive, whole, write_json
 from mplicits.pipelines.training.config import input_error
 
 if TYPE_CHECKING:
     from ..harness.benchmark import Benchmark
 
-__all__ = ["folder_flag", "measured_flags", "noise_of", "noisy_flags", "number", "run_benches", "view_flags"]
+__all__ = ["folder_flag", "measured_flags", "noise_of", "noisy_flags", "number", "run_benches", "typed", "view_flags"]
+
+
+def typed(arguments: argparse.Namespace) -> str:
+    """The command as it could be typed again beside its files: pages are for others, who have other folders."""
+    words = (Path(word).name if Path(word).is_absolute() else word for word in arguments.words)
+    return shlex.join(words)
 
 
 def run_benches(

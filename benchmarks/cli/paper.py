@@ -8,10 +8,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TypeVar
 
-from mplicits.pipelines.cli.common import Command, add_flags, check_output, typed, whole, write_json
+from mplicits.pipelines.cli.common import Command, add_flags, check_output, whole, write_json
 from mplicits.pipelines.training.config import closest, input_error
 
 from ..paper.names import METHODS, PRESETS, TABLES
+from .common import typed
 
 __all__ = ["PAPER"]
 

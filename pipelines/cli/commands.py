@@ -12,9 +12,9 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from ..training.config import input_error
+from ..training.config import given_flags, input_error
 from ..training.settings import FitConfig
-from .common import Command, add_flags, add_settings, between, check_output, read_settings
+from .common import Command, add_flags, add_settings, between, check_output, read_settings, refuse
 from .draw import ANIMATE, RENDER, SLICE, VIEW
 from .fit import FIT
 from .mesh import EVALUATE, MESH
@@ -28,10 +28,10 @@ __all__ = ["COMMANDS"]
 SOLIDS = ("box", "cylinder", "gear")
 SAMPLES = ("statue", *SOLIDS)
 LENGTHS = {  # faults of a scan that are lengths, and what each is
-    "--noise": "standard deviation of the ranges, along the rays (0.096)",
-    "--isotropic-noise": "standard deviation of each coordinate of each point (0)",
-    "--quantise": "ranges are rounded to multiples of this (0)",
-    "--misalign": "registration error: how far each scan is shifted along each axis, and turned as well (0)",
+    "noise": "standard deviation of the ranges, along the rays (0.096)",
+    "isotropic_noise": "standard deviation of each coordinate of each point (0)",
+    "quantise": "ranges are rounded to multiples of this (0)",
+    "misalign": "registration error: how far each scan is shifted along each axis, and turned as well (0)",
 }
 DEMO_PRESET = "fast"  # with all that the demo does beside the fit, about two minutes on two cores
 
@@ -60,8 +60,8 @@ def _sample_arguments(parser: argparse.ArgumentParser) -> None:
     add_flags(parser, "--out", help="a .ply file to write")
     add_flags(parser, "--seed", help="of the scanners' noise (0)")
     faults = parser.add_argument_group("faults of the statue's scan; lengths in mm, or with a unit: 0.2mm, 20um")
-    for flag, about in LENGTHS.items():
-        faults.add_argument(flag, metavar="LENGTH", help=about)
+    for name, about in LENGTHS.items():
+        faults.add_argument(f"--{name.replace('_', '-')}", metavar="LENGTH", help=about)
     what = "share of the readings beside a jump in depth that lie in the air between its two sides, from 0 to 1 (0)"
     faults.add_argument("--smear", type=between(0, 1), metavar="SHARE", help=what)
     what = "how many times as dense the points are on one side as on the other (1)"
@@ -70,12 +70,11 @@ def _sample_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _sample(arguments: argparse.Namespace) -> int:
     check_output(arguments.out, (".ply",))
-    given = [flag for flag in (*LENGTHS, "--smear", "--uneven") if getattr(arguments, _dest(flag)) is not None]
+    flags = (*LENGTHS, "smear", "uneven")
     if arguments.name in SOLIDS:
-        if given:
-            raise input_error(f"{given[0]}: is of scans, and {arguments.name} is an exact mesh; leave it out")
+        refuse(arguments, flags, f"is of scans, and {arguments.name} is an exact mesh; leave it out")
         return _solid(arguments)
-    options = _faults(arguments) if given else {}
+    options = _faults(arguments) if any(getattr(arguments, name) is not None for name in flags) else {}
     from ...datasets import statue_scan, write_cloud_ply
     from ..training.progress import counter_bar
 
@@ -86,28 +85,21 @@ def _sample(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _dest(flag: str) -> str:
-    return flag[2:].replace("-", "_")
-
-
 def _faults(arguments: argparse.Namespace) -> dict[str, Any]:
     """What `statue_scan` is told of the faults that were asked for, in units of the statue."""
     from ...datasets import STATUE_PLACEMENT, ScanFaults
     from ..mesh.solids import length_in
 
-    lengths: dict[str, float] = {}
-    for flag in LENGTHS:
-        text = getattr(arguments, _dest(flag))
+    given: dict[str, float] = {}
+    for name in LENGTHS:
+        text, flag = getattr(arguments, name), f"--{name.replace('_', '-')}"
         if text is not None:
             length = length_in(text, "mm", flag)
             if length < 0:
                 raise input_error(f"{flag} {text}: expected a length ≥ 0")
-            lengths[_dest(flag)] = length / STATUE_PLACEMENT.scale
-    noise = {"noise": lengths.pop("noise")} if "noise" in lengths else {}
-    if "isotropic_noise" in lengths:
-        lengths["isotropic"] = lengths.pop("isotropic_noise")
-    rest = {name: getattr(arguments, name) for name in ("smear", "uneven") if getattr(arguments, name) is not None}
-    return {**noise, "faults": ScanFaults(**lengths, **rest)}
+            given[name.removesuffix("_noise")] = length / STATUE_PLACEMENT.scale
+    noise = {"noise": given.pop("noise")} if "noise" in given else {}
+    return {**noise, "faults": ScanFaults(**{**given_flags(arguments, ScanFaults), **given})}
 
 
 def _solid(arguments: argparse.Namespace) -> int:

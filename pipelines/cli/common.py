@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import argparse
 import math
-import shlex
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -24,18 +23,16 @@ __all__ = [
     "add_flags",
     "add_new_run",
     "add_settings",
-    "add_tensorboard",
     "between",
     "check_output",
     "finite",
+    "new_settings",
     "positive",
     "read_settings",
+    "refuse",
     "stoppable",
     "tell_budget",
-    "tensorboard",
     "training",
-    "typed",
-    "were_given",
     "whole",
     "write_json",
 ]
@@ -90,7 +87,7 @@ def stoppable(kept: str = "", *, at_any_time: bool = False) -> Iterator[None]:
 
 @contextmanager
 def training(
-    kept: str = "", *, quiet: bool = False, at_any_time: bool = False, heard: Sequence[Report] = ()
+    kept: str = "", *, quiet: bool = False, at_any_time: bool = False, board: Path | None = None
 ) -> Iterator[Report | None]:
     """`stoppable` work with progress bars, unless it is to be ``quiet``.
 
@@ -98,43 +95,28 @@ def training(
         kept: see `stoppable`.
         quiet: no bars.
         at_any_time: see `stoppable`.
-        heard: others that are told of all progress.
+        board: folder for a TensorBoard log, or None.
+
+    Raises:
+        InputError: see `tensorboard_log`.
     """
     from ..training.progress import progress_bars
 
-    with stoppable(kept, at_any_time=at_any_time), nullcontext() if quiet else progress_bars() as bars:
-        if not heard:
-            yield bars
-            return
-        listeners = [*heard, *([] if bars is None else [bars])]
+    with ExitStack() as stack:
+        stack.enter_context(stoppable(kept, at_any_time=at_any_time))
+        listeners: list[Report] = []
+        if board is not None:
+            from ..training.tensorboard import tensorboard_log
+
+            listeners.append(stack.enter_context(tensorboard_log(board)))
+        if not quiet:
+            listeners.append(stack.enter_context(progress_bars()))
 
         def tell(progress: Progress, /) -> None:
             for listener in listeners:
                 listener(progress)
 
-        yield tell
-
-
-def add_tensorboard(parser: argparse.ArgumentParser) -> None:
-    """The flag for `tensorboard`."""
-    what = "write the losses for TensorBoard into this folder; needs mplicits[tensorboard]"
-    parser.add_argument("--tensorboard", type=Path, metavar="DIR", help=what)
-
-
-@contextmanager
-def tensorboard(directory: Path | None) -> Iterator[list[Report]]:
-    """Who writes what TensorBoard shows, if a ``directory`` is named: for `training`.
-
-    Raises:
-        InputError: see `tensorboard_log`.
-    """
-    if directory is None:
-        yield []
-        return
-    from ..training.tensorboard import tensorboard_log
-
-    with tensorboard_log(directory) as log:
-        yield [log]
+        yield tell if listeners else None
 
 
 def tell_budget(record: Mapping[str, Any], name: str = "") -> None:
@@ -217,7 +199,11 @@ def add_flags(parser: argparse.ArgumentParser, *names: str, of: str = "", **chan
         parser.add_argument(*(["-o"] if name == "--out" else []), name, **options)
 
 
-def add_begin(parser: argparse.ArgumentParser, *, resume: str, force: str) -> None:
+def add_begin(
+    parser: argparse.ArgumentParser,
+    resume: str = "continue the interrupted run in RUN, with its settings",
+    force: str = "overwrite the run in RUN",
+) -> None:
     """Add ``--resume`` and ``--force``, of which one may be given, and ``--quiet``."""
     begin = parser.add_mutually_exclusive_group()
     begin.add_argument("--resume", action="store_true", help=resume)
@@ -226,9 +212,11 @@ def add_begin(parser: argparse.ArgumentParser, *, resume: str, force: str) -> No
 
 
 def add_new_run(parser: argparse.ArgumentParser, out: str = "directory of the run") -> None:
-    """Add ``-o RUN`` and how it begins."""
+    """Add ``-o RUN``, how it begins, and ``--tensorboard``."""
     add_flags(parser, "--out", metavar="RUN", help=out)
-    add_begin(parser, resume="continue the interrupted run in RUN, with its settings", force="overwrite the run in RUN")
+    add_begin(parser)
+    what = "write the losses for TensorBoard into this folder; needs mplicits[tensorboard]"
+    parser.add_argument("--tensorboard", type=Path, metavar="DIR", help=what)
 
 
 def add_settings(
@@ -251,9 +239,34 @@ def read_settings(arguments: argparse.Namespace, cls: type[T], *, default: str =
     return load_config(cls, arguments.config or arguments.preset or default, given_flags(arguments, cls))
 
 
-def were_given(arguments: argparse.Namespace, cls: type) -> bool:
-    """Whether any setting was given."""
-    return bool(arguments.config or arguments.preset or given_flags(arguments, cls))
+def new_settings(arguments: argparse.Namespace, cls: type[T], *others: str) -> T | None:
+    """What the arguments say of a new run; None of a resumed one, which has its own settings.
+
+    Raises:
+        InputError: a resumed run got settings, or one of the flags named ``others``; see `load_config`.
+    """
+    if not arguments.resume:
+        return read_settings(arguments, cls)
+    given = arguments.config or arguments.preset or given_flags(arguments, cls)
+    if given or any(getattr(arguments, name) for name in others):
+        raise input_error("--resume: continues with the run's own settings; leave out --preset, --config and the rest")
+    return None
+
+
+def refuse(arguments: argparse.Namespace, names: Iterable[str], why: str) -> None:
+    """Refuse the first of these flags that was given.
+
+    Args:
+        arguments: of the command.
+        names: of flags that do not go with others.
+        why: what the message says after the flag.
+
+    Raises:
+        InputError: one was.
+    """
+    for name in names:
+        if getattr(arguments, name, None) not in (None, False):
+            raise input_error(f"--{name.replace('_', '-')}: {why}")
 
 
 # --- before any work, and after it ---
@@ -274,12 +287,6 @@ def check_output(path: Path | None, suffixes: Sequence[str]) -> None:
     from ...neural_fields.backend.files import check_place
 
     check_place(path)
-
-
-def typed(arguments: argparse.Namespace) -> str:
-    """The command as it could be typed again beside its files: pages are for others, who have other folders."""
-    words = (Path(word).name if Path(word).is_absolute() else word for word in arguments.words)
-    return shlex.join(words)
 
 
 def write_json(path: Path | None, data: Any) -> None:

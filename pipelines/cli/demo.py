@@ -19,7 +19,6 @@ from ...datasets import (
     Statue,
     orbit,
     read_cloud,
-    sample_surface,
     statue_scan,
     write_cloud_ply,
 )
@@ -45,8 +44,6 @@ __all__ = ["demo", "distances_to_surface", "draw_levels", "spread_colors"]
 
 Float64 = NDArray[np.float64]
 
-CHECKED = 3_000  # vertices of the mesh whose exact distance to the statue is worked out
-EVEN = 8_000  # points spread evenly over the statue
 TILE = (480, 640)
 
 
@@ -112,7 +109,7 @@ def demo(
         with reported(report, "figures"):
             said.append(_figures(run, meshes, points))
             if cloud is None:
-                said.append(_true_errors(points, run.field, finest, run.similarity))
+                said.append(_true_errors(points, run.field, run.similarity))
     tell_budget(run.record)
     print("\n".join(said))
     print(f"{out / 'mesh.ply'}, mesh.glb, picture.png, run/: {time.monotonic() - started:.0f} s in all")
@@ -213,31 +210,16 @@ def _figures(run: Run, meshes: Sequence[Mesh], cloud: PointCloud) -> str:
     return f"lengths in input units\n{format_table(header, rows)}"
 
 
-def _true_errors(cloud: PointCloud, field: Field, mesh: Mesh, similarity: Similarity) -> str:
-    """How far the scan, each level and the finest mesh are from the statue itself, in input units.
-
-    Levels are judged on the statue's own surface where it was measured: at the feet of the scan's points, and on points
-    spread evenly near those, where the gaps between them and the rims of what was seen count as well. What no
-    scanner saw is made up; it counts in the last row alone.
-    """
-    statue, place = Statue(), STATUE_PLACEMENT
-    scan = place.to_unit(cloud.points)
-    measured = feet_and_normals(statue, scan)[0]
-    tree, spread = KDTree(measured), sample_surface(statue, EVEN, block=1 << 15).points
-    reach = 2 * float(np.median(tree.query(measured, k=2, workers=-1)[0][:, 1]))
-    near = tree.query(spread, workers=-1)[0] < reach
-    places = {"at the scan's points": measured, f"within {reach * place.scale:.1f} mm of them": spread[near]}
-    rows = [_error_row("the scan's points themselves", np.linalg.norm(scan - measured, axis=1) * place.scale)]
-    for name, points in places.items():
-        unit = similarity.to_unit(place.to_input(points))
-        for level in range(field.num_levels):
-            away = distances_to_surface(field, unit, level=level) * similarity.scale
-            rows.append(_error_row(f"level {level}, {name}", away))
-    vertices = mesh.vertices[np.random.default_rng(0).permutation(len(mesh.vertices))[:CHECKED]]
-    away = np.abs(statue.exact_distance(place.to_unit(similarity.to_input(vertices)))) * place.scale
-    rows.append(_error_row(f"mesh.ply, with the {1 - near.mean():.0%} that are not so near", away))
+def _true_errors(cloud: PointCloud, field: Field, similarity: Similarity) -> str:
+    """How far the scan and each level are from the statue itself, at the feet of the scan's points, in input units."""
+    scan = STATUE_PLACEMENT.to_unit(cloud.points)
+    feet = feet_and_normals(Statue(), scan)[0]
+    unit = similarity.to_unit(STATUE_PLACEMENT.to_input(feet))
+    away = {"the scan's points themselves": np.linalg.norm(scan - feet, axis=1) * STATUE_PLACEMENT.scale}
+    for level in range(field.num_levels):
+        away[f"level {level}, at the scan's points"] = distances_to_surface(field, unit, level=level) * similarity.scale
+    rows = [
+        [name, *(f"{figure:.3f}" for figure in (np.sqrt((far**2).mean()), *np.quantile(far, (0.5, 0.95))))]
+        for name, far in away.items()
+    ]
     return format_table(["off the statue, mm", "rms", "median", "95 %"], rows)
-
-
-def _error_row(name: str, away: Float64) -> list[str]:
-    return [name, *(f"{figure:.3f}" for figure in (np.sqrt((away**2).mean()), *np.quantile(away, (0.5, 0.95))))]

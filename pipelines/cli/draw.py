@@ -13,14 +13,13 @@ from typing import Any
 
 from ..training.config import add_config_flags, given_flags, input_error, load_config
 from ..training.settings import SHADINGS, ShadeOptions
-from .common import Command, add_flags, between, check_output, finite, whole
+from .common import Command, add_flags, between, check_output, finite, refuse, whole
 
 __all__ = ["ANIMATE", "RENDER", "SLICE", "VIEW"]
 
 PICTURES = (".png", ".jpg", ".jpeg")
 FILMS = (".mp4", ".gif")
 BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), "gray": (0.5, 0.5, 0.5), "transparent": None}
-ORBIT_FLAGS = ("azimuth", "elevation", "up", "fov", "zoom")
 RADIANCE = "radiance"
 # Settings that one shading alone heeds.
 MEASURED = ("depth", "curvature", "error")
@@ -124,18 +123,17 @@ def _shading(arguments: argparse.Namespace, given: dict[str, object]) -> str | N
 def _check(arguments: argparse.Namespace) -> None:
     """Refuse what does not go together."""
     _check_size(arguments.size)
-    for name in ("level", "normal_level"):
-        if arguments.levels and getattr(arguments, name) is not None:
-            raise input_error(f"--{name.replace('_', '-')}: --levels draws all of them; leave one of the two out")
+    if arguments.levels:
+        refuse(arguments, ("level", "normal_level"), "--levels draws all of them; leave one of the two out")
     if arguments.shading == RADIANCE and arguments.background != BACKGROUNDS["white"]:
         raise input_error(f"--background: --shading {RADIANCE} has that of the photographs; leave it out")
     if arguments.background is None and (
         arguments.levels or (arguments.sides or 1) > 1 or arguments.out.suffix.lower() != ".png"
     ):
         raise input_error("--background transparent: needs a .png of a single level and side; give it a colour")
-    for name in ORBIT_FLAGS:
-        if arguments.cameras is not None and getattr(arguments, name) is not None:
-            raise input_error(f"--{name}: the cameras of {arguments.cameras} say where to look from; leave it out")
+    if arguments.cameras is not None:
+        why = f"the cameras of {arguments.cameras} say where to look from; leave it out"
+        refuse(arguments, ("azimuth", "elevation", "up", "fov", "zoom"), why)
 
 
 RENDER = Command(
@@ -190,13 +188,13 @@ def _slice_arguments(parser: argparse.ArgumentParser) -> None:
 def _slice(arguments: argparse.Namespace) -> int:
     check_output(arguments.out, (*PICTURES, *FILMS))
     film = arguments.out.suffix.lower() in FILMS
-    for flag, value in (("--at", arguments.at), ("--point", arguments.point)):
-        if film and value is not None:
-            raise input_error(f"{flag}: a film goes through the whole shape; leave it out, or write a picture (.png)")
-    if arguments.at is not None and arguments.normal is not None:
-        raise input_error("--at: is a place on an axis; with --normal say --point X Y Z")
-    if arguments.point is not None and arguments.normal is None:
-        raise input_error("--point: goes with --normal; with --axis say --at C")
+    if film:
+        why = "a film goes through the whole shape; leave it out, or write a picture (.png)"
+        refuse(arguments, ("at", "point"), why)
+    if arguments.normal is None:
+        refuse(arguments, ["point"], "goes with --normal; with --axis say --at C")
+    else:
+        refuse(arguments, ["at"], "is a place on an axis; with --normal say --point X Y Z")
     if arguments.normal is not None and not any(arguments.normal):
         raise input_error("--normal: has no direction; give three numbers that are not all 0")
     arguments.size = _pair(arguments.size)
@@ -230,7 +228,6 @@ SLICE = Command(
 
 MOVING = (*FILMS, ".png")
 ANIMATED_SHADINGS = ("lambert", "headlight", "normals", "matcap", "color")
-OF_FILMS = ("size", "up", "azimuth", "elevation", "zoom", "shading", "samples")
 
 
 def _animate_arguments(parser: argparse.ArgumentParser) -> None:
@@ -257,17 +254,16 @@ def _animate_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _animate(arguments: argparse.Namespace) -> int:
     film = arguments.out.suffix.lower() in MOVING
-    for name in OF_FILMS:
-        if not film and getattr(arguments, name) is not None:
-            raise input_error(f"--{name}: goes with a film (.mp4, .gif) or a sheet (.png)")
-    if arguments.loop and arguments.out.suffix.lower() not in FILMS:
-        raise input_error("--loop: goes with a film (.mp4, .gif)")
-    if film and arguments.resolution is not None:
-        raise input_error("--resolution: goes with meshes; a film is traced in pixels (--size)")
+    if film:
+        refuse(arguments, ["resolution"], "goes with meshes; a film is traced in pixels (--size)")
+    else:
+        of_films = ("size", "up", "azimuth", "elevation", "zoom", "shading", "samples")
+        refuse(arguments, of_films, "goes with a film (.mp4, .gif) or a sheet (.png)")
+    if arguments.out.suffix.lower() not in FILMS:
+        refuse(arguments, ["loop"], "goes with a film (.mp4, .gif)")
     arguments.size = _pair(arguments.size)
-    for name in ("colors", "last_colors"):
-        if arguments.no_colors and getattr(arguments, name) is not None:
-            raise input_error(f"--{name.replace('_', '-')}: --no-colors leaves them out; leave one of the two out")
+    if arguments.no_colors:
+        refuse(arguments, ("colors", "last_colors"), "--no-colors leaves them out; leave one of the two out")
 
     from ..evolve.animate import SequenceOptions, animate_run
     from ..render.subject import Orbit

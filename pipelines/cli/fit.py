@@ -16,14 +16,12 @@ from .common import (
     Command,
     add_new_run,
     add_settings,
-    add_tensorboard,
+    new_settings,
     positive,
-    read_settings,
+    refuse,
     stoppable,
     tell_budget,
-    tensorboard,
     training,
-    were_given,
     whole,
 )
 from .train import tell_texture
@@ -50,7 +48,6 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     what = "then learn the colours, if there are any, and write the mesh (.ply, .obj, .stl, .glb)"
     add("--mesh", type=Path, metavar="FILE", help=what)
     add("--no-colors", action="store_true", help="leave the colours out of --mesh")
-    add_tensorboard(parser)
     what = "show the growing field in the browser, checkpoint by checkpoint; needs mplicits[view]"
     add("--watch", action="store_true", help=what)
     add_settings(parser, FitConfig)
@@ -75,11 +72,9 @@ def _depth_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _fit(arguments: argparse.Namespace) -> int:
-    if arguments.resume and were_given(arguments, FitConfig):
-        raise input_error("--resume: continues with the run's own settings; leave out --preset, --config and the rest")
-    if arguments.no_colors and arguments.mesh is None:
-        raise input_error("--no-colors: is about --mesh FILE; leave it out, or add that")
-    config = None if arguments.resume else read_settings(arguments, FitConfig)
+    config = new_settings(arguments, FitConfig)
+    if arguments.mesh is None:
+        refuse(arguments, ["no_colors"], "is about --mesh FILE; leave it out, or add that")
     if len(arguments.clouds) > 1 or arguments.jobs is not None:
         return _fit_many(arguments, config)
     return _fit_one(arguments, arguments.clouds[0], config)
@@ -102,11 +97,7 @@ def _fit_one(arguments: argparse.Namespace, cloud: str, config: FitConfig | None
     if mesh is not None:
         again += f" --mesh {mesh.out}" + " --no-colors" * arguments.no_colors
     texture, made, said, started = None, None, list[str](), time.monotonic()
-    with (
-        _watched(arguments),
-        tensorboard(arguments.tensorboard) as heard,
-        training(again, quiet=arguments.quiet, heard=heard) as report,
-    ):
+    with _watched(arguments), training(again, quiet=arguments.quiet, board=arguments.tensorboard) as report:
         if not fitted and depth is None:
             fit(cloud, config, out=directory, resume=arguments.resume, progress=report)
         elif not fitted and depth is not None:
@@ -156,12 +147,8 @@ def _planned(arguments: argparse.Namespace, source: Path | DepthInput) -> FitMes
 
 def _fit_many(arguments: argparse.Namespace, config: FitConfig | None) -> int:
     """A run for each cloud; a failed one leaves the others alone, and exit code 1."""
-    if arguments.watch:
-        raise input_error("--watch: is for one cloud; fit them one by one, without --jobs")
-    if arguments.tensorboard is not None:
-        raise input_error("--tensorboard: is for one cloud; fit them one by one, without --jobs")
-    if arguments.mesh is not None:
-        raise input_error("--mesh: is for one cloud; leave it out, and mesh the runs afterwards")
+    refuse(arguments, ["watch", "tensorboard"], "is for one cloud; fit them one by one, without --jobs")
+    refuse(arguments, ["mesh"], "is for one cloud; leave it out, and mesh the runs afterwards")
     for cloud in arguments.clouds:
         if _depth_input(arguments, cloud) is not None:
             raise input_error(f"{cloud}: holds depth maps; fit them on their own, without --jobs")

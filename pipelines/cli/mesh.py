@@ -95,12 +95,12 @@ def _evaluate(arguments: argparse.Namespace) -> int:
         metrics = evaluate_files(arguments.mesh, arguments.reference, **options)
     else:
         from ...datasets.views.formats.reading import read_cameras
-        from ..reconstruct.data.witnesses import count_witnesses
+        from ..reconstruct.data.visibility import count_views
         from ..training.progress import counter_bar
 
         cameras = [camera for _, camera in read_cameras(arguments.photos)]
         with counter_bar("photographs") as progress:
-            view_counts = functools.partial(count_witnesses, cameras, progress=progress)
+            view_counts = functools.partial(count_views, cameras, progress=progress)
             metrics = evaluate_files(arguments.mesh, arguments.reference, view_counts=view_counts, **options)
     print(format_metrics(metrics))
     if arguments.json:

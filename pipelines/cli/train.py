@@ -16,14 +16,12 @@ from .common import (
     add_flags,
     add_new_run,
     add_settings,
-    add_tensorboard,
     check_output,
-    read_settings,
+    new_settings,
+    refuse,
     stoppable,
     tell_budget,
-    tensorboard,
     training,
-    were_given,
 )
 from .views import tell_found
 
@@ -39,15 +37,14 @@ def _texture_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("source", metavar="CLOUD|MESH", help=what)
     what = ".safetensors (default: texture.safetensors beside the field)"
     add_flags(parser, "--out", required=False, help=what)
-    resume = "continue an interrupted training, with its settings"
-    add_begin(parser, resume=resume, force="replace a texture that is there already")
+    add_begin(parser, "continue an interrupted training, with its settings", "replace a texture that is there already")
     add_settings(parser, TextureConfig)
 
 
 def _texture(arguments: argparse.Namespace) -> int:
-    if arguments.resume and (were_given(arguments, TextureConfig) or arguments.level is not None):
-        raise input_error("--resume: continues with its own settings; leave out --preset, --level and the rest")
-    config = read_settings(arguments, TextureConfig)
+    if arguments.resume:
+        refuse(arguments, ["level"], "--resume continues with its own; leave it out")
+    config = new_settings(arguments, TextureConfig)
     check_output(arguments.out, (".safetensors",))
     from ..texture.train import texture_run
     from ..training.folder import TEXTURE_FILE, find_field
@@ -134,14 +131,11 @@ def _reconstruct_arguments(parser: argparse.ArgumentParser) -> None:
         "(see find-cameras; needs mplicits[poses])"
     )
     parser.add_argument("--poses", choices=("given", "colmap"), default="given", help=what)
-    add_tensorboard(parser)
     add_settings(parser, ReconstructConfig)
 
 
 def _reconstruct(arguments: argparse.Namespace) -> int:
-    if arguments.resume and were_given(arguments, ReconstructConfig):
-        raise input_error("--resume: continues with the run's own settings; leave out --preset, --config and the rest")
-    config = None if arguments.resume else read_settings(arguments, ReconstructConfig)
+    config = new_settings(arguments, ReconstructConfig)
     from ...datasets.views.poses.find_cameras import find_cameras
     from ..mesh.extract import mesh_run
     from ..reconstruct.posing import colmap_report
@@ -151,7 +145,7 @@ def _reconstruct(arguments: argparse.Namespace) -> int:
 
     directory = check_new_run(arguments.out, resume=arguments.resume, force=arguments.force)
     data = arguments.data
-    with tensorboard(arguments.tensorboard) as heard, training(quiet=arguments.quiet, heard=heard) as report:
+    with training(quiet=arguments.quiet, board=arguments.tensorboard) as report:
         if arguments.poses == "colmap":
             data = directory.with_name(f"{directory.name}-cameras")
             with stoppable("the same command continues", at_any_time=True):
@@ -177,9 +171,7 @@ def _reconstruct(arguments: argparse.Namespace) -> int:
             f"({directory / HELD_OUT_FILE})"
         )
     print(f"{directory / MESH_FILE}: {len(mesh.vertices):,} vertices, {len(mesh.faces):,} faces")
-    for line in lines:
-        print(f"  {line}")
-    print(f"next: mplicits view {directory}")
+    print("".join(f"  {line}\n" for line in lines) + f"next: mplicits view {directory}")
     return 0
 
 
@@ -222,7 +214,6 @@ def _evolve_arguments(parser: argparse.ArgumentParser) -> None:
     fits = "settings of the fits of clouds and meshes, a preset of `mplicits fit` or a YAML file (default: fast)"
     parser.add_argument("--fits", metavar="NAME|FILE", default="fast", help=fits)
     add_new_run(parser)
-    add_tensorboard(parser)
     add_settings(parser, EvolveConfig)
 
 
@@ -242,10 +233,7 @@ def _evolve(arguments: argparse.Namespace) -> int:
         if config.landmarks != given:
             print("all of them have the same faces: vertices are landmarks (pairs-00.txt and so on, beside the fits)")
     again = f"to continue: mplicits evolve -o {directory} --resume"
-    with (
-        tensorboard(arguments.tensorboard) as heard,
-        training(again, quiet=arguments.quiet, heard=heard) as report,
-    ):
+    with training(again, quiet=arguments.quiet, board=arguments.tensorboard) as report:
         run = evolve(config, out=directory, resume=arguments.resume, progress=report)
     tell_budget(run.record)
     _tell_evolution(run.record)
@@ -257,9 +245,7 @@ def _evolve_settings(arguments: argparse.Namespace) -> EvolveConfig:
     """What the arguments say; of a resumed run its own settings are read later."""
     flags, preset = given_flags(arguments, EvolveConfig), arguments.config or arguments.preset
     if arguments.resume:
-        if flags or preset or arguments.inputs:
-            raise input_error("--resume: continues with the run's own shapes and settings; leave out all others")
-        return EvolveConfig()
+        return new_settings(arguments, EvolveConfig, "inputs") or EvolveConfig()
     inputs = arguments.inputs
     if inputs and inputs[0].lower().endswith(CONFIG_SUFFIXES):
         if len(inputs) > 1 or preset:

@@ -5,17 +5,19 @@ from __future__ import annotations
 import argparse
 import sys
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, get_args, get_type_hints
 
 from ..training.config import input_error
 from ..training.settings import ReconstructConfig
-from .common import Command, add_flags, check_output, positive, training, whole, write_json
+from .common import Command, add_flags, check_output, positive, refuse, training, whole, write_json
 
 __all__ = ["CHECK_CAMERAS", "FIND_CAMERAS", "FIND_POINTS", "SCENE", "tell_found"]
 
 if TYPE_CHECKING:
     from ...datasets.views.poses.find_cameras import FoundCameras
+    from ...datasets.views.poses.find_points import FoundPoints
 
 
 def _find_arguments(parser: argparse.ArgumentParser) -> None:
@@ -42,14 +44,11 @@ def _find_cameras(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def tell_found(found: FoundCameras) -> None:
-    """Print what `find_cameras` has found, and warn on stderr."""
+def tell_found(found: FoundCameras | FoundPoints) -> None:
+    """Print what was found, and warn on stderr."""
     from ..reconstruct.posing import said_of
 
-    _tell(*said_of(found))
-
-
-def _tell(line: str, warnings: list[str]) -> None:
+    line, warnings = said_of(found)
     print(line)
     for warning in warnings:
         print(f"warning: {warning}", file=sys.stderr)
@@ -76,12 +75,12 @@ def _points_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _find_points(arguments: argparse.Namespace) -> int:
     from ...datasets.views.poses.find_points import find_points
-    from ..reconstruct.posing import colmap_report, said_of_points
+    from ..reconstruct.posing import colmap_report
 
     out = arguments.out
     with training("the same command continues", quiet=arguments.quiet, at_any_time=True) as report:
         found = find_points(arguments.data, out, report=colmap_report(report))
-    _tell(*said_of_points(found))
+    tell_found(found)
     print(f"next: mplicits reconstruct {out} -o RUN")
     write_json(arguments.json, asdict(found) | {"project": str(out)})
     return 0
@@ -147,7 +146,6 @@ CHECK_CAMERAS = Command(
 SCENE_NAMES = ("painted-sphere", "striped-torus", "figure", "statue")
 FAULTS = ("poses", "pose", "image", "mirrored", "masks", "holes", "exposure")
 FORMATS = ("neus", "transforms", "colmap", "colmap-text")
-TRUTH = "surface.ply"
 
 
 def _scene_arguments(parser: argparse.ArgumentParser) -> None:
@@ -185,27 +183,23 @@ def _scene(arguments: argparse.Namespace) -> int:
     name, exact = arguments.name, arguments.name in SCENES
     if not exact and not Path(name).exists():
         raise input_error(f"{name}: neither a mesh file nor one of the scenes {', '.join(SCENE_NAMES)}; check the name")
-    if exact and arguments.up:
-        raise input_error(f"--up: goes with a mesh; {name} stands as it is, so leave it out")
+    if exact:
+        refuse(arguments, ["up"], f"goes with a mesh; {name} stands as it is, so leave it out")
     given = {flag: getattr(arguments, flag) for flag in ("seed", "samples", "shaded", "glossy", "depths")}
-    scene = SCENES[name]() if exact else None
-    truth = true_mesh(name) if scene is None else scene_mesh(scene)
     with counter_bar("render") as progress:
-        if scene is not None:
-            images = render_scene(scene, arguments.views, arguments.size, progress=progress, **given)
+        given |= {"views": arguments.views, "size": arguments.size, "progress": progress}
+        if exact:
+            scene = SCENES[name]()
+            truth, images = scene_mesh(scene), render_scene(scene, **given)
         else:
-            up = arguments.up or "y"
-            images = photograph_mesh(name, arguments.views, arguments.size, up=up, progress=progress, **given)
+            truth, images = true_mesh(name), photograph_mesh(name, up=arguments.up or "y", **given)
     if arguments.fault:
         images = with_fault(images, arguments.fault, arguments.seed)
-    if arguments.format == "neus":
-        write_neus(folder, images)
-    elif arguments.format == "transforms":
-        write_transforms(folder, images)
-    else:
-        write_colmap(folder, images, form="text" if arguments.format == "colmap-text" else "binary")
-    write_mesh(folder / TRUTH, truth)
-    print(f"{folder}: {arguments.views} views of {arguments.size} × {arguments.size} pixels; the truth is {TRUTH}")
+    text = partial(write_colmap, form="text")
+    writers = {"neus": write_neus, "transforms": write_transforms, "colmap": write_colmap, "colmap-text": text}
+    writers[arguments.format](folder, images)
+    write_mesh(folder / "surface.ply", truth)
+    print(f"{folder}: {arguments.views} views of {arguments.size} × {arguments.size} pixels; the truth is surface.ply")
     print(f"next: mplicits check-cameras {folder} -o cameras.glb")
     return 0
 

@@ -19,15 +19,13 @@ from ...neural_fields.meshing.mesh import check_mesh_path
 from ..mesh.bake import check_texture_size, textured_mesh
 from ..mesh.extract import normals_near
 from ..mesh.files import check_textured_path
-from ..reconstruct.data.seen import seen_points
+from ..reconstruct.data.visibility import seen_points
 from ..surface.trim import Support, seen_part
 
 __all__ = ["colored", "export_mesh", "host_cameras", "in_data_coordinates", "main", "part_seen"]
 
 Float64 = NDArray[np.float64]
 Move = tuple[Float64, float]  # (3, 4) and a scale: see `in_data_coordinates`
-
-BATCH = 1 << 14
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -120,7 +118,7 @@ def _textured(path: Path, mesh: Mesh, field: NerfstudioField, move: Move, size: 
     def colors_at(points: Float64) -> NDArray[np.float32]:
         x = torch.from_numpy(_moved(points, *move)).to(field.field.like)
         with torch.no_grad():
-            return torch.cat([field.frontal_colors(part) for part in x.split(BATCH)]).float().numpy()
+            return torch.cat([field.frontal_colors(part) for part in x.split(1 << 14)]).float().numpy()
 
     def normals_at(points: Float64) -> NDArray[np.float64]:
         return normals_near(field.field, _moved(points, *move) * field.scale, level=level) @ rotation
@@ -133,7 +131,7 @@ def _textured(path: Path, mesh: Mesh, field: NerfstudioField, move: Move, size: 
 def colored(mesh: Mesh, field: NerfstudioField) -> Mesh:
     """A mesh in nerfstudio's coordinates with the colours that the surface has when it is seen from the front."""
     points = torch.from_numpy(mesh.vertices).to(field.field.like)
-    colors = torch.cat([field.frontal_colors(part) for part in points.split(BATCH)])
+    colors = torch.cat([field.frontal_colors(part) for part in points.split(1 << 14)])
     return dataclasses.replace(mesh, colors=colors.float().cpu().numpy())
 
 

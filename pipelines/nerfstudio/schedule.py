@@ -13,7 +13,6 @@ from torch.optim.lr_scheduler import LambdaLR
 __all__ = ["STEPS", "WarmCosine", "WarmCosineConfig"]
 
 STEPS = 20_000
-WARM_MOST = 0.1  # share of a training that the warm-up takes at most
 
 
 @dataclass
@@ -47,7 +46,7 @@ class WarmCosine(Scheduler):
         """The rate at a step, in units of the peak."""
         config = self.config
         end = self.steps if config.max_steps is None else config.max_steps
-        warm = min(config.warm_up_end, int(WARM_MOST * end))
+        warm = min(config.warm_up_end, int(0.1 * end))
         if step < warm:
             return (step + 1) / (warm + 1)
         done = min(1.0, (step - warm) / max(1, end - warm))

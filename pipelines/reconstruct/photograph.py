@@ -25,8 +25,6 @@ from .views import render_camera
 
 __all__ = ["TrainedScene", "open_scene", "photograph"]
 
-MOST_CELLS = 1024  # along the grid of a file
-
 
 class TrainedScene(NamedTuple):
     """What a reconstruction has left to be rendered.
@@ -71,7 +69,7 @@ def open_scene(run: str | Path, *, device: torch.device | str = "cpu") -> Traine
         about = {"uniform": 64, "importance": 64, "march_grid": 0} | dict(metadata.get("sampling", {}))
         sampling = Sampling(uniform=int(about["uniform"]), importance=int(about["importance"]))
         cells = int(about["march_grid"])
-        if cells > MOST_CELLS:
+        if cells > 1024:
             raise ValueError(f"a grid of {cells}³ cells")
     guide = ValueGrid(cells, geometry.like.device) if cells else None
     if guide is not None:

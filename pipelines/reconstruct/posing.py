@@ -7,9 +7,7 @@ from ...datasets.views.poses.find_cameras import FoundCameras
 from ...datasets.views.poses.find_points import FoundPoints
 from ..training.report import Progress, Report, silent
 
-__all__ = ["colmap_report", "said_of", "said_of_points"]
-
-FEW_POINTS = 100
+__all__ = ["colmap_report", "said_of"]
 
 
 def colmap_report(report: Report | None) -> ColmapReport:
@@ -21,30 +19,17 @@ def colmap_report(report: Report | None) -> ColmapReport:
     return passed_on
 
 
-def said_of_points(found: FoundPoints) -> tuple[str, list[str]]:
+def said_of(found: FoundCameras | FoundPoints) -> tuple[str, list[str]]:
     """What was found, in a line, and what is to be warned of."""
-    line = (
-        f"{found.project}: {found.points:,} points that {found.photographs} photographs show, seen {found.error:.2f} "
-        "pixels off"
-    )
-    return line, _few(found.points)
-
-
-def _few(points: int) -> list[str]:
-    """What is to be warned of, if so many points are few."""
-    warning = f"{points} points are few: cameras may be wrong; see `mplicits check-cameras`"
-    return [warning] if points < FEW_POINTS else []
-
-
-def said_of(found: FoundCameras) -> tuple[str, list[str]]:
-    """What was found, in a line, and what is to be warned of."""
-    placed = found.photographs - len(found.left_out)
-    line = (
-        f"{found.project}: {placed} of {found.photographs} photographs placed by {found.points:,} points that are seen "
-        f"{found.error:.2f} pixels off"
-    )
-    warnings = []
-    if found.left_out:
-        names = ", ".join(found.left_out[:3]) + (", …" if len(found.left_out) > 3 else "")
-        warnings.append(f"not placed: {names}; too little in them is in others too, or they are blurred")
-    return line, warnings + _few(found.points)
+    seen, warnings = f"seen {found.error:.2f} pixels off", []
+    if isinstance(found, FoundCameras):
+        placed = found.photographs - len(found.left_out)
+        line = f"{placed} of {found.photographs} photographs placed by {found.points:,} points that are {seen}"
+        if found.left_out:
+            names = ", ".join(found.left_out[:3]) + (", …" if len(found.left_out) > 3 else "")
+            warnings.append(f"not placed: {names}; too little in them is in others too, or they are blurred")
+    else:
+        line = f"{found.points:,} points that {found.photographs} photographs show, {seen}"
+    if found.points < 100:
+        warnings.append(f"{found.points} points are few: cameras may be wrong; see `mplicits check-cameras`")
+    return f"{found.project}: {line}", warnings

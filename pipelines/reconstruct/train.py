@@ -34,8 +34,8 @@ from ..training.result import Run
 from ..training.settings import ReconstructConfig, TextureConfig
 from ..training.trainer import Interrupted, load_compiler, parameter_count, stop_on_signals
 from .data.measured import MeasuredDepths
-from .data.seen import seen_points
 from .data.silhouettes import Agreement
+from .data.visibility import seen_points
 from .initialisation.hull import begin
 from .model.model import RayPool, SceneModel, build_scene
 from .model.replayed import ReplayedTrainer, scene_trainer
@@ -54,19 +54,29 @@ __all__ = [
 HELD_OUT_FILE = "held_out.png"
 PREVIEW_FILE = "preview.png"
 MESH_FILE = "mesh.ply"  # that the command makes of a finished run
-PREVIEWS = 5  # pictures of the first view on the way
-PREVIEW_PIXELS = 4096  # of each: through fog, which a scene is at first, every pixel costs as much as one in training
-SHEET_VIEWS = 4  # rows of the sheet of held-out views
-TEXTURE_RESOLUTION = 128  # of the mesh whose points are coloured: finer than the texture's band is wide
-TEXTURE_SAMPLES = 100_000
-BATCH = 1 << 13
-# Of the cameras that decide the colour of a point, at least; the cosine within which they face it; and which of their
-# colours it is, from dark to light.
-LEAST_WITNESSES, FACING, DARKER = 3, 0.5, 0.25
-WITNESSES = 9  # cameras whose colours of a point of the texture count, at most
-# Of a time budget, at most, for what comes after the training. What that takes follows from the time of a picture of so
-# many pixels, and of a few steps of the texture, whose surface and samples take about as long as its steps.
-AFTER_SHARE, TIMED_PIXELS, TEXTURE_FACTOR = 0.15, 1024, 2
+
+
+@dataclass(frozen=True)
+class FinishOptions:
+    """Pictures on the way, the texture, and what of a time budget is kept for the end."""
+
+    previews: int = 5  # pictures of the first view on the way
+    # of each; through fog, which a scene is at first, a pixel costs as much as one in training
+    preview_pixels: int = 4096
+    sheet_views: int = 4  # rows of the sheet of held-out views
+    texture_resolution: int = 128  # of the mesh whose points are coloured: finer than the texture's band is wide
+    texture_samples: int = 100_000  # points on it
+    batch: int = 1 << 13  # points that are coloured at a time
+    least_views: int = 3  # cameras that decide the colour of a point, at least
+    most_views: int = 9  # the same at most
+    facing: float = 0.5  # cosine within which they face it
+    darker: float = 0.25  # which of their colours it is, as a quantile from dark to light
+    after_share: float = 0.15  # share of a time budget for what comes after the training, at most
+    timed_pixels: int = 1024  # of the picture by which its time is estimated
+    texture_factor: float = 2.0  # time of the texture, surface and samples included, over that of its steps
+
+
+FINISH = FinishOptions()
 
 
 @dataclass(frozen=True)
@@ -173,19 +183,19 @@ class _Reconstruction:
         if left is None:
             return None
         after = self.after_seconds(left)
-        return max((self.budget.left() or 0.0) - min(after, AFTER_SHARE * left), LEAST_SECONDS)
+        return max((self.budget.left() or 0.0) - min(after, FINISH.after_share * left), LEAST_SECONDS)
 
     def after_seconds(self, left: float) -> float:
         """Seconds for the held-out views and the texture, from the time of a small picture and a few steps."""
         seconds, views = 0.0, self.test_views
         if views:
-            started, small = time.monotonic(), reduced(views[0], TIMED_PIXELS)
+            started, small = time.monotonic(), reduced(views[0], FINISH.timed_pixels)
             self._image(small, level=-1)
             pixels = sum(view.color.shape[0] * view.color.shape[1] for view in views)
             seconds += (time.monotonic() - started) * pixels / (small.color.shape[0] * small.color.shape[1])
         if self.config.texture_steps:
             step = texture_step_seconds(texture_settings(self.config), self.device, left)
-            seconds += TEXTURE_FACTOR * self.config.texture_steps * step
+            seconds += FINISH.texture_factor * self.config.texture_steps * step
         return seconds
 
     @property
@@ -222,7 +232,7 @@ class _Reconstruction:
         metadata = {"sampling": about, "eyes": eyes}
         self.folder.keep(RADIANCE_FILE, radiance_bytes(self.model.radiance(), self.model.geometry, metadata=metadata))
         if pairs:
-            self.folder.keep(HELD_OUT_FILE, picture_bytes(self._sheet(pairs[:SHEET_VIEWS])))
+            self.folder.keep(HELD_OUT_FILE, picture_bytes(self._sheet(pairs[: FINISH.sheet_views])))
         record = self.folder.finish(self.model.geometry, self.images.similarity, record, gone=(PREVIEW_FILE,))
         return self._result(out, texture, record)
 
@@ -233,9 +243,9 @@ class _Reconstruction:
     def _report(self, progress: Progress) -> None:
         self.report(progress)
         done = progress.fraction
-        if self.folder.out is not None and done * (PREVIEWS + 1) >= self.shown + 1 and done < 1:
-            self.shown = int(done * (PREVIEWS + 1))
-            view = reduced((self.test_views or self.train_views)[0], PREVIEW_PIXELS)
+        if self.folder.out is not None and done * (FINISH.previews + 1) >= self.shown + 1 and done < 1:
+            self.shown = int(done * (FINISH.previews + 1))
+            view = reduced((self.test_views or self.train_views)[0], FINISH.preview_pixels)
             if not self.folder.has_checkpoint:  # or the picture would lie beside the run that was there
                 self._save()
             write_picture(self.folder.out / PREVIEW_FILE, self._sheet([(view, self._image(view))]))
@@ -359,7 +369,7 @@ class _Reconstruction:
 def surface_colors(model: SceneModel, points: Tensor, eyes: Tensor) -> Tensor:
     """Colours ``(N, 3)`` of points ``(N, 3)`` near the surface, as cameras that face them see them, but for highlights.
 
-    The lower quartile, for each channel, of what up to `WITNESSES` cameras see whose rays are within 60° of the normal:
+    The lower quartile, for each channel, of what up to nine cameras see whose rays are within 60° of the normal:
     paint is the same for all of them, and a highlight, which up to half of them may see, only adds light. Where fewer
     than three face it, the colour along the normal.
 
@@ -369,13 +379,13 @@ def surface_colors(model: SceneModel, points: Tensor, eyes: Tensor) -> Tensor:
         eyes: ``(V, 3)`` of the cameras, in unit-sphere coordinates; in an order in which the first ones are all around.
     """
     parts = []
-    for part in points.split(BATCH):
+    for part in points.split(FINISH.batch):
         jet: Jet = model.geometry.jet(part)
         normal = torch.nn.functional.normalize(jet.gradient, dim=-1)
         along = torch.nn.functional.normalize(part[:, None] - eyes, dim=-1)  # (B, V, 3)
-        facing = -(along * normal[:, None]).sum(dim=-1) >= FACING
+        facing = -(along * normal[:, None]).sum(dim=-1) >= FINISH.facing
         # The first of the cameras that face a point: they count the more, the earlier they come.
-        count = min(WITNESSES, len(eyes))
+        count = min(FINISH.most_views, len(eyes))
         rank = torch.arange(len(eyes), 0, -1, device=part.device) * facing
         found, chosen = rank.topk(count, dim=1)
         directions = along.gather(1, chosen[:, :, None].expand(-1, -1, 3))
@@ -383,8 +393,8 @@ def surface_colors(model: SceneModel, points: Tensor, eyes: Tensor) -> Tensor:
         seen = part.new_full((len(part), count, 3), torch.nan)
         seen[row, witness] = model.color(part[row], directions[row, witness], Jet(*(held[row] for held in jet)))
         ahead = model.color(part, -normal, jet)
-        enough = (found > 0).sum(dim=1, keepdim=True) >= LEAST_WITNESSES
-        parts.append(torch.where(enough, seen.nanquantile(DARKER, dim=1), ahead))
+        enough = (found > 0).sum(dim=1, keepdim=True) >= FINISH.least_views
+        parts.append(torch.where(enough, seen.nanquantile(FINISH.darker, dim=1), ahead))
     return torch.cat(parts)
 
 
@@ -410,10 +420,10 @@ def scene_texture(
     """
     started = time.monotonic()
     with reported(progress, "texture: surface"):
-        mesh = in_region(extract_mesh(model.geometry, resolution=TEXTURE_RESOLUTION))
+        mesh = in_region(extract_mesh(model.geometry, resolution=FINISH.texture_resolution))
         if mesh is None:
             raise NoSurfaceError("all of it is outside the region of interest")
-        points, _ = sample_points(mesh, TEXTURE_SAMPLES, np.random.default_rng(config.seed))
+        points, _ = sample_points(mesh, FINISH.texture_samples, np.random.default_rng(config.seed))
         random = np.random.default_rng(config.seed)
         eyes = np.stack([view.camera.eye.numpy() for view in images.views])[random.permutation(len(images.views))]
         seen_from = torch.from_numpy(images.similarity.to_unit(eyes)).float()
@@ -430,5 +440,5 @@ def scene_texture(
 def texture_settings(config: ReconstructConfig) -> TextureConfig:
     """Settings of the texture that a reconstruction ends with; one step of it, where there is none."""
     return TextureConfig(
-        steps=max(config.texture_steps, 1), samples=TEXTURE_SAMPLES, seed=config.seed, device=config.device
+        steps=max(config.texture_steps, 1), samples=FINISH.texture_samples, seed=config.seed, device=config.device
     )

@@ -38,10 +38,6 @@ __all__ = [
 
 Float32 = NDArray[np.float32]
 
-RAYS = 4096  # rendered at a time
-SSIM_WINDOW = 11
-GOLDEN = (5**0.5 - 1) / 2
-
 
 @dataclass(frozen=True)
 class ViewImage:
@@ -109,7 +105,7 @@ def render_camera(
     # Rays that pass the region of interest see the background, whose colour is known unless it is learnt.
     asked = (far > near).nonzero()[:, 0] if model.outside is None else torch.arange(len(origins), device=device)
     done = 0
-    for rows in asked.split(RAYS):
+    for rows in asked.split(4096):
         seen = model.render(
             origins[rows],
             directions[rows],
@@ -145,7 +141,8 @@ def held_out(views: Sequence[PosedImage], every: int) -> tuple[list[PosedImage],
 
 def spread(views: Sequence[PosedImage]) -> list[PosedImage]:
     """The views in an order whose first few, however many, are spread over all of them."""
-    order = sorted(range(len(views)), key=lambda index: index * GOLDEN % 1)
+    golden = (5**0.5 - 1) / 2
+    order = sorted(range(len(views)), key=lambda index: index * golden % 1)
     return [views[index] for index in order]
 
 
@@ -198,7 +195,7 @@ def measure(image: ViewImage, view: PosedImage, background: Tensor) -> dict[str,
     ours, theirs = (torch.from_numpy(picture).permute(2, 0, 1)[None] for picture in (image.color, target))
     figures = {
         "psnr": float(psnr(ours, theirs, 1.0)),
-        "ssim": float(ssim(ours, theirs, SSIM_WINDOW).mean()),
+        "ssim": float(ssim(ours, theirs, 11).mean()),
     }
     if view.mask is not None and bool((view.mask > OBJECT).any()):
         inside = torch.from_numpy(view.mask > OBJECT)

@@ -32,16 +32,23 @@ __all__ = ["CameraCheck", "check_cameras", "check_files", "format_check"]
 Float64 = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
-WIDTH = 320  # pixels across an image; more would add nothing to the figures
-SPHERE_POINTS = 2000
-MASK_PIXELS = 64  # across an image, for rays through masks
-OUT_OF_VIEW = 0.25  # share of the views that may miss the middle of the region
-SAME_PLACE = 0.02  # spread of the eyes, as a share of their distance: about one degree of parallax
-ROUNDING = 1e-7  # that of the float32 numbers that files of cameras hold
-APART = 0.5  # median distance of the axes from where they meet best, as a share of the eyes' distance from there
-EMPTY, FULL = 1e-3, 0.999  # shares of a mask
-PAST_REGION = 0.05  # share of the object's pixels that may see past the region
-EXPOSURE = 4.0  # times brighter or darker than the median of the views: two stops
+
+@dataclass(frozen=True)
+class CameraLimits:
+    """What is warned of. The values are this project's own, from data sets with and without faults."""
+
+    width: int = 320  # pixels across the images that are checked
+    out_of_view: float = 0.25  # share of the views that may miss the middle of the region
+    same_place: float = 0.02  # spread of the eyes, as a share of their distance: about one degree of parallax
+    # median distance of the axes from where they meet best, as a share of the eyes' distance from there
+    apart: float = 0.5
+    empty: float = 1e-3  # share of object of a mask below which it is empty
+    full: float = 0.999  # share of object of a mask above which it is full
+    past_region: float = 0.05  # share of the object's pixels that may see past the region
+    exposure: float = 4.0  # times brighter or darker than the median view: two stops
+
+
+LIMITS = CameraLimits()
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,10 +117,10 @@ def _read(
 ) -> tuple[PosedImages, tuple[str, ...]]:
     """The images, around a guessed region where none can be found: that is when cameras most need to be looked at."""
     try:
-        return read_posed_images(path, width=WIDTH, depths=depths), ()
+        return read_posed_images(path, width=LIMITS.width, depths=depths), ()
     except InputError as error:
         try:
-            images = read_posed_images(path, width=WIDTH, region=_guess(cameras), depths=depths)
+            images = read_posed_images(path, width=LIMITS.width, region=_guess(cameras), depths=depths)
         except InputError:
             raise error from None  # it was not the region, then
         return replace(images, region="a guess"), (f"there is no region of interest but a guess: {error}",)
@@ -126,7 +133,8 @@ def _guess(cameras: Sequence[Camera]) -> Similarity:
     center = middle + _meeting_point(eyes - middle, forward)
     distance = float(np.median(np.linalg.norm(eyes - center, axis=1)))
     spread = float(np.median(np.linalg.norm(eyes - middle, axis=1)))
-    differ = spread > ROUNDING * float(np.linalg.norm(middle))
+    # 1e-7 is the rounding of the float32 numbers that files of cameras hold.
+    differ = spread > 1e-7 * float(np.linalg.norm(middle))
     return Similarity((float(center[0]), float(center[1]), float(center[2])), distance / 3 if differ else 1.0)
 
 
@@ -140,7 +148,7 @@ def check_cameras(images: PosedImages) -> CameraCheck:
     """Work out the figures, and what they warn of."""
     cameras = [view.camera.moved(images.similarity) for view in images.views]
     eyes, forward = _eyes_and_axes(cameras)
-    sphere = fibonacci_directions(SPHERE_POINTS)
+    sphere = fibonacci_directions(2000)
     in_view = np.array([_inside_image(camera, sphere).mean() for camera in cameras])
     middle = np.array([_inside_image(camera, np.zeros((1, 3)))[0] for camera in cameras])
     points = None if images.points is None else images.similarity.to_unit(images.points)
@@ -150,7 +158,7 @@ def check_cameras(images: PosedImages) -> CameraCheck:
     # Where the cameras are wrong, what the masks and depth maps see of the region says nothing.
     warnings += [
         *_masks(images.views, None if warnings else mask_inside),
-        *([] if warnings or (mask_inside or 0) < 1 - PAST_REGION else _silhouettes(images)),
+        *([] if warnings or (mask_inside or 0) < 1 - LIMITS.past_region else _silhouettes(images)),
         *([] if warnings or depths is None else depths.warnings),
         *_exposure(images.views),
     ]
@@ -223,12 +231,12 @@ def _placement(eyes: Float64, forward: Float64, middle: Bool) -> Iterator[str]:
         yield "there is a single view; a shape needs several, from all sides"
         return
     spread = np.linalg.norm(eyes - eyes.mean(axis=0), axis=1).max()
-    if spread < SAME_PLACE * max(1.0, float(np.median(distance))):
+    if spread < LIMITS.same_place * max(1.0, float(np.median(distance))):
         yield "all cameras stand at one place, so nothing tells depth; are the poses really camera-to-world?"
         return
     offset = _meeting_point(eyes, forward) - eyes
     apart = np.linalg.norm(np.cross(offset, forward), axis=1)
-    if np.median(apart) > APART * np.median(np.linalg.norm(offset, axis=1)):
+    if np.median(apart) > LIMITS.apart * np.median(np.linalg.norm(offset, axis=1)):
         yield "the cameras look at no common place; are the poses really camera-to-world?"
         return
     away = ((offset * forward).sum(axis=1) < 0) | ((eyes * forward).sum(axis=1) > 0)
@@ -242,7 +250,7 @@ def _placement(eyes: Float64, forward: Float64, middle: Bool) -> Iterator[str]:
     if inside:
         yield f"{inside} of {count} cameras stand inside the region of interest; is the region right?"
     missing = int((~middle).sum())
-    if missing > OUT_OF_VIEW * count:
+    if missing > LIMITS.out_of_view * count:
         yield f"the middle of the region of interest is out of view in {missing} of {count}; is the region right?"
 
 
@@ -258,20 +266,20 @@ def _meeting_point(eyes: Float64, forward: Float64) -> Float64:
 def _masks(views: Sequence[PosedImage], inside: float | None) -> Iterator[str]:
     """Warnings about masks."""
     shares = {view.name: float(view.mask.mean()) for view in views if view.mask is not None}
-    empty = [name for name, share in shares.items() if share < EMPTY]
-    full = [name for name, share in shares.items() if share > FULL]
+    empty = [name for name, share in shares.items() if share < LIMITS.empty]
+    full = [name for name, share in shares.items() if share > LIMITS.full]
     if empty:
         yield f"{len(empty)} of {len(shares)} masks are empty: {named(empty)}"
     if full:
         yield f"{len(full)} of {len(shares)} masks are full: {named(full)}; they tell nothing from its background"
-    if inside is not None and inside < 1 - PAST_REGION and len(full) < len(shares):
+    if inside is not None and inside < 1 - LIMITS.past_region and len(full) < len(shares):
         past = 100 * (1 - inside)
         yield f"{past:.0f} % of the object's pixels see past the region of interest, which cuts it; enlarge it"
 
 
 def _silhouettes(images: PosedImages) -> Iterator[str]:
     """Warnings about masks that contradict each other."""
-    views = [view for view in images.views if view.mask is not None and EMPTY <= view.mask.mean() <= FULL]
+    views = [view for view in images.views if view.mask is not None and LIMITS.empty <= view.mask.mean() <= LIMITS.full]
     if not views:
         return
     agreement = Agreement.of(views, images.similarity)
@@ -298,7 +306,7 @@ def _mask_inside(views: Sequence[PosedImage], cameras: Sequence[Camera]) -> floa
     for view, camera in zip(views, cameras, strict=True):
         if view.mask is None or not view.mask.any():
             continue
-        step = max(1, max(view.mask.shape) // MASK_PIXELS)
+        step = max(1, max(view.mask.shape) // 64)
         size = (max(1, camera.width // step), max(1, camera.height // step))
         weight = cv2.resize(view.mask, size, interpolation=cv2.INTER_AREA).reshape(size[::-1])
         eye, directions = (x.numpy() for x in camera.resized(*size).rays(dtype=torch.float64))
@@ -315,7 +323,7 @@ def _exposure(views: Sequence[PosedImage]) -> Iterator[str]:
     odd = [
         view.name
         for view, level in zip(views, light, strict=True)
-        if level > EXPOSURE * usual or EXPOSURE * level < usual
+        if level > LIMITS.exposure * usual or LIMITS.exposure * level < usual
     ]
     if odd:
         yield f"{len(odd)} of {len(views)} images are two stops or more off the others' brightness: {named(odd)}"

@@ -7,6 +7,7 @@ points are octahedra. Coordinates are those of the unit sphere.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import cv2
@@ -25,14 +26,23 @@ Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 Rgb = tuple[float, float, float]
 
-THUMBNAIL = 48  # corners of a picture's triangles, along its longer side
-SPARSE_POINTS = 20_000  # as many are drawn at most
-TUBE = 0.015  # thickness of the lines of a frustum, as a share of its size
-WIRE = 0.004  # radius of the lines of the sphere
-POINT = 0.004  # radius of a sparse point
-AXIS = 0.25  # length of the axes
-GREY, DARK = (0.62, 0.62, 0.62), (0.3, 0.3, 0.3)
-AXES: tuple[Rgb, Rgb, Rgb] = ((0.85, 0.15, 0.15), (0.15, 0.65, 0.2), (0.2, 0.35, 0.9))
+
+@dataclass(frozen=True)
+class Style:
+    """How cameras are drawn; lengths are in radii of the region."""
+
+    thumbnail: int = 48  # corners of a picture's triangles, along its longer side
+    sparse_points: int = 20_000  # as many are drawn at most
+    tube: float = 0.015  # thickness of the lines of a frustum, as a share of its size
+    wire: float = 0.004  # radius of the lines of the sphere, and of sparse points
+    axis: float = 0.25  # length of the axes
+    # their colours, display RGB in [0, 1]
+    axes: tuple[Rgb, Rgb, Rgb] = ((0.85, 0.15, 0.15), (0.15, 0.65, 0.2), (0.2, 0.35, 0.9))
+    grey: Rgb = (0.62, 0.62, 0.62)  # of the sphere
+    dark: Rgb = (0.3, 0.3, 0.3)  # of sparse points
+
+
+STYLE = Style()
 
 
 class _Part(NamedTuple):
@@ -60,10 +70,13 @@ def camera_mesh(images: PosedImages) -> Mesh:
     parts = [_wire_sphere(), _axes()]
     for view, camera, color in zip(images.views, cameras, colors, strict=True):
         corners = _plane(camera, size, reach)
-        parts += [_frame(camera.eye.numpy(), corners, color, TUBE * size), _picture(corners, view.color, TUBE * size)]
+        parts += [
+            _frame(camera.eye.numpy(), corners, color, STYLE.tube * size),
+            _picture(corners, view.color, STYLE.tube * size),
+        ]
     if images.points is not None:
-        step = 1 + (len(images.points) - 1) // SPARSE_POINTS
-        parts.append(_octahedra(images.similarity.to_unit(images.points[::step]), POINT, DARK))
+        step = 1 + (len(images.points) - 1) // STYLE.sparse_points
+        parts.append(_octahedra(images.similarity.to_unit(images.points[::step]), STYLE.wire, STYLE.dark))
     return _joined(parts)
 
 
@@ -102,7 +115,7 @@ def _frame(eye: Float64, corners: Float64, color: Float64, radius: float) -> _Pa
 def _picture(corners: Float64, color: NDArray[np.float32], gap: float) -> _Part:
     """The image plane, seen from both sides (``gap`` apart), with the picture as colours of a grid of vertices."""
     height, width = color.shape[:2]
-    share = min(1.0, THUMBNAIL / max(height, width))
+    share = min(1.0, STYLE.thumbnail / max(height, width))
     columns, rows = max(2, round(share * width)), max(2, round(share * height))
     small = cv2.resize(color, (columns, rows), interpolation=cv2.INTER_AREA)
     across, along = np.linspace(0, 1, columns)[:, None], np.linspace(0, 1, rows)[:, None, None]
@@ -128,13 +141,16 @@ def _wire_sphere(*, meridians: int = 6, parallels: int = 5, sides: int = 64) -> 
     across = [np.stack((np.cos(t) * ring[:, 0], np.sin(t) * ring[:, 0], ring[:, 1]), axis=1) for t in turns]
     around = [np.concatenate((np.cos(h) * ring, np.full((sides + 1, 1), np.sin(h))), axis=1) for h in heights]
     circles = np.stack(across + around)
-    return _tubes(np.stack((circles[:, :-1], circles[:, 1:]), axis=2).reshape(-1, 2, 3), WIRE, GREY)
+    return _tubes(np.stack((circles[:, :-1], circles[:, 1:]), axis=2).reshape(-1, 2, 3), STYLE.wire, STYLE.grey)
 
 
 def _axes() -> _Part:
-    ends = AXIS * np.eye(3)
+    ends = STYLE.axis * np.eye(3)
     return _joined_parts(
-        [_tubes(np.stack((np.zeros(3), end))[None], 3 * WIRE, color) for end, color in zip(ends, AXES, strict=True)]
+        [
+            _tubes(np.stack((np.zeros(3), end))[None], 3 * STYLE.wire, color)
+            for end, color in zip(ends, STYLE.axes, strict=True)
+        ]
     )
 
 

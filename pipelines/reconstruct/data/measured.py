@@ -29,17 +29,26 @@ __all__ = ["DepthRays", "MeasuredDepths", "depth_loss", "fit_scale_shift", "said
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 
-LIMIT = 1 << 21  # readings that are kept, of all maps together
-FEWEST = 16  # readings that say scale and shift of a map
-# Of the fit that does not follow outliers: how often it is weighted again, the relative error below which all count
-# alike, and how far numbers differ at least, as a share of their mean.
-ROUNDS, LEAST_RESIDUAL, ALL_ALIKE = 10, 1e-3, 1e-6
-TINY = 1e-300
-ASKED, TOLERANCE = 256, 1e-3  # rays of each map that are held against the surface, and how exactly they are traced
 UNITS = "give --depth-scale (numbers per unit of the cameras), or --depth-kind relative"  # if they are others
-INSIDE = 0.01  # of the readings of maps in the cameras' units, at least, end in the region
-ALIKE = 1.2  # factor between the depths of such maps and of sparse points, at most
 AS_IT_IS, RELATIVE, DISPARITY = 0, 1, 2  # how a number becomes a depth
+
+
+@dataclass(frozen=True)
+class DepthLimits:
+    """How depth maps are fitted and judged. The values are this project's own."""
+
+    readings: int = 1 << 21  # that are kept, of all maps together
+    fewest: int = 16  # numbers that say scale and shift of a map
+    rounds: int = 10  # of the reweighted least squares
+    least_residual: float = 1e-3  # relative error below which all numbers count alike
+    all_alike: float = 1e-6  # how far numbers differ at least, as a share of their mean
+    rays: int = 256  # of each map that are compared with the surface
+    tolerance: float = 1e-3  # of their tracing, in radii of the region
+    inside: float = 0.01  # share of the readings of maps in the cameras' units that ends in the region, at least
+    alike: float = 1.2  # factor between the depths of such maps and of sparse points, at most
+
+
+LIMITS = DepthLimits()
 
 
 class DepthRays(NamedTuple):
@@ -154,7 +163,7 @@ class MeasuredDepths:
         # Of each view's readings, evenly; they lie one after the other.
         count = torch.bincount(self.views[loose].long(), minlength=len(self.eyes))
         owned = count.nonzero()[:, 0]
-        steps = (torch.arange(ASKED, device=self.device) + 0.5) / ASKED
+        steps = (torch.arange(LIMITS.rays, device=self.device) + 0.5) / LIMITS.rays
         first = count.cumsum(0) - count
         rows = loose.nonzero()[:, 0][(first[owned, None] + steps * count[owned, None]).long().reshape(-1)]
         view, along = self.views[rows].long(), self.along[rows]
@@ -163,8 +172,8 @@ class MeasuredDepths:
             distance,
             self.eyes[view],
             along / length[:, None],
-            tolerance=TOLERANCE,
-            resolution=TOLERANCE,
+            tolerance=LIMITS.tolerance,
+            resolution=LIMITS.tolerance,
             radius=1.0,
         )
         hit, depths = hits.mask, hits.depth / length
@@ -198,18 +207,18 @@ def fit_scale_shift(numbers: Tensor, wanted: Tensor, group: Tensor, groups: int)
 
     def line(weight: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Scale, shift, and whether the numbers differ."""
-        total = summed(weight).clamp_min(TINY)
+        total = summed(weight).clamp_min(1e-300)
         middle_m, middle_z = summed(weight * m) / total, summed(weight * z) / total
         off_m, off_z = m - middle_m[group], z - middle_z[group]
         spread = summed(weight * off_m.square()) / total
-        scale = summed(weight * off_m * off_z) / total / spread.clamp_min(TINY)
-        return scale, middle_z - scale * middle_m, spread > (ALL_ALIKE * middle_m).square()
+        scale = summed(weight * off_m * off_z) / total / spread.clamp_min(1e-300)
+        return scale, middle_z - scale * middle_m, spread > (LIMITS.all_alike * middle_m).square()
 
     scale, shift, differ = line(torch.ones_like(m))
-    for _ in range(ROUNDS):
-        away = (scale[group] * m + shift[group] - z).abs() + LEAST_RESIDUAL * z.abs()
-        scale, shift, differ = line(1 / away.clamp_min(TINY))
-    usable = (count >= FEWEST) & (scale > 0) & differ
+    for _ in range(LIMITS.rounds):
+        away = (scale[group] * m + shift[group] - z).abs() + LIMITS.least_residual * z.abs()
+        scale, shift, differ = line(1 / away.clamp_min(1e-300))
+    usable = (count >= LIMITS.fewest) & (scale > 0) & differ
     return torch.where(usable[:, None], torch.stack((scale, shift), dim=1), 0.0)
 
 
@@ -257,7 +266,7 @@ def _gathered(views: Sequence[PosedImage], images: PosedImages, random: np.rando
         parts.append(_on_object(view, points))
         if view.depth is None:
             continue
-        part = _of_map(view.depth, points, images, random, LIMIT // len(views))
+        part = _of_map(view.depth, points, images, random, LIMITS.readings // len(views))
         parts.append(_on_object(view, part))
         if view.depth.kind == "metric":
             ends = eye + part.numbers[:, None] * (part.lines @ axes.T)
@@ -329,7 +338,7 @@ def said_outside(share: float) -> str | None:
     Args:
         share: of the readings of all maps, that do.
     """
-    if share >= INSIDE:
+    if share >= LIMITS.inside:
         return None
     return f"{share:.1%} of the depths in all maps end in the region of interest; {UNITS}"
 
@@ -345,6 +354,6 @@ def _check_units(source: Path, in_region: Sequence[float], ratios: Sequence[Floa
     if outside := said_outside(float(np.mean(in_region))):
         raise InputError(f"{source}: {outside}")
     together = np.concatenate(ratios)
-    if len(together) >= FEWEST and not 1 / ALIKE < np.median(together) < ALIKE:
+    if len(together) >= LIMITS.fewest and not 1 / LIMITS.alike < np.median(together) < LIMITS.alike:
         times = f"depths in all maps are {np.median(together):.3g} times those of the sparse points"
         raise InputError(f"{source}: {times}; {UNITS}")

@@ -24,28 +24,18 @@ OBJECT = 0.5  # a pixel with a larger share of object counts as one
 
 @dataclass(frozen=True)
 class Limits:
-    """When a silhouette is wrong; right ones of the synthetic scenes keep a third or more below each limit.
+    """When a silhouette is wrong; right ones of the synthetic scenes keep a third or more below each limit."""
 
-    Attributes:
-        cells: along the grid on which silhouettes are compared.
-        agreed: share of the views that may contradict a point on which the views still agree.
-        wrong: a view is wrong that contradicts more than this share of the points on which the others agree, or has
-            more than this share of its object outside of the visual hull.
-        most_wrong: share of the views that may be left out as wrong; of more, nothing says which ones are.
-        lone: a mask has a hole if it alone contradicts more than this share of the visual hull.
-        few: views below which none is said to have a hole: of few, each may carve much.
-        bare: share of the object, in the median view, that may lie outside of the visual hull.
-        sure: share of the views that may contradict a point of that hull.
-    """
-
-    cells: int = 32
-    agreed: float = 0.25
+    cells: int = 32  # along the grid on which silhouettes are compared
+    agreed: float = 0.25  # share of the views that may contradict a point on which the views still agree
+    # a view is wrong that contradicts more than this share of the points on which the others agree, or has more
+    # than this share of its object outside of the visual hull
     wrong: float = 0.4
-    most_wrong: float = 0.1
-    lone: float = 0.02
-    few: int = 20
-    bare: float = 0.005
-    sure: float = 0.05
+    most_wrong: float = 0.1  # share of the views that may be left out as wrong; of more, nothing says which ones are
+    lone: float = 0.02  # a mask has a hole if it alone contradicts more than this share of the visual hull
+    few: int = 20  # views below which none is said to have a hole: of few, each may carve much
+    bare: float = 0.005  # share of the object, in the median view, that may lie outside of the visual hull
+    sure: float = 0.05  # share of the views that may contradict a point of that hull
 
 
 def grid_in_ball(resolution: int) -> tuple[Tensor, Tensor]:

@@ -10,12 +10,8 @@ from ..data.measured import MeasuredDepths
 
 __all__ = ["seen_through"]
 
-LIMIT = 1 << 18  # rays that carve, at most
-CHUNK = 1 << 14  # at a time
-CROSSED = 2  # rays that must pass through a place, at least
 
-
-def seen_through(measured: MeasuredDepths, resolution: int) -> Tensor:
+def seen_through(measured: MeasuredDepths, resolution: int, *, rays: int = 1 << 18, least: int = 2) -> Tensor:
     """Which vertices of a grid over [−1, 1]³ measured rays pass ``(resolution + 1,) * 3``, on the CPU.
 
     A vertex is passed where two rays at least go through the cell around it before they end in another one beyond it,
@@ -25,12 +21,14 @@ def seen_through(measured: MeasuredDepths, resolution: int) -> Tensor:
     Args:
         measured: the rays; those whose depth is not known yet are left out.
         resolution: cells along an edge.
+        rays: that carve, at most.
+        least: rays that must pass through a place.
     """
     count, edge = resolution + 1, 2 / resolution
     passed, ended = (torch.zeros(count**3, dtype=torch.int64, device=measured.device) for _ in range(2))
-    rows = torch.arange(len(measured), device=measured.device)[:: max(1, len(measured) // LIMIT)]
+    rows = torch.arange(len(measured), device=measured.device)[:: max(1, len(measured) // rays)]
     steps = torch.arange(round(2 / edge) * 2, device=measured.device) * (edge / 2)
-    for part in rows.split(CHUNK):
+    for part in rows.split(1 << 14):
         origins, directions, reach = measured.at(part)[:3]
         near, far = sphere_span(origins, directions)
         depths = near[:, None] + steps
@@ -45,7 +43,7 @@ def seen_through(measured: MeasuredDepths, resolution: int) -> Tensor:
         inside = (reach > near) & (reach < far)
         ends = _cell(origins + reach[:, None] * directions, resolution)
         ended += torch.bincount(ends[inside], minlength=count**3)
-    return ((passed >= CROSSED) & (passed >= ended)).reshape(count, count, count).cpu()
+    return ((passed >= least) & (passed >= ended)).reshape(count, count, count).cpu()
 
 
 def _cell(points: Tensor, resolution: int) -> Tensor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -23,17 +24,31 @@ from .free_space import seen_through
 
 __all__ = ["begin", "carve", "fitting_resolution", "start_at_hull"]
 
-RESOLUTION = 48  # cells along the grid that measured rays carve
-# Cells along that which silhouettes carve: doubled until they are of a pixel's size, nearly, or the coarse level could
-# not follow.
-COARSEST, FINEST, PIXELS = 32, 128, 1.5
-AGREE = 0.99  # share of the views that must take a point for object: through a gap often one camera looks alone
-SEEING = 0.25  # of all views that must see it
-ROOM = 3.0  # edges of a cell within which a coarse vertex must see object, to have finer ones tried
-LEAST, MOST = 1e-3, 0.5  # shares of the unit ball that a hull fills; others are no start
-MOST_UNSEEN = 0.9  # the same of what no measured ray passes: of a scene that is seen from one side, much is not seen
-STEPS, BATCH, RATE = 250, 1024, 2e-3
-DATA_WEIGHT, EIKONAL_WEIGHT = 100.0, 0.1
+
+@dataclass(frozen=True)
+class HullOptions:
+    """How a start is carved and learnt. The values are this project's own."""
+
+    resolution: int = 48  # cells along the grid that measured rays carve
+    coarsest: int = 32  # cells along the coarsest grid that silhouettes carve; doubled until they suit the pixels
+    finest: int = 128  # the same at most: the coarse level could not follow a finer one
+    pixels: float = 1.5  # largest cells, in pixels
+    # share of the views that must take a point for object: through a gap often one camera looks alone
+    agree: float = 0.99
+    seeing: float = 0.25  # share of all views that must see it
+    room: float = 3.0  # edges of a cell within which a coarse vertex must see object, to have finer ones tried
+    least: float = 1e-3  # share of the unit ball that a hull fills at least
+    most: float = 0.5  # the same at most, of silhouettes
+    # the same of what no measured ray passes: of a scene that is seen from one side, much is not seen
+    most_unseen: float = 0.9
+    steps: int = 250  # of Adam, in which the network learns the distances
+    batch: int = 1024  # points per step
+    rate: float = 2e-3  # of Adam, at first
+    data_weight: float = 100.0  # weight of the squared error of the distance
+    eikonal_weight: float = 0.1  # weight of (|∇f| − 1)²
+
+
+HULL = HullOptions()
 
 
 def begin(
@@ -65,7 +80,7 @@ def begin(
     masked = all(view.mask is not None for view in views) and config.start != "depths"
     carving = None if config.start == "hull" else measured
     if config.start != "sphere" and isinstance(base, Siren) and (masked or carving is not None):
-        empty = None if carving is None else seen_through(carving, RESOLUTION).numpy()
+        empty = None if carving is None else seen_through(carving, HULL.resolution).numpy()
         carved = (agreement or Agreement.of(views, images.similarity)).trusted() if masked else ()
         distances = carve(carved, images.similarity, empty=empty)
         if distances is not None:
@@ -92,9 +107,9 @@ def carve(
 ) -> NDArray[np.float64] | None:
     """Signed distances to what is left of the unit ball at the vertices of a grid over [−1, 1]³, negative inside.
 
-    A vertex of the unit ball is inside where AGREE of the views that see it find object within half a cell around it.
-    So the hull is up to a cell too large, and thin parts stay. Grids of half as many cells come first, which see object
-    from further around, so that most vertices are decided by a few.
+    A vertex of the unit ball is inside where `HullOptions.agree` of the views that see it find object within half a
+    cell. So the hull is up to a cell too large, and thin parts stay. Grids of half as many cells come first, which see
+    object from further around, so that most vertices are decided by a few.
 
     Args:
         views: pictures with masks; none leaves all that is not empty.
@@ -103,15 +118,15 @@ def carve(
         empty: ``(E, E, E)`` vertices of a grid over the same cube that are known to be outside.
 
     Returns:
-        ``(resolution + 1,) * 3`` distances by x, y and z, exact to about a cell; or None where less than LEAST or more
-        than MOST of the ball is left, as by empty and full masks.
+        ``(resolution + 1,) * 3`` distances by x, y and z, exact to about a cell; or None where too little or too
+        much of the ball is left, as by empty and full masks.
     """
     if resolution is None:
         resolution = fitting_resolution(views, similarity) if views or empty is None else len(empty) - 1
     solid, ball = _object_vertices(views, similarity, resolution)
     if empty is not None:
         solid &= ~_all_around(empty, resolution)
-    if not LEAST < solid.sum() / ball < (MOST if views else MOST_UNSEEN):
+    if not HULL.least < solid.sum() / ball < (HULL.most if views else HULL.most_unseen):
         return None
     # The surface lies half a cell from the outermost vertices inside.
     outer, inner = (np.asarray(distance_transform_edt(part), dtype=np.float64) for part in (~solid, solid))
@@ -122,8 +137,8 @@ def fitting_resolution(views: Sequence[PosedImage], similarity: Similarity) -> i
     """Cells along an edge of [−1, 1]³ that are hardly larger than what a pixel sees in its middle."""
     cameras = [view.camera.moved(similarity) for view in views]
     pixel = float(np.median([float(camera.eye.norm() / camera.intrinsics[0, 0]) for camera in cameras] or [1.0]))
-    resolution = COARSEST
-    while resolution < FINEST and 2 / resolution > PIXELS * pixel:
+    resolution = HULL.coarsest
+    while resolution < HULL.finest and 2 / resolution > HULL.pixels * pixel:
         resolution *= 2
     return resolution
 
@@ -131,12 +146,12 @@ def fitting_resolution(views: Sequence[PosedImage], similarity: Similarity) -> i
 def _object_vertices(
     views: Sequence[PosedImage], similarity: Similarity, resolution: int
 ) -> tuple[NDArray[np.bool_], int]:
-    """Vertices that AGREE of the views that see them take for object ``(resolution + 1,) * 3``, and how many are asked.
+    """Vertices that enough views take for object ``(resolution + 1,) * 3``, and how many are asked.
 
     Those in the unit ball are; without views all of them are object.
     """
     ball, sizes = 0, [resolution]
-    while views and sizes[0] > COARSEST and sizes[0] % 2 == 0:
+    while views and sizes[0] > HULL.coarsest and sizes[0] % 2 == 0:
         sizes.insert(0, sizes[0] // 2)
     solid = np.ones(3 * (sizes[0] + 1,), dtype=bool)
     for size in sizes:
@@ -151,7 +166,7 @@ def _object_vertices(
             among = torch.from_numpy(near[:count, :count, :count].reshape(-1))[places]
             points, places = points[among], places[among]
         if views:
-            places = places[_agreed(views, similarity, points, 2 / size * (1 if size == resolution else ROOM))]
+            places = places[_agreed(views, similarity, points, 2 / size * (1 if size == resolution else HULL.room))]
         solid = np.zeros(count**3, dtype=bool)
         solid[places.numpy()] = True
         solid = solid.reshape(count, count, count)
@@ -159,12 +174,12 @@ def _object_vertices(
 
 
 def _agreed(views: Sequence[PosedImage], similarity: Similarity, points: Tensor, edge: float) -> Tensor:
-    """Which points ``(N, 3)`` are object for AGREE of the views that see them, if enough do ``(N,)``."""
+    """Which points ``(N, 3)`` are object for enough of the views that see them, if enough do ``(N,)``."""
     seen, object_in = torch.zeros(len(points)), torch.zeros(len(points))
     for sees, objects in silhouettes([view for view in views if view.mask is not None], similarity, points, edge):
         seen += sees
         object_in += objects
-    return (object_in >= AGREE * seen) & (seen >= max(1.0, SEEING * len(views)))
+    return (object_in >= HULL.agree * seen) & (seen >= max(1.0, HULL.seeing * len(views)))
 
 
 def _all_around(empty: NDArray[np.bool_], resolution: int) -> NDArray[np.bool_]:
@@ -176,7 +191,7 @@ def _all_around(empty: NDArray[np.bool_], resolution: int) -> NDArray[np.bool_]:
     return empty
 
 
-def start_at_hull(network: Siren, distances: NDArray[np.float64], *, seed: int = 0, steps: int = STEPS) -> None:
+def start_at_hull(network: Siren, distances: NDArray[np.float64], *, seed: int = 0, steps: int = HULL.steps) -> None:
     """Train a SIREN in place to signed distances on a grid, smoothed as far as it cannot follow them.
 
     Args:
@@ -190,14 +205,16 @@ def start_at_hull(network: Siren, distances: NDArray[np.float64], *, seed: int =
     grid.kept.copy_(torch.from_numpy(distances).to(place))
     units = network.units
     network.set_units()
-    adam = torch.optim.Adam(network.parameters(), lr=RATE, betas=(0.9, 0.99))
+    adam = torch.optim.Adam(network.parameters(), lr=HULL.rate, betas=(0.9, 0.99))
     with seeded(seed):
         for step in range(steps):
-            points = _in_ball(BATCH).to(place)
+            points = _in_ball(HULL.batch).to(place)
             jet = network.jet(points)
-            loss = DATA_WEIGHT * data_loss(jet.value, grid(points)) + EIKONAL_WEIGHT * eikonal_loss(jet.gradient)
+            loss = HULL.data_weight * data_loss(jet.value, grid(points)) + HULL.eikonal_weight * eikonal_loss(
+                jet.gradient
+            )
             for group in adam.param_groups:
-                group["lr"] = RATE * (1 - step / steps)
+                group["lr"] = HULL.rate * (1 - step / steps)
             adam.zero_grad(set_to_none=True)
             loss.mean().backward()
             adam.step()

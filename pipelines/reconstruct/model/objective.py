@@ -26,39 +26,23 @@ __all__ = ["Kind", "Outcome", "SceneObjective", "Schedule"]
 
 @dataclass(frozen=True)
 class Schedule:
-    """What happens when in the training of a scene. The values are this project's own.
+    """What happens when in the training of a scene. The values are this project's own."""
 
-    Attributes:
-        near_every: steps between two updates of the SDF grid near the surface, at least.
-        near_rest: the same at most, while the surface rests.
-        whole_every: such updates between two of the whole grid, in the ``early`` share of the training.
-        whole_late: the same later.
-        early: share of the training in which the surface comes to its place.
-        moved: how far values near the surface may move between two updates, in units of its uncertainty 1/s.
-        known: distance from the surface within which values are updated, in units of 1/s.
-        furthest: the same at most, in radii of the region.
-        least_rays: share of the rays that a step keeps, however many samples they have.
-        poses_from: share of the training after which camera poses are refined.
-        pose_rate: their learning rate over the geometry's.
-        depth_rays: measured rays per step.
-        settle_every: steps between two fits of scale and shift of depth maps to the surface.
-        faded: share of the training after which depths that were estimated from single pictures do not count.
-    """
-
-    near_every: int = 16
-    near_rest: int = 128
-    whole_every: int = 8
-    whole_late: int = 64
-    early: float = 0.125
+    near_every: int = 16  # steps between two updates of the SDF grid near the surface, at least
+    near_rest: int = 128  # the same at most, while the surface rests
+    whole_every: int = 8  # such updates between two of the whole grid, in the ``early`` share of the training
+    whole_late: int = 64  # the same later
+    early: float = 0.125  # share of the training in which the surface comes to its place
+    # how far values near the surface may move between two updates, in units of its uncertainty 1/s
     moved: float = 0.125
-    known: float = 8.0
-    furthest: float = 0.15
-    least_rays: float = 0.25
-    poses_from: float = 0.1
-    pose_rate: float = 3.0
-    depth_rays: int = 256
-    settle_every: int = 64
-    faded: float = 0.5
+    known: float = 8.0  # distance from the surface within which values are updated, in units of 1/s
+    furthest: float = 0.15  # the same at most, in radii of the region
+    least_rays: float = 0.25  # share of the rays that a step keeps, however many samples they have
+    poses_from: float = 0.1  # share of the training after which camera poses are refined
+    pose_rate: float = 3.0  # their learning rate over the geometry's
+    depth_rays: int = 256  # measured rays per step
+    settle_every: int = 64  # steps between two fits of scale and shift of depth maps to the surface
+    faded: float = 0.5  # share of the training after which depths that were estimated from single pictures do not count
 
 
 class Kind(NamedTuple):

@@ -26,20 +26,14 @@ CHOICES = ("sections", "colors", "outside")
 
 @dataclass(frozen=True)
 class Capacity:
-    """How many rows a recorded step has room for: for n requested, ``spare`` n + ``more``, in multiples of ``step``.
-
-    Attributes:
-        full: share of the capacity that may be requested before it is enlarged.
-        empty: share of the capacity below which a new one has to lie to replace it.
-        ray_counts: numbers of rays are multiples of this share of the most, 1 / ``ray_counts``.
-    """
+    """How many rows a recorded step has room for: for n requested, ``spare`` n + ``more``, in multiples of ``step``."""
 
     spare: float = 1.25
     more: int = 64
     step: int = 256
-    full: float = 0.95
-    empty: float = 0.5
-    ray_counts: int = 8
+    full: float = 0.95  # share of the capacity that may be requested before it is enlarged
+    empty: float = 0.5  # share of the capacity below which a new one has to lie to replace it
+    ray_counts: int = 8  # numbers of rays are multiples of this share of the most, 1 / ``ray_counts``
 
     def of(self, need: float) -> int:
         """Rows to reserve."""

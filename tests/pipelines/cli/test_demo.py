@@ -8,7 +8,6 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 from mplicits.datasets import STATUE_PLACEMENT, PointCloud, Statue, sample_sphere, sample_surface, write_cloud_ply
-from mplicits.neural_fields import extract_mesh
 from mplicits.pipelines.cli import demo as module
 from mplicits.pipelines.cli.entry import main
 
@@ -51,39 +50,30 @@ def test_the_picture_grows_level_by_level(
 
 
 @pytest.mark.slow
-def test_errors_are_those_of_closed_forms(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_errors_are_those_of_closed_forms() -> None:
     """Of the statue itself they are 0, and of points beside it their distance."""
-    monkeypatch.setattr(module, "CHECKED", 40)
-    monkeypatch.setattr(module, "EVEN", 500)
     statue = Statue()
     exact = sample_surface(statue, 5000)
     assert exact.normals is not None
     off = 5e-4
     points = STATUE_PLACEMENT.to_input(exact.points + off * exact.normals.astype(np.float64))
-    mesh = extract_mesh(statue, resolution=64)
     scan = replace(exact, points=points, normals=None)
-    table = figures(module._true_errors(scan, statue, mesh, STATUE_PLACEMENT))
-    noise, at, near, whole = table.values()
+    table = figures(module._true_errors(scan, statue, STATUE_PLACEMENT))
+    noise, at = table.values()
     # The step back along the normal at the point, and not at its foot, is off by the turn of the normal on the way.
     np.testing.assert_allclose(noise, off * STATUE_PLACEMENT.scale, rtol=0.02)
     # Values in float32 are off by their rounding, 1e-6 of the unit, and figures are printed to a thousandth.
     assert max(at) <= 1e-6 * STATUE_PLACEMENT.scale + 1e-3
-    assert max(near) <= 1e-6 * STATUE_PLACEMENT.scale + 1e-3
-    # Interpolation along an edge of length h is off by h² κ / 8 at most; most of the statue has κ below 10.
-    assert whole[1] < (2 / 64) ** 2 * 10 / 8 * STATUE_PLACEMENT.scale
     names = list(table)
     assert names[0] == "the scan's points themselves"
     assert names[1] == "level 0, at the scan's points"
-    assert re.fullmatch(r"level 0, within [\d.]+ mm of them", names[2])
-    assert names[3].startswith("mesh.ply, with the ")
 
 
 @pytest.mark.slow
 def test_every_level_is_nearer_to_the_statue(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """What the demo is there to show: at the scan's points and on the surface around them."""
+    """What the demo is there to show, at the scan's points."""
     assert main(["demo", "-o", str(tmp_path / "demo")]) == 0
     table = figures(capsys.readouterr().out)
-    for where in ("at the scan's points", "within .* of them"):
-        levels = np.array([row for name, row in table.items() if re.fullmatch(rf"level \d, {where}", name)])
-        assert levels.shape == (3, 3)
-        assert (np.diff(levels, axis=0) < 0).all(), table
+    levels = np.array([row for name, row in table.items() if re.fullmatch(r"level \d, at the scan's points", name)])
+    assert levels.shape == (3, 3)
+    assert (np.diff(levels, axis=0) < 0).all(), table

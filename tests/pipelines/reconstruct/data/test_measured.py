@@ -11,7 +11,7 @@ from mplicits.datasets.views.formats.depth_maps import DepthKind
 from mplicits.datasets.views.images import PosedImages
 from mplicits.neural_fields import InputError, Jet, Similarity, Sphere, Union, render_volume
 from mplicits.neural_fields.volume.render import Sampling
-from mplicits.pipelines.reconstruct.data.measured import FEWEST, DepthRays, MeasuredDepths, depth_loss, fit_scale_shift
+from mplicits.pipelines.reconstruct.data.measured import LIMITS, DepthRays, MeasuredDepths, depth_loss, fit_scale_shift
 from torch import Tensor
 
 CPU = torch.device("cpu")
@@ -104,7 +104,7 @@ def test_scale_and_shift_are_found_among_outliers() -> None:
 @pytest.mark.parametrize(
     ("numbers", "wanted"),
     [
-        (torch.rand(FEWEST - 1), torch.rand(FEWEST - 1)),
+        (torch.rand(LIMITS.fewest - 1), torch.rand(LIMITS.fewest - 1)),
         (torch.full((50,), 3.0), torch.rand(50)),
         (torch.arange(50.0), -torch.arange(50.0)),
     ],

@@ -13,9 +13,7 @@ from mplicits.pipelines.reconstruct.data.measured import MeasuredDepths
 from mplicits.pipelines.reconstruct.data.silhouettes import Agreement
 from mplicits.pipelines.reconstruct.initialisation import hull
 from mplicits.pipelines.reconstruct.initialisation.hull import (
-    COARSEST,
-    FINEST,
-    PIXELS,
+    HULL,
     begin,
     carve,
     fitting_resolution,
@@ -89,7 +87,7 @@ def test_a_sphere_is_carved_out() -> None:
 def test_coarse_grids_decide_nothing_that_the_fine_one_would_not(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = render_scene(SCENES["striped-torus"](), views=12, size=24, samples=1)
     carved = carve(scene.views, scene.similarity, resolution=64)
-    monkeypatch.setattr(hull, "COARSEST", 64)
+    monkeypatch.setattr(hull, "HULL", replace(HULL, coarsest=64))
     at_once = carve(scene.views, scene.similarity, resolution=64)
     assert carved is not None
     assert at_once is not None
@@ -130,8 +128,8 @@ def test_cells_are_as_large_as_pixels(size: int, expected: int) -> None:
     camera = views[0].camera
     pixel = float(camera.eye.norm() / camera.intrinsics[0, 0])
     assert resolution == expected
-    assert 2 / resolution <= PIXELS * pixel or resolution == FINEST
-    assert 4 / resolution > PIXELS * pixel or resolution == COARSEST
+    assert 2 / resolution <= HULL.pixels * pixel or resolution == HULL.finest
+    assert 4 / resolution > HULL.pixels * pixel or resolution == HULL.coarsest
 
 
 def test_a_finer_grid_is_empty_between_empty_vertices() -> None:
@@ -191,7 +189,7 @@ def test_what_no_measured_ray_passes_is_a_start(monkeypatch: pytest.MonkeyPatch)
         assert begin(model, some.views, some, replace(SMALL, start=start), measured) == expected
     # Vertices half a diagonal inside are never passed, and those beyond what the rays see are solid; the distances
     # are those of a grid, to a cell.
-    cell = 2 / hull.RESOLUTION
+    cell = 2 / HULL.resolution
     for distances in started:
         assert bool((distances[lengths(len(distances)) < RADIUS - 2 * cell] < 0).all())
     by_masks = carve(scene.views, scene.similarity)

@@ -8,7 +8,7 @@ import pytest
 from mplicits.datasets.cameras import look_at
 from mplicits.neural_fields import Sphere, Union, extract_mesh, save_field
 from mplicits.pipelines.cli.entry import main
-from mplicits.pipelines.reconstruct.data.seen import SeenFrom, seen_points
+from mplicits.pipelines.reconstruct.data.visibility import SeenFrom, seen_points
 from mplicits.pipelines.surface.trim import Support, seen_part, thinned
 
 RADIUS, DISTANCE = 0.5, 2.0

@@ -12,7 +12,7 @@ from mplicits.datasets.synthetic.scenes import SCENES, render_scene
 from mplicits.datasets.views.writing import write_transforms
 from mplicits.neural_fields import Mesh
 from mplicits.pipelines.cli.entry import main
-from mplicits.pipelines.reconstruct.data.witnesses import count_witnesses
+from mplicits.pipelines.reconstruct.data.visibility import count_views
 
 BALLS = (np.array([0.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.5]))
 RADII = (0.5, 0.3)
@@ -51,7 +51,7 @@ def test_counts_are_those_of_the_closed_form(size: int) -> None:
     surface = balls()
     middle = surface.vertices[surface.faces].mean(axis=1)
     asked: list[tuple[int, int]] = []
-    counts = count_witnesses(cameras, surface, middle, finest=512, progress=lambda *done: asked.append(done))
+    counts = count_views(cameras, surface, middle, finest=512, progress=lambda *done: asked.append(done))
     assert asked == [(1, 3), (2, 3), (3, 3)]
     sure = np.ones(len(middle), dtype=bool)
     exact = np.zeros(len(middle), dtype=int)
@@ -88,5 +88,5 @@ def test_the_command_says_how_near_the_mesh_is_where_photographs_see(
 
 def test_cameras_keep_their_shape() -> None:
     camera: Camera = look_at(torch.tensor([0.0, 0.0, 3.0]), (0, 0, 0), up=(0, 1, 0), fov=50, width=3, height=2)
-    counts = count_witnesses([camera], balls(), np.array([[0.0, 0.0, 1.8], [0.0, 0.0, -0.5]]), finest=256)
+    counts = count_views([camera], balls(), np.array([[0.0, 0.0, 1.8], [0.0, 0.0, -0.5]]), finest=256)
     assert counts.tolist() == [1, 0]
