@@ -34,7 +34,7 @@ class NeuSGeometry(Hosted):
             ``bounds`` what brings their farthest corner onto the field's unit sphere.
         bounds: box of the mesh, ``(2, 3)``; from -1.01 to 1.01 by default, as in NeuS.
         learning_rate: at which NeuS trains all its networks alike; the parameters of the field are then kept in units
-            in which this rate suits them (`share_rate`). None leaves them alone.
+            in which this rate suits them (`rescale_parameters`). None leaves them alone.
         pace: share of the rates that suit the field, one for all levels or one for each; see `Pace`.
 
     Raises:
