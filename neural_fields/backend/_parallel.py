@@ -27,7 +27,7 @@ Step = Callable[[slice], None]
 # a good part of the block.
 LEAST_ROWS = 1024
 # Blocks that a short list of rows is cut into, where they can be of LEAST_ROWS: enough for eight cores.
-WANTED = 8
+WANTED_BLOCKS = 8
 # Fewer blocks than this go one after the other, every product split among the threads: who wakes up for a block or two
 # comes late.
 LEAST_BLOCKS = 4
@@ -54,7 +54,7 @@ def over_blocks(rows: int, size: int, prepare: Callable[[int], Step], *, like: T
         BaseException: what a step raised first; no further block is begun then.
     """
     if like.device.type == "cpu":  # elsewhere more blocks are more launches
-        shorter = min(size, max(LEAST_ROWS, -(-rows // WANTED)))
+        shorter = min(size, max(LEAST_ROWS, -(-rows // WANTED_BLOCKS)))
         if -(-rows // shorter) >= LEAST_BLOCKS:
             size = shorter
     count = -(-rows // size)

@@ -26,8 +26,6 @@ FIRST_PASSES, PASSES = 8, 16
 FEW, SHARE = 4096, 0.25
 # Room beyond what the passes before have asked for.
 SPARE, LEAST_ROOM = 1.25, 256
-# More doublings of the resolution than any ray sees; a shift by more would overflow.
-MOST_DOUBLINGS = 60
 
 
 def march_ahead(
@@ -100,7 +98,7 @@ class _Chunk:
         rays = rays._replace(sign=sign)
         if reach is not None:
             found.record_near(rays, (value * sign < reach) | (sign < 0), there)
-        doublings = (self.count // PATIENCE).clamp(max=MOST_DOUBLINGS)
+        doublings = (self.count // PATIENCE).clamp(max=60)  # more than any ray sees; a longer shift would overflow
         gap = self.rule.resolution * torch.bitwise_left_shift(torch.ones_like(doublings), doublings).to(value.dtype)
         moved, stand = look(rays, value * sign, self.rule, gap)
         self.count = self.count + there

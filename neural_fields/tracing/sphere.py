@@ -231,20 +231,9 @@ def trace_expected(
     else. But a ``value`` of an expectation is believed: where it says that the field falls evenly from ``near`` to the
     hit, nothing else is looked for in between.
 
-    Args:
-        field: see `sphere_trace`.
-        origins: see there.
-        directions: see there.
-        expected: depths and slopes ``(...,)`` of the hits, and values at ``near``; None for no idea.
-        level: see there.
-        near: see there.
-        far: see there.
-        tolerance: see there.
-        resolution: see there.
-        lipschitz: see there.
-        radius: see there.
-        max_steps: see there.
-        reach: note where rays come nearer than this to the surface; None does not.
+    ``expected`` has depths and slopes ``(...,)`` of the hits, and values at ``near``; None for no idea. With a
+    ``reach`` it is noted where rays come nearer than this to the surface. The other arguments are those of
+    `sphere_trace`.
 
     Returns:
         The hits, how fast the field fell along each ray at its last step ``(...,)``, to be expected the next time,
@@ -288,8 +277,8 @@ def march_constants(dtype: torch.dtype) -> dict[str, float]:
 
 def _march_fused(field: Field, level: int, spans: tuple[Tensor, ...], found: Found, rule: Rule, max_steps: int) -> None:
     """What `march` does, by the fused kernels; what they find has the same bounds, and not the same last bits."""
-    from ..backend.kernels.paths import march_levels
-    from ..backend.kernels.tracing import IN_REGISTERS, Marched, Queue, RayTensors, march_rays
+    from ..backend.kernels.paths import march_fused
+    from ..backend.kernels.tracing import Marched, Queue, RayTensors
 
     origins, directions, entries, starts, ends = (column.contiguous() for column in spans)
     if not len(starts):
@@ -297,10 +286,8 @@ def _march_fused(field: Field, level: int, spans: tuple[Tensor, ...], found: Fou
     levels = as_levels(field, level)
     marched, queue = Marched.nothing(found.depth), Queue.of(starts, ends)
     numbers = starts.new_tensor([rule.tolerance, rule.resolution, rule.lipschitz])
-    alone = len(levels.networks) == 1 and levels.networks[0].shape.width <= IN_REGISTERS
-    go = march_rays if alone else march_levels
     rays = RayTensors(origins, directions, starts, entries, ends)
-    go(levels, rays, queue, marched, numbers, max_steps=max_steps, constants=march_constants(starts.dtype))
+    march_fused(levels, rays, queue, marched, numbers, max_steps=max_steps, constants=march_constants(starts.dtype))
     mask, depth, steps, slope, own = marched.in_own_types()
     found.mask, found.depth, found.level, found.steps, found.slope = mask, depth, own, steps, slope
 

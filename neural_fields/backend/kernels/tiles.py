@@ -38,9 +38,9 @@ __all__ = [
 INTERPRETED = tl.constexpr(bool(triton.knobs.runtime.interpret))
 
 
-def planes(depth: int, *, jet: bool) -> int:
+def planes(depth: int) -> int:
     """How many matrices of ROWS points a program puts aside."""
-    return 2 + max(0, depth - 2) * jet
+    return max(2, depth)
 
 
 @triton.jit

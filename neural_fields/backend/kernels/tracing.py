@@ -29,10 +29,8 @@ from .rules import look_at, turned_back
 from .siren import half_scratch
 from .tensor_tiles import keep, value_of_tile
 
-__all__ = ["IN_REGISTERS", "REFILL", "Marched", "Queue", "RayTensors", "march_rays"]
+__all__ = ["IN_REGISTERS", "Marched", "Queue", "RayTensors", "march_rays"]
 
-# Places of a tile that are free before a program takes new rays. Fewer waste requests, more waste places.
-REFILL = 16
 # One network of so many units leaves registers enough to keep rays there too.
 IN_REGISTERS = 128
 
@@ -250,6 +248,6 @@ def march_rays(
         SHAPE=tuple(network.shape),
         SCRATCH=kept,
         ROWS=rows,
-        REFILL=REFILL,
+        REFILL=16,  # free places before a program takes new rays: fewer waste requests, more waste places
         warps=rows // 16,
     )  # fmt: skip

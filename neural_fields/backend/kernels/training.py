@@ -31,11 +31,6 @@ from .tiles import add_first, cosine, first_phase, product_from, sine
 
 __all__ = ["jet_backward"]
 
-# Planes of a layer: sines, slopes ω₀ cos, the sweep back before them (then z̄) and after them, the tangent.
-PLANES = 5
-# All programs' sums of weights together, in numbers: 256 MiB; wide networks get fewer programs for it.
-MOST_SUMS = 1 << 26
-
 
 @triton.jit(do_not_specialize=["count"])
 def sweep(
@@ -243,8 +238,11 @@ def jet_backward(x: Tensor, network: Network, value_bar: Tensor, gradient_bar: T
     sizes = [parameter.numel() for parameter in network.parameters]
     tiling = _tiling(network.width)
     tiles = triton.cdiv(len(x), tiling.rows)
-    programs = max(1, min(program_count(x.device, tiles), MOST_SUMS // sum(sizes)))
+    # All sums of weights together are at most 256 MiB; wide networks get fewer programs for it.
+    programs = max(1, min(program_count(x.device, tiles), (1 << 26) // sum(sizes)))
     sums = x.new_zeros(programs, sum(sizes))
+    # Planes of a layer: sines, slopes ω₀ cos, the sweep back before them (then z̄) and after them, the tangent.
+    kept = 5 * network.depth * tiling.rows * tiling.stride(network.width)
     if tiles:
         with on_device(x):
             sweep[(programs,)](  # pyright: ignore[reportIndexIssue]
@@ -254,7 +252,7 @@ def jet_backward(x: Tensor, network: Network, value_bar: Tensor, gradient_bar: T
                 gradient_bar.contiguous(),
                 x_bar,
                 sums,
-                scratch_for(x, programs, PLANES * network.depth * tiling.rows * tiling.stride(network.width)),
+                scratch_for(x, programs, kept),
                 len(x),
                 network.omega,
                 network.gain,
