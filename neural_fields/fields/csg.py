@@ -240,14 +240,8 @@ class Union(_Boolean):
 class Intersection(_Boolean):
     """What is in all of the parts: ``max_i f_i(x)``; exact inside of parts with exact distances, a bound outside.
 
-    With ``smooth`` k it shrinks by at most k/4, where two values differ by less than k; see `Union`.
-
-    Args:
-        parts: see `Union`.
-        smooth: see there.
-
-    Raises:
-        ValueError: see there.
+    With ``smooth`` k it shrinks by at most k/4, where two values differ by less than k. Arguments and errors are those
+    of `Union`.
     """
 
     def _signs(self) -> tuple[int, Sequence[int]]:
@@ -257,14 +251,7 @@ class Intersection(_Boolean):
 class Difference(_Boolean):
     """What is in the first part and in none of the others: ``max(f_0, −f_1, −f_2, …)``, a bound on the distance.
 
-    With ``smooth`` k it shrinks by at most k/4 for each part taken away; see `Union`.
-
-    Args:
-        parts: the solid, and what is taken from it; see `Union`.
-        smooth: see there.
-
-    Raises:
-        ValueError: see there.
+    With ``smooth`` k it shrinks by at most k/4 for each part taken away. Arguments and errors are those of `Union`.
 
     Example:
         >>> import torch

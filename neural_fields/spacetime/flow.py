@@ -162,21 +162,11 @@ def flow_jacobian(
     """Where the points of one time are at another, and how their neighbourhoods are strained on the way.
 
     With φ the map from ``start`` to ``end`` and M = ∂φ/∂x, both are followed together: dM/dt = ∂V/∂x M, M = I at first
-    (the equation of variation). det M says how volume grows; Mᵀ∇f is the gradient of f∘φ.
-
-    Args:
-        velocity: V with its derivatives.
-        points: ``(N, 3)``.
-        start: a number or ``(N,)``.
-        end: a number or ``(N,)``.
-        solver: as in `flow`; tolerances hold for the entries of M too.
+    (the equation of variation). det M says how volume grows; Mᵀ∇f is the gradient of f∘φ. Arguments and errors are
+    those of `flow`; tolerances hold for the entries of M too.
 
     Returns:
         Points ``(N, 3)`` and M, ``(N, 3, 3)``.
-
-    Raises:
-        ValueError: shapes do not fit.
-        IntegrationError: as in `flow`.
     """
     _check_points(points)
     start, end = _ends(points, start, end)

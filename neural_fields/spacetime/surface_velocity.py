@@ -23,9 +23,6 @@ from .field import at_time
 
 __all__ = ["CarriedVelocity"]
 
-# Motions that normals hardly show, as turns of a sphere, are left out: singular values below this share of the largest.
-LEAST_SHOWN = 3e-2
-
 
 class CarriedVelocity:
     """V(x, t) on a moving surface, for `flow`: the best motion as a whole, and the normal speed that it leaves.
@@ -91,5 +88,6 @@ class CarriedVelocity:
         normal, speed = self._normal_speed(moved, moved.new_full((len(moved),), t))
         growth = (normal * moved).sum(dim=-1, keepdim=True)
         system = torch.cat((normal, torch.linalg.cross(moved, normal), growth), dim=-1).double()
-        least = torch.linalg.pinv(system.T @ system, rtol=LEAST_SHOWN**2, hermitian=True)
+        # Motions that normals hardly show, as turns of a sphere, are left out: singular values below 3 % of the first.
+        least = torch.linalg.pinv(system.T @ system, rtol=3e-2**2, hermitian=True)
         return (least @ (system.T @ speed.double())).to(points)
