@@ -1,9 +1,8 @@
 """What goes wrong between a surface and the points of a scan, beside noise of the ranges: each fault by itself.
 
-Every function here does one of them to the readings of one scanner, from random numbers that it is given, and is
-exactly what its formula says. :mod:`.scanner` applies them in the order in which they happen: the beam (smear), the
-clock (noise, then quantisation), the position (isotropic noise), what is kept (uneven density), and where the scan is
-taken to stand (misalignment).
+Every function applies one of them to the readings of one scanner. :mod:`.scanner` applies them in this order: the beam
+(smear), the clock (noise, then quantisation), the position (isotropic noise), what is kept (uneven density), and where
+the scan is taken to stand (misalignment).
 """
 
 from __future__ import annotations

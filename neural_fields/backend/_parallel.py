@@ -1,10 +1,8 @@
 """Blocks of rows on several cores: each block is the work of one thread from its first product to its last.
 
-A block is small so that its activations stay in the cache of one core. Splitting every product of it among all threads
-would bring them together a dozen times in a block, for work that is too little to share; and where another process
-holds one of the cores, all of them wait for it each time. Here the threads meet once, at the end, and who
-is held up takes fewer blocks. What is computed for a block depends on nothing else, so that the results are the same
-bits for any number of threads.
+Blocks are small, so that activations stay in the cache of one core. Splitting every product among all threads would
+synchronise them a dozen times in a block, for little work. Here threads meet once, at the end. What is computed for a
+block depends on nothing else, so results are the same bits for any number of threads.
 """
 
 from __future__ import annotations

@@ -171,9 +171,7 @@ def _full_precision(x: Tensor) -> torch.autocast:
 def _reaching(x: Tensor) -> Iterator[Tensor]:
     """``x`` for an evaluation whose graph reaches it, with its own flag as it was afterwards.
 
-    The hosts evaluate first and mark the points as requiring gradients later, inside ``gradient``. Whoever then
-    differentiates the gradient by the points (curvature) needs a graph that knew them. While the flag is
-    off, autograd passes such points by.
+    Hosts evaluate first and mark the points as requiring gradients later, inside ``gradient``.
     """
     if not torch.is_grad_enabled() or x.requires_grad:
         yield x

@@ -1,8 +1,7 @@
 """Fields in the shapes that other people's renderers call: NeuS, instant-nsr-pl, nerfstudio and sdfstudio.
 
-Each shell holds a `Field` f and evaluates it in the host's own units: with ``scale`` s, points are multiplied by s and
-distances divided by it, so that f(s x) / s is again a distance and its gradient is ∇f(s x). None of the hosts is
-imported; what they pass in is used by the names of its attributes. How to change each host is in docs/drop-in.md.
+Each holds a `Field` f and evaluates it in the host's units: with ``scale`` s, f(s x) / s is again a distance and its
+gradient is ∇f(s x). None of the hosts is imported. How to change each host is in docs/drop-in.md.
 """
 
 from __future__ import annotations

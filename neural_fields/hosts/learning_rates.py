@@ -1,10 +1,10 @@
 """Learning rates for SIRENs in trainers that were made for softplus networks.
 
 In a layer z = ω₀ (W h + b) the weights are about ω₀ times as small as in a softplus layer that does as much, but Adam
-moves every weight by the learning rate, however small it is. At one rate for both a SIREN therefore takes steps about
-ω₀ times as long: at NeuS's 5e-4 the surface falls to pieces while the colours are learnt. `parameter_groups` has a rate
-for each layer; where a trainer sets the rate of all groups to the same number in every step, as NeuS's does,
-`rescale_parameters` keeps the parameters in units in which one rate means as much.
+moves every weight by the learning rate. At one rate for both, a SIREN takes steps about ω₀ times as long. At NeuS's
+5e-4 its surface breaks while the colours are learnt. `parameter_groups` has a rate for each layer. For trainers that
+set one rate for all groups, as NeuS's does, `rescale_parameters` keeps the parameters in units in which one rate fits
+all.
 """
 
 from __future__ import annotations

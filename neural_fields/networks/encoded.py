@@ -16,10 +16,9 @@ __all__ = ["EncodedField"]
 class EncodedField(Field):
     """A field whose features are its own and, after them, ``gain · e(x)`` of a hash encoding e.
 
-    A colour network of a NeuS-style host knows of the position's detail what the geometry's features say of it. Detail
-    that goes through the network whose value is the distance bends the surface; what goes through an encoding does not:
-    value, gradient, levels and bands stay those of the field. Hosts set one learning rate for all, which is too low for
-    a table; the gain makes up for that.
+    A colour network of a NeuS-style host gets the detail of the position from these features, so that the surface need
+    not bend for it: value, gradient, levels and bands stay those of the field. Hosts set one learning rate for all,
+    which is too low for a table; the gain makes up for that.
 
     Args:
         field: three-dimensional; a part of this module.

@@ -19,9 +19,8 @@ def fit_sphere(
 ) -> None:
     """Train a SIREN in place to |x| − radius on the unit ball, for training from images.
 
-    A few seconds on a CPU. torch's random state is used; units stay as they were. The weights that come of it are small
-    enough for hosts without a warm-up: where all of them move to the same side by NeuS's full rate, as in Adam's first
-    step, the surface of (128, 4) at ω₀ = 10 moves by 0.14, that of NeuS's own network by 0.36.
+    A few seconds on a CPU. torch's random state is used; units stay as they were. The weights are small enough for
+    hosts without a warm-up.
 
     Args:
         network: the coarse level.
@@ -65,10 +64,8 @@ def solve_sphere(
         Σ (w·h(x) + b − |x| + r)² + slope_weight |Jᵀw − x / |x||² + ridge n |w|²
 
     over n points in the ball, h being the last sines and J their Jacobian. (128, 4) at ω₀ = 10 is then off by 0.01, and
-    its slopes by 0.1: root mean squares over the ball, of the slopes without the middle, where the distance has a kink.
-    No random numbers are drawn; features stay as they were. The output's weights are seven times those of `fit_sphere`,
-    and cancel: a first step of Adam at NeuS's full rate would move this sphere by five times its radius. So only for
-    trainings that warm up slowly, or in which the field is not trained by Adam.
+    its slopes by 0.1 (root mean squares). No random numbers are drawn; features stay as they were. The output's weights
+    are seven times those of `fit_sphere`, and cancel, so use it only for trainings that warm up slowly.
 
     Args:
         network: untrained; the coarse level.

@@ -1,18 +1,17 @@
-"""Tracing surfaces that move: what one frame found out says what the next ones need not look for.
+"""Tracing surfaces that move: one frame says what the next ones need not look for.
 
 **Key frames** are traced as from scratch, and note for every ray where it comes within ``reach`` of the surface. Until
 the surface may have moved that far, the frames in between
 
 - leave out rays that came nowhere near it,
 - begin the others where they came near, and end those that passed where they left it again,
-- and look at once where a ray's hit is foretold to be, from its depths in the last two frames, if the key frame saw the
-  field fall evenly from there to the hit. One Newton step, or none, is then left to do.
+- start at a ray's expected hit, from its depths in the last two frames, if the key frame saw the field fall evenly to
+  the hit.
 
-**What holds.** Key frames are those of `sphere_trace`, whatever has moved and however far; there only the place where
-a ray looks first is taken from older frames. Frames in between rest on the ``speed``, a bound on |∂f/∂t|: a point with
-f ≥ reach at the time of the key frame stays outside for ``reach / speed``. Two things they do not see before the next
-key frame: what grows out of the last stretch of an even fall, and a spike between two samples of a ray that were both
-clear of it. With ``reach=0`` every frame is a key frame, and nothing is assumed about the motion.
+Key frames are those of `sphere_trace`, however far the surface has moved. Frames in between rest on the ``speed``, a
+bound on |∂f/∂t|: a point with f ≥ reach stays outside for ``reach / speed``. They miss what grows out of the last
+stretch of an even fall, and a spike between two clear samples of a ray, until the next key frame. With ``reach=0``
+every frame is a key frame.
 """
 
 from __future__ import annotations

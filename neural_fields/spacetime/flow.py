@@ -1,11 +1,7 @@
-"""Points that ride along: ordinary differential equations through vector fields and through moving surfaces.
+"""Points carried by vector fields and by moving surfaces: ordinary differential equations, solved by torchdiffeq.
 
-Two equations, both solved by torchdiffeq:
-
-- `flow` follows dx/dt = V(x, t). A field carried by V keeps its value along that path, f(x(t), t) = f(x(0), 0), which
-  gives exact targets for training and an exact measure of error.
-- `track` follows a point of a moving surface along its normal, dx/dt = −∂f/∂t ∇f / |∇f|², so that colours and
-  correspondences ride along with a field that knows nothing about points.
+- `flow` follows dx/dt = V(x, t). A field carried by V keeps its value along that path, f(x(t), t) = f(x(0), 0).
+- `track` follows a point of a moving surface along its normal, dx/dt = −∂f/∂t ∇f / |∇f|².
 """
 
 from __future__ import annotations
@@ -236,8 +232,7 @@ def track(
 ) -> Tracks:
     """Follow points of a moving surface by its normal velocity, dx/dt = −∂f/∂t ∇f / |∇f|².
 
-    The velocity has no part along the surface: of all the ways in which points could ride along this is the one
-    that a level set defines. A turning sphere, which looks the same at all times, leaves its points where they are.
+    The velocity has no part along the surface: a turning sphere leaves its points where they are.
 
     Args:
         field: four-dimensional.

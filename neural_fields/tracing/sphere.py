@@ -98,25 +98,17 @@ def sphere_trace(
 ) -> Hits:
     """First intersections of rays with the zero set of a level.
 
-    The default mode runs until the depth of every ray is known to ``tolerance``. Steps are the widest that still
-    leave no gap between the balls around two neighbouring samples if the surface is a plane (Bálint and Valasek
-    2018, from the last two values); where a gap opens after all, the step is taken back. Two crossings closer
-    to each other than ``resolution`` may be overlooked, which is what lets a ray go on along a surface that it
-    nearly touches; rays that need more than 16 steps are given twice the resolution, and again after every 16.
-    A change of sign is closed in on by the secant rule and bisection in turn. Rays are dropped as they end.
+    The default mode runs until the depth of every ray is known to ``tolerance``. Steps are the widest that leave no gap
+    between the balls around two samples if the surface is a plane (Bálint and Valasek 2018); where a gap opens, the
+    step is taken back. The resolution doubles after every 16 steps of a ray. A change of sign is closed in on by the
+    secant rule and bisection in turn. A ray that starts inside the surface looks for the way out.
 
     With a ``budget``, the paper's mode: so many steps ``t ← t + f_j − δ_j`` on each level (20, 5, 5 in its Tab. 4),
     after which |f| < ``capture`` is a hit.
 
-    A ray that starts inside the surface looks for the way out.
-
-    Depth and position have no graph, unless the trace is to be ``differentiable``. Then they carry the derivatives of
-    the implicit function f(o + t d) = 0 with respect to origins, directions and parameters, by one Newton step on the
-    graph whose slope is held fixed,
-
-        t ← t − f(o + t d) / ⟨∇f, d⟩,
-
-    so that dt = −(df + ⟨∇f, do + t dd⟩) / ⟨∇f, d⟩. They grow without bound where rays graze the surface.
+    With ``differentiable``, depth and position carry the derivatives of the implicit function f(o + t d) = 0 with
+    respect to origins, directions and parameters: dt = −(df + ⟨∇f, do + t dd⟩) / ⟨∇f, d⟩. They grow without bound where
+    rays graze the surface.
 
     Args:
         field: what to trace, three-dimensional; or any function of points ``(..., 3)`` → ``(...,)``.

@@ -81,7 +81,7 @@ class Tiling(NamedTuple):
 
 
 def tiling_of(width: int) -> Tiling:
-    """Tiles for a width: one accumulator up to 128 units; 64 units at a time beyond, of which 400 wastes fewest."""
+    """Tiles for a width: one accumulator up to 128 units; beyond, 64 units at a time, which wastes fewest of 400."""
     units = max(16, triton.next_power_of_2(width))
     if units <= 128:
         return Tiling(64, units, min(32, units), 8 if units == 128 else 4)

@@ -2,10 +2,9 @@
 
 Each program has SLOTS places for rays, a ring of free ones, and for each level a ring of those that wait for its value.
 Free places take the next rays of a queue that all programs share. A program serves its longest ring, up to ROWS rays at
-a time. A value that lies in the next band sends its ray on to the ring of the next level; any other is looked at
-(`rules.py`), and the ray has ended or goes back to the ring of level 0. So tiles of every level are full as long as
-there are rays enough, and neither the host nor another program has a say. Where rays stand lies in a scratch of the
-program's own, small enough for caches: some eleven numbers of each.
+a time. A value in the next band sends its ray to the ring of the next level. Any other goes through `rules.py`, after
+which the ray has ended or goes back to the ring of level 0. So tiles of every level are full as long as there are rays
+enough. The state of rays lies in a scratch of the program's own, small enough for caches.
 
 The rules are those of `sphere_trace` without expectations; see `tracing.py`.
 """
