@@ -34,7 +34,7 @@ from ..render.picture import Image, contact_sheet, write_picture
 from ..render.rasterise import picture_of
 from ..render.shade import ShadeOptions, compose, shade
 from ..render.trace import trace_view
-from ..surface.surface import from_cloud, from_mesh
+from ..surface.surface import from_cloud
 from ..training.machine import format_table
 from ..training.progress import progress_bars
 from ..training.report import Progress, Report, reported
@@ -176,7 +176,7 @@ def draw_levels(
     drawn += [_traced(field, camera, level) for level in range(len(drawn), field.num_levels)]
     pictures += [(f"level {level}, traced", image) for level, image in enumerate(drawn)]
     if mesh is not None and mesh.colors is not None:
-        pictures.append((f"mesh: {len(mesh.faces):,} faces", picture_of(from_mesh(mesh), camera)))
+        pictures.append((f"mesh: {len(mesh.faces):,} faces", picture_of(mesh, camera)))
     return contact_sheet(pictures)
 
 

@@ -34,13 +34,13 @@ class TrackedMesh:
     """A mesh, and where its vertices are at some times.
 
     Attributes:
-        faces: ``(F, 3)`` int32, the same at all times.
+        faces: ``(F, 3)``, the same at all times.
         times: ``(T,)``.
         vertices: ``(T, V, 3)``.
         normals: ``(T, V, 3)``, of unit length.
     """
 
-    faces: NDArray[np.int32]
+    faces: NDArray[np.integer]
     times: tuple[float, ...]
     vertices: NDArray[np.float32]
     normals: NDArray[np.float32]

@@ -23,7 +23,7 @@ from ...datasets.views.images import PosedImage, PosedImages, read_posed_images
 from ...neural_fields import InputError, Jet, NoSurfaceError, TextureField, extract_mesh
 from ...neural_fields.checkpoint import radiance_bytes, texture_bytes
 from ..render.picture import Image, picture_bytes, write_picture
-from ..surface.surface import from_mesh, sample_points
+from ..surface.surface import sample_points
 from ..surface.trim import in_region, thinned
 from ..texture.train import FittedTexture, fit_texture, texture_step_seconds
 from ..training.budget import LEAST_SECONDS, Budget
@@ -421,7 +421,7 @@ def scene_texture(
         mesh = in_region(extract_mesh(model.geometry, resolution=TEXTURE_RESOLUTION))
         if mesh is None:
             raise NoSurfaceError("all of it is outside the region of interest")
-        points, _ = sample_points(from_mesh(mesh), TEXTURE_SAMPLES, np.random.default_rng(config.seed))
+        points, _ = sample_points(mesh, TEXTURE_SAMPLES, np.random.default_rng(config.seed))
         random = np.random.default_rng(config.seed)
         eyes = np.stack([view.camera.eye.numpy() for view in images.views])[random.permutation(len(images.views))]
         seen_from = torch.from_numpy(images.similarity.to_unit(eyes)).float()

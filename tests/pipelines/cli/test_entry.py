@@ -301,8 +301,8 @@ def test_an_stl_comes_with_what_a_printer_asks(capsys, run, tmp_path):
     found = json.loads(figures.read_text())["printing"]
     mesh = trimesh.load_mesh(out)  # in millimetres
     assert found["unit"] == "mm"
-    assert found["shells"]["parts"] == 1
-    assert found["shells"]["volume"] == pytest.approx(mesh.volume, rel=1e-5)
+    assert found["parts"] == 1
+    assert found["volume"] == pytest.approx(mesh.volume, rel=1e-5)
     np.testing.assert_allclose(found["size"], mesh.extents, rtol=1e-5)
     assert found["thinnest"] == pytest.approx(60, rel=0.1)  # a ball of radius 3 cm, fitted in a moment
     assert main(["mesh", str(run), "-o", str(out), "--resolution", "24", "--no-report"]) == 0

@@ -32,7 +32,6 @@ from mplicits.pipelines.evolve import problem as evolve_problem
 from mplicits.pipelines.evolve.objective import EvolveObjective
 from mplicits.pipelines.evolve.problem import between, build_problem, velocity_field
 from mplicits.pipelines.evolve.shapes import Placed, Placement, StaticShape, aligned, into_unit_sphere, read_shape
-from mplicits.pipelines.surface.surface import from_mesh
 from mplicits.pipelines.training.settings import EvolveConfig
 
 CONFIG = EvolveConfig(samples=2000)
@@ -48,7 +47,7 @@ def _few_points(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def shape_of(field, *, similarity: Similarity | None = None) -> StaticShape:
     mesh = extract_mesh(field, resolution=48)
-    return StaticShape("made", field, similarity or Similarity.identity(), from_mesh(mesh))
+    return StaticShape("made", field, similarity or Similarity.identity(), mesh)
 
 
 def test_a_placement_and_its_inverse() -> None:
