@@ -324,7 +324,7 @@ def test_the_front_door() -> None:
         "import sys, mplicits\n"
         "assert mplicits.__version__ and not {'torch', 'numpy'} & set(sys.modules)\n"
         "assert all(getattr(mplicits, name) is not None and name in dir(mplicits) for name in mplicits.__all__)\n"
-        "assert set(mplicits.OF_FIT) < set(mplicits.__all__)\n"
+        "assert set(mplicits.HOMES) < set(mplicits.__all__)\n"
         "import mplicits.neural_fields, mplicits.pipelines.fit\n"
         "assert mplicits.Field is mplicits.neural_fields.Field and mplicits.fit is mplicits.pipelines.fit.fit\n"
     )
@@ -356,3 +356,13 @@ def test_a_run_through_the_front_door(tmp_path: Path) -> None:
     assert again.similarity == ball.similarity
     with pytest.raises(mplicits.InputError, match="no such run directory or file"):
         mplicits.load(tmp_path / "other")
+
+
+def test_every_training_returns_a_run(tmp_path: Path) -> None:
+    kind = importlib.import_module("mplicits.pipelines.reconstruct.train").Reconstruction
+    assert issubclass(kind, mplicits.Run)
+    field = mplicits.Sphere(radius=0.5)
+    run = mplicits.Run(field, mplicits.Similarity((1.0, 0.0, 0.0), 4.0), tmp_path, {})
+    assert run.folder == tmp_path
+    assert float(run.shape().distance(np.array([4.0, 0.0, 0.0]))) == pytest.approx(1.0)
+    assert run.mesh(16).vertices[:, 0].mean() == pytest.approx(1.0, abs=0.1)

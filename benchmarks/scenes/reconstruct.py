@@ -187,8 +187,7 @@ class ReconstructBench(Benchmark[ReconstructRow]):
         report(Progress(stage, 0, config.steps, 0.0, {}))
         started, has_masks = time.perf_counter(), all(view.mask is not None for view in train)
         model = self.build(config, has_masks=has_masks, views=len(train)).to(device)
-        whole, flat = model.outside is not None, config.smooth_weight > 0
-        pool = RayPool(train, similarity, device, whole=whole, flat=flat)
+        pool = RayPool(train, similarity, device, whole=model.outside is not None)
         start_seconds = time.perf_counter() - started
 
         def told(progress: Progress) -> None:

@@ -397,7 +397,7 @@ def test_the_command_goes_on_after_an_interruption(tmp_path, capsys, monkeypatch
         (["figure", "--views", "2", "--size", "8", "--test-every", "0"], "figure: no picture is held out"),
         (["figure", "--json", "rows.txt"], "rows.txt: unknown extension '.txt'"),
         (["figure", "--equaltime"], "unknown flag --equaltime; did you mean '--equal-time'?"),
-        (["figure", "--steps", "0"], "steps: 0; expected > 0"),
+        (["figure", "--steps", "0"], "steps: 0; expected a whole number > 0"),
     ],
 )
 def test_mistakes_are_one_line(arguments, message, capsys, tmp_path, monkeypatch):

@@ -128,7 +128,7 @@ def test_neither_help_nor_mistakes_wait_for_torch():
         ("fit a.ply -o b --steps many", "--steps: got 'many', expected a list of whole numbers"),
         ("fit a.ply -o b --normals maybe", "--normals: got 'maybe', expected one of auto, file, estimate"),
         ("fit a.ply -o b --batch 1.5", "--batch: got '1.5', expected a whole number"),
-        ("fit a.ply -o b --batch 0", "batch: 0; expected > 0"),
+        ("fit a.ply -o b --batch 0", "batch: 0; expected a whole number > 0"),
         ("fit a.ply -o b --resume --seed 3", "--resume: continues with the run's own settings"),
         ("fit a.ply -o b --resume --force", "not allowed with"),
         ("mesh run -o mesh.ply --resolution 9000", "got '9000', expected a whole number from 8 to 2048"),

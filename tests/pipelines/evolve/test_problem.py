@@ -317,10 +317,10 @@ def test_the_number_of_shapes_is_checked(kind, count: int) -> None:
         ({"axis": (0.0, 0.0, 0.0)}, "axis: (0.0, 0.0, 0.0); expected a vector of non-zero length"),
         ({"depths": (2,)}, "depths: 1 entries for 2 widths"),
         ({"widths": ()}, "widths: expected at least one level"),
-        ({"batch": 0}, "batch: 0; expected > 0"),
-        ({"law_weight": -1.0}, "law_weight: -1.0; expected ≥ 0"),
+        ({"batch": 0}, "batch: 0; expected a whole number > 0"),
+        ({"law_weight": -1.0}, "law_weight: -1.0; expected a finite number ≥ 0"),
         ({"frames": 1}, "frames: 1"),
-        ({"time_budget": 0.0}, "time_budget: 0.0; expected > 0, or none"),
+        ({"time_budget": 0.0}, "time_budget: 0.0; expected a finite number > 0, or none"),
     ],
 )
 def test_settings_out_of_range_are_named(settings: dict, message: str) -> None:
