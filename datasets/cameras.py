@@ -27,8 +27,6 @@ Float64 = NDArray[np.float64]
 UP_AXES: Mapping[str, tuple[float, float, float]] = MappingProxyType({"y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)})
 """The names of the axes that may point up, and their directions."""
 
-RIGID = 1e-6  # how far a pose's axes may be from orthonormal
-STRAIGHT = 1e-9  # sine of the angle below which a view runs along the up direction
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # of OpenCV's distortion, in its order
 UNDISTORTION = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 200, 1e-12)  # OpenCV's own five steps leave 1e-3
 
@@ -81,7 +79,7 @@ class Camera:
             raise ValueError(f"intrinsics: {self.intrinsics.tolist()}; expected {expected}")
         axes = self.world_from_camera[:3, :3]
         off = float((axes.T @ axes - torch.eye(3, dtype=torch.float64, device=axes.device)).abs().max())
-        if off > RIGID or float(torch.linalg.det(axes)) < 0 or self.world_from_camera[3].tolist() != [0, 0, 0, 1]:
+        if off > 1e-6 or float(torch.linalg.det(axes)) < 0 or self.world_from_camera[3].tolist() != [0, 0, 0, 1]:
             raise ValueError(
                 f"world_from_camera: {self.world_from_camera.tolist()}; expected a rigid pose (right-handed unit axes)"
             )
@@ -295,7 +293,7 @@ def look_at(
         raise ValueError("up: is zero; expected a direction")
     forward = forward / forward.norm()
     right = torch.linalg.cross(forward, up / up.norm())
-    if float(right.norm()) < STRAIGHT:
+    if float(right.norm()) < 1e-9:  # the view runs along the up direction
         axis = torch.eye(3, dtype=torch.float64)[1 if abs(float(forward[0])) > 0.9 else 0]
         right = axis - (axis @ forward) * forward
     return _camera(eye, right / right.norm(), forward, pinhole_intrinsics(fov, width, height), width, height)

@@ -78,7 +78,7 @@ _MOVED = {
     "fields.field": "OneLevelField SecondJet",
     "fields.function": "FieldLike as_field",
     "hosts.adapters": "Deviation",
-    "hosts.learning_rates": "parameter_groups share_rate",
+    "hosts.learning_rates": "parameter_groups share_rate=rescale_parameters",
     "meshing.extract": "map_normals",
     "meshing.placement": "Placement",
     "networks.encoded": "EncodedField",
@@ -101,8 +101,9 @@ _MOVED = {
 
 def __getattr__(name: str) -> Any:
     for module, names in _MOVED.items():
-        if name in names.split():
-            home = f"{__name__}.{module}"
-            warnings.warn(f"import {name} from {home}", DeprecationWarning, stacklevel=2)
-            return getattr(importlib.import_module(home), name)
+        for old, _, new in (pair.partition("=") for pair in names.split()):
+            if name == old:
+                home, now = f"{__name__}.{module}", new or old
+                warnings.warn(f"import {now} from {home}", DeprecationWarning, stacklevel=2)
+                return getattr(importlib.import_module(home), now)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

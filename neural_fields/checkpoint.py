@@ -48,25 +48,37 @@ __all__ = [
 
 M = TypeVar("M", bound=nn.Module)
 
-# Closed forms are made again of their definition; what is put together of fields, of that and of its parts.
+# Types by name. Networks and closed forms are made again from their definition, combinations also from their parts.
+NETWORKS: Mapping[str, Callable[..., Field]] = {cls.__name__: cls for cls in (Siren, NeusSDF)}
 CLOSED: Mapping[str, Callable[..., Field]] = {cls.__name__: cls for cls in (Box, Capsule, Plane, Sphere, Torus)}
 COMBINED: Mapping[str, Callable[..., Field]] = {
     cls.__name__: cls for cls in (Bounded, Difference, Intersection, Offset, Placed, Shell, Union)
 }
-FORMAT = "mplicits-field"
-TEXTURE_FORMAT = "mplicits-texture"
-RADIANCE_FORMAT = "mplicits-radiance"
-VERSION = 1
-_AGAIN = {
-    FORMAT: "take it from a backup, or fit again",
-    TEXTURE_FORMAT: "run `mplicits texture` again",
-    RADIANCE_FORMAT: "take it from a backup, or run `mplicits reconstruct` again",
-}
-_FILES = {
-    FORMAT: "field.safetensors",
-    TEXTURE_FORMAT: "texture.safetensors",
-    RADIANCE_FORMAT: "radiance.safetensors",
-}
+FILE_VERSION = 1
+
+
+class _Kind(NamedTuple):
+    """A kind of file: what is in it, the command that writes it, its usual name, and what to do if it is damaged."""
+
+    thing: str
+    command: str
+    name: str
+    remedy: str
+
+    @property
+    def key(self) -> str:
+        """Of the description in the file's metadata."""
+        return f"mplicits-{self.thing.split()[-1]}"
+
+
+_FIELD = _Kind("a field", "mplicits fit", "field.safetensors", "take it from a backup, or fit again")
+_TEXTURE = _Kind("a texture", "mplicits texture", "texture.safetensors", "run `mplicits texture` again")
+_RADIANCE = _Kind(
+    "a radiance",
+    "mplicits reconstruct",
+    "radiance.safetensors",
+    "take it from a backup, or run `mplicits reconstruct` again",
+)
 COLOR_SIZES = ("num_features", "width", "depth", "view_frequencies", "point_frequencies")
 OUTSIDE_SIZES = ("width", "depth", "point_frequencies", "view_frequencies")
 
@@ -92,13 +104,7 @@ def save_field(
     similarity: Similarity | None = None,
     metadata: Mapping[str, Any] | None = None,
 ) -> None:
-    """Write ``field`` to a safetensors file, whole or not at all (a temporary file beside it, then a rename).
-
-    Args:
-        path: where to write.
-        field: see `field_bytes`.
-        similarity: see `field_bytes`.
-        metadata: see `field_bytes`.
+    """Write the `field_bytes` of ``field`` to a safetensors file, whole or not at all.
 
     Raises:
         TypeError: a field of this type has no description on disk.
@@ -122,13 +128,11 @@ def field_bytes(
     """
     similarity = similarity or Similarity.identity()
     header = {
-        "format": FORMAT,
-        "version": VERSION,
         "field": _describe(field),
         "similarity": {"center": list(similarity.center), "scale": similarity.scale},
         "metadata": dict(metadata or {}),
     }
-    return _packed(dict(field.state_dict()), FORMAT, header)
+    return _packed(dict(field.state_dict()), _FIELD, header)
 
 
 def load_field(path: str | os.PathLike[str], *, device: torch.device | str = "cpu") -> SavedField:
@@ -138,7 +142,7 @@ def load_field(path: str | os.PathLike[str], *, device: torch.device | str = "cp
         InputError: there is no such file, it is damaged, or it is not a field of this package.
     """
     path = Path(path)
-    with _reading(path, FORMAT, "a field", "mplicits fit", device) as (header, tensors):
+    with _reading(path, _FIELD, device) as (header, tensors):
         field = _build(header["field"], tensors)
         _restore(path, field, tensors, "fit the field again")
         similarity = _similarity(header["similarity"])
@@ -163,14 +167,12 @@ def texture_bytes(texture: TextureField, *, metadata: Mapping[str, Any] | None =
     """
     siren = texture.network.siren
     header = {
-        "format": TEXTURE_FORMAT,
-        "version": VERSION,
         "network": {"width": siren.width, "depth": siren.depth, "omega": siren.omega, "in_dim": siren.in_dim},
         "geometry": {"level": texture.geometry_level, "digest": _digest(texture.geometry)},
         "metadata": dict(metadata or {}),
     }
     tensors = {name: tensor for name, tensor in texture.state_dict().items() if not name.startswith("geometry.")}
-    return _packed(tensors, TEXTURE_FORMAT, header)
+    return _packed(tensors, _TEXTURE, header)
 
 
 def load_texture(path: str | os.PathLike[str], geometry: Field) -> TextureField:
@@ -185,7 +187,7 @@ def load_texture(path: str | os.PathLike[str], geometry: Field) -> TextureField:
     """
     path = Path(path)
     device = geometry.like.device
-    with _reading(path, TEXTURE_FORMAT, "a texture", "mplicits texture", device) as (header, tensors):
+    with _reading(path, _TEXTURE, device) as (header, tensors):
         if header["geometry"]["digest"] != _digest(geometry):
             raise InputError(f"{path}: the texture of another field than this one; run `mplicits texture` again")
         sizes = dict(header["network"])
@@ -222,8 +224,6 @@ def radiance_bytes(radiance: Radiance, geometry: Field, *, metadata: Mapping[str
     """
     color, outside = radiance.color, radiance.outside
     header = {
-        "format": RADIANCE_FORMAT,
-        "version": VERSION,
         "color": _radiant_of(color, COLOR_SIZES),
         "outside": None if outside is None else _radiant_of(outside, OUTSIDE_SIZES),
         "inv_std": float(radiance.inv_std),
@@ -233,7 +233,7 @@ def radiance_bytes(radiance: Radiance, geometry: Field, *, metadata: Mapping[str
     tensors = {f"color.{name}": tensor for name, tensor in color.state_dict().items()}
     if outside is not None:
         tensors |= {f"outside.{name}": tensor for name, tensor in outside.state_dict().items()}
-    return _packed(tensors | {"background": radiance.background}, RADIANCE_FORMAT, header)
+    return _packed(tensors | {"background": radiance.background}, _RADIANCE, header)
 
 
 def load_radiance(path: str | os.PathLike[str], geometry: Field) -> tuple[Radiance, dict[str, Any]]:
@@ -248,7 +248,7 @@ def load_radiance(path: str | os.PathLike[str], geometry: Field) -> tuple[Radian
     """
     path = Path(path)
     device = geometry.like.device
-    with _reading(path, RADIANCE_FORMAT, "a radiance", "mplicits reconstruct", device) as (header, tensors):
+    with _reading(path, _RADIANCE, device) as (header, tensors):
         if header["geometry"]["digest"] != _digest(geometry):
             raise InputError(f"{path}: the colours of another field than this one; run `mplicits reconstruct` again")
         inv_std = float(header["inv_std"])
@@ -320,34 +320,34 @@ def checksum_of(tensors: Mapping[str, Tensor]) -> str:
     return digest.hexdigest()
 
 
-def _packed(state: Mapping[str, Tensor], form: str, header: Mapping[str, Any]) -> bytes:
+def _packed(state: Mapping[str, Tensor], kind: _Kind, header: Mapping[str, Any]) -> bytes:
     # Cloned: a field that is part of a combination twice has its tensors twice, which safetensors refuses.
     tensors = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in state.items()}
+    described = {"format": kind.key, "version": FILE_VERSION, **header, "checksum": checksum_of(tensors)}
     # Bytes, not save_file: that makes files nobody else may read, whatever the umask.
-    return save(tensors, metadata={form: json.dumps({**header, "checksum": checksum_of(tensors)})})
+    return save(tensors, metadata={kind.key: json.dumps(described)})
 
 
 @contextmanager
-def _reading(
-    path: Path, form: str, thing: str, command: str, device: torch.device | str
-) -> Iterator[tuple[dict[str, Any], dict[str, Tensor]]]:
+def _reading(path: Path, kind: _Kind, device: torch.device | str) -> Iterator[tuple[dict[str, Any], dict[str, Tensor]]]:
     """Header and tensors of a file; whatever goes wrong with them becomes an `InputError`."""
+    thing, command = kind.thing, kind.command
     if not path.is_file():
-        raise InputError(f"{path}: no such file; expected {thing} written by `{command}` ({_FILES[form]})")
+        raise InputError(f"{path}: no such file; expected {thing} written by `{command}` ({kind.name})")
     try:
         with safe_open(path, framework="pt") as file:  # it knows few devices by name; torch moves to any
-            header_text = (file.metadata() or {}).get(form)
+            header_text = (file.metadata() or {}).get(kind.key)
             if header_text is None:
                 raise InputError(f"{path}: a safetensors file, but not {thing}; expected one written by `{command}`")
             header = json.loads(header_text)
-            if header["version"] != VERSION:
+            if header["version"] != FILE_VERSION:
                 raise InputError(
                     f"{path}: {thing.split()[-1]} format version {header['version']}; this mplicits reads version "
-                    f"{VERSION}, so write it again with `{command}` or install the version that wrote it"
+                    f"{FILE_VERSION}, so write it again with `{command}` or install the version that wrote it"
                 )
             held = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
             if header.get("checksum") not in (None, checksum_of(held)):  # older files have none
-                raise InputError(f"{path}: damaged (its numbers are not those that were written); {_AGAIN[form]}")
+                raise InputError(f"{path}: damaged (its numbers are not those that were written); {kind.remedy}")
             tensors = {name: tensor.to(device) for name, tensor in held.items()}
         yield header, tensors
     except InputError:
@@ -370,23 +370,6 @@ def _restore(path: Path, module: nn.Module, tensors: Mapping[str, Tensor], remed
 
 def _describe(field: Field) -> dict[str, Any]:
     """What `_build` needs to construct an untrained copy."""
-    if isinstance(field, Siren):
-        return {
-            "type": "Siren",
-            "width": field.width,
-            "depth": field.depth,
-            "omega": field.omega,
-            "in_dim": field.in_dim,
-            "num_features": field.num_features,
-        }
-    if isinstance(field, NeusSDF):
-        return {
-            "type": "NeusSDF",
-            "width": field.width,
-            "depth": field.depth,
-            "frequencies": field.frequencies,
-            "num_features": field.num_features,
-        }
     if isinstance(field, MultiscaleSDF):
         levels = [_describe(level) for level in field.levels]
         return {"type": "MultiscaleSDF", "taper": field.taper, "levels": levels}
@@ -395,8 +378,8 @@ def _describe(field: Field) -> dict[str, Any]:
     if isinstance(field, EncodedField):
         grid = _grid_of(field.grid)
         return {"type": "EncodedField", "field": _describe(field.field), "grid": grid, "gain": field.gain}
-    name = type(field).__name__
-    if type(field) is CLOSED.get(name):
+    name = "Siren" if isinstance(field, Siren) else type(field).__name__
+    if isinstance(field, Siren | NeusSDF) or type(field) is CLOSED.get(name):
         return {"type": name, **plain(field.definition())}
     if isinstance(field, Combined):
         definition = plain(field.definition())
@@ -432,31 +415,29 @@ def _check_size(arguments: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> 
 
 def _build(description: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> Field:
     arguments = {key: value for key, value in description.items() if key != "type"}
-    if description["type"] in ("Siren", "NeusSDF"):
+    kind = description["type"]
+    if kind in NETWORKS:
         _check_size(arguments, tensors)
-    if description["type"] == "Siren":
-        return Siren(arguments.pop("width"), arguments.pop("depth"), **arguments)
-    if description["type"] == "NeusSDF":
-        return NeusSDF(**arguments)
-    if description["type"] == "MultiscaleSDF":
+        return NETWORKS[kind](**arguments)
+    if kind == "MultiscaleSDF":
         levels = [_build(level, tensors) for level in description["levels"]]
         # The band widths are among the tensors; the constructor only needs as many of them.
         return MultiscaleSDF(levels[0], levels[1:], [1.0] * (len(levels) - 1), taper=description["taper"])
-    if description["type"] == "SpaceTimeSDF":
+    if kind == "SpaceTimeSDF":
         sdf = _build(description["sdf"], tensors)
         if not isinstance(sdf, MultiscaleSDF):
             raise ValueError(f"a SpaceTimeSDF of a {type(sdf).__name__}")
         return SpaceTimeSDF(sdf)
-    if description["type"] == "EncodedField":
+    if kind == "EncodedField":
         grid = _made_grid(arguments["grid"], tensors)
         return EncodedField(_build(arguments["field"], tensors), grid, gain=arguments["gain"])
-    if description["type"] in CLOSED:
-        return CLOSED[description["type"]](
+    if kind in CLOSED:
+        return CLOSED[kind](
             **{key: tuple(value) if isinstance(value, list) else value for key, value in arguments.items()}
         )
-    if description["type"] in COMBINED:
+    if kind in COMBINED:
         if "similarity" in arguments:
             arguments["similarity"] = _similarity(arguments["similarity"])
         parts = [_build(part, tensors) for part in arguments.pop("parts")]
-        return COMBINED[description["type"]](*parts, **arguments)
-    raise ValueError(f"unknown field type {description['type']!r}")
+        return COMBINED[kind](*parts, **arguments)
+    raise ValueError(f"unknown field type {kind!r}")

@@ -26,9 +26,6 @@ __all__ = ["Closest", "WorldField", "WorldHits", "in_one_frame"]
 
 Points = TypeVar("Points", NDArray[np.floating], Tensor)
 
-# Points that come as arrays are evaluated so many at a time.
-BATCH = 1 << 18
-
 
 class Closest(NamedTuple):
     """Points of a surface near given ones, as arrays or tensors.
@@ -312,7 +309,7 @@ class WorldField:
         with torch.no_grad():
             parts = [
                 function(self._to_unit(unit).to(like), *(other.to(like) for other in beside))
-                for unit, *beside in zip(*(part.split(BATCH) for part in rows), strict=True)
+                for unit, *beside in zip(*(part.split(1 << 18) for part in rows), strict=True)
             ]
         whole = (torch.cat(part).cpu() for part in zip(*parts, strict=True))
         return tuple(

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import torch
 from mplicits.neural_fields import MultiscaleSDF, Siren
-from mplicits.neural_fields.backend.kernels.rounding import gated_bound, rounding_bound
 from mplicits.pipelines.training.trainer import seeded
 from torch import Tensor
 
@@ -15,6 +14,7 @@ from ..harness.benchmark import Benchmark, Part, network_name
 from ..harness.cells import Workplace
 from ..harness.tables import Column, Figure, Table, tabulated
 from .kernels import JET, MANY, POINT, evaluated_by, staged_bytes
+from .rounding import gated_bound, rounding_bound
 from .traffic import traffic_of
 
 __all__ = ["LevelsBench", "LevelsRow"]

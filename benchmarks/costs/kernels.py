@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import torch
 from mplicits.neural_fields import InputError, Siren
 from mplicits.neural_fields.backend.kernels.packing import Shape
-from mplicits.neural_fields.backend.kernels.rounding import rounding_bound
 from mplicits.neural_fields.backend.kernels.switch import VARIABLE, choose
 from mplicits.pipelines.training.trainer import seeded
 from torch import Tensor
@@ -21,6 +20,7 @@ from torch import Tensor
 from ..harness.benchmark import Benchmark, Part, network_name
 from ..harness.cells import Workplace
 from ..harness.tables import Column, Figure, Table, tabulated
+from .rounding import rounding_bound
 from .traffic import traffic_of
 
 __all__ = ["JET", "MANY", "POINT", "KernelRow", "KernelsBench", "evaluated_by", "staged_bytes"]

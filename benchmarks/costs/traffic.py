@@ -77,9 +77,9 @@ def _tensors(values: Any) -> Iterator[Tensor]:
 @contextmanager
 def _blocks_of_a_gpu() -> Iterator[None]:
     """Evaluate in blocks as large as on a GPU: the smaller blocks of a CPU would add launches."""
-    before = siren.BLOCK_FLOATS, _parallel.WANTED
-    siren.BLOCK_FLOATS, _parallel.WANTED = siren.GPU_BLOCK_FLOATS, 1
+    before = siren.BLOCK_FLOATS, _parallel.WANTED_BLOCKS
+    siren.BLOCK_FLOATS, _parallel.WANTED_BLOCKS = siren.GPU_BLOCK_FLOATS, 1
     try:
         yield
     finally:
-        siren.BLOCK_FLOATS, _parallel.WANTED = before
+        siren.BLOCK_FLOATS, _parallel.WANTED_BLOCKS = before

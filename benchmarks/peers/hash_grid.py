@@ -12,8 +12,9 @@ import torch
 from mplicits.neural_fields.backend._checks import at_least, positive
 from mplicits.neural_fields.fields.field import Jet, OneLevelField
 from mplicits.neural_fields.networks.hash_encoding import INITIAL, check_table, grid_resolutions, spatial_hash
-from mplicits.neural_fields.networks.trilinear import Place, interpolate, interpolate_jet, locate, vertices
 from torch import Tensor, nn
+
+from .trilinear import Place, interpolate, interpolate_jet, locate, vertices
 
 __all__ = ["HashGridSDF"]
 

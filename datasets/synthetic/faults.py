@@ -1,9 +1,8 @@
 """What goes wrong between a surface and the points of a scan, beside noise of the ranges: each fault by itself.
 
-Every function here does one of them to the readings of one scanner, from random numbers that it is given, and is
-exactly what its formula says. :mod:`.scanner` applies them in the order in which they happen: the beam (smear), the
-clock (noise, then quantisation), the position (isotropic noise), what is kept (uneven density), and where the scan is
-taken to stand (misalignment).
+Every function applies one of them to the readings of one scanner. :mod:`.scanner` applies them in this order: the beam
+(smear), the clock (noise, then quantisation), the position (isotropic noise), what is kept (uneven density), and where
+the scan is taken to stand (misalignment).
 """
 
 from __future__ import annotations
@@ -17,13 +16,10 @@ from scipy.spatial.transform import Rotation
 
 from ..depth.cleaning import both_sides
 
-__all__ = ["STEEPEST", "ScanFaults", "depth_jumps", "kept_unevenly", "quantised", "rigid_motion", "smeared"]
+__all__ = ["ScanFaults", "depth_jumps", "kept_unevenly", "quantised", "rigid_motion", "smeared"]
 
 Float64 = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-
-STEEPEST = 84.0
-"""Degrees between ray and normal beyond which a surface returns nothing; what climbs faster is a jump."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +67,7 @@ def depth_jumps(ranges: Float64, rays: Float64, axis: int) -> Mask:
     """Between which neighbours along ``axis`` of a grid of ranges ``(H, W)`` depth jumps; one shorter along it.
 
     Two readings r and r' on rays an angle α apart are on different surfaces if ``|r − r'| > tan(84°) α min(r, r')``:
-    one surface between them would be seen at `STEEPEST` or flatter. Without one of the readings (NaN) there is no jump.
+    one surface between them would be seen at 84° or flatter. Without one of the readings (NaN) there is no jump.
 
     Args:
         ranges: NaN without reading.
@@ -81,7 +77,7 @@ def depth_jumps(ranges: Float64, rays: Float64, axis: int) -> Mask:
     r, direction = np.moveaxis(ranges, axis, 0), np.moveaxis(rays, axis, 0)
     sine = np.linalg.norm(direction[1:] - direction[:-1], axis=-1) / 2  # of half the angle
     nearer = np.minimum(r[1:], r[:-1])
-    jump = np.abs(r[1:] - r[:-1]) > math.tan(math.radians(STEEPEST)) * 2 * np.arcsin(sine) * nearer
+    jump = np.abs(r[1:] - r[:-1]) > math.tan(math.radians(84.0)) * 2 * np.arcsin(sine) * nearer
     return np.moveaxis(jump, 0, axis)
 
 

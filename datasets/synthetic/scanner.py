@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -29,7 +29,6 @@ STATUE_NOISE = 2e-4
 
 _RELAX = 0.75  # steps are this much shorter than the field says, because a field may be steeper than a distance
 _STEPS = 96  # of a ray at most
-_ELEVATIONS = (12.0, 38.0, -30.0, 22.0)  # degrees; scanner after scanner, over again
 
 
 def statue_scan(
@@ -46,7 +45,7 @@ def statue_scan(
     little of the owl from below.
 
     ``STATUE_PLACEMENT.to_unit(points)`` leads back to the coordinates of ``Statue().exact_distance``. Of
-    ``noise``, ``faults`` (none unless given) and ``progress`` see `simulate_scan`.
+    ``noise``, ``faults`` (none unless given) and ``progress`` see `scan_with_truth`.
     """
     statue = Statue()
     return simulate_scan(
@@ -61,51 +60,9 @@ def statue_scan(
     )
 
 
-def simulate_scan(
-    field: Field,
-    *,
-    scanners: int = 8,
-    resolution: int = 216,
-    noise: float = 0.0008,
-    colors: Callable[[Float64], NDArray[np.float32]] | None = None,
-    placement: Similarity | None = None,
-    faults: ScanFaults | None = None,
-    seed: int = 0,
-    progress: Callable[[int, int], None] | None = None,
-) -> PointCloud:
-    """Scan the zero set of ``field``, which lies in the unit sphere, with a ring of range scanners.
-
-    Every scanner measures ranges on a perspective grid of rays. Distances and resolutions differ from one to the
-    next (uneven density), each sees only what nothing hides, ranges carry Gaussian noise along the ray, and rays
-    that graze the surface are mostly lost. Normals are those of the noisy range grid, facing the scanner;
-    where a pixel has no neighbour on the same surface its normal is zero, as in real range data.
-
-    Args:
-        field: a field in the unit sphere, 1-Lipschitz or nearly so, positive outside.
-        scanners: how many, evenly around the z axis, at changing heights.
-        resolution: rays along each side of a grid, on average.
-        noise: standard deviation of the ranges, in the field's units.
-        colors: the colour at points ``(N, 3)``, in the field's units.
-        placement: from the field's coordinates to those of the scan; none leaves them as they are.
-        faults: what else goes wrong; nothing by default. Their random numbers are their own: the same seed gives the
-            same rays, losses and noise with any of them.
-        seed: of the random numbers.
-        progress: told how many steps are done, and of how many: those of the rays, and one for each scanner.
-
-    Raises:
-        ValueError: ``scanners`` or ``resolution`` is too small, ``noise`` is negative, or no ray hits anything.
-    """
-    return scan_with_truth(
-        field,
-        scanners=scanners,
-        resolution=resolution,
-        noise=noise,
-        colors=colors,
-        placement=placement,
-        faults=faults,
-        seed=seed,
-        progress=progress,
-    ).cloud
+def simulate_scan(field: Field, **options: Any) -> PointCloud:
+    """The cloud of `scan_with_truth`, which has the same arguments."""
+    return scan_with_truth(field, **options).cloud
 
 
 @dataclass(frozen=True)
@@ -147,7 +104,27 @@ def scan_with_truth(
     seed: int = 0,
     progress: Callable[[int, int], None] | None = None,
 ) -> SimulatedScan:
-    """As `simulate_scan`, with the exact point of every reading and all that was done to it.
+    """Scan the zero set of ``field``, which lies in the unit sphere, with a ring of range scanners.
+
+    Every scanner measures ranges on a perspective grid of rays. Distances and resolutions differ from one to the
+    next (uneven density), each sees only what nothing hides, ranges carry Gaussian noise along the ray, and rays
+    that graze the surface are mostly lost. Normals are those of the noisy range grid, facing the scanner;
+    where a pixel has no neighbour on the same surface its normal is zero, as in real range data.
+
+    Args:
+        field: a field in the unit sphere, 1-Lipschitz or nearly so, positive outside.
+        scanners: how many, evenly around the z axis, at changing heights.
+        resolution: rays along each side of a grid, on average.
+        noise: standard deviation of the ranges, in the field's units.
+        colors: the colour at points ``(N, 3)``, in the field's units.
+        placement: from the field's coordinates to those of the scan; none leaves them as they are.
+        faults: what else goes wrong; nothing by default. Their random numbers are their own: the same seed gives the
+            same rays, losses and noise with any of them.
+        seed: of the random numbers.
+        progress: told how many steps are done, and of how many: those of the rays, and one for each scanner.
+
+    Raises:
+        ValueError: ``scanners`` or ``resolution`` is too small, ``noise`` is negative, or no ray hits anything.
 
     Example:
         >>> from mplicits.neural_fields import Sphere
@@ -223,7 +200,7 @@ class _View(NamedTuple):
 
 def _view(index: int, scanners: int, resolution: int, random: np.random.Generator) -> _View:
     azimuth = 2 * np.pi * (index + random.uniform(-0.2, 0.2)) / scanners
-    elevation = np.radians(_ELEVATIONS[index % len(_ELEVATIONS)] + random.uniform(-4, 4))
+    elevation = np.radians((12.0, 38.0, -30.0, 22.0)[index % 4] + random.uniform(-4, 4))
     position = random.uniform(2.2, 3.0) * np.array(
         [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)]
     )

@@ -44,8 +44,6 @@ Float64 = NDArray[np.float64]
 Rgb = tuple[float, float, float]
 
 RAYS_AT_ONCE = 1 << 17
-VISIBLE = 1e-3  # how far before a point of the surface a ray may meet it that sees the point
-SPARSE_POINTS = 1000  # as many as structure from motion would give, more or less
 
 
 @dataclass(frozen=True)
@@ -122,7 +120,8 @@ def render_scene(
             images.append(PosedImage(f"{len(images):03d}.png", camera, *seen, depth))
         if progress is not None:
             progress(len(images), views)
-    points = sample_surface(scene.field, SPARSE_POINTS, seed=seed).points
+    # About as many as structure from motion would give.
+    points = sample_surface(scene.field, 1000, seed=seed).points
     seen = _observations(scene, points, [view.camera for view in images])
     return PosedImages(tuple(images), Similarity.identity(), "the unit sphere", points, Path(scene.name), seen)
 
@@ -173,7 +172,7 @@ def _observations(scene: Scene, points: Float64, cameras: Sequence[Camera]) -> N
     length = away.norm(dim=-1)
     directions = away / length[..., None]
     hits = sphere_trace(scene.field, eyes[:, None].expand_as(directions), directions, lipschitz=scene.lipschitz)
-    free = (hits.mask & (hits.depth > length - VISIBLE)).numpy()
+    free = (hits.mask & (hits.depth > length - 1e-3)).numpy()
     framed = np.stack([camera.in_view(points)[2] for camera in cameras])
     return np.argwhere(free & framed)
 

@@ -20,11 +20,8 @@ __all__ = ["Statue"]
 
 Float64 = NDArray[np.float64]
 
-_STAFF_FOOT: Vector = (0.235, -0.265, -0.38)
 _STAFF_HEAD: Vector = (0.330, -0.300, 0.68)
-_STAFF_RADIUS = 0.022
 _EYE: Vector = (0.105, -0.225, 0.435)
-_BLOCK = 16384  # rows evaluated at once: enough for threads to share, few enough for the temporaries to stay in cache
 
 
 class Statue(OneLevelField):
@@ -51,7 +48,8 @@ class Statue(OneLevelField):
 
     def _evaluate(self, x: Tensor) -> Solid:
         rows = x.reshape(-1, 3)
-        blocks = [_statue(block) for block in rows.split(_BLOCK)] if len(rows) else [Solid(rows[:, 0], rows)]
+        # Enough rows for threads to share, few enough for the temporaries to stay in cache.
+        blocks = [_statue(block) for block in rows.split(16384)] if len(rows) else [Solid(rows[:, 0], rows)]
         return Solid(torch.cat([b.value for b in blocks]), torch.cat([b.gradient for b in blocks]))
 
     def exact_distance(self, points: NDArray[np.floating], *, candidates: int = 24) -> Float64:
@@ -130,7 +128,7 @@ def _parts(p: Tensor) -> dict[str, Solid]:
         "face": mirrored(_face(folded)),
         "eyes": mirrored(_eye(folded)),
         "plinth": _plinth(p),
-        "staff": solids.round_cone(p, _STAFF_FOOT, _STAFF_HEAD, _STAFF_RADIUS, _STAFF_RADIUS),
+        "staff": solids.round_cone(p, (0.235, -0.265, -0.38), _STAFF_HEAD, 0.022, 0.022),
         "gilt": solids.smooth_union(mirrored(_gilt(folded)), _staff_head(p), 0.01),
     }
 

@@ -23,8 +23,6 @@ Float64 = NDArray[np.float64]
 LAMP = (0.4, 0.7, 0.6)  # towards the lamp, for shaded scenes
 AMBIENT = 0.35  # share of the light that comes from everywhere
 GLOSS, SHARPNESS = 0.6, 40  # light in the middle of a lamp's reflection, and how narrow it is (Blinn 1977)
-DISTANCE = 4.0  # of the eyes from the middle, in radii of the shape
-MARGIN = 1.1  # radius of the ball that just fills the images, in radii of the shape
 
 
 def cameras_around(
@@ -50,9 +48,10 @@ def cameras_around(
             raise ValueError(f"{name}={number}: expected at least one")
     # The orthogonal factor of a Gaussian matrix is an evenly distributed rotation (or reflection, which is as good).
     turn = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))[0]
-    eyes = np.array(middle) + DISTANCE * radius * fibonacci_directions(views) @ turn.T
-    # A ball of radius r at distance d is seen within asin(r / d) of its middle.
-    fov = 2 * float(np.degrees(np.arcsin(MARGIN / DISTANCE)))
+    distance = 4.0  # of the eyes from the middle, in radii
+    eyes = np.array(middle) + distance * radius * fibonacci_directions(views) @ turn.T
+    # A ball of radius r at distance d is seen within asin(r / d) of its middle; one of 1.1 radii fills the images.
+    fov = 2 * float(np.degrees(np.arcsin(1.1 / distance)))
     return [look_at(torch.from_numpy(eye), middle, up=UP_AXES[up], fov=fov, width=size, height=size) for eye in eyes]
 
 

@@ -15,13 +15,6 @@ from ..views.images import PosedImage, PosedImages
 
 __all__ = ["VIEW_FAULTS", "with_fault"]
 
-TURN = 0.5  # degrees, standard deviation of an inexact pose about each axis
-SHIFT = 0.005  # the same of its eye along each axis, in radii of the region
-LOST = 30.0  # degrees that one camera looks past the object
-DARKER = 0.5  # light of every other photograph
-# Of the masks that have a hole: the first, how many further on the next one is, and its radius as a share of the width.
-TORN, HOLE = slice(2, None, 12), 0.1
-
 
 def with_fault(images: PosedImages, fault: str, seed: int = 0) -> PosedImages:
     """The data set with one of the `VIEW_FAULTS`.
@@ -50,12 +43,12 @@ def with_fault(images: PosedImages, fault: str, seed: int = 0) -> PosedImages:
 
 def _poses(images: PosedImages, random: np.random.Generator) -> list[PosedImage]:
     radius = images.similarity.scale
-    return [_turned(view, random.normal(0, TURN, 3), random.normal(0, SHIFT * radius, 3)) for view in images.views]
+    return [_turned(view, random.normal(0, 0.5, 3), random.normal(0, 0.005 * radius, 3)) for view in images.views]
 
 
 def _pose(images: PosedImages, _: np.random.Generator) -> list[PosedImage]:
     views = list(images.views)
-    views[2] = _turned(views[2], np.array([0, LOST, 0]), np.zeros(3))
+    views[2] = _turned(views[2], np.array([0, 30.0, 0]), np.zeros(3))
     return views
 
 
@@ -97,7 +90,7 @@ def _masks(images: PosedImages, _: np.random.Generator) -> list[PosedImage]:
 
 def _holes(images: PosedImages, _: np.random.Generator) -> list[PosedImage]:
     views = list(images.views)
-    views[TORN] = [_torn(view) for view in views[TORN]]
+    views[2::12] = [_torn(view) for view in views[2::12]]
     return views
 
 
@@ -106,13 +99,13 @@ def _torn(view: PosedImage) -> PosedImage:
         return view
     y, x = np.indices(view.mask.shape)
     down, across = (np.average(axis, weights=view.mask) for axis in (y, x))
-    hole = (y - down) ** 2 + (x - across) ** 2 < (HOLE * view.mask.shape[1]) ** 2
+    hole = (y - down) ** 2 + (x - across) ** 2 < (0.1 * view.mask.shape[1]) ** 2
     return replace(view, mask=np.where(hole, 0, view.mask).astype(view.mask.dtype))
 
 
 def _exposure(images: PosedImages, _: np.random.Generator) -> list[PosedImage]:
     return [
-        replace(view, color=linear_to_srgb(DARKER * srgb_to_linear(view.color)).astype(np.float32)) if odd % 2 else view
+        replace(view, color=linear_to_srgb(0.5 * srgb_to_linear(view.color)).astype(np.float32)) if odd % 2 else view
         for odd, view in enumerate(images.views)
     ]
 

@@ -1,10 +1,8 @@
 """Blocks of rows on several cores: each block is the work of one thread from its first product to its last.
 
-A block is small so that its activations stay in the cache of one core. Splitting every product of it among all threads
-would bring them together a dozen times in a block, for work that is too little to share; and where another process
-holds one of the cores, all of them wait for it each time. Here the threads meet once, at the end, and who
-is held up takes fewer blocks. What is computed for a block depends on nothing else, so that the results are the same
-bits for any number of threads.
+Blocks are small, so that activations stay in the cache of one core. Splitting every product among all threads would
+synchronise them a dozen times in a block, for little work. Here threads meet once, at the end. What is computed for a
+block depends on nothing else, so results are the same bits for any number of threads.
 """
 
 from __future__ import annotations
@@ -27,7 +25,7 @@ Step = Callable[[slice], None]
 # a good part of the block.
 LEAST_ROWS = 1024
 # Blocks that a short list of rows is cut into, where they can be of LEAST_ROWS: enough for eight cores.
-WANTED = 8
+WANTED_BLOCKS = 8
 # Fewer blocks than this go one after the other, every product split among the threads: who wakes up for a block or two
 # comes late.
 LEAST_BLOCKS = 4
@@ -54,7 +52,7 @@ def over_blocks(rows: int, size: int, prepare: Callable[[int], Step], *, like: T
         BaseException: what a step raised first; no further block is begun then.
     """
     if like.device.type == "cpu":  # elsewhere more blocks are more launches
-        shorter = min(size, max(LEAST_ROWS, -(-rows // WANTED)))
+        shorter = min(size, max(LEAST_ROWS, -(-rows // WANTED_BLOCKS)))
         if -(-rows // shorter) >= LEAST_BLOCKS:
             size = shorter
     count = -(-rows // size)

@@ -1,9 +1,8 @@
 """Evaluations whose shapes follow from those of the points alone, so that the host never waits for the device.
 
-How many rows lie in a band is a number that only the device knows. A CPU looks, and gathers exactly these rows; a GPU
-would have to finish all its work first, and then wait for the host. Inside `fixed_shapes` a band has room for
-a given number of rows instead. The first so many of those that lie in it are found by prefix sums and take their
-places; places that are left over are computed and thrown away.
+The number of rows in a band is known only on the device. A CPU gathers exactly these rows; a GPU would have to finish
+all its work first. Inside `fixed_shapes` a band has room for a given number of rows instead. The first ones in it are
+found by prefix sums; places that are left over are computed and thrown away.
 """
 
 from __future__ import annotations
@@ -151,13 +150,8 @@ def fixed_shapes(
 ) -> Iterator[FixedShapes]:
     """Inside this, a `MultiscaleSDF` never makes the host wait, and launches the same kernels for any points.
 
-    Without a ``capacity`` every level is evaluated at every point, and used where it lies in the band: as many more
-    operations as bands are thin. Results are those of the usual way but for rounding: a matrix product may add up in
-    another order when it has other rows beside it. With capacities, look at ``lost``.
-
-    Args:
-        capacity: see `FixedShapes`.
-        rooms: likewise.
+    Without a ``capacity`` every level is evaluated at every point, and used where it lies in the band. Results are the
+    usual ones but for rounding. With capacities, check ``lost``. The arguments are those of `FixedShapes`.
 
     Example:
         >>> import torch

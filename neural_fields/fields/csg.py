@@ -1,16 +1,12 @@
-"""Solids put together: union, intersection, difference, sharp or blended; offsets and shells; fields placed, bounded.
+"""Constructive solid geometry: union, intersection, difference, sharp or blended; offsets, shells, placing, bounding.
 
-Each is a `Field` of other fields, and all of them follow one rule for levels. Level j of a combination is that of its
-parts, a part with fewer levels staying at its finest; a band is as wide as it takes so that outside it no part changes
-what is said:
+Each is a `Field` of other fields. Level j of a combination is that of its parts, a part with fewer levels staying at
+its finest; a band is so wide that outside it no part changes the sign:
 
     h_{j+1} = join(f_{j+1}, g_{j+1}, …) where every coarser |h_i| < δ_i, and h_j elsewhere.
 
-So a combination keeps what `Field` promises, and tracer, mesher and renderers may skip what they would skip elsewhere.
-With parts of slope at most L the slope of each combination here is at most L.
-
-What comes out is a distance in sign and as a bound, not always in size: |h| is at most the distance to the surface of
-the combination, and less where the nearest point of a part was cut away. The surface itself is exact.
+With parts of slope at most L the slope of each combination is at most L. The result is a bound on the distance: |h| is
+at most the distance to its surface, and less where the nearest point of a part was cut away. The surface is exact.
 """
 
 from __future__ import annotations
@@ -240,14 +236,8 @@ class Union(_Boolean):
 class Intersection(_Boolean):
     """What is in all of the parts: ``max_i f_i(x)``; exact inside of parts with exact distances, a bound outside.
 
-    With ``smooth`` k it shrinks by at most k/4, where two values differ by less than k; see `Union`.
-
-    Args:
-        parts: see `Union`.
-        smooth: see there.
-
-    Raises:
-        ValueError: see there.
+    With ``smooth`` k it shrinks by at most k/4, where two values differ by less than k. Arguments and errors are those
+    of `Union`.
     """
 
     def _signs(self) -> tuple[int, Sequence[int]]:
@@ -257,14 +247,7 @@ class Intersection(_Boolean):
 class Difference(_Boolean):
     """What is in the first part and in none of the others: ``max(f_0, −f_1, −f_2, …)``, a bound on the distance.
 
-    With ``smooth`` k it shrinks by at most k/4 for each part taken away; see `Union`.
-
-    Args:
-        parts: the solid, and what is taken from it; see `Union`.
-        smooth: see there.
-
-    Raises:
-        ValueError: see there.
+    With ``smooth`` k it shrinks by at most k/4 for each part taken away. Arguments and errors are those of `Union`.
 
     Example:
         >>> import torch

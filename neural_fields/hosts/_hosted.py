@@ -17,7 +17,7 @@ from ..fields.similarity import Similarity
 from ..meshing._lattice import Bounds
 from ..meshing.mesh import Mesh
 from ..shape import WorldField
-from .learning_rates import HOST_RATE, Pace, parameter_groups, share_rate
+from .learning_rates import HOST_RATE, Pace, parameter_groups, rescale_parameters
 
 __all__ = ["Box", "Hosted", "as_bounds", "joined", "mark"]
 
@@ -34,7 +34,7 @@ class Hosted(nn.Module):
         bounds: lowest and highest corner of what the host samples and meshes, in its own units ``(2, 3)``; None for
             the box from −half to half on each axis.
         half: of that box, in the host's units.
-        learning_rate: see `share_rate`; None leaves the parameters in their own units.
+        learning_rate: see `rescale_parameters`; None leaves the parameters in their own units.
         pace: share of the rates that suit the field; see `Pace`.
 
     Raises:
@@ -60,7 +60,7 @@ class Hosted(nn.Module):
         self.field, self.scale, self.bounds = as_field(field), float(scale), box
         self.pace = pace
         if learning_rate is not None:
-            share_rate(self.field, learning_rate, pace=pace)
+            rescale_parameters(self.field, learning_rate, pace=pace)
 
     @property
     def world(self) -> WorldField:
@@ -171,9 +171,7 @@ def _full_precision(x: Tensor) -> torch.autocast:
 def _reaching(x: Tensor) -> Iterator[Tensor]:
     """``x`` for an evaluation whose graph reaches it, with its own flag as it was afterwards.
 
-    The hosts evaluate first and mark the points as requiring gradients later, inside ``gradient``. Whoever then
-    differentiates the gradient by the points (curvature) needs a graph that knew them. While the flag is
-    off, autograd passes such points by.
+    Hosts evaluate first and mark the points as requiring gradients later, inside ``gradient``.
     """
     if not torch.is_grad_enabled() or x.requires_grad:
         yield x

@@ -51,19 +51,17 @@ class _Waiting:
 
 
 class PointMemo:
-    """Remembers one half of the last pair (value, gradient) until it is asked for, on the very same points.
+    """Keeps one half of the last pair (value, gradient) until it is requested, at the very same points.
 
-    Renderers like NeuS's ask for the values and then, by another method, for the gradient at the same tensor of
-    points. Both come from one evaluation: the first call makes the pair and hands out its half, the second call
-    gets the other one, once. What waits is dropped
+    Renderers like NeuS's call for the values and then, by another method, for the gradient at the same tensor. The
+    first call evaluates both and returns its half; the second call gets the other one, once. What is kept is dropped
 
-    - when it is handed out, or anything else is asked for;
-    - when the points or the half handed out before die: so no graph lives longer than the caller's own tensors;
-    - when a gradient flows back through the half handed out before: autograd may have freed the graph of both.
+    - when it is returned, or anything else is requested;
+    - when the points or the returned half die, so no graph lives longer than the caller's own tensors;
+    - when a gradient flows back through the returned half: autograd may have freed the graph of both.
 
-    It is used only for the same tensor object at the same version, with the same tensors of the module, each at the
-    same version and place, and in the same grad mode. Writing through ``.data`` or NumPy, which PyTorch does not
-    count as a change, between the two calls is not noticed.
+    It is used only for the same tensor object at the same version, with the same tensors of the module at the same
+    versions, and in the same grad mode. Writing through ``.data`` or NumPy between the two calls is not noticed.
     """
 
     def __init__(self) -> None:

@@ -1,8 +1,7 @@
 """Fields in the shapes that other people's renderers call: NeuS, instant-nsr-pl, nerfstudio and sdfstudio.
 
-Each shell holds a `Field` f and evaluates it in the host's own units: with ``scale`` s, points are multiplied by s and
-distances divided by it, so that f(s x) / s is again a distance and its gradient is ∇f(s x). None of the hosts is
-imported; what they pass in is used by the names of its attributes. How to change each host is in docs/drop-in.md.
+Each holds a `Field` f and evaluates it in the host's units: with ``scale`` s, f(s x) / s is again a distance and its
+gradient is ∇f(s x). None of the hosts is imported. How to change each host is in docs/drop-in.md.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ class NeuSGeometry(Hosted):
             ``bounds`` what brings their farthest corner onto the field's unit sphere.
         bounds: box of the mesh, ``(2, 3)``; from -1.01 to 1.01 by default, as in NeuS.
         learning_rate: at which NeuS trains all its networks alike; the parameters of the field are then kept in units
-            in which this rate suits them (`share_rate`). None leaves them alone.
+            in which this rate suits them (`rescale_parameters`). None leaves them alone.
         pace: share of the rates that suit the field, one for all levels or one for each; see `Pace`.
 
     Raises:

@@ -1,10 +1,10 @@
 """Learning rates for SIRENs in trainers that were made for softplus networks.
 
 In a layer z = ω₀ (W h + b) the weights are about ω₀ times as small as in a softplus layer that does as much, but Adam
-moves every weight by the learning rate, however small it is. At one rate for both a SIREN therefore takes steps about
-ω₀ times as long: at NeuS's 5e-4 the surface falls to pieces while the colours are learnt. `parameter_groups` has a rate
-for each layer; where a trainer sets the rate of all groups to the same number in every step, as NeuS's does,
-`share_rate` keeps the parameters in units in which one rate means as much.
+moves every weight by the learning rate. At one rate for both, a SIREN takes steps about ω₀ times as long. At NeuS's
+5e-4 its surface breaks while the colours are learnt. `parameter_groups` has a rate for each layer. For trainers that
+set one rate for all groups, as NeuS's does, `rescale_parameters` keeps the parameters in units in which one rate fits
+all.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from ..fields.field import Field
 from ..networks.multiscale import MultiscaleSDF
 from ..networks.siren import Siren
 
-__all__ = ["HOST_RATE", "Pace", "parameter_groups", "share_rate"]
+__all__ = ["HOST_RATE", "Pace", "parameter_groups", "rescale_parameters"]
 
 # Shares of the rates below at which levels learn, the coarsest first; the last is for all that are finer, and one
 # number for all. Where colours do not need the geometry's own features, half of the rates leaves fewer waves.
@@ -63,7 +63,7 @@ def parameter_groups(field: Field, lr: float = HOST_RATE, *, pace: Pace = 1.0) -
     return [*groups, {"params": rest, "lr": lr}] if rest else groups
 
 
-def share_rate(field: Field, lr: float = HOST_RATE, *, pace: Pace = 1.0) -> None:
+def rescale_parameters(field: Field, lr: float = HOST_RATE, *, pace: Pace = 1.0) -> None:
     """Keep a field's parameters in units in which one rate serves all of them; the field stays the same function.
 
     The units are powers of two (`Siren.set_units`), so that values and jets stay the same bit for bit; the steps are
@@ -80,10 +80,10 @@ def share_rate(field: Field, lr: float = HOST_RATE, *, pace: Pace = 1.0) -> None
     Example:
         >>> import torch
         >>> from mplicits.neural_fields import Siren
-        >>> from mplicits.neural_fields.hosts.learning_rates import share_rate
+        >>> from mplicits.neural_fields.hosts.learning_rates import rescale_parameters
         >>> siren, x = Siren(16, 2, omega=30.0), torch.rand(5, 3)
         >>> before = siren.value(x)
-        >>> share_rate(siren, 5e-4)
+        >>> rescale_parameters(siren, 5e-4)
         >>> siren.units, torch.equal(siren.value(x), before)
         ((0.25, 0.25), True)
     """

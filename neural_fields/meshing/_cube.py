@@ -1,14 +1,10 @@
-"""The 256 cases of marching cubes, derived from one rule per face instead of typed in.
+"""The 256 cases of marching cubes (Lorensen and Cline 1987), derived from one rule per face instead of typed in.
 
-A cube has corners ``0..7`` (bit 0 of the number is x, bit 1 is y, bit 2 is z) and twelve edges. A case is the
-byte whose bit c says that corner c is inside (negative). On each face, walked counter-clockwise as seen from
-outside the cube, every crossing from outside to inside is joined to the next crossing back to outside. Two
-cubes that share a face therefore draw the same segments on it, also on the ambiguous faces, where this rule
-separates the two inside corners: the surface has no cracks, whatever the signs are. Each crossed edge is
-entered on one of its faces and left on the other, so the segments close into loops; the loops are cut into
-triangles without diagonals that lie in a face, where the neighbouring cube might place the same diagonal.
-
-After Lorensen and Cline, *Marching Cubes*, SIGGRAPH 1987.
+A cube has corners ``0..7`` (bit 0 of the number is x, bit 1 y, bit 2 z) and twelve edges. Bit c of a case says that
+corner c is inside (negative). On each face, walked counter-clockwise as seen from outside, every crossing from outside
+to inside is joined to the next one back. Two cubes that share a face therefore draw the same segments on it, so the
+surface has no cracks. Each crossed edge is entered on one of its faces and left on the other, so segments close into
+loops. Loops are cut into triangles without diagonals in a face, where the neighbour might place the same one.
 """
 
 from __future__ import annotations

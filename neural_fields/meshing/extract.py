@@ -25,7 +25,6 @@ DEFAULT_BOUNDS: Bounds = ((-1.02, -1.02, -1.02), (1.02, 1.02, 1.02))
 # Cells that a vertex may move before its normal is taken anew: a twentieth of a cell turns the normal by 0.3 degrees
 # where the radius of curvature is ten cells.
 RENEWED_NORMAL = 0.05
-CELLS_AT_ONCE = 1 << 18
 
 
 def extract_mesh(
@@ -175,8 +174,8 @@ def _triangles(cells: ActiveCells) -> tuple[NDArray[np.int32], NDArray[np.int32]
     first = tables.start[cells.cases]
     last = np.cumsum(tables.start[cells.cases.astype(np.int64) + 1] - first)
     faces = np.empty((last[-1], 3), np.int32)
-    for begin in range(0, len(first), CELLS_AT_ONCE):
-        part = slice(begin, begin + CELLS_AT_ONCE)
+    for begin in range(0, len(first), 1 << 18):
+        part = slice(begin, begin + (1 << 18))
         before = np.concatenate(([0] if begin == 0 else [last[begin - 1]], last[part][:-1]))
         cell = np.repeat(np.arange(begin, begin + len(before)), last[part] - before)
         within = np.arange(before[0], before[0] + len(cell)) - np.repeat(before, last[part] - before)

@@ -42,7 +42,6 @@ Origin = tuple[float, float, float]
 # float32 rounds a coordinate c by up to 6e-8 |c|. Up to this many scales from the origin that is less than a
 # hundredth of a cell at 2048³.
 FLOAT32_REACH = 128.0
-TEXT_ROWS = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -313,8 +312,8 @@ def write_obj(path: Path, mesh: Mesh, *, double: bool, library: str | None = Non
         if library is not None:
             file.write(f"mtllib {library}\nusemtl {MATERIAL}\n")
         for template, rows in blocks:
-            for start in range(0, len(rows), TEXT_ROWS):
-                part = rows[start : start + TEXT_ROWS]
+            for start in range(0, len(rows), 1 << 16):
+                part = rows[start : start + (1 << 16)]
                 file.write((template + "\n") * len(part) % tuple(part.ravel().tolist()))
 
 

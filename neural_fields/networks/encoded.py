@@ -12,23 +12,19 @@ from .hash_encoding import HashEncoding
 
 __all__ = ["EncodedField"]
 
-# Tables learn at rates far above those of networks: 0.01 in Instant-NGP (Müller et al. 2022, Sec. 4). Adam's step does
-# not depend on how large an entry is, so that entries which count 64 times learn as if at 0.03 beside networks at 5e-4.
-GAIN = 64.0
-
 
 class EncodedField(Field):
     """A field whose features are its own and, after them, ``gain · e(x)`` of a hash encoding e.
 
-    A colour network of a NeuS-style host knows of the position's detail what the geometry's features say of it. Detail
-    that goes through the network whose value is the distance bends the surface; what goes through an encoding does not:
-    value, gradient, levels and bands stay those of the field. Hosts set one learning rate for all, which is too low for
-    a table; the gain makes up for that.
+    A colour network of a NeuS-style host gets the detail of the position from these features, so that the surface need
+    not bend for it: value, gradient, levels and bands stay those of the field. Hosts set one learning rate for all,
+    which is too low for a table; the gain makes up for that.
 
     Args:
         field: three-dimensional; a part of this module.
         grid: the encoding e, a part of this module too; one of 24 features over the cube ±1 by default.
-        gain: factor on what it says.
+        gain: factor on what it says. Tables learn at 0.01 in Instant-NGP (Müller et al. 2022, Sec. 4); entries that
+            count 64 times learn as if at 0.03 beside networks at 5e-4, as Adam's steps do not depend on their size.
 
     Raises:
         ValueError: the field is not three-dimensional, or the gain not positive.
@@ -44,7 +40,7 @@ class EncodedField(Field):
 
     defined_by = ("gain",)
 
-    def __init__(self, field: FieldLike, grid: HashEncoding | None = None, *, gain: float = GAIN) -> None:
+    def __init__(self, field: FieldLike, grid: HashEncoding | None = None, *, gain: float = 64.0) -> None:
         super().__init__()
         positive(gain=gain)
         self.field = as_field(field)

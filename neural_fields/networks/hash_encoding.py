@@ -16,10 +16,7 @@ from ..backend._checks import at_least, positive
 
 __all__ = ["HashEncoding", "check_table", "grid_resolutions", "spatial_hash", "tables_apart"]
 
-# The factors of Eq. 4; the first is 1 so that neighbours along x stay neighbours in memory.
-PRIMES = (1, 2_654_435_761, 805_459_861)
 INITIAL = 1e-4  # entries begin uniform in ±INITIAL (Sec. 4)
-CORNERS = 8
 
 
 def grid_resolutions(levels: int, coarsest: int, finest: int) -> list[int]:
@@ -35,8 +32,8 @@ def grid_resolutions(levels: int, coarsest: int, finest: int) -> list[int]:
 
 
 def spatial_hash(x: Tensor, y: Tensor, z: Tensor, size: int) -> Tensor:
-    """``(x π₁ ⊕ y π₂ ⊕ z π₃) mod T`` (Eq. 4) of whole coordinates that broadcast; ``size`` is T, a power of two."""
-    return (x * PRIMES[0] ^ y * PRIMES[1] ^ z * PRIMES[2]) & (size - 1)
+    """``(x π₁ ⊕ y π₂ ⊕ z π₃) mod T`` (Eq. 4, π₁ = 1) of whole coordinates that broadcast; ``size`` is T = 2ⁿ."""
+    return (x ^ y * 2_654_435_761 ^ z * 805_459_861) & (size - 1)
 
 
 def check_table(table_size: int, coarsest: int, finest: int) -> None:
@@ -151,7 +148,7 @@ class _Lookup(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, table: Tensor, entries: Tensor, weights: Tensor) -> Tensor:
         ctx.save_for_backward(table, entries, weights)
-        rows, by_row = entries.reshape(-1, CORNERS), weights.reshape(-1, CORNERS)
+        rows, by_row = entries.flatten(0, 1), weights.flatten(0, 1)
         return nn.functional.embedding_bag(rows, table, per_sample_weights=by_row, mode="sum")
 
     @staticmethod
@@ -160,8 +157,8 @@ class _Lookup(torch.autograd.Function):
         (slope,) = (cotangent[:, None] for cotangent in cotangents)  # (N L, 1, F)
         by_table = by_weights = None
         if ctx.needs_input_grad[0]:
-            shares = (slope * weights.reshape(-1, CORNERS, 1)).flatten(0, 1)
+            shares = (slope * weights.flatten(0, 1)[..., None]).flatten(0, 1)
             by_table = torch.zeros_like(table).index_add_(0, entries.flatten(), shares)
         if ctx.needs_input_grad[2]:
-            by_weights = (table[entries.reshape(-1, CORNERS)] * slope).sum(dim=2).reshape(weights.shape)
+            by_weights = (table[entries.flatten(0, 1)] * slope).sum(dim=2).reshape(weights.shape)
         return by_table, None, by_weights

@@ -20,7 +20,6 @@ from .radiance import encode, encoded_size
 __all__ = ["NeusSDF"]
 
 BETA = 100.0  # of the softplus
-LINEAR = 50.0  # βz above which softplus is z to the last digit; torch's own 20 would show in float64
 
 
 class NeusSDF(OneLevelField):
@@ -124,7 +123,8 @@ class NeusSDF(OneLevelField):
             if index == self.depth:
                 return z, phases, weights
             phases.append(z)
-            h = nn.functional.softplus(z, beta=BETA, threshold=LINEAR)
+            # Above βz = 50 softplus is z to the last digit; torch's own 20 would show in float64.
+            h = nn.functional.softplus(z, beta=BETA, threshold=50.0)
         raise AssertionError("the last layer has returned")
 
 

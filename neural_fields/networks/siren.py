@@ -38,8 +38,6 @@ BLOCK_FLOATS = 1 << 18
 GPU_BLOCK_FLOATS = 1 << 27
 # While a graph is recorded every activation is kept anyway; larger blocks then save more calls than they lose in cache.
 GRAPH_BLOCK_FACTOR = 8
-# Parts that the derivatives of the parameters are summed in: enough for as many cores, few enough to hold them all.
-SHARES = 16
 
 
 class Siren(OneLevelField):
@@ -431,8 +429,8 @@ class _SirenJet(torch.autograd.Function):
         given = (output_bar, gradient_bar, x, *kept, g_out)
         x_bar = torch.empty_like(x) if ctx.needs_input_grad[0] else None
         size = _block_rows(parameters[-2].shape[1], x.device)
-        # The sums over points are made of a fixed number of parts, in their order: the same bits for any threads.
-        share = max(size, -(-len(x) // SHARES))
+        # Sums over points are made of 16 parts, in their order: the same bits for any number of threads.
+        share = max(size, -(-len(x) // 16))
         starts = range(0, len(x), share)
         bars = [torch.zeros(len(starts), *parameter.shape, dtype=x.dtype, device=x.device) for parameter in parameters]
 

@@ -22,8 +22,6 @@ from .siren import Siren, forward, needs_graph, plain_jet
 
 __all__ = ["ColorSiren", "TextureField"]
 
-CHANNELS = 3
-
 
 class ColorSiren(nn.Module):
     """A SIREN with three outputs, defined everywhere and not limited to [0, 1].
@@ -57,7 +55,7 @@ class ColorSiren(nn.Module):
         mean: Sequence[float] = (0.5, 0.5, 0.5),
     ) -> None:
         super().__init__()
-        self.siren = Siren(width, depth, omega=omega, in_dim=in_dim, num_features=CHANNELS - 1)
+        self.siren = Siren(width, depth, omega=omega, in_dim=in_dim, num_features=2)
         with torch.no_grad():
             self.siren.output.bias.copy_(torch.tensor([float(channel) for channel in mean]))
 
@@ -69,15 +67,15 @@ class ColorSiren(nn.Module):
             value = forward(rows, parameters)[0]
         else:
             value = torch.cat([_value_in_place(part, parameters) for part in self._blocks(rows)])
-        return value.reshape(*x.shape[:-1], CHANNELS)
+        return value.reshape(*x.shape[:-1], 3)
 
     def jet(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Colours ``(..., 3)`` and their Jacobian ``(..., 3, d)`` at ``x`` ``(..., d)``, by sweeps back."""
         rows = self._rows(x)
         parameters = self.siren.folded()
         blocks = [rows] if needs_graph(rows, parameters) else self._blocks(rows)
-        values, gradients = zip(*(plain_jet(part, parameters, CHANNELS) for part in blocks), strict=True)
-        shape = (*x.shape[:-1], CHANNELS)
+        values, gradients = zip(*(plain_jet(part, parameters, 3) for part in blocks), strict=True)
+        shape = (*x.shape[:-1], 3)
         return torch.cat(values).reshape(shape), torch.cat(gradients).reshape(*shape, x.shape[-1])
 
     def derivative_along(self, x: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
@@ -103,7 +101,7 @@ class ColorSiren(nn.Module):
             pairs = zip(self._blocks(rows), self._blocks(tangents), strict=True)
             parts = [_tangent_in_place(part, along, parameters) for part, along in pairs]
             value, derivative = (torch.cat(both) for both in zip(*parts, strict=True))
-        shape = (*x.shape[:-1], CHANNELS)
+        shape = (*x.shape[:-1], 3)
         return value.reshape(shape), derivative.reshape(shape)
 
     def _rows(self, x: Tensor) -> Tensor:
@@ -154,7 +152,7 @@ class TextureField(OneLevelField):
         if network.siren.in_dim != geometry.in_dim:
             raise ValueError(f"network: of {network.siren.in_dim} dimensions; the geometry has {geometry.in_dim}")
         color = torch.tensor([float(channel) for channel in outside])
-        if color.shape != (CHANNELS,) or not bool(((color >= 0) & (color <= 1)).all()):
+        if color.shape != (3,) or not bool(((color >= 0) & (color <= 1)).all()):
             raise ValueError(f"outside={tuple(outside)}: expected three numbers from 0 to 1")
         self.geometry, self.network = geometry, network
         self.geometry_level = geometry.resolve_level(geometry_level)
@@ -171,16 +169,16 @@ class TextureField(OneLevelField):
         """Colours at ``x`` ``(..., d)`` → ``(..., 3)`` in [0, 1]."""
         rows, inside = self._inside(x, level)
         found = self._background(rows).index_copy(0, inside, self.colors(rows[inside]))
-        return found.reshape(*x.shape[:-1], CHANNELS)
+        return found.reshape(*x.shape[:-1], 3)
 
     def jet(self, x: Tensor, *, level: int = -1) -> Jet:
         """See `Field.jet`: value ``(..., 3)``, gradient ``(..., 3, d)``, which is 0 outside the band."""
         rows, inside = self._inside(x, level)
         raw, slope = self.network.jet(rows[inside])
         value = self._background(rows).index_copy(0, inside, raw.clamp(0, 1))
-        gradient = rows.new_zeros(len(rows), CHANNELS, self.in_dim)
+        gradient = rows.new_zeros(len(rows), 3, self.in_dim)
         gradient = gradient.index_copy(0, inside, slope * _unclamped(raw)[..., None])
-        shape = (*x.shape[:-1], CHANNELS)
+        shape = (*x.shape[:-1], 3)
         return Jet(value.reshape(shape), gradient.reshape(*shape, self.in_dim), x.new_empty((*x.shape[:-1], 0)))
 
     def derivative_along(self, x: Tensor, direction: Tensor, *, level: int = -1) -> tuple[Tensor, Tensor]:
@@ -194,8 +192,8 @@ class TextureField(OneLevelField):
             raise ValueError(f"direction has shape {tuple(direction.shape)}; expected that of x, {tuple(x.shape)}")
         raw, slope = self.network.derivative_along(rows[inside], direction.reshape(rows.shape)[inside])
         value = self._background(rows).index_copy(0, inside, raw.clamp(0, 1))
-        derivative = rows.new_zeros(len(rows), CHANNELS).index_copy(0, inside, slope * _unclamped(raw))
-        shape = (*x.shape[:-1], CHANNELS)
+        derivative = rows.new_zeros(len(rows), 3).index_copy(0, inside, slope * _unclamped(raw))
+        shape = (*x.shape[:-1], 3)
         return value.reshape(shape), derivative.reshape(shape)
 
     @torch.no_grad()
@@ -210,7 +208,7 @@ class TextureField(OneLevelField):
         return rows, self.in_band(rows, level=level).nonzero()[:, 0]
 
     def _background(self, rows: Tensor) -> Tensor:
-        return self.outside.to(rows).expand(len(rows), CHANNELS)
+        return self.outside.to(rows).expand(len(rows), 3)
 
 
 def _unclamped(raw: Tensor) -> Tensor:

@@ -14,8 +14,6 @@ from ..fields.field import Field
 
 __all__ = ["ValueGrid"]
 
-CHUNK = 1 << 15  # vertices evaluated at a time
-
 
 class ValueGrid:
     """A level's values at (resolution + 1)³ vertices of the cube [−1, 1]³, trilinear in between.
@@ -77,7 +75,7 @@ class ValueGrid:
         cells = asked.nonzero()
         flat = self.kept.view(-1)
         squares = flat.new_zeros(())
-        for part in cells.split(CHUNK):
+        for part in cells.split(1 << 15):
             x, y, z = part.unbind(dim=1)
             place = (x * len(axis) + y) * len(axis) + z
             before, now = flat[place], field.value(axis[part], level=level).to(flat)

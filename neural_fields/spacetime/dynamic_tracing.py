@@ -1,18 +1,17 @@
-"""Tracing surfaces that move: what one frame found out says what the next ones need not look for.
+"""Tracing surfaces that move: one frame says what the next ones need not look for.
 
 **Key frames** are traced as from scratch, and note for every ray where it comes within ``reach`` of the surface. Until
 the surface may have moved that far, the frames in between
 
 - leave out rays that came nowhere near it,
 - begin the others where they came near, and end those that passed where they left it again,
-- and look at once where a ray's hit is foretold to be, from its depths in the last two frames, if the key frame saw the
-  field fall evenly from there to the hit. One Newton step, or none, is then left to do.
+- start at a ray's expected hit, from its depths in the last two frames, if the key frame saw the field fall evenly to
+  the hit.
 
-**What holds.** Key frames are those of `sphere_trace`, whatever has moved and however far; there only the place where
-a ray looks first is taken from older frames. Frames in between rest on the ``speed``, a bound on |∂f/∂t|: a point with
-f ≥ reach at the time of the key frame stays outside for ``reach / speed``. Two things they do not see before the next
-key frame: what grows out of the last stretch of an even fall, and a spike between two samples of a ray that were both
-clear of it. With ``reach=0`` every frame is a key frame, and nothing is assumed about the motion.
+Key frames are those of `sphere_trace`, however far the surface has moved. Frames in between rest on the ``speed``, a
+bound on |∂f/∂t|: a point with f ≥ reach stays outside for ``reach / speed``. They miss what grows out of the last
+stretch of an even fall, and a spike between two clear samples of a ray, until the next key frame. With ``reach=0``
+every frame is a key frame.
 """
 
 from __future__ import annotations
@@ -28,15 +27,6 @@ from ..tracing.sphere import BOUNDING_RADIUS, Expected, Hits, Near, ball_points,
 from .field import SpaceTimeSDF, TimeSlice, check_spacetime
 
 __all__ = ["DynamicTracer", "moment"]
-
-# How near a ray comes before a key frame takes note, in resolutions. More makes key frames fewer, the others dearer.
-REACH = 12.0
-# The speed is measured at those of so many points that are this near, by a difference over so long a time, and taken
-# for larger.
-SPEED_POINTS = 16384
-SPEED_NEAR = 0.1
-SPEED_INTERVAL = 1e-3
-SPEED_MARGIN = 1.25
 
 
 def moment(field: Field, t: float) -> Field:
@@ -90,11 +80,9 @@ class DynamicTracer:
         directions: ``(..., 3)`` of unit length. The rays ``(H, W, 3)`` of an image with one origin are traced in tiles
             first, as far as whole tiles see nothing.
         level: whose surface to find.
-        tolerance: see `sphere_trace`.
-        resolution: see `sphere_trace`.
-        lipschitz: see `sphere_trace`.
-        radius: see `sphere_trace`.
-        reach: how near to the surface is near; by default 12 resolutions. 0 makes every frame a key frame.
+        tolerance, resolution, lipschitz, radius: see `sphere_trace`.
+        reach: how near to the surface is near; by default 12 resolutions. More makes key frames fewer and the others
+            dearer; 0 makes every frame a key frame.
         speed: bound on |∂f/∂t| near the surface; by default a quarter more than the largest one that is measured, for
             every key frame, at points all around it.
 
@@ -132,7 +120,7 @@ class DynamicTracer:
         self.field, self.origins, self.directions = field, origins, directions
         self.level, self.radius = field.resolve_level(level), radius
         self.tolerance, self.resolution, self.lipschitz = tolerance, resolution, lipschitz
-        self.reach, self.speed = REACH * resolution if reach is None else reach, speed
+        self.reach, self.speed = 12.0 * resolution if reach is None else reach, speed
         self._frames: list[_Frame] = []
         self._key: _Key | None = None
 
@@ -183,12 +171,13 @@ class DynamicTracer:
 
     def _measured_speed(self, t: float) -> float:
         """How fast values change at this time near the surface; of a distance, that is how fast the surface moves."""
+        interval, near, margin = 1e-3, 0.1, 1.25  # of time; of the surface; a quarter more than was measured
         generator = torch.Generator().manual_seed(0)
-        points = ball_points(SPEED_POINTS, radius=self.radius, generator=generator).to(self.directions)
-        before, after = (moment(self.field, t + sign * SPEED_INTERVAL / 2).value(points, level=0) for sign in (-1, 1))
-        rate = (after - before).abs() / SPEED_INTERVAL
-        close = before.abs() < max(SPEED_NEAR, 4 * self.reach)
-        return SPEED_MARGIN * float((rate[close] if close.any() else rate).max())
+        points = ball_points(16384, radius=self.radius, generator=generator).to(self.directions)
+        before, after = (moment(self.field, t + sign * interval / 2).value(points, level=0) for sign in (-1, 1))
+        rate = (after - before).abs() / interval
+        close = before.abs() < max(near, 4 * self.reach)
+        return margin * float((rate[close] if close.any() else rate).max())
 
     def _tiles(self, field: Field) -> tuple[Tensor | float, Tensor | float]:
         """Between which depths something may be near, as far as tiles can tell."""

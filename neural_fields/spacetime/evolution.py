@@ -1,17 +1,14 @@
-"""Evolution laws: what ∂f/∂t shall be, given everything else in a space-time jet; and the losses that ask for it.
+"""Evolution laws, the right side of ∂f/∂t = F(x, t, ∇f, …), and the losses that train a field to obey them.
 
-After Novello et al. 2023, "Neural Implicit Surface Evolution": a surface that moves is the zero set of f(x, t), and the
-level-set equation ∂f/∂t = F(x, t, ∇f, …) says how. A `Law` is F. Laws are added and scaled like the speeds
-they stand for:
+After Novello et al. 2023, "Neural Implicit Surface Evolution". A `Law` is F. Laws are added and scaled like speeds:
 
     law = transport(motion.velocity) + mean_curvature(0.02)
     loss = law_loss(spacetime_jet(field, x, order=law.order), law).mean()
 
-**Distances.** Under most laws the level sets f = c move unlike the surface, so a solution does not stay a distance,
-and an eikonal loss contradicts the law everywhere but on the surface. With ``extend=True`` a law takes the speed of
-the surface point below, x − f ∇f / |∇f|, for every point (the extension velocities of Adalsteinsson and Sethian 1999):
-the surface moves the same, and the distance stays one. Near the medial axis there is no one point below; ask only
-for points near the surface (see `near_surface`).
+Under most laws a solution does not stay a distance, and an eikonal loss contradicts the law except on the surface. With
+``extend=True`` a law takes the speed of the surface point x − f ∇f / |∇f| (the extension velocities of Adalsteinsson
+and Sethian 1999): the surface moves the same, and the distance stays one. Use it only near the surface
+(`near_surface`), as near the medial axis that point is not unique.
 """
 
 from __future__ import annotations

@@ -1,11 +1,7 @@
-"""Points that ride along: ordinary differential equations through vector fields and through moving surfaces.
+"""Points carried by vector fields and by moving surfaces: ordinary differential equations, solved by torchdiffeq.
 
-Two equations, both solved by torchdiffeq:
-
-- `flow` follows dx/dt = V(x, t). A field carried by V keeps its value along that path, f(x(t), t) = f(x(0), 0), which
-  gives exact targets for training and an exact measure of error.
-- `track` follows a point of a moving surface along its normal, dx/dt = −∂f/∂t ∇f / |∇f|², so that colours and
-  correspondences ride along with a field that knows nothing about points.
+- `flow` follows dx/dt = V(x, t). A field carried by V keeps its value along that path, f(x(t), t) = f(x(0), 0).
+- `track` follows a point of a moving surface along its normal, dx/dt = −∂f/∂t ∇f / |∇f|².
 """
 
 from __future__ import annotations
@@ -162,21 +158,11 @@ def flow_jacobian(
     """Where the points of one time are at another, and how their neighbourhoods are strained on the way.
 
     With φ the map from ``start`` to ``end`` and M = ∂φ/∂x, both are followed together: dM/dt = ∂V/∂x M, M = I at first
-    (the equation of variation). det M says how volume grows; Mᵀ∇f is the gradient of f∘φ.
-
-    Args:
-        velocity: V with its derivatives.
-        points: ``(N, 3)``.
-        start: a number or ``(N,)``.
-        end: a number or ``(N,)``.
-        solver: as in `flow`; tolerances hold for the entries of M too.
+    (the equation of variation). det M says how volume grows; Mᵀ∇f is the gradient of f∘φ. Arguments and errors are
+    those of `flow`; tolerances hold for the entries of M too.
 
     Returns:
         Points ``(N, 3)`` and M, ``(N, 3, 3)``.
-
-    Raises:
-        ValueError: shapes do not fit.
-        IntegrationError: as in `flow`.
     """
     _check_points(points)
     start, end = _ends(points, start, end)
@@ -246,8 +232,7 @@ def track(
 ) -> Tracks:
     """Follow points of a moving surface by its normal velocity, dx/dt = −∂f/∂t ∇f / |∇f|².
 
-    The velocity has no part along the surface: of all the ways in which points could ride along this is the one
-    that a level set defines. A turning sphere, which looks the same at all times, leaves its points where they are.
+    The velocity has no part along the surface: a turning sphere leaves its points where they are.
 
     Args:
         field: four-dimensional.

@@ -1,8 +1,8 @@
-"""A velocity for the points of a moving surface: along with the shape as a whole, and along the normal for the rest.
+"""A velocity for the points of a moving surface: the best motion of the whole shape, and the rest along the normal.
 
-A level set defines only the normal speed v_n = −∂f/∂t / |∇f| of its points. Going by that alone (see `track`), the
-points of a ball that travels slide to its rear. Any velocity along the surface may be added, and the natural one is
-that of the motion u(x) = a + b × x + c x (travel, turn and growth) that explains the normal speeds best,
+A level set defines only the normal speed v_n = −∂f/∂t / |∇f| of its points. By that alone (see `track`) the points of a
+travelling ball slide to its rear. This takes the motion u(x) = a + b × x + c x (travel, turn and growth) that explains
+the normal speeds best,
 
     min over a, b, c of Σ (⟨n, u(x)⟩ − v_n(x))²  over points of the surface,   V = u + (v_n − ⟨n, u⟩) n.
 
@@ -22,9 +22,6 @@ from .dynamic_tracing import moment
 from .field import at_time
 
 __all__ = ["CarriedVelocity"]
-
-# Motions that normals hardly show, as turns of a sphere, are left out: singular values below this share of the largest.
-LEAST_SHOWN = 3e-2
 
 
 class CarriedVelocity:
@@ -91,5 +88,6 @@ class CarriedVelocity:
         normal, speed = self._normal_speed(moved, moved.new_full((len(moved),), t))
         growth = (normal * moved).sum(dim=-1, keepdim=True)
         system = torch.cat((normal, torch.linalg.cross(moved, normal), growth), dim=-1).double()
-        least = torch.linalg.pinv(system.T @ system, rtol=LEAST_SHOWN**2, hermitian=True)
+        # Motions that normals hardly show, as turns of a sphere, are left out: singular values below 3 % of the first.
+        least = torch.linalg.pinv(system.T @ system, rtol=3e-2**2, hermitian=True)
         return (least @ (system.T @ speed.double())).to(points)

@@ -1,9 +1,8 @@
 """A velocity field that is learnt, and shapes that it carries: motion with correspondences.
 
-A surface that is carried by v(x, t) is f(x, t) = f_k(φ_{t→t_k}(x)): φ follows the characteristic dx/dt = v from time
-t to the time of a shape that is known. `CarriedKeyframes` blends what the shape before and the shape after say. Where
-v carries the first onto the second both say the same, and the surface is moved and nothing else: no part can come off,
-since φ is a diffeomorphism. Only where they differ, as at a change of topology, is there a blend.
+A surface that is carried by v(x, t) is f(x, t) = f_k(φ_{t→t_k}(x)): φ follows the characteristic dx/dt = v from time t
+to the time of a known shape. `CarriedKeyframes` blends the shape before and the shape after. Where v carries the first
+onto the second, both agree and the surface only moves; where they differ, as at a change of topology, they are blended.
 """
 
 from __future__ import annotations

@@ -24,14 +24,8 @@ BAND_ENTRY = 0.5
 BOLDNESS = 0.9
 # A ray that leaves the surface faster than this may not stride out any further for it.
 STEEPEST_RISE = 0.6
-# A fall slower than this is not reckoned with: such a ray grazes the surface.
-LEAST_FALL = 0.1
-# A ray that expects a hit looks first a little nearer to its start than it would have to.
-FORESIGHT = 1.2
 # Values this many rounding errors from zero are zero: no step would bring them nearer.
 FLOOR = 8
-# The field falls steadily to a hit if the way there is at most this many times as long as its fall on it tells.
-STEADY = 1.5
 
 
 class Expected(NamedTuple):
@@ -166,15 +160,16 @@ class Rays(NamedTuple):
         """The same rays, each looking first where its ball is to reach back to the start if all is as expected."""
         depth, fall, value = (column[self.ray] for column in expected)
         known = depth.isfinite() & (depth > self.depth) & (depth < self.far)
-        steady = known & value.isfinite() & (fall * (depth - self.depth) <= STEADY * value)
-        fall = fall.clamp(LEAST_FALL, 1)
+        # The field falls steadily if the way is at most 1.5 times as long as its fall on it tells.
+        steady = known & value.isfinite() & (fall * (depth - self.depth) <= 1.5 * value)
+        fall = fall.clamp(0.1, 1)  # a ray with a slower fall grazes the surface
         way = torch.where(known, depth - self.depth, 0)
         ahead = torch.zeros_like(way)
         for _ in range(len(rule.deltas) + 1):  # a ball outside a band is smaller by its δ, so its middle is further off
             delta = rule.band(fall * ahead)[1]
             reach = way - rule.resolution + delta / rule.lipschitz
             ahead = (reach / (1 + fall / rule.lipschitz)).clamp(min=0)
-        ahead = torch.minimum(FORESIGHT * ahead, way)
+        ahead = torch.minimum(1.2 * ahead, way)  # a little nearer to the start than it would have to be
         ahead = torch.where(steady, 0, ahead)
         return self._replace(
             depth=torch.where(known, depth - ahead, self.depth),

@@ -1,10 +1,8 @@
-"""The loop behind `sphere_trace` for devices that work behind the host's back: it looks at them once in many passes.
+"""The loop behind `sphere_trace` for devices that work behind the host's back: the host waits once in many passes.
 
-`march` drops rays as they end, and so has to know after each pass which did. Here rays stay for a while after they have
-ended: `PASSES` passes are asked for at once, and only then the host reads how many rays are left. Bands have room for a
-number of rays that the passes before suggest (`fixed_shapes`). A ray that finds no room stands still for a
-pass, which changes nothing about its way: every ray sees the values that it would see in `march`, and ends where it
-would end there, but for what rounding does to a product of matrices when it has other rows beside it.
+`march` drops rays as they end, and so has to know after each pass which did. Here `PASSES` passes are launched at once,
+before the host reads how many rays are left. Bands have a capacity that the passes before suggest (`fixed_shapes`); a
+ray that overflows it waits for a pass. So every ray sees the values that it would see in `march`, but for rounding.
 """
 
 from __future__ import annotations
@@ -26,8 +24,6 @@ FIRST_PASSES, PASSES = 8, 16
 FEW, SHARE = 4096, 0.25
 # Room beyond what the passes before have asked for.
 SPARE, LEAST_ROOM = 1.25, 256
-# More doublings of the resolution than any ray sees; a shift by more would overflow.
-MOST_DOUBLINGS = 60
 
 
 def march_ahead(
@@ -100,7 +96,7 @@ class _Chunk:
         rays = rays._replace(sign=sign)
         if reach is not None:
             found.record_near(rays, (value * sign < reach) | (sign < 0), there)
-        doublings = (self.count // PATIENCE).clamp(max=MOST_DOUBLINGS)
+        doublings = (self.count // PATIENCE).clamp(max=60)  # more than any ray sees; a longer shift would overflow
         gap = self.rule.resolution * torch.bitwise_left_shift(torch.ones_like(doublings), doublings).to(value.dtype)
         moved, stand = look(rays, value * sign, self.rule, gap)
         self.count = self.count + there

@@ -95,19 +95,8 @@ def cone_ends(
     """Depths from which on whole tiles of an image see nothing: `cone_starts` from the other side.
 
     Rays that pass a shape closely would take many steps to get away from it again. From behind, with v = |f_0| at depth
-    t on the axis, the tile is empty from (t − (v − δ_0)/L) / (1 − σ) on.
-
-    Args:
-        field: see `cone_starts`.
-        origin: see there.
-        directions: see there.
-        wanted: ``(H, W)`` bool; tiles without such a pixel are left out.
-        level: see there.
-        tiles: see there.
-        lipschitz: see there.
-        radius: see there.
-        max_steps: see there.
-        clearance: see there.
+    t on the axis, the tile is empty from (t − (v − δ_0)/L) / (1 − σ) on. Tiles without a pixel of ``wanted`` ``(H, W)``
+    are left out; the other arguments are those of `cone_starts`.
 
     Returns:
         ``(H, W)`` depths for ``far`` of `sphere_trace`, infinite in tiles that were left out.

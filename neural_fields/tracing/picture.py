@@ -23,8 +23,8 @@ from torch import Tensor
 from ..backend.kernels.cones import march_cones
 from ..backend.kernels.launch import on_device
 from ..backend.kernels.levels import Levels, walk_rows
-from ..backend.kernels.paths import march_levels
-from ..backend.kernels.tracing import IN_REGISTERS, Marched, Queue, RayTensors, march_rays
+from ..backend.kernels.paths import march_fused
+from ..backend.kernels.tracing import Marched, Queue, RayTensors
 from ..fields.field import Field
 from .cones import TILES
 
@@ -35,7 +35,7 @@ __all__ = ["CAMERA", "Drawn", "Setting", "draw"]
 # the radius of the ball that holds the surface, and how far the eye and that ball reach.
 CAMERA = 22
 # Pixels of a program of the elementwise stages.
-PIXELS = 1024
+PROGRAM_PIXELS = 1024
 # Graphs that are kept for a field. One of 1920 × 1080 pixels holds about 0.3 GB.
 GRAPHS = 4
 
@@ -291,7 +291,7 @@ class Picture:
     def __init__(self, traced: Levels, shown: Levels, setting: Setting, device: torch.device) -> None:
         self.traced, self.shown, self.setting = traced, shown, setting
         count = setting.width * setting.height
-        programs = triton.cdiv(count, PIXELS)
+        programs = triton.cdiv(count, PROGRAM_PIXELS)
         numbers = {"dtype": torch.float32, "device": device}
         whole = {"dtype": torch.int32, "device": device}
         self.view = torch.zeros(CAMERA, dtype=torch.float64, device=device)
@@ -344,17 +344,17 @@ class Picture:
         origins, directions, starts, entries, ends = self.rays
         width, height = setting.width, setting.height
         count = width * height
-        grid = (triton.cdiv(count, PIXELS),)
+        grid = (triton.cdiv(count, PROGRAM_PIXELS),)
         self.queue.state.zero_()
         with on_device(view):
-            make_rays[grid](view, origins, directions, entries, ends, width, count, PIXELS=PIXELS)
+            make_rays[grid](view, origins, directions, entries, ends, width, count, PIXELS=PROGRAM_PIXELS)
             free, larger = entries, 0
             for side in TILES:
                 cones = triton.cdiv(width, side) * triton.cdiv(height, side)
                 axes, columns = directions.new_empty(cones, 3), directions.new_empty(3, cones)
-                make_cones[(triton.cdiv(cones, PIXELS),)](
+                make_cones[(triton.cdiv(cones, PROGRAM_PIXELS),)](
                     view, directions, free, axes, *columns, width, height, cones,
-                    SIDE=side, LARGER=larger, PIXELS=PIXELS,
+                    SIDE=side, LARGER=larger, PIXELS=PROGRAM_PIXELS,
                 )  # fmt: skip
                 free = march_cones(
                     self.traced.networks[0],
@@ -366,22 +366,21 @@ class Picture:
                 larger = side
             begin_rays[grid](
                 free, entries, ends, starts, *self.queue, self.found.mask, width, count,
-                SIDE=larger, PIXELS=PIXELS,
+                SIDE=larger, PIXELS=PROGRAM_PIXELS,
             )  # fmt: skip
-            alone = len(self.traced.networks) == 1 and self.traced.networks[0].shape.width <= IN_REGISTERS
-            (march_rays if alone else march_levels)(
+            march_fused(
                 self.traced, self.rays, self.queue, self.found, view[16:19],
                 max_steps=setting.max_steps, constants=dict(setting.march),
             )  # fmt: skip
-            count_hits[grid](self.found.mask, self.counts, count, PIXELS=PIXELS)
+            count_hits[grid](self.found.mask, self.counts, count, PIXELS=PROGRAM_PIXELS)
             place_hits[grid](
                 origins, directions, self.found.mask, self.found.depth, self.counts, self.hits, *self.drawn[:3], count,
-                PROGRAMS=triton.next_power_of_2(grid[0]), PIXELS=PIXELS,
+                PROGRAMS=triton.next_power_of_2(grid[0]), PIXELS=PROGRAM_PIXELS,
             )  # fmt: skip
             walk_rows(self.drawn.position, self.shown, self.values, self.gradients, count=self.hits, jet=True)
             see_hits[grid](
                 view, directions, self.drawn.pixel, self.hits, self.values, self.gradients, *self.drawn[1:],
-                SHALLOW=setting.shallow, NEWTON=setting.newton, PIXELS=PIXELS,
+                SHALLOW=setting.shallow, NEWTON=setting.newton, PIXELS=PROGRAM_PIXELS,
             )  # fmt: skip
 
 

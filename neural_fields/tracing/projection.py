@@ -18,9 +18,6 @@ from ..networks.texture import TextureField
 
 __all__ = ["Mapped", "map_attribute", "map_colors", "project_to_surface"]
 
-# A step is never longer than |f| over this, however flat the field is there.
-LEAST_SLOPE = 0.5
-
 
 class Mapped(NamedTuple):
     """Attributes at points.
@@ -76,7 +73,8 @@ def project_to_surface(
         value, gradient = value[~near, None], gradient[~near]
         slope = gradient.norm(dim=-1, keepdim=True)
         direction = gradient / slope.clamp_min(torch.finfo(slope.dtype).tiny)
-        moved[moving] = x[~near] - value * direction / slope.clamp_min(LEAST_SLOPE)
+        # However flat the field is, a step is never longer than 2 |f|.
+        moved[moving] = x[~near] - value * direction / slope.clamp_min(0.5)
     return moved.reshape(points.shape), arrived.reshape(points.shape[:-1])
 
 

@@ -98,25 +98,17 @@ def sphere_trace(
 ) -> Hits:
     """First intersections of rays with the zero set of a level.
 
-    The default mode runs until the depth of every ray is known to ``tolerance``. Steps are the widest that still
-    leave no gap between the balls around two neighbouring samples if the surface is a plane (Bálint and Valasek
-    2018, from the last two values); where a gap opens after all, the step is taken back. Two crossings closer
-    to each other than ``resolution`` may be overlooked, which is what lets a ray go on along a surface that it
-    nearly touches; rays that need more than 16 steps are given twice the resolution, and again after every 16.
-    A change of sign is closed in on by the secant rule and bisection in turn. Rays are dropped as they end.
+    The default mode runs until the depth of every ray is known to ``tolerance``. Steps are the widest that leave no gap
+    between the balls around two samples if the surface is a plane (Bálint and Valasek 2018); where a gap opens, the
+    step is taken back. The resolution doubles after every 16 steps of a ray. A change of sign is closed in on by the
+    secant rule and bisection in turn. A ray that starts inside the surface looks for the way out.
 
     With a ``budget``, the paper's mode: so many steps ``t ← t + f_j − δ_j`` on each level (20, 5, 5 in its Tab. 4),
     after which |f| < ``capture`` is a hit.
 
-    A ray that starts inside the surface looks for the way out.
-
-    Depth and position have no graph, unless the trace is to be ``differentiable``. Then they carry the derivatives of
-    the implicit function f(o + t d) = 0 with respect to origins, directions and parameters, by one Newton step on the
-    graph whose slope is held fixed,
-
-        t ← t − f(o + t d) / ⟨∇f, d⟩,
-
-    so that dt = −(df + ⟨∇f, do + t dd⟩) / ⟨∇f, d⟩. They grow without bound where rays graze the surface.
+    With ``differentiable``, depth and position carry the derivatives of the implicit function f(o + t d) = 0 with
+    respect to origins, directions and parameters: dt = −(df + ⟨∇f, do + t dd⟩) / ⟨∇f, d⟩. They grow without bound where
+    rays graze the surface.
 
     Args:
         field: what to trace, three-dimensional; or any function of points ``(..., 3)`` → ``(...,)``.
@@ -231,20 +223,9 @@ def trace_expected(
     else. But a ``value`` of an expectation is believed: where it says that the field falls evenly from ``near`` to the
     hit, nothing else is looked for in between.
 
-    Args:
-        field: see `sphere_trace`.
-        origins: see there.
-        directions: see there.
-        expected: depths and slopes ``(...,)`` of the hits, and values at ``near``; None for no idea.
-        level: see there.
-        near: see there.
-        far: see there.
-        tolerance: see there.
-        resolution: see there.
-        lipschitz: see there.
-        radius: see there.
-        max_steps: see there.
-        reach: note where rays come nearer than this to the surface; None does not.
+    ``expected`` has depths and slopes ``(...,)`` of the hits, and values at ``near``; None for no idea. With a
+    ``reach`` it is noted where rays come nearer than this to the surface. The other arguments are those of
+    `sphere_trace`.
 
     Returns:
         The hits, how fast the field fell along each ray at its last step ``(...,)``, to be expected the next time,
@@ -288,8 +269,8 @@ def march_constants(dtype: torch.dtype) -> dict[str, float]:
 
 def _march_fused(field: Field, level: int, spans: tuple[Tensor, ...], found: Found, rule: Rule, max_steps: int) -> None:
     """What `march` does, by the fused kernels; what they find has the same bounds, and not the same last bits."""
-    from ..backend.kernels.paths import march_levels
-    from ..backend.kernels.tracing import IN_REGISTERS, Marched, Queue, RayTensors, march_rays
+    from ..backend.kernels.paths import march_fused
+    from ..backend.kernels.tracing import Marched, Queue, RayTensors
 
     origins, directions, entries, starts, ends = (column.contiguous() for column in spans)
     if not len(starts):
@@ -297,10 +278,8 @@ def _march_fused(field: Field, level: int, spans: tuple[Tensor, ...], found: Fou
     levels = as_levels(field, level)
     marched, queue = Marched.nothing(found.depth), Queue.of(starts, ends)
     numbers = starts.new_tensor([rule.tolerance, rule.resolution, rule.lipschitz])
-    alone = len(levels.networks) == 1 and levels.networks[0].shape.width <= IN_REGISTERS
-    go = march_rays if alone else march_levels
     rays = RayTensors(origins, directions, starts, entries, ends)
-    go(levels, rays, queue, marched, numbers, max_steps=max_steps, constants=march_constants(starts.dtype))
+    march_fused(levels, rays, queue, marched, numbers, max_steps=max_steps, constants=march_constants(starts.dtype))
     mask, depth, steps, slope, own = marched.in_own_types()
     found.mask, found.depth, found.level, found.steps, found.slope = mask, depth, own, steps, slope
 

@@ -1,17 +1,18 @@
-"""``render_volume``: colours, depths and normals of rays through any field, by NeuS's volume rendering.
+"""Volume rendering of any field as in NeuS: `sample_rays`, then `render_samples`; `render_volume` does both.
 
-Where to sample is asked of the coarsest level alone; then one jet per sample gives value, gradient and features, and
-inside a `MultiscaleSDF` the residual levels see only the samples in their bands. Colours are asked only for the samples
-that contribute to their pixel, and jets, if wanted, only where the values of the march say that there is weight.
+Samples are placed by the coarsest level alone. One jet per sample then gives value, gradient and features, and inside a
+`MultiscaleSDF` the residual levels evaluate only the samples in their bands. Colours are evaluated only for samples
+that contribute to their pixel.
 """
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass
-from functools import partial
-from typing import NamedTuple, Protocol
+from functools import partial, wraps
+from typing import Any, NamedTuple, Protocol, TypeVar, cast
 
 import torch
 from torch import Tensor
@@ -34,15 +35,23 @@ from .weights import (
     transmittance_weights,
 )
 
-__all__ = ["RayColor", "RayOutside", "Rendered", "Sampling", "render_volume", "sample_depths"]
-
-# Sharpness of the importance samples in units of 1/δ₀: half of them lie within δ₀ / 15 of the coarse surface.
-BAND_SHARPNESS = 16.0
-# The same where weights are estimated to find sections without any: a finer surface may lie δ₀ / 8 away.
-SKIP_SHARPNESS = 8.0
+__all__ = [
+    "RayColor",
+    "RayOutside",
+    "Rendered",
+    "Samples",
+    "Sampling",
+    "render_samples",
+    "render_volume",
+    "sample_depths",
+    "sample_rays",
+]
 
 RayColor = Callable[[Tensor, Tensor, Jet], Tensor]
 """Colours ``(N, 3)`` of points ``(N, 3)`` seen along unit directions ``(N, 3)``, given the geometry's jet there."""
+
+
+F = TypeVar("F", bound=Callable[..., Any])
 
 
 class RayOutside(Protocol):
@@ -60,9 +69,11 @@ class Sampling:
     Attributes:
         uniform: evenly spaced depths.
         importance: further depths near the surface, at the coarsest level.
-        rounds: in how many rounds these come, each with twice the sharpness of the one before.
+        rounds: in how many rounds these are placed, each with twice the sharpness of the one before.
         sharpness: inv_std of the first round.
         outside: samples behind the region of interest, if something is there.
+        band_sharpness: highest inv_std of a round in units of 1/δ₀; half of the samples then lie within δ₀ / 15.
+        skip_sharpness: the same for the weights that decide what is skipped; a finer surface may lie δ₀ / 8 away.
 
     Raises:
         ValueError: a number is out of range.
@@ -73,12 +84,31 @@ class Sampling:
     rounds: int = 4
     sharpness: float = 64.0
     outside: int = 32
+    band_sharpness: float = 16.0
+    skip_sharpness: float = 8.0
 
     def __post_init__(self) -> None:
         at_least(2, uniform=self.uniform)
         at_least(1, rounds=self.rounds, outside=self.outside)
         at_least(0, importance=self.importance)
-        positive(sharpness=self.sharpness)
+        positive(sharpness=self.sharpness, band_sharpness=self.band_sharpness, skip_sharpness=self.skip_sharpness)
+
+
+class Samples(NamedTuple):
+    """Intervals of rays.
+
+    Attributes:
+        t_starts: ``(R, S)`` depth at which each begins.
+        t_ends: ``(R, S)`` depth at which each ends, where the next begins.
+        counts: ``(R, S)`` how many intervals each stands for in a mean over all of them: 1 if none was skipped, else 0
+            for skipped ones and 1 / ``skip_share`` for those kept by chance. 0 on rays that miss the unit sphere.
+        skipped: whether intervals with a count of 0 are left out of the rendering.
+    """
+
+    t_starts: Tensor
+    t_ends: Tensor
+    counts: Tensor
+    skipped: bool
 
 
 class Rendered(NamedTuple):
@@ -90,10 +120,9 @@ class Rendered(NamedTuple):
         depth: ``(R,)`` Σ w t, so depth / opacity is the mean depth of what is seen.
         normal: ``(R, 3)`` Σ w ∇f/|∇f|; shorter than 1 where normals differ or the ray passes.
         weights: ``(R, S)``.
-        depths: ``(R, S)`` the middles of the sections.
-        jet: of the field there, ``(R, S, …)``; 0 in sections that were skipped.
-        counts: ``(R, S)`` for how many sections each jet stands in a mean over all of them: 1 if none was skipped, else
-            0 there and 1 / ``skip_share`` in those that were kept by chance. 0 on rays that miss the unit sphere.
+        depths: ``(R, S)`` the middles of the intervals.
+        jet: of the field there, ``(R, S, …)``; 0 in intervals that were skipped.
+        counts: ``(R, S)``, see `Samples`.
     """
 
     color: Tensor
@@ -106,6 +135,20 @@ class Rendered(NamedTuple):
     counts: Tensor
 
 
+def _renamed(function: F, **names: str) -> F:
+    """The function, which accepts arguments by their ``names`` of earlier releases too, with a warning."""
+
+    @wraps(function)
+    def call(*arguments: Any, **options: Any) -> Any:
+        for old in names.keys() & options.keys():
+            warnings.warn(f"{old} is now called {names[old]}", DeprecationWarning, stacklevel=2)
+            options[names[old]] = options.pop(old)
+        return function(*arguments, **options)
+
+    return cast("F", call)
+
+
+@partial(_renamed, least_weight="early_stop_eps", skip="alpha_threshold", guide="sdf_grid")
 def render_volume(
     field: FieldLike,
     color: RayColor,
@@ -118,16 +161,16 @@ def render_volume(
     level: int = -1,
     background: Tensor | None = None,
     outside: RayOutside | None = None,
-    least_weight: float = 0.0,
-    skip: float = 0.0,
+    early_stop_eps: float = 0.0,
+    alpha_threshold: float = 0.0,
     skip_share: float = 0.0,
-    guide: Callable[[Tensor], Tensor] | None = None,
+    sdf_grid: Callable[[Tensor], Tensor] | None = None,
     generator: torch.Generator | None = None,
 ) -> Rendered:
     """Render rays through the unit sphere; differentiable in the rays and all parameters, ``inv_std`` too.
 
-    Inside `fixed_shapes` the sections, colours and rays that are chosen have the ``rooms`` "sections", "colors" and
-    "outside", as bands have theirs, and the host never waits.
+    Inside `fixed_shapes` the intervals, colours and rays that are chosen have the ``rooms`` "sections", "colors" and
+    "outside", and the host never waits.
 
     Args:
         field: the geometry, in unit-sphere coordinates; or any function of points ``(..., 3)`` → ``(...,)``.
@@ -140,16 +183,14 @@ def render_volume(
         level: level of the field to render.
         background: ``(3,)`` or ``(R, 3)`` colour of what light passes the sphere; None is black.
         outside: what is behind the sphere; ``background`` is then behind that.
-        least_weight: no colour is asked for samples of a smaller weight, nor what is outside of rays of which less
-            light is left; a pixel's error is at most ``least_weight`` times the number of its samples and one.
-        skip: sections whose weight is estimated to be smaller, from values of the coarsest level at their ends, get no
-            jet and stop no light; 0 evaluates all. The neighbours of kept sections are kept, and of each ray the
-            section in which the field is smallest. Where the skipped sections of a ray had the weights w in the full
-            sum, each channel of its colour differs from the full one by Σ w at most.
-        skip_share: of those sections, this share is evaluated nevertheless, drawn by ``generator``; see
-            `Rendered.counts`.
-        guide: values of points ``(..., 3)`` → ``(...,)`` by which samples are placed and skipped; for example a
-            `ValueGrid`, which costs no network. By default the coarsest level of the field.
+        early_stop_eps: colours are evaluated only for samples of a larger weight, and ``outside`` only for rays of
+            which more light is left. A pixel's error is at most this times the number of its samples and one.
+        alpha_threshold: intervals are skipped whose weight, estimated from values of the coarsest level at their ends,
+            is smaller; 0 skips none. Neighbours of kept intervals are kept, and the one with the smallest value of each
+            ray. Each channel of a ray's colour changes by at most the sum of the weights that were skipped.
+        skip_share: of the intervals to skip, this share is kept nevertheless, drawn by ``generator``.
+        sdf_grid: values of points ``(..., 3)`` → ``(...,)`` that place and skip samples in place of the coarsest level;
+            for example a `ValueGrid`, which costs no network.
         generator: jitters the samples, for training; None is deterministic.
 
     Raises:
@@ -164,6 +205,39 @@ def render_volume(
         >>> seen.color.round(decimals=3).tolist(), round(float(seen.depth), 2)
         ([[1.0, 0.0, 0.0]], 1.5)
     """
+    field, sampling = as_field(field), sampling or Sampling()
+    samples = sample_rays(
+        field, origins, directions, inv_std=inv_std, sampling=sampling, cos_anneal=cos_anneal, level=level,
+        alpha_threshold=alpha_threshold, skip_share=skip_share, sdf_grid=sdf_grid, generator=generator,
+    )  # fmt: skip
+    return render_samples(
+        field, color, origins, directions, samples, inv_std=inv_std, cos_anneal=cos_anneal, level=level,
+        background=background, outside=outside, outside_samples=sampling.outside, early_stop_eps=early_stop_eps,
+        generator=generator,
+    )  # fmt: skip
+
+
+def sample_rays(
+    field: FieldLike,
+    origins: Tensor,
+    directions: Tensor,
+    *,
+    inv_std: Tensor | float,
+    sampling: Sampling | None = None,
+    cos_anneal: Tensor | float = 1.0,
+    level: int = -1,
+    alpha_threshold: float = 0.0,
+    skip_share: float = 0.0,
+    sdf_grid: Callable[[Tensor], Tensor] | None = None,
+    generator: torch.Generator | None = None,
+) -> Samples:
+    """Cut rays ``(R, 3)`` through the unit sphere into intervals, short ones near the surface; without a graph.
+
+    The arguments are those of `render_volume`. ``inv_std`` matters only with an ``alpha_threshold``.
+
+    Raises:
+        ValueError: see `render_volume`.
+    """
     if origins.shape != directions.shape or origins.ndim != 2 or origins.shape[1] != 3:
         raise ValueError(
             f"origins {tuple(origins.shape)}, directions {tuple(directions.shape)}: expected (R, 3) for both"
@@ -174,63 +248,84 @@ def render_volume(
     level, sampling = field.resolve_level(level), sampling or Sampling()
     near, far = sphere_span(origins, directions)
     edges = sample_depths(
-        field, origins, directions, near, far, sampling, level=level, guide=guide, generator=generator
+        field, origins, directions, near, far, sampling, level=level, sdf_grid=sdf_grid, generator=generator
     )
-    interval = edges.diff(dim=1)
-    depths = edges[:, :-1] + 0.5 * interval
-    # Sections of a ray that misses the sphere have no length, and stand for nothing.
-    counts, rows = (far > near).to(depths)[:, None].expand_as(depths), None
-    if skip > 0 and counts.numel():
-        with torch.no_grad():  # an estimate chooses sections and teaches nobody
-            values = _march(field, guide)(ray_points(origins, directions, edges))
-            estimated = secant_weights(edges, values, _estimate_sharpness(field, level, inv_std), cos_anneal=cos_anneal)
-            counts = counts * _counts(estimated, values, skip, skip_share, generator)
-        rows = chosen("sections", counts.flatten() > 0)
+    # Intervals of a ray that misses the sphere have no length, and stand for nothing.
+    counts = (far > near).to(edges)[:, None].expand(-1, edges.shape[1] - 1)
+    skipped = alpha_threshold > 0 and counts.numel() > 0
+    if skipped:
+        with torch.no_grad():
+            values = _coarsest(field, sdf_grid)(ray_points(origins, directions, edges))
+            known = torch.as_tensor(inv_std).detach()
+            if level:  # a finer surface may lie beside the coarsest one
+                known = torch.minimum(known, (sampling.skip_sharpness / field.deltas[0]).to(known))
+            estimated = secant_weights(edges, values, known, cos_anneal=cos_anneal)
+            counts = counts * _counts(estimated, values, alpha_threshold, skip_share, generator)
+    return Samples(edges[:, :-1], edges[:, 1:], counts, skipped)
 
-    def of_sections(tensor: Tensor) -> Tensor:
-        """``(R, S, …)`` → ``(K, …)``, those that are evaluated."""
+
+def render_samples(
+    field: FieldLike,
+    color: RayColor,
+    origins: Tensor,
+    directions: Tensor,
+    samples: Samples,
+    *,
+    inv_std: Tensor | float,
+    cos_anneal: Tensor | float = 1.0,
+    level: int = -1,
+    background: Tensor | None = None,
+    outside: RayOutside | None = None,
+    outside_samples: int = 32,
+    early_stop_eps: float = 0.0,
+    generator: torch.Generator | None = None,
+) -> Rendered:
+    """Render rays ``(R, 3)`` that `sample_rays` has cut into intervals; differentiable as `render_volume`.
+
+    The arguments are those of `render_volume`; ``outside_samples`` is the number of samples of a ray in ``outside``.
+
+    Raises:
+        ValueError: there is no such level.
+    """
+    field, (t_starts, t_ends, counts, skipped) = as_field(field), samples
+    interval = t_ends - t_starts
+    depths = t_starts + 0.5 * interval
+    rows = chosen("sections", counts.flatten() > 0) if skipped else None
+
+    def gathered(tensor: Tensor) -> Tensor:
+        """``(R, S, …)`` → ``(K, …)``, the intervals that are evaluated."""
         flat = tensor.flatten(0, 1)
         return flat if rows is None else rows.of(flat)
 
     def in_place(found: Tensor) -> Tensor:
-        """The way back; 0 in sections that were skipped."""
+        """The way back; 0 in intervals that were skipped."""
         shape = (*depths.shape, *found.shape[1:])
         return (found if rows is None else rows.back(found)).reshape(shape)
 
-    points = of_sections(ray_points(origins, directions, depths))  # (K, 3)
-    along = of_sections(directions[:, None].expand(-1, depths.shape[1], -1))
+    points = gathered(ray_points(origins, directions, depths))  # (K, 3)
+    along = gathered(directions[:, None].expand(-1, depths.shape[1], -1))
     with nullcontext() if rows is None else rows.wanted():
         found = field.jet(points, level=level)
     slope = (found.gradient * along).sum(dim=-1)
-    optical = neus_optical_depth(found.value, slope, of_sections(interval), inv_std, cos_anneal=cos_anneal)
+    optical = neus_optical_depth(found.value, slope, gathered(interval), inv_std, cos_anneal=cos_anneal)
     weights, remaining = transmittance_weights(in_place(optical))
-    matter = None
-    if least_weight > 0:
-        matter = of_sections(weights.detach()) > least_weight
-        matter = matter if rows is None or rows.full else matter & rows.used
-    seen = in_place(_colors(color, points, along, found, matter))
-    mixed = composite(weights, seen)
+    mask = None
+    if early_stop_eps > 0:
+        mask = gathered(weights.detach()) > early_stop_eps
+        mask = mask if rows is None or rows.full else mask & rows.used
+    mixed = composite(weights, in_place(_colors(color, points, along, found, mask)))
     if outside is not None:
-        # As for colours: where next to no light gets there, nobody asks what is there.
-        through = chosen("outside", remaining.detach() > least_weight)
-        eyes, along, ends, light = (through.of(tensor) for tensor in (origins, directions, far, remaining))
+        through = chosen("outside", remaining.detach() > early_stop_eps)
+        eyes, along, ends, light = (through.of(tensor) for tensor in (origins, directions, t_ends[:, -1], remaining))
         last = background if background is None or background.ndim == 1 else through.of(background)
-        behind = _behind(outside, eyes, along, ends, sampling, last, generator)
+        behind = _behind(outside, eyes, along, ends, outside_samples, last, generator)
         mixed = mixed + through.back(light[:, None] * behind)
     elif background is not None:
         mixed = mixed + remaining[:, None] * background
     jet = Jet(*(in_place(part) for part in found))
     normals = torch.nn.functional.normalize(jet.gradient, dim=-1)
-    return Rendered(
-        color=mixed,
-        opacity=1 - remaining,
-        depth=(weights * depths).sum(dim=1),
-        normal=composite(weights, normals),
-        weights=weights,
-        depths=depths,
-        jet=jet,
-        counts=counts,
-    )
+    depth, normal = (weights * depths).sum(dim=1), composite(weights, normals)
+    return Rendered(mixed, 1 - remaining, depth, normal, weights, depths, jet, counts)
 
 
 @torch.no_grad()
@@ -243,19 +338,20 @@ def sample_depths(
     sampling: Sampling,
     *,
     level: int = -1,
-    guide: Callable[[Tensor], Tensor] | None = None,
+    sdf_grid: Callable[[Tensor], Tensor] | None = None,
     generator: torch.Generator | None = None,
 ) -> Tensor:
-    """The ends of the sections of each ray, ``(R, uniform + importance + 2)``, from ``near`` to ``far``, sorted.
+    """The ends of the intervals of each ray, ``(R, uniform + importance + 2)``, from ``near`` to ``far``, sorted.
 
-    Only the coarsest level is asked, or ``guide`` in its place. If a finer one is meant, the sharpness ends at
-    BAND_SHARPNESS / δ₀, so that samples reach into the band in which the finer surface may lie.
+    Only the coarsest level is evaluated, or ``sdf_grid`` in its place. If a finer one is meant, the sharpness ends at
+    ``band_sharpness`` / δ₀, so that samples reach into the band in which the finer surface may lie.
     """
     depths = stratified_depths(near, far, sampling.uniform, generator=generator)
-    sharpest = BAND_SHARPNESS / field.deltas[0].to(precise(near.device)) if field.resolve_level(level) else None
+    finer = bool(field.resolve_level(level))
+    sharpest = sampling.band_sharpness / field.deltas[0].to(precise(near.device)) if finer else None
     if sampling.importance:
-        march = _march(field, guide)
-        values = march(ray_points(origins, directions, depths))
+        coarsest = _coarsest(field, sdf_grid)
+        values = coarsest(ray_points(origins, directions, depths))
         share, extra = divmod(sampling.importance, sampling.rounds)
         for index in range(sampling.rounds):
             count = share + (index < extra)
@@ -264,43 +360,35 @@ def sample_depths(
             more = importance_depths(depths, values, count, sharpness, generator=generator)
             depths, order = torch.cat((depths, more), dim=1).sort(dim=1)
             if index + 1 < sampling.rounds:
-                found = march(ray_points(origins, directions, more))
+                found = coarsest(ray_points(origins, directions, more))
                 values = torch.cat((values, found), dim=1).gather(1, order)
     return torch.cat((near[:, None], depths, far[:, None]), dim=1)
 
 
-def _march(field: Field, guide: Callable[[Tensor], Tensor] | None) -> Callable[[Tensor], Tensor]:
-    """What is asked for values: points ``(..., 3)`` → ``(...,)``."""
-    return partial(field.value, level=0) if guide is None else guide
-
-
-def _estimate_sharpness(field: Field, level: int, inv_std: Tensor | float) -> Tensor:
-    """The s by which weights are estimated: a finer surface may lie beside the coarsest one, so it is bounded."""
-    known = torch.as_tensor(inv_std).detach()
-    if not level:
-        return known
-    return torch.minimum(known, (SKIP_SHARPNESS / field.deltas[0]).to(known))
+def _coarsest(field: Field, sdf_grid: Callable[[Tensor], Tensor] | None) -> Callable[[Tensor], Tensor]:
+    """Values of points ``(..., 3)`` → ``(...,)`` that place samples."""
+    return partial(field.value, level=0) if sdf_grid is None else sdf_grid
 
 
 @torch.no_grad()
-def _counts(estimated: Tensor, values: Tensor, skip: float, share: float, generator: torch.Generator | None) -> Tensor:
-    """See `Rendered.counts`, from estimated weights ``(R, S)`` and the values ``(R, S + 1)`` at sections' ends."""
-    if not estimated.numel():
-        return torch.ones_like(estimated)
+def _counts(
+    estimated: Tensor, values: Tensor, threshold: float, share: float, generator: torch.Generator | None
+) -> Tensor:
+    """See `Samples.counts`, from estimated weights ``(R, S)`` and the values ``(R, S + 1)`` at the intervals' ends."""
     around = torch.nn.functional.max_pool1d(estimated[:, None], 3, stride=1, padding=1)[:, 0]
     smallest = (values[:, 1:] + values[:, :-1]).argmin(dim=1, keepdim=True)
-    counts = (around >= skip).to(estimated).scatter(1, smallest, 1.0)
+    counts = (around >= threshold).to(estimated).scatter(1, smallest, 1.0)
     if share and generator is not None:
         chance = uniform(estimated.shape, generator, estimated.device) < share
         counts = torch.where((counts == 0) & chance, 1 / share, counts)
     return counts
 
 
-def _colors(color: RayColor, points: Tensor, along: Tensor, jet: Jet, matter: Tensor | None) -> Tensor:
-    """Colours ``(K, 3)`` of the samples that matter ``(K,)``, 0 for the others; of all for None."""
-    if matter is None or not len(points):
+def _colors(color: RayColor, points: Tensor, along: Tensor, jet: Jet, mask: Tensor | None) -> Tensor:
+    """Colours ``(K, 3)`` of the samples in the mask ``(K,)``, 0 for the others; of all for None."""
+    if mask is None or not len(points):
         return color(points, along, jet)
-    rows = chosen("colors", matter)
+    rows = chosen("colors", mask)
     return rows.back(color(rows.of(points), rows.of(along), Jet(*(rows.of(part) for part in jet))))
 
 
@@ -309,16 +397,16 @@ def _behind(
     origins: Tensor,
     directions: Tensor,
     far: Tensor,
-    sampling: Sampling,
+    count: int,
     background: Tensor | None,
     generator: torch.Generator | None,
 ) -> Tensor:
-    """The colour ``(R, 3)`` of what lies behind the unit sphere."""
+    """The colour ``(R, 3)`` of what lies behind the unit sphere, from ``count`` samples."""
     # A ray that misses the sphere begins to see the outside where it is nearest to the centre.
     nearest = torch.maximum(far, -(origins * directions).sum(dim=-1))
-    depths = outside_depths(nearest, sampling.outside, generator=generator)
+    depths = outside_depths(nearest, count, generator=generator)
     points = invert_outside(ray_points(origins, directions, depths))
-    along = directions[:, None].expand(-1, sampling.outside, -1).reshape(-1, 3)
+    along = directions[:, None].expand(-1, count, -1).reshape(-1, 3)
     density, seen = outside(points.flatten(0, 1), along)
     interval = torch.cat((depths.diff(dim=1), depths[:, -1:]), dim=1)
     weights, remaining = transmittance_weights(density.reshape(depths.shape) * interval)

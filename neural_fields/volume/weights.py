@@ -1,12 +1,9 @@
 """Volume rendering of a signed distance field, as in NeuS (Wang et al. 2021): pure functions of rays and samples.
 
-A ray x(t) = o + t v is cut into sections. With Φ_s(f) = 1 / (1 + e^{−s f}), a section along which f falls from
-f_in to f_out stops the share
-
-    α = max(0, 1 − Φ_s(f_out) / Φ_s(f_in)) = 1 − e^{−τ},   τ = softplus(−s f_out) − softplus(−s f_in)
-
-of the light. The optical depth τ is what we add up: transmittances are T_i = exp(−Σ_{j<i} τ_j), the weights
-w_i = T_i α_i, and Σ w_i + T_end = 1 holds by telescoping, without products that underflow.
+A ray x(t) = o + t v is cut into intervals. With Φ_s(f) = 1 / (1 + e^{−s f}), an interval along which f falls from f_in
+to f_out stops the share α = max(0, 1 − Φ_s(f_out) / Φ_s(f_in)) = 1 − e^{−τ} of the light, with the optical depth τ =
+softplus(−s f_out) − softplus(−s f_in). Transmittances are T_i = exp(−Σ_{j<i} τ_j), the weights w_i = T_i α_i. So Σ w_i
++ T_end = 1 holds by telescoping, without products that underflow.
 """
 
 from __future__ import annotations
@@ -34,18 +31,13 @@ __all__ = [
     "transmittance_weights",
 ]
 
-# A section's own slope is bounded by the network's Lipschitz constant; secants over tiny sections are not.
-STEEPEST = 10.0
-# The least probability of a section that can be drawn, as a share of a uniform one: empty rays are sampled evenly.
-EVEN_SHARE = 1e-3
-
 
 class Weights(NamedTuple):
-    """How much each section of a ray contributes.
+    """How much each interval of a ray contributes.
 
     Attributes:
         weights: ``(R, S)``, w_i = T_i α_i.
-        remaining: ``(R,)``, the transmittance behind the last section; Σ w_i + remaining = 1.
+        remaining: ``(R,)``, the transmittance behind the last interval; Σ w_i + remaining = 1.
     """
 
     weights: Tensor
@@ -55,15 +47,15 @@ class Weights(NamedTuple):
 def neus_optical_depth(
     value: Tensor, slope: Tensor, interval: Tensor, inv_std: Tensor | float, *, cos_anneal: Tensor | float = 1.0
 ) -> Tensor:
-    """Optical depth τ ≥ 0 of sections, from the field at their middles (NeuS, Eq. 13, in logarithms).
+    """Optical depth τ ≥ 0 of intervals, from the field at their middles (NeuS, Eq. 13, in logarithms).
 
     The field is extended along the ray by its slope c: f_in, f_out = f ∓ c Δ / 2. Early in training a half-open
     slope keeps gradients alive where the surface looks away: c′ = −((1 − a) relu(½ − ½c) + a relu(−c)).
 
     Args:
-        value: ``(...,)`` f at the middle of each section.
+        value: ``(...,)`` f at the middle of each interval.
         slope: ``(...,)`` c = ⟨∇f, v⟩ there, for unit directions v.
-        interval: ``(...,)`` length Δ of each section.
+        interval: ``(...,)`` length Δ of each interval.
         inv_std: s, a number or 0-d tensor; 1/s is the width of the surface's uncertainty.
         cos_anneal: a in [0, 1], a number or 0-d tensor: 0 at the start of training, 1 is the true slope.
 
@@ -83,12 +75,12 @@ def neus_optical_depth(
 def neus_alpha(
     value: Tensor, slope: Tensor, interval: Tensor, inv_std: Tensor | float, *, cos_anneal: Tensor | float = 1.0
 ) -> Tensor:
-    """Opacity α = 1 − e^{−τ} in [0, 1) of sections; the arguments are those of `neus_optical_depth`."""
+    """Opacity α = 1 − e^{−τ} in [0, 1) of intervals; the arguments are those of `neus_optical_depth`."""
     return -torch.expm1(-neus_optical_depth(value, slope, interval, inv_std, cos_anneal=cos_anneal))
 
 
 def transmittance_weights(optical_depth: Tensor) -> Weights:
-    """Weights of the sections of each ray, from their optical depths ``(R, S)``, first to last.
+    """Weights of the intervals of each ray, from their optical depths ``(R, S)``, first to last.
 
     Example:
         >>> import torch
@@ -157,9 +149,9 @@ def stratified_depths(near: Tensor, far: Tensor, count: int, *, generator: torch
 def secant_weights(
     depths: Tensor, values: Tensor, inv_std: Tensor | float, *, cos_anneal: Tensor | float = 1.0
 ) -> Tensor:
-    """Weights ``(R, S − 1)`` of the sections between depths, from the field's values at their ends alone.
+    """Weights ``(R, S − 1)`` of the intervals between depths, from the field's values at their ends alone.
 
-    The slope is the lesser (steeper) one of the section's own secant and the one before, so that a section which the
+    The slope is the lesser (steeper) one of the interval's own secant and the one before, so that an interval which the
     surface enters through its end is found as well (NeuS, suppl. "hierarchical sampling").
 
     Args:
@@ -171,7 +163,8 @@ def secant_weights(
     interval = depths.diff(dim=1)
     secant = values.diff(dim=1) / interval.clamp(min=1e-9)
     previous = torch.cat((torch.zeros_like(secant[:, :1]), secant[:, :-1]), dim=1)
-    slope = torch.minimum(secant, previous).clamp(-STEEPEST, 0)
+    # Secants over tiny intervals are not bounded by the network's Lipschitz constant.
+    slope = torch.minimum(secant, previous).clamp(-10.0, 0)
     middle = 0.5 * (values[:, 1:] + values[:, :-1])
     return transmittance_weights(neus_optical_depth(middle, slope, interval, inv_std, cos_anneal=cos_anneal)).weights
 
@@ -192,7 +185,8 @@ def importance_depths(
     """
     interval = depths.diff(dim=1)
     weights = secant_weights(depths, values, inv_std)
-    density = weights + EVEN_SHARE * interval / (depths[:, -1:] - depths[:, :1]).clamp(min=1e-9) + 1e-9
+    # The least density, as a share of a uniform one: empty rays are sampled evenly.
+    density = weights + 1e-3 * interval / (depths[:, -1:] - depths[:, :1]).clamp(min=1e-9) + 1e-9
     cumulative = torch.nn.functional.pad(density.cumsum(dim=1), (1, 0))
     cumulative = cumulative / cumulative[:, -1:]
     quantiles = stratified_depths(torch.zeros_like(depths[:, 0]), torch.ones_like(depths[:, 0]), count)

@@ -39,7 +39,7 @@ __all__ = [
 
 OURS = ReconstructConfig()  # colours are those of `mplicits reconstruct`
 COLOR_RATE = OURS.color_rate * OURS.learning_rate
-# Peak rates of Adam for the groups of parameters; the geometry is made to suit its own (`share_rate`).
+# Peak rates of Adam for the groups of parameters; the geometry is made to suit its own (`rescale_parameters`).
 RATES = {
     "fields": HOST_RATE,
     "colors": COLOR_RATE,

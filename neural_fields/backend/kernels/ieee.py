@@ -58,7 +58,7 @@ def jet(x: Tensor, network: Network) -> tuple[Tensor, Tensor]:
     if len(x):
         tiling = tiling_of(network.width)
         programs = program_count(x.device, triton.cdiv(len(x), tiling.rows))
-        kept = planes(network.depth, jet=True)
+        kept = planes(network.depth)
         with on_device(x):
             evaluate[(programs,)](  # pyright: ignore[reportIndexIssue]
                 x.contiguous(),

@@ -25,17 +25,10 @@ __all__ = [
     "tiling_of",
 ]
 
-# Programs for each multiprocessor. By their registers two run beside each other, one of the jet of 128 units; the other
-# comes after it.
-PROGRAMS_PER_MULTIPROCESSOR = 2
 # Of a multiprocessor, of compute capability 8.0 and later: registers; and of a warp, threads.
 REGISTERS, WARP = 1 << 16, 32
-# Bytes of shared memory that the driver keeps for each program.
-RESERVED_SHARED = 1 << 10
 # The interpreter runs one after the other; three show what several do.
 INTERPRETED_PROGRAMS = 3
-# Up to this width an accumulator holds all units of a layer.
-WHOLE = 128
 
 
 class Network(NamedTuple):
@@ -88,10 +81,10 @@ class Tiling(NamedTuple):
 
 
 def tiling_of(width: int) -> Tiling:
-    """Tiles for a width: one accumulator up to 128 units; 64 units at a time beyond, of which 400 wastes fewest."""
+    """Tiles for a width: one accumulator up to 128 units; beyond, 64 units at a time, which wastes fewest of 400."""
     units = max(16, triton.next_power_of_2(width))
-    if units <= WHOLE:
-        return Tiling(64, units, min(32, units), 8 if units == WHOLE else 4)
+    if units <= 128:
+        return Tiling(64, units, min(32, units), 8 if units == 128 else 4)
     return Tiling(64, 64, 32, 4)
 
 
@@ -99,7 +92,8 @@ def program_count(device: torch.device, tiles: int) -> int:
     """How many programs share ``tiles``: at least 1, and as many as run at a time."""
     if device.type != "cuda":
         return max(1, min(tiles, INTERPRETED_PROGRAMS))
-    return max(1, min(tiles, PROGRAMS_PER_MULTIPROCESSOR * multiprocessors(device)))
+    # By their registers two run beside each other; of the jet of 128 units one, and the other comes after it.
+    return max(1, min(tiles, 2 * multiprocessors(device)))
 
 
 def multiprocessors(device: torch.device) -> int:
@@ -175,6 +169,7 @@ def resident_programs(registers: int, shared: int, warps: int, properties: Any) 
         properties: of the device, as PyTorch gives them.
     """
     by_registers = REGISTERS // (-(-registers // 8) * 8 * WARP * warps)
-    by_shared = properties.shared_memory_per_multiprocessor // (shared + RESERVED_SHARED)
+    # The driver keeps 1 KiB of shared memory for each program.
+    by_shared = properties.shared_memory_per_multiprocessor // (shared + (1 << 10))
     by_threads = properties.max_threads_per_multi_processor // (WARP * warps)
     return max(1, min(by_registers, by_shared, by_threads))

@@ -1,10 +1,9 @@
 """All levels of a `MultiscaleSDF` in one launch: value, or value and gradient, with the gates decided inside.
 
-Each program evaluates level 0 on its tiles, writes what it finds, and puts the rows that lie in the band on a list of
-its own, in order, by prefix sums. Then it goes through the list, ROWS at a time, evaluates the next level there, adds
-it on behind its gate, and keeps those on the list that lie in the next band; and so on. So a level costs what the rows
-in its band cost, rounded up to one tile for each program, and no other program and no host has to know how many there
-are. A program with an empty list skips the level.
+Each program evaluates level 0 on its tiles, and puts the rows that lie in the band on a list of its own, in order. Then
+it evaluates the next level on the list, ROWS at a time, adds it behind its gate, and keeps the rows that lie in the
+next band; and so on. So a level costs what the rows in its band cost, rounded up to one tile for each program. No other
+program and no host has to know how many there are.
 
 With f the value so far, δ the half-width of the band, τ the taper and r the next level, as in `multiscale.py`:
 

@@ -5,8 +5,8 @@ hidden matrix is kept as the sum of two float16 matrices,
 
     S_i M_i ≈ H + L,   H = fp16(S_i M_i),   L = fp16(S_i M_i − H),
 
-with S_i a power of two that brings its largest entry near `LARGEST`. The factor is exact in both formats, and keeps L
-above the smallest numbers of float16: |S_i M_i − H − L| ≤ max(2⁻²² |S_i M_i|, 2⁻²⁵).
+with S_i a power of two that brings its largest entry near `LARGEST_WEIGHT`. The factor is exact in both formats, and
+keeps L above the smallest numbers of float16: |S_i M_i − H − L| ≤ max(2⁻²² |S_i M_i|, 2⁻²⁵).
 """
 
 from __future__ import annotations
@@ -20,18 +20,12 @@ from weakref import WeakKeyDictionary
 import torch
 from torch import Tensor
 
-__all__ = ["LARGEST", "SINES", "Packed", "Shape", "Weights", "is_hopper", "pack", "packed", "state_of"]
+__all__ = ["LARGEST_WEIGHT", "SINES", "Packed", "Shape", "Weights", "is_hopper", "pack", "packed", "state_of"]
 
 # Sines are multiplied by this before they are split: a power of two, so that their low halves are normal numbers.
 SINES = 1024.0
-# The largest entry of a scaled matrix lies in (LARGEST / 2, LARGEST].
-LARGEST = 16.0
-# Likewise the largest number of a sweep back, which is split as sines are.
-BACK = 1024.0
-# Major compute capability of GPUs whose products are made by groups of four warps.
-HOPPER = 9
-# Two halves of a square matrix of so many units, 64 KiB, fit the shared memory of a program.
-KEPT_WIDTH = 128
+# The largest entry of a scaled matrix lies in (LARGEST_WEIGHT / 2, LARGEST_WEIGHT].
+LARGEST_WEIGHT = 16.0
 
 
 class Shape(NamedTuple):
@@ -60,13 +54,14 @@ class Shape(NamedTuple):
         Only Hopper's products take their second operand from shared memory, and leave registers for 256 units. Above
         128 units the weights of a level do not stay in shared memory; there twice as many points share them.
         """
+        kept_width = 128  # two halves of such a matrix, 64 KiB, fit the shared memory of a program
         columns = max(16, 1 << (width - 1).bit_length())
-        if columns > KEPT_WIDTH:
+        if columns > kept_width:
             columns = 256 if hopper and columns == 256 else 128
         padded = -(-width // columns) * columns
-        rows = 128 if hopper and padded > KEPT_WIDTH else 64
+        rows = 128 if hopper and padded > kept_width else 64
         piece = 32 if columns == 256 else min(64, columns)
-        return cls(padded, depth, columns, piece, rows, hopper and depth == 2 and padded <= KEPT_WIDTH)
+        return cls(padded, depth, columns, piece, rows, hopper and depth == 2 and padded <= kept_width)
 
     @property
     def direct(self) -> bool:
@@ -114,16 +109,17 @@ def pack(parameters: Sequence[Tensor], omega: float, gain: float) -> Packed:
     biases = [turns * bias.double() for bias in parameters[1:-2:2]]
     last = gain * parameters[-2][0].double()
     hidden = weights[1:]
-    scales = [power_of_two(LARGEST, matrix) for matrix in hidden]
+    scales = [power_of_two(LARGEST_WEIGHT, matrix) for matrix in hidden]
 
     # The sweep back: s_d = w cos, s_i = (s_{i+1} M_{i+1}ᵀ) cos, each scaled by a bound on its largest entry.
-    bound, outer = last.abs(), power_of_two(BACK, last)
+    largest = 1024.0  # of a number of the sweep back, which is split as sines are
+    bound, outer = last.abs(), power_of_two(largest, last)
     rows, back = [*weights[0], *biases, last, last * outer], []
     for index in range(depth - 2, -1, -1):
         factor = 1 / (scales[index] * outer)
         if index > 0:  # below the first hidden layer the gradient is summed in float32
             bound = hidden[index].abs() @ bound
-            outer = power_of_two(BACK, bound)
+            outer = power_of_two(largest, bound)
             factor = factor * outer
         back.insert(0, factor)
     numbers = [gain * parameters[-1][0].double(), last.new_full((), (2 * math.pi) ** depth)]
@@ -141,7 +137,7 @@ def pack(parameters: Sequence[Tensor], omega: float, gain: float) -> Packed:
 @functools.cache
 def is_hopper(device: torch.device) -> bool:
     """Whether a device has compute capability 9; the interpreter is taken for one that has."""
-    return device.type != "cuda" or torch.cuda.get_device_capability(device)[0] == HOPPER
+    return device.type != "cuda" or torch.cuda.get_device_capability(device)[0] == 9
 
 
 def power_of_two(target: float, like: Tensor) -> Tensor:

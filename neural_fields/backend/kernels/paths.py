@@ -2,10 +2,9 @@
 
 Each program has SLOTS places for rays, a ring of free ones, and for each level a ring of those that wait for its value.
 Free places take the next rays of a queue that all programs share. A program serves its longest ring, up to ROWS rays at
-a time. A value that lies in the next band sends its ray on to the ring of the next level; any other is looked at
-(`rules.py`), and the ray has ended or goes back to the ring of level 0. So tiles of every level are full as long as
-there are rays enough, and neither the host nor another program has a say. Where rays stand lies in a scratch of the
-program's own, small enough for caches: some eleven numbers of each.
+a time. A value in the next band sends its ray to the ring of the next level. Any other goes through `rules.py`, after
+which the ray has ended or goes back to the ring of level 0. So tiles of every level are full as long as there are rays
+enough. The state of rays lies in a scratch of the program's own, small enough for caches.
 
 The rules are those of `sphere_trace` without expectations; see `tracing.py`.
 """
@@ -21,6 +20,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from . import tracing
 from .launch import launch
 from .levels import Levels, gate_of, level_of_tile
 from .rules import first_band, look_at, turned_back
@@ -28,12 +28,8 @@ from .siren import half_scratch
 from .tensor_tiles import keep
 from .tracing import Marched, Queue, RayTensors
 
-__all__ = ["march_levels"]
+__all__ = ["march_fused", "march_levels"]
 
-# Numbers of a ray, in this order: value so far, depth, low, low_value, free, gap, high, high_value, boldness, sign.
-COLUMNS = 10
-# Whole numbers of a ray: its number, and how often it was looked at.
-COUNTS = 2
 # Rays under way in a program: more of them fill the tiles, and fewer leave later rays for the end, when the last ones
 # are on their way. Twice as many above so many rays in all.
 SLOTS, MANY_RAYS = 256, 1 << 19
@@ -297,6 +293,22 @@ def march_bands(
         running = more | (lengths[LEVELS] < SLOTS)
 
 
+def march_fused(
+    levels: Levels,
+    rays: RayTensors,
+    queue: Queue,
+    found: Marched,
+    numbers: Tensor,
+    *,
+    max_steps: int,
+    constants: dict[str, float],
+) -> None:
+    """`march_rays` for one network that leaves registers enough for rays, `march_levels` for all others."""
+    alone = len(levels.networks) == 1 and levels.networks[0].shape.width <= tracing.IN_REGISTERS
+    march = tracing.march_rays if alone else march_levels
+    march(levels, rays, queue, found, numbers, max_steps=max_steps, constants=constants)
+
+
 def march_levels(
     levels: Levels,
     rays: RayTensors,
@@ -307,24 +319,17 @@ def march_levels(
     max_steps: int,
     constants: dict[str, float],
 ) -> None:
-    """March the rays of a queue to the surface of the finest of some levels.
-
-    Args:
-        levels: one or more, on the rays' device, in three dimensions.
-        rays: see `mplicits.neural_fields.backend.kernels.tracing.march_rays`, as are all that follow.
-        queue: see there.
-        found: see there.
-        numbers: see there.
-        max_steps: see there.
-        constants: see there.
-    """
+    """March the rays of a queue to the surface of the finest of one or more levels; arguments as of `march_rays`."""
     kept, like, rows = levels.scratch(jet=False), rays.starts, levels.rows
+    # Numbers of a ray: value so far, depth, low, low_value, free, gap, high, high_value, boldness, sign.
+    floats = 10
+    whole = 2  # its number, and how often it was looked at
     slots = SLOTS if len(like) <= MANY_RAYS else 2 * SLOTS
 
     def arguments(programs: int) -> tuple[object, ...]:
-        columns = torch.empty(programs * slots * COLUMNS, dtype=torch.float32, device=like.device)
+        columns = torch.empty(programs * slots * floats, dtype=torch.float32, device=like.device)
         counts = torch.empty(
-            programs * slots * (len(levels.networks) + 1 + COUNTS), dtype=torch.int32, device=like.device
+            programs * slots * (len(levels.networks) + 1 + whole), dtype=torch.int32, device=like.device
         )
         scratch = half_scratch(like, programs * kept)
         return *rays, *queue, *levels.arguments(), *found, columns, counts, scratch, numbers, max_steps, levels.taper
@@ -339,8 +344,8 @@ def march_levels(
         TAPERED=levels.taper > 0,
         SHAPES=levels.shapes,
         SCRATCH=kept,
-        COLUMNS=COLUMNS,
-        COUNTS=COUNTS,
+        COLUMNS=floats,
+        COUNTS=whole,
         SLOTS=slots,
         ROWS=rows,
         warps=rows // 16,

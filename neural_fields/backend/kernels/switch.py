@@ -30,8 +30,6 @@ MODES = ("auto", "off", "interpret")
 MAX_WIDTH, MAX_DEPTH = 512, 8
 # A kernel over levels has the code of each; compiling takes some seconds for one of them.
 MAX_LEVELS = 4
-# Before it, no tensor cores for float32 of any kind; Triton itself wants 7.0.
-LEAST_CAPABILITY = (8, 0)
 
 
 class Choice(NamedTuple):
@@ -99,6 +97,7 @@ def obstacle(device: torch.device, asked: str) -> str:
         return "" if os.environ.get("TRITON_INTERPRET") == "1" else "TRITON_INTERPRET=1 is not set"
     if os.environ.get("TRITON_INTERPRET") == "1":
         return "TRITON_INTERPRET=1 is set; only MPLICITS_KERNELS=interpret uses the interpreter"
-    if torch.cuda.get_device_capability(device) < LEAST_CAPABILITY:
+    # Before 8.0 there are no tensor cores for float32 of any kind; Triton itself needs 7.0.
+    if torch.cuda.get_device_capability(device) < (8, 0):
         return f"{torch.cuda.get_device_name(device)} is older than compute capability 8.0"
     return ""

@@ -1,13 +1,13 @@
 """Value, or value and gradient, of a tile of points on tensor cores.
 
 A tile is a matrix of ROWS points. A product of matrices is three of float16 with sums in float32: both operands are
-split into a high and a low half, and the product of the low ones, about 2⁻²² of a term, is left out. So values and
+split into a high and a low half. The product of the low ones, about 2⁻²² of a term, is left out. So values and
 gradients have the error of float32.
 
-The first sine layer is made from the points, piece by piece, as the product with the second one needs it; the last one
-goes from its accumulator into the output's sum. Layers between them, and all layers of networks that are wider than one
-accumulator, lie as halves in a scratch of the program's own: layer i in plane i mod 2, and behind these two planes the
-cosines of the layers between first and last. See `packing.py` for the weights.
+The first sine layer is made from the points, piece by piece, as the product with the second one needs it. The last one
+goes from its accumulator into the output's sum. Layers between them, and all layers of networks wider than one
+accumulator, lie as halves in a scratch of the program's own. Layer i is in plane i mod 2; behind these two planes are
+the cosines of the layers between first and last. See `packing.py` for the weights.
 
 Arguments that functions have in common:
     points: the coordinates, a tuple of IN columns (ROWS,).

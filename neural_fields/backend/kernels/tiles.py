@@ -1,19 +1,17 @@
-"""What one program does with a tile of points in IEEE float32: value and gradient of a network of any width.
+"""Value and gradient of a network of any width for a tile of points, in IEEE float32.
 
-A tile is a matrix of ROWS points; a product is made COLUMNS units at a time, in an accumulator (ROWS, COLUMNS) that
+A tile is a matrix of ROWS points. Products are made COLUMNS units at a time, in an accumulator (ROWS, COLUMNS) that
 stays in registers, PIECE inner units after PIECE. Where it is as wide as the network (up to 128 units):
 
-- the first sine layer is never kept: each piece of it is made from the points when a product wants it, once;
+- the first sine layer is never kept: each piece of it is made from the points when a product needs it;
 - the last one goes from its accumulator into the output's sum;
 - the first layer's cosines are made again from the points for the end of the sweep back.
 
-So a jet of (128, 2) puts one matrix aside, s₂. What is put aside lies in a scratch of the program's own, as many
-`planes` of ROWS times its width, small enough for caches: layer i in plane i mod 2, on the way up and on the way back,
-since that of layer i − 1 is free by then; and after these two the cosines of the layers between first and last.
-Products read a plane piece by piece, in a loop: a product over all inner units at once is unrolled, and spills
-thousands of bytes of registers.
-
-Units beyond the width have weights and biases of 0: their sines are 0, and 0 is swept back to them.
+So a jet of (128, 2) puts one matrix aside, s₂. What is put aside lies in a scratch of the program's own: `planes` of
+ROWS times its width, small enough for caches. Layer i is in plane i mod 2 on both sweeps; that of layer i − 1 is free
+by then. The cosines of the layers between first and last follow. Products read a plane piece by piece, in a loop: a
+product over all inner units at once is unrolled, and spills thousands of bytes of registers. Units beyond the width
+have weights and biases of 0.
 """
 
 # pyright: reportGeneralTypeIssues=false, reportArgumentType=false, reportCallIssue=false
@@ -38,9 +36,9 @@ __all__ = [
 INTERPRETED = tl.constexpr(bool(triton.knobs.runtime.interpret))
 
 
-def planes(depth: int, *, jet: bool) -> int:
+def planes(depth: int) -> int:
     """How many matrices of ROWS points a program puts aside."""
-    return 2 + max(0, depth - 2) * jet
+    return max(2, depth)
 
 
 @triton.jit

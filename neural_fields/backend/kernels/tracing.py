@@ -1,14 +1,12 @@
 """Rays that march through one network in one launch: each stays in registers until it meets the surface or leaves.
 
-`tracing._march` evaluates the field once a pass for all rays that are left, and between passes has some
-seventy small operations for what a value allows; on a GPU each is a launch. Here a program marches ROWS rays at a time:
-a value of its tile, then the same rules (`rules.py`) in registers. A ray that ends writes what it found, and its place
-is taken by the next ray of a queue that all programs share, so that tiles stay full though rays are of different
-lengths. Which program marches a ray depends on the order of their requests; what the ray finds does not.
+`tracing._march` evaluates the field once a pass, and between passes has some seventy small operations; on a GPU each is
+a launch. Here a program marches ROWS rays at a time: a value of its tile, then the same rules (`rules.py`) in
+registers. A ray that ends writes what it found, and the next ray of a queue takes its place. All programs share the
+queue, so tiles stay full. What a ray finds does not depend on the program that marches it.
 
-The rules are those of `sphere_trace` for a field without bands and without expectations: steps as wide as two tangent
-balls on a plane allow, taken back where a gap opens, then the secant and bisection in turn. What they decide is the
-same; values differ by rounding, so depths do by about as much over the slope.
+The rules are those of `sphere_trace` for a field without bands and without expectations. Decisions are the same;
+values differ by rounding, so depths do by about as much over the slope.
 """
 
 # pyright: reportGeneralTypeIssues=false, reportArgumentType=false, reportCallIssue=false
@@ -29,10 +27,8 @@ from .rules import look_at, turned_back
 from .siren import half_scratch
 from .tensor_tiles import keep, value_of_tile
 
-__all__ = ["IN_REGISTERS", "REFILL", "Marched", "Queue", "RayTensors", "march_rays"]
+__all__ = ["IN_REGISTERS", "Marched", "Queue", "RayTensors", "march_rays"]
 
-# Places of a tile that are free before a program takes new rays. Fewer waste requests, more waste places.
-REFILL = 16
 # One network of so many units leaves registers enough to keep rays there too.
 IN_REGISTERS = 128
 
@@ -250,6 +246,6 @@ def march_rays(
         SHAPE=tuple(network.shape),
         SCRATCH=kept,
         ROWS=rows,
-        REFILL=REFILL,
+        REFILL=16,  # free places before a program takes new rays: fewer waste requests, more waste places
         warps=rows // 16,
     )  # fmt: skip

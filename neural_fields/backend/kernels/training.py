@@ -1,19 +1,18 @@
-"""The way back through a jet: what a loss on value and gradient says to points, weights and biases, in one launch.
+"""The backward pass of a jet in one launch: cotangents of points, weights and biases from those of value and gradient.
 
-Let f̄ and ḡ be the cotangents of f and ∇f. With φ_i = ω₀(W_i h_{i−1} + b_i), c_i = ω₀ cos φ_i and s_i = g_i ⊙ c_i as in
-`tiles.py`, the sweep back is linear in ḡ, and its adjoint is one tangent forward:
+Let f̄ and ḡ be the cotangents of f and ∇f, with φ_i = ω₀(W_i h_{i−1} + b_i), c_i = ω₀ cos φ_i and s_i = g_i ⊙ c_i as in
+`tiles.py`. The sweep back is linear in ḡ, and its adjoint is one tangent forward:
 
-    u_0 = ḡ,   v_i = u_{i−1} W_iᵀ,   u_i = v_i ⊙ c_i,
+    u_0 = ḡ,   v_i = u_{i−1} W_iᵀ,   u_i = v_i ⊙ c_i.
 
-and the adjoint of the value picks up what the tangent finds of the cosines' bending:
+The adjoint of the value adds what the tangent meets of the cosines' derivative:
 
     h̄_d = f̄ w,   z̄_i = h̄_i ⊙ c_i − ω₀² v_i ⊙ g_i ⊙ sin φ_i,   h̄_{i−1} = z̄_i W_i,   x̄ = h̄_0,
     W̄_i = Σ s_iᵀ u_{i−1} + z̄_iᵀ h_{i−1},   b̄_i = Σ z̄_i,   w̄ = Σ u_d + f̄ h_d.
 
-Nothing is kept from the way there but the points: sweeps up and back are made again, tile by tile, into five planes
-for each layer (h, c, g, s, u; z̄ takes the place of g), which a GPU's second-level cache can hold. That is eight matrix
-products for each layer, where PyTorch makes six and keeps all activations of all points in memory. Sums over points are
-made by each program for itself, tile after tile, and added up at the end, in the same order every time.
+Only the points are kept from the forward pass. Sweeps up and back are made again, tile by tile, into five planes for
+each layer (h, c, g, s, u; z̄ takes the place of g). A GPU's second-level cache can hold them. Sums over points
+are made by each program for itself and added up at the end, in the same order every time.
 """
 
 # pyright: reportGeneralTypeIssues=false, reportArgumentType=false, reportCallIssue=false
@@ -30,11 +29,6 @@ from .tensor_tiles import points_of, rows_of
 from .tiles import add_first, cosine, first_phase, product_from, sine
 
 __all__ = ["jet_backward"]
-
-# Planes of a layer: sines, slopes ω₀ cos, the sweep back before them (then z̄) and after them, the tangent.
-PLANES = 5
-# All programs' sums of weights together, in numbers: 256 MiB; wide networks get fewer programs for it.
-MOST_SUMS = 1 << 26
 
 
 @triton.jit(do_not_specialize=["count"])
@@ -243,8 +237,11 @@ def jet_backward(x: Tensor, network: Network, value_bar: Tensor, gradient_bar: T
     sizes = [parameter.numel() for parameter in network.parameters]
     tiling = _tiling(network.width)
     tiles = triton.cdiv(len(x), tiling.rows)
-    programs = max(1, min(program_count(x.device, tiles), MOST_SUMS // sum(sizes)))
+    # All sums of weights together are at most 256 MiB; wide networks get fewer programs for it.
+    programs = max(1, min(program_count(x.device, tiles), (1 << 26) // sum(sizes)))
     sums = x.new_zeros(programs, sum(sizes))
+    # Planes of a layer: sines, slopes ω₀ cos, the sweep back before them (then z̄) and after them, the tangent.
+    kept = 5 * network.depth * tiling.rows * tiling.stride(network.width)
     if tiles:
         with on_device(x):
             sweep[(programs,)](  # pyright: ignore[reportIndexIssue]
@@ -254,7 +251,7 @@ def jet_backward(x: Tensor, network: Network, value_bar: Tensor, gradient_bar: T
                 gradient_bar.contiguous(),
                 x_bar,
                 sums,
-                scratch_for(x, programs, PLANES * network.depth * tiling.rows * tiling.stride(network.width)),
+                scratch_for(x, programs, kept),
                 len(x),
                 network.omega,
                 network.gain,

@@ -177,10 +177,10 @@ class SceneModel(nn.Module):
             level=level,
             background=self.background,
             outside=self.outside,
-            least_weight=least_weight,
-            skip=skip,
+            early_stop_eps=least_weight,
+            alpha_threshold=skip,
             skip_share=skip_share,
-            guide=guide,
+            sdf_grid=guide,
             generator=generator,
         )
 

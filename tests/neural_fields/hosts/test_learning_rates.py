@@ -5,7 +5,7 @@ import copy
 import pytest
 import torch
 from mplicits.neural_fields import MultiscaleSDF, NeuSGeometry, Siren, SpaceTimeSDF, Sphere, Union
-from mplicits.neural_fields.hosts.learning_rates import OUTPUT_RATE, SINE_RATE, parameter_groups, share_rate
+from mplicits.neural_fields.hosts.learning_rates import OUTPUT_RATE, SINE_RATE, parameter_groups, rescale_parameters
 from torch import Tensor, nn
 
 
@@ -24,7 +24,7 @@ def test_units_change_no_bit_of_the_function(graph: bool) -> None:
     with torch.set_grad_enabled(graph):
         before = outputs(field, x)
         stored = field.base.output.weight.detach().clone()  # pyright: ignore[reportAttributeAccessIssue]
-        share_rate(field, 5e-4)
+        rescale_parameters(field, 5e-4)
         assert not torch.equal(field.base.output.weight, stored)  # pyright: ignore[reportAttributeAccessIssue]
         for one, other in zip(before, outputs(field, x), strict=True):
             assert torch.equal(one, other)
@@ -33,11 +33,11 @@ def test_units_change_no_bit_of_the_function(graph: bool) -> None:
 def test_state_dicts_hold_the_weights_whatever_the_units() -> None:
     plain, x = tapered(), torch.rand(50, 3)
     shared = copy.deepcopy(plain)
-    share_rate(shared, 5e-4)
+    rescale_parameters(shared, 5e-4)
     state = shared.state_dict()
     assert all(torch.equal(tensor, state[name]) for name, tensor in plain.state_dict().items())
     other = tapered()
-    share_rate(other, 1e-2)
+    rescale_parameters(other, 1e-2)
     other.load_state_dict(state)
     fresh = tapered()
     fresh.load_state_dict(other.state_dict())
@@ -62,7 +62,7 @@ def test_one_rate_takes_the_steps_of_the_groups() -> None:
     host, x = 5e-4, torch.rand(50, 3) - 0.5
     grouped, shared = tapered(), tapered()
     shared.load_state_dict(grouped.state_dict())
-    share_rate(shared, host)
+    rescale_parameters(shared, host)
     moved = []
     for field, groups in (
         (grouped, parameter_groups(grouped, host)),
@@ -90,7 +90,7 @@ def test_levels_learn_at_their_pace(pace: float | tuple[float, ...], shares: tup
     of_group = [share for share in shares for _ in range(2)]  # sine layers and output
     for one, other, share in zip(plain, slow, of_group, strict=True):
         assert other["lr"] == pytest.approx(share * one["lr"], rel=1e-12)
-    share_rate(field, 5e-4)
+    rescale_parameters(field, 5e-4)
     units = [unit for siren in field.levels for unit in siren.units]  # pyright: ignore[reportAttributeAccessIssue]
     shell = NeuSGeometry(field, learning_rate=5e-4, pace=pace)
     found = [unit for siren in field.levels for unit in siren.units]  # pyright: ignore[reportAttributeAccessIssue]
@@ -113,7 +113,7 @@ def test_levels_of_all_parts_have_their_pace() -> None:
 def test_groups_in_units_are_in_the_same_proportion() -> None:
     field = tapered()
     plain = parameter_groups(field, 1e-3)
-    share_rate(field, 5e-4)
+    rescale_parameters(field, 5e-4)
     units = [unit for siren in field.levels for unit in siren.units]  # pyright: ignore[reportAttributeAccessIssue]
     for one, other, unit in zip(plain, parameter_groups(field, 1e-3), units, strict=True):
         assert other["lr"] * unit == pytest.approx(one["lr"], rel=1e-12)
@@ -137,7 +137,7 @@ def test_units_are_powers_of_two(unit: float) -> None:
 
 
 def test_rates_are_positive() -> None:
-    for function in (parameter_groups, share_rate):
+    for function in (parameter_groups, rescale_parameters):
         with pytest.raises(ValueError, match="lr=0"):
             function(Siren(8, 1), 0)
         for pace, message in ((-1.0, "pace=-1"), ((1.0, 0.0), "pace=0"), ((), "pace: there is none")):
@@ -148,7 +148,7 @@ def test_rates_are_positive() -> None:
 def test_lifted_into_space_time_and_sliced_it_stays_the_same() -> None:
     plain = tapered()
     shared = copy.deepcopy(plain)
-    share_rate(shared)
+    rescale_parameters(shared)
     fields = []
     for field in (plain, shared):
         torch.manual_seed(3)

@@ -5,13 +5,20 @@ from typing import Any
 import pytest
 import torch
 from fields import FIELDS
-from mplicits.neural_fields import Jet, MultiscaleSDF, Siren, Sphere, ViewColor, render_volume
+from mplicits.neural_fields import Jet, MultiscaleSDF, Plane, Siren, Sphere, ViewColor, render_volume
 from mplicits.neural_fields.backend.fixed_shapes import fixed_shapes
 from mplicits.neural_fields.fields.field import OneLevelField
 from mplicits.neural_fields.fields.function import as_field
 from mplicits.neural_fields.networks.radiance import Outside
 from mplicits.neural_fields.networks.value_grid import ValueGrid
-from mplicits.neural_fields.volume.render import Rendered, Sampling, sample_depths
+from mplicits.neural_fields.volume.render import (
+    Rendered,
+    Samples,
+    Sampling,
+    render_samples,
+    sample_depths,
+    sample_rays,
+)
 from mplicits.neural_fields.volume.weights import sphere_span
 from torch import Tensor
 
@@ -102,7 +109,7 @@ def test_in_fixed_shapes_rays_see_the_same_if_there_is_room(spare: int | None) -
     def render() -> list[Tensor]:
         seen = render_volume(
             field, color, origins, directions, inv_std=300.0, sampling=Sampling(12, 8, 2), outside=around,
-            least_weight=0.05, skip=0.05,
+            early_stop_eps=0.05, alpha_threshold=0.05,
         )  # fmt: skip
         loss = seen.color.square().sum() + (seen.counts * seen.jet.gradient.square().sum(dim=-1)).sum()
         grown = torch.autograd.grad(loss, parameters, allow_unused=True, materialize_grads=True)
@@ -126,6 +133,27 @@ def test_in_fixed_shapes_rays_see_the_same_if_there_is_room(spare: int | None) -
             return
     for one, same in zip(usual, fixed, strict=True):
         torch.testing.assert_close(same, one, rtol=1e-10, atol=1e-10)  # float64 sums of some hundred numbers
+
+
+def test_earlier_names_of_arguments_warn() -> None:
+    with pytest.warns(DeprecationWarning, match="least_weight is now called early_stop_eps"):
+        before = render_volume(Sphere(), position_color, *rays(4), inv_std=100.0, least_weight=1e-3)
+    now = render_volume(Sphere(), position_color, *rays(4), inv_std=100.0, early_stop_eps=1e-3)
+    assert torch.equal(before.color, now.color)
+
+
+def test_sampling_and_rendering_are_two_calls() -> None:
+    """Intervals follow each other, and may come from elsewhere: a slab of constant opacity has a closed form."""
+    origins, directions = rays(5)
+    samples = sample_rays(Sphere(), origins, directions, inv_std=100.0)
+    assert torch.equal(samples.t_starts[:, 1:], samples.t_ends[:, :-1])
+    edges = torch.tensor([[1.0, 1.25, 2.0]])
+    own = Samples(edges[:, :-1], edges[:, 1:], torch.ones(1, 2), skipped=False)
+    eye, ahead = torch.tensor([[0.0, 0, 2]]), torch.tensor([[0.0, 0, -1]])
+    seen = render_samples(Plane(offset=0.5), position_color, eye, ahead, own, inv_std=4.0)
+    # From f = 0.5 at the first depth to -0.5 at the last: the light left is the ratio of sigmoids.
+    expected = torch.sigmoid(torch.tensor(-2.0)) / torch.sigmoid(torch.tensor(2.0))
+    torch.testing.assert_close(1 - seen.opacity[0], expected)
 
 
 def test_no_rays_are_legal() -> None:
@@ -178,7 +206,7 @@ class TestBands:
 
         field = self.field()
         everywhere = render_volume(field, color, *rays(50), inv_std=200.0)
-        only = render_volume(field, color, *rays(50), inv_std=200.0, least_weight=1e-4)
+        only = render_volume(field, color, *rays(50), inv_std=200.0, early_stop_eps=1e-4)
         assert asked[1] < 0.6 * asked[0]
         torch.testing.assert_close(only.color, everywhere.color, atol=1e-4 * 129, rtol=0)
         assert float((only.color - everywhere.color).detach().abs().max()) > 0
@@ -208,7 +236,7 @@ def test_sections_of_rays_that_miss_the_sphere_stand_for_nothing(skip: float) ->
     # Through the middle, past the sphere, and away from it.
     origins = torch.tensor([[0.0, 0.0, 2.0], [1.5, 0.0, 2.0], [0.0, 0.0, 2.0]])
     along = torch.tensor([[0.0, 0.0, -1.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-    options = {"inv_std": 50.0, "outside": fog, "skip": skip, "skip_share": 0.5}
+    options = {"inv_std": 50.0, "outside": fog, "alpha_threshold": skip, "skip_share": 0.5}
     field = MultiscaleSDF.from_widths([(8, 1), (8, 1)], omegas=[5, 10], deltas=[0.2])
 
     def seen(rows: list[int]) -> Rendered:
@@ -234,7 +262,7 @@ def test_what_is_behind_something_opaque_is_not_asked_for() -> None:
     origins = torch.tensor([[0.0, 0.0, 2.0], [0.9, 0.0, 2.0], [0.0, 0.0, 2.0]])
     ahead = torch.tensor([[0.0, 0.0, -1.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
     sampling, options = Sampling(outside=4), {"inv_std": 1000.0, "outside": fog, "background": torch.zeros(3)}
-    seen = render_volume(Sphere(radius=0.5), red, origins, ahead, sampling=sampling, least_weight=1e-4, **options)
+    seen = render_volume(Sphere(radius=0.5), red, origins, ahead, sampling=sampling, early_stop_eps=1e-4, **options)
     assert torch.equal(asked[0], ahead[1:].repeat_interleave(4, dim=0))
     expected = render_volume(Sphere(radius=0.5), red, origins, ahead, sampling=sampling, **options)
     # A ray of S sections loses 1e-4 of each at most, and of the light that is left.
@@ -290,7 +318,7 @@ class TestSkipping:
 
     @pytest.mark.parametrize("skip", [1e-2, 1e-4])
     def test_colours_are_off_by_the_skipped_weight_at_most(self, skip: float) -> None:
-        full, some = self.seen(), self.seen(skip=skip)
+        full, some = self.seen(), self.seen(alpha_threshold=skip)
         assert torch.equal(full.depths, some.depths)
         skipped = some.counts == 0
         lost = (full.weights * skipped).sum(dim=1)
@@ -305,24 +333,27 @@ class TestSkipping:
 
     def test_nothing_changes_where_nothing_is_skipped(self) -> None:
         full = self.seen(generator=torch.Generator().manual_seed(1))
-        every = self.seen(skip=1e-3, skip_share=1.0, generator=torch.Generator().manual_seed(1))
+        every = self.seen(alpha_threshold=1e-3, skip_share=1.0, generator=torch.Generator().manual_seed(1))
         assert bool((full.counts == 1).all())
         assert bool((every.counts == 1).all())
         torch.testing.assert_close(every.color, full.color, atol=1e-12, rtol=0)
         torch.testing.assert_close(every.jet.gradient, full.jet.gradient, atol=1e-12, rtol=0)
 
     def test_those_kept_by_chance_stand_for_the_others(self) -> None:
-        counts = self.seen(skip=1e-3, skip_share=0.25, generator=torch.Generator().manual_seed(1)).counts
+        counts = self.seen(alpha_threshold=1e-3, skip_share=0.25, generator=torch.Generator().manual_seed(1)).counts
         assert {*counts.unique().tolist()} == {0.0, 1.0, 4.0}
         light = counts[counts != 1]
         # Each is 4 with a probability of 1/4, so of n the mean is 1 with a variance of 3/n.
         assert abs(float(light.mean()) - 1) < 5 * (3 / len(light)) ** 0.5
-        assert {*self.seen(skip=1e-3, skip_share=0.25).counts.unique().tolist()} == {0.0, 1.0}  # no generator
+        assert {*self.seen(alpha_threshold=1e-3, skip_share=0.25).counts.unique().tolist()} == {
+            0.0,
+            1.0,
+        }
 
     def test_rays_that_miss_keep_where_they_come_nearest(self) -> None:
         field, origins = Sphere(radius=0.5), torch.tensor([[0.0, 0.7, 2.0], [0.0, 0.9, 2.0]])
         seen = render_volume(
-            field, position_color, origins, torch.tensor([[0.0, 0, -1]]).expand(2, 3), inv_std=1e3, skip=1e-3
+            field, position_color, origins, torch.tensor([[0.0, 0, -1]]).expand(2, 3), inv_std=1e3, alpha_threshold=1e-3
         )
         assert (seen.counts == 1).sum(dim=1).tolist() == [1, 1]
         assert bool((seen.depths[seen.counts == 1] - 2.0).abs().max() < 0.05)
@@ -333,7 +364,9 @@ class TestSkipping:
         origins, directions = rays(100)
         grid = ValueGrid(48)
         grid.refresh(field)
-        guided = render_volume(wrapped, position_color, origins, directions, inv_std=150.0, skip=1e-4, guide=grid)
+        guided = render_volume(
+            wrapped, position_color, origins, directions, inv_std=150.0, alpha_threshold=1e-4, sdf_grid=grid
+        )
         assert base.values == residual.values == 0
         assert base.jets == int((guided.counts > 0).sum())
         full = render_volume(field, position_color, origins, directions, inv_std=150.0)
@@ -342,4 +375,4 @@ class TestSkipping:
 
     def test_shares_out_of_range_are_refused(self) -> None:
         with pytest.raises(ValueError, match=r"skip_share=1\.5"):
-            self.seen(skip=0.1, skip_share=1.5)
+            self.seen(alpha_threshold=0.1, skip_share=1.5)

@@ -10,8 +10,9 @@ import torch
 from bounds import assert_within
 from mplicits.neural_fields import Jet, MultiscaleSDF, Siren
 from mplicits.neural_fields.backend.fixed_shapes import fixed_shapes
-from mplicits.neural_fields.backend.kernels.rounding import gated_bound, rounding_bound
 from torch import Tensor
+
+from benchmarks.costs.rounding import gated_bound, rounding_bound
 
 SIZES = [(16, 1), (24, 2), (17, 1)]
 # Residuals as large as their bands, so that gates matter: nobody in the first band, or nobody in the second, or some in

@@ -8,9 +8,10 @@ import triton
 import triton.language as tl
 from bounds import assert_within, unit_roundoff
 from mplicits.neural_fields import Siren
-from mplicits.neural_fields.backend.kernels.packing import LARGEST, SINES, Shape, pack, packed
-from mplicits.neural_fields.backend.kernels.rounding import COSINE_ERROR, SINE_ERROR
+from mplicits.neural_fields.backend.kernels.packing import LARGEST_WEIGHT, SINES, Shape, pack, packed
 from mplicits.neural_fields.backend.kernels.tensor_tiles import cosine, sine
+
+from benchmarks.costs.rounding import COSINE_ERROR, SINE_ERROR
 
 U = unit_roundoff(torch.float32)
 
@@ -45,7 +46,7 @@ def test_halves_hold_what_float32_holds(scale: float) -> None:
         factor = SINES * float(own.floats[(3 + 3 + 2) * own.shape.width + 2 + index])  # 1 / S, a power of two
         assert math.frexp(factor)[0] == 0.5
         high, low = (half.double()[:40, :40] * factor for half in own.halves[index])
-        assert LARGEST / 2 < float((exact / factor).abs().max()) <= LARGEST
+        assert LARGEST_WEIGHT / 2 < float((exact / factor).abs().max()) <= LARGEST_WEIGHT
         assert_within(high + low, exact, (4 * U * exact.abs()).clamp(min=2.0**-25 * factor))
         assert not bool(own.halves[index][:, 40:].any())
 

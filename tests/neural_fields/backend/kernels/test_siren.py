@@ -8,8 +8,9 @@ import pytest
 import torch
 from bounds import assert_within, rounding
 from mplicits.neural_fields import Siren
-from mplicits.neural_fields.backend.kernels.rounding import rounding_bound
 from mplicits.neural_fields.backend.kernels.tiles import planes
+
+from benchmarks.costs.rounding import rounding_bound
 
 # Widths that fill their blocks and widths that do not, in one block and in several; every depth that puts aside other
 # things; points that end within a tile, at its end, and more than there are programs.
@@ -141,4 +142,4 @@ def test_a_bound_that_is_no_bound_would_be_noticed(place: torch.device) -> None:
 
 def test_planes() -> None:
     """The matrices that a training's jet puts aside, as its doc says."""
-    assert [planes(depth, jet=True) for depth in (1, 2, 3, 5)] == [2, 2, 3, 5]
+    assert [planes(depth) for depth in (1, 2, 3, 5)] == [2, 2, 3, 5]

@@ -1,4 +1,4 @@
-"""Trilinear interpolation on cubic grids over a cube, with derivatives in closed form.
+"""Trilinear interpolation on cubic grids over a cube.
 
 A grid of resolution R has R cells and R + 1 vertices along each side of the cube [-extent, extent]³. Points outside the
 cube take the value at the point of the cube that is nearest to them.
@@ -11,7 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-__all__ = ["Place", "interpolate", "interpolate_jet", "locate", "vertex_weights", "vertices"]
+__all__ = ["Place", "interpolate", "interpolate_jet", "locate", "vertices"]
 
 
 class Place(NamedTuple):
@@ -46,12 +46,6 @@ def vertices(cell: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """
     both = torch.stack((cell, cell + 1), dim=1)  # (N, 2, 3)
     return both[:, :, None, None, 0], both[:, None, :, None, 1], both[:, None, None, :, 2]
-
-
-def vertex_weights(within: Tensor) -> Tensor:
-    """What the eight vertices of a cell count ``(N, 2, 2, 2)`` at ``(N, 3)`` places in it; they add up to 1."""
-    u, v, w = torch.stack((1 - within, within), dim=1).unbind(dim=2)  # (N, 2) each
-    return u[:, :, None, None] * v[:, None, :, None] * w[:, None, None, :]
 
 
 def interpolate(corners: Tensor, within: Tensor) -> Tensor:
