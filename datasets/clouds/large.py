@@ -16,13 +16,13 @@ import math
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from .point_cloud import PointCloud, begins, colors_from, normals_from, unit_rows, usable_rows
+from .point_cloud import PointCloud, begins, color_scale, colors_from, normals_from, unit_rows, usable_rows
 from .readers.stream import CloudStream
 
 __all__ = ["Merging", "merge_cloud"]
@@ -79,7 +79,8 @@ class _Survey(NamedTuple):
         finite: how many there are.
         sample: ``(M, 3)`` offsets of some of them, evenly chosen.
         normals: whether there are any.
-        brightest: the largest colour number; None without colours.
+        scale: the number of full brightness, see `color_scale`; None without colours.
+        read: how many points were read at all.
     """
 
     low: Float64
@@ -87,7 +88,8 @@ class _Survey(NamedTuple):
     finite: int
     sample: Float64
     normals: bool
-    brightest: float | None
+    scale: float | None
+    read: int
 
 
 class _Groups(NamedTuple):
@@ -137,13 +139,14 @@ def merge_cloud(
     cloud = PointCloud(
         rows[:, 1:4] / count + frame.low,
         unit_rows(rows[:, 4:7]).astype(np.float32) if frame.normals else None,
-        None if frame.brightest is None else (rows[:, 7:10] / count).clip(0, 1).astype(np.float32),
+        None if frame.scale is None else (rows[:, 7:10] / count).clip(0, 1).astype(np.float32),
         stream.source,
+        reading=stream.reading,
     )
     return cloud, Merging(
-        read=stream.count,
+        read=frame.read,
         kept=len(cloud),
-        dropped_nan=stream.count - frame.finite,
+        dropped_nan=frame.read - frame.finite,
         dropped_isolated=round(float(before - count.sum())),
         voxel=size,
         seconds=round(time.monotonic() - started, 3),
@@ -152,9 +155,10 @@ def merge_cloud(
 
 def _survey(stream: CloudStream) -> _Survey:
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
-    finite, normals, brightest = 0, False, None
+    read, finite, normals = 0, 0, False
     stride = 1 + stream.count // SAMPLE
     samples: list[Float64] = []
+    colors: list[NDArray[Any]] = []
     for piece in stream.pieces(ROWS):
         points = piece.points.astype(np.float64)
         points = points[usable_rows(points)]
@@ -163,9 +167,11 @@ def _survey(stream: CloudStream) -> _Survey:
         finite, normals = finite + len(points), piece.normals is not None
         samples.append(points[::stride].copy())
         if piece.colors is not None:
-            brightest = max(brightest or 0.0, float(np.nan_to_num(piece.colors, posinf=0, neginf=0).max(initial=0)))
+            colors.append(piece.colors[::stride].copy())
+        read += len(piece.points)
     extent = float((high - low).max()) if finite else 0.0
-    return _Survey(low, extent, finite, np.concatenate(samples) - low, normals, brightest)
+    scale = color_scale(np.concatenate(colors)) if colors else None
+    return _Survey(low, extent, finite, np.concatenate(samples) - low, normals, scale, read)
 
 
 def _first_size(frame: _Survey, limit: int, *, each: int = 20) -> float:
@@ -184,7 +190,7 @@ def _first_size(frame: _Survey, limit: int, *, each: int = 20) -> float:
 def _grouped(stream: CloudStream, frame: _Survey, size: float, limit: int) -> tuple[_Groups, float]:
     """Sums of all points by voxel and direction, and the edge of the voxels, doubled whenever there are too many."""
     size = max(size, frame.extent / ((1 << BITS) - 2))
-    groups = _Groups(np.empty(0, np.int64), np.empty((0, 7 if frame.brightest is None else 10)))
+    groups = _Groups(np.empty(0, np.int64), np.empty((0, 7 if frame.scale is None else 10)))
     for offsets, normals, colors in _pieces(stream, frame):
         keys = _cell_keys(offsets, size) << 3 | _directions(normals)
         ones = np.ones((len(keys), 1))
@@ -203,10 +209,10 @@ def _pieces(stream: CloudStream, frame: _Survey) -> Iterator[tuple[Float64, Floa
         finite = usable_rows(points)
         count = int(finite.sum())
         normals = np.zeros((count, 3)) if piece.normals is None else unit_rows(normals_from(piece.normals[finite]))
-        if piece.colors is None or frame.brightest is None:
+        if piece.colors is None or frame.scale is None:
             colors = np.empty((count, 0))
         else:
-            colors = colors_from(piece.colors[finite], brightest=frame.brightest).astype(np.float64)
+            colors = colors_from(piece.colors[finite], scale=frame.scale).astype(np.float64)
         yield points[finite] - frame.low, normals, colors
 
 

@@ -43,7 +43,7 @@ DEPTH_FLAGS = (
 
 def _arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    what = "PLY, OBJ, STL, OFF, XYZ, TXT, CSV, NPY, NPZ, LAS or LAZ file; a depth map, or a folder of them"
+    what = "PLY, PCD, OBJ, STL, OFF, XYZ, TXT, ASC, CSV, PTS, NPY, NPZ, LAS or LAZ file; a depth map, or a folder of them"
     add("clouds", nargs="+", metavar="CLOUD", help=f"{what}; several clouds get a run each, RUN/NAME")
     add_new_run(parser, "directory of the run, or runs")
     add("--jobs", type=whole(1), metavar="N", help="several clouds: so many at a time; above 1 needs mplicits[ray]")
@@ -101,7 +101,8 @@ def _fit_one(arguments: argparse.Namespace, cloud: str, config: FitConfig | None
     fitted = arguments.resume and arguments.mesh is not None and is_fitted(directory)
     if not fitted:
         check_new_run(directory, resume=arguments.resume, force=arguments.force)
-    mesh = _planned(arguments, Path(cloud) if depth is None else depth)
+    columns = read_record(directory)["config"].get("columns") if config is None else config.columns
+    mesh = _planned(arguments, Path(cloud) if depth is None else depth, columns)
     again = f"to continue: mplicits fit {cloud} -o {directory} --resume"
     if mesh is not None:
         again += f" --mesh {mesh.out}" + " --no-colors" * arguments.no_colors
@@ -149,13 +150,14 @@ def _watched(arguments: argparse.Namespace) -> AbstractContextManager[object]:
     return Watcher(arguments.out, resume=arguments.resume, say=lambda line: print(line, file=sys.stderr))
 
 
-def _planned(arguments: argparse.Namespace, source: Path | DepthInput) -> FitMesh | None:
+def _planned(arguments: argparse.Namespace, source: Path | DepthInput, columns: str | None) -> FitMesh | None:
     """The mesh that shall follow, checked; None if there is to be none."""
     if arguments.mesh is None:
         return None
     from ..mesh.finish import plan_mesh
 
-    return plan_mesh(arguments.mesh, arguments.out, source, colors=not arguments.no_colors, resume=arguments.resume)
+    options = {"colors": not arguments.no_colors, "resume": arguments.resume}
+    return plan_mesh(arguments.mesh, arguments.out, source, columns=columns, **options)
 
 
 def _follow(arguments: argparse.Namespace, cloud: str, config: FitConfig | None) -> int:

@@ -78,6 +78,8 @@ def _describe_record(record: dict[str, Any], path: Path) -> Rows:
         return []
     rows: Rows = [("fitted to", str(record.get("cloud", "?")))]
     cleaning, environment = record.get("cleaning", {}), record.get("environment", {})
+    if record.get("reading"):
+        rows.append(("read", record["reading"]))
     if cleaning:
         points = f"{cleaning['kept']:,} of {cleaning['read']:,}, normals {cleaning['normals_source']}"
         for name, what in (("dropped_outliers", "strays dropped"), ("turned_normals", "normals turned round")):
@@ -132,6 +134,7 @@ def _describe_surface(surface: Surface) -> Rows:
     else:
         rows.append(("kind", "point cloud"))
         rows.append(("points", f"{len(surface.vertices):,}"))
+        rows.append(("read", surface.reading))
         rows.append(("normals", "no" if surface.normals is None else "yes"))
     rows.append(("bounds", "  ".join(f"{axis} {a:.9g} … {b:.9g}" for axis, a, b in zip("xyz", low, high, strict=True))))
     rows.append(("diagonal", f"{float(np.linalg.norm(high - low)):.6g}"))

@@ -5,10 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
@@ -16,6 +14,7 @@ from scipy.sparse.csgraph import connected_components
 from ...datasets import PointCloud, read_cloud
 from ...datasets.clouds.point_cloud import unit_rows
 from ...datasets.clouds.readers.meshes import spread_on_faces
+from ...datasets.clouds.readers.reading import read_mesh
 from ...datasets.textured.gltf import read_gltf
 from ...neural_fields import InputError, Similarity
 from ...neural_fields.meshing.extract import Mesh
@@ -58,6 +57,7 @@ class Surface:
     faces: Int64
     normals: Float64 | None = None
     colors: Float64 | None = None
+    reading: str = ""
 
     def used_vertices(self) -> Float64:
         """The vertices that a face uses; of a cloud, all."""
@@ -122,26 +122,18 @@ def from_cloud(cloud: PointCloud) -> Surface:
         normals = unit_rows(normals)
     if cloud.colors is not None:
         colors = cloud.colors[finite].astype(np.float64)
-    return Surface(cloud.points[finite], np.empty((0, 3), np.int64), normals, colors)
+    return Surface(cloud.points[finite], np.empty((0, 3), np.int64), normals, colors, cloud.reading)
 
 
 def _load_mesh(path: Path) -> Surface | None:
     """The triangles of a file; None where it has no faces."""
     if not path.is_file():
         raise InputError(f"{path}: no such file")
-    try:
-        # process=False: trimesh would otherwise merge vertices and drop faces before we count them.
-        loaded: Any = trimesh.load_mesh(path, process=False)
-    except Exception as error:  # trimesh's readers raise whatever their parsing runs into
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise InputError(f"{path}: cannot be read as a {path.suffix[1:].upper()} mesh ({reason})") from error
-    faces = np.asarray(getattr(loaded, "faces", ()), np.int64).reshape(-1, 3)
+    cloud, faces = read_mesh(path)
     if not len(faces):
         return None
-    colors = None
-    if loaded.visual.kind == "vertex":
-        colors = np.asarray(loaded.visual.vertex_colors, np.float64)[:, :3] / 255
-    return _checked(path, Surface(np.asarray(loaded.vertices, np.float64), faces, None, colors))
+    colors = None if cloud.colors is None else cloud.colors.astype(np.float64)
+    return _checked(path, Surface(cloud.points, faces, None, colors))
 
 
 def _load_gltf(path: Path) -> Surface:

@@ -56,6 +56,10 @@ class FitConfig(Settings):
         at_most=1,
     )
     samples: int = setting(400_000, "samples made per level and kind, drawn from at every step", above=0)
+    columns: str | None = setting(
+        None, "names of all columns of a table that has no names, - for one to ignore, such as x,y,z,nx,ny,nz,r,g,b,-"
+    )
+    drop_noise: bool = setting(False, "leave out points of LAS and LAZ files that are classified as noise")
     normals: Literal["auto", "file", "estimate", "none"] = setting(
         "auto",
         "where normals come from: auto, file, estimate, or none: level 0 learns from points alone, and says which way "
@@ -123,6 +127,7 @@ class FitConfig(Settings):
 class TextureConfig(Settings):
     """Settings of ``texture``; the defaults are the ``default`` preset. Raises as `Settings` does."""
 
+    columns: str | None = setting(None, "names of all columns of a table that has no names; see fit")
     width: int = setting(256, "neurons per layer", above=0)
     depth: int = setting(3, "sine layers", above=0)
     omega: float = setting(60.0, "SIREN frequency: higher takes up finer detail, and more of the noise", above=0)
