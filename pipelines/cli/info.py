@@ -9,6 +9,7 @@ import numpy as np
 
 from ...neural_fields import Siren, levels_of, load_field
 from ..surface.surface import Surface, components, is_closed, read_surface
+from ..training.config import command_line
 from ..training.folder import RECORD_FILE, find_field, is_field, read_record, resumes_with
 from ..training.trainer import parameter_count
 
@@ -92,7 +93,7 @@ def _describe_record(record: dict[str, Any], path: Path) -> Rows:
     rows.append(("state", _describe_state(record, path)))
     texture = record.get("texture")
     if texture and not texture.get("finished", True):
-        rows.append(("texture", f"unfinished: mplicits texture {path} {texture['source']} --resume"))
+        rows.append(("texture", f"unfinished: {command_line('texture', path, texture['source'], '--resume')}"))
     if "training_seconds" in record:
         rows.append(("time", f"{record['training_seconds']:.1f} s"))
     if environment:

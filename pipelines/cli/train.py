@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..training.config import given_flags, input_error, load_config
+from ..training.config import command_line, given_flags, input_error, load_config
 from ..training.settings import EvolveConfig, FitConfig, ReconstructConfig, TextureConfig
 from .common import (
     Command,
@@ -67,8 +67,9 @@ def _texture(arguments: argparse.Namespace) -> int:
             resume=arguments.resume,
             progress=report,
         )
-    where = "" if arguments.out is None else f" -o {arguments.out}"
-    tell_texture(target, fitted, f"to continue: mplicits texture {arguments.run} {arguments.source}{where} --resume")
+    where = () if arguments.out is None else ("-o", arguments.out)
+    again = command_line("texture", arguments.run, arguments.source, *where, "--resume")
+    tell_texture(target, fitted, f"to continue: {again}")
     return 0
 
 
@@ -179,7 +180,7 @@ def _reconstruct_here(arguments: argparse.Namespace, config: ReconstructConfig |
             with stoppable("the same command continues", at_any_time=True):
                 found = find_cameras(arguments.data, data, report=colmap_report(report))
             tell_found(found)
-        with stoppable(f"to continue: mplicits reconstruct {data} -o {directory} --resume"):
+        with stoppable(f"to continue: {command_line('reconstruct', data, '-o', directory, '--resume')}"):
             run = reconstruct(data, config, out=directory, resume=arguments.resume, progress=report)
         with reported(report, "mesh"):
             lines: list[str] = []
@@ -198,10 +199,11 @@ def _reconstruct_here(arguments: argparse.Namespace, config: ReconstructConfig |
             f"{len(held_out['views'])} held-out views: PSNR {held_out['psnr']:.2f} dB, SSIM {held_out['ssim']:.3f} "
             f"({directory / HELD_OUT_FILE})"
         )
+    print(run.record["reading"])
     print(f"{directory / MESH_FILE}: {len(mesh.vertices):,} vertices, {len(mesh.faces):,} faces")
     for line in lines:
         print(f"  {line}")
-    print(f"next: mplicits view {directory}")
+    print("next:", command_line("view", directory))
     return 0
 
 
@@ -263,7 +265,7 @@ def _evolve(arguments: argparse.Namespace) -> int:
         print(f"{folder}: the fits of {', '.join(scans)}")
         if config.landmarks != given:
             print("all of them have the same faces: vertices are landmarks (pairs-00.txt and so on, beside the fits)")
-    again = f"to continue: mplicits evolve -o {directory} --resume"
+    again = f"to continue: {command_line('evolve', '-o', directory, '--resume')}"
     with (
         tensorboard(arguments.tensorboard) as heard,
         training(again, quiet=arguments.quiet, heard=heard) as report,

@@ -181,6 +181,9 @@ class ReconstructConfig(Settings):
     background: Literal["auto", "black", "white", "outside"] = setting(
         "auto", "what is behind the object: black, white, or a learnt outside; auto is white with masks, else outside"
     )
+    allow_missing: bool = setting(
+        False, "go on where fewer than half of the photographs have a camera, and without those that are missing"
+    )
     depth_maps: str | None = setting(
         None, "folder with a depth map for each photograph; by default those that the data set names, if it does"
     )

@@ -102,10 +102,11 @@ def check_cloud_path(path: str | Path) -> Path:
         InputError: it is not.
     """
     path = Path(path)
-    if path.is_dir():
-        raise InputError(f"{path}: is a directory; name the point-cloud file in it")
-    if not path.exists():
-        raise InputError(f"{path}: no such file; check the path")
+    with readable(path):
+        if path.is_dir():
+            raise InputError(f"{path}: is a directory; name the point-cloud file in it")
+        if not path.exists():
+            raise InputError(f"{path}: no such file; check the path")
     extension = path.suffix.lower()
     if extension not in CLOUD_SUFFIXES:
         known = ", ".join(CLOUD_SUFFIXES)
