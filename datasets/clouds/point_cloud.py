@@ -28,8 +28,6 @@ __all__ = [
 
 Float64 = NDArray[np.float64]
 
-FARTHEST = 1e150  # a coordinate whose square is still a number
-
 
 @dataclass(frozen=True)
 class PointCloud:
@@ -186,7 +184,7 @@ def voxel_representatives(points: Float64, size: float) -> NDArray[np.int64]:
 def usable_rows(points: NDArray[np.floating]) -> NDArray[np.bool_]:
     """Which points ``(N, 3)`` are usable ``(N,)``: finite, and near enough for the squares of their distances to be."""
     with np.errstate(invalid="ignore"):
-        return np.asarray((np.abs(points) < FARTHEST).all(axis=1))
+        return np.asarray((np.abs(points) < 1e150).all(axis=1))
 
 
 def centred(points: Float64) -> Float64:
