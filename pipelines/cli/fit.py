@@ -44,7 +44,7 @@ DEPTH_FLAGS = (
 def _arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     what = (
-        "PLY, PCD, OBJ, STL, OFF, XYZ, TXT, ASC, CSV, PTS, NPY, NPZ, LAS or LAZ file; a depth map, or a folder of them"
+        "PLY, PCD, E57, OBJ, STL, OFF, XYZ, TXT, ASC, CSV, PTS, NPY, NPZ, LAS or LAZ; a depth map, or a folder of them"
     )
     add("clouds", nargs="+", metavar="CLOUD", help=f"{what}; several clouds get a run each, RUN/NAME")
     add_new_run(parser, "directory of the run, or runs")

@@ -75,7 +75,9 @@ _NAMES = {
     "normals": ("nx ny nz", "xn yn zn", "normal0 normal1 normal2"),
     "colors": ("red green blue", "r g b", "red8 green8 blue8", "r8 g8 b8", "red16 green16 blue16", "r16 g16 b16"),
 }
-_FILLERS = re.compile(r"scalar|diffuse|vertex|point|position|pos|coordinates?|coord|color|colour|channel|value")
+_FILLERS = re.compile(
+    r"scalar|cartesian|diffuse|vertex|point|position|pos|coordinates?|coord|color|colour|channel|value"
+)
 
 
 def _plain(name: str) -> str:

@@ -73,7 +73,7 @@ class _Choice:
 
     def __init__(self, path: Path, drop_noise: bool) -> None:
         self.path, self.drop_noise = path, drop_noise
-        self.names: list[str] = []
+        self.names = ["x", "y", "z"]
         self.points = self.withheld = self.noise = 0
         self.colored = False
 

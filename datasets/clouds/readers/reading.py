@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from ....neural_fields import InputError
 from ...files import readable
 from ..point_cloud import PointCloud, usable_rows
+from .e57 import read_e57
 from .las import LasStream, read_las
 from .meshes import read_obj, read_off, read_stl
 from .pcd import read_pcd
@@ -45,6 +46,7 @@ _TABLES: dict[str, Callable[[Path, str | None], PointCloud]] = {
     ".npy": read_npy,
     ".npz": read_npz,
     ".pcd": read_pcd,
+    ".e57": read_e57,
 }
 _LAS = (".las", ".laz")
 
@@ -56,7 +58,7 @@ def read_cloud(path: str | Path, *, columns: str | None = None, drop_noise: bool
     """Read a point cloud; of a mesh, its vertices with area-weighted vertex normals.
 
     Args:
-        path: a PLY, PCD, OBJ, STL, OFF, XYZ, TXT, ASC, CSV, PTS, NPY, NPZ, LAS or LAZ file.
+        path: a PLY, PCD, E57, OBJ, STL, OFF, XYZ, TXT, ASC, CSV, PTS, NPY, NPZ, LAS or LAZ file.
         columns: names of all columns of a table, where the file does not tell: ``x,y,z,nx,ny,nz,r,g,b,-``.
         drop_noise: whether LAS points of the classes for noise are left out.
 
