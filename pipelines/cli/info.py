@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from ...neural_fields import Siren, levels_of, load_field
-from ..surface.surface import Surface, components, is_closed, read_surface
+from ...neural_fields import Mesh, Siren, load_field
+from ...neural_fields.networks.multiscale import levels_of
+from ..surface.surface import components, is_closed, read_described
 from ..training.config import command_line
 from ..training.folder import RECORD_FILE, find_field, is_field, read_record, resumes_with
 from ..training.trainer import parameter_count
@@ -24,7 +25,7 @@ def describe(path: str | Path) -> str:
     Raises:
         InputError: it is nothing that we can read.
     """
-    rows = _describe_field(Path(path)) if is_field(path) else _describe_surface(read_surface(path))
+    rows = _describe_field(Path(path)) if is_field(path) else _describe_surface(*read_described(path))
     width = max(len(name) for name, _ in rows)
     return "\n".join([str(path), *(f"  {name:<{width}}  {text}".rstrip() for name, text in rows)])
 
@@ -123,7 +124,7 @@ def _describe_signs(signs: dict[str, Any], count: int) -> str:
     return f"{what} (slope along them {signs['slope']:.2f})"
 
 
-def _describe_surface(surface: Surface) -> Rows:
+def _describe_surface(surface: Mesh, reading: str) -> Rows:
     points = surface.used_vertices()
     low, high = points.min(axis=0), points.max(axis=0)
     rows: Rows = []
@@ -135,7 +136,7 @@ def _describe_surface(surface: Surface) -> Rows:
     else:
         rows.append(("kind", "point cloud"))
         rows.append(("points", f"{len(surface.vertices):,}"))
-        rows.append(("read", surface.reading))
+        rows.append(("read", reading))
         rows.append(("normals", "no" if surface.normals is None else "yes"))
     rows.append(("bounds", "  ".join(f"{axis} {a:.9g} … {b:.9g}" for axis, a, b in zip("xyz", low, high, strict=True))))
     rows.append(("diagonal", f"{float(np.linalg.norm(high - low)):.6g}"))

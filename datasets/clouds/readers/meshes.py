@@ -177,7 +177,7 @@ def strips(lengths: Int64, corners: Int64) -> Int64:
     return faces[(a != b) & (b != c) & (a != c)]  # repeated corners join strips and have no area
 
 
-def vertex_normals(vertices: Float64, faces: Int64) -> NDArray[np.float32]:
+def vertex_normals(vertices: Float64, faces: NDArray[np.integer]) -> NDArray[np.float32]:
     """Area-weighted vertex normals ``(N, 3)``, of unit length; zero where no face with an area meets.
 
     Vertices at the same place count as one, so seams of texture coordinates do not split the normals.

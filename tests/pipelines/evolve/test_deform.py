@@ -9,7 +9,9 @@ from pathlib import Path
 import pytest
 import torch
 from evolutions import BRIEF, few_points
-from mplicits.neural_fields import CarriedKeyframes, Keyframes, VelocitySiren, at_time, flow, load_field
+from mplicits.neural_fields import at_time, flow, load_field
+from mplicits.neural_fields.spacetime.moving import Keyframes
+from mplicits.neural_fields.spacetime.velocity import CarriedKeyframes, VelocitySiren
 from mplicits.pipelines.evolve import deform
 from mplicits.pipelines.evolve.deform import carried_samples, learn_motion, match
 from mplicits.pipelines.evolve.shapes import read_shape
