@@ -271,7 +271,7 @@ def decode_image(data: bytes) -> NDArray[Any]:
     try:
         return np.asarray(iio.imread(data, plugin="pillow"))
     except Exception as error:  # Pillow's readers raise whatever they trip over
-        raise ValueError("not of a known kind, or damaged") from error
+        raise ValueError("not an image that can be read") from error
 
 
 def _check_pixels(data: bytes) -> None:
