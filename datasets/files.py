@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import functools
+import io
 import json
 import math
 import os
+import stat
+import struct
 import threading
+import warnings
 import zipfile
 import zlib
 from collections.abc import Callable, Iterable, Iterator
@@ -43,7 +47,7 @@ R = TypeVar("R")
 # An archive may hold this many times its own bytes and more than MODEST, and no more: points do not shrink so much.
 MOST_UNPACKED, MODEST = 200, 256 << 20
 
-DAMAGED_ARRAYS = (ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error)
+DAMAGED_ARRAYS = (ValueError, EOFError, KeyError, NotImplementedError, zipfile.BadZipFile, zlib.error)
 """What NumPy's loaders raise on files that are not whole, or not theirs."""
 
 
@@ -62,6 +66,10 @@ def readable(path: Path, *, missing: str = "check the path") -> Iterator[None]:
     """
     with damage(path, "export it again"), _silence:
         try:
+            with suppress(FileNotFoundError, NotADirectoryError):
+                mode = path.stat().st_mode
+                if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+                    raise InputError(f"{path}: is a pipe or a device, and no file; copy what it gives to a file")
             yield
         except FileNotFoundError as error:
             raise InputError(f"{error.filename or path}: no such file; {missing}") from None
@@ -125,7 +133,7 @@ def read_json(path: Path, *, missing: str = "check the path") -> Any:
     with readable(path, missing=missing):
         data = path.read_bytes()
     try:
-        return json.loads(data.decode("utf-8"))
+        return json.loads(data.decode("utf-8-sig"))
     except ValueError as error:  # both of JSON and of UTF-8
         raise InputError(f"{path}: is not JSON ({error}); export it again") from error
 
@@ -219,7 +227,8 @@ def read_image(path: Path) -> NDArray[Any]:
     try:
         return decode_image(data)
     except ValueError as error:
-        raise InputError(f"{path}: cannot be decoded as an image; export it again") from error
+        extra = "pip install 'mplicits[heic]', or " if path.suffix.lower() in (".heic", ".heif") else ""
+        raise InputError(f"{path}: cannot be decoded as an image ({error}); {extra}export it again") from error
 
 
 def read_rgb(path: Path) -> tuple[NDArray[Any], NDArray[Any] | None]:
@@ -242,6 +251,7 @@ def decode_image(data: bytes) -> NDArray[Any]:
     Raises:
         ValueError: it is no image, or of a kind that is not read.
     """
+    _check_pixels(data)
     # imread would not say why it fails, and has trouble with names that are not ASCII.
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
@@ -254,10 +264,34 @@ def decode_image(data: bytes) -> NDArray[Any]:
         return stored
     import imageio.v3 as iio  # here: loading it takes a fifth of a second, and what OpenCV does not know (TGA) is rare
 
+    with suppress(ImportError):
+        import pillow_heif
+
+        pillow_heif.register_heif_opener()
     try:
         return np.asarray(iio.imread(data, plugin="pillow"))
     except Exception as error:  # Pillow's readers raise whatever they trip over
         raise ValueError("not an image that can be read") from error
+
+
+def _check_pixels(data: bytes) -> None:
+    """Refuse an image whose header claims far more pixels than its bytes can hold, before they are allocated.
+
+    Raises:
+        ValueError: it has more than 32 million pixels, and more than 50 for each byte.
+    """
+    width = height = 0
+    if data[:8] == b"\x89PNG\r\n\x1a\n" and len(data) > 24:
+        width, height = struct.unpack_from(">II", data, 16)
+    elif len(data) > 8:
+        from PIL import Image
+
+        with suppress(Exception), warnings.catch_warnings():  # Pillow's readers raise whatever they trip over
+            warnings.simplefilter("ignore")
+            with Image.open(io.BytesIO(data)) as image:
+                width, height = image.size
+    if width * height > max(32_000_000, 50 * len(data)):
+        raise ValueError(f"{width} × {height} pixels in {len(data)} bytes")
 
 
 def rgb_and_alpha(stored: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any] | None]:

@@ -1,5 +1,6 @@
 """What the tests of evolutions share: small settings, a fit that takes no time, bad input."""
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -48,8 +49,7 @@ def few_points(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(evolve_problem, "END_POINTS", 1000)
     patch.setattr(evolve_problem, "REACH_POINTS", 200)
     patch.setattr(evolve_checks, "END_RESOLUTION", 32)
-    patch.setattr(deform, "MATCHED", 200)
-    patch.setattr(deform, "POOL", 2000)
+    patch.setattr(deform, "MOTION", dataclasses.replace(deform.MOTION, matched=200, pool=2000))
 
 
 def ball(path: Path, radius: float, *, levels: bool = False) -> None:

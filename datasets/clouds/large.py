@@ -16,13 +16,13 @@ import math
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from .point_cloud import PointCloud, begins, colors_from, normals_from, unit_rows, usable_rows
+from .point_cloud import PointCloud, begins, color_scale, colors_from, normals_from, unit_rows, usable_rows
 from .readers.stream import CloudStream
 
 __all__ = ["Merging", "merge_cloud"]
@@ -30,16 +30,19 @@ __all__ = ["Merging", "merge_cloud"]
 Float64 = NDArray[np.float64]
 Keys = NDArray[np.int64]
 
-# Points read at once; they and all that is worked out from them take about 200 MiB.
-ROWS = 1 << 19
-# Points that the size of the voxels is estimated from.
-SAMPLE = 200_000
-# A key is three cell numbers of so many bits and one of seven directions, which fills an int64.
-BITS = 20
-# Voxels that may follow each other along a normal before the next counts as another surface.
-RUN = 16
-# The direction of a point without a normal.
-NOWHERE = 6
+
+@dataclass(frozen=True)
+class MergeOptions:
+    """How points are gathered in voxels."""
+
+    rows: int = 1 << 19  # points read at once; with all that is worked out from them about 200 MiB
+    sample: int = 200_000  # points that the size of the voxels is estimated from
+    bits: int = 20  # of a cell number; a key of three and one of seven directions fills an int64
+    run: int = 16  # voxels that follow each other along a normal before the next counts as another surface
+    nowhere: int = 6  # the direction of a point without a normal
+
+
+MERGE = MergeOptions()
 
 
 @dataclass(frozen=True)
@@ -79,7 +82,8 @@ class _Survey(NamedTuple):
         finite: how many there are.
         sample: ``(M, 3)`` offsets of some of them, evenly chosen.
         normals: whether there are any.
-        brightest: the largest colour number; None without colours.
+        scale: the number of full brightness, see `color_scale`; None without colours.
+        read: how many points were read at all.
     """
 
     low: Float64
@@ -87,7 +91,8 @@ class _Survey(NamedTuple):
     finite: int
     sample: Float64
     normals: bool
-    brightest: float | None
+    scale: float | None
+    read: int
 
 
 class _Groups(NamedTuple):
@@ -137,13 +142,14 @@ def merge_cloud(
     cloud = PointCloud(
         rows[:, 1:4] / count + frame.low,
         unit_rows(rows[:, 4:7]).astype(np.float32) if frame.normals else None,
-        None if frame.brightest is None else (rows[:, 7:10] / count).clip(0, 1).astype(np.float32),
+        None if frame.scale is None else (rows[:, 7:10] / count).clip(0, 1).astype(np.float32),
         stream.source,
+        reading=stream.reading,
     )
     return cloud, Merging(
-        read=stream.count,
+        read=frame.read,
         kept=len(cloud),
-        dropped_nan=stream.count - frame.finite,
+        dropped_nan=frame.read - frame.finite,
         dropped_isolated=round(float(before - count.sum())),
         voxel=size,
         seconds=round(time.monotonic() - started, 3),
@@ -152,10 +158,11 @@ def merge_cloud(
 
 def _survey(stream: CloudStream) -> _Survey:
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
-    finite, normals, brightest = 0, False, None
-    stride = 1 + stream.count // SAMPLE
+    read, finite, normals = 0, 0, False
+    stride = 1 + stream.count // MERGE.sample
     samples: list[Float64] = []
-    for piece in stream.pieces(ROWS):
+    colors: list[NDArray[Any]] = []
+    for piece in stream.pieces(MERGE.rows):
         points = piece.points.astype(np.float64)
         points = points[usable_rows(points)]
         if len(points):
@@ -163,9 +170,11 @@ def _survey(stream: CloudStream) -> _Survey:
         finite, normals = finite + len(points), piece.normals is not None
         samples.append(points[::stride].copy())
         if piece.colors is not None:
-            brightest = max(brightest or 0.0, float(np.nan_to_num(piece.colors, posinf=0, neginf=0).max(initial=0)))
+            colors.append(piece.colors[::stride].copy())
+        read += len(piece.points)
     extent = float((high - low).max()) if finite else 0.0
-    return _Survey(low, extent, finite, np.concatenate(samples) - low, normals, brightest)
+    scale = color_scale(np.concatenate(colors)) if colors else None
+    return _Survey(low, extent, finite, np.concatenate(samples) - low, normals, scale, read)
 
 
 def _first_size(frame: _Survey, limit: int, *, each: int = 20) -> float:
@@ -175,7 +184,7 @@ def _first_size(frame: _Survey, limit: int, *, each: int = 20) -> float:
     meets goes with one over their edge squared.
     """
     size, found = frame.extent, 1
-    while found * each < len(frame.sample) and size > frame.extent / 2**BITS:
+    while found * each < len(frame.sample) and size > frame.extent / 2**MERGE.bits:
         size /= 2
         found = len(np.unique(_cell_keys(frame.sample, size)))
     return size * math.sqrt(found / (0.5 * limit))
@@ -183,8 +192,8 @@ def _first_size(frame: _Survey, limit: int, *, each: int = 20) -> float:
 
 def _grouped(stream: CloudStream, frame: _Survey, size: float, limit: int) -> tuple[_Groups, float]:
     """Sums of all points by voxel and direction, and the edge of the voxels, doubled whenever there are too many."""
-    size = max(size, frame.extent / ((1 << BITS) - 2))
-    groups = _Groups(np.empty(0, np.int64), np.empty((0, 7 if frame.brightest is None else 10)))
+    size = max(size, frame.extent / ((1 << MERGE.bits) - 2))
+    groups = _Groups(np.empty(0, np.int64), np.empty((0, 7 if frame.scale is None else 10)))
     for offsets, normals, colors in _pieces(stream, frame):
         keys = _cell_keys(offsets, size) << 3 | _directions(normals)
         ones = np.ones((len(keys), 1))
@@ -198,29 +207,29 @@ def _grouped(stream: CloudStream, frame: _Survey, size: float, limit: int) -> tu
 
 def _pieces(stream: CloudStream, frame: _Survey) -> Iterator[tuple[Float64, Float64, Float64]]:
     """Offsets, unit normals (zero where unusable) and colours (of no columns without any) of the finite points."""
-    for piece in stream.pieces(ROWS):
+    for piece in stream.pieces(MERGE.rows):
         points = piece.points.astype(np.float64)
         finite = usable_rows(points)
         count = int(finite.sum())
         normals = np.zeros((count, 3)) if piece.normals is None else unit_rows(normals_from(piece.normals[finite]))
-        if piece.colors is None or frame.brightest is None:
+        if piece.colors is None or frame.scale is None:
             colors = np.empty((count, 0))
         else:
-            colors = colors_from(piece.colors[finite], brightest=frame.brightest).astype(np.float64)
+            colors = colors_from(piece.colors[finite], scale=frame.scale).astype(np.float64)
         yield points[finite] - frame.low, normals, colors
 
 
 def _cell_keys(offsets: Float64, size: float) -> Keys:
-    """One number per cell: three of ``BITS`` bits each."""
+    """One number per cell: three of ``bits`` bits each."""
     x, y, z = (np.floor(axis / size).astype(np.int64) for axis in offsets.T)
-    return (x << BITS | y) << BITS | z
+    return (x << MERGE.bits | y) << MERGE.bits | z
 
 
 def _directions(normals: Float64) -> Keys:
-    """0 to 5 for normals closest to +x, −x, +y, −y, +z, −z; `NOWHERE` for a normal of no length: ``(n,)``."""
+    """0 to 5 for normals closest to +x, −x, +y, −y, +z, −z; `nowhere` for a normal of no length: ``(n,)``."""
     axis = np.abs(normals).argmax(axis=1)
     along = np.take_along_axis(normals, axis[:, None], axis=1)[:, 0]
-    return np.where(along == 0, NOWHERE, 2 * axis + (along < 0))
+    return np.where(along == 0, MERGE.nowhere, 2 * axis + (along < 0))
 
 
 def _summed(keys: Keys, values: Float64) -> _Groups:
@@ -234,32 +243,32 @@ def _summed(keys: Keys, values: Float64) -> _Groups:
 
 
 def _cells(keys: Keys) -> tuple[Keys, Keys, Keys]:
-    mask = (1 << BITS) - 1
-    return keys >> (3 + 2 * BITS) & mask, keys >> (3 + BITS) & mask, keys >> 3 & mask
+    mask = (1 << MERGE.bits) - 1
+    return keys >> (3 + 2 * MERGE.bits) & mask, keys >> (3 + MERGE.bits) & mask, keys >> 3 & mask
 
 
 def _coarser(groups: _Groups) -> _Groups:
     """The same points in voxels of twice the edge."""
     x, y, z = (cell >> 1 for cell in _cells(groups.keys))
-    return _summed(((x << BITS | y) << BITS | z) << 3 | groups.keys & 7, groups.sums)
+    return _summed(((x << MERGE.bits | y) << MERGE.bits | z) << 3 | groups.keys & 7, groups.sums)
 
 
 def _along_normals(groups: _Groups) -> Float64:
     """Join voxels that follow each other along the axis that their points face → sums, as in `_Groups`."""
     direction, cells = groups.keys & 7, _cells(groups.keys)
-    joined = [groups.sums[direction == NOWHERE]]
+    joined = [groups.sums[direction == MERGE.nowhere]]
     for axis in range(3):
         rows = np.flatnonzero(direction >> 1 == axis)
         if len(rows) == 0:
             continue
         along, (u, v) = cells[axis][rows], (cells[other][rows] for other in range(3) if other != axis)
         # Numbers one apart are neighbours in one column, facing the same way; the last cell number is never used.
-        columns = ((u << BITS | v) << 1 | direction[rows] & 1) << BITS | along
+        columns = ((u << MERGE.bits | v) << 1 | direction[rows] & 1) << MERGE.bits | along
         order = np.argsort(columns, kind="stable")
         first = begins(columns[order], step=1)
         place = np.arange(len(rows))
         place -= np.maximum.accumulate(np.where(first, place, 0))
-        starts = np.flatnonzero(place % RUN == 0)
+        starts = np.flatnonzero(place % MERGE.run == 0)
         joined.append(np.add.reduceat(groups.sums[rows[order]], starts, axis=0))
     return np.concatenate(joined)
 
@@ -304,7 +313,7 @@ def _without_isolated(groups: _Groups, factor: float) -> _Groups:
     for x in (-1, 0, 1):
         for y in (-1, 0, 1):
             for z in (-1, 0, 1):
-                shifted = voxels.keys[few] + (((x << BITS) + y) << BITS) + z
+                shifted = voxels.keys[few] + (((x << MERGE.bits) + y) << MERGE.bits) + z
                 at = np.searchsorted(voxels.keys, shifted).clip(max=len(counts) - 1)
                 around += np.where(voxels.keys[at] == shifted, counts[at], 0)
     isolated = voxels.keys[few[around * factor < usual]]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -14,8 +13,8 @@ __all__ = [
     "PointCloud",
     "begins",
     "centred",
+    "color_scale",
     "colors_from",
-    "columns_of",
     "middle_of",
     "normals_from",
     "select",
@@ -29,14 +28,6 @@ __all__ = [
 
 Float64 = NDArray[np.float64]
 
-FARTHEST = 1e150  # a coordinate whose square is still a number
-
-NAMES = {  # of columns, as files have them; what comes first counts
-    "points": (("x", "y", "z"), ("px", "py", "pz")),
-    "normals": (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"), ("NormalX", "NormalY", "NormalZ")),
-    "colors": (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b")),
-}
-
 
 @dataclass(frozen=True)
 class PointCloud:
@@ -48,6 +39,7 @@ class PointCloud:
         colors: ``(N, 3)`` float32 in [0, 1], or None.
         source: what messages call this cloud; the file's path, say.
         normals_source: whether the normals stood in the file or were computed from its faces.
+        reading: one line about what was read from a file, and what was not.
 
     Raises:
         ValueError: an array has the wrong shape or a colour lies outside [0, 1].
@@ -58,6 +50,7 @@ class PointCloud:
     colors: NDArray[np.float32] | None = None
     source: str = "point cloud"
     normals_source: Literal["file", "mesh"] = "file"
+    reading: str = ""
 
     def __post_init__(self) -> None:
         points = np.asarray(self.points, np.float64)
@@ -79,33 +72,42 @@ class PointCloud:
         return len(self.points)
 
 
-def columns_of(names: Collection[str], what: str) -> tuple[str, str, str] | None:
-    """Which of the columns of a file hold its "points", "normals" or "colors"; None if none do."""
-    return next((triple for triple in NAMES[what] if all(name in names for name in triple)), None)
-
-
 def normals_from(values: NDArray[Any]) -> NDArray[np.float32]:
     """Normals as files store them → float32; signed integers of b bits are fractions of 2^(b-1) - 1."""
     scale = np.iinfo(values.dtype).max if np.issubdtype(values.dtype, np.signedinteger) else 1
     return (values / np.float64(scale)).astype(np.float32)
 
 
-def colors_from(values: NDArray[Any], *, brightest: float | None = None) -> NDArray[np.float32]:
-    """Colours as files store them → float32 in [0, 1].
+def color_scale(values: NDArray[Any]) -> float:
+    """The number that stands for full brightness: 1, 255 or 65535.
 
-    Numbers up to 1 in a floating-point type are taken as they are, up to 255 as bytes, beyond that as
-    16-bit numbers; an 8-bit type is always over 255. A colour that is not a number becomes black.
+    Bytes have 255. Other numbers are judged by all but the largest thousandth of an even sample, so that single strays
+    change nothing: fractions up to 2 have 1, and whole numbers the least of 255 and 65535 that holds them.
+
+    Args:
+        values: ``(N, 3)`` as files store them.
+    """
+    if values.dtype == np.uint8:
+        return 255.0
+    some = values[:: 1 + len(values) // 100_000].astype(np.float64)
+    some = np.sort(some[np.isfinite(some)])
+    most = some[(len(some) - 1) * 999 // 1000] if len(some) else 0.0
+    if values.dtype.kind == "f" and most <= 2 and (some.max(initial=0) <= 1 or bool((some % 1 != 0).any())):
+        return 1.0
+    return 255.0 if most <= 255 else 65535.0
+
+
+def colors_from(values: NDArray[Any], *, scale: float | None = None) -> NDArray[np.float32]:
+    """Colours as files store them → float32 in [0, 1]; a colour that is not a number becomes black.
 
     Args:
         values: the numbers.
-        brightest: the largest of all, if these are only some.
+        scale: of full brightness, if these are only some of them; see `color_scale`.
     """
+    scale = color_scale(values) if scale is None else scale
     if values.dtype == np.uint8:
-        return (values / np.float32(255)).astype(np.float32)
+        return (values / np.float32(scale)).astype(np.float32)
     finite = np.nan_to_num(values.astype(np.float64), nan=0.0, posinf=0.0, neginf=0.0)
-    largest = finite.max(initial=0.0) if brightest is None else brightest
-    integral = np.issubdtype(values.dtype, np.integer)
-    scale = 1.0 if largest <= 1 and not integral else 255.0 if largest <= 255 else 65535.0
     return (finite / scale).clip(0, 1).astype(np.float32)
 
 
@@ -125,6 +127,7 @@ def select(cloud: PointCloud, index: NDArray[np.integer] | NDArray[np.bool_]) ->
         None if cloud.colors is None else cloud.colors[index],
         cloud.source,
         cloud.normals_source,
+        cloud.reading,
     )
 
 
@@ -181,7 +184,7 @@ def voxel_representatives(points: Float64, size: float) -> NDArray[np.int64]:
 def usable_rows(points: NDArray[np.floating]) -> NDArray[np.bool_]:
     """Which points ``(N, 3)`` are usable ``(N,)``: finite, and near enough for the squares of their distances to be."""
     with np.errstate(invalid="ignore"):
-        return np.asarray((np.abs(points) < FARTHEST).all(axis=1))
+        return np.asarray((np.abs(points) < 1e150).all(axis=1))
 
 
 def centred(points: Float64) -> Float64:

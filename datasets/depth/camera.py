@@ -3,24 +3,24 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+import yaml
 from numpy.typing import NDArray
 from torch import Tensor
 
 from ...neural_fields import InputError
 from ..cameras import COEFFICIENTS, Camera, intrinsics, pinhole_intrinsics
-from ..files import finite_number, read_json, reader
+from ..files import finite_number, read_json, readable, reader
 
 __all__ = ["DepthCamera", "read_intrinsics"]
 
 Float64 = NDArray[np.float64]
-
-MODELLED = 5  # of the coefficients, in depth cameras; lenses with others are not read
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class DepthCamera:
         for name, value in (
             ("cx", self.cx),
             ("cy", self.cy),
-            *zip(COEFFICIENTS[:MODELLED], self.distortion, strict=True),
+            *zip(COEFFICIENTS[:5], self.distortion, strict=True),
         ):
             if not math.isfinite(value):
                 raise ValueError(f"{name}={value}: expected a finite number")
@@ -118,37 +118,49 @@ class DepthCamera:
 
 
 @reader
-def read_intrinsics(path: str | Path) -> DepthCamera:
-    """Read the intrinsics of a depth camera from JSON.
+def read_intrinsics(path: str | Path, *, size: tuple[int, int] | None = None) -> DepthCamera:
+    """Read the intrinsics of a depth camera.
 
-    - ours: ``width``, ``height``, ``fx``, ``fy``, ``cx``, ``cy``, and if known ``depth_scale`` and the distortion
-      ``k1``, ``k2``, ``p1``, ``p2``, ``k3``;
-    - Open3D's: ``width``, ``height`` and ``intrinsic_matrix``, nine numbers column by column.
+    - JSON and YAML: ``width``, ``height``, ``fx``, ``fy``, ``cx``, ``cy``, and if known ``depth_scale`` and the
+      distortion ``k1``, ``k2``, ``p1``, ``p2``, ``k3`` (ours, and Polycam's); or with a matrix in the place of the
+      four numbers, by rows or by columns: Open3D's intrinsics and camera parameters, Record3D's metadata, ROS's
+      camera information and OpenCV's calibration.
+    - text: four numbers fx fy cx cy, or a matrix of 3 × 3 or more.
+
+    Args:
+        path: the file.
+        size: width and height of the images, where the file does not say.
 
     Raises:
-        InputError: the file is missing or no such JSON, or a field is missing or not a number that it can be.
+        InputError: the file is missing or none of these, or a field is missing or not a number that it can be.
     """
     path = Path(path)
-    content = read_json(path, missing="check the path, or give --intrinsics FX FY CX CY")
+    fix = "give --intrinsics FX FY CX CY in pixels"
+    if path.suffix.lower() == ".json":
+        content = read_json(path, missing=f"check the path, or {fix}")
+    else:
+        with readable(path, missing=f"check the path, or {fix}"):
+            text = path.read_bytes().decode("utf-8-sig", "replace")
+        content = _from_text(text, path)
     if not isinstance(content, dict):
-        raise InputError(f"{path}: expected an object with width, height, fx, fy, cx and cy")
-    if "intrinsic_matrix" in content:
-        content = {**content, **_open3d(content["intrinsic_matrix"], path)}
-    missing = [name for name in ("width", "height", "fx", "fy", "cx", "cy") if content.get(name) is None]
+        raise InputError(f"{path}: expected width, height, fx, fy, cx and cy, or a 3 × 3 matrix; or {fix}")
+    fields = _fields({} if size is None else {"width": size[0], "height": size[1]}, content, path)
+    missing = [name for name in _FIELDS if fields.get(name) is None]
     if missing:
-        raise InputError(f"{path}: {', '.join(missing)}: missing; add {'it' if len(missing) == 1 else 'them'}")
+        add = "it" if len(missing) == 1 else "them"
+        raise InputError(f"{path}: {', '.join(missing)}: missing; add {add}, or {fix}")
     numbers = {
-        name: finite_number(content[name], f"{path}: {name}")
-        for name in ("width", "height", "fx", "fy", "cx", "cy", "depth_scale", *COEFFICIENTS)
-        if content.get(name) is not None
+        name: finite_number(fields[name], f"{path}: {name}")
+        for name in (*_FIELDS, "depth_scale", *COEFFICIENTS)
+        if fields.get(name) is not None
     }
-    for name in COEFFICIENTS[MODELLED:]:
+    for name in COEFFICIENTS[5:]:
         if numbers.get(name):
             raise InputError(f"{path}: {name}: lenses with k4 to k6 are not supported; undistort the images first")
     for name in ("width", "height"):
         if not numbers[name].is_integer():
             raise InputError(f"{path}: {name}: {numbers[name]:g}; expected a whole number of pixels")
-    k1, k2, p1, p2, k3 = (numbers.get(name, 0.0) for name in COEFFICIENTS[:MODELLED])
+    k1, k2, p1, p2, k3 = (numbers.get(name, 0.0) for name in COEFFICIENTS[:5])
     try:
         return DepthCamera(
             int(numbers["width"]),
@@ -161,10 +173,61 @@ def read_intrinsics(path: str | Path) -> DepthCamera:
         raise InputError(f"{path}: {error}") from error
 
 
-def _open3d(matrix: Any, path: Path) -> dict[str, Any]:
-    if not isinstance(matrix, list) or len(matrix) != 9:
-        raise InputError(f"{path}: intrinsic_matrix: expected nine numbers, column by column")
-    fx, low, a, skew, fy, b, cx, cy, one = (finite_number(value, f"{path}: intrinsic_matrix") for value in matrix)
-    if any((low, a, skew, b)) or one != 1:
-        raise InputError(f"{path}: intrinsic_matrix: {matrix}; expected [fx, 0, 0, 0, fy, 0, cx, cy, 1]")
+_FIELDS = ("width", "height", "fx", "fy", "cx", "cy")
+_OTHER_NAMES = {"w": "width", "h": "height", "image_width": "width", "image_height": "height"}
+_MATRICES = ("intrinsic_matrix", "camera_matrix", "K", "k", "matrix")
+_DISTORTIONS = ("distortion_coefficients", "dist_coeffs", "D", "d")
+
+
+def _from_text(text: str, path: Path) -> Any:
+    """YAML with names, or bare numbers."""
+    words = re.sub(r"#.*", "", text).replace(",", " ").split()
+    try:
+        numbers = [float(word) for word in words]
+    except ValueError:
+        plain = re.sub(r"^%YAML.*$|!!opencv-matrix", "", text, flags=re.MULTILINE)
+        try:
+            return yaml.safe_load(plain)
+        except yaml.YAMLError as error:
+            reason = " ".join(str(error).split())[:80]
+            raise InputError(f"{path}: neither numbers nor YAML ({reason}); give --intrinsics FX FY CX CY") from error
+    if len(numbers) == 4:
+        return dict(zip(("fx", "fy", "cx", "cy"), numbers, strict=True))
+    return {"matrix": numbers}
+
+
+def _fields(known: dict[str, Any], content: dict[str, Any], path: Path) -> dict[str, Any]:
+    """The fields of a file under our names, over those that are known already."""
+    if isinstance(content.get("intrinsic"), dict):
+        content = {**content, **content["intrinsic"]}
+    fields = {**known, **{_OTHER_NAMES.get(name, name): value for name, value in content.items()}}
+    for name in (name for name in _MATRICES if content.get(name) is not None):
+        fields |= _matrix(_flat(content[name]), f"{path}: {name}")
+    for name in (name for name in _DISTORTIONS if content.get(name) is not None):
+        model = str(content.get("distortion_model", "plumb_bob"))
+        coefficients = _flat(content[name])
+        if model not in ("plumb_bob", "rational_polynomial") and any(coefficients):
+            raise InputError(f"{path}: distortion_model: {model}: no pinhole; undistort the images first")
+        fields |= dict(zip(COEFFICIENTS, coefficients, strict=False))
+    return fields
+
+
+def _flat(value: Any) -> list[Any]:
+    """The numbers of lists in lists, or of a matrix with its ``data``."""
+    value = value.get("data") if isinstance(value, dict) else value
+    return [x for row in value for x in _flat(row)] if isinstance(value, list) else [value]
+
+
+def _matrix(numbers: list[Any], named: str) -> dict[str, float]:
+    """fx, fy, cx and cy of a matrix by rows or columns: 3 × 3, 3 × 4 or 4 × 4."""
+    values = np.array([finite_number(number, named) for number in numbers])
+    expected = f"{named}: {values.tolist()}; expected fx 0 cx, 0 fy cy, 0 0 1, by rows or by columns"
+    if len(values) not in (9, 12, 16):
+        raise InputError(expected)
+    matrix = values.reshape(4 if len(values) == 16 else 3, -1)[:3]
+    if len(values) == 9 and matrix[2, :2].any():
+        matrix = matrix.T
+    (fx, skew, cx), (a, fy, cy), last = matrix[:, :3].tolist()
+    if skew or a or last != [0, 0, 1] or matrix[:, 3:].any():
+        raise InputError(expected)
     return {"fx": fx, "fy": fy, "cx": cx, "cy": cy}

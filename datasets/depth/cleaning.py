@@ -6,6 +6,7 @@ Everything here works on the grid of pixels. Where there is no reading, depth is
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import cv2
@@ -27,10 +28,18 @@ __all__ = [
 Float64 = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-MAX_RADIUS = 12  # pixels; beyond that smoothing rounds off what the sensor did see
-BLOCKS = (2, 4)  # sides in pixels of the blocks over which noise may be alike
-ALIKE = 2.0  # averages of blocks have so many times the noise that they would have if it were independent
-LEAST_NOISE = 1e-4  # for readings without any noise, whose smoothing somebody asks for
+
+@dataclass(frozen=True)
+class SmoothingOptions:
+    """How noise of depth maps is measured and smoothed."""
+
+    max_radius: int = 12  # pixels; beyond that smoothing rounds off what the sensor did see
+    blocks: tuple[int, int] = (2, 4)  # sides in pixels of the blocks over which noise may be alike
+    alike: float = 2.0  # averages of blocks have so many times the noise that they would have if it were independent
+    least_noise: float = 1e-4  # for readings without any noise, whose smoothing somebody asks for
+
+
+SMOOTHING = SmoothingOptions()
 
 
 def _breaks(depth: Float64, axis: int, *, pixel_angle: float, jump: float, incidence: float) -> Mask:
@@ -127,11 +136,13 @@ def measure_noise(depth: Float64, *, pixel_angle: float, jump: float = 0.01) -> 
     found = Noise(fine, smoothing_radius(fine, pixel_angle), patchy=False)
     if not found.radius:  # what is left is shape
         return found
-    for side in BLOCKS:
+    for side in SMOOTHING.blocks:
         coarse = noise_of(_block_means(depth, side), jump=jump)
-        if side * coarse > ALIKE * fine:
+        if side * coarse > SMOOTHING.alike * fine:
             radius = side * smoothing_radius(coarse, side * pixel_angle)
-            found = Noise(max(found.deviation, coarse), min(max(found.radius, radius), MAX_RADIUS), patchy=True)
+            found = Noise(
+                max(found.deviation, coarse), min(max(found.radius, radius), SMOOTHING.max_radius), patchy=True
+            )
     return found
 
 
@@ -147,15 +158,15 @@ def smoothing_radius(noise: float, pixel_angle: float, *, tilt: float = 3.0) -> 
 
     The slope of a plane through (2r + 1)² readings of noise σ one pixel apart has the standard deviation
     ``σ √(3 / (r (r + 1) (2r + 1)²))``; a pixel is ``pixel_angle`` times the depth wide. 0 where single
-    differences do (σ / √2), and at most `MAX_RADIUS`.
+    differences do (σ / √2), and at most `max_radius`.
     """
     limit = math.tan(math.radians(tilt)) * pixel_angle
     if noise / math.sqrt(2) <= limit:
         return 0
-    for radius in range(1, MAX_RADIUS):
+    for radius in range(1, SMOOTHING.max_radius):
         if noise * math.sqrt(3 / (radius * (radius + 1) * (2 * radius + 1) ** 2)) <= limit:
             return radius
-    return MAX_RADIUS
+    return SMOOTHING.max_radius
 
 
 def smooth_depth(
@@ -189,7 +200,7 @@ def smooth_depth(
     scale = float(np.median(depth[known]))
     relative = np.where(known, depth / scale, 1.0)
     guide = np.zeros((*depth.shape, 3), np.float32)
-    guide[..., 0] = np.log(relative) / (3 * max(noise, LEAST_NOISE))
+    guide[..., 0] = np.log(relative) / (3 * max(noise, SMOOTHING.least_noise))
     if color is not None:
         red, green, blue = np.moveaxis(color.astype(np.float32), 2, 0)
         guide[..., 1] = (0.299 * red + 0.587 * green + 0.114 * blue) / contrast

@@ -27,11 +27,19 @@ Float64 = NDArray[np.float64]
 Int32 = NDArray[np.int32]
 Int64 = NDArray[np.int64]
 
-TYPICAL = 0.99  # share of the points that are nearer than what is called typical
-STRAY = 1.5  # what is further away than so many times that makes everything else coarse
-TOLERANCE = 0.03  # of the depth: a point this much nearer than what a frame sees there is in its way
-WITNESSES = 12  # frames that are asked about each point, so that long sequences take linear time
-ROOM = 2  # times as many points as will stay are kept until all frames have been asked about them
+
+@dataclass(frozen=True)
+class FusionOptions:
+    """How depth maps are joined."""
+
+    typical: float = 0.99  # share of the points that are nearer than what is called typical
+    stray: float = 1.5  # what is further away than so many times that makes everything else coarse
+    tolerance: float = 0.03  # of the depth: a point this much nearer than what a frame sees there is in its way
+    witnesses: int = 12  # frames that are asked about each point, so that long sequences take linear time
+    room: int = 2  # times as many points as will stay are kept until all frames have been asked about them
+
+
+FUSION = FusionOptions()
 
 
 @dataclass(frozen=True)
@@ -127,7 +135,7 @@ class DepthReport:
             f"{maps}: {self.kept:,} points of {self.pixels:,} pixels" + (f"; dropped {parts}" if parts else ""),
             f"depths {self.nearest:.4g} to {self.furthest:.4g} units, noise {self.noise:.2%}, {smoothing}",
         ]
-        if self.furthest > STRAY * self.typical:
+        if self.furthest > FUSION.stray * self.typical:
             limit = f"--max-depth {1.05 * self.typical:.2g}"
             lines.append(f"hint: 99 % of the points are nearer than {self.typical:.3g}; {limit} makes them finer")
         return "\n".join(lines)
@@ -188,7 +196,7 @@ def frame_cloud(frame: RgbdFrame, settings: DepthSettings | None = None) -> tupl
         smoothing=radius,
         nearest=float(depth[kept].min()),
         furthest=float(depth[kept].max()),
-        typical=float(np.quantile(depth[kept], TYPICAL)),
+        typical=float(np.quantile(depth[kept], FUSION.typical)),
     )
     return cloud, report
 
@@ -197,8 +205,8 @@ def fuse_frames(
     frames: Iterable[RgbdFrame],
     settings: DepthSettings | None = None,
     *,
-    tolerance: float = TOLERANCE,
-    witnesses: int = WITNESSES,
+    tolerance: float = FUSION.tolerance,
+    witnesses: int = FUSION.witnesses,
 ) -> tuple[PointCloud, DepthReport]:
     """Join depth maps in world coordinates; one frame alone is fine.
 
@@ -266,9 +274,9 @@ class _Pool:
         self.clouds.append(thin(cloud, self.settings.max_points))
         self.owners.append(np.full(len(self.clouds[-1]), self.frames, np.int32))
         self.frames += 1
-        if sum(map(len, self.clouds)) > 2 * ROOM * self.settings.max_points:
+        if sum(map(len, self.clouds)) > 2 * FUSION.room * self.settings.max_points:
             cloud, owner = self.joined()
-            kept = spread(cloud.points, ROOM * self.settings.max_points)
+            kept = spread(cloud.points, FUSION.room * self.settings.max_points)
             self.clouds, self.owners = [select(cloud, kept)], [owner[kept]]
         return report
 

@@ -1,21 +1,23 @@
-"""``RgbdFrame``: a depth map, its lens, its colours and where it was seen from, each from its file.
-
-Poses are those of Open3D's trajectory.log, or of the JSON files that `read_cameras` knows.
-"""
+"""``RgbdFrame``: a depth map, its lens, its colours and where it was seen from, each from its file."""
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from ...neural_fields import InputError
+from ...neural_fields.backend.files import files_in
 from ..cameras import Camera
-from ..files import readable, reader
+from ..files import finite_number, read_json, readable, reader
 from ..views.formats.reading import read_cameras
-from .camera import DepthCamera
+from .camera import DepthCamera, read_intrinsics
 from .images import fit_color, read_color, read_depth
 
 __all__ = ["PosedFrame", "RgbdFrame", "read_frame", "read_poses", "read_trajectory"]
@@ -23,8 +25,6 @@ __all__ = ["PosedFrame", "RgbdFrame", "read_frame", "read_poses", "read_trajecto
 Float64 = NDArray[np.float64]
 PosedFrame = tuple[str | None, Float64, DepthCamera | None]
 """Name of the frame's image, if the file has names; its world_from_camera (4, 4); its lens, if the file has one."""
-
-RIGID = 1e-3  # how far the axes in a file, written with few digits, may be from orthonormal
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,63 +105,124 @@ def read_frame(
     return RgbdFrame(values, camera, picture, pose, str(depth))
 
 
+@reader
 def read_poses(path: str | Path) -> list[PosedFrame]:
     """Read the poses of frames, camera to world in OpenCV's axes, in the order of the file.
 
-    Args:
-        path: ``*.log`` of Open3D, or ``transforms.json``, which also brings names and lenses.
+    - text: Open3D's ``trajectory.log``; TUM's ``timestamp tx ty tz qx qy qz qw``; KITTI's rows of 3 × 4 matrices.
+    - a folder with a 4 × 4 (or 3 × 4) matrix for each frame (ScanNet, 7-Scenes), or with Polycam's cameras in JSON.
+    - JSON: ``transforms.json``, which also brings names and lenses; Open3D's camera trajectories and parameters;
+      Record3D's ``metadata``.
 
     Raises:
-        InputError: see `read_trajectory` and `read_cameras`.
+        InputError: the file is none of these, or a pose in it is not rigid.
     """
     path = Path(path)
-    if path.suffix.lower() == ".json":
-        return [
-            (name, camera.world_from_camera.numpy(), DepthCamera.from_camera(camera))
-            for name, camera in read_cameras(path)
-        ]
-    return [(None, pose, None) for pose in read_trajectory(path)]
+    if path.is_dir():
+        files = files_in(path, (".txt", ".json"))
+        if not files:
+            raise InputError(f"{path}: {_EXPECTED}")
+        return [(file.stem, pose, lens) for file in files for _, pose, lens in _file_poses(file)[:1]]
+    return _file_poses(path)
 
 
-@reader
 def read_trajectory(path: str | Path) -> Float64:
-    """Read an Open3D trajectory: per frame a line of three whole numbers, and four of a 4 × 4 matrix.
-
-    The matrices are camera to world. Printed digits leave their axes not quite orthonormal; the nearest rotation
-    (polar factor) is taken.
+    """Read the poses of a text or JSON file; see `read_poses`.
 
     Returns:
         ``(F, 4, 4)``.
 
     Raises:
-        InputError: the file is missing, a line is not as it should be, or a matrix is no rigid pose.
+        InputError: the file is missing, or holds no poses.
     """
-    path = Path(path)
+    return np.stack([pose for _, pose, _ in read_poses(path)])
+
+
+_EXPECTED = "no poses in it; expected a trajectory.log, TUM's poses, a transforms.json, or a folder of 4 × 4 matrices"
+_OPENGL = np.diag([1.0, -1, -1, 1])  # x right, y up, z backward: the axes of ARKit and of OpenGL
+
+
+def _file_poses(path: Path) -> list[PosedFrame]:
+    if path.suffix.lower() == ".json" or path.name == "metadata":
+        return _json_poses(path)
     with readable(path):
-        data = path.read_bytes()
+        text = re.sub(r"#.*", "", path.read_bytes().decode("utf-8-sig", "replace")).replace(",", " ")
+    lines = [line.split() for line in text.splitlines() if line.strip()]
     try:
-        lines = [line.split() for line in data.decode("utf-8").splitlines() if line.strip()]
+        rows = [[float(word) for word in words] for words in lines]
     except ValueError as error:
-        raise InputError(f"{path}: is not text; expected a trajectory.log or a transforms.json") from error
-    if not lines or len(lines) % 5:
-        raise InputError(f"{path}: {len(lines)} lines; expected five per frame: three numbers, then a 4 × 4 matrix")
-    try:
-        if any(len(words) != 3 for words in lines[::5]):
-            raise ValueError("the first line of a frame has not three numbers")
-        rows = [words for index, words in enumerate(lines) if index % 5]
-        poses = np.array(rows, np.float64).reshape(-1, 4, 4)
-    except ValueError as error:
-        raise InputError(f"{path}: {str(error)[:80]}; expected five lines per frame, as Open3D writes them") from error
-    return np.stack([_rigid(pose, f"{path}: frame {index}") for index, pose in enumerate(poses)])
+        raise InputError(f"{path}: {_EXPECTED} ({str(error)[:60]})") from error
+    widths = [len(row) for row in rows]
+    names: Sequence[str | None] = [None] * len(rows)
+    if rows and widths == [3, 4, 4, 4, 4] * (len(rows) // 5):
+        matrices = [rows[at + 1 : at + 5] for at in range(0, len(rows), 5)]
+    elif widths == [4] * 4 or widths == [4] * 3:
+        matrices = [rows]
+    elif rows and set(widths) == {8}:
+        matrices = [_from_quaternion(row[1:4], row[4:]) for row in rows]
+        names = [words[0] for words in lines]
+    elif rows and set(widths) in ({12}, {16}):
+        matrices = [np.reshape(row, (-1, 4)) for row in rows]
+    else:
+        raise InputError(f"{path}: {len(rows)} lines of {sorted(set(widths))} numbers; {_EXPECTED}")
+    poses = [_rigid(pose, f"{path}: frame {index}") for index, pose in enumerate(matrices)]
+    return [(name, pose, None) for name, pose in zip(names, poses, strict=False)]
 
 
-def _rigid(pose: Float64, named: str) -> Float64:
-    axes = pose[:3, :3]
-    finite = bool(np.isfinite(pose).all())
-    off = np.abs(axes.T @ axes - np.eye(3)).max() if finite else np.inf
-    if off > RIGID or np.linalg.det(axes) < 0 or bool((pose[3] != (0, 0, 0, 1)).any()):
+def _json_poses(path: Path) -> list[PosedFrame]:
+    content = read_json(path)
+    content = content if isinstance(content, dict) else {}
+    if "frames" in content:
+        return [
+            (name, camera.world_from_camera.numpy(), DepthCamera.from_camera(camera))
+            for name, camera in read_cameras(path)
+        ]
+    found: list[PosedFrame] = []
+    if "t_00" in content:  # Polycam
+        rows = [[content.get(f"t_{i}{j}") for j in range(4)] for i in range(3)]
+        found.append((path.stem, _rigid(rows, f"{path}: t_00", _OPENGL), read_intrinsics(path)))
+    elif isinstance(content.get("poses"), list):  # Record3D; its lens is that of the pictures
+        for index, pose in enumerate(content["poses"]):
+            named = f"{path}: poses[{index}]"
+            numbers = [finite_number(x, named) for x in pose] if isinstance(pose, list) else []
+            if len(numbers) != 7:
+                raise InputError(f"{named}: expected qx, qy, qz, qw, tx, ty, tz")
+            found.append((f"{index}", _rigid(_from_quaternion(numbers[4:], numbers[:4]), named, _OPENGL), None))
+    else:  # Open3D: from world to camera, by columns
+        for index, item in enumerate(content.get("parameters", [content])):
+            extrinsic = item.get("extrinsic") if isinstance(item, dict) else None
+            if not isinstance(extrinsic, list) or len(extrinsic) != 16:
+                raise InputError(f"{path}: {_EXPECTED}")
+            pose = _rigid(np.reshape(extrinsic, (4, 4)).T, f"{path}: parameters[{index}].extrinsic")
+            found.append((None, np.asarray(np.linalg.inv(pose), np.float64), None))
+    return found
+
+
+def _from_quaternion(place: list[float], quaternion: list[float]) -> Float64:
+    pose = np.eye(4)
+    pose[:3, 3] = place
+    if np.isfinite(quaternion).all() and any(quaternion):
+        pose[:3, :3] = Rotation.from_quat(quaternion).as_matrix()  # x, y, z, w, of any length
+    else:
+        pose[:3, :3] = np.nan
+    return pose
+
+
+def _rigid(matrix: Any, named: str, axes: Float64 | None = None) -> Float64:
+    """A pose ``(4, 4)`` of ``(3, 4)`` or ``(4, 4)`` numbers; printed digits leave axes not quite orthonormal.
+
+    The nearest rotation (polar factor) is taken, as long as no number is off by more than 1e-3.
+    """
+    try:
+        pose = np.concatenate((np.asarray(matrix, np.float64), [[0, 0, 0, 1]]))[: max(4, len(matrix))]
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{named}: expected the numbers of a pose; {error}") from error
+    turn = pose[:3, :3]
+    finite = pose.shape == (4, 4) and bool(np.isfinite(pose).all())
+    off = np.abs(turn.T @ turn - np.eye(3)).max() if finite else np.inf
+    if off > 1e-3 or np.linalg.det(turn) < 0 or bool((pose[3] != (0, 0, 0, 1)).any()):
         raise InputError(f"{named}: {pose.round(4).tolist()}; expected a rigid pose, camera to world")
-    left, _, right = np.linalg.svd(axes)
+    left, _, right = np.linalg.svd(turn)
     rigid = pose.copy()
     rigid[:3, :3] = left @ right
-    return rigid
+    return rigid if axes is None else rigid @ axes

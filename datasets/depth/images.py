@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -22,14 +23,13 @@ COLOR_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 DEPTH_SCALE = 1000.0
 """Steps of an integer depth image in one unit where nobody says how many: millimetres in a metre."""
 
-CLOUD_COLUMNS = (3, 6, 9)  # of a table of points; see `read_cloud`
 ASPECT = 0.01  # how far two aspect ratios may be apart and still show the same picture
 
 
 def is_depth_file(path: str | Path) -> bool:
     """Whether a file is a depth map by its name, or, of NPY and NPZ, by the shape of what is in it.
 
-    A two-dimensional array with 3, 6 or 9 columns is a table of points, and no depth map.
+    A two-dimensional array with at most 12 columns is a table of points, and no depth map.
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -38,7 +38,7 @@ def is_depth_file(path: str | Path) -> bool:
     try:
         array = np.load(path, mmap_mode="r", allow_pickle=False)
         if suffix == ".npy":
-            return array.ndim == 3 or (array.ndim == 2 and array.shape[1] not in CLOUD_COLUMNS)
+            return array.ndim == 3 or (array.ndim == 2 and array.shape[1] > 12)
         with array:
             return "points" not in array and len(array.files) > 0
     except (OSError, *DAMAGED_ARRAYS):
@@ -46,7 +46,12 @@ def is_depth_file(path: str | Path) -> bool:
 
 
 def read_depth(
-    path: str | Path, *, scale: float | None = None, integer_scale: float | None = None, inverse: bool = False
+    path: str | Path,
+    *,
+    scale: float | None = None,
+    integer_scale: float | None = None,
+    inverse: bool = False,
+    saturates: bool = True,
 ) -> Float64:
     """Read a depth map.
 
@@ -56,10 +61,12 @@ def read_depth(
             ``integer_scale`` for integers and 1 for floating-point numbers.
         integer_scale: what the camera says of its integer images; None is `DEPTH_SCALE`.
         inverse: whether the numbers are inverse depths (disparities), ``z = scale / number``; then None is 1.
+        saturates: whether the largest number of the type, 65535, and their like in other units are no readings, as
+            sensors write them; never so for inverse depths, whose largest number is the nearest.
 
     Returns:
         ``(H, W)`` depth z along the camera's axis, in the unit that ``scale`` makes; NaN where there is no
-        reading (zero, negative, NaN or infinite in the file).
+        reading (zero, negative, NaN, infinite, or saturated).
 
     Raises:
         InputError: the file is missing or damaged, has 8 bits or several channels, or no reading at all.
@@ -73,10 +80,10 @@ def read_depth(
             f"{path}: unknown extension {path.suffix!r}; depth maps are read from {', '.join(DEPTH_SUFFIXES)}"
         )
     with readable(path):
-        return _depth(path, scale, integer_scale, inverse=inverse)
+        return _depth(path, scale, integer_scale, inverse=inverse, saturates=saturates and not inverse)
 
 
-def _depth(path: Path, scale: float | None, integer_scale: float | None, *, inverse: bool) -> Float64:
+def _depth(path: Path, scale: float | None, integer_scale: float | None, *, inverse: bool, saturates: bool) -> Float64:
     numbers = _read_array(path) if path.suffix.lower() in (".npy", ".npz") else read_image(path)
     if numbers.ndim == 3 and 1 in (numbers.shape[0], numbers.shape[2]):
         numbers = numbers[0] if numbers.shape[0] == 1 else numbers[..., 0]
@@ -88,11 +95,23 @@ def _depth(path: Path, scale: float | None, integer_scale: float | None, *, inve
         )
     values = numbers.astype(np.float64)
     values[~((values > 0) & (values < np.inf))] = np.nan
+    if saturates:
+        values[_saturated(numbers)] = np.nan
     if np.isnan(values).all():
         raise InputError(f"{path}: no pixel has a positive depth; export it again")
     if inverse:
         return (scale or 1.0) / values
     return values / (scale or (1.0 if numbers.dtype.kind == "f" else integer_scale or DEPTH_SCALE))
+
+
+def _saturated(numbers: NDArray[Any]) -> NDArray[np.bool_]:
+    """Where a sensor or a renderer has written its largest number: of 16 bits, of the type, or a far plane's.
+
+    Of floating-point numbers these are 65535, that in metres, the largest half-precision number, and 1e9 and more.
+    """
+    if numbers.dtype.kind == "f":
+        return (numbers >= 1e9) | np.isin(numbers, np.array([65535, 65504, 65.535, 65.504], numbers.dtype))
+    return (numbers == 65535) | (numbers == np.iinfo(numbers.dtype).max)
 
 
 @reader

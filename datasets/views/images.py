@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from ...neural_fields import InputError, Similarity
 from ..cameras import Camera
 from ..files import readable
-from .formats.colmap import read_colmap_points
+from .formats.colmap import find_models, read_colmap_points
 from .formats.depth_maps import DepthMap, DepthSource, find_depth_maps, read_depth_map
 from .formats.neus import read_neus_sphere
 from .formats.reading import find_source, read_shots
-from .formats.shots import Shot
+from .formats.shots import Shot, list_images
 from .pictures import read_mask, read_picture, resample, shrink, undistort, undistorted_camera
 from .region import region_from_cameras, region_from_masks, region_from_points
 
@@ -58,6 +58,7 @@ class PosedImages:
         points: ``(P, 3)`` sparse points of the surface in world coordinates, or None.
         source: the file that the cameras were read from; for COLMAP the folder of the model.
         observations: ``(K, 2)`` which view saw which point: their numbers; None where nobody said.
+        reading: one line about which photographs have a camera.
     """
 
     views: tuple[PosedImage, ...]
@@ -66,6 +67,7 @@ class PosedImages:
     points: NDArray[np.float64] | None
     source: Path
     observations: NDArray[np.int64] | None = None
+    reading: str = ""
 
 
 def read_posed_images(
@@ -74,6 +76,7 @@ def read_posed_images(
     width: int | None = None,
     region: Similarity | None = None,
     depths: DepthSource | None = None,
+    allow_missing: bool = False,
 ) -> PosedImages:
     """Read photographs, their cameras, masks and depth maps, and find out where the object is.
 
@@ -89,6 +92,8 @@ def read_posed_images(
             sparse points, or that which the cameras look at: the first that there is.
         depths: where depth maps are, and what they hold; by default those that a transforms.json names
             (``depth_file_path``, ``depth_path``), in the units of the cameras.
+        allow_missing: whether to go on where fewer than half of the photographs have a camera, and without the
+            cameras whose photograph, mask or depth map is missing.
 
     Raises:
         InputError: a file is missing or damaged, a picture and its camera, mask or depth map do not go together, a
@@ -105,17 +110,27 @@ def read_posed_images(
         raise ValueError(f"width={width}: expected at least one pixel")
     source = find_source(path)
     with readable(source):
-        return _posed(source, width, region, depths or DepthSource())
+        return _posed(source, width, region, depths or DepthSource(), allow_missing=allow_missing)
 
 
-def _posed(source: Path, width: int | None, region: Similarity | None, depths: DepthSource) -> PosedImages:
+def _posed(
+    source: Path, width: int | None, region: Similarity | None, depths: DepthSource, *, allow_missing: bool
+) -> PosedImages:
     shots = read_shots(source)
     neus = source.suffix.lower() == ".npz"
     sphere = read_neus_sphere(source) if neus else None
     points, observations = (read_colmap_points(source) if source.is_dir() else None) or (None, None)
     maps = find_depth_maps(shots, depths)
     shots = [replace(shot, depth=path) for shot, path in zip(shots, maps, strict=True)]
-    _check_files(shots)
+    whole = [not _missing(shot) for shot in shots]
+    if not allow_missing:
+        _check_files(shots)
+    reading = _counted(source, shots, sum(whole), allow_missing=allow_missing)
+    if not all(whole):
+        shots = [shot for shot, kept in zip(shots, whole, strict=True) if kept]
+        if observations is not None:
+            observations = observations[np.array(whole)[observations[:, 0]]]
+            observations[:, 0] = (np.cumsum(whole) - 1)[observations[:, 0]]
     views = tuple(_view(shot, width, depths) for shot in shots)
     if all(view.mask is None or view.mask.min() > OPAQUE for view in views):
         views = tuple(replace(view, mask=None) for view in views)  # white masks in all views say nothing
@@ -125,13 +140,39 @@ def _posed(source: Path, width: int | None, region: Similarity | None, depths: D
         similarity, words = sphere, f"scale_mat_i of {source.name}"
     else:
         similarity, words = _find_region(views, points, source)
-    return PosedImages(views, similarity, words, points, source, observations)
+    return PosedImages(views, similarity, words, points, source, observations, reading)
+
+
+def _missing(shot: Shot) -> bool:
+    return any(file is not None and not file.is_file() for file in (shot.image, shot.mask, shot.depth))
+
+
+def _counted(source: Path, shots: Sequence[Shot], placed: int, *, allow_missing: bool) -> str:
+    """One line about how many photographs there are, and how many of them have a camera.
+
+    Raises:
+        InputError: fewer than half, or none.
+    """
+    photographs = len({shot.image for shot in shots})
+    folders = {shot.image.parent for shot in shots}
+    if source.is_dir() or source.name == "transforms.json":  # others hold a choice on purpose: training views, say
+        kinds = {shot.image.suffix.lower() for shot in shots}
+        listed = {file for folder in folders for file in list_images(folder) if file.suffix.lower() in kinds}
+        extras = {file for shot in shots for file in (shot.mask, shot.depth) if file is not None}
+        photographs = len((listed - extras) | {shot.image for shot in shots})
+    reading = f"{placed} of {photographs} photographs have a camera"
+    if source.is_dir() and len(models := find_models(source.parent.parent)) > 1 and source in models:
+        reading += f" in sparse/{source.name}, the largest of {len(models)} models"
+    if not placed or (2 * placed < photographs and not allow_missing):
+        fix = "find the others' cameras, or go on with --allow-missing" if placed else "add the photographs"
+        raise InputError(f"{source}: only {reading}; {fix}")
+    return reading
 
 
 def _check_files(shots: Sequence[Shot]) -> None:
     """Say before any long work what is missing."""
     fixes = {
-        "image": "add it, or leave that camera out",
+        "image": "add it, or leave that camera out: --allow-missing",
         "mask": "add it, or leave all masks out",
         "depth": "add it, or leave all depth maps out",
     }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -16,14 +17,23 @@ __all__ = ["region_from_cameras", "region_from_masks", "region_from_points"]
 
 Float64 = NDArray[np.float64]
 
-PARALLEL = 1e-6  # squared sine between axes of view below which they meet nowhere
-CLEAR = 0.9  # of the distance to the nearest camera, that the sphere may reach to
-MARGIN = 1.05  # by how much the sphere is larger than what it is put around
-CELLS = 64  # of the grid of the visual hull, along each side
-# One view in so many may take for background what is in the hull; of so few views, one if else there were none.
-ONE_IN, FEW = 20, 4
-FEWEST = 8  # points or grid points that say where something is
-TAIL = 0.02  # share of the sparse points on either side that are not trusted
+
+@dataclass(frozen=True)
+class RegionOptions:
+    """How the sphere around the object is found."""
+
+    parallel: float = 1e-6  # squared sine between axes of view below which they meet nowhere
+    clear: float = 0.9  # of the distance to the nearest camera, that the sphere may reach to
+    margin: float = 1.05  # by how much the sphere is larger than what it is put around
+    cells: int = 64  # of the grid of the visual hull, along each side
+    # One view in so many may take for background what is in the hull; of so few views, one if else there were none.
+    one_in: int = 20
+    few: int = 4
+    fewest: int = 8  # points or grid points that say where something is
+    tail: float = 0.02  # share of the sparse points on either side that are not trusted
+
+
+REGION = RegionOptions()
 
 
 def region_from_cameras(cameras: Sequence[Camera]) -> Similarity:
@@ -43,7 +53,7 @@ def region_from_cameras(cameras: Sequence[Camera]) -> Similarity:
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # (V, 3, 3) takes the part along the axis away
     middle = eyes.mean(axis=0) if len(eyes) else np.zeros(3)  # taken off first: map coordinates have many digits
     total = across.sum(axis=0)
-    if not len(eyes) or np.linalg.eigvalsh(total)[0] < PARALLEL * len(eyes):
+    if not len(eyes) or np.linalg.eigvalsh(total)[0] < REGION.parallel * len(eyes):
         raise ValueError("cameras: their axes of view are parallel, so they meet nowhere")
     center = middle + np.linalg.solve(total, np.einsum("vij,vj->i", across, eyes - middle))
     radius = float(np.median([_view_radius(camera, center) for camera in cameras]))
@@ -52,7 +62,7 @@ def region_from_cameras(cameras: Sequence[Camera]) -> Similarity:
     nearest = float(np.linalg.norm(eyes - center, axis=1).min())
     if nearest == 0:
         raise ValueError("cameras: one stands where the axes of view meet")
-    return _sphere(center, min(radius, CLEAR * nearest))
+    return _sphere(center, min(radius, REGION.clear * nearest))
 
 
 def region_from_points(points: Float64, cameras: Sequence[Camera]) -> Similarity:
@@ -76,13 +86,13 @@ def region_from_points(points: Float64, cameras: Sequence[Camera]) -> Similarity
     else:
         reach = np.median([np.linalg.norm(camera.eye.numpy() - focus) for camera in cameras])
         kept = kept[np.linalg.norm(kept - focus, axis=1) < reach]
-    if len(kept) < FEWEST:
-        raise ValueError(f"points: {len(kept)} of {len(points)} are where most cameras look; expected {FEWEST}")
-    center = np.quantile(kept, (TAIL, 1 - TAIL), axis=0).mean(axis=0)
-    radius = float(np.quantile(np.linalg.norm(kept - center, axis=1), 1 - TAIL))
+    if len(kept) < REGION.fewest:
+        raise ValueError(f"points: {len(kept)} of {len(points)} are where most cameras look; expected {REGION.fewest}")
+    center = np.quantile(kept, (REGION.tail, 1 - REGION.tail), axis=0).mean(axis=0)
+    radius = float(np.quantile(np.linalg.norm(kept - center, axis=1), 1 - REGION.tail))
     if radius == 0:
         raise ValueError("points: all of them coincide")
-    return _sphere(center, MARGIN * radius)
+    return _sphere(center, REGION.margin * radius)
 
 
 def region_from_masks(cameras: Sequence[Camera], masks: Sequence[NDArray[np.floating]]) -> Similarity:
@@ -105,11 +115,11 @@ def region_from_masks(cameras: Sequence[Camera], masks: Sequence[NDArray[np.floa
         raise ValueError("masks: show no background")
     start = region_from_cameras(cameras)
     low, high = (np.array(start.center) + side * 2 * start.scale for side in (-1, 1))
-    may_differ = len(masks) // ONE_IN
+    may_differ = len(masks) // REGION.one_in
     try:
         hull, step = _hull(low, high, cameras, solid, may_differ)
     except ValueError:
-        if len(masks) < FEW:
+        if len(masks) < REGION.few:
             raise
         may_differ += 1
         hull, step = _hull(low, high, cameras, solid, may_differ)
@@ -117,14 +127,14 @@ def region_from_masks(cameras: Sequence[Camera], masks: Sequence[NDArray[np.floa
     hull, step = _hull(low, high, cameras, solid, may_differ)
     center = (hull.min(axis=0) + hull.max(axis=0)) / 2
     reach = np.linalg.norm(np.abs(hull - center) + step, axis=1).max()
-    return _sphere(center, MARGIN * float(reach))
+    return _sphere(center, REGION.margin * float(reach))
 
 
 def _hull(
     low: Float64, high: Float64, cameras: Sequence[Camera], solid: Sequence[NDArray[np.bool_]], may_differ: int
 ) -> tuple[Float64, Float64]:
     """Points of the grid between two corners, object but in so many views ``(N, 3)``, and its steps ``(3,)``."""
-    lines = [np.linspace(low[axis], high[axis], CELLS) for axis in range(3)]
+    lines = [np.linspace(low[axis], high[axis], REGION.cells) for axis in range(3)]
     points = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, 3)
     views, against = np.zeros((2, len(points)), np.int64)
     for camera, mask in zip(cameras, solid, strict=True):
@@ -137,9 +147,9 @@ def _hull(
         kept = against <= may_differ
         points, views, against = points[kept], views[kept], against[kept]
     hull = points[views * 2 >= len(cameras)]
-    if len(hull) < FEWEST:
+    if len(hull) < REGION.fewest:
         raise ValueError("masks: no part of space is object in enough of them")
-    return hull, (high - low) / (CELLS - 1)
+    return hull, (high - low) / (REGION.cells - 1)
 
 
 def _view_radius(camera: Camera, center: Float64) -> float:

@@ -24,6 +24,7 @@ __all__ = [
     "damage",
     "files_in",
     "json_bytes",
+    "natural",
     "partial_of",
     "remove",
     "rename",
@@ -173,9 +174,12 @@ def write_json(path: str | Path, data: Any) -> None:
     write_whole(path, json_bytes(data))
 
 
-def files_in(folder: Path, suffixes: Collection[str]) -> list[Path]:
-    """What a folder holds with one of these extensions (lower case), by name; not half-written files, nor macOS's own.
+def natural(name: str) -> tuple[list[str | int], str]:
+    """A key that sorts names with their numbers as numbers: ``2.png`` comes before ``10.png``."""
+    return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name)], name
 
-    Both of these have names that begin with a dot.
-    """
-    return sorted(file for file in folder.iterdir() if file.suffix.lower() in suffixes and file.name[0] != ".")
+
+def files_in(folder: Path, suffixes: Collection[str]) -> list[Path]:
+    """What a folder holds with one of these extensions (lower case), in natural order of names; no hidden files."""
+    files = (file for file in folder.iterdir() if file.suffix.lower() in suffixes and file.name[0] != ".")
+    return sorted(files, key=lambda file: natural(file.name))

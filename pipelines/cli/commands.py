@@ -12,7 +12,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from ..training.config import given_flags, input_error
+from ..training.config import command_line, given_flags, input_error
 from ..training.settings import FitConfig
 from .common import Command, add_flags, add_settings, between, check_output, read_settings, refuse
 from .draw import ANIMATE, RENDER, SLICE, VIEW
@@ -81,7 +81,7 @@ def _sample(arguments: argparse.Namespace) -> int:
     with counter_bar("scan") as progress:
         cloud = statue_scan(seed=arguments.seed, progress=progress, **options)
     write_cloud_ply(arguments.out, cloud)
-    print(f"{arguments.out}: {len(cloud):,} points; fit it with: mplicits fit {arguments.out} -o RUN")
+    print(f"{arguments.out}: {len(cloud):,} points; fit it with: {command_line('fit', arguments.out, '-o', 'RUN')}")
     return 0
 
 

@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..training.config import given_flags, input_error
+from ..training.config import command_line, given_flags, input_error
 from ..training.settings import FitConfig
 from .common import (
     Command,
@@ -41,7 +41,9 @@ DEPTH_FLAGS = (
 
 def _arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    what = "PLY, OBJ, STL, OFF, XYZ, TXT, CSV, NPY, NPZ, LAS or LAZ file; a depth map, or a folder of them"
+    what = (
+        "PLY, PCD, E57, OBJ, STL, OFF, XYZ, TXT, ASC, CSV, PTS, NPY, NPZ, LAS or LAZ; a depth map, or a folder of them"
+    )
     add("clouds", nargs="+", metavar="CLOUD", help=f"{what}; several clouds get a run each, RUN/NAME")
     add_new_run(parser, "directory of the run, or runs")
     add("--jobs", type=whole(1), metavar="N", help="several clouds: so many at a time; above 1 needs mplicits[ray]")
@@ -65,7 +67,7 @@ def _depth_arguments(parser: argparse.ArgumentParser) -> None:
     what = "numbers per unit (integers: as the camera says, or 1000; else 1)"
     add("--depth-scale", type=positive, metavar="N", help=what)
     add("--inverse-depth", action="store_true", help="the numbers are disparities: z = scale / number")
-    add("--max-depth", type=positive, metavar="Z", help="drop what is further away than this")
+    add("--max-depth", "--depth-max", type=positive, metavar="Z", help="drop what is further away than this")
     add("--max-points", type=whole(1), metavar="N", help="thin the cloud to as many (200000)")
     what = "radius of smoothing (as the noise asks for; 0: none)"
     add("--smooth-depth", type=whole(0, 16), metavar="PIXELS", help=what)
@@ -92,10 +94,10 @@ def _fit_one(arguments: argparse.Namespace, cloud: str, config: FitConfig | None
     fitted = arguments.resume and arguments.mesh is not None and is_fitted(directory)
     if not fitted:
         check_new_run(directory, resume=arguments.resume, force=arguments.force)
-    mesh = _planned(arguments, Path(cloud) if depth is None else depth)
-    again = f"to continue: mplicits fit {cloud} -o {directory} --resume"
-    if mesh is not None:
-        again += f" --mesh {mesh.out}" + " --no-colors" * arguments.no_colors
+    columns = read_record(directory)["config"].get("columns") if config is None else config.columns
+    mesh = _planned(arguments, Path(cloud) if depth is None else depth, columns)
+    then = () if mesh is None else ("--mesh", mesh.out, *["--no-colors"] * arguments.no_colors)
+    again = f"to continue: {command_line('fit', cloud, '-o', directory, '--resume', *then)}"
     texture, made, said, started = None, None, list[str](), time.monotonic()
     with _watched(arguments), training(again, quiet=arguments.quiet, board=arguments.tensorboard) as report:
         if not fitted and depth is None:
@@ -113,16 +115,16 @@ def _fit_one(arguments: argparse.Namespace, cloud: str, config: FitConfig | None
     if memory is not None:
         print(f"  peak memory  {memory / 2**20:,.0f} MiB")
     # A depth map shows one side of things; what the fit closes behind it is no part of them.
-    trim = "" if depth is None else f" --trim-distance {trim_suggestion(directory):.2g}"
+    trim = [] if depth is None else ["--trim-distance", f"{trim_suggestion(directory):.2g}"]
     if mesh is None:
-        print(f"next: mplicits mesh {directory} -o {directory / 'mesh.ply'}{trim}")
+        print("next:", command_line("mesh", directory, "-o", directory / "mesh.ply", *trim))
         return 0
     if texture is not None:
         tell_texture(directory / TEXTURE_FILE, texture, again)
     assert made is not None
     print("\n".join(said), end="\n" * bool(said))
     facts = [f"{len(made.vertices):,} vertices", f"{len(made.faces):,} faces"]
-    facts += ["with colours"] * mesh.colored + ([trim.strip()] if trim else [])
+    facts += ["with colours"] * mesh.colored + ([" ".join(trim)] if trim else [])
     print(f"{mesh.out}: {', '.join(facts)}, {time.monotonic() - started:.1f} s in all")
     return 0
 
@@ -136,13 +138,14 @@ def _watched(arguments: argparse.Namespace) -> AbstractContextManager[object]:
     return Watcher(arguments.out, resume=arguments.resume, say=lambda line: print(line, file=sys.stderr))
 
 
-def _planned(arguments: argparse.Namespace, source: Path | DepthInput) -> FitMesh | None:
+def _planned(arguments: argparse.Namespace, source: Path | DepthInput, columns: str | None) -> FitMesh | None:
     """The mesh that shall follow, checked; None if there is to be none."""
     if arguments.mesh is None:
         return None
     from ..mesh.finish import plan_mesh
 
-    return plan_mesh(arguments.mesh, arguments.out, source, colors=not arguments.no_colors, resume=arguments.resume)
+    options = {"colors": not arguments.no_colors, "resume": arguments.resume}
+    return plan_mesh(arguments.mesh, arguments.out, source, columns=columns, **options)
 
 
 def _fit_many(arguments: argparse.Namespace, config: FitConfig | None) -> int:
@@ -158,7 +161,7 @@ def _fit_many(arguments: argparse.Namespace, config: FitConfig | None) -> int:
     jobs = arguments.jobs or 1
     check_jobs(jobs)
     planned = plan_fits(arguments.clouds, arguments.out, config, resume=arguments.resume, force=arguments.force)
-    again = f"mplicits fit {' '.join(arguments.clouds)} -o {arguments.out} --jobs {jobs} --resume"
+    again = command_line("fit", *arguments.clouds, "-o", arguments.out, "--jobs", jobs, "--resume")
     quiet = arguments.quiet or jobs > 1
     with training(f"to continue: {again}", quiet=quiet, at_any_time=True) as show:
         outcomes = fit_many(

@@ -9,7 +9,8 @@ import numpy as np
 
 from ...neural_fields import Mesh, Siren, load_field
 from ...neural_fields.networks.multiscale import levels_of
-from ..surface.surface import components, is_closed, read_surface
+from ..surface.surface import components, is_closed, read_described
+from ..training.config import command_line
 from ..training.folder import RECORD_FILE, find_field, is_field, read_record, resumes_with
 from ..training.trainer import parameter_count
 
@@ -24,7 +25,7 @@ def describe(path: str | Path) -> str:
     Raises:
         InputError: it is nothing that we can read.
     """
-    rows = _describe_field(Path(path)) if is_field(path) else _describe_surface(read_surface(path))
+    rows = _describe_field(Path(path)) if is_field(path) else _describe_surface(*read_described(path))
     width = max(len(name) for name, _ in rows)
     return "\n".join([str(path), *(f"  {name:<{width}}  {text}".rstrip() for name, text in rows)])
 
@@ -79,6 +80,8 @@ def _describe_record(record: dict[str, Any], path: Path) -> Rows:
         return []
     rows: Rows = [("fitted to", str(record.get("cloud", "?")))]
     cleaning, environment = record.get("cleaning", {}), record.get("environment", {})
+    if record.get("reading"):
+        rows.append(("read", record["reading"]))
     if cleaning:
         points = f"{cleaning['kept']:,} of {cleaning['read']:,}, normals {cleaning['normals_source']}"
         for name, what in (("dropped_outliers", "strays dropped"), ("turned_normals", "normals turned round")):
@@ -91,7 +94,7 @@ def _describe_record(record: dict[str, Any], path: Path) -> Rows:
     rows.append(("state", _describe_state(record, path)))
     texture = record.get("texture")
     if texture and not texture.get("finished", True):
-        rows.append(("texture", f"unfinished: mplicits texture {path} {texture['source']} --resume"))
+        rows.append(("texture", f"unfinished: {command_line('texture', path, texture['source'], '--resume')}"))
     if "training_seconds" in record:
         rows.append(("time", f"{record['training_seconds']:.1f} s"))
     if environment:
@@ -121,7 +124,7 @@ def _describe_signs(signs: dict[str, Any], count: int) -> str:
     return f"{what} (slope along them {signs['slope']:.2f})"
 
 
-def _describe_surface(surface: Mesh) -> Rows:
+def _describe_surface(surface: Mesh, reading: str) -> Rows:
     points = surface.used_vertices()
     low, high = points.min(axis=0), points.max(axis=0)
     rows: Rows = []
@@ -133,6 +136,7 @@ def _describe_surface(surface: Mesh) -> Rows:
     else:
         rows.append(("kind", "point cloud"))
         rows.append(("points", f"{len(surface.vertices):,}"))
+        rows.append(("read", reading))
         rows.append(("normals", "no" if surface.normals is None else "yes"))
     rows.append(("bounds", "  ".join(f"{axis} {a:.9g} … {b:.9g}" for axis, a, b in zip("xyz", low, high, strict=True))))
     rows.append(("diagonal", f"{float(np.linalg.norm(high - low)):.6g}"))

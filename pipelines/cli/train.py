@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..training.config import given_flags, input_error, load_config
+from ..training.config import command_line, given_flags, input_error, load_config
 from ..training.settings import EvolveConfig, FitConfig, ReconstructConfig, TextureConfig
 from .common import (
     Command,
@@ -64,8 +64,9 @@ def _texture(arguments: argparse.Namespace) -> int:
             resume=arguments.resume,
             progress=report,
         )
-    where = "" if arguments.out is None else f" -o {arguments.out}"
-    tell_texture(target, fitted, f"to continue: mplicits texture {arguments.run} {arguments.source}{where} --resume")
+    where = () if arguments.out is None else ("-o", arguments.out)
+    again = command_line("texture", arguments.run, arguments.source, *where, "--resume")
+    tell_texture(target, fitted, f"to continue: {again}")
     return 0
 
 
@@ -151,7 +152,7 @@ def _reconstruct(arguments: argparse.Namespace) -> int:
             with stoppable("the same command continues", at_any_time=True):
                 found = find_cameras(arguments.data, data, report=colmap_report(report))
             tell_found(found)
-        with stoppable(f"to continue: mplicits reconstruct {data} -o {directory} --resume"):
+        with stoppable(f"to continue: {command_line('reconstruct', data, '-o', directory, '--resume')}"):
             run = reconstruct(data, config, out=directory, resume=arguments.resume, progress=report)
         with reported(report, "mesh"):
             lines: list[str] = []
@@ -170,8 +171,9 @@ def _reconstruct(arguments: argparse.Namespace) -> int:
             f"{len(held_out['views'])} held-out views: PSNR {held_out['psnr']:.2f} dB, SSIM {held_out['ssim']:.3f} "
             f"({directory / HELD_OUT_FILE})"
         )
+    print(run.record["reading"])
     print(f"{directory / MESH_FILE}: {len(mesh.vertices):,} vertices, {len(mesh.faces):,} faces")
-    print("".join(f"  {line}\n" for line in lines) + f"next: mplicits view {directory}")
+    print("".join(f"  {line}\n" for line in lines) + f"next: {command_line('view', directory)}")
     return 0
 
 
@@ -232,7 +234,7 @@ def _evolve(arguments: argparse.Namespace) -> int:
         print(f"{folder}: the fits of {', '.join(scans)}")
         if config.landmarks != given:
             print("all of them have the same faces: vertices are landmarks (pairs-00.txt and so on, beside the fits)")
-    again = f"to continue: mplicits evolve -o {directory} --resume"
+    again = f"to continue: {command_line('evolve', '-o', directory, '--resume')}"
     with training(again, quiet=arguments.quiet, board=arguments.tensorboard) as report:
         run = evolve(config, out=directory, resume=arguments.resume, progress=report)
     tell_budget(run.record)

@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, get_args, get_type_hints
 
-from ..training.config import input_error
+from ..training.config import command_line, input_error
 from ..training.settings import ReconstructConfig
 from .common import Command, add_flags, check_output, positive, refuse, training, whole, write_json
 
@@ -39,7 +39,7 @@ def _find_cameras(arguments: argparse.Namespace) -> int:
         lens, told = arguments.lens, colmap_report(report)
         found = find_cameras(arguments.photos, out, frames=arguments.frames, lens=lens, report=told)
     tell_found(found)
-    print(f"next: mplicits check-cameras {out} -o cameras.glb")
+    print("next:", command_line("check-cameras", out, "-o", "cameras.glb"))
     write_json(arguments.json, asdict(found) | {"project": str(out)})
     return 0
 
@@ -81,7 +81,7 @@ def _find_points(arguments: argparse.Namespace) -> int:
     with training("the same command continues", quiet=arguments.quiet, at_any_time=True) as report:
         found = find_points(arguments.data, out, report=colmap_report(report))
     tell_found(found)
-    print(f"next: mplicits reconstruct {out} -o RUN")
+    print("next:", command_line("reconstruct", out, "-o", "RUN"))
     write_json(arguments.json, asdict(found) | {"project": str(out)})
     return 0
 
@@ -111,6 +111,8 @@ def _check_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--depth-kind", choices=kinds, default="metric", metavar="KIND", help=what)
     what = "numbers of the depth maps per unit of the cameras (1000 for integers, else 1)"
     parser.add_argument("--depth-scale", type=positive, metavar="X", help=what)
+    what = "go on where fewer than half of the photographs have a camera, and without those that are missing"
+    parser.add_argument("--allow-missing", action="store_true", help=what)
     add_flags(parser, "--json")
 
 
@@ -120,7 +122,7 @@ def _check_cameras(arguments: argparse.Namespace) -> int:
     from ..reconstruct.checks.check import check_files
 
     depths = DepthSource(arguments.depth_maps, arguments.depth_kind, arguments.depth_scale)
-    _, check, text = check_files(arguments.data, arguments.out, depths)
+    _, check, text = check_files(arguments.data, arguments.out, depths, allow_missing=arguments.allow_missing)
     print(text)
     if arguments.out is not None:
         print(f"{arguments.out}: frustums from violet (first) to yellow (last), the region's sphere, the world's axes")
@@ -200,7 +202,7 @@ def _scene(arguments: argparse.Namespace) -> int:
     writers[arguments.format](folder, images)
     write_mesh(folder / "surface.ply", truth)
     print(f"{folder}: {arguments.views} views of {arguments.size} × {arguments.size} pixels; the truth is surface.ply")
-    print(f"next: mplicits check-cameras {folder} -o cameras.glb")
+    print("next:", command_line("check-cameras", folder, "-o", "cameras.glb"))
     return 0
 
 

@@ -14,6 +14,7 @@ import dataclasses
 import json
 import math
 import zipfile
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ from ...datasets import PointCloud, read_cloud
 from ...datasets.clouds.cleaning.dipoles import DipoleField
 from ...datasets.clouds.large import Merging, merge_cloud
 from ...datasets.clouds.readers.reading import check_cloud, open_stream
-from ...datasets.clouds.readers.stream import MemoryStream
+from ...datasets.clouds.readers.stream import CloudStream, MemoryStream
 from ...neural_fields.backend.files import whole_file
 from ..training.folder import MERGED_FILE
 
@@ -36,7 +37,7 @@ __all__ = ["CloudDistance", "load_cloud"]
 Float32 = NDArray[np.float32]
 
 # What merging does may change; what an older version left behind is then made again.
-VERSION = 1
+VERSION = 2
 # Area of a point's disc over the median one: scans are this much sparser where they graze the surface, hardly more.
 LARGEST_AREA = 100.0
 # Queries at a time: between two of them a progress display is told.
@@ -68,7 +69,13 @@ CHANCE = 3.0  # standard deviations of the noise
 
 
 def load_cloud(
-    cloud: PointCloud | str | Path, *, limit: int | None, isolation: float | None = 30.0, cache: Path | None = None
+    cloud: PointCloud | str | Path,
+    *,
+    limit: int | None,
+    isolation: float | None = 30.0,
+    cache: Path | None = None,
+    columns: str | None = None,
+    drop_noise: bool = False,
 ) -> tuple[PointCloud, Merging | None]:
     """Read a cloud; of one with more than ``limit`` points, at most as many that stand for them.
 
@@ -77,6 +84,8 @@ def load_cloud(
         limit: clouds of no more points are left as they are; None leaves all so.
         isolation: see `merge_cloud`.
         cache: a run directory: keeps what was merged from a file, for as long as that file does not change.
+        columns: see `read_cloud`.
+        drop_noise: see `read_cloud`.
 
     Returns:
         The cloud, and what merging did to it, if anything.
@@ -84,20 +93,24 @@ def load_cloud(
     Raises:
         InputError: see `read_cloud`.
     """
+    read = partial(read_cloud, columns=columns, drop_noise=drop_noise)
     if limit is None:
-        return cloud if isinstance(cloud, PointCloud) else read_cloud(cloud), None
-    stream = MemoryStream(cloud) if isinstance(cloud, PointCloud) else open_stream(cloud)
-    if stream is None:
-        stream = MemoryStream(read_cloud(cloud))  # pyright: ignore[reportArgumentType]
+        return cloud if isinstance(cloud, PointCloud) else read(cloud), None
+    if isinstance(cloud, PointCloud):
+        stream: CloudStream = MemoryStream(cloud)
+    else:
+        stream = open_stream(cloud, columns=columns, drop_noise=drop_noise) or MemoryStream(read(cloud))
     if stream.count <= limit:
-        return stream.cloud if isinstance(stream, MemoryStream) else read_cloud(stream.source), None
-    about = None if isinstance(cloud, PointCloud) else _about(Path(cloud), limit, isolation)
+        return stream.cloud if isinstance(stream, MemoryStream) else read(stream.source), None
+    about = None
+    if not isinstance(cloud, PointCloud):
+        about = _about(Path(cloud), limit=limit, isolation=isolation, columns=columns, drop_noise=drop_noise)
     kept = None if cache is None or about is None else _kept(cache / MERGED_FILE, about)
     if kept is not None:
         return kept
     merged = merge_cloud(stream, limit, isolation=isolation)
     if merged is None:  # nothing to fit, and a message that says so
-        check_cloud(stream.cloud if isinstance(stream, MemoryStream) else read_cloud(stream.source))
+        check_cloud(stream.cloud if isinstance(stream, MemoryStream) else read(stream.source))
     assert merged is not None
     check_cloud(merged[0])
     if cache is not None and about is not None:
@@ -105,7 +118,7 @@ def load_cloud(
     return merged
 
 
-def _about(path: Path, limit: int, isolation: float | None) -> dict[str, Any]:
+def _about(path: Path, **options: Any) -> dict[str, Any]:
     """What a merged cloud depends on."""
     facts = path.stat()
     return {
@@ -113,8 +126,7 @@ def _about(path: Path, limit: int, isolation: float | None) -> dict[str, Any]:
         "file": str(path.absolute()),
         "bytes": facts.st_size,
         "changed": facts.st_mtime_ns,
-        "limit": limit,
-        "isolation": isolation,
+        **options,
     }
 
 
@@ -122,7 +134,8 @@ def _keep(file: Path, about: dict[str, Any], cloud: PointCloud, merging: Merging
     """Write a merged cloud, whole or not at all."""
     file.parent.mkdir(parents=True, exist_ok=True)
     arrays = {"points": cloud.points, "normals": cloud.normals, "colors": cloud.colors}
-    text = json.dumps({"about": about, "merging": dataclasses.asdict(merging), "source": cloud.source})
+    record = {"about": about, "merging": dataclasses.asdict(merging), "source": cloud.source, "reading": cloud.reading}
+    text = json.dumps(record)
     with whole_file(file) as partial, partial.open("wb") as stream:
         np.savez(stream, record=np.array(text), **{name: a for name, a in arrays.items() if a is not None})
 
@@ -135,7 +148,7 @@ def _kept(file: Path, about: dict[str, Any]) -> tuple[PointCloud, Merging] | Non
             if record["about"] != about:
                 return None
             normals, colors = (archive[name] if name in archive.files else None for name in ("normals", "colors"))
-            cloud = PointCloud(archive["points"], normals, colors, record["source"])
+            cloud = PointCloud(archive["points"], normals, colors, record["source"], reading=record["reading"])
             return cloud, Merging(**record["merging"])
     except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):
         return None

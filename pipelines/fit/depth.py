@@ -179,19 +179,40 @@ def _files(path: Path, suffixes: tuple[str, ...], what: str) -> list[Path]:
 
 
 def _in_order_of(files: list[Path], items: list[T], names: list[str | None], trouble: str) -> list[T]:
-    """What belongs to each file: by the stem of its name where all have names that fit, else by order."""
-    named = {Path(name).stem: item for name, item in zip(names, items, strict=True) if name is not None}
+    """What belongs to each file: by the stem of its name where all fit, by the nearest time, or by order."""
+    named = {_stem(name): item for name, item in zip(names, items, strict=True) if name is not None}
     if all(file.stem in named for file in files):
         return [named[file.stem] for file in files]
+    times, wanted = _seconds(list(named)), _seconds([file.stem for file in files])
+    if times is not None and wanted is not None and (times % 1 != 0).any():
+        nearest = np.abs(wanted[:, None] - times).argmin(axis=1)
+        if (np.abs(times[nearest] - wanted) <= 0.02).all():  # seconds, as the TUM benchmark's own tool matches them
+            found = list(named.values())
+            return [found[k] for k in nearest]
     if len(items) != len(files):
         raise InputError(trouble)
     return items
 
 
+def _stem(name: str) -> str:
+    """Of a file's name; a time, which has digits after a point, has no extension."""
+    path = Path(name)
+    return path.stem if path.suffix.lower() in {*DEPTH_SUFFIXES, *COLOR_SUFFIXES} else path.name
+
+
+def _seconds(names: list[str]) -> np.ndarray | None:
+    """Names that are times ``(N,)``; None where one is none."""
+    try:
+        return np.array([float(name) for name in names]) if names else None
+    except ValueError:
+        return None
+
+
 def _cameras(files: list[Path], posed: list[PosedFrame], source: DepthInput) -> list[DepthCamera]:
     """The lens of each depth map; what the user says comes before what the poses' file says."""
     if len(source.intrinsics) == 1:
-        return [read_intrinsics(source.intrinsics[0])] * len(files)
+        height, width = read_depth(files[0], inverse=source.inverse).shape
+        return [read_intrinsics(source.intrinsics[0], size=(width, height))] * len(files)
     lenses = [lens for _, _, lens in posed if lens is not None]
     if not source.intrinsics and source.fov is None and len(lenses) == len(files):
         return lenses

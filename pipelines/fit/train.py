@@ -128,11 +128,19 @@ def _fit(
     device = choose_device(config.device)
     budget, points = Budget(config.time_budget), _as_cloud(cloud)
     with reported(progress, "reading the cloud"):
-        raw, merging = load_cloud(points, limit=config.merge_above, isolation=config.isolation, cache=folder.path)
+        raw, merging = load_cloud(
+            points,
+            limit=config.merge_above,
+            isolation=config.isolation,
+            cache=folder.path,
+            columns=config.columns,
+            drop_noise=config.drop_noise,
+        )
     with reported(progress, "preparing the cloud"):
         prepared = prepare(raw, config)
     load_compiler()
     fitting = _Fitting(prepared, source or raw.source, config, device, folder, budget, merging)
+    fitting.reading = raw.reading
     fitting.report = progress or silent
     fitting.level_done = level_done
     with folder.writing(), stop_on_signals() as flag:
@@ -186,6 +194,7 @@ class _Fitting:
         self.device, self.folder, self.merging = device, folder, merging
         self.budget, self.preparation_seconds = budget, time.monotonic() - budget.started
         self.report: Report = silent
+        self.reading = ""
         self.costs: dict[int, float] = {}  # measured seconds of a step, by level
         self.fingerprint = digest_of((cloud.points, cloud.normals))
         self.points, self.normals = torch.from_numpy(cloud.points), torch.from_numpy(cloud.normals)
@@ -512,6 +521,7 @@ class _Fitting:
         return {
             "finished": finished,
             **named_cloud(self.source, self.folder.path),
+            "reading": self.reading,
             "merging": None if self.merging is None else dataclasses.asdict(self.merging),
             "cleaning": dataclasses.asdict(self.cloud.report),
             "signs": None if self.signs is None else self.signs.record(),

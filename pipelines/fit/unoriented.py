@@ -28,11 +28,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ...datasets import OrientedCloud
-from ...datasets.clouds.cleaning.exterior import OUTSIDE, Exterior
+from ...datasets.clouds.cleaning.exterior import OUTER_REGION, Exterior
 from ...datasets.clouds.cleaning.noise import noise_deviation
 from ...datasets.clouds.cleaning.orientation import settle_signs
 from ...datasets.clouds.cleaning.reestimate import denoise
-from ...datasets.clouds.cleaning.winding import MUCH_LESS
+from ...datasets.clouds.cleaning.winding import WINDING
 from ...datasets.clouds.point_cloud import spread
 from ...neural_fields import Siren
 from ...neural_fields.backend.devices import upload
@@ -110,8 +110,8 @@ class Places(NamedTuple):
     @property
     def contested(self) -> bool:
         """Whether the witnesses contradict each other, or there is a hollow or another part whose sign is in doubt."""
-        inside = float(((self.region == OUTSIDE) & (self.winding < 0)).float().mean())
-        enclosed = torch.bincount(self.region)[OUTSIDE + 1 :]
+        inside = float(((self.region == OUTER_REGION) & (self.winding < 0)).float().mean())
+        enclosed = torch.bincount(self.region)[OUTER_REGION + 1 :]
         return inside > CONTRADICTED or int((enclosed > CONTRADICTED * len(self.region)).sum()) > 1
 
 
@@ -140,7 +140,7 @@ def give_signs(
         What was found; None if it was asked to stop.
     """
     places = places or Places.around(CloudDistance(points, normals), seed=config.seed)
-    outside = (places.region == OUTSIDE).float()
+    outside = (places.region == OUTER_REGION).float()
     found: list[tuple[Tensor, str]] = []
     witnesses = (("winding", places.winding, None), ("exterior", outside, places.region))
     for stage, (witness, sign, region) in zip(STAGES, witnesses, strict=True):
@@ -177,7 +177,7 @@ def fits_better(cloud: OrientedCloud, signs: Signs) -> bool:
         return False
     turned = turned[spread(turned.astype(np.float64), ASKED)]
     after = np.where(signs.turned[:, None], -cloud.normals, cloud.normals)
-    return _misfit(cloud.points, after, turned) < MUCH_LESS * _misfit(cloud.points, cloud.normals, turned)
+    return _misfit(cloud.points, after, turned) < WINDING.much_less * _misfit(cloud.points, cloud.normals, turned)
 
 
 def _misfit(points: Float32, normals: Float32, at: Float32) -> float:
@@ -220,7 +220,7 @@ class _Unoriented(Objective):
         points: ``(N, 3)`` of the cloud.
         places: around it.
         sign: ``(M,)`` of the known distances, 0 where it is not known.
-        region: ``(M,)`` of those beyond `OUTSIDE` the signs follow from the field on its way; None: they stay.
+        region: ``(M,)`` of those beyond `OUTER_REGION` the signs follow from the field on its way; None: they stay.
         generator: draws the batches.
         device: that trains.
     """
@@ -264,10 +264,10 @@ class _Unoriented(Objective):
     def _settle(self, region: Tensor) -> None:
         """Give each enclosed region the sign of the mean of f/d in it, where places near the points count most."""
         value = torch.cat([self.siren.value(part) for part in self.places.split(1 << 16)])
-        weight = self.distance.square().reciprocal() * (region > OUTSIDE)
+        weight = self.distance.square().reciprocal() * (region > OUTER_REGION)
         count = int(region.max()) + 1
         total = torch.zeros(count, device=weight.device).index_add_(0, region, weight)
         slope = torch.zeros_like(total).index_add_(0, region, weight * value / self.distance)
         slope /= total.clamp(min=1e-30)
         signs = torch.where(slope.abs() > CLEAR, slope.sign(), 0.0)
-        self.sign = torch.where(region > OUTSIDE, signs[region], self.sign)
+        self.sign = torch.where(region > OUTER_REGION, signs[region], self.sign)

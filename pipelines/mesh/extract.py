@@ -143,7 +143,9 @@ def export_run(
         raise InputError(f"--seen: {file} keeps no place that two photographs see; runs of `mplicits reconstruct` do")
     points = None
     if options.trim_distance is not None:
-        cloud = read_cloud(options.cloud or fitted_cloud(file, metadata, remedy="name it with --cloud FILE"))
+        columns = metadata.get("run", {}).get("config", {}).get("columns") if options.cloud is None else None
+        source = options.cloud or fitted_cloud(file, metadata, remedy="name it with --cloud FILE")
+        cloud = read_cloud(source, columns=columns)
         points = similarity.to_unit(cloud.points[np.isfinite(cloud.points).all(axis=1)])
     resolution = _resolution(field, options.resolution, support, level, say)
     try:

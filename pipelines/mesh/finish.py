@@ -35,6 +35,7 @@ class FitMesh:
         run: directory of the run.
         source: what holds the colours, a cloud or a mesh in the coordinates of the fit.
         colored: whether there are colours, and they are wanted.
+        columns: of that cloud; see `read_cloud`.
         trim: whether what the fit closes behind a depth map is cut off.
     """
 
@@ -43,6 +44,7 @@ class FitMesh:
     source: Path
     colored: bool
     trim: bool
+    columns: str | None = None
 
     def texture(self, *, refit: bool, progress: Callable[[Progress], None] | None = None) -> FittedTexture | None:
         """Train the texture with the default settings, on the device and with the seed of the fit.
@@ -63,7 +65,9 @@ class FitMesh:
         if not self.colored or (not refit and not resume and texture.is_file()):
             return None
         fitted = read_record(self.run)["config"]
-        config = dataclasses.replace(TextureConfig(), device=fitted["device"], seed=fitted["seed"])
+        config = dataclasses.replace(
+            TextureConfig(), device=fitted["device"], seed=fitted["seed"], columns=self.columns
+        )
         return texture_run(self.run, self.source, config, resume=resume, progress=progress)
 
     def extract(
@@ -84,7 +88,9 @@ class FitMesh:
             return mesh_run(self.run, self.out, options, say=say)
 
 
-def plan_mesh(out: Path, run: Path, source: Path | DepthInput, *, colors: bool, resume: bool) -> FitMesh:
+def plan_mesh(
+    out: Path, run: Path, source: Path | DepthInput, *, colors: bool, resume: bool, columns: str | None = None
+) -> FitMesh:
     """Check, before the fit, all that its mesh will need.
 
     Args:
@@ -93,6 +99,7 @@ def plan_mesh(out: Path, run: Path, source: Path | DepthInput, *, colors: bool, 
         source: what is fitted.
         colors: whether colours are wanted.
         resume: whether the run was begun before; depth maps are then not read again.
+        columns: of the cloud; see `read_cloud`.
 
     Raises:
         InputError: ``out`` cannot be written or is the cloud itself, or the cloud or its texture cannot be read.
@@ -105,11 +112,11 @@ def plan_mesh(out: Path, run: Path, source: Path | DepthInput, *, colors: bool, 
     colors = colors and out.suffix.lower() != COLORLESS
     if depth and not resume:
         return FitMesh(out, run, cloud, colors and source.color is not None, trim=True)
-    points = read_cloud(kept_cloud(run) if depth else cloud).points
+    points = read_cloud(kept_cloud(run) if depth else cloud, columns=columns).points
     finite = points[np.isfinite(points).all(axis=1)]
     check_mesh_path(out, Similarity.to_unit_sphere(finite))
     try:
-        colored = colors and has_colors(cloud)
+        colored = colors and has_colors(cloud, columns)
     except InputError as error:
         raise InputError(f"{error} (or leave the colours out: --no-colors)") from error
-    return FitMesh(out, run, cloud, colored, trim=depth)
+    return FitMesh(out, run, cloud, colored, trim=depth, columns=columns)

@@ -126,7 +126,11 @@ def reconstruct(
     with reported(progress, "reading the pictures"):
         maps = None if config.depth_maps is None else Path(config.depth_maps)
         depths = DepthSource(maps, config.depth_kind, config.depth_scale)
-        images = data if isinstance(data, PosedImages) else read_posed_images(data, width=config.width, depths=depths)
+        images = (
+            data
+            if isinstance(data, PosedImages)
+            else read_posed_images(data, width=config.width, depths=depths, allow_missing=config.allow_missing)
+        )
     load_compiler()
     training = _Reconstruction(images, config, device, folder, progress or silent, budget, resume=resume)
     with folder.writing(HELD_OUT_FILE, PREVIEW_FILE, MESH_FILE):
@@ -343,6 +347,7 @@ class _Reconstruction:
         return {
             "finished": finished,
             "data": str(self.images.source),
+            "reading": self.images.reading,
             "views": {"trained": len(self.train_views), "held_out": len(self.test_views)},
             "region": self.images.region,
             "start": self.start,

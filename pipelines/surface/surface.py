@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
@@ -14,6 +12,7 @@ from scipy.sparse.csgraph import connected_components
 from ...datasets import PointCloud, read_cloud
 from ...datasets.clouds.point_cloud import unit_rows
 from ...datasets.clouds.readers.meshes import spread_on_faces
+from ...datasets.clouds.readers.reading import read_mesh
 from ...datasets.textured.gltf import read_gltf
 from ...neural_fields import InputError, Mesh
 
@@ -24,6 +23,7 @@ __all__ = [
     "face_normals",
     "from_cloud",
     "is_closed",
+    "read_described",
     "read_reference",
     "read_surface",
     "sample_points",
@@ -42,14 +42,21 @@ def read_surface(path: str | Path) -> Mesh:
     Raises:
         InputError: the file is missing, damaged, empty or of a kind we do not read.
     """
+    return read_described(path)[0]
+
+
+def read_described(path: str | Path) -> tuple[Mesh, str]:
+    """`read_surface`, and of a cloud one line about what was read; see `PointCloud`."""
     path = Path(path)
+    mesh = None
     if path.suffix.lower() in (".glb", ".gltf"):
-        return _load_gltf(path)
-    if path.suffix.lower() in MESH_SUFFIXES:
+        mesh = _load_gltf(path)
+    elif path.suffix.lower() in MESH_SUFFIXES:
         mesh = _load_mesh(path)
-        if mesh is not None:
-            return mesh
-    return from_cloud(read_cloud(path))
+    if mesh is not None:
+        return mesh, ""
+    cloud = read_cloud(path)
+    return from_cloud(cloud), cloud.reading
 
 
 def read_reference(path: str | Path, *, fix: str = "give a mesh") -> Mesh:
@@ -84,19 +91,11 @@ def _load_mesh(path: Path) -> Mesh | None:
     """The triangles of a file; None where it has no faces."""
     if not path.is_file():
         raise InputError(f"{path}: no such file")
-    try:
-        # process=False: trimesh would otherwise merge vertices and drop faces before we count them.
-        loaded: Any = trimesh.load_mesh(path, process=False)
-    except Exception as error:  # trimesh's readers raise whatever their parsing runs into
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise InputError(f"{path}: cannot be read as a {path.suffix[1:].upper()} mesh ({reason})") from error
-    faces = np.asarray(getattr(loaded, "faces", ()), np.int64).reshape(-1, 3)
+    cloud, faces = read_mesh(path)
     if not len(faces):
         return None
-    colors = None
-    if loaded.visual.kind == "vertex":
-        colors = np.asarray(loaded.visual.vertex_colors, np.float64)[:, :3] / 255
-    return _checked(path, Mesh(np.asarray(loaded.vertices, np.float64), faces, None, colors))
+    colors = None if cloud.colors is None else cloud.colors.astype(np.float64)
+    return _checked(path, Mesh(cloud.points, faces, None, colors))
 
 
 def _load_gltf(path: Path) -> Mesh:

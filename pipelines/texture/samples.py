@@ -45,13 +45,14 @@ class BandSamples(NamedTuple):
     gradients: Tensor
 
 
-def read_colors(path: str | Path, *, samples: int, seed: int) -> PointCloud:
+def read_colors(path: str | Path, *, samples: int, seed: int, columns: str | None = None) -> PointCloud:
     """Read a cloud with colours; a mesh is sampled, with the colours of its texture or its vertices.
 
     Args:
         path: any cloud with colours, or an OBJ, GLB, glTF or PLY mesh.
         samples: how many points on a mesh.
         seed: of those.
+        columns: of a table; see `read_cloud`.
 
     Raises:
         InputError: the file cannot be read, or has no colours.
@@ -59,20 +60,20 @@ def read_colors(path: str | Path, *, samples: int, seed: int) -> PointCloud:
     path = Path(path)
     if path.suffix.lower() in TEXTURED_READERS and _has_faces(path):
         return sample_textured(read_textured(path), samples, seed=seed)
-    cloud = read_cloud(path)
+    cloud = read_cloud(path, columns=columns)
     if cloud.colors is None:
         raise InputError(f"{path}: colors: there are none; export the points with their colours, or name a mesh")
     return cloud
 
 
-def has_colors(path: str | Path) -> bool:
+def has_colors(path: str | Path, columns: str | None = None) -> bool:
     """Whether `read_colors` would find colours in the file of a cloud or mesh.
 
     Raises:
         InputError: the file, or an image of its texture, cannot be read.
     """
     path = Path(path)
-    cloud = read_cloud(path)
+    cloud = read_cloud(path, columns=columns)
     if path.suffix.lower() in TEXTURED_READERS and _has_faces(path):
         return TEXTURED_READERS[path.suffix.lower()](path).has_colors
     return cloud.colors is not None

@@ -226,7 +226,7 @@ def texture_run(
         if geometry.in_dim == 4:
             geometry = moment(geometry, 0.0)  # from there, colours ride along
         trained_level = chosen_level(geometry, file, level)
-        cloud = read_colors(source, samples=config.samples, seed=config.seed)
+        cloud = read_colors(source, samples=config.samples, seed=config.seed, columns=config.columns)
         fingerprint = _fingerprint(cloud, geometry)
         if before is not None and before.fingerprint != fingerprint:
             raise InputError(

@@ -7,6 +7,7 @@ import dataclasses
 import difflib
 import functools
 import math
+import shlex
 import types
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -18,6 +19,7 @@ __all__ = [
     "Settings",
     "add_config_flags",
     "closest",
+    "command_line",
     "given_flags",
     "input_error",
     "load_config",
@@ -27,6 +29,12 @@ __all__ = [
 ]
 
 T = TypeVar("T")
+
+
+def command_line(*words: object) -> str:
+    """A command of ours that can be pasted into a shell: words with spaces or brackets are quoted."""
+    return shlex.join(["mplicits", *map(str, words)])
+
 
 _KINDS = {bool: "true or false", int: "a whole number", float: "a finite number", str: "text"}
 _PLURALS = {bool: "true or false", int: "whole numbers", float: "finite numbers", str: "texts"}

@@ -29,7 +29,7 @@ from ...neural_fields.backend.files import check_place, damage, json_bytes, writ
 from ...neural_fields.checkpoint import SavedField, checksum_of, field_bytes
 from ...neural_fields.spacetime.dynamic_tracing import moment
 from .atomic import is_scratch, prune, recovered, replace_files
-from .config import load_config
+from .config import command_line, load_config
 from .lock import check_unlocked, locked
 
 __all__ = [
@@ -249,10 +249,10 @@ def resumes_with(run: Path, record: Mapping[str, Any]) -> str | None:
     if not (run / STATE_FILE).is_file():
         return None
     if "shapes" in record:
-        return f"mplicits evolve -o {run} --resume"
+        return command_line("evolve", "-o", run, "--resume")
     if "data" in record:
-        return f"mplicits reconstruct {record['data']} -o {run} --resume"
-    return f"mplicits fit {record.get('cloud', 'CLOUD')} -o {run} --resume"
+        return command_line("reconstruct", record["data"], "-o", run, "--resume")
+    return command_line("fit", record.get("cloud", "CLOUD"), "-o", run, "--resume")
 
 
 class RunFolder:

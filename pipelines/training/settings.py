@@ -58,6 +58,10 @@ class FitConfig(TrainingSettings):
         at_most=1,
     )
     samples: int = setting(400_000, "samples made per level and kind, drawn from at every step", above=0)
+    columns: str | None = setting(
+        None, "names of all columns of a table that has no names, - for one to ignore, such as x,y,z,nx,ny,nz,r,g,b,-"
+    )
+    drop_noise: bool = setting(False, "leave out points of LAS and LAZ files that are classified as noise")
     normals: Literal["auto", "file", "estimate", "none"] = setting(
         "auto", "where normals come from; none: level 0 learns from points alone, and orients their normals"
     )
@@ -114,6 +118,7 @@ class FitConfig(TrainingSettings):
 class TextureConfig(TrainingSettings):
     """Settings of ``texture``; the defaults are the ``default`` preset."""
 
+    columns: str | None = setting(None, "names of all columns of a table that has no names; see fit")
     width: int = setting(256, "neurons per layer", above=0)
     depth: int = setting(3, "sine layers", above=0)
     omega: float = setting(60.0, "SIREN frequency: higher takes up finer detail, and more of the noise", above=0)
@@ -160,6 +165,9 @@ class ReconstructConfig(TrainingSettings):
     )
     background: Literal["auto", "black", "white", "outside"] = setting(
         "auto", "what is behind the object; outside is learnt; auto: white with masks, else outside"
+    )
+    allow_missing: bool = setting(
+        False, "go on where fewer than half of the photographs have a camera, and without those that are missing"
     )
     depth_maps: str | None = setting(
         None, "folder with a depth map for each photograph; by default those that the data set names"

@@ -1,9 +1,13 @@
 """Files are opened in one way: what they hold comes back as stored, and what is wrong with them is one line."""
 
+import os
+import struct
+
 import cv2
 import imageio.v3 as iio
 import numpy as np
 import pytest
+from mplicits.datasets import read_cloud, read_depth
 from mplicits.datasets.files import (
     decode_image,
     finite_number,
@@ -15,6 +19,7 @@ from mplicits.datasets.files import (
     unit_range,
 )
 from mplicits.neural_fields import InputError
+from mplicits.neural_fields.backend.files import files_in
 
 RGBA = np.random.default_rng(0).integers(0, 256, (3, 5, 4)).astype(np.uint8)
 
@@ -90,6 +95,42 @@ def test_what_is_wrong_is_one_line_that_names_the_file(tmp_path, read, content, 
 def test_a_folder_in_the_place_of_a_file_is_said(tmp_path):
     with pytest.raises(InputError, match="cannot be read"):
         read_json(tmp_path)
+
+
+def test_names_are_in_natural_order(tmp_path):
+    for name in ("10.png", "2.png", "01.png", "a10.png", "a9.png", ".3.png", "4.txt"):
+        (tmp_path / name).touch()
+    assert [file.name for file in files_in(tmp_path, (".png",))] == ["01.png", "2.png", "10.png", "a9.png", "a10.png"]
+
+
+@pytest.mark.parametrize("read", [read_json, read_arrays, read_image, read_cloud, read_depth])
+@pytest.mark.parametrize("kind", ["pipe", "device", "long name"])
+def test_what_is_no_file_is_one_line(tmp_path, read, kind):
+    suffix = ".ply" if read is read_cloud else ".png"
+    path = tmp_path / (300 * "x" if kind == "long name" else "a")
+    path = path.with_name(path.name + suffix)
+    if kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "device":
+        path.symlink_to("/dev/zero")
+    with pytest.raises(InputError, match=r"is a pipe or a device|cannot be read"):
+        read(path)
+
+
+def test_images_that_claim_too_much(tmp_path):
+    head = b"\x89PNG\r\n\x1a\n" + struct.pack(">I4sIIBBBBB", 13, b"IHDR", 10_000, 10_000, 16, 0, 0, 0, 0)
+    (tmp_path / "a.png").write_bytes(head + bytes(100_000))
+    with pytest.raises(InputError, match="10000 × 10000 pixels in"):
+        read_image(tmp_path / "a.png")
+
+
+def test_archives_of_a_version_to_come(tmp_path):
+    np.savez(tmp_path / "a.npz", points=RGBA)
+    data = (tmp_path / "a.npz").read_bytes()
+    at = data.find(b"PK\x01\x02")
+    (tmp_path / "a.npz").write_bytes(data[: at + 6] + struct.pack("<H", 99) + data[at + 8 :])
+    with pytest.raises(InputError, match="damaged or not a NumPy file"):
+        read_arrays(tmp_path / "a.npz")
 
 
 @pytest.mark.parametrize("value", [True, "1", None, float("nan"), float("inf"), [1.0]])

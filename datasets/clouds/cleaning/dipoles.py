@@ -4,7 +4,7 @@ A dipole μ at p has the winding number ``⟨p − x, μ⟩ K(|p − x|)`` at x,
 small disc whose area-weighted normal is μ, seen from further away than the softening ε. Points lie in leaves of a k-d
 tree, all of the same size, so that everything is a product of dense matrices: leaves near a point's own are summed
 point by point, each further one as a single dipole at its middle. For N points that is of order N^1.5 instead of N²
-(20,000 points: 3 % of the pairs), and bounded by `LEAF`. `DipoleSums` asks at the points themselves, over and over;
+(20,000 points: 3 % of the pairs), and bounded by `leaf`. `DipoleSums` asks at the points themselves, over and over;
 `DipoleField` once at any places.
 """
 
@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -23,11 +24,19 @@ __all__ = ["DipoleField", "DipoleSums"]
 
 Float64 = NDArray[np.float64]
 
-LEAF = 48  # points of a leaf, about
-# Leaves are near whose middles are closer than this many times the sum of their radii; sums are then off by 2 %.
-NEAR = 1.4
-MOST_LEAVES = 2048  # of larger clouds, leaves are larger
-BATCH = 1 << 22  # pairs handled at once, to bound memory
+
+@dataclass(frozen=True)
+class DipoleOptions:
+    """How sums over dipoles are split into leaves."""
+
+    leaf: int = 48  # points of a leaf, about
+    # Leaves are near whose middles are closer than this many times the sum of their radii; sums are then off by 2 %.
+    near: float = 1.4
+    most_leaves: int = 2048  # of larger clouds, leaves are larger
+    batch: int = 1 << 22  # pairs handled at once, to bound memory
+
+
+DIPOLES = DipoleOptions()
 
 
 class _Batch(NamedTuple):
@@ -61,7 +70,7 @@ class DipoleSums:
         placed = self._by_leaf(self._x)
         self._middles = placed.mean(dim=1)
         radii = (placed - self._middles[:, None]).norm(dim=2).amax(dim=1)
-        near = torch.cdist(self._middles, self._middles) < NEAR * (radii[:, None] + radii)
+        near = torch.cdist(self._middles, self._middles) < DIPOLES.near * (radii[:, None] + radii)
         self._near = near.fill_diagonal_(True)
         members = self._x.shape[0] // leaves
         self._batches = list(_batches(near, lambda count: count * members**2))
@@ -176,7 +185,7 @@ class DipoleField:
     def __init__(
         self, points: NDArray[np.floating], dipoles: NDArray[np.floating], softening: NDArray[np.floating]
     ) -> None:
-        order, real, leaves = _leaves(points.astype(np.float64), max(LEAF, len(points) / MOST_LEAVES))
+        order, real, leaves = _leaves(points.astype(np.float64), max(DIPOLES.leaf, len(points) / DIPOLES.most_leaves))
 
         def by_leaf(rows: NDArray[np.floating]) -> Tensor:
             return torch.from_numpy(rows.astype(np.float32)).view(leaves, -1, rows.shape[1])
@@ -200,7 +209,7 @@ class DipoleField:
         places = torch.from_numpy(x[order].astype(np.float32)).view(groups, -1, 3)
         middles = places.mean(dim=1)
         radii = (places - middles[:, None]).norm(dim=2).amax(dim=1)
-        near = torch.cdist(middles, self._middles) < NEAR * (radii[:, None] + self._radii)
+        near = torch.cdist(middles, self._middles) < DIPOLES.near * (radii[:, None] + self._radii)
         sums = torch.empty(places.shape[:2])
         (size, leaves), members = (places.shape[1], len(self._middles)), self._x.shape[1]
         for batch in _batches(near, lambda count: size * max(leaves, count * members)):
@@ -232,7 +241,7 @@ def _batches(near: Tensor, pairs: Callable[[int], int]) -> Iterator[_Batch]:
     while start < len(near):
         few = int(counts[start])
         alike = int((counts <= 1.15 * few + 1).sum()) - start
-        end = start + max(1, min(alike, BATCH // pairs(few)))
+        end = start + max(1, min(alike, DIPOLES.batch // pairs(few)))
         rows = order[start:end]
         there, found = torch.topk(near[rows].to(torch.int8), int(counts[end - 1]), dim=1)
         yield _Batch(rows, found, (there > 0)[:, :, None, None].float())
@@ -244,7 +253,7 @@ def _kernel(squares: Tensor) -> Tensor:
     return squares.sqrt().mul_(squares).reciprocal_().mul_(1 / (4 * math.pi))
 
 
-def _leaves(points: Float64, size: float = LEAF) -> tuple[NDArray[np.int64], NDArray[np.bool_], int]:
+def _leaves(points: Float64, size: float = DIPOLES.leaf) -> tuple[NDArray[np.int64], NDArray[np.bool_], int]:
     """The points in the order of a balanced k-d tree's leaves, all of the same size: ``size``, or down to half of it.
 
     Returns:

@@ -8,6 +8,7 @@ take a hollow behind a thin wall for filled: what both say is sure.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,21 +16,27 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import KDTree
 
-__all__ = ["OUTSIDE", "Exterior"]
+__all__ = ["OUTER_REGION", "Exterior"]
 
 Float64 = NDArray[np.float64]
 Labels = NDArray[np.int64]
 
-OUTSIDE = 1  # the number of that region
+OUTER_REGION = 1  # the number of that region
 
-RESOLUTION = 128
-HALF = 1.15  # of the edge of the grid: the unit sphere, and room around it
-WALL = 1.5  # spacings around a point that belong to the surface
-# Regions that nothing wider than twice so many spacings joins are apart: of points that are drawn uniformly, one in
-# e^(π r²) lies beside an empty disc of r spacings.
-GATE = 2.5
-NEIGHBORS = 8  # whose mean spacing is a point's
-FEWEST = 500  # cells of a region; smaller ones lie between points that are unevenly spaced
+
+@dataclass(frozen=True)
+class ExteriorOptions:
+    """The grid around a cloud in the unit sphere; lengths in spacings of the points."""
+
+    resolution: int = 128
+    half: float = 1.15  # half edge of the grid, in units of the sphere
+    wall: float = 1.5  # around a point: part of the surface
+    gate: float = 2.5  # half width of a gap that joins two regions; one uniform point in e^(π r²) has such a gap
+    neighbors: int = 8  # whose mean spacing is a point's
+    fewest: int = 500  # cells of a region
+
+
+EXTERIOR = ExteriorOptions()
 
 
 class Exterior:
@@ -40,37 +47,37 @@ class Exterior:
         resolution: cells along each edge of the grid.
 
     Attributes:
-        count: how many regions there are, of `FEWEST` cells at least; `OUTSIDE`, and others that are enclosed.
+        count: how many regions there are, of `fewest` cells at least; `OUTER_REGION`, and others that are enclosed.
     """
 
-    def __init__(self, points: Float64, *, resolution: int = RESOLUTION) -> None:
-        self.cell = 2 * HALF / resolution
-        distance, near = KDTree(points).query(points, k=min(NEIGHBORS + 1, len(points)), workers=-1)
+    def __init__(self, points: Float64, *, resolution: int = EXTERIOR.resolution) -> None:
+        self.cell = 2 * EXTERIOR.half / resolution
+        distance, near = KDTree(points).query(points, k=min(EXTERIOR.neighbors + 1, len(points)), workers=-1)
         reach = np.asarray(distance)[:, -1][np.asarray(near)].max(axis=1)  # beside a gap that is its neighbours'
-        spacing = np.maximum(np.sqrt(np.pi / NEIGHBORS) * reach, self.cell / np.sqrt(3))
+        spacing = np.maximum(np.sqrt(np.pi / EXTERIOR.neighbors) * reach, self.cell / np.sqrt(3))
         where, widest = self._cells(points, resolution), np.zeros((resolution,) * 3)
         np.maximum.at(widest, tuple(where.T), spacing)
         apart, nearest = _distances(widest > 0)
         apart *= self.cell / widest[nearest]
-        label: Any = ndimage.label(apart > GATE)
+        label: Any = ndimage.label(apart > EXTERIOR.gate)
         label = np.asarray(label[0])
         beside, nearest = _distances(label > 0)
-        grown = (apart > WALL) & (beside * self.cell <= (GATE - WALL) * widest.max())
+        grown = (apart > EXTERIOR.wall) & (beside * self.cell <= (EXTERIOR.gate - EXTERIOR.wall) * widest.max())
         label = np.where(grown, label[nearest], label)
         size = np.bincount(label.ravel())
         size[[0, label[0, 0, 0]]] = 0
-        kept = [int(label[0, 0, 0]), *np.argsort(-size)[: int((size >= FEWEST).sum())].tolist()]
+        kept = [int(label[0, 0, 0]), *np.argsort(-size)[: int((size >= EXTERIOR.fewest).sum())].tolist()]
         names = np.zeros(len(size), np.int64)
-        names[kept] = OUTSIDE + np.arange(len(kept))
+        names[kept] = OUTER_REGION + np.arange(len(kept))
         self.count = len(kept)
         self._region = names[label]
 
     def regions(self, x: Float64) -> Labels:
-        """The region of each of ``(M, 3)`` places: 0 near the cloud's points, `OUTSIDE`, or more."""
+        """The region of each of ``(M, 3)`` places: 0 near the cloud's points, `OUTER_REGION`, or more."""
         return self._region[tuple(self._cells(x, len(self._region)).T)]
 
     def _cells(self, x: Float64, resolution: int) -> Labels:
-        return np.floor((x + HALF) / self.cell).astype(np.int64).clip(0, resolution - 1)
+        return np.floor((x + EXTERIOR.half) / self.cell).astype(np.int64).clip(0, resolution - 1)
 
 
 def _distances(there: NDArray[np.bool_]) -> tuple[Float64, tuple[Labels, ...]]:

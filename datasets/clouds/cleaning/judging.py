@@ -8,13 +8,15 @@ half of the points and judged by the other: in the half that it was fitted to a 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from ..point_cloud import unit_rows
 from .noise import noise_level
-from .reestimate import REACH, refit_normals
+from .reestimate import REFIT, refit_normals
 
 __all__ = ["layer_level", "neighborly", "worse_normals"]
 
@@ -22,19 +24,29 @@ Float64 = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Rows = NDArray[np.int64]
 
-ASKED = 1000  # points that say whether the others are worth a look
-BLOCK = 1 << 13  # rows handled at once, to bound memory
-FEWEST = 64  # points of a cloud that has two halves with neighbourhoods
-# Neighbours, of a point's own half, that judge it: of clean points the nearest, which see the finest relief; of noisy
-# ones those further away, as normals that another program fitted to the nearest follow their noise.
-NEAR, FAR = (1, 9), (16, 33)
-FITTED, FITTED_NOISY = 16, 64  # neighbours that planes are fitted to, of the other half
-ALIKE = 0.5  # smallest cosine between normals of one surface
-RATIO = 1.5  # of the squares that are left, from which on a normal is worse
-TILT = 0.05  # radians that it must be off at least: normals of files are rounded, and nobody sees three degrees
-# The least share of normals that are worse, and in units of the share whose planes are worse than they are, by the same
-# measure: of sound normals there are a few at sharp edges, where vertices have a mean normal that no side has.
-SHARE, AGAINST = 0.08, 1.5
+
+@dataclass(frozen=True)
+class JudgingOptions:
+    """How given normals are compared with those of planes through neighbours."""
+
+    asked: int = 1000  # points that say whether the others are worth a look
+    block: int = 1 << 13  # rows handled at once, to bound memory
+    fewest: int = 64  # points of a cloud that has two halves with neighbourhoods
+    # Neighbours that judge a point: the nearest; with noise those further away, as nearer ones share it.
+    near: tuple[int, int] = (1, 9)
+    far: tuple[int, int] = (16, 33)
+    # Neighbours that planes are fitted to, without and with noise.
+    fitted: int = 16
+    fitted_noisy: int = 64
+    alike: float = 0.5  # smallest cosine between normals of one surface
+    ratio: float = 1.5  # of the squares that are left, from which on a normal is worse
+    tilt: float = 0.05  # radians that a worse normal is off at least
+    # Least share of worse normals, and that in shares of those whose planes are worse.
+    share: float = 0.08
+    against: float = 1.5
+
+
+JUDGING = JudgingOptions()
 
 
 def layer_level(points: Float64, normals: Float64) -> float:
@@ -47,7 +59,7 @@ def layer_level(points: Float64, normals: Float64) -> float:
     level = noise_level(points, normals)
     if not level:
         return 0.0
-    return min(level, noise_level(points, refit_normals(points, normals, 0.0, neighbors=FITTED), fitted=True))
+    return min(level, noise_level(points, refit_normals(points, normals, 0.0, neighbors=JUDGING.fitted), fitted=True))
 
 
 def neighborly(points: Float64, normals: Float64) -> Float64:
@@ -71,9 +83,9 @@ def worse_normals(points: Float64, normals: Float64, level: float, *, seed: int 
     """Which normals ``(N,)`` are worse than those of planes through neighbours; none if the file's are mostly better.
 
     Let f be normals of planes fitted to the half of the points that a point is not in (see `refit_normals`), and n its
-    given one. It is worse if ``Σ_j (½(n + f_j)·(p_j − p))²`` over neighbours in its own half is more than `RATIO` times
-    what f leaves of it, and more than that by what a tilt of `TILT` would leave. In the same way it may be better. None
-    is taken for worse unless `SHARE` of all are, and `AGAINST` times as many as are better.
+    given one. It is worse if ``Σ_j (½(n + f_j)·(p_j − p))²`` over neighbours in its own half is more than `ratio` times
+    what f leaves of it, and more than that by what a tilt of `tilt` would leave. In the same way it may be better. None
+    is taken for worse unless `share` of all are, and `against` times as many as are better.
 
     Args:
         points: ``(N, 3)``, around the origin.
@@ -82,13 +94,13 @@ def worse_normals(points: Float64, normals: Float64, level: float, *, seed: int 
         seed: of the halves.
     """
     none = np.zeros(len(points), bool)
-    if len(points) < FEWEST:
+    if len(points) < JUDGING.fewest:
         return none
     random = np.random.default_rng(seed)
     judge = _Judge(points, normals, level, random.permutation(len(points)) < len(points) // 2)
-    verdict = judge.verdict(random.permutation(len(points))[:ASKED])
+    verdict = judge.verdict(random.permutation(len(points))[: JUDGING.asked])
     share = float((verdict > 0).mean())
-    if share < max(SHARE, AGAINST * float((verdict < 0).mean())):
+    if share < max(JUDGING.share, JUDGING.against * float((verdict < 0).mean())):
         return none
     return judge.verdict(np.arange(len(points))) > 0
 
@@ -101,7 +113,7 @@ class _Judge:
 
     def verdict(self, rows: Rows) -> Rows:
         """1 where the given normal is worse than the plane's, −1 where it is better, else 0; ``(m,)`` for ``rows``."""
-        low, high = FAR if self.level else NEAR
+        low, high = JUDGING.far if self.level else JUDGING.near
         result = np.zeros(len(rows), np.int64)
         for half in (True, False):
             own, other = np.flatnonzero(self.first == half), np.flatnonzero(self.first != half)
@@ -114,28 +126,28 @@ class _Judge:
             fitted = refit_normals(
                 self.points,
                 self.normals,
-                REACH * self.level,
-                neighbors=FITTED_NOISY if self.level else FITTED,
+                REFIT.reach * self.level,
+                neighbors=JUDGING.fitted_noisy if self.level else JUDGING.fitted,
                 rows=members,
                 among=other,
             )
             index = place[: len(mine)], place[len(mine) :].reshape(near.shape)
-            for block in np.array_split(np.arange(len(mine)), -(-len(mine) // BLOCK)):
+            for block in np.array_split(np.arange(len(mine)), -(-len(mine) // JUDGING.block)):
                 result[mine[block]] = self._compared(members, fitted, index[0][block], index[1][block])
         return result
 
     def _compared(self, members: Rows, fitted: Float64, one: Rows, others: Rows) -> Rows:
         edge = self.points[members[others]] - self.points[members[one]][:, None]
         theirs, given, plane = fitted[others], self.normals[members[one]], fitted[one]
-        alike = np.einsum("mkd,md->mk", theirs, plane) > ALIKE
+        alike = np.einsum("mkd,md->mk", theirs, plane) > JUDGING.alike
         along = np.einsum("mkd,mkd->mk", edge, theirs)
 
         def left(normal: Float64) -> Float64:
             return np.where(alike, (0.5 * (np.einsum("mkd,md->mk", edge, normal) + along)) ** 2, 0).sum(axis=1)
 
         # A tilt δ is seen as ½ δ times the part of the edge along it, half of whose square is there on average.
-        seen = 0.125 * TILT**2 * np.where(alike, (edge**2).sum(axis=2), 0).sum(axis=1)
+        seen = 0.125 * JUDGING.tilt**2 * np.where(alike, (edge**2).sum(axis=2), 0).sum(axis=1)
         theirs_left, ours_left = left(given), left(plane)
-        worse = theirs_left > np.maximum(RATIO * ours_left, ours_left + seen)
-        better = ours_left > np.maximum(RATIO * theirs_left, theirs_left + seen)
+        worse = theirs_left > np.maximum(JUDGING.ratio * ours_left, ours_left + seen)
+        better = ours_left > np.maximum(JUDGING.ratio * theirs_left, theirs_left + seen)
         return (worse.astype(np.int64) - better) * (alike.sum(axis=1) >= 4)

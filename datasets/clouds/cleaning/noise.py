@@ -8,6 +8,7 @@ The two sides of a thin part have opposite normals, and do not see each other.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -19,33 +20,34 @@ __all__ = ["noise_deviation", "noise_level", "smooth_along_normals", "thick_of_e
 Float64 = NDArray[np.float64]
 Rows = NDArray[np.integer]
 
-ASKED = 2000  # points that the noise is measured at
-BLOCK = 1 << 13  # points moved at once, to bound memory
-VOTERS = 256  # neighbours that are asked, at most
-ALIKE = 0.7  # smallest cosine between normals of one surface
-# Heights of the eight nearest over their distance: 1/√5 = 0.45 where noise is far wider than the spacing. Below the
-# first it is narrower than a fourth of that, and levels average over it themselves; above the second there is no shape
-# left that it could be. Between them may be edges, the other side of a blade, or normals estimated there.
-THICK, THICKEST = 0.2, 0.35
-# The same where normals were estimated from the points: of half that noise they are wrong by five degrees and more, and
-# a network that is told of them does not average over that. Of so many points and more it sees several at once, and
-# smoothing them takes minutes.
-THICK_OF_ESTIMATED, DENSE = 0.1, 100_000
-# Those are the higher the further away, while noise is as high nearby: heights of the last four of sixteen neighbours
-# over those of the first four, medians, on a plane with noise of any direction, by that ratio. Six shapes with noise of
-# 0.1 to 1 % and estimated normals have 0.9 to 1.14 times as much; the same without noise 1.35 times and more.
-RATIOS, GROWTHS = (0.08, 0.155, 0.224, 0.28, 0.352), (1.02, 1.06, 1.12, 1.22, 1.48)
-GROWN = 1.2
-# The same of a neighbourhood so much wider than the noise that it holds nearly all of the layer; yet wider ones hold
-# other parts of a fine structure.
-THIN = 0.35
-# The same of neighbourhoods, five standard deviations in radius and more, whose middle may be at the layer's rim.
-WHOLE = 0.25
-# Of the area that a neighbourhood shows at the height of its middle: less counts as this much.
-LEAST_SEEN = 0.1
-# Half the thickness of the layer that a point looks through, in units of `noise_level`; after a round less is left. A
-# point at its rim must see past the middle: of a layer of three standard deviations one at two would be moved by half.
-LAYER, LAYER_LEFT = 4.0, 3.0
+
+@dataclass(frozen=True)
+class NoiseOptions:
+    """Noise along normals. Heights are over the tangent plane; values from clouds with 0.1 to 1 % noise."""
+
+    asked: int = 2000  # points that the noise is measured at
+    block: int = 1 << 13  # points moved at once, to bound memory
+    voters: int = 256  # most neighbours of a point that is moved
+    alike: float = 0.7  # smallest cosine between normals of one surface
+    # Heights over distances of the eight nearest that count as noise: 1/√5 = 0.45 where it is far wider than spacing.
+    thick: float = 0.2
+    thickest: float = 0.35
+    thick_of_estimated: float = 0.1  # the same of estimated normals, which half as much noise tilts by 5°
+    dense: int = 100_000  # points from which on a network averages over that noise itself
+    # Noise is as high nearby as further away: last four over first four heights of sixteen neighbours, by thickness.
+    ratios: tuple[float, float, float, float, float] = (0.08, 0.155, 0.224, 0.28, 0.352)
+    growths: tuple[float, float, float, float, float] = (1.02, 1.06, 1.12, 1.22, 1.48)
+    grown: float = 1.2  # times the expected growth, above which it is shape
+    # Heights over radii of wider neighbourhoods, which hold nearly all of the layer: the most, and of the widest.
+    thin: float = 0.35
+    whole: float = 0.25
+    least_seen: float = 0.1  # smallest weight of the area that a neighbourhood shows at a height
+    # Half thickness of the layer that a point looks through, in noise levels; and in the rounds after the first.
+    layer: float = 4.0
+    layer_left: float = 3.0
+
+
+NOISE = NoiseOptions()
 
 
 class _Neighbors(NamedTuple):
@@ -64,11 +66,11 @@ class _Neighbors(NamedTuple):
 
 def thick_of_estimated(count: int) -> float:
     """From which thickness on there is noise in a cloud of ``count`` points with estimated normals: ``thick`` below."""
-    return THICK_OF_ESTIMATED if count < DENSE else THICK
+    return NOISE.thick_of_estimated if count < NOISE.dense else NOISE.thick
 
 
 def noise_level(
-    points: Float64, normals: Float64, *, seed: int = 0, fitted: bool = False, thick: float = THICK
+    points: Float64, normals: Float64, *, seed: int = 0, fitted: bool = False, thick: float = NOISE.thick
 ) -> float:
     """How thick the layer of points is along the normals, or 0 where the spacing is wider than that.
 
@@ -86,7 +88,7 @@ def noise_level(
     return _measured(points, normals, seed, fitted=fitted, thick=thick)[0]
 
 
-def noise_deviation(points: Float64, normals: Float64, *, seed: int = 0, thick: float = THICK) -> float:
+def noise_deviation(points: Float64, normals: Float64, *, seed: int = 0, thick: float = NOISE.thick) -> float:
     """The standard deviation of the noise along the normals, or 0 where the spacing is wider than that.
 
     Whatever direction the noise has: what it does across the normals moves points within the surface, and is not
@@ -104,7 +106,7 @@ def noise_deviation(points: Float64, normals: Float64, *, seed: int = 0, thick: 
         seed: of the points that are asked.
         thick: see `noise_level`.
     """
-    level, near = _measured(points, normals, seed, thin=WHOLE, thick=thick)
+    level, near = _measured(points, normals, seed, thin=NOISE.whole, thick=thick)
     return _deviation(near) if level and near is not None else 0.0
 
 
@@ -113,22 +115,22 @@ def _measured(
     normals: Float64,
     seed: int,
     *,
-    thin: float = THIN,
+    thin: float = NOISE.thin,
     fitted: bool = False,
-    thick: float = THICK,
+    thick: float = NOISE.thick,
 ) -> tuple[float, _Neighbors | None]:
     """The layer's thickness, in neighbourhoods ``1/thin`` times as wide, and those; 0 and None if it is no layer."""
     order = np.random.default_rng(seed).permutation(len(points))
     layer = _Layer(points, normals, order)
-    ratio = _thickness(layer.around(order[:ASKED], 8))[0]
+    ratio = _thickness(layer.around(order[: NOISE.asked], 8))[0]
     if not ratio > thick:
         return 0.0, None
-    grown = GROWN * np.interp(ratio, RATIOS, GROWTHS)
-    if ratio < THICKEST and not fitted and _growth(layer.around(order[:ASKED], 16)) > grown:
+    grown = NOISE.grown * np.interp(ratio, NOISE.ratios, NOISE.growths)
+    if ratio < NOISE.thickest and not fitted and _growth(layer.around(order[: NOISE.asked], 16)) > grown:
         return 0.0, None
     level, near = 0.0, None
     while len(order) > 32:  # fewer and fewer points show wider and wider neighbourhoods, at the same cost
-        near = layer.around(order[:ASKED], 16)
+        near = layer.around(order[: NOISE.asked], 16)
         ratio, height = _thickness(near)
         level = height / 2**0.5  # of a difference of two
         if ratio < thin:
@@ -139,7 +141,7 @@ def _measured(
 
 
 def smooth_along_normals(
-    points: Float64, normals: Float64, level: float, *, rounds: int = 2, alike: float = ALIKE, seed: int = 0
+    points: Float64, normals: Float64, level: float, *, rounds: int = 2, alike: float = NOISE.alike, seed: int = 0
 ) -> Float64:
     """Move points along their normals to where those neighbours agree whose normals are like their own.
 
@@ -153,7 +155,7 @@ def smooth_along_normals(
         level: the noise's standard deviation, see `noise_level`.
         rounds: how often.
         alike: smallest cosine between normals that count; the better they are, the more it can ask for.
-        seed: of the neighbours that are asked, where more than `VOTERS` are within reach.
+        seed: of the neighbours that are asked, where more than `voters` are within reach.
 
     Returns:
         The points, moved, ``(N, 3)``.
@@ -163,12 +165,12 @@ def smooth_along_normals(
     spacing = _spacing(points, normals, order)
     reach = max(3 * level, 4 * spacing)
     # In a dense cloud the nearest points would all lie at a point's own height: of that, fewer are asked.
-    share = VOTERS / (np.pi * (reach / spacing) ** 2)
-    voters = order[: max(VOTERS, int(share * len(points)))]
-    for layer in (LAYER * level, *(rounds - 1) * (LAYER_LEFT * level,)):
+    share = NOISE.voters / (np.pi * (reach / spacing) ** 2)
+    voters = order[: max(NOISE.voters, int(share * len(points)))]
+    for layer in (NOISE.layer * level, *(rounds - 1) * (NOISE.layer_left * level,)):
         offset, others = np.empty(len(points)), _Layer(moved, normals, voters)
-        for rows in np.array_split(np.arange(len(points)), -(-len(points) // BLOCK)):
-            near = others.around(rows, VOTERS, within=float(np.hypot(reach, layer)))
+        for rows in np.array_split(np.arange(len(points)), -(-len(points) // NOISE.block)):
+            near = others.around(rows, NOISE.voters, within=float(np.hypot(reach, layer)))
             beside = (near.distance**2 - near.height**2) / reach**2
             likeness = (near.cosine - alike) / (1 - alike)
             seen = (beside < 1) & (np.abs(near.height) < layer) & (likeness > 0)
@@ -227,7 +229,7 @@ def _deviation(near: _Neighbors) -> float:
     if not some.any():
         return 0.0
     height = np.where(alike, near.height, 0.0)[some]
-    seen = np.maximum(1 - (height / radius[some]) ** 2, LEAST_SEEN)
+    seen = np.maximum(1 - (height / radius[some]) ** 2, NOISE.least_seen)
     weight = alike[some] / seen
     total = weight.sum(axis=1, keepdims=True)
     mean = (weight * height).sum(axis=1, keepdims=True) / total
@@ -238,5 +240,5 @@ def _deviation(near: _Neighbors) -> float:
 
 def _spacing(points: Float64, normals: Float64, order: Rows) -> float:
     """The side of the square that a point has to itself, of the points seen along the normals."""
-    near = _Layer(points, normals, order).around(order[:ASKED], 16)
+    near = _Layer(points, normals, order).around(order[: NOISE.asked], 16)
     return float(np.median(np.nanmax(near.distance, axis=1))) * np.sqrt(np.pi / near.distance.shape[1])

@@ -11,6 +11,7 @@ nothing, nor does an odd normal: thin and sharp parts have many.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -28,19 +29,28 @@ Float64 = NDArray[np.float64]
 Rows = NDArray[np.integer]
 Mask = NDArray[np.bool_]
 
-NEIGHBORS = 12
-REACH = 8  # the neighbour whose distance tells how sparse a place is
-BLOCK = 1 << 16  # points handled at once, to bound memory
-# Of six clean meshes, the raw scans of the bunny and all of them with 1 % noise, at most 1 point in 1,000 has its
-# eighth neighbour further away than 2.5 times its neighbours', and at most 1 in 30,000 than four times the median.
-SPARSER = 2.5
-SPARSE = 4.0
-# How far off a neighbour's plane a supported point may be, as the sine of the edge's elevation (the corners of a cube
-# are 0.58 off each other's), and how well normals must mirror each other: a random one does one time in four. Where
-# neighbours are very far they are all alike and support a point all together, by chance: there, one time in twenty.
-ELEVATION, MIRRORED = 0.6, 0.5
-LONELY, LONELY_ELEVATION, LONELY_MIRRORED = 4.0, 0.3, 0.9
-MAJORITY = 0.5  # share of neighbours that must support a sparse point
+
+@dataclass(frozen=True)
+class OutlierOptions:
+    """Which points belong to no surface."""
+
+    neighbors: int = 12
+    reach: int = 8  # the neighbour whose distance tells how sparse a place is
+    block: int = 1 << 16  # points handled at once, to bound memory
+    # Distance of that neighbour over its neighbours' (1 in 1,000 of clean points), and over the median (1 in 30,000).
+    sparser: float = 2.5
+    sparse: float = 4.0
+    # Of a neighbour that supports a point: sine of the edge's elevation over its plane (0.58 at the corners of a cube),
+    # and cosine of the mirrored normals; the same of points so many times sparser than others.
+    elevation: float = 0.6
+    mirrored: float = 0.5
+    lonely: float = 4.0
+    lonely_elevation: float = 0.3
+    lonely_mirrored: float = 0.9
+    majority: float = 0.5  # share of neighbours that must support a sparse point
+
+
+OUTLIERS = OutlierOptions()
 
 
 class Verdict(NamedTuple):
@@ -68,7 +78,7 @@ def inspect_points(
     """Find strays and flipped normals.
 
     Isolated is a point whose eighth neighbour is ``isolation`` times further away than the median point's, unless it
-    has company: neighbours about as sparse that support it. Outliers are points that are sparse (`SPARSER`, `SPARSE`)
+    has company: neighbours about as sparse that support it. Outliers are points that are sparse (`sparser`, `sparse`)
     and supported by fewer than half of their neighbours; points off the plane, or across the normals, that all their
     neighbours agree on; and small clusters apart whose members do not support each other. As strays may be each
     other's neighbours, those of the dropped are judged again. A normal is flipped if nearly all neighbours in the
@@ -91,7 +101,7 @@ def inspect_points(
     if isolation is not None:
         isolated = _isolated(cloud, isolation)
         cloud.drop(isolated)
-    enough = cloud.kept.sum() > 2 * NEIGHBORS  # for neighbourhoods that are no whole cloud
+    enough = cloud.kept.sum() > 2 * OUTLIERS.neighbors  # for neighbourhoods that are no whole cloud
     if flips and enough and normals is not None:
         flipped = _flipped(cloud, normals)
         cloud.normals = np.where(flipped[:, None], -normals, normals)
@@ -107,7 +117,7 @@ def agreement(points: Float64, normals: Float64, rows: Rows) -> tuple[Float64, F
         The share of their neighbours that support them ``(m,)``, and their neighbours' mean normals ``(m, 3)``, of
         length 1 where all agree. In a cloud too small for neighbourhoods every point agrees.
     """
-    if len(points) <= 2 * NEIGHBORS:
+    if len(points) <= 2 * OUTLIERS.neighbors:
         return np.ones(len(rows)), normals[rows]
     cloud = _Cloud(points, normals, rows)
     support = _by_blocks(rows, lambda part: _support(cloud, part, np.zeros(len(part), bool)))
@@ -133,7 +143,7 @@ class _Cloud:
         self.signed = normals is not None
         self.normals = np.zeros_like(points) if normals is None else normals
         self.flat = np.ones(len(points), bool)
-        self.near = np.empty((len(points), min(NEIGHBORS, len(points) - 1)), np.int32)
+        self.near = np.empty((len(points), min(OUTLIERS.neighbors, len(points) - 1)), np.int32)
         self.reach = np.empty(len(points))
         self.kept = np.ones(len(points), bool)
         self._look(np.arange(len(points)) if rows is None else rows)
@@ -155,7 +165,7 @@ class _Cloud:
         for part in _blocks(rows):
             distance, found = tree.query(self.points[part], k=self.near.shape[1] + 1, workers=-1)
             self.near[part] = among[np.asarray(found)[:, 1:]]
-            self.reach[part] = np.asarray(distance)[:, min(REACH, self.near.shape[1])]
+            self.reach[part] = np.asarray(distance)[:, min(OUTLIERS.reach, self.near.shape[1])]
             if not self.signed:
                 self.normals[part], spread = fit_planes(self.points[self.near[part]])
                 self.flat[part] = spread < 0.25 * self.reach[part]
@@ -167,14 +177,14 @@ class _Cloud:
 
     def thinning(self, rows: Rows) -> Float64:
         """How many times sparser it is around points ``(m,)`` than around their neighbours."""
-        return self.reach[rows] / np.maximum(np.median(self.reach[self.near[rows, :REACH]], axis=1), 1e-300)
+        return self.reach[rows] / np.maximum(np.median(self.reach[self.near[rows, : OUTLIERS.reach]], axis=1), 1e-300)
 
 
 def _isolated(cloud: _Cloud, factor: float) -> Mask:
     isolated = cloud.reach > factor * np.median(cloud.reach)
     rows = np.flatnonzero(isolated)
     support = _by_blocks(rows, lambda part: _support(cloud, part, np.ones(len(part), bool)))
-    isolated[rows] = (support < MAJORITY) | (cloud.thinning(rows) > SPARSER)
+    isolated[rows] = (support < OUTLIERS.majority) | (cloud.thinning(rows) > OUTLIERS.sparser)
     return isolated
 
 
@@ -186,11 +196,11 @@ def _outliers(cloud: _Cloud, *, rounds: int = 4) -> Mask:
         dropped = np.zeros(len(before), bool)
         for part in _blocks(asked):
             thinning, overall = cloud.thinning(part), cloud.reach[part] / usual
-            sparse = (thinning > SPARSER) | (overall > SPARSE)
-            lonely = (thinning > LONELY) | (overall > LONELY * SPARSE)
+            sparse = (thinning > OUTLIERS.sparser) | (overall > OUTLIERS.sparse)
+            lonely = (thinning > OUTLIERS.lonely) | (overall > OUTLIERS.lonely * OUTLIERS.sparse)
             support[part] = _support(cloud, part, lonely)
-            dropped[part] = (support[part] < MAJORITY) & (sparse | _off(cloud, part))
-        if cloud.kept.sum() - dropped.sum() <= 2 * NEIGHBORS:
+            dropped[part] = (support[part] < OUTLIERS.majority) & (sparse | _off(cloud, part))
+        if cloud.kept.sum() - dropped.sum() <= 2 * OUTLIERS.neighbors:
             break  # nothing here is sound enough to judge the rest by
         asked = cloud.drop(dropped)
         if len(asked) == 0:
@@ -249,8 +259,8 @@ def _support(cloud: _Cloud, rows: Rows, lonely: Mask) -> Float64:
     mirrored = np.einsum("mkd,md->mk", theirs, own) - 2 * np.einsum("mkd,md->mk", edge, own) / length * rise
     if not cloud.signed:
         mirrored = np.abs(mirrored)
-    supports = np.abs(rise) <= np.where(lonely, LONELY_ELEVATION, ELEVATION)[:, None]
-    supports &= mirrored >= np.where(lonely, LONELY_MIRRORED, MIRRORED)[:, None]
+    supports = np.abs(rise) <= np.where(lonely, OUTLIERS.lonely_elevation, OUTLIERS.elevation)[:, None]
+    supports &= mirrored >= np.where(lonely, OUTLIERS.lonely_mirrored, OUTLIERS.mirrored)[:, None]
     return supports.mean(axis=1) * cloud.flat[rows]
 
 
@@ -291,13 +301,13 @@ def _stray_clusters(cloud: _Cloud, support: Float64) -> Mask:
     group = connected_components(graph.tocsr(), directed=False)[1]
     size = np.bincount(group, weights=cloud.kept)
     mean = np.bincount(group, weights=support * cloud.kept) / np.maximum(size, 1)
-    small = size < max(NEIGHBORS, 1e-3 * len(rows))
-    return (small & (mean < MAJORITY))[group] & cloud.kept
+    small = size < max(OUTLIERS.neighbors, 1e-3 * len(rows))
+    return (small & (mean < OUTLIERS.majority))[group] & cloud.kept
 
 
 def _blocks(rows: Rows) -> Iterator[Rows]:
-    for start in range(0, len(rows), BLOCK):
-        yield rows[start : start + BLOCK]
+    for start in range(0, len(rows), OUTLIERS.block):
+        yield rows[start : start + OUTLIERS.block]
 
 
 def _by_blocks(rows: Rows, function: Callable[[Rows], Float64]) -> Float64:

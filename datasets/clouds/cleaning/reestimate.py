@@ -18,6 +18,8 @@ through both sides of bars; those of like normals leave the other sides out.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
@@ -29,36 +31,40 @@ __all__ = ["denoise", "filter_normals", "has_edges", "refit_normals", "sharper_n
 Float64 = NDArray[np.float64]
 Rows = NDArray[np.integer]
 
-BLOCK = 1 << 13  # points fitted at once, to bound memory
-NEIGHBORS = 64
-ALIKE = 0.3  # smallest cosine between normals that count
-ROUNDS = 2
-# Of the neighbours that a plane is fitted to, in standard deviations of the noise. A plane that reaches less far than
-# nine is tilted by noise more than bends tilt it; where points are sparser than that, the number of them is the limit.
-REACH = 9.0
-# Where there are edges, smallest cosines between normals: of neighbours that the first planes are fitted to, before a
-# filter has told faces apart; of points that move each other, once it has; of those that planes are then fitted to.
-ALIKE_AT_FIRST, ALIKE_MOVED, ALIKE_AFTER = 0.6, 0.9, 0.8
-EDGE_ROUNDS = 3
-TURN = 0.2  # radians, about: normals this much apart count e^(-1/2) of equal ones in a filter
-FILTERED, PASSES = 32, 3  # neighbours that a filter averages, and how often
-# Angles to the next eight normals, in the mean, that nine tenths of the points are below, over their median: 2.3 on
-# shapes that bend everywhere, 5 and more where faces meet at edges.
-EDGED = 4.0
-ASKED = 3000  # points that are asked for that
-# Normals fitted to few like neighbours must leave less than this part of what neighbours disagreed by. Without noise it
-# is 0.4 to 0.8 on smooth shapes, scans' vertices and bars; where some noise is left, 0.9, and they are worse.
-SHARPER = 0.8
-FEW = 16
+
+@dataclass(frozen=True)
+class RefitOptions:
+    """Normals fitted again. Cosines are between normals; distances in standard deviations of the noise."""
+
+    block: int = 1 << 13  # points fitted at once, to bound memory
+    neighbors: int = 64
+    alike: float = 0.3  # smallest cosine that counts
+    rounds: int = 2
+    reach: float = 9.0  # of a plane; a shorter one is tilted more by noise than by bends
+    # Smallest cosines where there are edges: for the first planes, for points that move each other, for planes after.
+    alike_at_first: float = 0.6
+    alike_moved: float = 0.9
+    alike_after: float = 0.8
+    edge_rounds: int = 3
+    turn: float = 0.2  # radians: width of the filter over angles between normals
+    filtered: int = 32  # neighbours that the filter averages
+    passes: int = 3
+    edged: float = 4.0  # 90 % quantile over median of angles to neighbours: 2.3 on smooth shapes, 5 with edges
+    asked: int = 3000  # points that are asked for that
+    sharper: float = 0.8  # disagreement of neighbours that must be left at most: 0.4 to 0.8 without noise, 0.9 with
+    few: int = 16  # neighbours of the finest planes
 
 
-def denoise(points: Float64, normals: Float64, *, rounds: int = ROUNDS) -> tuple[Float64, Float64, float]:
+REFIT = RefitOptions()
+
+
+def denoise(points: Float64, normals: Float64, *, rounds: int = REFIT.rounds) -> tuple[Float64, Float64, float]:
     """Points and normals that agree with each other, of noisy ones with signs.
 
     Args:
         points: ``(N, 3)``, around the origin.
         normals: ``(N, 3)`` unit normals of the noisy points, on the right side for the most part.
-        rounds: how often normals are fitted and points are moved; `EDGE_ROUNDS` times more where there are edges (see
+        rounds: how often normals are fitted and points are moved; `edge_rounds` times more where there are edges (see
             `has_edges`), with filtered normals.
 
     Returns:
@@ -69,7 +75,7 @@ def denoise(points: Float64, normals: Float64, *, rounds: int = ROUNDS) -> tuple
     level = noise_level(points, normals, thick=thick)
     if not level:
         return points, sharper_normals(points, normals), 0.0
-    reach = REACH * level
+    reach = REFIT.reach * level
     for _ in range(rounds):
         normals = refit_normals(smooth_along_normals(points, normals, level), normals, reach)
         level = noise_level(points, normals, thick=thick) or level
@@ -78,13 +84,13 @@ def denoise(points: Float64, normals: Float64, *, rounds: int = ROUNDS) -> tuple
     fitted = refit_normals(moved, normals, reach, tree=tree)
     if not has_edges(moved, fitted, tree=tree):
         return moved, fitted, level
-    fitted = refit_normals(moved, fitted, reach, alike=ALIKE_AT_FIRST, tree=tree)
-    for _ in range(EDGE_ROUNDS):
+    fitted = refit_normals(moved, fitted, reach, alike=REFIT.alike_at_first, tree=tree)
+    for _ in range(REFIT.edge_rounds):
         normals = filter_normals(moved, fitted, tree=tree)
         level = noise_level(points, normals, thick=thick) or level
-        moved = smooth_along_normals(points, normals, level, alike=ALIKE_MOVED)
+        moved = smooth_along_normals(points, normals, level, alike=REFIT.alike_moved)
         tree = KDTree(moved)
-        fitted = refit_normals(moved, normals, reach, alike=ALIKE_AFTER, tree=tree)
+        fitted = refit_normals(moved, normals, reach, alike=REFIT.alike_after, tree=tree)
     return moved, filter_normals(moved, fitted, tree=tree), level
 
 
@@ -102,15 +108,15 @@ def sharper_normals(points: Float64, normals: Float64) -> Float64:
         ``(N, 3)``.
     """
     tree, fitted = KDTree(points), normals
-    for _ in range(ROUNDS):
-        fitted = refit_normals(points, fitted, 0.0, neighbors=FEW, tree=tree)
+    for _ in range(REFIT.rounds):
+        fitted = refit_normals(points, fitted, 0.0, neighbors=REFIT.few, tree=tree)
     before, after = (_disagreement(points, each, tree) for each in (normals, fitted))
-    return fitted if after < SHARPER * before else normals
+    return fitted if after < REFIT.sharper * before else normals
 
 
 def _disagreement(points: Float64, normals: Float64, tree: KDTree) -> float:
     """The mean of |½(n_i + n_j)·(p_j − p_i)| / |p_j − p_i| over the eight nearest neighbours of some points."""
-    asked = np.random.default_rng(0).permutation(len(points))[:ASKED]
+    asked = np.random.default_rng(0).permutation(len(points))[: REFIT.asked]
     found = tree.query(points[asked], k=min(9, len(points)), workers=-1)
     distance, near = np.asarray(found[0])[:, 1:], np.asarray(found[1])[:, 1:]
     offset = points[near] - points[asked][:, None]
@@ -127,21 +133,26 @@ def has_edges(points: Float64, normals: Float64, *, seed: int = 0, tree: KDTree 
         seed: of the points that are asked.
         tree: of the points; None to build it.
     """
-    asked = np.random.default_rng(seed).permutation(len(points))[:ASKED]
+    asked = np.random.default_rng(seed).permutation(len(points))[: REFIT.asked]
     tree = tree or KDTree(points)
     near = np.asarray(tree.query(points[asked], k=min(9, len(points)), workers=-1)[1])[:, 1:]
     cosine = np.einsum("md,mkd->mk", normals[asked], normals[near])
     angle = np.arccos(cosine.clip(-1, 1)).mean(axis=1)
     usual, large = np.quantile(angle, (0.5, 0.9))
-    return bool(large > EDGED * usual)
+    return bool(large > REFIT.edged * usual)
 
 
 def filter_normals(
-    points: Float64, normals: Float64, *, turn: float = TURN, passes: int = PASSES, tree: KDTree | None = None
+    points: Float64,
+    normals: Float64,
+    *,
+    turn: float = REFIT.turn,
+    passes: int = REFIT.passes,
+    tree: KDTree | None = None,
 ) -> Float64:
     """Unit means of normals over neighbours, those counting most that are near and nearly the same.
 
-    Weights are ``(1 − d²/r²)² exp(−(1 − c)/turn²)``, d being the distance, r that of the last of `FILTERED` nearest
+    Weights are ``(1 − d²/r²)² exp(−(1 − c)/turn²)``, d being the distance, r that of the last of `filtered` nearest
     points, c the cosine between the normals, for which ``1 − c ≈ angle²/2``.
 
     Args:
@@ -154,12 +165,12 @@ def filter_normals(
     Returns:
         ``(N, 3)``.
     """
-    found = (tree or KDTree(points)).query(points, k=min(FILTERED, len(points)), workers=-1)
+    found = (tree or KDTree(points)).query(points, k=min(REFIT.filtered, len(points)), workers=-1)
     distance, near = np.asarray(found[0]), np.asarray(found[1])
     beside = (1 - (distance / (distance[:, -1:] * 1.001)) ** 2) ** 2
     for _ in range(passes):
         mean = np.empty_like(normals)
-        for part in np.array_split(np.arange(len(points)), -(-len(points) // BLOCK)):
+        for part in np.array_split(np.arange(len(points)), -(-len(points) // REFIT.block)):
             theirs = normals[near[part]]
             cosine = np.einsum("md,mkd->mk", normals[part], theirs)
             mean[part] = np.einsum("mk,mkd->md", beside[part] * np.exp((cosine - 1) / turn**2), theirs)
@@ -172,8 +183,8 @@ def refit_normals(
     normals: Float64,
     reach: float,
     *,
-    neighbors: int = NEIGHBORS,
-    alike: float = ALIKE,
+    neighbors: int = REFIT.neighbors,
+    alike: float = REFIT.alike,
     rows: Rows | None = None,
     among: Rows | None = None,
     tree: KDTree | None = None,
@@ -201,7 +212,7 @@ def refit_normals(
     others = np.arange(len(points)) if among is None else among
     count = min(neighbors, len(others))
     tree, fitted = tree or KDTree(points[others]), np.empty((len(asked), 3))
-    for part in np.array_split(np.arange(len(asked)), -(-len(asked) // BLOCK)):
+    for part in np.array_split(np.arange(len(asked)), -(-len(asked) // REFIT.block)):
         here = asked[part]
         found = tree.query(points[here], k=count, workers=-1)
         distance, near = np.asarray(found[0]), others[np.asarray(found[1])]

@@ -11,6 +11,7 @@ ones see the shape, narrow ones its thin parts. Ones narrower than the noise wou
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -24,7 +25,7 @@ from .noise import noise_level
 from .orientation import fit_planes, openness
 
 __all__ = [
-    "MUCH_LESS",
+    "WINDING",
     "WindingNormals",
     "disc_areas",
     "layer_thickness",
@@ -36,27 +37,39 @@ __all__ = [
 Float64 = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-WIDEST, NARROWING = 0.3, 1.5  # the first softening, of a cloud in the unit sphere, and what it is divided by
-# Points on the square of a softening; of the last, if it is the noise that stops there.
-COUNT, COUNT_LAST = 1.5, 4.0
-FEWEST = 500
-# Softenings stop at this many standard deviations of the noise: below, normals follow it.
-NOISE_WIDTHS = 1.4
-# Rounds at each softening: until next to no direction moves, but not for ever; what is wrong as a whole is put right
-# while points are few.
-FEWEST_ROUNDS, MOST_ROUNDS, MANY, MOST_ROUNDS_OF_MANY = 4, 16, 4000, 6
-STILL = 0.002
-# A cloud fits if the misfit of its normals is below this: solid and thin shapes have 0.05 to 0.25, half of a sphere
-# 0.2, range scans from one side 0.34, open sheets 0.5. The others keep the signs that they have unless those that
-# winding numbers give leave much less; and so do all that are open even with those (see `openness`).
-FITS, MUCH_LESS, OPEN = 0.25, 0.75, 0.2
-HARDLY_FITS = 0.33
-# Where normals do not fit, parts may be thin: softenings go on, of so many points at most, down to this many spacings.
-NARROWEST, LIMIT_OF_THIN = 0.2, 24_000
-SCALES = (0.6, 1.0)
-ASKED = 2000  # points that the thickness of the cloud is measured at, with neighbourhoods of so many
-SIZES = (16, 32, 64, 128, 256)
-NEIGHBORS = 8  # that share the disc out to the last of them
+
+@dataclass(frozen=True)
+class WindingOptions:
+    """Normals by winding numbers, in a cloud of radius 1. The misfit is that of `misfit`."""
+
+    widest: float = 0.3  # first softening of the dipoles
+    narrowing: float = 1.5  # what each next softening is divided by
+    # Points on the square of a softening; of the last, if noise stops there.
+    count: float = 1.5
+    count_last: float = 4.0
+    fewest: int = 500  # points
+    noise_widths: float = 1.4  # smallest softening, in standard deviations of the noise
+    # Rounds at each softening: at least, at most, and at most with more than so many points.
+    fewest_rounds: int = 4
+    most_rounds: int = 16
+    many: int = 4000
+    most_rounds_of_many: int = 6
+    still: float = 0.002  # share of the directions that still move when rounds end
+    # Misfit of a cloud that fits: closed shapes 0.05 to 0.25, half a sphere 0.2, scans of one side 0.34, sheets 0.5.
+    fits: float = 0.25
+    hardly_fits: float = 0.33
+    much_less: float = 0.75  # of the misfit before, that new signs must leave at most
+    open: float = 0.2  # openness from which on a cloud has no inside
+    # Of thin parts: narrowest softening in spacings, and most points.
+    narrowest: float = 0.2
+    limit_of_thin: int = 24_000
+    scales: tuple[float, float] = (0.6, 1.0)  # range of the correction of disc areas for noise
+    asked: int = 2000  # points that the thickness of the cloud is measured at
+    sizes: tuple[int, int, int, int, int] = (16, 32, 64, 128, 256)  # of their neighbourhoods
+    neighbors: int = 8  # that share a disc out to the last of them
+
+
+WINDING = WindingOptions()
 
 
 def orient_by_winding(points: Float64, normals: Float64, *, limit: int = 16_000) -> Float64 | None:
@@ -80,21 +93,21 @@ def orient_by_winding(points: Float64, normals: Float64, *, limit: int = 16_000)
         return misfit(points[some], signed[some], softening=softening, least=least)
 
     before = judged(normals, 2 * noise)
-    if before < FITS and not noise:
+    if before < WINDING.fits and not noise:
         return None
     found = winding_normals(points, limit=limit)
     oriented = _turned(points, normals, found)
     after = judged(oriented, 2 * noise)
-    if after >= FITS:
-        thin = narrower_normals(points, normals, found, limit=LIMIT_OF_THIN)
+    if after >= WINDING.fits:
+        thin = narrower_normals(points, normals, found, limit=WINDING.limit_of_thin)
         signed = _turned(points, normals, thin)
         least = thin.softening
         now, since = (judged(n, 2 * thin.noise, least) for n in (signed, normals))
         if now < judged(oriented, 2 * thin.noise, least):
             oriented, before, after = signed, since, now
-    if openness(points, oriented) > OPEN:
+    if openness(points, oriented) > WINDING.open:
         return None
-    return oriented if after < max(FITS, min(HARDLY_FITS, MUCH_LESS * before)) else None
+    return oriented if after < max(WINDING.fits, min(WINDING.hardly_fits, WINDING.much_less * before)) else None
 
 
 def _turned(points: Float64, normals: Float64, found: WindingNormals) -> Float64:
@@ -132,21 +145,21 @@ def winding_normals(points: Float64, *, limit: int = 16_000) -> WindingNormals:
     limit = min(limit, len(unit))
 
     def widened(rows: Index, normals: Float64, softening: float, count: float) -> tuple[Index, Float64]:
-        wanted = int(np.clip(count * area / softening**2, min(FEWEST, limit), limit))
+        wanted = int(np.clip(count * area / softening**2, min(WINDING.fewest, limit), limit))
         asked = spread(unit, wanted)
         before = normals[KDTree(unit[rows]).query(unit[asked])[1]]
-        most = MOST_ROUNDS if len(asked) <= MANY else MOST_ROUNDS_OF_MANY
+        most = WINDING.most_rounds if len(asked) <= WINDING.many else WINDING.most_rounds_of_many
         return asked, _consistent(unit[asked], before * area / len(asked), softening, most)
 
-    softening = WIDEST
-    rows, normals = widened(np.zeros(1, np.int64), np.zeros((1, 3)), softening, COUNT)
+    softening = WINDING.widest
+    rows, normals = widened(np.zeros(1, np.int64), np.zeros((1, 3)), softening, WINDING.count)
     noise = min(thickness, noise_level(unit[rows], normals))
-    while limit * softening**2 > COUNT * area and softening / NARROWING > NOISE_WIDTHS * noise:
-        softening /= NARROWING
-        rows, normals = widened(rows, normals, softening, COUNT)
+    while limit * softening**2 > WINDING.count * area and softening / WINDING.narrowing > WINDING.noise_widths * noise:
+        softening /= WINDING.narrowing
+        rows, normals = widened(rows, normals, softening, WINDING.count)
         noise = min(thickness, noise_level(unit[rows], normals))
-    if limit * softening**2 > COUNT * area:
-        rows, normals = widened(rows, normals, softening, COUNT_LAST)
+    if limit * softening**2 > WINDING.count * area:
+        rows, normals = widened(rows, normals, softening, WINDING.count_last)
         noise = min(thickness, noise_level(unit[rows], normals))
     return WindingNormals(rows, normals, softening * radius, noise * radius)
 
@@ -168,17 +181,17 @@ def narrower_normals(points: Float64, normals: Float64, found: WindingNormals, *
     unit, radius = _in_unit_ball(points)
     rows = spread(unit, limit)
     areas = disc_areas(unit[rows])
-    narrowest = NARROWEST * float(np.sqrt(np.median(areas)))
+    narrowest = WINDING.narrowest * float(np.sqrt(np.median(areas)))
     softenings = [found.softening / radius]
     steps = [found.normals[KDTree(unit[found.rows]).query(unit[rows])[1]]]
     while softenings[-1] > narrowest:
-        softenings.append(softenings[-1] / NARROWING)
-        steps.append(_consistent(unit[rows], steps[-1] * areas[:, None], softenings[-1], MOST_ROUNDS))
+        softenings.append(softenings[-1] / WINDING.narrowing)
+        steps.append(_consistent(unit[rows], steps[-1] * areas[:, None], softenings[-1], WINDING.most_rounds))
     last = WindingNormals(rows, steps[-1], softenings[-1] * radius, 0.0)
     noise = noise_level(unit, _turned(points, normals, last))
-    if NOISE_WIDTHS * noise <= softenings[-1]:
+    if WINDING.noise_widths * noise <= softenings[-1]:
         return last
-    allowed = max(1, sum(softening > NOISE_WIDTHS * noise for softening in softenings)) - 1
+    allowed = max(1, sum(softening > WINDING.noise_widths * noise for softening in softenings)) - 1
     return WindingNormals(rows, steps[allowed], softenings[allowed] * radius, noise * radius)
 
 
@@ -202,7 +215,7 @@ def _consistent(points: Float64, dipoles: Float64, softening: float, most: int) 
         mu = turned * mu.norm(dim=1, keepdim=True)
         moved = float(((turned * normals).sum(dim=1) < 0.5).float().mean())
         normals = turned
-        if done >= FEWEST_ROUNDS and moved < STILL:
+        if done >= WINDING.fewest_rounds and moved < WINDING.still:
             break
     return normals.double().numpy()
 
@@ -227,21 +240,21 @@ def misfit(points: Float64, normals: Float64, *, softening: float = 0.0, least: 
     if (
         softening
     ):  # noise moves neighbours apart, so that their discs look larger than what they share, by as much for all
-        mean *= (0.5 * mean.sum() / mean.square().sum().clamp(min=1e-12)).clamp(*SCALES)
+        mean *= (0.5 * mean.sum() / mean.square().sum().clamp(min=1e-12)).clamp(*WINDING.scales)
     return float((mean - 0.5).square().mean().sqrt())
 
 
 def layer_thickness(points: Float64, *, flat: float = 0.25, seed: int = 0) -> float:
     """The standard deviation of points ``(N, 3)`` from the planes through their neighbourhoods.
 
-    Neighbourhoods are the smallest, of `SIZES` points, that look flat: whose thickness is below ``flat`` times their
+    Neighbourhoods are the smallest, of `sizes` points, that look flat: whose thickness is below ``flat`` times their
     radius in the median. No sign is asked for, so what is thinner than the noise counts as noise.
     """
-    asked = np.random.default_rng(seed).permutation(len(points))[:ASKED]
-    found = KDTree(points).query(points[asked], k=min(SIZES[-1], len(points)), workers=-1)
+    asked = np.random.default_rng(seed).permutation(len(points))[: WINDING.asked]
+    found = KDTree(points).query(points[asked], k=min(WINDING.sizes[-1], len(points)), workers=-1)
     distance, near = np.asarray(found[0]), np.asarray(found[1])
     thickness = 0.0
-    for size in SIZES:
+    for size in WINDING.sizes:
         _, spread = fit_planes(points[near[:, :size]])
         radius = distance[:, min(size, near.shape[1]) - 1]
         thickness = float(np.median(spread))
@@ -255,7 +268,7 @@ def disc_areas(points: Float64, *, largest: float = 100.0) -> Float64:
 
     Those larger than ``largest`` times the median are of points on their own, which have no surface of that size.
     """
-    count = min(NEIGHBORS, len(points) - 1)
+    count = min(WINDING.neighbors, len(points) - 1)
     reach = np.asarray(KDTree(points).query(points, k=count + 1, workers=-1)[0])[:, -1]
     areas = np.pi * reach**2 / count
     return np.minimum(areas, largest * np.median(areas))

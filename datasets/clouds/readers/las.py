@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ....neural_fields import InputError
-from ..point_cloud import PointCloud, colors_from, columns_of
+from ..point_cloud import PointCloud, colors_from
+from .columns import Layout, Table, Triple, describe_layout, named_layout
 from .stream import CloudStream, RawRows
 
 __all__ = ["LasStream", "read_las"]
@@ -19,77 +22,100 @@ __all__ = ["LasStream", "read_las"]
 _VERSION = struct.Struct("<BB"), 24
 _SIZES = struct.Struct("<HIIBHI"), 94
 _SIZES_14 = struct.Struct("<QIQ"), 235
-_RECORD, _LATE_RECORD = 54, 60  # bytes of a variable-length record, and of one after the points, without their content
-_COMPRESSED = 0x80  # in the point format
-_DENSEST = 256  # points in a byte of LAZ, which makes 94 of a point repeated and 67 of a plane's grid
-
-
-def read_las(path: Path) -> PointCloud:
-    """Read points, and colours and normals where the file has them.
-
-    Raises:
-        InputError: laspy is not installed, or it cannot read the file.
-    """
-    laspy = _laspy(path)
-    _check_sizes(path)
-    try:
-        las: Any = laspy.read(path)
-        points = np.stack((las.x, las.y, las.z), axis=1).astype(np.float64)
-    except OSError:
-        raise
-    except Exception as error:  # laspy lets through its own errors and those of its decompressors
-        raise _unreadable(path, error) from error
-    names = set(las.point_format.dimension_names)
-    colors = np.stack((las.red, las.green, las.blue), axis=1) if "red" in names else None
-    # without colours, writers fill the columns with zeros
-    colors = None if colors is None or not colors.any() else colors_from(colors)
-    triple = columns_of(names, "normals")
-    normals = None if triple is None else np.stack([las[name] for name in triple], axis=1).astype(np.float32)
-    return PointCloud(points, normals, colors, str(path))
 
 
 class LasStream(CloudStream):
-    """A LAS or LAZ file, read in pieces.
+    """A LAS or LAZ file, read in pieces. Points that are marked as withheld are left out.
 
     Args:
         path: the file.
+        columns: refused: LAS files name their columns.
+        drop_noise: whether points of the classes for noise (7 and 18) are left out too.
 
     Raises:
         InputError: laspy is not installed, or it cannot read the file; also while pieces are read.
     """
 
-    def __init__(self, path: Path) -> None:
-        self.path, self.source, self.laspy = path, str(path), _laspy(path)
-        _check_sizes(path)
-        try:
-            with self.laspy.open(path) as reader:
-                self.count = int(reader.header.point_count)
-                names = set(reader.header.point_format.dimension_names)
-        except OSError:
-            raise
-        except Exception as error:  # see `read_las`
-            raise _unreadable(path, error) from error
-        self.normals = columns_of(names, "normals")
-        self.colored = "red" in names
-        # without colours, writers fill the columns with zeros
-        self.colored = self.colored and any(
-            piece.colors.any() for piece in self.pieces(1 << 20) if piece.colors is not None
-        )
+    def __init__(self, path: Path, columns: str | None = None, *, drop_noise: bool = False) -> None:
+        self.path, self.source, self.laspy = path, str(path), _laspy(path, columns)
+        self.choice = _Choice(path, drop_noise)
+        with _reading(path), self.laspy.open(path) as reader:
+            self.count = int(reader.header.point_count)
+            for part in reader.chunk_iterator(1 << 20):
+                self.choice.look(part)
+        self.reading = self.choice.reading()
 
     def pieces(self, rows: int) -> Iterator[RawRows]:
         """See `CloudStream.pieces`."""
-        try:
-            with self.laspy.open(self.path) as reader:
-                for part in reader.chunk_iterator(rows):
-                    yield RawRows(
-                        np.stack((part.x, part.y, part.z), axis=1).astype(np.float64),
-                        None if self.normals is None else np.stack([part[name] for name in self.normals], axis=1),
-                        np.stack((part.red, part.green, part.blue), axis=1) if self.colored else None,
-                    )
-        except OSError:
-            raise
-        except Exception as error:  # see `read_las`
-            raise _unreadable(self.path, error) from error
+        with _reading(self.path), self.laspy.open(self.path) as reader:
+            for part in reader.chunk_iterator(rows):
+                yield self.choice.rows(part)
+
+
+def read_las(path: Path, columns: str | None = None, *, drop_noise: bool = False) -> PointCloud:
+    """Read points, and colours and normals where the file has them; see `LasStream`.
+
+    Raises:
+        InputError: laspy is not installed, or it cannot read the file.
+    """
+    laspy, choice = _laspy(path, columns), _Choice(path, drop_noise)
+    with _reading(path):
+        las = laspy.read(path)
+        choice.look(las)
+        points, normals, colors = choice.rows(las)
+    normals = None if normals is None else normals.astype(np.float32)
+    colors = None if colors is None else colors_from(colors)
+    return PointCloud(points, normals, colors, str(path), reading=choice.reading())
+
+
+class _Choice:
+    """Which points and columns of a file are read, and how many points are not."""
+
+    def __init__(self, path: Path, drop_noise: bool) -> None:
+        self.path, self.drop_noise = path, drop_noise
+        self.names = ["x", "y", "z"]
+        self.points = self.withheld = self.noise = 0
+        self.colored = False
+
+    def look(self, part: Any) -> None:
+        """Count what is left out, and see whether there are colours: without any, writers fill the columns with 0."""
+        self.names = ["x", "y", "z", *(name for name in part.point_format.dimension_names if name not in "XYZ")]
+        self.points += len(part)
+        self.withheld += int(np.count_nonzero(part.withheld))
+        self.noise += int(np.count_nonzero(self._is_noise(part)))
+        self.colored = self.colored or (
+            "red" in self.names and bool(np.any(part.red) or np.any(part.green) or np.any(part.blue))
+        )
+
+    def rows(self, part: Any) -> RawRows:
+        """The points of one piece that are read."""
+        kept = np.asarray(part.withheld) == 0
+        if self.drop_noise:
+            kept &= ~self._is_noise(part)
+        layout = self._layout()
+
+        def pick(which: Triple) -> NDArray[Any]:
+            values = np.stack([np.asarray(part[self.names[k]]) for k in which], axis=1)
+            return values if kept.all() else values[kept]
+
+        normals, colors = layout.normals and pick(layout.normals), layout.colors and pick(layout.colors)
+        return RawRows(pick(layout.points), normals, colors)
+
+    def reading(self) -> str:
+        """See `PointCloud`."""
+        noise = f"{self.noise:,} of noise classes {'left out' if self.drop_noise else 'kept (--drop-noise)'}"
+        notes = [f"{self.withheld:,} withheld points left out"] * (self.withheld > 0) + [noise] * (self.noise > 0)
+        table = Table(self.path, [np.empty(0)] * len(self.names), self.names, notes=tuple(notes))
+        count = self.points - self.withheld - (self.noise if self.drop_noise else 0)
+        return describe_layout(table, self._layout(), count)
+
+    def _layout(self) -> Layout:
+        layout = named_layout(self.names)
+        assert layout is not None, "x, y and z are always there"
+        return layout if self.colored else layout._replace(colors=None)
+
+    def _is_noise(self, part: Any) -> NDArray[np.bool_]:
+        return np.isin(np.asarray(part.classification), (7, 18)) & (np.asarray(part.withheld) == 0)
 
 
 def _check_sizes(path: Path) -> None:
@@ -103,23 +129,63 @@ def _check_sizes(path: Path) -> None:
     late_start, late = size, 0
     if _at(head, _VERSION) >= (1, 4) and len(head) == 375:
         late_start, late, points = _at(head, _SIZES_14)
-    compressed = bool(form & _COMPRESSED)
+    compressed = bool(form & 0x80)
     room = size - start
     wrong = (
         f"byte 94: a header of {header} bytes before points at {start}, in {size} bytes"
         if not 227 <= header <= start <= size
         else f"byte 100: {records} records in {start - header} bytes"
-        if records * _RECORD > start - header
+        if records * 54 > start - header  # bytes of a record without its content; of a late one, 60
         else f"byte 105: points of {length} bytes"
         if length < 20
         else f"byte 243: {late} records after the points, from byte {late_start} of {size}"
-        if late and late_start + late * _LATE_RECORD > size
+        if late and late_start + late * 60 > size
         else f"{points} points in {room} bytes"
-        if points > (room * _DENSEST if compressed else room // length)
+        if points > (room * 256 if compressed else room // length)  # LAZ makes 94 points of a byte at the most
         else ""
     )
     if wrong:
-        raise InputError(f"{path}: not a readable LAS file ({wrong}); export it again")
+        raise _unreadable(path, wrong)
+    if compressed and points:
+        _check_laz(path, start, points)
+
+
+def _check_laz(path: Path, start: int, points: int) -> None:
+    """Refuse LAZ on which the decompressor would abort or loop: old compressors, and chunk tables that cannot be.
+
+    Layout: the LASzip record (LASzip, "laszip.hpp") among the variable-length records; then at ``start`` the place of
+    the chunk table, whose second number is the count of chunks.
+    """
+    with path.open("rb") as file:
+        head, size = file.read(start), path.stat().st_size
+        at = head.find(b"laszip encoded")
+        record = head[at + 52 : at + 68] if at >= 0 else b""
+        if len(record) < 16:
+            raise _unreadable(path, "no LASzip record")
+        compressor, chunk = struct.unpack_from("<H10xI", record)
+        if compressor not in (2, 3):
+            raise _unreadable(path, f"LASzip's compressor {compressor}, without chunks")
+        (table,) = struct.unpack("<q", file.read(8).ljust(8, b"\xff"))
+        if table == -1 and size >= start + 8:  # a writer that could not go back: it stands at the end
+            file.seek(-8, 2)
+            (table,) = struct.unpack("<q", file.read(8))
+        file.seek(table if 0 <= table < size else size)
+        entry = file.read(8)
+        chunks = int.from_bytes(entry[4:], "little") if len(entry) == 8 else -1
+        fixed = chunk not in (0, 2**32 - 1)
+        if not 0 <= chunks <= size or (fixed and chunks > points // chunk + 1) or not chunk:
+            raise _unreadable(path, f"a chunk table of {chunks} chunks at byte {table}")
+
+
+@contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """A block that calls laspy: whatever it or its decompressor raises becomes one line."""
+    try:
+        yield
+    except (OSError, InputError, KeyboardInterrupt, SystemExit, GeneratorExit):
+        raise
+    except BaseException as error:  # a panic of the decompressor, which is written in Rust, is no Exception
+        raise _unreadable(path, (str(error).splitlines() or [type(error).__name__])[0]) from error
 
 
 def _at(head: bytes, field: tuple[struct.Struct, int]) -> tuple[int, ...]:
@@ -127,17 +193,17 @@ def _at(head: bytes, field: tuple[struct.Struct, int]) -> tuple[int, ...]:
     return form.unpack_from(head, offset)
 
 
-def _laspy(path: Path) -> Any:
+def _laspy(path: Path, columns: str | None) -> Any:
+    """The library, once the file is known to be one that it can read without harm."""
+    if columns is not None:
+        raise InputError(f"{path}: --columns is for tables without names; LAS files name their columns")
     try:
         import laspy
     except ImportError as error:
         raise InputError(f"{path}: LAS and LAZ need laspy; pip install mplicits[las]") from error
+    _check_sizes(path)
     return laspy
 
 
-def _unreadable(path: Path, error: Exception) -> InputError:
-    return InputError(f"{path}: not a readable LAS file ({_first_line(error)}); export it again")
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0]
+def _unreadable(path: Path, why: str) -> InputError:
+    return InputError(f"{path}: not a readable LAS file ({why}); export it again")

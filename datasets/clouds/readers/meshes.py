@@ -6,69 +6,111 @@ without faces.
 
 from __future__ import annotations
 
-import logging
+import dataclasses
 import re
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 
 from ....neural_fields import InputError
 from ..point_cloud import PointCloud, colors_from, unit_rows
+from .columns import Table, choose_layout, cloud_from
 from .tables import numbers
 
-__all__ = ["ObjText", "read_obj", "read_off", "read_stl", "spread_on_faces", "triangulate", "vertex_normals", "weld"]
-
-# Its parsers print the traceback of every damaged file, where nobody handles what they log.
-logging.getLogger("trimesh").addHandler(logging.NullHandler())
+__all__ = [
+    "ObjText",
+    "as_mesh",
+    "read_obj",
+    "read_off",
+    "read_stl",
+    "spread_on_faces",
+    "strips",
+    "triangulate",
+    "vertex_normals",
+    "weld",
+]
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 
 
-def read_stl(path: Path) -> PointCloud:
-    """Read an STL file; equal corners of its loose triangles become one vertex.
+def read_stl(path: Path) -> tuple[PointCloud, Int64]:
+    """Read the triangles of an STL file, text of any number of solids or binary; equal corners become one vertex.
 
     Raises:
         InputError: it is not STL or holds no triangle.
     """
-    vertices, faces = _load(path, "stl")
-    if len(faces) == 0:
-        raise InputError(f"{path}: facets: there are none; check that it is an STL file")
-    kept, index = weld(vertices)
-    points, faces = vertices[kept], index[faces]
-    return PointCloud(points, vertex_normals(points, faces), None, str(path), "mesh")
+    data = path.read_bytes()
+    count = int.from_bytes(data[80:84], "little")
+    if len(data) >= 84 and len(data) == 84 + 50 * count:
+        facet = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+        corners = np.frombuffer(data, facet, count, 84)["corners"].reshape(-1, 3).astype(np.float64)
+    elif re.match(rb"\s*solid\b", data, re.IGNORECASE):
+        found = re.findall(r"^\s*vertex\s+([^\r\n]*)", data.decode("utf-8", "replace"), re.MULTILINE | re.IGNORECASE)
+        corners = numbers("\n".join(found), path, first_line=1, what="vertex") if found else np.empty((0, 3))
+    else:
+        raise InputError(f"{path}: not a readable STL file; check its extension or export it again")
+    if not len(corners) or len(corners) % 3 or corners.shape[1] != 3:
+        raise InputError(f"{path}: {len(corners)} vertices of facets, three by three; check that it is an STL file")
+    kept, index = weld(corners)
+    faces = index.reshape(-1, 3)
+    return as_mesh(_vertices(path, corners[kept]), faces), faces
 
 
-def read_off(path: Path) -> PointCloud:
-    """Read an OFF file, with or without faces.
+def read_off(path: Path) -> tuple[PointCloud, Int64]:
+    """Read an OFF file, with or without faces; NOFF has normals and COFF colours at its vertices.
 
     Raises:
         InputError: it is not OFF.
     """
-    vertices, faces = _load(path, "off")
-    normals = vertex_normals(vertices, faces) if len(faces) else None
-    return PointCloud(vertices, normals, None, str(path), "mesh" if len(faces) else "file")
-
-
-def _load(path: Path, kind: str) -> tuple[Float64, Int64]:
-    """Vertices and faces as they stand in the file."""
-    try:
-        with path.open("rb") as file:
-            loaded: Any = trimesh.load(file, file_type=kind, process=False)
-    except Exception as error:  # trimesh lets through whatever its parsers trip over
+    text = re.sub(r"#[^\r\n]*", "", path.read_bytes().decode("utf-8", "replace"))
+    head = re.match(r"\s*(ST)?(C)?(N)?OFF\b", text)
+    lines = [line for line in text[head.end() if head else 0 :].splitlines() if line.strip()]
+    sizes = lines[0].split() if lines else []
+    if head is None or len(sizes) < 2 or not (sizes[0] + sizes[1]).isdecimal():
+        raise InputError(f"{path}: not a readable OFF file (text of OFF, COFF or NOFF); export it again")
+    vertices, polygons = int(sizes[0]), int(sizes[1])
+    if len(lines) < 1 + vertices + polygons or not vertices:
         raise InputError(
-            f"{path}: not a readable {kind.upper()} file; check its extension or export it again"
-        ) from error
-    vertices = np.asarray(getattr(loaded, "vertices", ()), np.float64)
-    faces = np.asarray(getattr(loaded, "faces", ()), np.int64).reshape(-1, 3)
-    if vertices.ndim != 2 or vertices.shape[1] != 3 or len(vertices) == 0:
-        raise InputError(f"{path}: no vertices in it; check that it is a {kind.upper()} file")
-    if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
-        raise InputError(f"{path}: a face names a vertex beyond the {len(vertices)} there are; export it again")
-    return vertices, faces
+            f"{path}: {len(lines) - 1} lines for {vertices} vertices and {polygons} faces; export it again"
+        )
+    rows = numbers("\n".join(lines[1 : 1 + vertices]), path, first_line=1, what="vertex")
+    names = ["x", "y", "z"] + ["nx", "ny", "nz"] * (head[3] is not None)
+    rest = rows.shape[1] - len(names) - 2 * (head[1] is not None)
+    names += ["r", "g", "b", "a"][:rest] if head[2] is not None or rest in (3, 4) else []
+    names += ["-"] * (rows.shape[1] - len(names))
+    table = Table(path, rows, names, "vertex 1: ")
+    listed = [line.split() for line in lines[1 + vertices : 1 + vertices + polygons]]
+    try:
+        lengths = np.array([int(words[0]) for words in listed], np.int64)
+        corners = [word for words in listed for word in words[1 : 1 + int(words[0])]]
+        faces = triangulate(lengths, np.array(corners, np.int64))
+    except (ValueError, IndexError, OverflowError) as error:
+        raise InputError(f"{path}: a face is no list of vertices ({error}); export it again") from error
+    cloud = cloud_from(table, choose_layout(table))
+    if len(faces):
+        cloud = dataclasses.replace(cloud, normals=None)
+    return as_mesh(cloud, faces), faces
+
+
+def _vertices(path: Path, points: Float64, colors: NDArray[np.float32] | None = None) -> PointCloud:
+    return PointCloud(points, None, colors, str(path), reading=f"{len(points):,} vertices")
+
+
+def as_mesh(cloud: PointCloud, faces: Int64) -> PointCloud:
+    """The vertices of a mesh; where they have no normals, with those of its triangles ``(F, 3)``.
+
+    Raises:
+        InputError: a face names a vertex that is not there.
+    """
+    if len(faces) and (faces.min() < 0 or faces.max() >= len(cloud)):
+        raise InputError(f"{cloud.source}: face: names a vertex beyond the {len(cloud)} there are; export it again")
+    if cloud.normals is not None or not len(faces):
+        return cloud
+    reading = f"{cloud.reading}; normals from {len(faces):,} triangles"
+    normals = vertex_normals(cloud.points, faces)
+    return dataclasses.replace(cloud, normals=normals, normals_source="mesh", reading=reading)
 
 
 def weld(vertices: Float64) -> tuple[Int64, Int64]:
@@ -121,6 +163,20 @@ def triangulate(lengths: Int64, corners: Int64) -> Int64:
     return np.stack((corners[first], corners[first + step + 1], corners[first + step + 2]), axis=1)
 
 
+def strips(lengths: Int64, corners: Int64) -> Int64:
+    """Cut triangle strips, each ended by −1 or the end of its list, into triangles ``(F, 3)`` that face one way."""
+    ends = np.zeros(len(corners), bool)
+    ends[np.cumsum(lengths)[lengths > 0] - 1] = True
+    stops = ends | (corners < 0)
+    first = np.flatnonzero(np.concatenate(([True], stops[:-1])))
+    place = np.arange(len(corners)) - np.repeat(first, np.diff(np.append(first, len(corners))))
+    at = np.flatnonzero(~stops[:-2] & ~stops[1:-1] & (corners[2:] >= 0))
+    a, b, c = corners[at], corners[at + 1], corners[at + 2]
+    turned = place[at] % 2 == 1
+    faces = np.stack((np.where(turned, b, a), np.where(turned, a, b), c), axis=1)
+    return faces[(a != b) & (b != c) & (a != c)]  # repeated corners join strips and have no area
+
+
 def vertex_normals(vertices: Float64, faces: NDArray[np.integer]) -> NDArray[np.float32]:
     """Area-weighted vertex normals ``(N, 3)``, of unit length; zero where no face with an area meets.
 
@@ -153,14 +209,18 @@ class ObjText:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._text = path.read_bytes().decode("utf-8", "replace").replace("\\\n", " ")
-        table, starts = self.table("v", "vertex")
+        self._text = re.sub(r"\\\r?\n", " ", path.read_bytes().decode("utf-8", "replace"))
+        listed, starts = self.records("v")
         if not len(starts):
             raise InputError(f"{path}: v: no vertex lines in it; check that it is an OBJ file")
+        table = _vertex_table(listed, path)
         if table.shape[1] not in (3, 4, 6, 7):
             raise InputError(f"{path}: v: {table.shape[1]} numbers per vertex; expected x y z, or x y z r g b")
         self.points = np.ascontiguousarray(table[:, :3])
-        self.colors = colors_from(table[:, 3:6]) if table.shape[1] == 6 else None
+        self.colors = None
+        if table.shape[1] > 4:
+            bare = np.isnan(table[:, 3])  # white, where others have colours
+            self.colors = np.where(bare[:, None], np.float32(1), colors_from(table[:, 3:6]))
         polygons, polygon_starts = self.records("f")
         self.lengths = np.array([len(polygon.split()) for polygon in polygons], np.int64)
         self.words = " ".join(polygons)
@@ -199,22 +259,37 @@ class ObjText:
         return index
 
 
-def read_obj(path: Path) -> PointCloud:
+def _vertex_table(listed: list[str], path: Path) -> Float64:
+    """The numbers of ``v`` lines; where only some have colours, the others get NaN."""
+    try:
+        return numbers("\n".join(listed), path, first_line=1, what="vertex")
+    except InputError:
+        rows = [line.split() for line in listed]
+        if not {len(row) for row in rows} <= {3, 4, 6, 7} or len(max(rows, key=len)) < 6:
+            raise
+        even = (" ".join(row[:6] if len(row) > 5 else [*row[:3], "nan", "nan", "nan"]) for row in rows)
+        return numbers("\n".join(even), path, first_line=1, what="vertex")
+
+
+def read_obj(path: Path) -> tuple[PointCloud, Int64]:
     """Read an OBJ file; a vertex that its faces give several normals gets their sum.
 
     Raises:
         InputError: there is no vertex, or something in it is not a number.
     """
     obj = ObjText(path)
-    points, corners = obj.points, obj.corners
+    corners, faces = obj.corners, triangulate(obj.lengths, obj.corners)
+    cloud = _vertices(path, obj.points, obj.colors)
     directions, starts = obj.table("vn", "normal")
     if directions.shape[1] != 3:
         raise InputError(f"{path}: vn: {directions.shape[1]} numbers per normal; expected 3")
-    if not len(corners):
-        normals = directions.astype(np.float32) if len(directions) == len(points) else None
-        return PointCloud(points, normals, obj.colors, str(path))
-    if len(directions) and obj.words.count("/") == 2 * len(corners):
+    normals = None
+    if not len(corners) and len(directions) == len(cloud):
+        normals = directions.astype(np.float32)
+    elif len(corners) and len(directions) and obj.words.count("/") == 2 * len(corners):
         chosen = obj.indices(re.sub(r"\S*/", "", obj.words), starts, obj.used_at, "vn")
-        sums = [np.bincount(corners, directions[chosen, k], len(points)) for k in range(3)]
-        return PointCloud(points, np.stack(sums, axis=1).astype(np.float32), obj.colors, str(path))
-    return PointCloud(points, vertex_normals(points, triangulate(obj.lengths, corners)), obj.colors, str(path), "mesh")
+        sums = [np.bincount(corners, directions[chosen, k], len(cloud)) for k in range(3)]
+        normals = np.stack(sums, axis=1).astype(np.float32)
+    if normals is not None:
+        cloud = dataclasses.replace(cloud, normals=normals, reading=f"{cloud.reading}; normals from vn")
+    return as_mesh(cloud, faces), faces

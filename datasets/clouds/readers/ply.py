@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,8 +18,9 @@ from numpy.typing import NDArray
 
 from ....neural_fields import InputError
 from ....neural_fields.backend.files import write_whole
-from ..point_cloud import PointCloud, colors_from, columns_of, normals_from
-from .meshes import triangulate, vertex_normals
+from ..point_cloud import PointCloud
+from .columns import Table, choose_layout, cloud_from, describe_layout
+from .meshes import as_mesh, strips, triangulate
 from .stream import TableStream
 
 __all__ = ["ply_stream", "read_ply", "read_ply_mesh", "write_cloud_ply"]
@@ -34,7 +36,6 @@ _KINDS = {
     **dict.fromkeys(("double", "float64"), "f8"),
 }
 _ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
-_LONGEST_HEADER = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -62,13 +63,13 @@ class _Lists:
 _Columns = dict[str, "NDArray[Any] | _Lists"]
 
 
-def read_ply(path: Path) -> PointCloud:
+def read_ply(path: Path, columns: str | None = None) -> PointCloud:
     """Read the vertices of a PLY file; if they have no normals but the file has faces, take those of the mesh.
 
     Raises:
         InputError: the header is not PLY, x, y or z is missing, or the file ends too early.
     """
-    return _read(path, meshes=False)[0]
+    return _read(path, columns, meshes=False)[0]
 
 
 def read_ply_mesh(path: Path) -> tuple[PointCloud, NDArray[np.int64]]:
@@ -77,35 +78,52 @@ def read_ply_mesh(path: Path) -> tuple[PointCloud, NDArray[np.int64]]:
     Raises:
         InputError: see `read_ply`.
     """
-    return _read(path, meshes=True)
+    return _read(path, None, meshes=True)
 
 
-def _read(path: Path, *, meshes: bool) -> tuple[PointCloud, NDArray[np.int64]]:
+def _read(path: Path, columns: str | None, *, meshes: bool) -> tuple[PointCloud, NDArray[np.int64]]:
     """Vertices and faces; unless ``meshes`` are asked for, no faces where the vertices have normals of their own."""
     data = path.read_bytes()
     encoding, elements, body = _parse_header(data, path)
     order = _ORDERS[encoding]
     if encoding == "ascii":
         data, body = _ascii_to_doubles(data[body:], path), 0
-    vertex: _Columns | None = None
-    faces = np.empty((0, 3), np.int64)
+    cloud: PointCloud | None = None
+    faces = [np.empty((0, 3), np.int64)]
     for element in elements:
         stored = _as_doubles(element) if encoding == "ascii" else element
-        columns, body = _decode(data, body, stored, order, path)
+        found, body = _decode(data, body, stored, order, path)
         if element.name == "vertex":
-            vertex = {p.name: _restore(columns[p.name], p) for p in element.properties}
-            if not meshes and _channels(vertex, "normals") is not None:
+            cloud = _cloud({p.name: _restore(found[p.name], p) for p in element.properties}, columns, path)
+            if not meshes and cloud.normals is not None:
                 break  # nothing that follows is needed
-        elif element.name == "face":
-            lists = columns.get("vertex_indices", columns.get("vertex_index"))
-            if isinstance(lists, _Lists):
-                faces = triangulate(lists.lengths, lists.items.astype(np.int64))
-    if vertex is None:
+        elif element.name in ("face", "tristrips"):
+            faces.append(_faces(found, triangulate if element.name == "face" else strips))
+    if cloud is None:
         raise InputError(f"{path}: vertex: the header declares no such element; export it as a point cloud")
-    return _cloud(vertex, faces, path), faces
+    triangles = np.concatenate(faces)
+    return as_mesh(cloud, triangles), triangles
 
 
-def ply_stream(path: Path) -> TableStream | None:
+def _cloud(vertex: _Columns, columns: str | None, path: Path) -> PointCloud:
+    scalars = {name: column for name, column in vertex.items() if isinstance(column, np.ndarray)}
+    table = Table(path, list(scalars.values()), list(scalars), "vertex: ")
+    return cloud_from(table, choose_layout(table, columns))
+
+
+def _faces(
+    columns: _Columns, cut: Callable[[NDArray[np.int64], NDArray[np.int64]], NDArray[np.int64]]
+) -> NDArray[np.int64]:
+    """Triangles ``(F, 3)`` from the list of vertices: the one of the usual name, or else the first."""
+    lists = {name.lower(): column for name, column in columns.items() if isinstance(column, _Lists)}
+    usual = [lists[name] for name in ("vertex_indices", "vertex_index") if name in lists]
+    found = usual or [column for name, column in lists.items() if "tex" not in name]
+    if not found:
+        return np.empty((0, 3), np.int64)
+    return cut(found[0].lengths, found[0].items.astype(np.int64))
+
+
+def ply_stream(path: Path, columns: str | None = None) -> TableStream | None:
     """The vertices of a PLY file, to be read in pieces; None if that cannot be: only `read_ply` reads such a file.
 
     The file must be binary, its vertices must come first and hold no lists, and their normals must stand with them if
@@ -115,27 +133,23 @@ def ply_stream(path: Path) -> TableStream | None:
         InputError: the header is not PLY, or the file ends too early.
     """
     with path.open("rb") as file:
-        head = file.read(_LONGEST_HEADER)
+        head = file.read(1 << 20)  # longer headers are left to `read_ply`
     if b"end_header" not in head:
         return None
     encoding, elements, body = _parse_header(head, path)
-    vertex = next(iter(elements), None)
-    if (
-        encoding == "ascii"
-        or vertex is None
-        or vertex.name != "vertex"
-        or any(p.length_kind for p in vertex.properties)
-    ):
+    vertex = elements[0] if elements else _Element("", 0, ())
+    names = [p.name for p in vertex.properties]
+    if encoding == "ascii" or vertex.name != "vertex" or any(p.length_kind for p in vertex.properties):
         return None
-    names = {p.name for p in vertex.properties}
-    normals, colors = columns_of(names, "normals"), columns_of(names, "colors")
-    has_faces = any(element.name == "face" for element in elements)
-    if len(names) < len(vertex.properties) or not names.issuperset("xyz") or (normals is None and has_faces):
+    if len(set(names)) < len(names):
         return None
     row = np.dtype([(p.name, _ORDERS[encoding] + p.kind) for p in vertex.properties])
-    return TableStream(
-        path, offset=body, row=row, count=vertex.count, points=("x", "y", "z"), normals=normals, colors=colors
-    )
+    table = Table(path, [np.empty(0, row[k]) for k in range(len(names))], names, "vertex: ")
+    layout = choose_layout(table, columns)
+    if layout.normals is None and any(element.name in ("face", "tristrips") for element in elements):
+        return None
+    reading = describe_layout(table, layout, vertex.count)
+    return TableStream(path, offset=body, row=row, count=vertex.count, layout=layout, reading=reading)
 
 
 def write_cloud_ply(path: str | Path, cloud: PointCloud) -> None:
@@ -157,32 +171,10 @@ def write_cloud_ply(path: str | Path, cloud: PointCloud) -> None:
     write_whole(path, "\n".join([*header, "end_header\n"]).encode() + rows.tobytes())
 
 
-def _cloud(vertex: _Columns, faces: NDArray[np.int64], path: Path) -> PointCloud:
-    points = _channels(vertex, "points")
-    if points is None:
-        missing = ", ".join(name for name in "xyz" if name not in vertex)
-        raise InputError(f"{path}: vertex: property {missing} is missing; export it with x, y and z")
-    points = points.astype(np.float64)
-    normals, colors = _channels(vertex, "normals"), _channels(vertex, "colors")
-    if len(faces) and (faces.min() < 0 or faces.max() >= len(points)):
-        raise InputError(f"{path}: face: names a vertex beyond the {len(points)} there are; export it again")
-    shades = None if colors is None else colors_from(colors)
-    if normals is None and len(faces):
-        return PointCloud(points, vertex_normals(points, faces), shades, str(path), "mesh")
-    return PointCloud(points, None if normals is None else normals_from(normals), shades, str(path))
-
-
-def _channels(columns: _Columns, what: str) -> NDArray[Any] | None:
-    """The scalar properties that hold points, normals or colours, as ``(N, 3)``; see `columns_of`."""
-    scalars = {name: column for name, column in columns.items() if isinstance(column, np.ndarray)}
-    triple = columns_of(scalars, what)
-    return None if triple is None else np.stack([scalars[name] for name in triple], axis=1)
-
-
 def _parse_header(data: bytes, path: Path) -> tuple[str, list[_Element], int]:
-    if not re.match(rb"ply[ \t]*\r?\n", data):
+    if not re.match(rb"ply[ \t]*[\r\n]", data):
         raise InputError(f"{path}: does not start with 'ply', so it is not a PLY file; check its extension")
-    end = re.search(rb"^end_header[ \t]*(\r\n|\n|\r)", data, re.MULTILINE)
+    end = re.search(rb"(?<=[\r\n])end_header[ \t]*(\r\n|\n|\r)", data)
     if end is None:
         raise InputError(f"{path}: end_header is missing, so the header is cut off; export it again")
     encoding = ""
@@ -196,7 +188,7 @@ def _parse_header(data: bytes, path: Path) -> tuple[str, list[_Element], int]:
                 case ["format", name, *_] if name in _ORDERS:
                     encoding = name
                 case ["element", name, count] if int(count) >= 0:
-                    elements.append(_Element(name, int(count), ()))
+                    elements.append(_Element(name.lower(), int(count), ()))
                 case ["property", "list", length_kind, kind, name]:
                     elements[-1] = _with(elements[-1], _Property(name, _KINDS[kind], _KINDS[length_kind]))
                 case ["property", kind, name]:

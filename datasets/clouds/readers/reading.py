@@ -8,52 +8,59 @@ from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ....neural_fields import InputError
 from ...files import readable
 from ..point_cloud import PointCloud, usable_rows
+from .e57 import read_e57
 from .las import LasStream, read_las
 from .meshes import read_obj, read_off, read_stl
-from .ply import ply_stream, read_ply
+from .pcd import read_pcd
+from .ply import ply_stream, read_ply, read_ply_mesh
 from .stream import CloudStream
 from .tables import npy_stream, read_npy, read_npz, read_text
 
-__all__ = ["MIN_POINTS", "READERS", "check_cloud", "check_cloud_path", "open_stream", "read_cloud"]
+__all__ = [
+    "CLOUD_SUFFIXES",
+    "MESH_READERS",
+    "MIN_POINTS",
+    "check_cloud",
+    "check_cloud_path",
+    "open_stream",
+    "read_cloud",
+    "read_mesh",
+]
 
 MIN_POINTS = 10
 """Fewer points than this are no surface."""
 
-SMALLEST = 1e-100
-"""Clouds of a smaller extent cannot be computed with: squares of distances within them vanish."""
-
-READERS: Mapping[str, Callable[[Path], PointCloud]] = MappingProxyType(
-    {
-        ".ply": read_ply,
-        ".obj": read_obj,
-        ".stl": read_stl,
-        ".off": read_off,
-        ".xyz": read_text,
-        ".txt": read_text,
-        ".csv": read_text,
-        ".npy": read_npy,
-        ".npz": read_npz,
-        ".las": read_las,
-        ".laz": read_las,
-    }
+MESH_READERS: Mapping[str, Callable[[Path], tuple[PointCloud, NDArray[np.int64]]]] = MappingProxyType(
+    {".ply": read_ply_mesh, ".obj": read_obj, ".stl": read_stl, ".off": read_off}
 )
-"""What reads which extension."""
+"""What reads which extension as vertices and triangles."""
 
-STREAMS: Mapping[str, Callable[[Path], CloudStream | None]] = MappingProxyType(
-    {".ply": ply_stream, ".npy": npy_stream, ".las": LasStream, ".laz": LasStream}
-)
-"""What reads which extension in pieces."""
+_TABLES: dict[str, Callable[[Path, str | None], PointCloud]] = {
+    ".ply": read_ply,
+    **dict.fromkeys((".xyz", ".txt", ".asc", ".csv", ".pts"), read_text),
+    ".npy": read_npy,
+    ".npz": read_npz,
+    ".pcd": read_pcd,
+    ".e57": read_e57,
+}
+_LAS = (".las", ".laz")
+
+CLOUD_SUFFIXES: tuple[str, ...] = (*_TABLES, *(end for end in MESH_READERS if end not in _TABLES), *_LAS)
+"""Extensions that `read_cloud` knows."""
 
 
-def read_cloud(path: str | Path) -> PointCloud:
+def read_cloud(path: str | Path, *, columns: str | None = None, drop_noise: bool = False) -> PointCloud:
     """Read a point cloud; of a mesh, its vertices with area-weighted vertex normals.
 
     Args:
-        path: a PLY, OBJ, STL, OFF, XYZ, TXT, CSV, NPY, NPZ, LAS or LAZ file.
+        path: a PLY, PCD, E57, OBJ, STL, OFF, XYZ, TXT, ASC, CSV, PTS, NPY, NPZ, LAS or LAZ file.
+        columns: names of all columns of a table, where the file does not tell: ``x,y,z,nx,ny,nz,r,g,b,-``.
+        drop_noise: whether LAS points of the classes for noise are left out.
 
     Raises:
         InputError: the file is missing, damaged, foreign or of an unknown kind, or holds no usable cloud.
@@ -65,10 +72,29 @@ def read_cloud(path: str | Path) -> PointCloud:
         mplicits.neural_fields.backend.errors.InputError: scan.xyzz: no such file; check the path
     """
     path = check_cloud_path(path)
+    suffix = path.suffix.lower()
     with readable(path):
-        cloud = READERS[path.suffix.lower()](path)
+        if suffix in _LAS:
+            cloud = read_las(path, columns, drop_noise=drop_noise)
+        elif suffix in _TABLES:
+            cloud = _TABLES[suffix](path, columns)
+        elif columns is not None:
+            raise InputError(f"{path}: --columns is for tables; {suffix[1:].upper()} files say what they hold")
+        else:
+            cloud = MESH_READERS[suffix](path)[0]
     check_cloud(cloud)
     return cloud
+
+
+def read_mesh(path: str | Path) -> tuple[PointCloud, NDArray[np.int64]]:
+    """The vertices and the triangles ``(F, 3)``, of which there may be none, of a PLY, OBJ, STL or OFF file.
+
+    Raises:
+        InputError: see `read_cloud`.
+    """
+    path = check_cloud_path(path)
+    with readable(path):
+        return MESH_READERS[path.suffix.lower()](path)
 
 
 def check_cloud_path(path: str | Path) -> Path:
@@ -78,14 +104,15 @@ def check_cloud_path(path: str | Path) -> Path:
         InputError: it is not.
     """
     path = Path(path)
-    if path.is_dir():
-        raise InputError(f"{path}: is a directory; name the point-cloud file in it")
-    if not path.exists():
-        raise InputError(f"{path}: no such file; check the path")
+    with readable(path):
+        if path.is_dir():
+            raise InputError(f"{path}: is a directory; name the point-cloud file in it")
+        if not path.exists():
+            raise InputError(f"{path}: no such file; check the path")
     extension = path.suffix.lower()
-    if extension not in READERS:
-        known = ", ".join(READERS)
-        nearest = difflib.get_close_matches(extension, READERS, n=1, cutoff=0.5)
+    if extension not in CLOUD_SUFFIXES:
+        known = ", ".join(CLOUD_SUFFIXES)
+        nearest = difflib.get_close_matches(extension, CLOUD_SUFFIXES, n=1, cutoff=0.5)
         hint = f"did you mean {nearest[0]}? " if nearest else ""
         raise InputError(f"{path}: unknown extension {extension!r}; {hint}known are {known}")
     with readable(path):
@@ -94,15 +121,18 @@ def check_cloud_path(path: str | Path) -> Path:
     return path
 
 
-def open_stream(path: str | Path) -> CloudStream | None:
+def open_stream(path: str | Path, *, columns: str | None = None, drop_noise: bool = False) -> CloudStream | None:
     """A file to be read in pieces: binary PLY, NPY, LAS and LAZ; None for all that only `read_cloud` reads.
 
     Raises:
         InputError: the file is missing, damaged or of an unknown kind.
     """
     path = check_cloud_path(path)
+    suffix = path.suffix.lower()
     with readable(path):
-        return STREAMS[path.suffix.lower()](path) if path.suffix.lower() in STREAMS else None
+        if suffix in _LAS:
+            return LasStream(path, columns, drop_noise=drop_noise)
+        return {".ply": ply_stream, ".npy": npy_stream}.get(suffix, lambda *_: None)(path, columns)
 
 
 def check_cloud(cloud: PointCloud) -> None:
@@ -116,7 +146,9 @@ def check_cloud(cloud: PointCloud) -> None:
         raise InputError(f"{cloud.source}: points: none with finite coordinates among {len(cloud)}; export it again")
     if bool((finite == finite[0]).all()) and len(finite) > 1:
         raise InputError(f"{cloud.source}: points: all {len(finite)} coincide; export it with more digits")
-    if len(finite) > 1 and (extent := float(np.ptp(finite, axis=0).max())) < SMALLEST:
+    if (
+        len(finite) > 1 and (extent := float(np.ptp(finite, axis=0).max())) < 1e-100
+    ):  # squares of distances within vanish
         raise InputError(f"{cloud.source}: points: {extent:.3g} across; export it in a smaller unit")
     if len(finite) < MIN_POINTS:
         raise InputError(

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ....neural_fields import InputError
 from ..point_cloud import PointCloud
+from .columns import Layout, Triple
 
 __all__ = ["CloudStream", "MemoryStream", "RawRows", "TableStream"]
 
@@ -39,11 +40,13 @@ class CloudStream(ABC):
 
     Attributes:
         source: what messages call it.
-        count: how many points.
+        count: how many points the file has; pieces may leave some of them out.
+        reading: one line about what is read; see `PointCloud`.
     """
 
     source: str
     count: int
+    reading: str = ""
 
     @abstractmethod
     def pieces(self, rows: int) -> Iterator[RawRows]:
@@ -54,7 +57,7 @@ class MemoryStream(CloudStream):
     """A cloud that is in memory already."""
 
     def __init__(self, cloud: PointCloud) -> None:
-        self.cloud, self.source, self.count = cloud, cloud.source, len(cloud)
+        self.cloud, self.source, self.count, self.reading = cloud, cloud.source, len(cloud), cloud.reading
 
     def pieces(self, rows: int) -> Iterator[RawRows]:
         """See `CloudStream.pieces`."""
@@ -76,32 +79,22 @@ class TableStream(CloudStream):
         offset: where its rows begin, in bytes.
         row: type of one row: a structure, or numbers (``(">f4", (6,))``).
         count: how many rows.
-        points: the three columns, by name or by number, that hold the points.
-        normals: those of the normals, or None.
-        colors: those of the colours, or None.
+        layout: the columns of the points, the normals and the colours.
+        reading: see `CloudStream`.
 
     Raises:
         InputError: the file ends too early.
     """
 
     def __init__(
-        self,
-        path: Path,
-        *,
-        offset: int,
-        row: np.dtype[Any],
-        count: int,
-        points: tuple[str, str, str] | slice,
-        normals: tuple[str, str, str] | slice | None,
-        colors: tuple[str, str, str] | slice | None,
+        self, path: Path, *, offset: int, row: np.dtype[Any], count: int, layout: Layout, reading: str
     ) -> None:
         if path.stat().st_size < offset + count * row.itemsize:
             raise InputError(
                 f"{path}: vertex: the file ends before its {count} rows do (truncated?); copy or export it again"
             )
-        self.path, self.source, self.count = path, str(path), count
-        self.offset, self.row = offset, row
-        self.points, self.normals, self.colors = points, normals, colors
+        self.path, self.source, self.count, self.reading = path, str(path), count, reading
+        self.offset, self.row, self.layout = offset, row, layout
 
     def rows(self, start: int, stop: int) -> NDArray[Any]:
         """Rows from ``start`` to ``stop``; their pages are given back when the array goes."""
@@ -110,16 +103,16 @@ class TableStream(CloudStream):
 
     def pieces(self, rows: int) -> Iterator[RawRows]:
         """See `CloudStream.pieces`."""
+        points, normals, colors = self.layout[:3]
         for start in range(0, self.count, rows):
             table = self.rows(start, start + rows)
             yield RawRows(
-                _columns(table, self.points),
-                None if self.normals is None else _columns(table, self.normals),
-                None if self.colors is None else _columns(table, self.colors),
+                _columns(table, points),
+                None if normals is None else _columns(table, normals),
+                None if colors is None else _columns(table, colors),
             )
 
 
-def _columns(table: NDArray[Any], which: tuple[str, str, str] | slice) -> NDArray[Any]:
-    if isinstance(which, slice):
-        return np.array(table[:, which])
-    return np.stack([table[name] for name in which], axis=1)
+def _columns(table: NDArray[Any], which: Triple) -> NDArray[Any]:
+    names = table.dtype.names
+    return np.array(table[:, list(which)]) if names is None else np.stack([table[names[k]] for k in which], axis=1)

@@ -1,78 +1,95 @@
-"""Tables of points: text (XYZ, TXT, CSV), one NumPy array (NPY), or an archive of named ones (NPZ).
-
-A table has 3, 6 or 9 columns, or a header line that names them.
-"""
+"""Tables of points: text (XYZ, TXT, ASC, CSV, PTS), one NumPy array (NPY), or an archive of named ones (NPZ)."""
 
 from __future__ import annotations
 
 import io
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ....neural_fields import InputError
 from ...files import DAMAGED_ARRAYS, numeric, read_arrays
-from ..point_cloud import PointCloud, colors_from, columns_of, normals_from
+from ..point_cloud import PointCloud
+from .columns import Table, choose_layout, cloud_from, describe_layout, named_layout, sampled
 from .stream import TableStream
 
-__all__ = ["is_number", "npy_stream", "numbers", "read_npy", "read_npz", "read_text", "table_to_cloud"]
+__all__ = ["is_number", "npy_stream", "numbers", "read_npy", "read_npz", "read_text"]
+
+_MARKS = re.compile(r"^\s*(//|[#;%!])[#;%!/\s]*")  # before a comment
 
 
-def read_text(path: Path) -> PointCloud:
-    """Read a text table; columns are separated by commas, semicolons, tabs or spaces; ``#`` starts a comment.
+def read_text(path: Path, columns: str | None = None) -> PointCloud:
+    """Read a text table; columns are separated by commas, semicolons, tabs or spaces.
 
-    Columns are xyz, xyz + normal, xyz + rgb (see :func:`table_to_cloud`) or xyz + normal + rgb, unless a header
-    line names x, y and z: then columns are taken by name and others are ignored. A lone count in the first
-    line is skipped.
+    A line before the numbers may name the columns, as a comment or not; see `choose_layout` for what names mean, and
+    for tables without names. A lone count, as PTS has it, is skipped; of several scans in a PTS file, each of them.
 
     Raises:
-        InputError: it is not text, a word is not a number, or the number of columns is not one of these.
+        InputError: it is not text, a word is not a number, or the columns cannot be told.
     """
     data = path.read_bytes()
-    if b"\0" in data:
+    wide = data[:2] in (b"\xff\xfe", b"\xfe\xff")
+    if b"\0" in data and not wide:
         raise InputError(f"{path}: holds binary data, not text; check its extension")
-    lines = data.decode("utf-8-sig", "replace").replace("\r\n", "\n").replace("\r", "\n").split("\n")
-    filled = ((number, _strip(line)) for number, line in enumerate(lines) if _strip(line))
-    first, line = next(filled, (0, ""))
-    second = next(filled, (0, ""))[1]
-    if not line:
-        raise InputError(f"{path}: holds only comments and blank lines; export it again")
-    # "1,5;2,5;3,5": with semicolons between columns, a comma is a decimal comma
-    commas = "." if ";" in (second or line) else " "
-    words = line.replace(";", " ").replace(",", commas).split()
-    has_header = not all(is_number(word) for word in words)
-    is_count = len(words) == 1 and len(re.split(r"[\s,;]+", second)) >= 3
-    skipped = first + 1 if has_header or is_count else first
-    body = "\n".join(lines[skipped:]).replace("//", "#").replace(",", commas).replace(";", " ")
-    table = numbers(body, path, first_line=skipped + 1, what="line")
-    if has_header:
-        named = _by_name(re.split(r"[\s,;]+", line.lower()), table, path)
-        if named is not None:
-            return named
-    return table_to_cloud(table, path, f"line {skipped + 1}: ")
+    text = data.decode("utf-16" if wide else "utf-8-sig", "replace")
+    lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
+    heads, count, skipped = [], False, 0
+    for skipped, line in enumerate(lines):  # noqa: B007 (where the loop stopped is wanted)
+        words = re.split(r"[\s,;]+", _strip(line).strip(",; \t"))
+        if _MARKS.match(line) or not any(map(is_number, words)):
+            heads.append(_MARKS.sub("", line).strip())
+        elif len(words) == 1 and not count:
+            count = True
+        else:
+            break
+    first = _strip(lines[skipped])
+    if not first:
+        what = (
+            "only comments and blank lines"
+            if not any(not _MARKS.match(x) and x.strip() for x in lines)
+            else "no numbers"
+        )
+        raise InputError(f"{path}: {what} in it; export it again")
+    separator, decimal = _dialect(first)
+    body = "\n".join(lines[skipped:])
+    if count:
+        body = re.sub(r"^[ \t]*\d+[ \t]*$", "", body, flags=re.MULTILINE)
+    if re.search(r"^[ \t]*[;%!]", body, re.MULTILINE):
+        body = re.sub(r"^[ \t]*[;%!]", "#", body, flags=re.MULTILINE)
+    body = body.replace("//", "#").replace(",", decimal).replace(";", " ")
+    rows = numbers(body, path, first_line=skipped + 1, what="line")
+    names = next(filter(None, (_names(head, separator, rows.shape[1]) for head in reversed(heads))), None)
+    table = Table(path, rows, names, f"line {skipped + 1}: ")
+    scanner = path.suffix.lower() == ".pts" or count
+    return cloud_from(table, choose_layout(table, columns, scanner=scanner))
 
 
-def table_to_cloud(table: NDArray[np.floating], path: Path, where: str) -> PointCloud:
-    """Split ``(N, 3 | 6 | 9)`` into xyz, xyz + normal, xyz + normal + rgb.
+def _dialect(line: str) -> tuple[str | None, str]:
+    """What separates the columns of a line (None: white space), and what its commas become."""
+    if ";" in line:
+        return ";", "."  # "1,5;2,5;3,5": a comma is a decimal comma
+    words = line.split()
+    if len(words) > 2 and all(re.fullmatch(r"[-+]?\d+,\d+([eE][-+]?\d+)?", word) for word in words):
+        return ("\t" if "\t" in line else None), "."
+    return ("," if "," in line else "\t" if "\t" in line else None), " "
 
-    Six columns are xyz + rgb when the last three cannot be unit vectors but can be colours from 0 to 255:
-    none is negative and few have unit length.
 
-    Raises:
-        InputError: there is another number of columns.
-    """
-    columns = table.shape[1] if table.ndim == 2 else 0
-    if columns not in (3, 6, 9):
-        raise InputError(f"{path}: {where}{columns} columns; expected 3 (xyz), 6 (xyz, normal) or 9 (xyz, normal, rgb)")
-    points = np.ascontiguousarray(table[:, :3], np.float64)
-    extra = table[:, 3:6]
-    if columns == 6 and _look_like_colors(extra):
-        return PointCloud(points, None, colors_from(extra), str(path))
-    normals = extra.astype(np.float32) if columns >= 6 else None
-    colors = colors_from(table[:, 6:]) if columns == 9 else None
-    return PointCloud(points, normals, colors, str(path))
+def _names(line: str, separator: str | None, width: int) -> list[str] | None:
+    """The names in a line, if there are as many as columns and x, y and z are among them."""
+    line = re.sub(r"^\w+\s*:\s*", "", line)  # "columns: x y z"
+    joined = re.sub(r"\s*[\[({<][^\])}>]*[\])}>]", "", line)  # units would be words of their own
+    word = r"\"[^\"]*\"|'[^']*'|[^\s\"',;]+"
+    splits = [re.findall(word, joined)]
+    if separator is not None:
+        splits.insert(0, re.findall(rf"\"[^\"]*\"|'[^']*'|[^{separator}\"']+", line))
+    for names in ([name.strip().strip("\"'") for name in split] for split in splits):
+        names = names[:-1] if names and not names[-1] else names
+        if len(names) == width and named_layout(names) is not None:
+            return names
+    return None
 
 
 def numbers(body: str, path: Path, *, first_line: int, what: str) -> NDArray[np.float64]:
@@ -109,59 +126,40 @@ def _strip(line: str) -> str:
 
 
 def is_number(word: str) -> bool:
-    """Whether a word can be read as a number."""
+    """Whether a word can be read as a number; with a decimal comma too."""
     try:
-        float(word)
+        float(word.replace(",", ".", 1))
     except ValueError:
         return False
     return True
 
 
-def _look_like_colors(values: NDArray[np.floating]) -> bool:
-    finite = values[np.isfinite(values).all(axis=1)]
-    if len(finite) == 0 or finite.min() < 0 or finite.max() > 255:
-        return False
-    lengths = np.linalg.norm(finite, axis=1)
-    # zero stands for "no normal" as well as for black
-    return bool((np.abs(lengths - 1) < 0.05).sum() < 0.5 * (lengths > 0).sum() or finite.max() > 1.5)
-
-
-def _by_name(names: list[str], table: NDArray[np.float64], path: Path) -> PointCloud | None:
-    def pick(what: str) -> NDArray[np.float64] | None:
-        triple = columns_of(names, what)
-        return None if triple is None else table[:, [names.index(name) for name in triple]]
-
-    names = [name.strip("\"'") for name in names if name.strip("\"'")]
-    points = pick("points")
-    if points is None or len(names) != table.shape[1]:
-        return None
-    normals, colors = pick("normals"), pick("colors")
-    return PointCloud(
-        np.ascontiguousarray(points),
-        None if normals is None else normals.astype(np.float32),
-        None if colors is None else colors_from(colors),
-        str(path),
-    )
-
-
-def read_npy(path: Path) -> PointCloud:
-    """Read one array with columns xyz, xyz + normal or xyz + normal + rgb.
+def read_npy(path: Path, columns: str | None = None) -> PointCloud:
+    """Read one array ``(N, C)``, or a structured one with names; see `choose_layout`.
 
     Raises:
-        InputError: it is not a NumPy array of numbers with 3, 6 or 9 columns.
+        InputError: it is not a NumPy array of numbers, or the columns cannot be told.
     """
     array = read_arrays(path)
     if not isinstance(array, np.ndarray):
         raise InputError(f"{path}: an NPZ archive under another name; rename it to .npz")
-    return table_to_cloud(numeric(array, f"{path}: array"), path, f"array of shape {array.shape}: ")
+    table = _array_table(path, array)
+    return cloud_from(table, choose_layout(table, columns))
 
 
-def npy_stream(path: Path, *, sample: int = 100_000) -> TableStream | None:
+def _array_table(path: Path, array: NDArray[Any]) -> Table:
+    where = f"array of shape {array.shape}: "
+    if array.dtype.names is not None:
+        return Table(
+            path, [numeric(array[name].ravel(), f"{path}: {name}") for name in array.dtype.names], array.dtype.names
+        )
+    if numeric(array, f"{path}: array").ndim != 2:
+        raise InputError(f"{path}: {where}expected rows of x y z, and perhaps more")
+    return Table(path, array, None, where)
+
+
+def npy_stream(path: Path, columns: str | None = None) -> TableStream | None:
     """The rows of an array, to be read in pieces; None if that cannot be: only `read_npy` reads such a file.
-
-    Args:
-        path: an NPY file.
-        sample: so many rows, evenly chosen, tell whether six columns are points and normals or points and colours.
 
     Raises:
         InputError: see `read_npy`.
@@ -170,48 +168,68 @@ def npy_stream(path: Path, *, sample: int = 100_000) -> TableStream | None:
         array = np.lib.format.open_memmap(path, mode="r")
     except DAMAGED_ARRAYS:
         return None
-    if array.ndim != 2 or not array.flags.c_contiguous or len(array) == 0:
+    if array.ndim != 2 or not array.flags.c_contiguous or len(array) == 0 or array.dtype.names is not None:
         return None
-    numeric(array, f"{path}: array")
-    some = table_to_cloud(np.array(array[:: 1 + len(array) // sample]), path, f"array of shape {array.shape}: ")
-    first_color = None if some.colors is None else array.shape[1] - 3
-    return TableStream(
-        path,
-        offset=array.offset,
-        row=np.dtype((array.dtype, array.shape[1:])),
-        count=len(array),
-        points=slice(0, 3),
-        normals=None if some.normals is None else slice(3, 6),
-        colors=None if first_color is None else slice(first_color, first_color + 3),
-    )
+    table = _array_table(path, np.array(sampled(array)))
+    layout = choose_layout(table, columns)
+    row = np.dtype((array.dtype, array.shape[1:]))
+    reading = describe_layout(table, layout, len(array))
+    return TableStream(path, offset=array.offset, row=row, count=len(array), layout=layout, reading=reading)
 
 
-def read_npz(path: Path) -> PointCloud:
+# Names of arrays, without case and underscores, and the columns that they hold.
+_ARRAYS = {
+    **dict.fromkeys(("points", "point", "xyz", "positions", "pos", "vertices", "verts", "coords", "pts"), "xyz"),
+    **dict.fromkeys(("normals", "normal", "vertexnormals", "pointnormals"), ("nx", "ny", "nz")),
+    **dict.fromkeys(("colors", "color", "colours", "colour", "rgb", "rgba", "vertexcolors"), ("r", "g", "b")),
+}
+
+
+def read_npz(path: Path, columns: str | None = None) -> PointCloud:
     """Read ``points`` (N, 3), ``normals`` (float, or int8/int16 over their largest value) and ``colors``.
+
+    Other usual names (``xyz``, ``rgb``), and arrays for single columns (``x``, ``nx``, ``red``), are known too.
 
     Raises:
         InputError: it is not such an archive, or an array has the wrong type or shape.
     """
 
+    def known(name: str) -> tuple[str, ...] | None:
+        plain = re.sub(r"[\W_]", "", name).casefold()
+        return tuple(_ARRAYS[plain]) if plain in _ARRAYS else None
+
     def choose(names: list[str]) -> list[str]:
-        if "points" not in names:
-            raise InputError(f"{path}: points: no such array (there are: {', '.join(names) or 'none'}); add it")
-        return [name for name in ("points", "normals", "colors") if name in names]
+        roles = [known(name) for name in names]
+        chosen = [name for k, name in enumerate(names) if roles[k] is not None and roles[k] not in roles[:k]]
+        if ("x", "y", "z") in roles:
+            return chosen
+        if named_layout(names) is not None:
+            return names
+        raise InputError(f"{path}: points: no such array (there are: {', '.join(names) or 'none'}); add it")
 
     arrays = read_arrays(path, choose)
     if isinstance(arrays, np.ndarray):
         raise InputError(f"{path}: a single NumPy array under another name; rename it to .npy")
-    points = arrays["points"]
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise InputError(f"{path}: points: shape {points.shape}; expected (N, 3)")
+    names: list[str] = []
+    values: list[NDArray[Any]] = []
+    first = next((array for name, array in arrays.items() if known(name) == ("x", "y", "z")), None)
+    if first is not None and (first.ndim != 2 or first.shape[1] < 3):
+        raise InputError(f"{path}: points: shape {first.shape}; expected (N, 3)")
+    if first is not None and first.shape[1] > 3 and len(arrays) == 1:
+        table = _array_table(path, first)
+        return cloud_from(table, choose_layout(table, columns))
     for name, array in arrays.items():
         numeric(array, f"{path}: {name}")
-        if array.shape != points.shape:
-            raise InputError(f"{path}: {name}: shape {array.shape}; expected {points.shape}, one row per point")
-    normals, colors = arrays.get("normals"), arrays.get("colors")
-    return PointCloud(
-        points.astype(np.float64),
-        None if normals is None else normals_from(normals),
-        None if colors is None else colors_from(colors),
-        str(path),
-    )
+        parts = known(name)
+        if first is not None and parts is not None:
+            if len(array) != len(first) or array.ndim != 2 or array.shape[1] not in (3, 3 + (parts[0] == "r")):
+                raise InputError(f"{path}: {name}: shape {array.shape}; expected {first.shape}, one row per point")
+            names += parts
+            values += list(array.T[:3])
+        elif first is None:
+            names.append(name)
+            values.append(array.ravel())
+    if len({len(value) for value in values}) > 1:
+        raise InputError(f"{path}: its arrays have different lengths; expected one number of each per point")
+    table = Table(path, values, names)
+    return cloud_from(table, choose_layout(table, columns))

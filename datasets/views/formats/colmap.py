@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator, Sequence, Sized
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,10 +18,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ....neural_fields import InputError
+from ....neural_fields.backend.files import natural
 from ...cameras import Camera, intrinsics
 from .shots import IMAGE_SUFFIXES, Shot
 
-__all__ = ["find_model", "read_colmap", "read_colmap_points"]
+__all__ = ["find_model", "find_models", "read_colmap", "read_colmap_points"]
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
@@ -62,11 +64,28 @@ class _Pose:
 
 
 def find_model(folder: Path) -> Path | None:
-    """The model's folder: ``sparse/0``, ``sparse`` or the folder itself; None where there is none."""
-    for model in (folder / "sparse" / "0", folder / "sparse", folder):
-        if any((model / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt")):
-            return model
-    return None
+    """The model with most photographs of ``sparse/*``, or ``sparse`` or the folder itself; None where there is none."""
+    models = find_models(folder)
+    return max(models, key=_count_images, default=None)  # of equal ones the first
+
+
+def find_models(folder: Path) -> list[Path]:
+    """The models in ``sparse/*``, in natural order; where there are none there, in ``sparse`` or the folder itself."""
+
+    def is_model(place: Path) -> bool:
+        return any((place / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt"))
+
+    sparse = folder / "sparse"
+    numbered = sorted(sparse.iterdir(), key=lambda place: natural(place.name)) if sparse.is_dir() else []
+    return list(filter(is_model, numbered)) or list(filter(is_model, (sparse, folder)))[:1]
+
+
+def _count_images(model: Path) -> int:
+    """How many photographs a model places; 0 where it is damaged, which its reader will say."""
+    images = _part(model, "images")
+    with suppress(InputError):
+        return int(_Records(images).take("Q")[0]) if images.suffix == ".bin" else len(_text_poses(images))
+    return 0
 
 
 def read_colmap(model: Path) -> list[Shot]:
@@ -135,7 +154,7 @@ def _poses(images: Path) -> list[_Pose]:
     poses = _binary_poses(images) if images.suffix == ".bin" else _text_poses(images)
     if not poses:
         raise InputError(f"{images}: no images; expected at least one that COLMAP registered")
-    return sorted(poses, key=lambda pose: pose.name)
+    return sorted(poses, key=lambda pose: natural(pose.name))
 
 
 def _beside(model: Path, names: tuple[str, ...]) -> Path | None:

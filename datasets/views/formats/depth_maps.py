@@ -95,7 +95,7 @@ def read_depth_map(path: Path, shot: Shot, source: DepthSource) -> DepthMap:
     Raises:
         InputError: the file is missing, damaged or no depth map, or of another shape than the photograph.
     """
-    depth = read_depth(path, scale=source.scale, integer_scale=shot.depth_scale)
+    depth = read_depth(path, scale=source.scale, integer_scale=shot.depth_scale, saturates=source.kind == "metric")
     height, width = depth.shape
     if not shot.camera.fits(width, height):
         size = f"{shot.camera.width} × {shot.camera.height}"

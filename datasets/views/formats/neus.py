@@ -22,7 +22,7 @@ __all__ = ["read_neus", "read_neus_sphere"]
 IMAGE_FOLDERS = ("image", "images", "rgb")  # beside the file; NeuS has the first
 MASK_FOLDERS = ("mask", "masks")
 MAX_SKEW = 0.5  # pixels that skew may move a point at the image's edge, before we say that we cannot draw it
-AGREE = 1e-5  # how far two spheres, or the axes of one, may be apart, as a share of their radius
+SAME_SPHERE = 1e-5  # how far two spheres, or the axes of one, may be apart, as a share of their radius
 
 
 def read_neus(path: Path) -> list[Shot]:
@@ -70,9 +70,9 @@ def read_neus_sphere(path: Path) -> Similarity | None:
         scale = float(matrix[0, 0])
         uniform = np.eye(4) * (scale, scale, scale, 1)
         uniform[:3, 3] = matrix[:3, 3]
-        if scale <= 0 or np.abs(matrix - uniform).max() > AGREE * scale:
+        if scale <= 0 or np.abs(matrix - uniform).max() > SAME_SPHERE * scale:
             raise InputError(f"{path}: {name}: {matrix.tolist()}; {expected}")
-        if np.abs(matrix - matrices[first]).max() > AGREE * scale:
+        if np.abs(matrix - matrices[first]).max() > SAME_SPHERE * scale:
             raise InputError(f"{path}: {name}: differs from {first}; {expected} for all views")
     center = matrices[first][:3, 3].astype(np.float64)
     return Similarity((float(center[0]), float(center[1]), float(center[2])), float(matrices[first][0, 0]))

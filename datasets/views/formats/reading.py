@@ -56,7 +56,7 @@ def find_source(path: str | Path) -> Path:
     if path.is_dir():
         found = next((path / name for name in FILES if (path / name).is_file()), None) or find_model(path)
         if found is None:
-            raise InputError(f"{path}: none of {', '.join(FILES)} or a COLMAP model (sparse/0) in it; name the file")
+            raise InputError(f"{path}: none of {', '.join(FILES)} or a COLMAP model (sparse/*) in it; name the file")
         return found
     if not path.exists():
         raise InputError(f"{path}: no such file; check the path")

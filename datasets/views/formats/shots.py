@@ -9,9 +9,9 @@ from ....neural_fields import InputError
 from ....neural_fields.backend.files import files_in
 from ...cameras import Camera
 
-__all__ = ["IMAGE_SUFFIXES", "Shot", "find_image", "image_size", "list_images"]
+__all__ = ["IMAGE_SUFFIXES", "Shot", "find_file", "find_image", "image_size", "list_images"]
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".heic", ".heif")
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,9 +37,15 @@ class Shot:
     depth_scale: float | None = None
 
 
+def find_file(folder: Path, name: str) -> Path:
+    """The file of that name, as a file of cameras has it: written on Windows, it may have backslashes."""
+    beside = folder / name
+    return beside if beside.exists() or "\\" not in name else folder / name.replace("\\", "/")
+
+
 def find_image(folder: Path, name: str) -> Path:
     """The image of that name; Blender's scenes leave its extension out. Whether there is one is not said."""
-    beside = folder / name
+    beside = find_file(folder, name)
     files = [beside, *(beside.with_name(beside.name + suffix) for suffix in IMAGE_SUFFIXES)]
     return next((file for file in files if file.is_file()), beside)
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ....neural_fields import InputError
 from ...cameras import COEFFICIENTS, Camera, intrinsics
 from ...files import finite_number, read_json
-from .shots import Shot, find_image, image_size
+from .shots import Shot, find_file, find_image, image_size
 
 __all__ = ["read_transforms"]
 
@@ -88,20 +88,22 @@ def _shot(frame: _Frame) -> Shot:
     image = find_image(folder, name)
     # nerfstudio's name of the key, and instant-ngp's, which says how much a step of an integer is.
     depth = _file_name(frame, "depth_file_path") or _file_name(frame, "depth_path")
-    step = frame.positive("integer_depth_scale")
+    step = None if depth is None else frame.positive("integer_depth_scale")
     return Shot(
         name,
         _camera(frame, image),
         image,
-        None if mask is None else folder / mask,
+        None if mask is None else find_file(folder, mask),
         f"{frame.path}: frames[{frame.index}]",
-        None if depth is None else folder / depth,
+        None if depth is None else find_file(folder, depth),
         None if step is None else 1 / step,
     )
 
 
 def _file_name(frame: _Frame, key: str) -> str | None:
     name = frame.own.get(key)
+    if name == "" and key != "file_path":
+        return None
     if name is not None and (not isinstance(name, str) or not name):
         raise InputError(f"{frame.named(key)}: {name!r}; expected the name of the image")
     return name
@@ -117,10 +119,9 @@ def _camera(frame: _Frame, image: Path) -> Camera:
         raise InputError(f"{frame.named(key)}: {frame.get(key)!r}: no pinhole; undistort the images and export again")
     width, height = _size(frame, image)
     fx, fy = frame.positive("fl_x"), frame.positive("fl_y")
-    angle_x, angle_y = frame.angle("camera_angle_x"), frame.angle("camera_angle_y")
-    if fx is None and angle_x is not None:
+    if fx is None and (angle_x := frame.angle("camera_angle_x")) is not None:
         fx = width / 2 / math.tan(angle_x / 2)
-        if fy is None and angle_y is not None:
+        if fy is None and (angle_y := frame.angle("camera_angle_y")) is not None:
             fy = height / 2 / math.tan(angle_y / 2)
     if fx is None:
         raise InputError(f"{frame.named('fl_x')}: missing, and so is camera_angle_x; add one of them")

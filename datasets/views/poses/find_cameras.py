@@ -36,7 +36,7 @@ from .colmap_process import (
 __all__ = ["FILM_SUFFIXES", "PLACING", "FoundCameras", "find_cameras"]
 
 FILM_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
-LEAST = 3  # photographs; two say little of a surface
+FEWEST_PHOTOGRAPHS = 3  # photographs; two say little of a surface
 SHARPNESS_WIDTH = 480  # pixels across, in which the sharpness of frames is compared
 PLACING = "placing cameras"
 
@@ -113,10 +113,10 @@ def find_cameras(
 def _photographs(source: Path) -> list[Path]:
     if source.is_dir():
         files = list_images(source)
-        if len(files) < LEAST:
+        if len(files) < FEWEST_PHOTOGRAPHS:
             kinds = ", ".join(IMAGE_SUFFIXES)
             raise InputError(
-                f"{source}: {len(files)} photographs ({kinds}) in it; {LEAST} are the least, 30 are better"
+                f"{source}: {len(files)} photographs ({kinds}) in it; {FEWEST_PHOTOGRAPHS} are the least, 30 are better"
             )
         return files
     if not source.exists():
@@ -163,8 +163,8 @@ def _sharpest(film: Path, images: Path, frames: int, report: Report) -> None:
                     raise InputError(f"{film}: frame {index} cannot be written as PNG")
                 place.write_bytes(data.tobytes())
             report("reading the film", index + 1, total)
-    if count < LEAST:
-        raise InputError(f"{film}: {count} frames can be read; {LEAST} are the least")
+    if count < FEWEST_PHOTOGRAPHS:
+        raise InputError(f"{film}: {count} frames can be read; {FEWEST_PHOTOGRAPHS} are the least")
     half.replace(images)
 
 
@@ -173,7 +173,7 @@ def _opened(film: Path) -> Iterator[tuple[cv2.VideoCapture, int]]:
     capture = cv2.VideoCapture(str(film))
     try:
         total = int(capture.get(cv2.CAP_PROP_FRAME_COUNT)) if capture.isOpened() else 0
-        if total < LEAST:
+        if total < FEWEST_PHOTOGRAPHS:
             raise InputError(f"{film}: not a film that can be read; convert it to MP4, or give a folder of photographs")
         yield capture, total
     finally:
@@ -195,7 +195,7 @@ def _reconstructed(project: Path, told: Connection, *, one: bool, film: bool) ->
     else:
         pycolmap.match_exhaustive(database, verification_options=verification)
     options = pycolmap.IncrementalPipelineOptions()
-    options.min_model_size, options.random_seed = LEAST, 0
+    options.min_model_size, options.random_seed = FEWEST_PHOTOGRAPHS, 0
     placed = itertools.count(3)  # two are placed together, of which one is told
     told.send(("stage", (PLACING, 0)))
     (project / "models").mkdir(exist_ok=True)

@@ -34,7 +34,7 @@ from .colmap_process import (
 __all__ = ["TRIANGULATING", "FoundPoints", "find_points", "neighbours"]
 
 TRIANGULATING = "triangulating"
-NEAREST = 20  # views that each is matched with: those that look at the region from most nearly the same side
+MATCHED_VIEWS = 20  # views that each is matched with: those that look at the region from most nearly the same side
 GIVEN, PAIRS_FILE = "given", "pairs.txt"  # what COLMAP is given: a model with cameras and no points, and who is matched
 
 
@@ -109,7 +109,7 @@ def _write_given(source: Path, project: Path) -> None:
     shutil.rmtree(half)
 
 
-def neighbours(away: NDArray[np.float64], nearest: int = NEAREST) -> list[tuple[int, int]]:
+def neighbours(away: NDArray[np.float64], nearest: int = MATCHED_VIEWS) -> list[tuple[int, int]]:
     """Pairs of views that may show the same: each with those whose directions from the region are nearest to its own.
 
     Args:

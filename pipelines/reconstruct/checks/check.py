@@ -6,8 +6,9 @@ All lengths are in radii of the region of interest, because cameras are moved in
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -87,7 +88,7 @@ class CameraCheck:
 
 
 def check_files(
-    path: str | Path, out: Path | None = None, depths: DepthSource | None = None
+    path: str | Path, out: Path | None = None, depths: DepthSource | None = None, *, allow_missing: bool = False
 ) -> tuple[PosedImages, CameraCheck, str]:
     """Check a data set, and write what it looks like.
 
@@ -95,6 +96,7 @@ def check_files(
         path: as for `read_posed_images`.
         out: ``.glb`` or ``.ply`` file for `camera_mesh`, in world coordinates.
         depths: as for `read_posed_images`.
+        allow_missing: as for `read_posed_images`.
 
     Returns:
         The images (made small), the figures, and both in words.
@@ -103,7 +105,8 @@ def check_files(
         InputError: the data set cannot be read, or the file not be written.
     """
     cameras = [camera for _, camera in read_cameras(path)]
-    images, trouble = _read(path, cameras, depths)
+    read = partial(read_posed_images, path, width=LIMITS.width, depths=depths, allow_missing=allow_missing)
+    images, trouble = _read(read, cameras)
     check = check_cameras(images)
     check = replace(check, warnings=(*check.warnings, *trouble))
     sizes = [(camera.width, camera.height) for camera in cameras]
@@ -112,15 +115,13 @@ def check_files(
     return images, check, format_check(images, check, sizes)
 
 
-def _read(
-    path: str | Path, cameras: Sequence[Camera], depths: DepthSource | None
-) -> tuple[PosedImages, tuple[str, ...]]:
+def _read(read: Callable[..., PosedImages], cameras: Sequence[Camera]) -> tuple[PosedImages, tuple[str, ...]]:
     """The images, around a guessed region where none can be found: that is when cameras most need to be looked at."""
     try:
-        return read_posed_images(path, width=LIMITS.width, depths=depths), ()
+        return read(), ()
     except InputError as error:
         try:
-            images = read_posed_images(path, width=LIMITS.width, region=_guess(cameras), depths=depths)
+            images = read(region=_guess(cameras))
         except InputError:
             raise error from None  # it was not the region, then
         return replace(images, region="a guess"), (f"there is no region of interest but a guess: {error}",)
@@ -189,6 +190,7 @@ def format_check(images: PosedImages, check: CameraCheck, sizes: Sequence[tuple[
     across, down = check.fields_of_view.T
     lines = [
         f"{len(images.views)} views of {size} pixels, from {images.source}",
+        *[images.reading] * bool(images.reading),
         f"region of interest: centre ({center}), radius {scale:.{digits}f}; from {images.region}",
         f"field of view: {_range(across, '.1f', '°')} across, {_range(down, '.1f', '°')} down",
         f"eyes: {_range(check.distances, '.2f')} radii from the centre",

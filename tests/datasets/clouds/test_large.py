@@ -102,7 +102,7 @@ def test_in_pieces_as_whole(monkeypatch: pytest.MonkeyPatch) -> None:
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     cloud = PointCloud(normals * 0.5 + 1e6, normals.astype(np.float32), random.random((30_000, 3)).astype(np.float32))
     whole, report = merged(cloud, limit=3000, voxel=0.004)
-    monkeypatch.setattr(large_cloud, "ROWS", 1000)
+    monkeypatch.setattr(large_cloud, "MERGE", large_cloud.MergeOptions(rows=1000))
     pieces, again = merged(cloud, limit=3000, voxel=0.004)
     assert again.voxel == report.voxel > 0.004
     assert np.allclose(ordered(pieces), ordered(whole), atol=1e-9)

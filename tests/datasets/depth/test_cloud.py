@@ -324,7 +324,7 @@ def test_fusion_keeps_few_points_of_long_sequences():
     for frame in sphere_frames([(4 * np.cos(a), 4 * np.sin(a), 0.2) for a in np.linspace(0, 6, 20)]):
         pool.add(frame)
         cloud, owner = pool.joined()
-        assert len(cloud) == len(owner) <= 2 * depth_fusion.ROOM * settings.max_points
+        assert len(cloud) == len(owner) <= 2 * depth_fusion.FUSION.room * settings.max_points
     # Rows stay together: a point was seen by the camera of its frame, from the front.
     angle = np.linspace(0, 6, 20)[owner]
     towards = np.stack((4 * np.cos(angle), 4 * np.sin(angle), np.full(len(angle), 0.2)), axis=1) - cloud.points

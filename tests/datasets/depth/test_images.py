@@ -17,6 +17,7 @@ from mplicits.datasets import (
 )
 from mplicits.datasets.depth.images import fit_color
 from mplicits.neural_fields import InputError
+from scipy.spatial.transform import Rotation
 
 OURS = {"width": 8, "height": 6, "fx": 10.0, "fy": 11.0, "cx": 3.5, "cy": 2.25}
 LENS = DepthCamera(160, 120, 130.0, 128.0, 81.5, 57.0, (-0.28, 0.09, 1e-3, -7e-4, -0.01))
@@ -116,10 +117,24 @@ def test_missing_damaged_and_foreign_files(tmp_path, steps):
         read_depth(write(tmp_path / "a.png", steps), scale=0)
 
 
+@pytest.mark.parametrize("largest", [65535, np.iinfo(np.int32).max, 65.535, 65504.0, 1e10, np.inf])
+def test_the_largest_number_is_no_reading(tmp_path, largest):
+    """As sensors and renderers write it where there is nothing; but of inverse depths it is the nearest."""
+    kind = np.int32 if isinstance(largest, int) else np.float32
+    values = np.full((6, 8), 2, kind)
+    values[:, :3] = largest
+    path = write(tmp_path / "a.npy", values)
+    assert np.isnan(read_depth(path)[:, :3]).all()
+    assert np.isfinite(read_depth(path)[:, 3:]).all()
+    if np.isfinite(largest):
+        assert np.isfinite(read_depth(path, inverse=True)).all()
+        assert np.isfinite(read_depth(path, saturates=False)).all()
+
+
 def test_tables_of_points_are_no_depth_maps(tmp_path):
     for name, shape, expected in (
-        ("a", (9, 4), True),
-        ("b", (9, 3), False),
+        ("a", (9, 16), True),
+        ("b", (9, 4), False),
         ("c", (9, 6), False),
         ("d", (1, 6, 8), True),
     ):
@@ -171,13 +186,62 @@ def test_pictures_of_another_size(tmp_path):
 # --- lenses ------------------------------------------------------------------------------------------
 
 
-def test_intrinsics_of_both_kinds(tmp_path):
+ROWS = [10, 0, 3.5, 0, 11, 2.25, 0, 0, 1]
+COLUMNS = [10, 0, 0, 0, 11, 0, 3.5, 2.25, 1]
+ROS = """image_width: 8
+image_height: 6
+camera_name: depth
+distortion_model: plumb_bob
+camera_matrix:
+  rows: 3
+  cols: 3
+  data: [10, 0, 3.5, 0, 11, 2.25, 0, 0, 1]
+distortion_coefficients:
+  rows: 1
+  cols: 5
+  data: [0.1, 0, 0, -0.2, 0]
+"""
+OPENCV = """%YAML:1.0
+---
+image_width: 8
+image_height: 6
+camera_matrix: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: [ 10., 0., 3.5, 0., 11., 2.25, 0., 0., 1. ]
+"""
+OPEN3D = {"class_name": "PinholeCameraParameters", "intrinsic": {"width": 8, "height": 6, "intrinsic_matrix": COLUMNS}}
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("camera.json", OURS | {"k4": 0, "note": "x"}),
+        ("Open3D.json", {"width": 8, "height": 6, "intrinsic_matrix": COLUMNS}),
+        ("Open3D.json", OPEN3D | {"extrinsic": np.eye(4).ravel().tolist()}),
+        ("Record3D.json", {"w": 8, "h": 6, "K": COLUMNS, "fps": 30}),
+        ("Polycam.json", OURS | {"t_00": 1.0, "blur_score": 2.0}),
+        ("ROS.json", {"width": 8, "height": 6, "K": ROWS, "D": [0] * 5}),
+        ("rows.json", {"width": 8, "height": 6, "camera_matrix": [ROWS[:3], ROWS[3:6], ROWS[6:]]}),
+        ("ROS.yaml", ROS),
+        ("OpenCV.yml", OPENCV),
+        ("K.txt", "10 0 3.5\n0 11 2.25\n0 0 1\n"),
+        ("intrinsic_depth.txt", "10 0 3.5 0\n0 11 2.25 0\n0 0 1 0\n0 0 0 1\n"),
+        ("four.txt", "# fx fy cx cy\n10, 11, 3.5, 2.25\n"),
+    ],
+)
+def test_intrinsics_of_other_programs(tmp_path, name, content):
+    path = tmp_path / name
+    path.write_text(content if isinstance(content, str) else json.dumps(content))
+    distortion = (0.1, 0.0, 0.0, -0.2, 0.0) if name == "ROS.yaml" else (0.0,) * 5
+    assert read_intrinsics(path, size=(8, 6)) == DepthCamera(8, 6, 10.0, 11.0, 3.5, 2.25, distortion)
+
+
+def test_distortion_and_scale_of_our_intrinsics(tmp_path):
     path = tmp_path / "camera.json"
-    path.write_text(json.dumps(OURS | {"depth_scale": 5000, "k1": 0.1, "p2": -0.2, "k4": 0, "note": "x"}))
-    expected = DepthCamera(8, 6, 10.0, 11.0, 3.5, 2.25, (0.1, 0.0, 0.0, -0.2, 0.0), 5000.0)
-    assert read_intrinsics(path) == expected
-    path.write_text(json.dumps({"width": 8, "height": 6, "intrinsic_matrix": [10, 0, 0, 0, 11, 0, 3.5, 2.25, 1]}))
-    assert read_intrinsics(path) == DepthCamera(8, 6, 10.0, 11.0, 3.5, 2.25)
+    path.write_text(json.dumps(OURS | {"depth_scale": 5000, "k1": 0.1, "p2": -0.2}))
+    assert read_intrinsics(path) == DepthCamera(8, 6, 10.0, 11.0, 3.5, 2.25, (0.1, 0.0, 0.0, -0.2, 0.0), 5000.0)
 
 
 @pytest.mark.parametrize(
@@ -189,12 +253,10 @@ def test_intrinsics_of_both_kinds(tmp_path):
         (OURS | {"width": 8.5}, "width: 8.5; expected a whole number"),
         (OURS | {"k5": 0.1}, "k5: lenses with k4 to k6 are not supported"),
         (OURS | {"depth_scale": 0}, "depth_scale=0.0: expected"),
-        (
-            {"width": 8, "height": 6, "intrinsic_matrix": [10, 0, 3.5, 0, 11, 2.25, 0, 0, 1]},
-            "intrinsic_matrix: .*expected",
-        ),
-        ({"width": 8, "height": 6, "intrinsic_matrix": [[10, 0, 3.5]]}, "nine numbers"),
-        ([1, 2], "expected an object"),
+        ({"width": 8, "height": 6, "K": [10, 0.5, 3.5, 0, 11, 2.25, 0, 0, 1]}, "K: .*expected fx 0 cx"),
+        ({"width": 8, "height": 6, "intrinsic_matrix": [[10, 0, 3.5]]}, "intrinsic_matrix: .*expected fx 0 cx"),
+        ({"width": 8, "height": 6, "K": ROWS, "D": [0.1], "distortion_model": "fisheye"}, "distortion_model: fisheye"),
+        ([1, 2], "expected width, height, fx, fy, cx and cy, or a 3 × 3 matrix; or give --intrinsics FX FY CX CY"),
     ],
 )
 def test_bad_intrinsics(tmp_path, content, message):
@@ -252,31 +314,84 @@ def test_points_outside_or_behind_are_not_in_the_image():
 # --- poses -------------------------------------------------------------------------------------------
 
 
-def test_trajectory_is_camera_to_world(tmp_path):
-    angle = 0.3
-    pose = np.eye(4)
-    pose[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
-    pose[:3, 3] = 1.5, -2, 1e4
-    path = tmp_path / "trajectory.log"
-    rows = "\n".join(" ".join(f"{x:.6g}" for x in row) for row in pose)
-    path.write_text(f"0 0 2\n{rows}\n\n1 1 2\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n")
-    poses = read_trajectory(path)
-    assert poses.shape == (2, 4, 4)
-    assert np.abs(poses[0] - pose).max() < 1e-6
-    assert np.abs(poses[0, :3, :3].T @ poses[0, :3, :3] - np.eye(3)).max() < 1e-14
-    named = read_poses(path)
-    assert named[1][0] is None
-    assert named[1][2] is None
-    assert np.array_equal(named[1][1], np.eye(4))
+POSE = np.eye(4)
+POSE[:2, :2] = [[np.cos(0.3), -np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]]
+POSE[:3, 3] = 1.5, -2, 1e4
+QUATERNION = [0, 0, np.sin(0.15), np.cos(0.15)]
+OPENGL = POSE @ np.diag([1.0, -1, -1, 1])  # the same pose in axes with y up and z backward
+
+
+def text(rows):
+    return "".join(" ".join(f"{x:.12g}" for x in row) + "\n" for row in rows)
+
+
+@pytest.mark.parametrize(
+    ("files", "names"),
+    [
+        ({"trajectory.log": f"0 0 2\n{text(POSE)}\n1 1 2\n{text(np.eye(4))}"}, [None, None]),
+        (
+            {
+                "tum.txt": "# timestamp tx ty tz qx qy qz qw\n5.25 "
+                + text([[*POSE[:3, 3], *QUATERNION]])
+                + "5.5 0 0 0 0 0 0 2\n"
+            },
+            ["5.25", "5.5"],
+        ),
+        ({"kitti.txt": text([POSE[:3].ravel(), np.eye(4)[:3].ravel()])}, [None, None]),
+        ({"poses/2.txt": text(POSE), "poses/10.txt": text(np.eye(4)[:3]), "poses/.hidden.txt": "x"}, ["2", "10"]),
+        (
+            {
+                "open3d.json": {
+                    "class_name": "PinholeCameraTrajectory",
+                    "parameters": [{"extrinsic": np.linalg.inv(pose).T.ravel().tolist()} for pose in (POSE, np.eye(4))],
+                }
+            },
+            [None, None],
+        ),
+        (
+            {
+                "metadata": {
+                    "K": COLUMNS,
+                    "poses": [
+                        [*Rotation.from_matrix(OPENGL[:3, :3]).as_quat(), *POSE[:3, 3]],
+                        [1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
+                    ],
+                }
+            },
+            ["0", "1"],
+        ),
+        (
+            {
+                f"cameras/{name}.json": OURS | {f"t_{i}{j}": pose[i, j] for i in range(3) for j in range(4)}
+                for name, pose in (("7", OPENGL), ("11", np.diag([1.0, -1, -1, 1])))
+            },
+            ["7", "11"],
+        ),
+    ],
+    ids=["Open3D log", "TUM", "KITTI", "folder", "Open3D JSON", "Record3D", "Polycam"],
+)
+def test_poses_of_other_programs_are_camera_to_world(tmp_path, files, names):
+    for name, content in files.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(content if isinstance(content, str) else json.dumps(content))
+    name = next(iter(files))
+    path = tmp_path / name
+    found = read_poses(path.parent if "/" in name else path)
+    assert [name for name, _, _ in found] == names
+    assert np.abs(found[0][1] - POSE).max() < 1e-8
+    assert np.abs(found[1][1] - np.eye(4)).max() < 1e-12
+    assert np.abs(found[0][1][:3, :3].T @ found[0][1][:3, :3] - np.eye(3)).max() < 1e-14
+    lenses = [lens for _, _, lens in found]
+    assert lenses == [DepthCamera(**OURS) if names == ["7", "11"] else None] * 2
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("0 0 1\n1 0 0 0\n0 1 0 0\n", "3 lines; expected five per frame"),
-        ("0 0 1\n1 0 0 0\n0 1 0 0\n0 0 1 x\n0 0 0 1\n", "could not convert"),
-        ("0 0 1\n1 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n", "expected five lines per frame"),
-        ("0 1\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n", "has not three numbers"),
+        ("0 0 1\n1 0 0 0\n0 1 0 0\n", "3 lines of .* numbers; no poses in it; expected a trajectory.log, TUM's"),
+        ("0 0 1\n1 0 0 0\n0 1 0 0\n0 0 1 x\n0 0 0 1\n", "no poses in it; .*could not convert"),
+        ("", "0 lines"),
+        ("1 0 0 0 0 0 0 0\n", "frame 0: .*expected a rigid pose"),
         ("0 0 1\n2 0 0 0\n0 2 0 0\n0 0 2 0\n0 0 0 1\n", "frame 0: .*expected a rigid pose"),
         ("0 0 1\n1 0 0 0\n0 1 0 0\n0 0 -1 0\n0 0 0 1\n", "frame 0: .*expected a rigid pose"),
         ("0 0 1\n1 0 0 nan\n0 1 0 0\n0 0 1 0\n0 0 0 1\n", "frame 0: .*expected a rigid pose"),

@@ -182,8 +182,8 @@ def test_without_anything_that_cameras_share_the_region_must_be_given(tmp_path):
     content["frames"] = content["frames"][:1]
     (tmp_path / "transforms.json").write_text(json.dumps(content))
     with pytest.raises(InputError, match=r"transforms\.json: region: not found \(cameras: .* parallel"):
-        read_posed_images(tmp_path)
-    assert len(read_posed_images(tmp_path, region=Similarity.identity()).views) == 1
+        read_posed_images(tmp_path, allow_missing=True)
+    assert len(read_posed_images(tmp_path, region=Similarity.identity(), allow_missing=True).views) == 1
 
 
 def test_distorted_pictures_show_the_world_where_the_new_cameras_have_it(tmp_path):
@@ -339,7 +339,48 @@ def test_spheres_that_are_none_are_refused(change, message, tmp_path):
 
 
 def test_what_is_no_data_set_says_what_was_looked_for(tmp_path):
-    with pytest.raises(InputError, match=r"none of cameras_sphere\.npz, .* or a COLMAP model \(sparse/0\) in it"):
+    with pytest.raises(InputError, match=r"none of cameras_sphere\.npz, .* or a COLMAP model \(sparse/\*\) in it"):
         read_posed_images(tmp_path)
     with pytest.raises(ValueError, match="width=0: expected at least one pixel"):
         read_posed_images(tmp_path, width=0)
+
+
+def test_photographs_without_a_camera_are_counted(tmp_path):
+    """Two more photographs are said, twenty more are too many, and cameras without a photograph are left out."""
+    write_colmap(tmp_path, np.random.default_rng(0).normal(size=(50, 3)) * 0.2 + CENTER)
+    for index in range(2):
+        write(tmp_path / "images" / f"more{index}.png", picture(0))
+    assert read_posed_images(tmp_path).reading == f"{VIEWS} of {VIEWS + 2} photographs have a camera"
+    for index in range(20):
+        write(tmp_path / "images" / f"more{index}.png", picture(0))
+    with pytest.raises(InputError, match=r"only 6 of 26 photographs have a camera; .*--allow-missing"):
+        read_posed_images(tmp_path)
+    (tmp_path / "images" / "3.png").unlink()
+    read = read_posed_images(tmp_path, allow_missing=True)
+    assert [view.name for view in read.views] == [f"{k}.png" for k in range(VIEWS) if k != 3]
+    assert read.reading == "5 of 26 photographs have a camera"
+
+
+def test_names_that_were_written_on_windows(tmp_path):
+    content = json.loads((write_transforms(tmp_path) / "transforms.json").read_text())
+    unused = {"camera_angle_x": 0, "integer_depth_scale": 0}
+    for frame in content["frames"]:
+        frame.update(file_path=frame["file_path"].replace("/", "\\"), mask_path="", depth_file_path="")
+    (tmp_path / "transforms.json").write_text(json.dumps(content | unused), encoding="utf-8-sig")
+    read = read_posed_images(tmp_path)
+    assert len(read.views) == VIEWS
+    assert all(view.mask is None and view.depth is None for view in read.views)
+
+
+@pytest.mark.parametrize("extension", [".tif", ".webp"])
+def test_photographs_of_other_kinds(tmp_path, extension):
+    write_transforms(tmp_path)
+    content = json.loads((tmp_path / "transforms.json").read_text())
+    for index, frame in enumerate(content["frames"]):
+        (tmp_path / frame["file_path"]).unlink()
+        frame["file_path"] = f"images/{index}"  # Blender's leave the extension out
+        image = picture(index)[..., ::-1]
+        data = cv2.imencode(extension, image, [cv2.IMWRITE_WEBP_QUALITY, 101] if extension == ".webp" else [])[1]
+        (tmp_path / "images" / f"{index}{extension}").write_bytes(data.tobytes())
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    assert np.allclose(read_posed_images(tmp_path).views[2].color, picture(2) / 255, atol=1e-6)

@@ -264,7 +264,7 @@ def test_a_cloud_may_be_the_reference_but_not_the_mesh(tmp_path):
     ("name", "content", "message"),
     [
         ("absent.ply", None, "no such file"),
-        ("broken.ply", b"ply\nformat nonsense", "cannot be read as a PLY mesh"),
+        ("broken.ply", b"ply\nformat nonsense", "end_header is missing"),
         ("broken.glb", b"not a glb at all", "cannot be read as a GLB mesh"),
         ("index.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "index.obj"),
         ("point.obj", b"v 1 1 1\nv 1 1 1\nv 1 1 1\nf 1 2 3\n", "all vertices coincide"),

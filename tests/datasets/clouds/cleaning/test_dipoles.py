@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 from bounds import unit_roundoff
-from mplicits.datasets.clouds.cleaning.dipoles import LEAF, MOST_LEAVES, DipoleField, DipoleSums
+from mplicits.datasets.clouds.cleaning.dipoles import DIPOLES, DipoleField, DipoleSums
 
 SOFTENING = 0.05
 # A leaf of 48 points seen as one dipole from beyond its near leaves; see `NEAR` of `dipoles`.
@@ -35,7 +35,7 @@ def expected(points: np.ndarray, dipoles: np.ndarray, values: np.ndarray) -> dic
     }
 
 
-@pytest.mark.parametrize(("count", "relative"), [(LEAF, 0.0), (1500, FAR)])
+@pytest.mark.parametrize(("count", "relative"), [(DIPOLES.leaf, 0.0), (1500, FAR)])
 def test_sums_are_those_over_all_pairs(count, relative):
     points, dipoles = sphere(count)
     values = 1 + points[:, 0]
@@ -54,7 +54,7 @@ def test_sums_are_those_over_all_pairs(count, relative):
 
 def test_descent_is_the_gradient_of_winding():
     """The far side of a point that has no dipole itself, moved to and fro."""
-    points, dipoles = sphere(LEAF - 1)
+    points, dipoles = sphere(DIPOLES.leaf - 1)
     probe, step = np.array([0.1, 0.2, -0.3]), 1e-2
 
     def at(place: np.ndarray) -> tuple[float, np.ndarray]:
@@ -84,7 +84,7 @@ def test_leaf_means_count_no_point_twice():
     assert torch.equal(means, torch.ones(32))
 
 
-@pytest.mark.parametrize(("count", "relative"), [(1, FAR), (LEAF, 0.0), (3000, FAR)])
+@pytest.mark.parametrize(("count", "relative"), [(1, FAR), (DIPOLES.leaf, 0.0), (3000, FAR)])
 def test_a_field_of_dipoles_is_the_sum_over_all_of_them(count, relative):
     points, dipoles = sphere(count)
     places = np.random.default_rng(1).uniform(-1, 1, (2000, 3))
@@ -124,6 +124,6 @@ def test_no_place_has_no_winding_number():
 
 
 def test_leaves_of_a_large_cloud_are_no_more_than_so_many():
-    points, dipoles = sphere(2 * LEAF * MOST_LEAVES)
+    points, dipoles = sphere(2 * DIPOLES.leaf * DIPOLES.most_leaves)
     found = DipoleField(points, dipoles, np.full(len(points), SOFTENING)).winding(np.array([[0.0, 0, 0], [0, 0, 0.95]]))
     assert np.abs(found - (1, 0)).max() < FAR

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from mplicits.datasets import sample_sphere
-from mplicits.datasets.clouds.cleaning.exterior import OUTSIDE, Exterior
+from mplicits.datasets.clouds.cleaning.exterior import OUTER_REGION, Exterior
 
 PLACES = np.array([[0.0, 0, 0], [0.35, 0, 0], [0.0, 0, 0.95], [-1.1, 1.1, 1.1]])
 
@@ -11,7 +11,7 @@ PLACES = np.array([[0.0, 0, 0], [0.35, 0, 0], [0.0, 0, 0.95], [-1.1, 1.1, 1.1]])
 def test_a_closed_surface_encloses_what_is_in_it() -> None:
     ball = Exterior(sample_sphere(8000, radius=0.7).points)
     assert ball.count == 2
-    assert ball.regions(PLACES).tolist() == [2, 2, OUTSIDE, OUTSIDE]
+    assert ball.regions(PLACES).tolist() == [2, 2, OUTER_REGION, OUTER_REGION]
     assert not ball.regions(sample_sphere(500, radius=0.7, seed=1).points).any()
 
 
@@ -20,12 +20,12 @@ def test_each_hollow_is_a_region() -> None:
     points = np.concatenate([sample_sphere(9000, radius=radius).points for radius in (0.8, 0.5)])
     nested = Exterior(points)
     assert nested.count == 3
-    assert nested.regions(np.array([[0.0, 0, 0], [0.65, 0, 0], [0.9, 0, 0]])).tolist() == [3, 2, OUTSIDE]
+    assert nested.regions(np.array([[0.0, 0, 0], [0.65, 0, 0], [0.9, 0, 0]])).tolist() == [3, 2, OUTER_REGION]
 
 
 def test_a_bowl_encloses_nothing() -> None:
     points = sample_sphere(8000, radius=0.7).points
-    assert Exterior(points[points[:, 2] < 0]).regions(PLACES[:2]).tolist() == [OUTSIDE, OUTSIDE]
+    assert Exterior(points[points[:, 2] < 0]).regions(PLACES[:2]).tolist() == [OUTER_REGION, OUTER_REGION]
 
 
 @pytest.mark.slow

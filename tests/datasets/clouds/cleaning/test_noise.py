@@ -5,6 +5,7 @@ import pytest
 import torch
 from bounds import unit_roundoff
 from mplicits.datasets import PointCloud, add_noise, add_outliers, prepare_cloud, sample_sphere, sample_surface
+from mplicits.datasets.clouds.cleaning import noise
 from mplicits.datasets.clouds.cleaning.noise import noise_deviation, noise_level, smooth_along_normals
 from mplicits.neural_fields import Box, Torus
 from mplicits.pipelines.fit.cloud import CloudDistance
@@ -248,7 +249,7 @@ def test_the_fit_of_a_noisy_cloud_says_what_was_smoothed_and_can_leave_it():
 def test_less_noise_is_smoothed_off_where_it_is_in_the_normals_too(estimated, dense, monkeypatch):
     """A fifth of the spacing: the network's own business if normals are exact, but estimated ones are tilted by it."""
     count, radius = 8000, 0.7
-    monkeypatch.setattr("mplicits.datasets.clouds.cleaning.noise.DENSE", count + (not dense))
+    monkeypatch.setattr(noise, "NOISE", noise.NoiseOptions(dense=count + (not dense)))
     points, normals = sphere(count, radius=radius)
     sigma = np.sqrt(4 * np.pi * radius**2 / count) / 5
     cloud = PointCloud(points + RNG.normal(0, sigma, points.shape), normals.astype(np.float32), None, "ball")

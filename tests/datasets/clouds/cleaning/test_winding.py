@@ -3,7 +3,13 @@
 import numpy as np
 import pytest
 from mplicits.datasets import PointCloud, prepare_cloud, sample_sphere, sample_surface
-from mplicits.datasets.clouds.cleaning.winding import SIZES, layer_thickness, misfit, orient_by_winding, winding_normals
+from mplicits.datasets.clouds.cleaning.winding import (
+    WINDING,
+    layer_thickness,
+    misfit,
+    orient_by_winding,
+    winding_normals,
+)
 from mplicits.neural_fields import Box
 from scipy.optimize import brentq
 from scipy.spatial import KDTree
@@ -61,7 +67,7 @@ def expected_thickness(density: float, sigma: float, *, flat: float = 0.25) -> t
     z = np.linspace(-5, 5, 2001) * sigma
     share = np.exp(-((z / sigma) ** 2) / 2) / np.exp(-((z / sigma) ** 2) / 2).sum()
     levels = norm.ppf((np.arange(100) + 0.5) / 100) * sigma  # of the points in the middle
-    for size in SIZES:
+    for size in WINDING.sizes:
         spreads, radii = [], []
         for level in levels:
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from mplicits.datasets import Camera, look_at, read_cameras
-from mplicits.datasets.views.formats.colmap import MODELS, read_colmap, read_colmap_points
+from mplicits.datasets.views.formats.colmap import MODELS, find_model, read_colmap, read_colmap_points
 from mplicits.neural_fields import InputError
 from scipy.spatial.transform import Rotation
 
@@ -137,6 +137,15 @@ def test_models_are_found_where_colmap_leaves_them(place, write, tmp_path):
     assert list(read) == sorted(NAMES)
     torch.testing.assert_close(read["a.jpg"].world_from_camera, cameras()["a.jpg"].world_from_camera)
     assert list(dict(read_cameras(tmp_path / place))) == sorted(NAMES)
+
+
+@pytest.mark.parametrize("write", WRITERS)
+def test_the_model_with_most_photographs_is_read(write, tmp_path):
+    write(tmp_path / "sparse" / "10")
+    (tmp_path / "sparse" / "2").mkdir()
+    one = "3 PINHOLE 40 30 55 53 19 16\n"
+    write_text(tmp_path / "sparse" / "2", cameras=one, images="1 1 0 0 0 0 0 0 3 a.jpg\n\n")
+    assert find_model(tmp_path) == tmp_path / "sparse" / "10"
 
 
 @pytest.mark.parametrize("place", ["sparse/0", "sparse", "."])

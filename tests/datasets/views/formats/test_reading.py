@@ -153,7 +153,7 @@ def without(key: str) -> dict:
         (frame_change(transform_matrix=np.full((4, 4), math.nan).tolist()), "transform_matrix: .* not finite"),
         (frame_change(fl_x=-3), r"frames\[1\]\.fl_x: -3; expected more than 0"),
         (frame_change(cx="middle"), r"frames\[1\]\.cx: 'middle'; expected a finite number"),
-        (frame_change(camera_angle_x=4), r"frames\[1\]\.camera_angle_x: 4; expected radians"),
+        (transforms(**SIZE, camera_angle_x=4), r"camera_angle_x: 4; expected radians"),
         (frame_change(w=40.5), r"frames\[1\]\.w: 40\.5; expected whole pixels"),
         (
             transforms(**FOCAL, **SIZE, camera_model="OPENCV_FISHEYE"),
