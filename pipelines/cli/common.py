@@ -26,7 +26,6 @@ __all__ = [
     "between",
     "check_output",
     "finite",
-    "help_train",
     "new_settings",
     "positive",
     "read_settings",
@@ -118,17 +117,6 @@ def training(
                 listener(progress)
 
         yield tell if listeners else None
-
-
-def help_train(train: Callable[[], object]) -> int:
-    """Train along with the process that does the rest, and speaks for all; see `team`. Returns the exit code."""
-    from ..training.trainer import Interrupted
-
-    try:
-        train()
-    except Interrupted:
-        return 130
-    return 0
 
 
 def tell_budget(record: Mapping[str, Any], name: str = "") -> None:

@@ -16,7 +16,6 @@ from .common import (
     Command,
     add_new_run,
     add_settings,
-    help_train,
     new_settings,
     positive,
     refuse,
@@ -78,10 +77,7 @@ def _fit(arguments: argparse.Namespace) -> int:
         refuse(arguments, ["no_colors"], "is about --mesh FILE; leave it out, or add that")
     if len(arguments.clouds) > 1 or arguments.jobs is not None:
         return _fit_many(arguments, config)
-    from ..training.team import team
-
-    with team(device="auto" if config is None else config.device) as leads:
-        return (_fit_one if leads else _follow)(arguments, arguments.clouds[0], config)
+    return _fit_one(arguments, arguments.clouds[0], config)
 
 
 def _fit_one(arguments: argparse.Namespace, cloud: str, config: FitConfig | None) -> int:
@@ -147,15 +143,6 @@ def _planned(arguments: argparse.Namespace, source: Path | DepthInput) -> FitMes
     from ..mesh.finish import plan_mesh
 
     return plan_mesh(arguments.mesh, arguments.out, source, colors=not arguments.no_colors, resume=arguments.resume)
-
-
-def _follow(arguments: argparse.Namespace, cloud: str, config: FitConfig | None) -> int:
-    """Help the process that does the rest, and speaks for all; see `team`."""
-    from ..fit.train import fit
-
-    if _depth_input(arguments, cloud) is not None:
-        raise input_error(f"{cloud}: depth maps are fitted by one process; leave out torchrun")
-    return help_train(lambda: fit(cloud, config, out=arguments.out, resume=arguments.resume))
 
 
 def _fit_many(arguments: argparse.Namespace, config: FitConfig | None) -> int:

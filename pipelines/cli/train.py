@@ -17,7 +17,6 @@ from .common import (
     add_new_run,
     add_settings,
     check_output,
-    help_train,
     new_settings,
     refuse,
     stoppable,
@@ -137,19 +136,6 @@ def _reconstruct_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _reconstruct(arguments: argparse.Namespace) -> int:
     config = new_settings(arguments, ReconstructConfig)
-    from ..reconstruct.train import reconstruct
-    from ..training.team import is_alone, team
-
-    with team(device="auto" if config is None else config.device) as leads:
-        if arguments.poses == "colmap" and not is_alone():
-            raise input_error("--poses colmap: cameras are found by one process; run `mplicits find-cameras` before")
-        if leads:
-            return _reconstruct_here(arguments, config)
-        return help_train(lambda: reconstruct(arguments.data, config, out=arguments.out, resume=arguments.resume))
-
-
-def _reconstruct_here(arguments: argparse.Namespace, config: ReconstructConfig | None) -> int:
-    """Train, measure and mesh."""
     from ...datasets.views.poses.find_cameras import find_cameras
     from ..mesh.extract import mesh_run
     from ..reconstruct.posing import colmap_report
