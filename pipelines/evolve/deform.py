@@ -29,7 +29,7 @@ from torch import Tensor
 from torch.nn.functional import huber_loss, normalize, pad
 
 from ...neural_fields import CarriedKeyframes, Field, VelocitySiren, at_time, flow
-from ..training.budget import LEAST_SECONDS, Budget
+from ..training.budget import BUDGET, Budget
 from ..training.report import Report
 from ..training.settings import EvolveConfig
 from ..training.trainer import Group, Objective, Trainer, seeded, warm_cosine
@@ -198,7 +198,7 @@ def learn_motion(
         shape.field.requires_grad_(False)
     objective = MotionObjective(velocity, shapes, keys, config, generator)
     left = None if budget is None else budget.left()
-    seconds = None if left is None else max(MOVING_SHARE * left, LEAST_SECONDS)
+    seconds = None if left is None else max(MOVING_SHARE * left, BUDGET.least_seconds)
     trainer = Trainer(objective, stage="motion", steps=config.motion_steps * (len(keys) - 1), seconds=seconds)
     trainer.run(report=progress)
     if budget is not None and trainer.ended_early:

@@ -29,7 +29,7 @@ from ...neural_fields import (
     transport,
 )
 from ...neural_fields.spacetime.evolution import VectorField
-from ..training.budget import SAMPLING_SHARE, Budget, affordable
+from ..training.budget import BUDGET, Budget, affordable
 from ..training.report import Report
 from ..training.settings import EvolveConfig
 from .deform import carried_samples, learn_motion, motion_figures
@@ -297,7 +297,7 @@ def _sampled(samples: Callable[[int], tuple[Known, Bounds]], config: EvolveConfi
     """As many samples as the settings want, or as a time budget leaves time for."""
     count, left = config.samples, None if budget is None else budget.left()
     if budget is not None and left is not None:
-        count = affordable(samples, config.samples, SAMPLING_SHARE * left)
+        count = affordable(samples, config.samples, BUDGET.sampling_share * left)
         if count < config.samples:
             budget.notes.append(f"{count:,} known samples instead of {config.samples:,}")
     return _Sampled(*samples(count), count)

@@ -9,10 +9,6 @@ from torch import Tensor
 
 __all__ = ["Focus"]
 
-EVERY = 16  # steps after which a training draws by newer errors
-STRIP = 16  # neighbouring pixels of a line share one error; samples that are no neighbours have one each
-TINY = 1e-30  # of a sum of errors: what is nowhere wrong
-
 
 class Focus:
     """Pixels of a pool, drawn evenly or by the errors of their strips.
@@ -26,7 +22,7 @@ class Focus:
         pixels: how many there are, line after line.
         share: of the draws that go by errors, from 0 to 1.
         device: of the errors.
-        strip: how many pixels after one another share an error.
+        strip: how many neighbouring pixels of a line share an error; 1 for samples that are no neighbours.
 
     Attributes:
         errors: ``(S,)`` of the strips, running means; 1 in the beginning.
@@ -34,7 +30,7 @@ class Focus:
         drawn: ``(S,)`` shares of the draws by errors that strips have had since then, on the device.
     """
 
-    def __init__(self, pixels: int, share: float, device: torch.device, *, strip: int = STRIP) -> None:
+    def __init__(self, pixels: int, share: float, device: torch.device, *, strip: int = 16) -> None:
         self.pixels, self.share, self.strip = pixels, share, strip
         self.errors = torch.ones(-(-pixels // strip), device=device)
         self.drawn = torch.empty_like(self.errors)
@@ -53,7 +49,7 @@ class Focus:
             kept: the objective's, with what `kept` has put there.
         """
         self.errors, self.bounds, self.drawn = kept["errors"], kept["bounds"], kept["drawn"]
-        if step % EVERY == 0:
+        if step % 16 == 0:
             self.refresh()
             kept["bounds"] = self.bounds
         return self
@@ -61,7 +57,7 @@ class Focus:
     def refresh(self) -> None:
         """Draw by the errors as they are now; a GPU is waited for."""
         self.bounds = self.errors.double().cumsum(0).cpu()
-        self.drawn.copy_(self.errors / self.errors.sum().clamp_min(TINY))
+        self.drawn.copy_(self.errors / self.errors.sum().clamp_min(1e-30))
 
     def rows(self, count: int, generator: torch.Generator) -> Tensor:
         """``(count,)`` numbers of pixels on the CPU, with replacement."""
