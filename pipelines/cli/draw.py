@@ -350,7 +350,7 @@ def _served(arguments: argparse.Namespace) -> Iterator[str]:
     from ..web.serve import PageServer
     from ..web.watch import Watcher
 
-    options = WebOptions(time=arguments.time, up=arguments.up, highlights=False)  # a page that is to be there at once
+    options = WebOptions(time=arguments.time, up=arguments.up)
     try:
         server = PageServer(arguments.run, options, host=arguments.host, port=arguments.port)
     except NoShaderError:

@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 
 from ..training.config import given_flags, input_error
-from .common import Command, add_flags, check_output, training, whole
+from .common import Command, add_flags, check_output, stoppable, whole
 
 __all__ = ["WEB"]
 
@@ -22,8 +22,7 @@ def _web_arguments(parser: argparse.ArgumentParser) -> None:
     add_flags(parser, "--out", help=f"{', '.join(PAGES)}, or a folder: field, module and page")
     add("--levels", type=whole(1), metavar="N", help="only the N coarsest levels (default: all)")
     add("--no-colors", dest="colors", action="store_false", help="leave out the colours of the run's texture")
-    what = "leave out how they change with the direction of view, which a reconstruction's do (takes up to a minute)"
-    add("--no-highlights", dest="highlights", action="store_false", help=what)
+    add("--no-highlights", action="store_true", help=argparse.SUPPRESS)
     add("--float32", action="store_true", help="keep the weights as they are (default: 13 bits each)")
     add_flags(parser, "--up")
     add("--title", metavar="TEXT", help="of the page (default: the name of the run)")
@@ -44,6 +43,8 @@ def _check_folder(out: Path) -> None:
 
 
 def _web(arguments: argparse.Namespace) -> int:
+    if arguments.no_highlights:
+        raise input_error("--no-highlights: pages have no colours by direction of view any more; leave the option out")
     out = arguments.out
     if out.suffix:
         check_output(out, PAGES)
@@ -55,12 +56,10 @@ def _web(arguments: argparse.Namespace) -> int:
     from ..web.export import WebOptions, web_run
 
     started = time.monotonic()
-    with training("nothing was written", at_any_time=True) as progress:
-        options = WebOptions(**given_flags(arguments, WebOptions))
-        done = web_run(arguments.run, out, options, say=print, progress=progress)
+    with stoppable("nothing was written", at_any_time=True):
+        done = web_run(arguments.run, out, WebOptions(**given_flags(arguments, WebOptions)), say=print)
     levels = f"{done.levels} level{'s' if done.levels > 1 else ''}"
-    by_direction = done.highlights is not None and done.highlights.worth_it
-    levels += f" with colours{' by direction' * by_direction}" if done.colored else ""
+    levels += " with colours" if done.colored else ""
     seconds = time.monotonic() - started
     print(f"{out}: {done.size / 1024:,.0f} KiB, {levels}, {done.triangles:,} triangles around them, in {seconds:.1f} s")
     return 0

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ...neural_fields import InputError, MultiscaleSDF, Similarity, SpaceTimeSDF
+from ...neural_fields import InputError, MultiscaleSDF, SpaceTimeSDF
 from ..fit.band import delta_of
 from ..fit.level import new_level
 from ..training.budget import BUDGET, Budget, step_seconds
@@ -22,6 +22,7 @@ from ..training.folder import RunFolder, digest_of
 from ..training.machine import choose_device, environment
 from ..training.motion import VELOCITY_FILE, load_motion
 from ..training.report import Progress, Report, reported, silent
+from ..training.result import Run
 from ..training.settings import EvolveConfig
 from ..training.trainer import (
     Interrupted,
@@ -49,20 +50,8 @@ FEWEST_FRAMES, END_FRAMES = 3, 3
 
 
 @dataclass(frozen=True)
-class Evolution:
-    """A finished evolution.
-
-    Attributes:
-        field: trained, in unit-sphere coordinates, on the CPU.
-        similarity: the way back to the input coordinates of the first shape.
-        directory: where it was written, or None.
-        record: what ``run.json`` holds.
-    """
-
-    field: SpaceTimeSDF
-    similarity: Similarity
-    directory: Path | None
-    record: dict[str, Any]
+class Evolution(Run[SpaceTimeSDF]):
+    """A finished evolution; its coordinates are those of the first shape."""
 
 
 def evolve(

@@ -9,7 +9,6 @@ import dataclasses
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +19,13 @@ from torch import Tensor, nn
 
 from ...datasets import OrientedCloud, PointCloud, prepare_cloud, spacing_of
 from ...datasets.clouds.large import Merging
-from ...neural_fields import InputError, MultiscaleSDF, Similarity, Siren, WorldField, save_field
+from ...neural_fields import InputError, MultiscaleSDF, Similarity, Siren
 from ..surface.trim import thinned
 from ..training.budget import BUDGET, Budget, affordable, least_share, step_seconds
 from ..training.folder import SUPPORT_FILE, RunFolder, digest_of, named_cloud
 from ..training.machine import choose_device, environment, peak_memory
 from ..training.report import reported, silent
+from ..training.result import Run
 from ..training.settings import FitConfig
 from ..training.trainer import (
     Interrupted,
@@ -56,44 +56,6 @@ Cloud = PointCloud | str | Path | NDArray[np.floating]
 LevelDone = Callable[[MultiscaleSDF, Similarity], object]
 
 
-@dataclass(frozen=True)
-class Run:
-    """A finished fit.
-
-    Attributes:
-        field: the trained field, in unit-sphere coordinates, on the CPU.
-        similarity: the way back to input coordinates.
-        directory: where it was written, or None.
-        record: what ``run.json`` holds.
-    """
-
-    field: MultiscaleSDF
-    similarity: Similarity
-    directory: Path | None
-    record: dict[str, Any]
-
-    @property
-    def world(self) -> WorldField:
-        """The field in the coordinates and units of the cloud: distances, normals, closest points, rays, meshes."""
-        return WorldField(self.field, self.similarity)
-
-    def save(self, path: str | Path) -> None:
-        """Write the field, and where it belongs, to a .safetensors file, whole or not at all.
-
-        Raises:
-            InputError: the file cannot be written.
-        """
-        save_field(path, self.field, similarity=self.similarity, metadata={"run": self.record})
-
-    def show(self, *, up: str = "y", block: bool = True, browser: bool = True) -> Any:
-        """Look at the fit, in the browser or in a notebook; see `WorldField.show`.
-
-        Raises:
-            InputError: viser is not installed.
-        """
-        return self.world.show(up=up, block=block, browser=browser)
-
-
 def fit(
     cloud: Cloud,
     config: FitConfig | None = None,
@@ -102,7 +64,7 @@ def fit(
     resume: bool = False,
     progress: Report | None = None,
     level_done: LevelDone | None = None,
-) -> Run:
+) -> Run[MultiscaleSDF]:
     """Fit a multiscale SDF to a point cloud.
 
     Args:
@@ -126,7 +88,9 @@ def fit(
     return _fit(RunFolder(out, resume=resume), cloud, config, progress=progress, level_done=level_done)
 
 
-def fit_moved(file: Path, config: FitConfig, *, out: Path, name: str, progress: Report | None = None) -> Run:
+def fit_moved(
+    file: Path, config: FitConfig, *, out: Path, name: str, progress: Report | None = None
+) -> Run[MultiscaleSDF]:
     """`fit` a cloud that was made for the run, and lies in its directory.
 
     Args:
@@ -153,7 +117,7 @@ def _fit(
     source: str | None = None,
     progress: Report | None = None,
     level_done: LevelDone | None = None,
-) -> Run:
+) -> Run[MultiscaleSDF]:
     config = folder.config(FitConfig, config)
     device = choose_device(config.device)
     budget, points = Budget(config.time_budget), _as_cloud(cloud)
@@ -231,7 +195,7 @@ class _Fitting:
         # Of the level under way, and of the cloud's index; fewer than the settings' where a time budget leaves no more.
         self.samples = self.filling = config.samples
 
-    def run(self, flag: StopFlag) -> Run:
+    def run(self, flag: StopFlag) -> Run[MultiscaleSDF]:
         if not self.stages and not self.trainer_state:
             self.find_signs(flag)
         self.keep_support()

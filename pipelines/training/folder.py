@@ -24,9 +24,9 @@ from safetensors import safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from ...neural_fields import Field, InputError, SavedField, Similarity, load_field
+from ...neural_fields import Field, InputError, Similarity, load_field
 from ...neural_fields.backend.files import check_place, damage, json_bytes, write_whole
-from ...neural_fields.checkpoint import checksum_of, field_bytes
+from ...neural_fields.checkpoint import SavedField, checksum_of, field_bytes
 from ...neural_fields.spacetime.dynamic_tracing import moment
 from .atomic import is_scratch, prune, recovered, replace_files
 from .config import load_config

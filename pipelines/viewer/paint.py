@@ -22,7 +22,7 @@ from ...neural_fields.spacetime.evolution import VectorField
 from ..render.light import load_matcap
 from ..render.shade import ShadeOptions, compose, measure, shade
 from ..render.trace import Seen, merge_strips, strips, trace_view
-from ..texture.riding import Colors, RidingColors
+from ..texture.transport import Colors, TransportedColors
 from .camera import z_buffer
 from .frames import Look
 
@@ -117,9 +117,9 @@ class Painter:
         return lambda points: map_colors(texture, points).values
 
     @cached_property
-    def _riding(self) -> RidingColors:
+    def _riding(self) -> TransportedColors:
         assert self._texture is not None
-        return RidingColors(self._moments.field, self._texture, motion=self._motion)
+        return TransportedColors(self._moments.field, self._texture, motion=self._motion)
 
     def _reference(self, look: Look) -> KDTree | None:
         return self._tree if look.shading == "error" else None

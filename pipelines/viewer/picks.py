@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ...datasets.landmarks import read_landmarks, write_landmarks
-from ...neural_fields import Field, InputError, Jet, OneLevelField, Similarity, load_field
+from ...neural_fields import Field, InputError, Jet, Similarity, load_field
+from ...neural_fields.fields.field import OneLevelField
 from ..training.folder import find_field
 
 __all__ = ["Picks", "SideBySide", "open_picks"]

@@ -19,7 +19,8 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from ...datasets import read_cloud
-from ...neural_fields import Field, InputError, Jet, OneLevelField, Similarity
+from ...neural_fields import Field, InputError, Jet, Similarity
+from ...neural_fields.fields.field import OneLevelField
 from ...neural_fields.meshing.extract import Mesh, NoSurfaceError, extract_mesh
 from ..render.slice import draw_slice, plane_axes, round_step, take_slice
 from .camera import Reading

@@ -17,9 +17,10 @@ import torch
 
 from ...datasets.cameras import UP_AXES
 from ...datasets.clouds.readers.reading import check_cloud_path
-from ...neural_fields import FieldLike, InputError, Similarity, TextureField, as_field, load_field
+from ...neural_fields import InputError, Similarity, TextureField, load_field
+from ...neural_fields.fields.function import FieldLike, as_field
 from ...neural_fields.spacetime.evolution import VectorField
-from ..texture.riding import start_texture
+from ..texture.transport import start_texture
 from ..training.folder import find_field, fitted_cloud
 from ..training.motion import load_motion
 from .camera import first_eye

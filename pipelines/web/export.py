@@ -12,28 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...datasets.cameras import turntable
-from ...neural_fields import (
-    Field,
-    InputError,
-    MultiscaleSDF,
-    SavedField,
-    Siren,
-    TextureField,
-    extract_mesh,
-    load_field,
-    load_radiance,
-)
-from ...neural_fields.backend.files import damage, write_whole
+from ...neural_fields import Field, InputError, MultiscaleSDF, Siren, TextureField, extract_mesh, load_field
+from ...neural_fields.backend.files import write_whole
+from ...neural_fields.checkpoint import SavedField
 from ...neural_fields.meshing.extract import NoSurfaceError
 from ...neural_fields.networks.multiscale import levels_of
 from ...neural_fields.spacetime.field import SpaceTimeSDF
 from ...neural_fields.tracing.sphere import BOUNDING_RADIUS
 from ..render.subject import FRAME_RESOLUTION, traced_part
-from ..surface.trim import in_region, read_support, seen_part
-from ..texture.highlights import Highlights, fit_highlights
 from ..texture.train import texture_of
-from ..training.folder import RADIANCE_FILE, chosen_level, find_field, load_still
-from ..training.report import Report
+from ..training.folder import chosen_level, find_field, load_still
 from .assembly import fill_page, write_folder
 from .film import MOMENTS, band_reach, swept_shell
 from .networks import Rounding, network_layers, rounding_error, shader_levels, taper_of
@@ -46,7 +34,6 @@ PAGES = (".html", ".htm")
 BITS = 13
 VERSION = 1
 CHANNELS = 3
-COLORED_RESOLUTION = 128  # of the mesh whose points are coloured
 ERROR_POINTS = 4000  # at which rounding is measured
 
 
@@ -58,7 +45,6 @@ class WebOptions:
         levels: how many levels, from the coarsest on; None is all.
         time: the moment, of a run that moves; None shows all of its moments.
         colors: whether the colours of the run's texture are in it, if it has one and does not move.
-        highlights: whether they change with the direction of view, if the run knows how; see `fit_highlights`.
         float32: whether the weights are kept as they are; else they are rounded to `BITS` bits.
         up: the axis that points up, "y" or "z".
         title: of the page; None is the name of the run.
@@ -67,7 +53,6 @@ class WebOptions:
     levels: int | None = None
     time: float | None = None
     colors: bool = True
-    highlights: bool = True
     float32: bool = False
     up: str = "y"
     title: str | None = None
@@ -81,7 +66,6 @@ class WebPage:
         size: of the file, or of what the element fetches: ``field.bin`` and its module; in bytes.
         levels: that it shows.
         colored: whether it has colours.
-        highlights: what their change with the direction of view was learnt to; None without it.
         triangles: of the mesh between which rays are sought.
         rounding: what rounding the weights has changed, for each level; empty if they are exact.
     """
@@ -89,7 +73,6 @@ class WebPage:
     size: int
     levels: int
     colored: bool
-    highlights: Highlights | None
     triangles: int
     rounding: tuple[Rounding, ...]
 
@@ -109,12 +92,7 @@ class Packed(NamedTuple):
 
 
 def web_run(
-    run: str | Path,
-    out: str | Path,
-    options: WebOptions | None = None,
-    *,
-    say: Callable[[str], None] | None = None,
-    progress: Report | None = None,
+    run: str | Path, out: str | Path, options: WebOptions | None = None, *, say: Callable[[str], None] | None = None
 ) -> WebPage:
     """Write a page that shows a run, and needs nothing but itself; or a folder, to show it in another page.
 
@@ -123,14 +101,12 @@ def web_run(
         out: a file of `PAGES`; any other name is a folder's, see `write_folder`.
         options: what to show.
         say: called with a line about what rounding has cost, and what is shown.
-        progress: called now and then while colours by direction are learnt.
 
     Raises:
         InputError: there is no such run, it has no surface or is of a kind that no shader knows, or the file cannot be
             written.
-        Interrupted: Ctrl-C; nothing was written.
     """
-    header, data, page = pack_run(run, options, progress=progress)
+    header, data, page = pack_run(run, options)
     out = Path(out)
     if out.suffix.lower() in PAGES:
         write_whole(out, fill_page(header, data))
@@ -143,20 +119,15 @@ def web_run(
         worst = [max(getattr(part, key) for part in done.rounding) for key in ("value", "angle")]
         length = worst[0] * header["unit"]
         say(f"weights of {BITS} bits: distances change by at most {length:.2g} input units, normals by {worst[1]:.2g}°")
-    if say is not None and done.highlights is not None:
-        errors = f"off by {done.highlights.after:.3f} of 1; the texture alone by {done.highlights.before:.3f}"
-        kept = "" if done.highlights.worth_it else " and is left to itself"
-        say(f"colours by direction: {errors}{kept}")
     return done
 
 
-def pack_run(run: str | Path, options: WebOptions | None = None, *, progress: Report | None = None) -> Packed:
+def pack_run(run: str | Path, options: WebOptions | None = None) -> Packed:
     """What a page shows of a run.
 
     Args:
         run: run directory or .safetensors file.
         options: what to show.
-        progress: called now and then while colours by direction are learnt.
 
     Raises:
         NoShaderError: no shader knows this kind of field.
@@ -171,26 +142,7 @@ def pack_run(run: str | Path, options: WebOptions | None = None, *, progress: Re
     if options.levels is not None:
         chosen_level(shown, file, options.levels - 1, flag="--levels")
         shown = _coarse(shown, options.levels)
-    return _content(shown, texture, saved, file, options, progress)
-
-
-def _highlights(
-    file: Path, texture: TextureField, record: dict[str, Any], progress: Report | None
-) -> Highlights | None:
-    """What the direction of view adds to a texture; None where the run knows no colours by direction."""
-    path, level = file.with_name(RADIANCE_FILE), texture.geometry_level
-    if not path.is_file():
-        return None
-    radiance, metadata = load_radiance(path, texture.geometry)
-    with damage(path, "take it from a backup, or run `mplicits reconstruct` again"):
-        eyes = np.asarray(metadata["eyes"], np.float64).reshape(-1, 3) if metadata.get("eyes") else None
-        if eyes is not None and not np.isfinite(eyes).all():
-            raise ValueError("eyes that are not finite")
-    mesh = in_region(extract_mesh(texture.geometry, resolution=COLORED_RESOLUTION, level=level, normals=False))
-    support = read_support(file, record, level)
-    if mesh is not None and support is not None:
-        mesh, _ = seen_part(mesh, support)
-    return None if mesh is None else fit_highlights(radiance.color, texture, mesh, eyes, progress=progress)
+    return _content(shown, texture, saved, file, options)
 
 
 def _fetched(out: Path) -> list[Path]:
@@ -224,14 +176,7 @@ def _name_of(file: Path) -> str:
     return file.resolve().parent.name if file.name == "field.safetensors" else file.stem
 
 
-def _content(
-    shown: Field,
-    texture: TextureField | None,
-    saved: SavedField,
-    file: Path,
-    options: WebOptions,
-    progress: Report | None,
-) -> Packed:
+def _content(shown: Field, texture: TextureField | None, saved: SavedField, file: Path, options: WebOptions) -> Packed:
     moving = shown if isinstance(shown, SpaceTimeSDF) else None
     stills: list[Field] = [shown] if moving is None else [moving.at(float(t)) for t in MOMENTS]
     shader_levels(stills[0], file)
@@ -242,10 +187,6 @@ def _content(
     except NoSurfaceError as error:
         raise InputError(f"{file}: no surface to show ({error})") from error
     outline = np.concatenate([points for _, points in outlines])
-    # What takes a while comes after all that may be refused.
-    highlights = None
-    if texture is not None and options.highlights:
-        highlights = _highlights(file, texture, saved.metadata.get("run", {}), progress)
     bits = None if options.float32 else BITS
     rounding = [] if bits is None else _rounding(outlines, bits)
     payload = Payload()
@@ -256,10 +197,6 @@ def _content(
         # Of a page with fewer levels, the finest that it has stands for the one that was coloured.
         colors["level"] = min(texture.geometry_level, shown.num_levels - 1)
         colors |= {"delta": float(texture.delta), "outside": texture.outside.tolist()}
-    by_direction = None
-    if highlights is not None and highlights.worth_it:
-        layers = network_layers(highlights.network.siren, bits, channels=CHANNELS)
-        by_direction = payload.add_network("highlights", layers) | {"inputs": highlights.network.siren.in_dim}
     low, high = shell.vertices.min(axis=0), shell.vertices.max(axis=0)
     payload.add_steps("shell.vertices", np.rint((shell.vertices - low) / (high - low) * GRID).T)
     payload.add_steps("shell.faces", shell.faces)
@@ -271,7 +208,6 @@ def _content(
         "moves": moving is not None,
         "levels": levels,
         "colors": colors,
-        "highlights": by_direction,
         "deltas": [float(delta) for delta in shown.deltas],
         "taper": taper_of(stills[0]),
         # What a film's levels reach at every moment is not known; their bands are.
@@ -285,7 +221,7 @@ def _content(
         "rounding": [dataclasses.asdict(part) for part in rounding],
         **described,
     }
-    page = WebPage(0, len(levels), colors is not None, highlights, len(shell.faces), tuple(rounding))
+    page = WebPage(0, len(levels), colors is not None, len(shell.faces), tuple(rounding))
     return Packed(header, data, page)
 
 

@@ -49,7 +49,7 @@ class PageServer:
         self, run: str | Path, options: WebOptions | None = None, *, host: str = "127.0.0.1", port: int | None = None
     ) -> None:
         websockets = import_websockets()
-        self._run, self._options = run, options or WebOptions(highlights=False)
+        self._run, self._options = run, options or WebOptions()
         self._packed = pack_run(run, self._options)
         self._clients: set[Any] = set()
         self._lock = threading.Lock()

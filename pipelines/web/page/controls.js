@@ -19,7 +19,7 @@ class Controls {
   // What the field has: levels, colours, moments; again when another takes its place.
   fill() {
     const { ui, page } = this;
-    const { levels, colors, highlights, moves } = page.saved.header;
+    const { levels, colors, moves } = page.saved.header;
     const last = levels.length - 1;
     ui.level.max = last;
     ui.levels.hidden = !last;
@@ -27,7 +27,6 @@ class Controls {
     ui.normals.parentNode.hidden = !last;
     for (const option of [...ui.shading.options]) if (option.value > 2) option.remove();
     if (colors) ui.shading.prepend(new Option('colours', 3), new Option('bare colours', 4));
-    if (highlights) ui.shading.prepend(new Option('as photographed', 5));
     ui.times.hidden = !moves;
     if (moves) ui.saveFilm.textContent = 'Save film';
     this.show();

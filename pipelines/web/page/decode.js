@@ -68,8 +68,8 @@ function numbersOf(bytes, kind, count, start) {
   return numbers;
 }
 
-// The networks of a field, as they are counted: its levels, then its colours, then what these gain by direction.
-const networksOf = ({ levels, colors, highlights }) => [...levels, ...(colors ? [colors] : []), ...(highlights ? [highlights] : [])];
+// The networks of a field, as they are counted: its levels, then its colours.
+const networksOf = ({ levels, colors }) => [...levels, ...(colors ? [colors] : [])];
 
 // The layers of a network: weights row by row, out x in.
 function layersOf(arrays, { name, depth }) {

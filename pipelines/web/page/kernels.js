@@ -28,7 +28,7 @@ function packNetwork(layers) {
   };
   // Rows of zeros up to the padded width: what the kernels multiply there must not be another matrix.
   const square = (at) => add(4 * quads, (row, n) => (row < width ? at(row, n) : 0));
-  const inputs = layers[0].weight.length / width; // of six, the last three are a direction
+  const inputs = layers[0].weight.length / width;
   layers.slice(0, depth).forEach(({ weight, bias }, index) => {
     starts.columns.push(index ? square((column, n) => weight[n * width + column]) : add(inputs, (column, n) => weight[inputs * n + column]));
     starts.bias.push(add(1, (_, n) => bias[n]));
@@ -74,9 +74,8 @@ function networkKernel({ starts, width, depth, inputs, outputs }, kind, parts) {
     ${each((p) => `y${p}+=a*h${p};z${p}+=c*h${p};`)}}
     ${then('n', 'y')}${then('(n+1u)', 'z')}}`;
   const columns = Array.from({ length: inputs }, (_, c) => `let w${c}=weights[${starts.columns[0] + c * quads}u+n];`).join('');
-  const directed = (p) => (inputs === 6 ? `+w3*d${p}.x+w4*d${p}.y+w5*d${p}.z` : '');
   const lines = [`for(var n=0u;n<${quads}u;n++){${columns}
-    ${each((p) => `var y${p}=w0*x${p}.x+w1*x${p}.y+w2*x${p}.z${directed(p)};`)}
+    ${each((p) => `var y${p}=w0*x${p}.x+w1*x${p}.y+w2*x${p}.z;`)}
     ${finish(0, 0, 'n', 'y')}}`];
   let held = 0;
   for (let layer = 1; layer < depth; layer++) {
@@ -101,7 +100,7 @@ function networkKernel({ starts, width, depth, inputs, outputs }, kind, parts) {
     base=group.x*${scratchOf({ width, depth }) / 16}u+lane;
     let count=filled[JET].count;
     for(var first=(group.x*${LANES}u+lane)*${OWN}u;first<count;first+=groups.x*${LANES * OWN}u){
-    ${each((p) => `let i${p}=ray(min(first+${p}u,count-1u));let x${p}=places[i${p}].point;${inputs === 6 ? `let d${p}=places[i${p}].answer;` : ''}var found${p}=${begin};`)}
+    ${each((p) => `let i${p}=ray(min(first+${p}u,count-1u));let x${p}=places[i${p}].point;var found${p}=${begin};`)}
     ${lines.join('\n')}
     ${each((p) => `if(first+${p}u<count){told(i${p},found${p});}`)}}}`;
 }

@@ -37,8 +37,6 @@ export interface Wanted {
   normalLevel?: number;
   precision?: number | null;
   colored?: boolean;
-  /** Colours as they are seen from there, where the field has them. */
-  directed?: boolean;
 }
 
 /** One ray of the last picture. */

@@ -36,8 +36,8 @@ class Page {
     this.waiters = [];      // for the finest picture
     this.occlusion = true;
     this.section = new Section(saved.header);
-    // 3 is colours in light, 4 bare colours, 5 those as they are seen from here; they want the networks of colours.
-    this.shading = saved.header.highlights ? 5 : saved.header.colors ? 3 : 2;
+    // 3 is colours in light, 4 bare colours; both want the network of colours.
+    this.shading = saved.header.colors ? 3 : 2;
     this.factor = COARSEST; // canvas pixels per ray while it moves; less as soon as the adapter shows how fast it is
     this.speed = 200;     // pixels per millisecond
     this.finest = pixel > 0 ? Math.min(COARSEST, Math.max(FINEST, pixel)) : FINEST; // coarser at rest, for slow adapters
@@ -90,7 +90,7 @@ class Page {
     before.close();
     this.level = this.level === finest ? last : Math.min(this.level, last);
     this.normals = this.normals === finest ? last : Math.min(this.normals, last);
-    this.shading = Math.min(this.shading, saved.header.highlights ? 5 : saved.header.colors ? 4 : 2);
+    this.shading = Math.min(this.shading, saved.header.colors ? 4 : 2);
     this.describe();
     this.controls.fill();
     this.version++;
@@ -188,7 +188,7 @@ class Page {
   }
 
   wanted() {
-    return { level: this.level, normalLevel: this.normals, colored: this.shading > 2, directed: this.shading === 5, clip: this.section.clip, time: this.time };
+    return { level: this.level, normalLevel: this.normals, colored: this.shading > 2, clip: this.section.clip, time: this.time };
   }
 
   // The whole picture at once, in rays of `factor` pixels.
@@ -279,8 +279,8 @@ class Page {
   }
 
   // One picture of any camera, for tests and for other scripts: arrays of its pixels, and what they have cost.
-  render({ camera, level = this.level, normalLevel = level, precision = null, colored = false, directed = false, time = this.time }) {
-    return this.renderer.frame(camera, { level, normalLevel, precision, colored: colored || directed, directed, time });
+  render({ camera, level = this.level, normalLevel = level, precision = null, colored = false, time = this.time }) {
+    return this.renderer.frame(camera, { level, normalLevel, precision, colored, time });
   }
 
   // Pictures of a camera that goes around, one in each frame: how many in a second, and what one costs; how long one takes

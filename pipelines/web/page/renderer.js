@@ -46,10 +46,6 @@ class Renderer {
     return Boolean(this.header.colors);
   }
 
-  get directed() {
-    return Boolean(this.header.highlights);
-  }
-
   queue(work) {
     const answer = this.last.then(work);
     this.last = answer.catch(() => {});
@@ -60,12 +56,11 @@ class Renderer {
   // the normal and the depth along the ray, 0 where nothing is; `color` its own colours where they were asked for; and
   // what it has cost, see `counts`.
   //
-  // Options: level, normalLevel (whose normals), first, rows, colored, directed (colours as they are seen from there), and precision: of depths, in units of the field;
+  // Options: level, normalLevel (whose normals), first, rows, colored, and precision: of depths, in units of the field;
   // null is a tenth of a pixel; clip: {axis, at}, a plane before which nothing is seen;
   // time: of a field that moves, which single rays and values then stay at.
   frame(camera, options) {
     if (options.colored && !this.colored) throw new PageError('This page has no colours.');
-    if (options.directed && !this.directed) throw new PageError('The colours of this page are the same from everywhere.');
     return this.queue(async () => {
       [this.camera, this.options] = [camera, options];
       this.clear();
@@ -140,8 +135,8 @@ class Renderer {
 
   // Operations of those counts: a product of a weight and a sum are two, and a jet goes through the matrices twice.
   operations({ values, jets }) {
-    return networksOf(this.header).reduce((sum, { width, depth, inputs = 3 }, index) => {
-      const once = 2 * width * (inputs + (depth - 1) * width + 1);
+    return networksOf(this.header).reduce((sum, { width, depth }, index) => {
+      const once = 2 * width * (3 + (depth - 1) * width + 1);
       return sum + once * (values[index] + 2 * jets[index]);
     }, 0);
   }
@@ -159,12 +154,11 @@ function fitting(saved, widest) {
   const limit = `this adapter holds ${widest} (MAX_TEXTURE_SIZE)`;
   if (odd === 0) throw new PageError(`Level 0 has ${header.levels[0].width} neurons in a layer; ${limit}. Another device may hold more.`);
   const colors = header.colors && fits(header.colors) ? header.colors : null;
-  const highlights = colors && header.highlights && fits(header.highlights) ? header.highlights : null;
   const bare = header.colors && !colors ? `The colours have ${header.colors.width} neurons in a layer; ${limit}. ` : '';
-  if (odd < 0) return { saved: { ...saved, header: { ...header, colors, highlights } }, left: bare };
+  if (odd < 0) return { saved: { ...saved, header: { ...header, colors } }, left: bare };
   const shown = {
     ...header, levels: header.levels.slice(0, odd), deltas: header.deltas.slice(0, odd - 1), reach: header.reach.slice(0, odd),
-    rounding: header.rounding.slice(0, odd), highlights, colors: colors && { ...colors, level: Math.min(colors.level, odd - 1) },
+    rounding: header.rounding.slice(0, odd), colors: colors && { ...colors, level: Math.min(colors.level, odd - 1) },
   };
   return {
     saved: { ...saved, header: shown },

@@ -32,10 +32,6 @@ uniform int quads;
 #ifdef FIRST
 uniform highp sampler2D points;
 uniform int base;
-#ifdef DIRECTED
-uniform highp sampler2D ways;
-mat3x4 along;
-#endif
 #else
 uniform highp sampler2DArray source;
 #endif
@@ -50,9 +46,6 @@ layout(location = 3) out vec4 out3;
 vec4 product(ivec2 at, int point, mat3x4 w, vec4 b) {
   int i = base + 4 * at.x + point;
   ivec2 place = ivec2(i & 2047, i >> 11);
-#ifdef DIRECTED
-  b += along * texelFetch(ways, place, 0).xyz;
-#endif
   return w * texelFetch(points, place, 0).xyz + b;
 }
 #endif
@@ -77,12 +70,6 @@ void main() {
     texelFetch(weights, ivec2(0, at.y), 0),
     texelFetch(weights, ivec2(1, at.y), 0),
     texelFetch(weights, ivec2(2, at.y), 0));
-#ifdef DIRECTED
-  along = mat3x4(
-    texelFetch(weights, ivec2(3, at.y), 0),
-    texelFetch(weights, ivec2(4, at.y), 0),
-    texelFetch(weights, ivec2(5, at.y), 0));
-#endif
   vec4 z0 = product(at, 0, w, b), z1 = product(at, 1, w, b), z2 = product(at, 2, w, b), z3 = product(at, 3, w, b);
 #else
   vec4 z0 = b, z1 = b, z2 = b, z3 = b;

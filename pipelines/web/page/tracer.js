@@ -106,15 +106,14 @@ class Field {
 }
 
 // Display colours around a surface: those of a network at points in the band of a level, the others first moved onto the
-// surface by x - f g / |g|^2; what does not arrive there has the colour of what lies outside. Where directions are
-// given, a second network says what colours gain by them.
+// surface by x - f g / |g|^2; what does not arrive there has the colour of what lies outside.
 class Colors {
-  // `source` answers value(points, count, level), jet(…), color(points, count) and color(points, count, ways), or promises to.
+  // `source` answers value(points, count, level), jet(…), color(points, count), or promises to.
   constructor(source, { level, delta, outside }) {
     Object.assign(this, { source, level, delta, outside });
   }
 
-  async at(points, count, ways = null) {
+  async at(points, count) {
     const { source, delta } = this;
     const moved = points.slice(0, 3 * count);
     const reached = (await source.value(moved, count, this.level)).map((f) => Number(Math.abs(f) < delta));
@@ -133,12 +132,10 @@ class Colors {
       });
     }
     const found = await source.color(moved, count);
-    const gained = ways && (await source.color(moved, count, ways));
     const colors = new Float32Array(3 * count);
     for (let i = 0; i < count; i++) {
       for (let c = 0; c < 3; c++) {
-        const own = found[4 * i + c] + (gained ? gained[4 * i + c] : 0);
-        colors[3 * i + c] = reached[i] ? Math.min(1, Math.max(0, own)) : this.outside[c];
+        colors[3 * i + c] = reached[i] ? Math.min(1, Math.max(0, found[4 * i + c])) : this.outside[c];
       }
     }
     return colors;
@@ -228,7 +225,7 @@ class Tracer {
     this.colors = header.colors && new Colors({
       value: (...asked) => this.field.value(...asked),
       jet: (...asked) => this.field.jet(...asked),
-      color: (points, count, ways) => this.networks.color(header.levels.length + Number(Boolean(ways)), points, count, ways),
+      color: (points, count) => this.networks.color(header.levels.length, points, count),
     }, header.colors);
     this.hull = new Hull(gl, parts, arrays, header);
   }
@@ -265,9 +262,9 @@ class Tracer {
   }
 
   // What rows [first, first + rows) of a camera's picture see: normal and depth of each pixel, depth 0 for nothing; and
-  // where it is `colored`, the surface's own colours; `directed`, as they are seen from there.
+  // where it is `colored`, the surface's own colours.
   // Depths are known to a tenth of a pixel, or to `precision` in units of the field.
-  async trace(camera, { level, normalLevel = level, first = 0, rows = camera.height, precision = null, colored = false, directed = false, clip = null }) {
+  async trace(camera, { level, normalLevel = level, first = 0, rows = camera.height, precision = null, colored = false, clip = null }) {
     const { size, tolerance, resolution } = ruleOf(camera, this.header.radius, precision);
     const seen = new Float32Array(4 * camera.width * rows);
     const rays = this.begin(camera, first, rows, clip);
@@ -290,8 +287,7 @@ class Tracer {
       for (let c = 0; c < 3; c++) points[3 * i + c] = camera.eye[c] + depth * rays.direction[3 * ray + c];
     });
     if (colored) {
-      const ways = directed ? Float32Array.from([...hits].flatMap((ray) => [...rays.direction.subarray(3 * ray, 3 * ray + 3)])) : null;
-      const colors = await this.colors.at(points, hits.length, ways);
+      const colors = await this.colors.at(points, hits.length);
       hits.forEach((ray, i) => color.set(colors.subarray(3 * i, 3 * i + 3), 4 * rays.pixel[ray]));
     }
     return { seen, color };

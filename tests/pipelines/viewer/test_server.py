@@ -15,9 +15,7 @@ import pytest
 import torch
 from mplicits.datasets.cameras import look_at
 from mplicits.neural_fields import (
-    ColorSiren,
     InputError,
-    Keyframes,
     Moving,
     MultiscaleSDF,
     RigidMotion,
@@ -30,6 +28,8 @@ from mplicits.neural_fields import (
     save_field,
 )
 from mplicits.neural_fields.fields.primitives import Plane
+from mplicits.neural_fields.networks.texture import ColorSiren
+from mplicits.neural_fields.spacetime.moving import Keyframes
 from mplicits.pipelines.render.trace import trace_view
 from mplicits.pipelines.training.folder import named_cloud
 from mplicits.pipelines.viewer import frames

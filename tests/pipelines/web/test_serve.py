@@ -9,7 +9,8 @@ import urllib.request
 
 import pytest
 import torch
-from mplicits.neural_fields import MultiscaleSDF, Siren, Sphere, save_field, solve_sphere
+from mplicits.neural_fields import MultiscaleSDF, Siren, Sphere, save_field
+from mplicits.neural_fields.networks.sphere_init import solve_sphere
 from mplicits.pipelines.web.networks import NoShaderError
 from mplicits.pipelines.web.serve import PageServer
 from mplicits.pipelines.web.watch import Watcher
