@@ -43,7 +43,7 @@ from mplicits.neural_fields.spacetime.dynamic_tracing import DynamicTracer
 from mplicits.neural_fields.tracing.cones import cone_ends, cone_starts
 from mplicits.neural_fields.volume.render import Sampling
 from mplicits.pipelines.cli.entry import main
-from mplicits.pipelines.fit.unoriented import give_signs
+from mplicits.pipelines.fit.unoriented import SIGNING, give_signs
 from mplicits.pipelines.mesh.files import write_mesh
 from mplicits.pipelines.training.config import load_config
 from mplicits.pipelines.training.settings import FitConfig
@@ -247,8 +247,8 @@ def test_methods_of_the_peers(recipe: object, accelerator: torch.device) -> None
 
 
 def test_signs_of_normals(accelerator: torch.device, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mplicits.pipelines.fit.unoriented.STEPS", 3)
-    monkeypatch.setattr("mplicits.pipelines.fit.unoriented.SAMPLES", 500)
+    monkeypatch.setitem(vars(SIGNING), "steps", 3)
+    monkeypatch.setitem(vars(SIGNING), "samples", 500)
     config = replace(load_config(FitConfig, "fast"), batch=64, widths=(16,) * 3, depths=(1,) * 3)
     cloud = prepare_cloud(sample_torus(300))
     points, normals = torch.from_numpy(cloud.points), torch.from_numpy(cloud.normals)

@@ -31,7 +31,7 @@ from torch.nn.functional import huber_loss, normalize, pad
 
 from ...neural_fields import Field, at_time, flow
 from ...neural_fields.spacetime.velocity import CarriedKeyframes, VelocitySiren
-from ..training.budget import LEAST_SECONDS, Budget
+from ..training.budget import BUDGET, Budget
 from ..training.report import Report
 from ..training.settings import EvolveConfig
 from ..training.trainer import Group, Objective, Trainer, seeded, warm_cosine
@@ -241,7 +241,7 @@ def learn_motion(
         shape.field.requires_grad_(False)
     objective = MotionObjective(velocity, shapes, keys, config, generator)
     left = None if budget is None else budget.left()
-    seconds = None if left is None else max(MOTION.share * left, LEAST_SECONDS)
+    seconds = None if left is None else max(MOTION.share * left, BUDGET.least_seconds)
     trainer = Trainer(objective, stage="motion", steps=config.motion_steps * (len(keys) - 1), seconds=seconds)
     trainer.run(report=progress)
     if budget is not None and trainer.ended_early:

@@ -16,7 +16,7 @@ from ...neural_fields.spacetime.evolution import Law, VectorField, mean_curvatur
 from ...neural_fields.spacetime.flow import IntegrationError, trajectories
 from ...neural_fields.spacetime.moving import Keyframes
 from ...neural_fields.spacetime.velocity import CarriedKeyframes, VelocitySiren
-from ..training.budget import SAMPLING_SHARE, Budget, affordable
+from ..training.budget import BUDGET, Budget, affordable
 from ..training.report import Report
 from ..training.settings import EvolveConfig
 from .deform import carried_samples, learn_motion, motion_figures
@@ -280,7 +280,7 @@ def _sampled(samples: Callable[[int], tuple[Known, Bounds]], config: EvolveConfi
     """As many samples as the settings want, or as a time budget leaves time for."""
     count, left = config.samples, None if budget is None else budget.left()
     if budget is not None and left is not None:
-        count = affordable(samples, config.samples, SAMPLING_SHARE * left)
+        count = affordable(samples, config.samples, BUDGET.sampling_share * left)
         if count < config.samples:
             budget.notes.append(f"{count:,} known samples instead of {config.samples:,}")
     return _Sampled(*samples(count), count)

@@ -17,7 +17,7 @@ from torch import Tensor
 from ...neural_fields import InputError, MultiscaleSDF, SpaceTimeSDF
 from ..fit.band import delta_of
 from ..fit.level import new_level
-from ..training.budget import LEAST_SECONDS, Budget, step_seconds
+from ..training.budget import BUDGET, Budget, step_seconds
 from ..training.folder import RunFolder, digest_of
 from ..training.machine import choose_device, environment
 from ..training.motion import VELOCITY_FILE, load_motion
@@ -221,7 +221,7 @@ class _Evolving:
             if self.trainer_state:
                 return self.empty(1).to(self.device)
             left = self.budget.left()
-            seconds = None if left is None else max(STARTING_SHARE * left, LEAST_SECONDS)
+            seconds = None if left is None else max(STARTING_SHARE * left, BUDGET.least_seconds)
             known = self.problem.known.to(self.device)
             return learn_start(known, config, generator, self.report, seconds=seconds).to(self.device)
         assert self.frozen is not None
@@ -253,7 +253,7 @@ class _Evolving:
         left = self.budget.left()
         if left is None:
             return math.inf
-        left = max(left - min(self.checking_seconds(), CHECKING_SHARE * left), LEAST_SECONDS)
+        left = max(left - min(self.checking_seconds(), CHECKING_SHARE * left), BUDGET.least_seconds)
         steps, begun = self.config.steps[: self.config.num_levels], bool(self.trainer_state)
         return self.budget.share(left, level, steps, self.cost, begun=begun)
 
@@ -276,7 +276,7 @@ class _Evolving:
         frame_figures(shown, 0.0, self.config.resolution)
         self.frame_seconds = time.monotonic() - begun
         took = float(self.trainer_state["progress"][1]) if self.trainer_state else 0.0
-        return max(self.share(level) or 0.0, LEAST_SECONDS) + took
+        return max(self.share(level) or 0.0, BUDGET.least_seconds) + took
 
     def checking_seconds(self) -> float:
         """Seconds for all checks at the end, at what a frame took when the last level began."""

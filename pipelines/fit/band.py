@@ -17,19 +17,28 @@ from torch import Tensor
 
 from ...neural_fields import Field
 from .cloud import CloudDistance
-from .samples import CLEAR, SURE, spread_points
+from .samples import SAMPLING, spread_points
 
-__all__ = ["Band", "band_of", "delta_of", "with_wrong_sides"]
+__all__ = ["Band", "BandOptions", "band_of", "delta_of", "with_wrong_sides"]
 
-# Largest error over its 99th percentile: 1.0 for uniform noise, 1.6 for Gaussian, 2 to 3 for what a coarse level
-# misses of the fine parts of a clean cloud.
-STRAY = 4.0
-# The same over the 90th percentile, generous: a level may miss a thin part as a whole.
-TAIL = 20.0
-# Places on the wrong side widen a band to so many times its width at most: a level that is lost would have no band.
-WIDEST = 2.0
-# Of the places this part is asked first: most levels have none on the wrong side, and winding numbers take time.
-FIRST = 4
+
+@dataclass(frozen=True)
+class BandOptions:
+    """Numbers of `band_of` and `with_wrong_sides`."""
+
+    # Largest error over its 99th percentile: 1.0 for uniform noise, 1.6 for Gaussian, 2 to 3 for what a coarse level
+    # misses of the fine parts of a clean cloud.
+    stray: float = 4.0
+    # The same over the 90th percentile, generous: a level may miss a thin part as a whole.
+    tail: float = 20.0
+    # Places on the wrong side widen a band to so many times its width at most: a level that is lost would have no
+    # band.
+    widest: float = 2.0
+    # Of the places this part is asked first: most levels have none on the wrong side, and winding numbers take time.
+    first: int = 4
+
+
+BAND = BandOptions()
 
 
 @dataclass(frozen=True)
@@ -79,11 +88,11 @@ def band_of(errors: Tensor, *, epsilon: float, quantile: float | None) -> Band:
     return Band.of(delta, rule, errors)
 
 
-def delta_of(errors: Tensor, *, epsilon: float, quantile: float | None) -> float:
+def delta_of(errors: Tensor, *, epsilon: float, quantile: float | None, options: BandOptions = BAND) -> float:
     """The half-width of a band, ``δ = (1 + ε) · Q_q(|f(x_j)|)``; the paper's Eq. 5 at ``quantile = 1``.
 
     The maximum of Eq. 5 is fragile: one stray point far from the surface widens the band to half the domain. With
-    ``quantile=None`` it is taken over the points with no more than ``STRAY`` times the 99th percentile and ``TAIL``
+    ``quantile=None`` it is taken over the points with no more than ``stray`` times the 99th percentile and ``tail``
     times the 90th, which all points of a sound cloud are: their errors have a bounded distribution, strays do not.
     The second bound holds where more than one point in a hundred is a stray.
 
@@ -91,10 +100,14 @@ def delta_of(errors: Tensor, *, epsilon: float, quantile: float | None) -> float
         errors: ``(n,)`` values f(x_j) at the input points.
         epsilon: the ε of Eq. 5.
         quantile: q in (0, 1], or None.
+        options: numbers of the algorithm.
     """
     ordered = errors.abs().flatten().sort().values
     if quantile is None:
-        usual = min(q * ordered[math.ceil(share * len(ordered)) - 1] for q, share in ((STRAY, 0.99), (TAIL, 0.9)))
+        usual = min(
+            q * ordered[math.ceil(share * len(ordered)) - 1]
+            for q, share in ((options.stray, 0.99), (options.tail, 0.9))
+        )
         return (1 + epsilon) * float(ordered[ordered <= usual][-1])
     return (1 + epsilon) * float(ordered[max(0, math.ceil(quantile * len(ordered)) - 1)])
 
@@ -110,6 +123,7 @@ def with_wrong_sides(
     count: int,
     seed: int,
     device: torch.device,
+    options: BandOptions = BAND,
 ) -> Band:
     """This band, or a wider one that also holds the places which ``field`` puts on the wrong side.
 
@@ -125,17 +139,18 @@ def with_wrong_sides(
         count: how many places are tried, spread as for level 0; a fourth of them only if none of those is wrong.
         seed: draws them.
         device: where the field is.
+        options: numbers of the algorithm.
 
     Returns:
-        A band with ``δ = (1 + ε) · max |f|`` over those places, `WIDEST` times as wide at most.
+        A band with ``δ = (1 + ε) · max |f|`` over those places, `widest` times as wide at most.
     """
     generator = torch.Generator().manual_seed(seed)
-    wrong = _wrong_sides(band.delta, cloud, field, spread_points(cloud, count // FIRST, generator), device)
+    wrong = _wrong_sides(band.delta, cloud, field, spread_points(cloud, count // options.first, generator), device)
     if not len(wrong):
         return band
     more = _wrong_sides(band.delta, cloud, field, spread_points(cloud, count, generator), device)
     widest = float(torch.cat((wrong, more)).abs().max())
-    delta = min((1 + epsilon) * widest, WIDEST * band.delta)
+    delta = min((1 + epsilon) * widest, options.widest * band.delta)
     return Band.of(delta, "places on the wrong side", errors)
 
 
@@ -145,6 +160,6 @@ def _wrong_sides(delta: float, cloud: CloudDistance, field: Field, places: Tenso
     beyond = (value.abs() > delta).nonzero()[:, 0]
     points, value = places[beyond].numpy(), value[beyond]
     depth = cloud.winding_number(points) - 0.5
-    wrong = (np.abs(depth) > SURE) & ((depth > 0) == (value.numpy() > 0))
-    wrong &= cloud.nearest(points) > CLEAR * cloud.gap
+    wrong = (np.abs(depth) > SAMPLING.sure) & ((depth > 0) == (value.numpy() > 0))
+    wrong &= cloud.nearest(points) > SAMPLING.clear * cloud.gap
     return value[torch.from_numpy(wrong)]

@@ -15,6 +15,7 @@ patches contradict each other: the wider the noise, the fewer points there are.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -23,46 +24,62 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from .cloud import SOFT_GUESSED, CloudDistance
+from .cloud import CLOUD, CloudDistance
 
-__all__ = ["Densified", "dense_distance", "densified"]
+__all__ = ["BetweenOptions", "Densified", "dense_distance", "densified"]
 
 Float64 = NDArray[np.float64]
 Rows = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
-NEIGHBORS = 16  # that a patch is fitted to
-BLENDED = 8  # patches that a place is asked of
-BLOCK = 1 << 15  # rows handled at once, to bound memory
-# Cosine between the normals of a point and of a neighbour on the same smooth surface, and how far from an arc of
-# circle they may be: |½(n_i + n_j)·(p_j − p_i)| over the distance, 0.35 for a corner's mean normal and a side's.
-ALIKE, MIRRORED = 0.85, 0.08
-# Between the normals of patches at one place, which their curvature has turned towards each other.
-AGREED = 0.9
-# Of a patch's neighbours: how many must agree with it, the second over the first eigenvalue of their spread, and the
-# sum of weights that must be across it. The points along an edge have each other's mean normals: a line is no patch.
-COMPANY, WIDE, ENOUGH = 4, 0.1, 0.2
-RIDGE = 0.02  # of that fit, in the same units
-# Height of a point over the plane of a patch, over its distance, below which it is in its rim whatever its normal: on a
-# smooth surface normals that are not alike are at heights above a quarter. Such a patch must have so many neighbours
-# of its own in the row, and as many in the rim as another has company.
-RIM, ROW = 0.03, 2
-# All in units of the distance to the fourth nearest point: how much patches may differ at a new point, how far one may
-# be beyond another's plane, and how near two must pass to a point of an edge.
-SPREAD, BEYOND, THROUGH = 0.05, 0.03, 0.1
-# In those units, how far a new point may be from the weighted mean of the points around it. On the rim of a half-plane
-# that is 1/√π = 0.56, and beyond it more.
-ONE_SIDED = 0.7
-LARGEST_AREA = 100.0  # that a point stands for, over the median
-# Least part of the sphere of directions that a solid, or the space around it, fills at a new point: half of it on a
-# smooth surface, a fourth on the edge of a cube, and next to nothing where guessed normals have led beyond an edge.
-SOLID_ANGLE = 0.2
-# That is asked only where so many of the cloud's own points meet it: an open sheet sees nothing of itself.
-CLOSED, ASKED = 0.95, 4000
 
-# Radians that the finest level's frequency may turn through between two points. Where four points lie on a wave they
-# hold it down, and nothing is filled in: patches are less exact than the points themselves.
-TURN = np.pi / 2
+@dataclass(frozen=True)
+class BetweenOptions:
+    """Numbers of `densified`; lengths in the units that each comment says."""
+
+    neighbors: int = 16  # that a patch is fitted to
+    blended: int = 8  # patches that a place is asked of
+    block: int = 1 << 15  # rows handled at once, to bound memory
+    # Cosine between the normals of a point and of a neighbour on the same smooth surface, and how far from an arc of
+    # circle they may be: |½(n_i + n_j)·(p_j − p_i)| over the distance, 0.35 for a corner's mean normal and a side's.
+    alike: float = 0.85
+    mirrored: float = 0.08
+    # Between the normals of patches at one place, which their curvature has turned towards each other.
+    agreed: float = 0.9
+    # Of a patch's neighbours: how many must agree with it, the second over the first eigenvalue of their spread, and
+    # the sum of weights that must be across it. The points along an edge have each other's mean normals: a line is no
+    # patch.
+    company: int = 4
+    wide: float = 0.1
+    enough: float = 0.2
+    ridge: float = 0.02  # of that fit, in the same units
+    # Height of a point over the plane of a patch, over its distance, below which it is in its rim whatever its
+    # normal: on a smooth surface normals that are not alike are at heights above a quarter. Such a patch must have so
+    # many neighbours of its own in the row, and as many in the rim as another has company.
+    rim: float = 0.03
+    row: int = 2
+    # All in units of the distance to the fourth nearest point: how much patches may differ at a new point, how far
+    # one may be beyond another's plane, and how near two must pass to a point of an edge.
+    spread: float = 0.05
+    beyond: float = 0.03
+    through: float = 0.1
+    # In those units, how far a new point may be from the weighted mean of the points around it. On the rim of a
+    # half-plane that is 1/√π = 0.56, and beyond it more.
+    one_sided: float = 0.7
+    largest_area: float = 100.0  # that a point stands for, over the median
+    # Least part of the sphere of directions that a solid, or the space around it, fills at a new point: half of it on
+    # a smooth surface, a fourth on the edge of a cube, and next to nothing where guessed normals have led beyond an
+    # edge.
+    solid_angle: float = 0.2
+    # That is asked only where so many of the cloud's own points meet it: an open sheet sees nothing of itself.
+    closed: float = 0.95
+    asked: int = 4000
+    # Radians that the finest level's frequency may turn through between two points. Where four points lie on a wave
+    # they hold it down, and nothing is filled in: patches are less exact than the points themselves.
+    turn: float = np.pi / 2
+
+
+BETWEEN = BetweenOptions()
 
 
 class Densified(NamedTuple):
@@ -90,6 +107,7 @@ def dense_distance(
     noise: float = 0.0,
     guessed: bool = False,
     seed: int = 0,
+    options: BetweenOptions = BETWEEN,
 ) -> CloudDistance:
     """Distances to a cloud, and where it is sparse for a network of frequency ``omega``, to what fills it in.
 
@@ -101,29 +119,39 @@ def dense_distance(
         noise: see `CloudDistance`.
         guessed: see `CloudDistance`.
         seed: of the places.
+        options: numbers of the algorithm.
     """
     about = {"noise": noise, "guessed": guessed}
     index = CloudDistance(points, normals, **about)
-    if index.spacing * omega <= TURN or count <= len(points):
+    if index.spacing * omega <= options.turn or count <= len(points):
         return index
     noisy = guessed and noise > 0
-    found = densified(index.points, index.normals, count - len(points), guessed=noisy, seed=seed)
+    found = densified(index.points, index.normals, count - len(points), guessed=noisy, seed=seed, options=options)
     new_points, new_normals = (torch.from_numpy(a.astype(np.float32)) for a in (found.points, found.new_normals))
-    if noisy and _on_solid(index, index.points[:: 1 + len(points) // ASKED]).mean() > CLOSED:
-        kept = torch.from_numpy(_on_solid(index, new_points.numpy()))
+    if (
+        noisy
+        and _on_solid(index, index.points[:: 1 + len(points) // options.asked], options=options).mean() > options.closed
+    ):
+        kept = torch.from_numpy(_on_solid(index, new_points.numpy(), options=options))
         new_points, new_normals = new_points[kept], new_normals[kept]
     own_normals = torch.from_numpy(found.normals.astype(np.float32))
     dense = torch.cat((points.cpu(), new_points)), torch.cat((own_normals, new_normals))
     return CloudDistance(*dense, **about, given=len(points), gap=index.spacing, repaired=found.repaired)
 
 
-def _on_solid(index: CloudDistance, x: NDArray[np.float32]) -> Mask:
-    """Whether both sides of each of ``(M, 3)`` points of a surface have `SOLID_ANGLE`, by winding numbers."""
-    return np.abs(index.winding_number(x, soft=SOFT_GUESSED) - 0.5) < 0.5 - SOLID_ANGLE
+def _on_solid(index: CloudDistance, x: NDArray[np.float32], options: BetweenOptions = BETWEEN) -> Mask:
+    """Whether both sides of each of ``(M, 3)`` points of a surface have `solid_angle`, by winding numbers."""
+    return np.abs(index.winding_number(x, soft=CLOUD.soft_guessed) - 0.5) < 0.5 - options.solid_angle
 
 
 def densified(
-    points: NDArray[np.floating], normals: NDArray[np.floating], count: int, *, guessed: bool = False, seed: int = 0
+    points: NDArray[np.floating],
+    normals: NDArray[np.floating],
+    count: int,
+    *,
+    guessed: bool = False,
+    seed: int = 0,
+    options: BetweenOptions = BETWEEN,
 ) -> Densified:
     """Find points of the surface between those of a cloud.
 
@@ -134,19 +162,22 @@ def densified(
         guessed: whether the normals were estimated from noisy points: those beyond an edge may then not contradict
             what runs on beyond it, and new points must have points on all sides.
         seed: of the places.
+        options: numbers of the algorithm.
     """
-    if len(points) <= NEIGHBORS:  # too few for a neighbourhood that is not the whole
+    if len(points) <= options.neighbors:  # too few for a neighbourhood that is not the whole
         return Densified(normals.astype(np.float64), 0, np.empty((0, 3)), np.empty((0, 3)))
-    patches = _Patches(points.astype(np.float64), normals.astype(np.float64))
+    patches = _Patches(points.astype(np.float64), normals.astype(np.float64), options=options)
     able = np.flatnonzero(patches.sound)
-    fixed, repaired = _repaired(patches)
+    fixed, repaired = _repaired(patches, options=options)
     found = [(np.empty((0, 3)), np.empty((0, 3)))]
     if len(able):
         random = np.random.default_rng(seed)
-        area = np.minimum(patches.reach**2, LARGEST_AREA * np.median(patches.reach) ** 2)[able]
+        area = np.minimum(patches.reach**2, options.largest_area * np.median(patches.reach) ** 2)[able]
         parents = np.sort(random.choice(able, count, p=area / area.sum()))  # in order: neighbours are near in memory
-        for start in range(0, count, BLOCK):
-            found.append(_placed(patches, parents[start : start + BLOCK], random, guessed=guessed))
+        for start in range(0, count, options.block):
+            found.append(
+                _placed(patches, parents[start : start + options.block], random, guessed=guessed, options=options)
+            )
     new = [np.concatenate(columns) for columns in zip(*found, strict=True)]
     return Densified(fixed, repaired, new[0], new[1])
 
@@ -162,35 +193,38 @@ class _Patches:
         sound: ``(N,)`` whether neighbours on all sides agree with it.
     """
 
-    def __init__(self, points: Float64, normals: Float64) -> None:
+    def __init__(self, points: Float64, normals: Float64, options: BetweenOptions = BETWEEN) -> None:
+        self.options = options
         self.points, self.normals = points, normals
         self.tree = KDTree(points, balanced_tree=False)
         self.shape, self.reach = np.zeros((len(points), 3, 3)), np.zeros(len(points))
         self.sound: Mask = np.zeros(len(points), bool)
-        for start in range(0, len(points), BLOCK):
-            self._fit(np.arange(start, min(start + BLOCK, len(points))))
+        for start in range(0, len(points), self.options.block):
+            self._fit(np.arange(start, min(start + self.options.block, len(points))))
 
     def _fit(self, rows: Rows) -> None:
-        distance, found = self._nearest(self.points[rows], NEIGHBORS + 1)
+        distance, found = self._nearest(self.points[rows], self.options.neighbors + 1)
         distance, found = distance[:, 1:], found[:, 1:]  # not the point itself
         own, theirs = self.normals[rows][:, None], self.normals[found]
         edge = self.points[found] - self.points[rows][:, None]
-        mirrored = np.abs(0.5 * ((own + theirs) * edge).sum(axis=2)) < MIRRORED * distance
+        mirrored = np.abs(0.5 * ((own + theirs) * edge).sum(axis=2)) < self.options.mirrored * distance
         scale = np.maximum(np.median(distance, axis=1), 1e-300)[:, None]
-        weight = mirrored & ((own * theirs).sum(axis=2) > ALIKE)
+        weight = mirrored & ((own * theirs).sum(axis=2) > self.options.alike)
         near = np.exp(-((distance / scale) ** 2) / 2)
         across = (edge - (edge * own).sum(axis=2, keepdims=True) * own) / scale[..., None]
         turn = theirs - (theirs * own).sum(axis=2, keepdims=True) * own
-        spread, mixed, sound = _fitted(weight, near, across, turn)
+        spread, mixed, sound = _fitted(weight, near, across, turn, options=self.options)
         # A face as narrow as two spacings has one row of points of its own. Those of its edges have the normals of
         # other faces, but lie in its plane, where it is flat up to them.
-        rim = ~weight & (np.abs((edge * own).sum(axis=2)) < RIM * distance)
+        rim = ~weight & (np.abs((edge * own).sum(axis=2)) < self.options.rim * distance)
         turn = np.where(weight[..., None], turn, 0.0)
-        wider, mixed_too, sound_too = _fitted(weight | rim, near, across, turn)
+        wider, mixed_too, sound_too = _fitted(weight | rim, near, across, turn, options=self.options)
         spread = np.where(sound[:, None, None], spread, wider)
         mixed = np.where(sound[:, None, None], mixed, mixed_too)
-        self.sound[rows] = sound | (sound_too & (weight.sum(axis=1) >= ROW) & (rim.sum(axis=1) >= COMPANY))
-        solved = np.linalg.solve(spread + RIDGE * np.eye(3), mixed)
+        self.sound[rows] = sound | (
+            sound_too & (weight.sum(axis=1) >= self.options.row) & (rim.sum(axis=1) >= self.options.company)
+        )
+        solved = np.linalg.solve(spread + self.options.ridge * np.eye(3), mixed)
         self.shape[rows] = 0.5 * (solved + solved.transpose(0, 2, 1)) / scale[..., None]
         self.reach[rows] = distance[:, 5]
 
@@ -213,7 +247,9 @@ class _Patches:
         return distance, found, offset, value, _unit(own + bent)
 
 
-def _fitted(chosen: Mask, near: Float64, across: Float64, turn: Float64) -> tuple[Float64, Float64, Mask]:
+def _fitted(
+    chosen: Mask, near: Float64, across: Float64, turn: Float64, options: BetweenOptions = BETWEEN
+) -> tuple[Float64, Float64, Mask]:
     """What the shape of patches is solved from, and which have company on all sides.
 
     Args:
@@ -221,15 +257,18 @@ def _fitted(chosen: Mask, near: Float64, across: Float64, turn: Float64) -> tupl
         near: ``(n, k)`` weights by distance.
         across: ``(n, k, 3)`` where they are in the plane.
         turn: ``(n, k, 3)`` how their normals are turned.
+        options: numbers of the algorithm.
     """
     weighted = ((chosen * near)[..., None] * across).transpose(0, 2, 1)  # (n, 3, k)
     spread = weighted @ across
     values = np.linalg.eigvalsh(spread)  # the first is across the plane: 0
-    sound = (values[:, 1] > np.maximum(WIDE * values[:, 2], ENOUGH)) & (chosen.sum(axis=1) >= COMPANY)
+    sound = (values[:, 1] > np.maximum(options.wide * values[:, 2], options.enough)) & (
+        chosen.sum(axis=1) >= options.company
+    )
     return spread, weighted @ turn, sound
 
 
-def _repaired(patches: _Patches) -> tuple[Float64, int]:
+def _repaired(patches: _Patches, options: BetweenOptions = BETWEEN) -> tuple[Float64, int]:
     """The normals, those of points on an edge replaced by one side's, and how many were.
 
     On an edge is a point through which sound patches of two sides pass, and that is part of no sound one itself.
@@ -237,17 +276,19 @@ def _repaired(patches: _Patches) -> tuple[Float64, int]:
     fixed, odd = patches.normals.copy(), np.flatnonzero(~patches.sound)
     if not len(odd):
         return fixed, 0
-    distance, found, _, value, normal = patches.at(patches.points[odd], NEIGHBORS)
-    through = patches.sound[found] & (np.abs(value) < THROUGH * distance[:, 4:5])
+    distance, found, _, value, normal = patches.at(patches.points[odd], options.neighbors)
+    through = patches.sound[found] & (np.abs(value) < options.through * distance[:, 4:5])
     first = through.argmax(axis=1)  # the nearest
     side = normal[np.arange(len(odd)), first]
-    other = through & ((normal * side[:, None]).sum(axis=2) < ALIKE)
-    torn = other.any(axis=1) & ((side * fixed[odd]).sum(axis=1) < ALIKE**0.25)
+    other = through & ((normal * side[:, None]).sum(axis=2) < options.alike)
+    torn = other.any(axis=1) & ((side * fixed[odd]).sum(axis=1) < options.alike**0.25)
     fixed[odd[torn]] = side[torn]
     return fixed, int(torn.sum())
 
 
-def _placed(patches: _Patches, parents: Rows, random: np.random.Generator, *, guessed: bool) -> tuple[Float64, Float64]:
+def _placed(
+    patches: _Patches, parents: Rows, random: np.random.Generator, *, guessed: bool, options: BetweenOptions = BETWEEN
+) -> tuple[Float64, Float64]:
     """New points and their normals, at most one beside each of ``parents``."""
     normal = patches.normals[parents]
     step = random.normal(size=(len(parents), 3))
@@ -257,17 +298,23 @@ def _placed(patches: _Patches, parents: Rows, random: np.random.Generator, *, gu
     x = patches.points[parents] + step - 0.5 * (bent * step).sum(axis=1, keepdims=True) * normal
     normal, good = _unit(normal + bent), np.ones(len(parents), bool)
     for _ in range(2):  # patches are flat across a spacing: the second move is a hundredth of the first
-        moved, normal, good = _blended(patches, x, normal, ONE_SIDED if guessed else np.inf)
+        moved, normal, good = _blended(patches, x, normal, options.one_sided if guessed else np.inf, options=options)
         x = x + moved
     return x[good], normal[good]
 
 
-def _blended(patches: _Patches, x: Float64, normal: Float64, one_sided: float) -> tuple[Float64, Float64, Mask]:
+def _blended(
+    patches: _Patches, x: Float64, normal: Float64, one_sided: float, options: BetweenOptions = BETWEEN
+) -> tuple[Float64, Float64, Mask]:
     """What moves places ``(m, 3)`` onto the blend of patches with their normals; normals there; which are good."""
-    distance, found, offset, value, theirs = patches.at(x, BLENDED)
+    distance, found, offset, value, theirs = patches.at(x, options.blended)
     scale, sound = distance[:, 3:4], patches.sound[found]
     cosine = (theirs * normal[:, None]).sum(axis=2)
-    weight = sound * np.exp(-((distance / scale) ** 2)) * np.clip((cosine - AGREED) / (1 - AGREED), 0, 1) ** 2
+    weight = (
+        sound
+        * np.exp(-((distance / scale) ** 2))
+        * np.clip((cosine - options.agreed) / (1 - options.agreed), 0, 1) ** 2
+    )
     total = weight.sum(axis=1, keepdims=True)
     weight /= np.maximum(total, 1e-300)
     mean = (weight * value).sum(axis=1, keepdims=True)
@@ -275,10 +322,10 @@ def _blended(patches: _Patches, x: Float64, normal: Float64, one_sided: float) -
     spread = np.sqrt((weight * (value - mean) ** 2).sum(axis=1, keepdims=True))
     # Two points of a surface are both behind or both before the plane of the other, on arcs as on edges.
     above, below = -(offset * blend[:, None]).sum(axis=2), (offset * patches.normals[found]).sum(axis=2)
-    beyond = sound & (cosine < AGREED) & (above * below < 0)
-    beyond &= np.minimum(np.abs(above), np.abs(below)) > BEYOND * scale
+    beyond = sound & (cosine < options.agreed) & (above * below < 0)
+    beyond &= np.minimum(np.abs(above), np.abs(below)) > options.beyond * scale
     middle = np.linalg.norm(np.einsum("mk,mkd->md", weight, offset), axis=1, keepdims=True)
-    good = (total > ENOUGH) & (spread < SPREAD * scale) & ~beyond.any(axis=1, keepdims=True)
+    good = (total > options.enough) & (spread < options.spread * scale) & ~beyond.any(axis=1, keepdims=True)
     good = (good & (middle < one_sided * scale))[:, 0]
     return -mean * blend, blend, good
 

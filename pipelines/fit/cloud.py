@@ -14,6 +14,7 @@ import dataclasses
 import json
 import math
 import zipfile
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -32,40 +33,54 @@ from ...datasets.clouds.readers.stream import CloudStream, MemoryStream
 from ...neural_fields.backend.files import whole_file
 from ..training.folder import MERGED_FILE
 
-__all__ = ["CloudDistance", "load_cloud"]
+__all__ = ["CloudDistance", "CloudOptions", "load_cloud"]
 
 Float32 = NDArray[np.float32]
 
-# What merging does may change; what an older version left behind is then made again.
-VERSION = 2
-# Area of a point's disc over the median one: scans are this much sparser where they graze the surface, hardly more.
-LARGEST_AREA = 100.0
-# Queries at a time: between two of them a progress display is told.
-ROWS = 1 << 15
-# Winding numbers at a time: of more places, groups of neighbouring ones are smaller, and fewer points are near them.
-PLACES = 1 << 18
-# Neighbours that share the disc out to the last of them, and among how many nearest ones they are looked for.
-SHARING, ASKED = 8, 16
-# Points in each other's tangent plane, to within this part of their distance, lie beside each other on one side. A
-# normal that so many times as many of those contradict as confirm has the wrong sign.
-BESIDE_ANOTHER, ODD = 0.25, 2.0
-# Dipoles are softened by this part of the radius of their discs, or of the noise that was smoothed off, whichever is
-# more: close to the surface, between two of them, the winding number would waver. Of wider ones the sides of a thin bar
-# cancel.
-SOFT = 0.3
-# Where normals were estimated from noisy points, dipoles of so many standard deviations of the noise are asked: what is
-# left of it moves the sides of a thin part into each other. It is as wide as those that gave the normals their signs.
-SOFT_GUESSED = 2.0
-# Sides of a square bar: of all neighbours of a point on it at least one in so many is on its own side.
-SIDES = 4.0
-# Nearer to the discs than this many spacings, sides of discs are right more often than winding numbers.
-BESIDE = 0.25
-# So near to one half a winding number says little: in the holes of scans. Up to this far from their rims the discs
-# there, which go on where the surface ends, say more; if a place is on one side of all, by this sine or more. Elsewhere
-# winding numbers are in doubt too, beside bars and in the folds of coarse meshes, and discs say nothing there. Nor do
-# those of points that fill a sparse cloud in: at a sharp corner they may go on where there is nothing.
-DOUBT, RIM, FACE_ON = 0.25, 0.1, 0.2
-CHANCE = 3.0  # standard deviations of the noise
+
+@dataclass(frozen=True)
+class CloudOptions:
+    """Numbers of `CloudDistance`."""
+
+    # Area of a point's disc over the median one: scans are this much sparser where they graze the surface, hardly
+    # more.
+    largest_area: float = 100.0
+    # Queries at a time: between two of them a progress display is told.
+    rows: int = 1 << 15
+    # Winding numbers at a time: of more places, groups of neighbouring ones are smaller, and fewer points are near
+    # them.
+    places: int = 1 << 18
+    # Neighbours that share the disc out to the last of them, and among how many nearest ones they are looked for.
+    sharing: int = 8
+    asked: int = 16
+    # Points in each other's tangent plane, to within this part of their distance, lie beside each other on one side.
+    # A normal that so many times as many of those contradict as confirm has the wrong sign.
+    beside_another: float = 0.25
+    odd: float = 2.0
+    # Dipoles are softened by this part of the radius of their discs, or of the noise that was smoothed off, whichever
+    # is more: close to the surface, between two of them, the winding number would waver. Of wider ones the sides of a
+    # thin bar cancel.
+    soft: float = 0.3
+    # Where normals were estimated from noisy points, dipoles of so many standard deviations of the noise are asked:
+    # what is left of it moves the sides of a thin part into each other. It is as wide as those that gave the normals
+    # their signs.
+    soft_guessed: float = 2.0
+    # Sides of a square bar: of all neighbours of a point on it at least one in so many is on its own side.
+    sides: float = 4.0
+    # Nearer to the discs than this many spacings, sides of discs are right more often than winding numbers.
+    beside: float = 0.25
+    # So near to one half a winding number says little: in the holes of scans. Up to this far from their rims the
+    # discs there, which go on where the surface ends, say more; if a place is on one side of all, by this sine or
+    # more. Elsewhere winding numbers are in doubt too, beside bars and in the folds of coarse meshes, and discs say
+    # nothing there. Nor do those of points that fill a sparse cloud in: at a sharp corner they may go on where there
+    # is nothing.
+    doubt: float = 0.25
+    rim: float = 0.1
+    face_on: float = 0.2
+    chance: float = 3.0  # standard deviations of the noise
+
+
+CLOUD = CloudOptions()
 
 
 def load_cloud(
@@ -122,7 +137,7 @@ def _about(path: Path, **options: Any) -> dict[str, Any]:
     """What a merged cloud depends on."""
     facts = path.stat()
     return {
-        "version": VERSION,
+        "version": 1,  # of what merging does; a cloud that was merged otherwise is made again
         "file": str(path.absolute()),
         "bytes": facts.st_size,
         "changed": facts.st_mtime_ns,
@@ -166,6 +181,7 @@ class CloudDistance:
         given: how many of the points are the cloud's own, the first ones; None for all. The others fill it in.
         gap: the spacing of those; None for that of all.
         repaired: how many normals of points on edges were replaced by one side's.
+        options: numbers of the algorithm.
     """
 
     def __init__(
@@ -179,7 +195,9 @@ class CloudDistance:
         given: int | None = None,
         gap: float | None = None,
         repaired: int = 0,
+        options: CloudOptions = CLOUD,
     ) -> None:
+        self.options = options
         self.points: Float32 = points.cpu().numpy()
         self.normals: Float32 = normals.cpu().numpy()
         self.tree = KDTree(self.points, compact_nodes=False, balanced_tree=False)
@@ -199,9 +217,11 @@ class CloudDistance:
 
     def nearest(self, x: NDArray[np.floating]) -> NDArray[np.float64]:
         """Distance from each of ``(M, 3)`` to the nearest point of the cloud → ``(M,)``."""
-        return np.concatenate([self._query(x[start : start + ROWS], 1)[0] for start in _starts(len(x))])
+        return np.concatenate(
+            [self._query(x[start : start + self.options.rows], 1)[0] for start in _starts(len(x), options=self.options)]
+        )
 
-    def signed(self, x: Tensor, *, soft: float = SOFT) -> Tensor:
+    def signed(self, x: Tensor, *, soft: float = CLOUD.soft) -> Tensor:
         """Signed distance of ``(M, 3)`` points → ``(M,)`` on the CPU, negative inside.
 
         Args:
@@ -209,7 +229,10 @@ class CloudDistance:
             soft: softening of the dipoles that the signs are asked of, in standard deviations of the noise.
         """
         query = x.cpu().numpy()
-        parts = [self._query(query[start : start + ROWS], self.neighbors) for start in _starts(len(query))]
+        parts = [
+            self._query(query[start : start + self.options.rows], self.neighbors)
+            for start in _starts(len(query), options=self.options)
+        ]
         distance, index = (np.concatenate(part) for part in zip(*parts, strict=True))
         offset = query[:, None] - self.points[index]  # (M, k, 3)
         along = np.einsum("mkd,mkd->mk", offset, self.normals[index])
@@ -219,12 +242,18 @@ class CloudDistance:
         # Each disc votes with its side, the nearer and the more face-on the louder.
         side = np.sum(along / (distance**3 + 1e-12), axis=1)
         # Where normals follow noise, sides of discs as near as that are chance.
-        chance = distance[:, 0] < (CHANCE * self.noise if self.guessed else 0.0)
-        asked = np.flatnonzero(chance | (magnitude > BESIDE * self.spacing))
+        chance = distance[:, 0] < (self.options.chance * self.noise if self.guessed else 0.0)
+        asked = np.flatnonzero(chance | (magnitude > self.options.beside * self.spacing))
         number = 0.5 - self.winding_number(query[asked], soft=soft)
         sine = along[asked] / np.maximum(distance[asked], 1e-12)
-        one_side = np.maximum(sine.min(axis=1), -sine.max(axis=1)) >= FACE_ON
-        rim = (np.abs(number) < DOUBT) & (distance[asked, 0] < RIM) & one_side & ~chance[asked] & (not self.filled)
+        one_side = np.maximum(sine.min(axis=1), -sine.max(axis=1)) >= self.options.face_on
+        rim = (
+            (np.abs(number) < self.options.doubt)
+            & (distance[asked, 0] < self.options.rim)
+            & one_side
+            & ~chance[asked]
+            & (not self.filled)
+        )
         side[asked] = np.where(rim, side[asked], number)
         return torch.from_numpy(np.where(side < 0, -magnitude, magnitude).astype(np.float32))
 
@@ -233,7 +262,7 @@ class CloudDistance:
         distance, index = self.tree.query(x, k=k, workers=-1)
         return np.asarray(distance), np.asarray(index)
 
-    def winding_number(self, x: Float32, *, soft: float = SOFT) -> NDArray[np.float64]:
+    def winding_number(self, x: Float32, *, soft: float = CLOUD.soft) -> NDArray[np.float64]:
         """Generalised winding number at ``(M, 3)`` points: about 1 inside, 0 outside, in between near holes.
 
         ``w(x) = Σ_i a_i ⟨p_i − x, n_i⟩ / 4π (|p_i − x|² + ε_i²)^(3/2)`` (Barill et al. 2018), see `DipoleField`.
@@ -243,13 +272,13 @@ class CloudDistance:
             soft: softening of the dipoles, in standard deviations of the noise.
         """
         dipoles = self._softened(soft)
-        starts = range(0, max(len(x), 1), PLACES)
-        return np.concatenate([dipoles.winding(x[start : start + PLACES]) for start in starts])
+        starts = range(0, max(len(x), 1), self.options.places)
+        return np.concatenate([dipoles.winding(x[start : start + self.options.places]) for start in starts])
 
     def _softened(self, soft: float) -> DipoleField:
-        """The points as dipoles, softened by so many standard deviations of the noise, or `SOFT` of their discs."""
+        """The points as dipoles, softened by so many standard deviations of the noise, or `soft` of their discs."""
         if soft not in self._dipoles:
-            softening = np.maximum(SOFT * self.radii, soft * self.noise)
+            softening = np.maximum(self.options.soft * self.radii, soft * self.noise)
             self._dipoles[soft] = DipoleField(self.points, self.normals * self.areas[:, None], softening)
         return self._dipoles[soft]
 
@@ -260,7 +289,7 @@ class CloudDistance:
         winding numbers of one half inside. Where most of those beside a point face the other way, its own normal is
         wrong, and all of them share the disc.
         """
-        count, asked = (min(number, len(self.points) - 1) for number in (SHARING, ASKED))
+        count, asked = (min(number, len(self.points) - 1) for number in (self.options.sharing, self.options.asked))
         found = self.tree.query(self.points, k=asked + 1, workers=-1)
         reach, near = np.asarray(found[0])[:, 1:], np.asarray(found[1])[:, 1:]
         cosine = np.einsum("nd,nkd->nk", self.normals, self.normals[near])
@@ -268,16 +297,16 @@ class CloudDistance:
         last = (alike < count).sum(axis=1).clip(max=asked - 1)
         sharing = alike[:, -1].clip(1, count)
         height = np.einsum("nd,nkd->nk", self.normals, self.points[near] - self.points[:, None])
-        beside = np.abs(height) < BESIDE_ANOTHER * reach
-        odd = (beside & (cosine < 0)).sum(axis=1) > ODD * (beside & (cosine > 0)).sum(axis=1)
+        beside = np.abs(height) < self.options.beside_another * reach
+        odd = (beside & (cosine < 0)).sum(axis=1) > self.options.odd * (beside & (cosine > 0)).sum(axis=1)
         last, sharing = np.where(odd, count - 1, last), np.where(odd, count, sharing)
         areas = math.pi * reach[np.arange(len(reach)), last] ** 2 / sharing
         # A normal that hardly any neighbour shares is more likely wrong than its point is alone.
-        areas = np.minimum(areas, SIDES * math.pi * reach[:, count - 1] ** 2 / count)
+        areas = np.minimum(areas, self.options.sides * math.pi * reach[:, count - 1] ** 2 / count)
         # A few points on their own have nobody near, but no surface of that size either.
-        return np.minimum(areas, LARGEST_AREA * np.median(areas)).astype(np.float32)
+        return np.minimum(areas, self.options.largest_area * np.median(areas)).astype(np.float32)
 
 
-def _starts(count: int) -> range:
+def _starts(count: int, options: CloudOptions = CLOUD) -> range:
     """Where the parts of so many queries begin; of none there is one."""
-    return range(0, max(count, 1), ROWS)
+    return range(0, max(count, 1), options.rows)

@@ -14,6 +14,7 @@ if less surely, is no overfitting.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,18 +26,32 @@ from ...neural_fields import Field, Siren
 from ...neural_fields.fields.losses import data_loss, normal_loss, pseudo_huber
 from .samples import SQUARES, Samples, Usual, with_previous
 
-__all__ = ["FEWEST", "LEARNT", "LOOKS", "Error", "Fall", "Judge", "Verdict", "held_out", "standard_errors", "voxels_of"]
-
-FEWEST = 200  # whose mean square is known to a tenth
-WANTED, SPARED = 600, 0.05  # so many, of clouds that need not spare more than this part for them
-MOST = 0.1  # of the points; a cloud that would have to spare more spares none
-LEARNT = 0.8  # root mean square at the points that a level has learnt from, over that without it: a gain by far
-VOXEL = 2.0  # edge of a voxel in spacings: about four points, whose neighbours can still fill the gap
-SURELY = 2.0  # standard errors
-LOOKS = 8  # how often a level is judged while it trains
+__all__ = ["Error", "Fall", "Judge", "JudgeOptions", "Verdict", "held_out", "standard_errors", "voxels_of"]
 
 
-def held_out(points: NDArray[np.float32], spacing: float, share: float, *, seed: int = 0) -> NDArray[np.bool_]:
+@dataclass(frozen=True)
+class JudgeOptions:
+    """Numbers of `held_out` and `Judge`."""
+
+    fewest: int = 200  # whose mean square is known to a tenth
+    # so many, of clouds that need not spare more than this part for them
+    wanted: int = 600
+    spared: float = 0.05
+    most: float = 0.1  # of the points; a cloud that would have to spare more spares none
+    learnt: float = (
+        0.8  # root mean square at the points that a level has learnt from, over that without it: a gain by far
+    )
+    voxel: float = 2.0  # edge of a voxel in spacings: about four points, whose neighbours can still fill the gap
+    surely: float = 2.0  # standard errors
+    looks: int = 8  # how often a level is judged while it trains
+
+
+JUDGE = JudgeOptions()
+
+
+def held_out(
+    points: NDArray[np.float32], spacing: float, share: float, *, seed: int = 0, options: JudgeOptions = JUDGE
+) -> NDArray[np.bool_]:
     """Which points of a cloud are not trained on: those of voxels drawn at random.
 
     Args:
@@ -44,14 +59,17 @@ def held_out(points: NDArray[np.float32], spacing: float, share: float, *, seed:
         spacing: of the cloud; of a voxel of twice that edge all points are taken or none.
         share: of the points; 0 for none.
         seed: of the draw.
+        options: numbers of the algorithm.
 
     Returns:
         ``(N,)``; of a cloud that is too small to spare any, none.
     """
-    count = max(FEWEST, math.ceil(share * len(points)), min(WANTED, math.floor(SPARED * len(points))))
-    if not share or count > MOST * len(points) or not spacing > 0:
+    count = max(
+        options.fewest, math.ceil(share * len(points)), min(options.wanted, math.floor(options.spared * len(points)))
+    )
+    if not share or count > options.most * len(points) or not spacing > 0:
         return np.zeros(len(points), bool)
-    owner = voxels_of(points, spacing)
+    owner = voxels_of(points, spacing, options=options)
     order = np.random.default_rng(seed).permutation(int(owner.max()) + 1)
     total = np.cumsum(np.bincount(owner)[order])
     drawn = np.zeros(len(order), bool)
@@ -59,9 +77,9 @@ def held_out(points: NDArray[np.float32], spacing: float, share: float, *, seed:
     return drawn[owner]
 
 
-def voxels_of(points: NDArray[np.float32], spacing: float) -> NDArray[np.int64]:
+def voxels_of(points: NDArray[np.float32], spacing: float, options: JudgeOptions = JUDGE) -> NDArray[np.int64]:
     """The voxel of twice ``spacing``'s edge that each of the points ``(N, 3)`` is in → ``(N,)`` numbers from 0 on."""
-    cells = np.floor(points.astype(np.float64) / (VOXEL * spacing)).astype(np.int64)
+    cells = np.floor(points.astype(np.float64) / (options.voxel * spacing)).astype(np.int64)
     owner = np.unique(cells @ np.array([1 << 42, 1 << 21, 1]), return_inverse=True)[1]
     return owner.reshape(-1).astype(np.int64)
 
@@ -144,13 +162,13 @@ class Verdict(NamedTuple):
         are less, surely or not, and it has gained by far at the points that it has learnt from.
         """
         against = self.fall.distance if self.guessed else min(self.fall)
-        sure = max(self.fall) > SURELY and against > -SURELY
+        sure = max(self.fall) > JUDGE.surely and against > -JUDGE.surely
         return sure or self.learns
 
     @property
     def learns(self) -> bool:
         """Whether both errors are less, and those at the points that it has learnt from are by far."""
-        return min(self.fall) > 0 and self.learnt < LEARNT
+        return min(self.fall) > 0 and self.learnt < JUDGE.learnt
 
     def words(self, level: int, *, scale: float = 1.0) -> str:
         """One line for people, of the ``level`` with this number; ``scale`` takes distances to input units."""
@@ -164,7 +182,7 @@ class Verdict(NamedTuple):
         pairs = zip(before, after, self.fall, (scale, 1.0), strict=True)
         distance, angle = (f"{b * unit:.3g} → {a * unit:.3g}{{}} ({_sure(fall)})" for b, a, fall, unit in pairs)
         errors = f"mean distance {distance.format('')}, mean angle of the normals {angle.format('°')}"
-        if self.learns and max(self.fall) <= SURELY:
+        if self.learns and max(self.fall) <= JUDGE.surely:
             errors += f"; at those that it has learnt from the root mean square is {self.learnt:.2f} of what it was"
         return f"level {level} {judged}: without it → with it, at {self.points:,} points that it has not seen: {errors}"
 
@@ -183,8 +201,8 @@ class Verdict(NamedTuple):
         }
 
 
-def _sure(fall: float) -> str:
-    if abs(fall) <= SURELY:
+def _sure(fall: float, options: JudgeOptions = JUDGE) -> str:
+    if abs(fall) <= options.surely:
         return "no sure difference"
     return "surely less" if fall > 0 else "surely more"
 
@@ -213,6 +231,7 @@ class Judge:
         normal: weight of 1 − cos(∇f, N).
         usual: the scales of `pseudo_huber` around them.
         guessed: whether the normals were estimated from the points.
+        options: numbers of the algorithm.
     """
 
     def __init__(
@@ -227,12 +246,14 @@ class Judge:
         normal: float,
         usual: Usual = SQUARES,
         guessed: bool = False,
+        options: JudgeOptions = JUDGE,
     ) -> None:
+        self.options = options
         samples = Samples(points, distance=torch.zeros(len(points)), normal=normals)
         self.samples = with_previous(samples, previous, delta, device=previous.like.device)
         self.data, self.normal, self.usual, self.count = data, normal, usual, len(self.samples)
         self.guessed = guessed
-        self.voxels = torch.from_numpy(voxels_of(self.samples.points.cpu().numpy(), spacing))
+        self.voxels = torch.from_numpy(voxels_of(self.samples.points.cpu().numpy(), spacing, options=self.options))
         assert self.samples.value is not None
         assert self.samples.gradient is not None
         self.without = self._errors(self.samples.value, self.samples.gradient)
@@ -249,7 +270,7 @@ class Judge:
 
     def surely_less(self, first: Each, second: Each) -> bool:
         """Whether the first losses are less in the mean, by more than chance makes them."""
-        return standard_errors(second.loss - first.loss, self.voxels) > SURELY
+        return standard_errors(second.loss - first.loss, self.voxels) > self.options.surely
 
     def verdict(self, each: Each, at: float) -> Verdict:
         """On a level with these errors; see `Verdict`."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -13,17 +14,31 @@ from ...neural_fields.backend.devices import upload
 from ...neural_fields.fields.losses import data_loss, eikonal_loss, normal_loss, pseudo_huber
 from ..training.settings import EvolveConfig, FitConfig
 from ..training.trainer import Group, Objective, seeded, warm_cosine
-from .heldout import LOOKS, Judge, Verdict
+from .heldout import JUDGE, Judge, Verdict
 from .samples import Source
 
-__all__ = ["RESIDUAL_GAIN", "LevelObjective", "calm_omega", "new_level"]
+__all__ = ["LevelObjective", "LevelOptions", "calm_omega", "new_level"]
 
-# A residual starts at a tenth of the usual output scale, close to the level before it.
-RESIDUAL_GAIN = 0.1
-# Largest frequency of a residual, in units of 1 / the standard deviation of noise that was smoothed off along estimated
-# normals: of waves shorter than 2π/0.4 of those, smoothing leaves nothing in the points but noise. Where a cloud is
-# filled in between its points, that smooths them once more, and edges need the higher ones.
-CALM = 0.4
+
+@dataclass(frozen=True)
+class LevelOptions:
+    """Numbers of `new_level` and `calm_omega`."""
+
+    # A residual starts at a tenth of the usual output scale, close to the level before it.
+    residual_gain: float = 0.1
+    # Of a sparse cloud: at a tenth of the usual its waves tilt the normals of the level before by degrees.
+    small_gain: float = 0.01
+    # Largest frequency of a residual, in units of 1 / the standard deviation of noise that was smoothed off along
+    # estimated normals: of waves shorter than 2π/0.4 of those, smoothing leaves nothing in the points but noise.
+    # Where a cloud is filled in between its points, that smooths them once more, and edges need the higher ones.
+    calm: float = 0.4
+    # A level whose error at the points is so many times that of the level before is set to zero: data contradict
+    # themselves where a part is thinner than their noise.
+    worse: float = 2.0
+
+
+LEVEL = LevelOptions()
+
 BEST = "best."  # before the names of the weights that did best
 
 
@@ -33,8 +48,9 @@ def new_level(
     *,
     residual: bool,
     in_dim: int = 3,
-    gain: float = RESIDUAL_GAIN,
+    gain: float = LEVEL.residual_gain,
     omega: float | None = None,
+    options: LevelOptions = LEVEL,
 ) -> Siren:
     """The untrained SIREN of a level, whose weights follow from the seed; small by ``gain`` where it is a residual.
 
@@ -45,13 +61,13 @@ def new_level(
         return Siren(width, depth, omega=omega, in_dim=in_dim, output_gain=gain if residual else 1.0)
 
 
-def calm_omega(config: FitConfig, level: int, noise: float) -> float:
+def calm_omega(config: FitConfig, level: int, noise: float, options: LevelOptions = LEVEL) -> float:
     """The frequency of a level of a cloud whose normals were estimated from points with ``noise``, 0 for none.
 
-    That of the configuration, but no more than `CALM` / noise, which is no less than that of level 0.
+    That of the configuration, but no more than `calm` / noise, which is no less than that of level 0.
     """
     omega = config.omegas[level]
-    return min(omega, max(config.omegas[0], CALM / noise)) if noise else omega
+    return min(omega, max(config.omegas[0], options.calm / noise)) if noise else omega
 
 
 class LevelObjective(Objective):
@@ -88,7 +104,7 @@ class LevelObjective(Objective):
 
     def losses(self, step: int, done: float) -> tuple[dict[str, Tensor], Tensor]:
         """See `Objective.losses`: the mean of every term of every source."""
-        if self.judge is not None and int(done * LOOKS) > int(self.kept["looks"]):
+        if self.judge is not None and int(done * JUDGE.looks) > int(self.kept["looks"]):
             self.look(done)
         batches = [source.samples.take(self._draw(source)) for source in self.sources]
         jet = self.siren.jet(torch.cat([batch.points for batch in batches]))
@@ -115,7 +131,7 @@ class LevelObjective(Objective):
         """Ask the judge, and keep the weights if they are the best so far."""
         if self.judge is None:
             return
-        self.kept["looks"].fill_(int(done * LOOKS))
+        self.kept["looks"].fill_(int(done * JUDGE.looks))
         loss = self.judge.errors(self.siren).mean().loss
         if loss < float(self.kept["least"]):
             self.kept["least"].fill_(loss)

@@ -20,12 +20,13 @@ from torch import Tensor
 from ...neural_fields import Field, InputError, Jet
 from ...neural_fields.fields.losses import data_loss, eikonal_loss, normal_loss
 from ..training.settings import FitConfig
-from .cloud import SOFT_GUESSED, CloudDistance
+from .cloud import CLOUD, CloudDistance
 
 __all__ = [
     "SQUARES",
     "Remote",
     "Rows",
+    "SampleOptions",
     "Samples",
     "Source",
     "Usual",
@@ -46,21 +47,32 @@ __all__ = [
 
 # Half-edge of the cube in which level 0 learns distances: the mesher's box is [-1, 1]³, and a little more.
 DOMAIN = 1.05
-# How far a winding number must be from one half to say in or out: it is off by less than 0.05 where it is asked.
-SURE = 0.4
-# The same where normals were estimated from the points, which are wrong at thin parts: in the arches of a tower, far
-# from its bars, the number is 0.11 to 0.32. In the holes of scans of solid parts it is nearer to one half.
-SURE_GUESSED = 0.3
-# Normals estimated from the points are wrong by tens of degrees where parts are as thin as a neighbourhood, or as the
-# noise, and there no field of slope 1 is near the points either. Weights of both terms, in units of the settings'.
-GUESSED_NORMAL, GUESSED_SLOPE = 0.1, 0.2
-# Of noise without normals, smoothing leaves this much: 0.3 to 0.7 of it in the root mean square on six shapes with 0.5
-# and 1 %, 0.4 in the median. Distances are that good.
-LEFT = 0.4
-# Spacings from all points, from which on a place is no longer between them: there a surface is about one away.
-CLEAR = 4.0
-# So few places that the level before gets wrong far from the cloud are not worth a share of the batch.
-FEWEST = 32
+
+
+@dataclass(frozen=True)
+class SampleOptions:
+    """Numbers of `banded_sources`."""
+
+    # How far a winding number must be from one half to say in or out: it is off by less than 0.05 where it is asked.
+    sure: float = 0.4
+    # The same where normals were estimated from the points, which are wrong at thin parts: in the arches of a tower,
+    # far from its bars, the number is 0.11 to 0.32. In the holes of scans of solid parts it is nearer to one half.
+    sure_guessed: float = 0.3
+    # Normals estimated from the points are wrong by tens of degrees where parts are as thin as a neighbourhood, or as
+    # the noise, and there no field of slope 1 is near the points either. Weights of both terms, in units of the
+    # settings'.
+    guessed_normal: float = 0.1
+    guessed_slope: float = 0.2
+    # Of noise without normals, smoothing leaves this much: 0.3 to 0.7 of it in the root mean square on six shapes
+    # with 0.5 and 1 %, 0.4 in the median. Distances are that good.
+    left: float = 0.4
+    # Spacings from all points, from which on a place is no longer between them: there a surface is about one away.
+    clear: float = 4.0
+    # So few places that the level before gets wrong far from the cloud are not worth a share of the batch.
+    fewest: int = 32
+
+
+SAMPLING = SampleOptions()
 
 
 class Rows:
@@ -160,10 +172,10 @@ class Weights:
 
     def resolved(self, config: FitConfig, errors: Tensor, cloud: CloudDistance) -> tuple[float, float, float]:
         """Data, normal and eikonal weight, where the levels before miss the surface samples by ``errors`` ``(n,)``."""
-        noise = LEFT * cloud.noise if cloud.guessed else cloud.noise
+        noise = SAMPLING.left * cloud.noise if cloud.guessed else cloud.noise
         data = config.data_weight_after(float(errors.square().mean()), noise)
         given = (self.data, self.normal, self.eikonal)
-        normal, slope = (GUESSED_NORMAL, GUESSED_SLOPE) if cloud.guessed else (1.0, 1.0)
+        normal, slope = (SAMPLING.guessed_normal, SAMPLING.guessed_slope) if cloud.guessed else (1.0, 1.0)
         usual = (data, normal * config.normal_weight, slope * config.eikonal_weight)
         return tuple(u if g is None else g for g, u in zip(given, usual, strict=True))  # pyright: ignore[reportReturnType]
 
@@ -190,6 +202,7 @@ def banded_sources(
     generator: torch.Generator,
     weights: Weights | None = None,
     name: str = "cloud",
+    options: SampleOptions = SAMPLING,
 ) -> list[Source]:
     """A residual level's: the cloud, its offsets and dithered points, inside the band (Sec. 3.2); and remote places.
 
@@ -203,6 +216,7 @@ def banded_sources(
         generator: draws the samples.
         weights: other weights than the fit's own.
         name: what messages call the cloud.
+        options: numbers of the algorithm.
 
     Raises:
         InputError: one kind of samples is empty.
@@ -233,9 +247,9 @@ def banded_sources(
     sources = [Source(kind, samples, third, *terms, usual) for kind, samples in kept.items()]
     # Of its own generator: a cloud without such places is fitted as if nobody had looked for them.
     own = torch.Generator().manual_seed(generator.initial_seed() + 1)
-    remote = remote_samples(index, previous, delta, config.samples, generator=own, device=device)
+    remote = remote_samples(index, previous, delta, config.samples, generator=own, device=device, options=options)
     for kind, samples in remote._asdict().items():
-        if len(samples) >= FEWEST:
+        if len(samples) >= options.fewest:
             sources.append(Source(kind, samples, third // 4, terms[0], 0.0, 0.0))
     return sources
 
@@ -301,6 +315,7 @@ def remote_samples(
     *,
     generator: torch.Generator,
     device: torch.device,
+    options: SampleOptions = SAMPLING,
 ) -> Remote:
     """Points of the band around ``field`` that are far from every point of the cloud.
 
@@ -317,6 +332,7 @@ def remote_samples(
         count: how many points are tried, spread as for level 0; as many again around unseen ones, if there are some.
         generator: draws them.
         device: where the field is.
+        options: numbers of the algorithm.
 
     Returns:
         Samples with distances, values and gradients, on ``device``; often none.
@@ -327,9 +343,9 @@ def remote_samples(
         points = samples.points.cpu().numpy()
         assert samples.value is not None
         distance = cloud.nearest(points)
-        far = np.flatnonzero(distance - samples.value.abs().cpu().numpy() > max(delta, CLEAR * cloud.gap))
+        far = np.flatnonzero(distance - samples.value.abs().cpu().numpy() > max(delta, options.clear * cloud.gap))
         depth = cloud.winding_number(points[far]) - 0.5
-        sure = np.abs(depth) > (SURE_GUESSED if cloud.guessed else SURE)
+        sure = np.abs(depth) > (options.sure_guessed if cloud.guessed else options.sure)
         empty, unseen = (samples.take(torch.from_numpy(far[some]).to(device)) for some in (sure, ~sure))
         length = np.minimum(distance[far[sure]], 2 * delta)
         signed = np.where(depth[sure] > 0, -length, length).astype(np.float32)
@@ -337,7 +353,7 @@ def remote_samples(
         return Remote(empty, replace(unseen, distance=unseen.value))
 
     remote = found(spread_points(cloud, count, generator))
-    if len(remote.unseen) < FEWEST:
+    if len(remote.unseen) < options.fewest:
         return remote
     seeds = remote.unseen.points.cpu()[torch.randint(len(remote.unseen), (count,), generator=generator)]
     beside = seeds + (2 * torch.rand(count, 3, generator=generator) - 1) * 2 * delta
@@ -405,7 +421,7 @@ def near_samples(cloud: CloudDistance, delta: float, count: int, *, generator: t
     Their signs are those of winding numbers, which weigh all normals against each other; nothing is known of gradients.
     """
     points = band_samples(cloud, delta / 2, count, generator=generator).points
-    return Samples(points, distance=cloud.signed(points, soft=SOFT_GUESSED))
+    return Samples(points, distance=cloud.signed(points, soft=CLOUD.soft_guessed))
 
 
 def band_samples(cloud: CloudDistance, delta: float, count: int, *, generator: torch.Generator) -> Samples:

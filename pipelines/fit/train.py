@@ -21,7 +21,7 @@ from ...datasets import OrientedCloud, PointCloud, prepare_cloud, spacing_of
 from ...datasets.clouds.large import Merging
 from ...neural_fields import InputError, MultiscaleSDF, Similarity, Siren
 from ..surface.trim import thinned
-from ..training.budget import SAMPLING_SHARE, Budget, affordable, least_share, step_seconds
+from ..training.budget import BUDGET, Budget, affordable, least_share, step_seconds
 from ..training.folder import SUPPORT_FILE, RunFolder, digest_of, named_cloud
 from ..training.machine import choose_device, environment, peak_memory
 from ..training.report import reported, silent
@@ -42,21 +42,15 @@ from ..training.trainer import (
 from .band import Band, band_of, with_wrong_sides
 from .between import dense_distance
 from .cloud import CloudDistance, load_cloud
-from .heldout import FEWEST, Judge, held_out
-from .level import RESIDUAL_GAIN, LevelObjective, calm_omega, new_level
+from .heldout import JUDGE, Judge, held_out
+from .level import LEVEL, LevelObjective, calm_omega, new_level
 from .review import Review, review_points
 from .samples import DOMAIN, Source, banded_sources, first_sources
 from .unoriented import Places, Signs, fits_better, give_signs, signed
 
 __all__ = ["FitConfig", "Review", "Run", "fit", "fit_moved", "prepare", "review_points"]
 
-# A level whose error at the points is so many times that of the level before it is worse than none: set to zero, it is
-# that level. Where data contradict themselves, as the sides of a part do that is thinner than their noise, it happens.
-WORSE = 2.0
 GUESSED = ("winding", "propagation")  # what gives estimated normals signs that may be wrong in whole patches
-# Of a sparse cloud, a residual begins so small: at a tenth of the usual its waves tilt the normals of the level before
-# by degrees, on flat places too.
-SMALL_GAIN = 0.01
 
 Cloud = PointCloud | str | Path | NDArray[np.floating]
 LevelDone = Callable[[MultiscaleSDF, Similarity], object]
@@ -263,7 +257,7 @@ class _Fitting:
         left, steps = self.budget.left(), self.config.steps[: self.config.num_levels]
         if left is None:
             return math.inf
-        training, begun = 1 - SAMPLING_SHARE, bool(self.trainer_state)
+        training, begun = 1 - BUDGET.sampling_share, bool(self.trainer_state)
         return self.budget.share(left, level, steps, self.cost, training=training, begun=begun)
 
     def cost(self, level: int) -> float:
@@ -298,7 +292,7 @@ class _Fitting:
             if not self.trainer_state:
                 self.samples = self.affordable_samples(level, share, started, index, delta)
             config = dataclasses.replace(self.config, samples=self.samples)
-            gain = SMALL_GAIN if index.filled and config.robust_normals else RESIDUAL_GAIN
+            gain = LEVEL.small_gain if index.filled and config.robust_normals else LEVEL.residual_gain
             noisy = self.cloud.estimated and not index.filled
             omega = calm_omega(config, level, self.cloud.noise if noisy else 0.0)
             siren = new_level(config, level, residual=level > 0, gain=gain, omega=omega).to(self.device)
@@ -325,7 +319,7 @@ class _Fitting:
         if level == 0 and config.hold_out:
             self.index = None  # the next level leaves some points out
         before, self.errors = self.errors, self.values_at_cloud()
-        silenced = level > 0 and _rms(self.errors) > WORSE * _rms(before)
+        silenced = level > 0 and _rms(self.errors) > LEVEL.worse * _rms(before)
         if verdict is not None:
             seen = ~self.held
             learnt = _rms(self.errors[seen]) / max(_rms(before[seen]), 1e-30)
@@ -377,7 +371,7 @@ class _Fitting:
         return affordable(
             lambda count: self.sources(index, None, dataclasses.replace(self.config, samples=count), generator),
             full,
-            SAMPLING_SHARE / 2 * share,
+            BUDGET.sampling_share / 2 * share,
         )
 
     def affordable_samples(
@@ -391,7 +385,7 @@ class _Fitting:
         count = affordable(
             lambda count: self.sources(index, delta, dataclasses.replace(self.config, samples=count), generator),
             full,
-            max(SAMPLING_SHARE * share, spare) - (time.monotonic() - started),
+            max(BUDGET.sampling_share * share, spare) - (time.monotonic() - started),
         )
         if count < full:
             note = f"level {level} learns from {count:,} samples of each kind instead of {full:,}"
@@ -444,7 +438,7 @@ class _Fitting:
         terms = {"data": surface.data, "normal": surface.normal, "usual": surface.usual}
         guessed = self.cloud.estimated
         judge = Judge(points, normals, self.frozen, delta, spacing=self.spacing, guessed=guessed, **terms)
-        return judge if judge.count >= FEWEST / 2 else None
+        return judge if judge.count >= JUDGE.fewest / 2 else None
 
     def review(self) -> dict[str, Any]:
         """Take out of the data, or turn round, what level 0 shows to be wrong → counts for the record."""

@@ -20,6 +20,7 @@ winding numbers fit them better there, by far.
 from __future__ import annotations
 
 import dataclasses
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -40,20 +41,32 @@ from ..training.settings import FitConfig
 from ..training.trainer import Group, Objective, Report, StopFlag, Trainer, warm_cosine
 from .cloud import CloudDistance
 from .level import new_level
-from .samples import SURE, spread_points
+from .samples import SAMPLING, spread_points
 
-__all__ = ["BATCH", "SAMPLES", "STAGE", "STAGES", "STEPS", "Places", "Signs", "fits_better", "give_signs", "signed"]
+__all__ = ["STAGE", "STAGES", "Places", "SignOptions", "Signs", "fits_better", "give_signs", "signed"]
 
 Float32 = NDArray[np.float32]
 
-STEPS, BATCH, SAMPLES, RATE = 300, 4096, 50_000, 2e-3
-POINTS = 2.0  # weight of f = 0 at the points, in units of that of known distances
-SETTLED = 0.25  # of the steps, after which the regions that the outside does not reach get their signs
-CLEAR = 0.1  # mean slope of the field into a region, from which on that has a sign
-FAINT = 0.15  # mean slope at the points, below which it says nothing: that of an open sheet
-CONTRADICTED = 0.01  # share of the places
-ASKED = 16_000  # points at which winding numbers are looked at
-FAR = 0.05  # from the points, where wrong signs of a few of them no longer decide a winding number
+
+@dataclass(frozen=True)
+class SignOptions:
+    """Numbers of `give_signs` and `fits_better`."""
+
+    steps: int = 300
+    batch: int = 4096
+    samples: int = 50_000
+    rate: float = 2e-3
+    points: float = 2.0  # weight of f = 0 at the points, in units of that of known distances
+    settled: float = 0.25  # of the steps, after which the regions that the outside does not reach get their signs
+    clear: float = 0.1  # mean slope of the field into a region, from which on that has a sign
+    faint: float = 0.15  # mean slope at the points, below which it says nothing: that of an open sheet
+    contradicted: float = 0.01  # share of the places
+    asked: int = 16_000  # points at which winding numbers are looked at
+    far: float = 0.05  # from the points, where wrong signs of a few of them no longer decide a winding number
+
+
+SIGNING = SignOptions()
+
 STAGE = "level 0: signs"
 STAGES = tuple(f"{STAGE} ({number} of 2)" for number in (1, 2))  # one for each witness
 
@@ -79,7 +92,7 @@ class Signs(NamedTuple):
     @property
     def clear(self) -> bool:
         """Whether there was an in- and an outside; of an open sheet there is none, and signs stay."""
-        return self.slope >= FAINT
+        return self.slope >= SIGNING.faint
 
 
 class Places(NamedTuple):
@@ -100,11 +113,11 @@ class Places(NamedTuple):
     @classmethod
     def around(cls, index: CloudDistance, *, seed: int) -> Places:
         """Drawn as for level 0's distances."""
-        points = spread_points(index, SAMPLES, torch.Generator().manual_seed(seed))
+        points = spread_points(index, SIGNING.samples, torch.Generator().manual_seed(seed))
         distance = torch.from_numpy(index.nearest(points.numpy())).float().clamp(min=1e-6)
         region = torch.from_numpy(Exterior(index.points.astype(np.float64)).regions(points.double().numpy()))
         depth = torch.from_numpy(index.winding_number(points.numpy())).float() - 0.5
-        sure = (depth.abs() > SURE) & (distance > FAR)
+        sure = (depth.abs() > SAMPLING.sure) & (distance > SIGNING.far)
         return cls(points, distance, region, torch.where(sure, -depth.sign(), 0.0))
 
     @property
@@ -112,7 +125,7 @@ class Places(NamedTuple):
         """Whether the witnesses contradict each other, or there is a hollow or another part whose sign is in doubt."""
         inside = float(((self.region == OUTER_REGION) & (self.winding < 0)).float().mean())
         enclosed = torch.bincount(self.region)[OUTER_REGION + 1 :]
-        return inside > CONTRADICTED or int((enclosed > CONTRADICTED * len(self.region)).sum()) > 1
+        return inside > SIGNING.contradicted or int((enclosed > SIGNING.contradicted * len(self.region)).sum()) > 1
 
 
 def give_signs(
@@ -124,6 +137,7 @@ def give_signs(
     places: Places | None = None,
     flag: StopFlag | None = None,
     report: Report | None = None,
+    options: SignOptions = SIGNING,
 ) -> Signs | None:
     """Which normals point inward, by a network that is not told.
 
@@ -135,6 +149,7 @@ def give_signs(
         places: see `Places.around`; None to draw them.
         flag: asks to stop.
         report: told of the training, as the stages `STAGES`.
+        options: numbers of the algorithm.
 
     Returns:
         What was found; None if it was asked to stop.
@@ -146,8 +161,10 @@ def give_signs(
     for stage, (witness, sign, region) in zip(STAGES, witnesses, strict=True):
         siren = new_level(config, 0, residual=False).to(device)
         generator = torch.Generator().manual_seed(config.seed)
-        objective = _Unoriented(siren, points, places, sign, region, generator=generator, device=device)
-        trainer = Trainer(objective, stage=stage, steps=STEPS)
+        objective = _Unoriented(
+            siren, points, places, sign, region, generator=generator, device=device, options=options
+        )
+        trainer = Trainer(objective, stage=stage, steps=options.steps)
         if not trainer.run(flag, report=report):
             return None
         with torch.no_grad():
@@ -155,13 +172,13 @@ def give_signs(
         found.append(((gradient * normals).sum(dim=1), witness))
     slope, witness = max(found, key=lambda one: float(one[0].abs().mean()))
     clear = float(slope.abs().mean())
-    if clear < FAINT:
+    if clear < options.faint:
         return Signs(np.zeros(len(points), bool), clear, witness)
     signs = settle_signs(points.double().numpy(), normals.double().numpy(), slope.double().numpy())
     return Signs(signs < 0, clear, witness)
 
 
-def fits_better(cloud: OrientedCloud, signs: Signs) -> bool:
+def fits_better(cloud: OrientedCloud, signs: Signs, options: SignOptions = SIGNING) -> bool:
     """Whether these signs fit the cloud better than its own, by far.
 
     Winding numbers are ½ at points whose normals are right. They are asked where normals were turned and nowhere else,
@@ -171,11 +188,12 @@ def fits_better(cloud: OrientedCloud, signs: Signs) -> bool:
     Args:
         cloud: as it was prepared.
         signs: of its normals.
+        options: numbers of the algorithm.
     """
     turned = cloud.points[signs.turned]
     if not len(turned):
         return False
-    turned = turned[spread(turned.astype(np.float64), ASKED)]
+    turned = turned[spread(turned.astype(np.float64), options.asked)]
     after = np.where(signs.turned[:, None], -cloud.normals, cloud.normals)
     return _misfit(cloud.points, after, turned) < WINDING.much_less * _misfit(cloud.points, cloud.normals, turned)
 
@@ -223,6 +241,7 @@ class _Unoriented(Objective):
         region: ``(M,)`` of those beyond `OUTER_REGION` the signs follow from the field on its way; None: they stay.
         generator: draws the batches.
         device: that trains.
+        options: numbers of the algorithm.
     """
 
     def __init__(
@@ -235,30 +254,33 @@ class _Unoriented(Objective):
         *,
         generator: torch.Generator,
         device: torch.device,
+        options: SignOptions = SIGNING,
     ) -> None:
-        super().__init__(siren, [Group(list(siren.parameters()), warm_cosine(RATE))], generator)
+        self.options = options
+        super().__init__(siren, [Group(list(siren.parameters()), warm_cosine(self.options.rate))], generator)
         self.siren, self.points, self.places = siren, points.to(device), places.points.to(device)
         self.distance, self.sign = places.distance.to(device), sign.to(device)
         self.region = None if region is None else region.to(device)
 
     def losses(self, step: int, done: float) -> tuple[dict[str, Tensor], Tensor]:
         """See `Objective.losses`."""
-        if self.region is not None and done >= SETTLED:
+        if self.region is not None and done >= self.options.settled:
             self._settle(self.region)
             self.region = None
         at, by = (
-            torch.randint(len(rows), (BATCH // 2,), generator=self.generator) for rows in (self.points, self.places)
+            torch.randint(len(rows), (self.options.batch // 2,), generator=self.generator)
+            for rows in (self.points, self.places)
         )
         at, by = upload(at, self.points.device), upload(by, self.points.device)
         value = self.siren.value(torch.cat((self.points[at], self.places[by])))
-        surface, space = value.split(BATCH // 2)
+        surface, space = value.split(self.options.batch // 2)
         distance, sign = self.distance[by], self.sign[by]
         known = (space - sign * distance).square()
         terms = {
             "points": surface.square().mean(),
             "space": torch.where(sign == 0, (space.abs() - distance).clamp(min=0).square(), known).mean(),
         }
-        return terms, POINTS * terms["points"] + terms["space"]
+        return terms, self.options.points * terms["points"] + terms["space"]
 
     @torch.no_grad()
     def _settle(self, region: Tensor) -> None:
@@ -269,5 +291,5 @@ class _Unoriented(Objective):
         total = torch.zeros(count, device=weight.device).index_add_(0, region, weight)
         slope = torch.zeros_like(total).index_add_(0, region, weight * value / self.distance)
         slope /= total.clamp(min=1e-30)
-        signs = torch.where(slope.abs() > CLEAR, slope.sign(), 0.0)
+        signs = torch.where(slope.abs() > self.options.clear, slope.sign(), 0.0)
         self.sign = torch.where(region > OUTER_REGION, signs[region], self.sign)

@@ -26,7 +26,7 @@ from ..render.picture import Image, picture_bytes, write_picture
 from ..surface.surface import sample_points
 from ..surface.trim import in_region, thinned
 from ..texture.train import FittedTexture, fit_texture, texture_step_seconds
-from ..training.budget import LEAST_SECONDS, Budget
+from ..training.budget import BUDGET, Budget
 from ..training.folder import RADIANCE_FILE, SUPPORT_FILE, TEXTURE_FILE, RunFolder, digest_of
 from ..training.machine import choose_device, environment
 from ..training.report import Progress, Report, reported, silent
@@ -187,7 +187,7 @@ class _Reconstruction:
         if left is None:
             return None
         after = self.after_seconds(left)
-        return max((self.budget.left() or 0.0) - min(after, FINISH.after_share * left), LEAST_SECONDS)
+        return max((self.budget.left() or 0.0) - min(after, FINISH.after_share * left), BUDGET.least_seconds)
 
     def after_seconds(self, left: float) -> float:
         """Seconds for the held-out views and the texture, from the time of a small picture and a few steps."""
@@ -436,7 +436,7 @@ def scene_texture(
         cloud = PointCloud(images.similarity.to_input(points), colors=colors, source=str(images.source))
     settings = texture_settings(config)
     if seconds is not None:
-        settings = dataclasses.replace(settings, time_budget=max(seconds, LEAST_SECONDS))
+        settings = dataclasses.replace(settings, time_budget=max(seconds, BUDGET.least_seconds))
     return fit_texture(
         model.geometry, cloud, settings, similarity=images.similarity, progress=progress, started=started
     )

@@ -23,7 +23,7 @@ from ...neural_fields.fields.losses import color_loss, tangential_loss
 from ...neural_fields.networks.texture import ColorSiren
 from ...neural_fields.spacetime.dynamic_tracing import moment
 from ..training.atomic import prune
-from ..training.budget import SAMPLING_SHARE, Budget, affordable, step_seconds
+from ..training.budget import BUDGET, Budget, affordable, step_seconds
 from ..training.config import load_config
 from ..training.folder import (
     TEXTURE_FILE,
@@ -140,7 +140,7 @@ def fit_texture(
     with reported(progress, "texture: samples"):
         left = budget.left()
         if left is not None:
-            seconds = SAMPLING_SHARE * left
+            seconds = BUDGET.sampling_share * left
             count = affordable(lambda count: made(*part(count)), len(cloud), seconds, fewest=FEWEST_COLORED)
             if count < len(cloud):
                 cloud, band_samples = part(count)

@@ -9,9 +9,6 @@ from torch import Tensor
 
 __all__ = ["Focus"]
 
-EVERY = 16  # steps after which a training draws by newer errors
-STRIP = 16  # neighbouring pixels of a line share one error; samples that are no neighbours have one each
-
 
 class Focus:
     """Pixels of a pool, drawn evenly or by the errors of their strips.
@@ -25,14 +22,14 @@ class Focus:
         pixels: how many there are, line after line.
         share: of the draws that go by errors, from 0 to 1.
         device: of the errors.
-        strip: how many pixels after one another share an error.
+        strip: how many neighbouring pixels of a line share an error; 1 for samples that are no neighbours.
 
     Attributes:
         errors: ``(S,)`` of the strips, running means; 1 in the beginning.
         bounds: ``(S,)`` their running sums when `refresh` was called last, in float64 on the CPU.
     """
 
-    def __init__(self, pixels: int, share: float, device: torch.device, *, strip: int = STRIP) -> None:
+    def __init__(self, pixels: int, share: float, device: torch.device, *, strip: int = 16) -> None:
         self.pixels, self.share, self.strip = pixels, share, strip
         self.errors = torch.ones(-(-pixels // strip), device=device)
         self.refresh()
@@ -50,7 +47,7 @@ class Focus:
             kept: the objective's, with what `kept` has put there.
         """
         self.errors, self.bounds = kept["errors"], kept["bounds"]
-        if step % EVERY == 0:
+        if step % 16 == 0:
             self.refresh()
             kept["bounds"] = self.bounds
         return self

@@ -26,10 +26,6 @@ __all__ = ["Outcome", "check_jobs", "run_jobs", "run_streams"]
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-# How long workers may take to write their checkpoints after Ctrl-C.
-GRACE_SECONDS = 60.0
-# How long Ctrl-C may go unheard by threads.
-HEARING_SECONDS = 0.2
 # Read by Ray when it is imported: no usage reports, devices stay visible to tasks that ask for none, and workers do not
 # give way to whatever else runs: they are what was asked for, and their seconds are measured.
 RAY_ENVIRONMENT = {
@@ -146,7 +142,7 @@ def run_streams(
         waiting = {threads.submit(work, item): index for index, item in enumerate(items)}
         while waiting:
             # A signal that arrives just before a wait is heard after it, so that no wait may be long.
-            for done in wait(waiting, HEARING_SECONDS, FIRST_COMPLETED).done:
+            for done in wait(waiting, 0.2, FIRST_COMPLETED).done:
                 outcome = outcomes[waiting.pop(done)] = done.result()
                 if report is not None:
                     report(outcome)
@@ -221,10 +217,10 @@ def _collected(ray: Any, done: Any, item: Item) -> Outcome[Item, Any]:
 
 
 def _stop(ray: Any, tasks: list[Any]) -> None:
-    """Interrupt what runs, as Ctrl-C would, forget what waits, and let checkpoints be written."""
+    """Interrupt what runs, as Ctrl-C would, forget what waits, and give checkpoints a minute to be written."""
     for task in tasks:
         ray.cancel(task)
-    ray.wait(tasks, num_returns=len(tasks), timeout=GRACE_SECONDS)
+    ray.wait(tasks, num_returns=len(tasks), timeout=60.0)
 
 
 def _gpus_each(gpus: int, jobs: int) -> float:

@@ -16,9 +16,6 @@ from .report import Progress, Report
 
 __all__ = ["Lines", "counter_bar", "progress_bars", "time_words"]
 
-# Seconds between two lines about a stage, where there is no terminal.
-SILENCE = 30.0
-
 
 @contextmanager
 def progress_bars(*, clock: Callable[[], float] = time.monotonic) -> Iterator[Report]:
@@ -72,7 +69,7 @@ class Lines:
         begun, before = self.begun.setdefault(progress.stage, (now, progress.fraction))
         if ended and (self.counting or progress.stage == self.finished):
             return
-        if not ended and now - self.told < SILENCE:
+        if not ended and now - self.told < 30:
             return
         if ended:
             steps = f"{progress.step:,} steps" if progress.losses else "done"

@@ -20,9 +20,6 @@ from ...neural_fields.backend.devices import Supply
 
 __all__ = ["Again", "CudaGraphs", "Recorder", "Replays", "Results", "Work"]
 
-# Recorded kinds of steps that are kept: each holds memory for all its intermediate results.
-KEPT = 12
-
 Results = Mapping[str, Tensor]
 Work = Callable[[], Results]
 
@@ -92,14 +89,16 @@ class Replays:
     Args:
         device: where they are done.
         recorder: how they are recorded.
+        kept: kinds that are kept; each holds memory for all its intermediate results.
 
     Attributes:
         recorded: how many times something was.
         refused: why nothing is recorded any more; empty as long as it is.
     """
 
-    def __init__(self, device: torch.device, recorder: Recorder) -> None:
+    def __init__(self, device: torch.device, recorder: Recorder, *, kept: int = 12) -> None:
         self.device, self.recorder, self.recorded, self.refused = device, recorder, 0, ""
+        self.kept = kept
         self._kinds: OrderedDict[Hashable, _Kind] = OrderedDict()
 
     def do(self, kind: Hashable, work: Work) -> Results:
@@ -139,6 +138,6 @@ class Replays:
         with supply.noting():
             results = work()
         self._kinds[kind] = _Kind(supply, None, results)
-        if len(self._kinds) > KEPT:
+        if len(self._kinds) > self.kept:
             self._kinds.popitem(last=False)
         return results

@@ -8,6 +8,7 @@ import pytest
 from mplicits.datasets import OrientedCloud, PointCloud
 from mplicits.neural_fields import InputError, Similarity, Sphere, extract_mesh
 from mplicits.pipelines.fit.train import prepare
+from mplicits.pipelines.fit.unoriented import SIGNING
 from mplicits.pipelines.mesh.files import write_mesh
 from mplicits.pipelines.training.settings import FitConfig
 
@@ -20,8 +21,8 @@ CONFIG = FitConfig(widths=(32, 32), depths=(2, 2), omegas=(20.0, 20.0), steps=(1
 
 @pytest.fixture
 def ball(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    for name, less in (("STEPS", 150), ("BATCH", 1024), ("SAMPLES", 10_000)):
-        monkeypatch.setattr(f"mplicits.pipelines.fit.unoriented.{name}", less)
+    for name, less in (("steps", 150), ("batch", 1024), ("samples", 10_000)):
+        monkeypatch.setitem(vars(SIGNING), name, less)
     write_mesh(tmp_path / "ball.ply", extract_mesh(Sphere(radius=0.7), resolution=32), Similarity((5.0, 0, -1), 20.0))
     return tmp_path / "ball.ply"
 

@@ -5,7 +5,7 @@ import torch
 from mplicits.datasets import sample_sphere
 from mplicits.neural_fields import Field, Sphere, Union
 from mplicits.neural_fields.fields.primitives import Evaluated
-from mplicits.pipelines.fit.band import WIDEST, Band, band_of, delta_of, with_wrong_sides
+from mplicits.pipelines.fit.band import BAND, Band, band_of, delta_of, with_wrong_sides
 from mplicits.pipelines.fit.cloud import CloudDistance
 
 
@@ -52,7 +52,8 @@ def test_a_level_that_is_right_keeps_the_band_of_its_points() -> None:
 
 
 @pytest.mark.parametrize(
-    ("delta", "expected"), [(0.12, 1.05 * 0.2), (0.06, WIDEST * 0.06), pytest.param(0.21, 0.21, marks=pytest.mark.slow)]
+    ("delta", "expected"),
+    [(0.12, 1.05 * 0.2), (0.06, BAND.widest * 0.06), pytest.param(0.21, 0.21, marks=pytest.mark.slow)],
 )
 def test_a_band_holds_what_a_level_puts_on_the_wrong_side(delta: float, expected: float) -> None:
     """A ball of radius 0.2 hangs beside the sphere: 0.2 deep. Of the places in it the deepest is asked, nearly."""

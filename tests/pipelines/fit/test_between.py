@@ -9,7 +9,7 @@ from mplicits.datasets import PointCloud
 from mplicits.datasets.synthetic.samples import sample_sphere, sample_torus
 from mplicits.neural_fields import Torus
 from mplicits.pipelines.fit import between
-from mplicits.pipelines.fit.between import ONE_SIDED, TURN, Densified, dense_distance, densified
+from mplicits.pipelines.fit.between import BETWEEN, Densified, dense_distance, densified
 from mplicits.pipelines.fit.cloud import CloudDistance
 from mplicits.pipelines.fit.train import fit
 from mplicits.pipelines.training.settings import FitConfig
@@ -151,7 +151,7 @@ def test_guessed_normals_are_not_followed_beyond_the_rim_of_a_strip() -> None:
     for found, bounded in ((believed, False), (guessed, True)):
         beyond = np.linalg.norm((np.abs(found[:, :2]) - [1, 0.1]).clip(min=0), axis=1)
         fourth = np.asarray(tree.query(found, k=4)[0])[:, 3]
-        assert bool((beyond < ONE_SIDED * fourth).all()) == bounded
+        assert bool((beyond < BETWEEN.one_sided * fourth).all()) == bounded
     assert len(guessed) > 0.7 * len(believed)
 
 
@@ -181,7 +181,7 @@ def test_dense_clouds_are_left_as_they_are() -> None:
     points = torch.from_numpy(sample_sphere(3000).points).float()
     normals = 2 * points
     plain = CloudDistance(points, normals)
-    enough = 0.99 * TURN / plain.spacing
+    enough = 0.99 * BETWEEN.turn / plain.spacing
     for omega, count in ((enough, 10_000), (80.0, 3000)):
         index = dense_distance(points, normals, omega=omega, count=count)
         assert (index.given, len(index.points), index.gap) == (3000, 3000, index.spacing)

@@ -12,9 +12,7 @@ from mplicits.neural_fields import Siren, Sphere
 from mplicits.pipelines.cli.info import describe
 from mplicits.pipelines.fit.band import Band
 from mplicits.pipelines.fit.heldout import (
-    FEWEST,
-    LEARNT,
-    VOXEL,
+    JUDGE,
     Each,
     Error,
     Fall,
@@ -57,17 +55,17 @@ def test_whole_voxels_are_held_out() -> None:
     x = np.random.default_rng(0).uniform(-1, 1, (20_000, 3)).astype(np.float32)
     spacing = 0.1
     held = held_out(x, spacing, 0.03)
-    size = np.bincount(np.unique(np.floor(x / (VOXEL * spacing)), axis=0, return_inverse=True)[1].reshape(-1))
+    size = np.bincount(np.unique(np.floor(x / (JUDGE.voxel * spacing)), axis=0, return_inverse=True)[1].reshape(-1))
     assert 600 <= held.sum() <= 600 + size.max()
     assert 600 <= held_out(x, spacing, 0.01).sum() <= 600 + size.max()  # a share would be two hundred
     assert 400 <= held_out(x[:8000], spacing, 0.01).sum() <= 400 + size.max()  # and six hundred too many
-    cells = np.floor(x.astype(np.float64) / (VOXEL * spacing)).astype(np.int64)
+    cells = np.floor(x.astype(np.float64) / (JUDGE.voxel * spacing)).astype(np.int64)
     inside, outside = ({tuple(cell) for cell in cells[rows].tolist()} for rows in (held, ~held))
     assert not inside & outside
     assert (held_out(x, spacing, 0.03) == held).all()
     assert (held_out(x, spacing, 0.03, seed=1) != held).any()
-    assert held_out(x[:3000], spacing, 0.01).sum() >= FEWEST  # fewer tell nothing
-    for few, share in ((x, 0.0), (x[: 10 * FEWEST - 1], 0.03)):
+    assert held_out(x[:3000], spacing, 0.01).sum() >= JUDGE.fewest  # fewer tell nothing
+    for few, share in ((x, 0.0), (x[: 10 * JUDGE.fewest - 1], 0.03)):
         assert not held_out(few, spacing, share).any()
 
 
@@ -322,10 +320,10 @@ def test_no_level_of_a_fit_is_worse_at_held_out_points_than_the_one_before(noise
     run = fit(PointCloud(x, normals.astype(np.float32), None, "ball"), config, out=tmp_path / "run")
     stage = run.record["stages"][1]
     judged = stage["held_out"]
-    assert judged["points"] >= FEWEST / 2
+    assert judged["points"] >= JUDGE.fewest / 2
     assert math.isfinite(judged["before"])
     falls = judged["fall_in_standard_errors"].values()
-    learns = min(falls) > 0 and judged["learnt"] < LEARNT
+    learns = min(falls) > 0 and judged["learnt"] < JUDGE.learnt
     assert stage["silenced"] == ((max(falls) <= 2 or min(falls) < -2) and not learns)
     assert judged["verdict"].startswith(f"level 1 {'set to zero' if stage['silenced'] else 'kept'}")
     assert judged["verdict"] in describe(tmp_path / "run")

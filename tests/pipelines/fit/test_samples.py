@@ -4,13 +4,11 @@ import numpy as np
 import pytest
 import torch
 from mplicits.neural_fields import MultiscaleSDF, Siren, Sphere, Torus, Union
-from mplicits.pipelines.fit.cloud import DOUBT, CloudDistance
+from mplicits.pipelines.fit.cloud import CLOUD, CloudDistance
 from mplicits.pipelines.fit.samples import (
     LEAST,
-    LEFT,
+    SAMPLING,
     SQUARES,
-    SURE,
-    SURE_GUESSED,
     Samples,
     Weights,
     band_samples,
@@ -87,7 +85,7 @@ def test_beside_the_rim_of_a_hole_discs_that_agree_go_on_where_the_surface_ends(
     beside = torch.tensor([[0.95, 0.0, 0.03], [0.0, 0.95, 0.03], [-0.92, 0.0, 0.05]]) * RADIUS  # within the sphere
     winding = bowl.winding_number(beside.numpy())
     assert (winding < 0.5).all()
-    assert (winding > 0.5 - DOUBT).all()
+    assert (winding > 0.5 - CLOUD.doubt).all()
     assert (bowl.signed(beside) < 0).all()
     # Not of points that fill a sparse cloud in, which may go on beyond an edge.
     filled = CloudDistance(points[below], normals[below], given=int(below.sum()) - 1)
@@ -267,7 +265,7 @@ def test_places_in_less_doubt_are_empty_where_normals_are_guesses() -> None:
         for places, sure in ((found[guessed].empty, True), (found[guessed].unseen, False)):
             depth = np.abs(bowl.winding_number(places.points.numpy()) - 0.5)
             # Which dipoles count one by one depends on which places are asked for together.
-            least = (SURE_GUESSED if guessed else SURE) + (-FAR if sure else FAR)
+            least = (SAMPLING.sure_guessed if guessed else SAMPLING.sure) + (-FAR if sure else FAR)
             assert ((depth > least) == sure).all()
     assert len(found[True].empty) > len(found[False].empty)
     assert len(found[True].unseen) < len(found[False].unseen)
@@ -355,7 +353,7 @@ def test_near_a_cloud_of_guessed_normals_all_of_them_together_say_the_side() -> 
     assert {(source.normal, source.eikonal) for source in sources} == {(1.0, 2.0)}
 
 
-@pytest.mark.parametrize(("guessed", "left"), [(True, LEFT), (False, 1.0)])
+@pytest.mark.parametrize(("guessed", "left"), [(True, SAMPLING.left), (False, 1.0)])
 def test_distances_are_weighed_by_the_noise_that_is_left(guessed: bool, left: float) -> None:
     points, normals = sphere_points(2000)
     cloud, config = CloudDistance(points, normals, noise=0.01, guessed=guessed), FitConfig()

@@ -14,8 +14,8 @@ from mplicits.datasets import PointCloud
 from mplicits.neural_fields import InputError, load_field
 from mplicits.neural_fields.meshing.extract import extract_mesh
 from mplicits.pipelines.cli.info import describe
-from mplicits.pipelines.fit.heldout import FEWEST
-from mplicits.pipelines.fit.level import CALM, calm_omega
+from mplicits.pipelines.fit.heldout import JUDGE
+from mplicits.pipelines.fit.level import LEVEL, calm_omega
 from mplicits.pipelines.fit.train import fit
 from mplicits.pipelines.training.folder import read_record
 from mplicits.pipelines.training.machine import choose_device
@@ -68,7 +68,11 @@ def test_bands_hold_the_points(fitted: Path) -> None:
 
 
 def test_the_run_directory(fitted: Path) -> None:
-    assert sorted(path.name for path in fitted.iterdir()) == ["field.safetensors", "run.json", "support.safetensors"]
+    assert sorted(path.name for path in fitted.iterdir() if path.name != "run.lock") == [
+        "field.safetensors",
+        "run.json",
+        "support.safetensors",
+    ]
     record = json.loads((fitted / "run.json").read_text())
     assert record["finished"] is True
     assert record["cloud"] == "ball"
@@ -117,7 +121,7 @@ def test_frequencies_of_residuals_follow_the_noise_where_normals_are_guesses(fit
     config = replace(SMALL, **small, learning_rates=(3e-3,) * 3, samples=6000, between=False)
     whole = fit(PointCloud(noisy), config, out=tmp_path / "whole")
     stages, noise = whole.record["stages"], whole.record["cleaning"]["smoothed_noise"]
-    cap = CALM * whole.record["similarity"]["scale"] / noise
+    cap = LEVEL.calm * whole.record["similarity"]["scale"] / noise
     assert 5 < cap < 90
     assert [stage["omega"] for stage in stages] == pytest.approx([5.0, min(8.0, cap), cap])
 
@@ -135,8 +139,13 @@ def test_frequencies_of_residuals_follow_the_noise_where_normals_are_guesses(fit
 
 def test_frequencies_fall_no_lower_than_that_of_level_0() -> None:
     config = replace(SMALL, omegas=(10.0, 40.0))
-    assert [calm_omega(config, 1, noise) for noise in (0.0, CALM / 50, CALM / 20, CALM / 5)] == [40, 40, 20, 10]
-    assert calm_omega(config, 0, CALM / 5) == 10
+    assert [calm_omega(config, 1, noise) for noise in (0.0, LEVEL.calm / 50, LEVEL.calm / 20, LEVEL.calm / 5)] == [
+        40,
+        40,
+        20,
+        10,
+    ]
+    assert calm_omega(config, 0, LEVEL.calm / 5) == 10
 
 
 def test_a_level_that_is_worse_than_none_adds_nothing(fitted: Path, tmp_path: Path) -> None:
@@ -158,7 +167,7 @@ def test_the_level_that_nobody_judges_learns_from_all_points() -> None:
     kept = len(sphere_cloud()) - run.record["cleaning"]["dropped_outliers"]
     assert first["samples"]["surface"] == kept
     assert second["held_out"]["points"] <= kept - second["samples"]["surface"]
-    assert FEWEST <= kept - second["samples"]["surface"] < 0.1 * kept
+    assert JUDGE.fewest <= kept - second["samples"]["surface"] < 0.1 * kept
 
 
 def test_levels_are_handed_out_as_they_are_finished() -> None:

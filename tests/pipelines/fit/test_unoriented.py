@@ -12,7 +12,7 @@ from mplicits.datasets import OrientedCloud, PointCloud, prepare_cloud, sample_s
 from mplicits.neural_fields import load_field
 from mplicits.pipelines.fit.cloud import CloudDistance
 from mplicits.pipelines.fit.train import fit, prepare
-from mplicits.pipelines.fit.unoriented import STAGES, Places, Signs, fits_better, give_signs
+from mplicits.pipelines.fit.unoriented import SIGNING, STAGES, Places, Signs, fits_better, give_signs
 from mplicits.pipelines.training.settings import FitConfig
 from mplicits.pipelines.training.trainer import Interrupted, Progress, StopFlag
 from torch import Tensor
@@ -35,8 +35,8 @@ FEW = 0.01
 @pytest.fixture(autouse=True)
 def _less_of_all(monkeypatch: pytest.MonkeyPatch) -> None:
     """Shapes as simple as these are clear after a quarter of the work."""
-    for name, less in (("STEPS", 150), ("BATCH", 2048), ("SAMPLES", 20_000)):
-        monkeypatch.setattr(f"mplicits.pipelines.fit.unoriented.{name}", less)
+    for name, less in (("steps", 150), ("batch", 2048), ("samples", 20_000)):
+        monkeypatch.setitem(vars(SIGNING), name, less)
 
 
 def ball(count: int, radius: float, *, inward: bool = False) -> tuple[Tensor, Tensor]:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 import pytest
 import torch
 from mplicits.pipelines.training import budget as module
-from mplicits.pipelines.training.budget import FEWEST_STEPS, Budget, affordable, step_seconds
+from mplicits.pipelines.training.budget import BUDGET, Budget, affordable, step_seconds
 
 STEPS, COSTS = (1000, 500, 500), (0.01, 0.02, 0.04)  # 10 s, 10 s, 20 s
 
@@ -67,7 +67,7 @@ def test_levels_that_are_left_out_are_recorded() -> None:
     budget.leave_out(1, 3)
     record = json.loads(json.dumps(budget.record()))["budget"]
     assert record["left_out"] == [1, 2]
-    assert record["notes"] == [f"levels 1 to 2 are left out: too little time for {FEWEST_STEPS} steps"]
+    assert record["notes"] == [f"levels 1 to 2 are left out: too little time for {BUDGET.fewest_steps} steps"]
 
 
 def making(now: list[float], seconds: Callable[[int], float]) -> tuple[Callable[[int], None], list[int]]:

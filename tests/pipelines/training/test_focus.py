@@ -2,8 +2,9 @@
 
 import pytest
 import torch
-from mplicits.pipelines.training.focus import STRIP, Focus
+from mplicits.pipelines.training.focus import Focus
 
+STRIP = 16
 PIXELS, DRAWS = 5 * STRIP + 3, 40_000
 CPU = torch.device("cpu")
 

@@ -3,10 +3,8 @@
 from collections.abc import Callable, Mapping
 from typing import NoReturn
 
-import pytest
 import torch
 from mplicits.neural_fields.backend.devices import Supply, handed, is_supplied
-from mplicits.pipelines.training import replay
 from mplicits.pipelines.training.replay import Again, CudaGraphs, Recorder, Replays
 from torch import Tensor
 
@@ -67,9 +65,8 @@ def test_replays_are_the_work_itself(accelerator: torch.device) -> None:
     assert replays.recorded == 2
 
 
-def test_kinds_that_were_not_used_for_long_are_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(replay, "KEPT", 2)
-    replays = Replays(torch.device("cpu"), Again())
+def test_kinds_that_were_not_used_for_long_are_forgotten() -> None:
+    replays = Replays(torch.device("cpu"), Again(), kept=2)
     for kind in (0, 1, 1, 0, 2, 0, 1):  # 1 is forgotten for 2, and is done as if it were new
         replays.do(kind, lambda kind=kind: {"kind": torch.tensor(kind)})
     assert replays.recorded == 2
