@@ -33,7 +33,6 @@ ROOMS = (
     "pipelines/texture",
     "pipelines/mesh",
     "pipelines/render",
-    "pipelines/viewer",
     "pipelines/web",
     "pipelines/evolve",
     "pipelines/reconstruct",

@@ -96,7 +96,7 @@ class Run:
         """Look at the fit, in the browser or in a notebook; see `WorldField.show`.
 
         Raises:
-            InputError: viser is not installed.
+            InputError: no port is free.
         """
         return self.world.show(up=up, block=block, browser=browser)
 

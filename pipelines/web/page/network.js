@@ -100,7 +100,6 @@ class Networks {
       triple: compile(gl, parts, 'plane', 'triple'),
     };
     this.nets = layersOfAll.map((layers) => this.upload(layers));
-    if (this.nets.some((net) => net.directed)) this.programs.directedSine = compile(gl, parts, 'plane', 'layer', ['FIRST', 'DIRECTED']);
     const quads = Math.max(...this.nets.map((net) => net.quads));
     const phases = Math.max(...this.nets.map((net) => net.depth));
     this.work = [activations(gl, quads), activations(gl, quads)];
@@ -115,8 +114,7 @@ class Networks {
     const { gl } = this;
     const width = layers[0].bias.length, padded = 4 * Math.ceil(width / 4), depth = layers.length - 1;
     const { weight: last, bias: lastBias } = layers[depth];
-    // Of six inputs, the last three are a direction; such a network has no sweep back.
-    const net = { width, depth, quads: padded / 4, sines: [], directed: layers[0].weight.length === 6 * width };
+    const net = { width, depth, quads: padded / 4, sines: [] };
     layers.slice(0, depth).forEach(({ weight, bias }, index) => {
       const inputs = weight.length / width;
       const forward = (row, column) => (column < inputs ? weight[row * inputs + column] : 0);
@@ -146,7 +144,7 @@ class Networks {
       gl.deleteTexture(held.texture);
       gl.deleteFramebuffer(held.buffer);
     }
-    for (const texture of [this.points, this.ways]) gl.deleteTexture(texture);
+    gl.deleteTexture(this.points);
   }
 
   // The moment, of a field that moves: b + t w, the weights of time folded into the first biases.
@@ -172,28 +170,25 @@ class Networks {
         gl.deleteFramebuffer(held.buffer);
       }
     }
-    for (const texture of [this.points, this.ways]) if (texture) gl.deleteTexture(texture);
+    if (this.points) gl.deleteTexture(this.points);
     this.rows = 4 * Math.ceil(rows / 4);
     this.points = texture2d(gl, ROW, this.rows);
-    this.ways = this.nets.some((net) => net.directed) ? texture2d(gl, ROW, this.rows) : null;
     this.values = target2d(gl, ROW, this.rows / 4);
     this.triples = target2d(gl, ROW, this.rows);
     this.staged = new Float32Array(4 * ROW * this.rows);
   }
 
-  // Points (x, y, z for each) as the shaders want them, and directions.
-  load(points, count, ways = null) {
+  // Uploads points (x, y, z for each) as the shaders want them.
+  load(points, count) {
     const { gl } = this;
     const rows = Math.ceil(count / ROW);
     this.reserve(rows);
-    for (const [into, numbers] of [[this.points, points], ...(ways ? [[this.ways, ways]] : [])]) {
-      for (let i = 0; i < count; i++) {
-        for (let c = 0; c < 3; c++) this.staged[4 * i + c] = numbers[3 * i + c];
-      }
-      gl.activeTexture(gl.TEXTURE0);
-      gl.bindTexture(gl.TEXTURE_2D, into);
-      gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, ROW, rows, gl.RGBA, gl.FLOAT, this.staged.subarray(0, 4 * ROW * rows));
+    for (let i = 0; i < count; i++) {
+      for (let c = 0; c < 3; c++) this.staged[4 * i + c] = points[3 * i + c];
     }
+    gl.activeTexture(gl.TEXTURE0);
+    gl.bindTexture(gl.TEXTURE_2D, this.points);
+    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, ROW, rows, gl.RGBA, gl.FLOAT, this.staged.subarray(0, 4 * ROW * rows));
   }
 
   bind(place, unit, name, texture, kind) {
@@ -224,11 +219,10 @@ class Networks {
       const first = index === 0;
       const free = this.work.find((one) => one !== held);
       const into = keep ? this.phases[index] : free;
-      const begun = net.directed ? 'directed' : 'first';
-      const program = this.programs[first ? `${begun}${keep ? 'Phase' : 'Sine'}` : keep ? 'phase' : 'sine'];
+      const program = this.programs[first ? `first${keep ? 'Phase' : 'Sine'}` : keep ? 'phase' : 'sine'];
       this.pass(program, into.buffer, [0, 0, wide, net.quads], {
         arrays: first ? {} : { source: held.texture },
-        planes: { weights: layer.forward, bias: layer.bias, ...(first ? { points: this.points } : {}), ...(first && net.directed ? { ways: this.ways } : {}) },
+        planes: { weights: layer.forward, bias: layer.bias, ...(first ? { points: this.points } : {}) },
         whole: first ? { base } : { quads: net.quads },
       });
       if (keep) this.pass(this.programs.bend, free.buffer, [0, 0, wide, net.quads], { arrays: { phases: into.texture } });
@@ -290,11 +284,11 @@ class Networks {
     return this.read(this.values, count, 1);
   }
 
-  // Three outputs of a network, as r, g, b and 1; of one of six inputs, directions as well.
-  color(index, points, count, ways = null) {
+  // Three outputs of a network, as r, g, b and 1.
+  color(index, points, count) {
     if (!count) return new Float32Array(0);
     const net = this.nets[index];
-    this.load(points, count, ways);
+    this.load(points, count);
     this.each(count, (base, here, wide) => this.addTriples(net, this.sweep(net, base, wide, false), net.output, net.outputBias, base, here));
     this.counts.values[index] += count;
     return this.read(this.triples, count, 4);

@@ -106,15 +106,14 @@ class Field {
 }
 
 // Display colours around a surface: those of a network at points in the band of a level, the others first moved onto the
-// surface by x - f g / |g|^2; what does not arrive there has the colour of what lies outside. Where directions are
-// given, a second network says what colours gain by them.
+// surface by x - f g / |g|^2; what does not arrive there has the colour of what lies outside.
 class Colors {
-  // `source` answers value(points, count, level), jet(…), color(points, count) and color(points, count, ways), or promises to.
+  // `source` answers value(points, count, level), jet(…) and color(points, count), or promises to.
   constructor(source, { level, delta, outside }) {
     Object.assign(this, { source, level, delta, outside });
   }
 
-  async at(points, count, ways = null) {
+  async at(points, count) {
     const { source, delta } = this;
     const moved = points.slice(0, 3 * count);
     const reached = (await source.value(moved, count, this.level)).map((f) => Number(Math.abs(f) < delta));
@@ -133,90 +132,11 @@ class Colors {
       });
     }
     const found = await source.color(moved, count);
-    const gained = ways && (await source.color(moved, count, ways));
     const colors = new Float32Array(3 * count);
     for (let i = 0; i < count; i++) {
-      for (let c = 0; c < 3; c++) {
-        const own = found[4 * i + c] + (gained ? gained[4 * i + c] : 0);
-        colors[3 * i + c] = reached[i] ? Math.min(1, Math.max(0, own)) : this.outside[c];
-      }
+      for (let c = 0; c < 3; c++) colors[3 * i + c] = reached[i] ? Math.min(1, Math.max(0, found[4 * i + c])) : this.outside[c];
     }
     return colors;
-  }
-}
-
-// The mesh around the band, rasterised: where the ray of each pixel enters it first and leaves it last.
-class Hull {
-  constructor(gl, parts, arrays, header) {
-    this.gl = gl;
-    this.program = compile(gl, parts, 'hull', 'depth');
-    const { places, faces } = shellArrays(header, arrays);
-    this.places = gl.createVertexArray();
-    gl.bindVertexArray(this.places);
-    gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
-    gl.bufferData(gl.ARRAY_BUFFER, places, gl.STATIC_DRAW);
-    gl.enableVertexAttribArray(gl.getAttribLocation(this.program.program, 'position'));
-    gl.vertexAttribPointer(gl.getAttribLocation(this.program.program, 'position'), 3, gl.FLOAT, false, 0, 0);
-    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
-    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, faces, gl.STATIC_DRAW);
-    gl.bindVertexArray(null);
-    this.corners = faces.length;
-    this.target = null;
-  }
-
-  close() {
-    const { gl, target } = this;
-    gl.deleteVertexArray(this.places);
-    gl.deleteProgram(this.program.program);
-    if (!target) return;
-    gl.deleteTexture(target.texture);
-    gl.deleteFramebuffer(target.buffer);
-    gl.deleteRenderbuffer(this.depth);
-  }
-
-  // For each pixel of rows [first, first + rows): r = nearest front face, g = farthest back face; 0 where there is none.
-  crossings(camera, first, rows) {
-    const { gl, program } = this;
-    const { width } = camera;
-    if (this.target?.width !== width || this.target.height < rows) {
-      if (this.target) {
-        gl.deleteTexture(this.target.texture);
-        gl.deleteFramebuffer(this.target.buffer);
-        gl.deleteRenderbuffer(this.depth);
-      }
-      this.target = target2d(gl, width, rows);
-      this.depth = gl.createRenderbuffer();
-      gl.bindRenderbuffer(gl.RENDERBUFFER, this.depth);
-      gl.renderbufferStorage(gl.RENDERBUFFER, gl.DEPTH_COMPONENT24, width, rows);
-      gl.framebufferRenderbuffer(gl.FRAMEBUFFER, gl.DEPTH_ATTACHMENT, gl.RENDERBUFFER, this.depth);
-    }
-    const far = Math.hypot(...camera.eye) + 3, near = far / 4096;
-    gl.useProgram(program.program);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, this.target.buffer);
-    gl.viewport(0, 0, width, rows);
-    gl.uniform3f(program.at('eye'), ...camera.eye);
-    gl.uniformMatrix3fv(program.at('axes'), false, [...camera.right, ...camera.down, ...camera.forward]);
-    gl.uniform4f(program.at('lens'), camera.fx, camera.fy, camera.cx, camera.cy - first);
-    gl.uniform4f(program.at('frame'), width, rows, near, far);
-    gl.bindVertexArray(this.places);
-    gl.enable(gl.DEPTH_TEST);
-    gl.enable(gl.CULL_FACE);
-    gl.frontFace(gl.CW); // y points down in the target
-    gl.clearBufferfv(gl.COLOR, 0, [0, 0, 0, 0]);
-    for (const [face, test, clear, red] of [[gl.BACK, gl.LESS, 1, true], [gl.FRONT, gl.GREATER, 0, false]]) {
-      gl.colorMask(red, !red, false, false);
-      gl.clearBufferfv(gl.DEPTH, 0, [clear]);
-      gl.cullFace(face);
-      gl.depthFunc(test);
-      gl.drawElements(gl.TRIANGLES, this.corners, gl.UNSIGNED_INT, 0);
-    }
-    gl.colorMask(true, true, true, true);
-    gl.disable(gl.DEPTH_TEST);
-    gl.disable(gl.CULL_FACE);
-    gl.bindVertexArray(null);
-    const numbers = new Float32Array(4 * width * rows);
-    gl.readPixels(0, 0, width, rows, gl.RGBA, gl.FLOAT, numbers);
-    return numbers;
   }
 }
 
@@ -228,7 +148,7 @@ class Tracer {
     this.colors = header.colors && new Colors({
       value: (...asked) => this.field.value(...asked),
       jet: (...asked) => this.field.jet(...asked),
-      color: (points, count, ways) => this.networks.color(header.levels.length + Number(Boolean(ways)), points, count, ways),
+      color: (points, count) => this.networks.color(header.levels.length, points, count),
     }, header.colors);
     this.hull = new Hull(gl, parts, arrays, header);
   }
@@ -265,9 +185,9 @@ class Tracer {
   }
 
   // What rows [first, first + rows) of a camera's picture see: normal and depth of each pixel, depth 0 for nothing; and
-  // where it is `colored`, the surface's own colours; `directed`, as they are seen from there.
+  // where it is `colored`, the surface's own colours.
   // Depths are known to a tenth of a pixel, or to `precision` in units of the field.
-  async trace(camera, { level, normalLevel = level, first = 0, rows = camera.height, precision = null, colored = false, directed = false, clip = null }) {
+  async trace(camera, { level, normalLevel = level, first = 0, rows = camera.height, precision = null, colored = false, clip = null }) {
     const { size, tolerance, resolution } = ruleOf(camera, this.header.radius, precision);
     const seen = new Float32Array(4 * camera.width * rows);
     const rays = this.begin(camera, first, rows, clip);
@@ -290,8 +210,7 @@ class Tracer {
       for (let c = 0; c < 3; c++) points[3 * i + c] = camera.eye[c] + depth * rays.direction[3 * ray + c];
     });
     if (colored) {
-      const ways = directed ? Float32Array.from([...hits].flatMap((ray) => [...rays.direction.subarray(3 * ray, 3 * ray + 3)])) : null;
-      const colors = await this.colors.at(points, hits.length, ways);
+      const colors = await this.colors.at(points, hits.length);
       hits.forEach((ray, i) => color.set(colors.subarray(3 * i, 3 * i + 3), 4 * rays.pixel[ray]));
     }
     return { seen, color };

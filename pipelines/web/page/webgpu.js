@@ -176,7 +176,7 @@ class GpuTracer {
       first: [asked(0, this.lists[0], even), asked(0, this.lists[1], odd)],
       finer: this.nets.map((_, j) => (j && j < levels ? asked(j, this.lists[1 + j], this.slots.finer[j]) : null)),
       host: asked(0, this.identity, this.slots.asked),
-      colors: this.nets.slice(levels).map((_, k) => asked(levels + k, this.identity, this.slots.asked)),
+      colors: this.header.colors && asked(levels, this.identity, this.slots.asked),
     };
     const marched = (here, there) => this.group(
       this.layouts.march, whole(this.frame), whole(this.rays), whole(this.places), whole(this.lists[here]),
@@ -233,8 +233,8 @@ class GpuTracer {
     return bytes;
   }
 
-  // What networks say at a list of points: gradient and value of each, or its colour, or what that gains by direction.
-  async ask(points, count, level, kind, ways = null) {
+  // What networks say at a list of points: gradient and value of each, or its colour.
+  async ask(points, count, level, kind) {
     const found = new Float32Array(4 * count);
     for (let first = 0; first < count; first += MOST_RAYS) {
       const many = Math.min(MOST_RAYS, count - first);
@@ -242,19 +242,16 @@ class GpuTracer {
       this.setGates(level, this.header.deltas);
       const staged = new Float32Array(8 * many);
       for (let i = 0; i < many; i++) for (let c = 0; c < 3; c++) staged[8 * i + c] = points[3 * (first + i) + c];
-      // A direction stands where the answer will.
-      if (ways) for (let i = 0; i < many; i++) for (let c = 0; c < 3; c++) staged[8 * i + 4 + c] = ways[3 * (first + i) + c];
       const { queue } = this.device;
       queue.writeBuffer(this.places, 0, staged);
-      const coloring = Number(Boolean(ways)); // the texture, or what it gains by direction
-      const net = kind === 'color' ? this.header.levels.length + coloring : 0, jet = kind === 'jet' ? 1 : 0;
+      const net = kind === 'color' ? this.header.levels.length : 0, jet = kind === 'jet' ? 1 : 0;
       queue.writeBuffer(this.slots.asked, jet * KIND, Uint32Array.from([many]));
       const encoder = this.device.createCommandEncoder();
       this.clear(encoder);
       const pass = encoder.beginComputePass();
       if (kind === 'color') {
         pass.setPipeline(this.kernels[net][0]);
-        pass.setBindGroup(0, this.asks.colors[coloring], [0, 0]);
+        pass.setBindGroup(0, this.asks.colors, [0, 0]);
         pass.dispatchWorkgroups(this.crew(net, many));
         this.counts.passes++;
       } else {
@@ -283,12 +280,12 @@ class GpuTracer {
     return { value: Float32Array.from({ length: count }, (_, i) => found[4 * i + 3]), gradient };
   }
 
-  color(points, count, ways) {
-    return this.ask(points, count, 0, 'color', ways);
+  color(points, count) {
+    return this.ask(points, count, 0, 'color');
   }
 
   // See Tracer.trace.
-  async trace(camera, { level, normalLevel = level, first = 0, rows = camera.height, precision = null, colored = false, directed = false, clip = null }) {
+  async trace(camera, { level, normalLevel = level, first = 0, rows = camera.height, precision = null, colored = false, clip = null }) {
     const { width } = camera;
     const seen = new Float32Array(4 * width * rows);
     const strip = Math.max(1, Math.floor(MOST_RAYS / width));
@@ -309,11 +306,7 @@ class GpuTracer {
       }
       if (colored) {
         color = new Float32Array(seen.length);
-        const ways = directed ? Float32Array.from(pixels.flatMap((pixel, i) => {
-          const way = [0, 1, 2].map((c) => points[3 * i + c] - camera.eye[c]), length = Math.hypot(...way);
-          return way.map((part) => part / length);
-        })) : null;
-        const colors = await this.colors.at(points, pixels.length, ways);
+        const colors = await this.colors.at(points, pixels.length);
         pixels.forEach((pixel, i) => color.set(colors.subarray(3 * i, 3 * i + 3), 4 * pixel));
       }
     }
