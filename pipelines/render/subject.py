@@ -42,8 +42,6 @@ __all__ = [
 Float64 = NDArray[np.float64]
 
 FRAME_RESOLUTION = 128  # of the mesh that says what the camera has to look at
-SAMPLES = 500_000  # on a reference that is a mesh
-WIDER = 2.0  # discs of a reference, so that they leave no gaps between points that are spread at random
 
 
 @dataclass(frozen=True)
@@ -259,7 +257,7 @@ def reference_distance(subject: Subject, reference: str | Path | None) -> Callab
     surface = read_surface(reference)
     points, normals = surface.vertices, surface.normals
     if len(surface.faces):
-        points, normals = sample_points(surface, SAMPLES, np.random.default_rng(0))
+        points, normals = sample_points(surface, 500_000, np.random.default_rng(0))
     points = subject.similarity.to_unit(points)
     if normals is None:
         tree = KDTree(points)
@@ -268,7 +266,8 @@ def reference_distance(subject: Subject, reference: str | Path | None) -> Callab
     if known.sum() < 2:
         raise InputError(f"{reference}: fewer than two points with normals; nothing can be measured from it")
     cloud = CloudDistance(torch.from_numpy(points[known]), torch.from_numpy(normals[known]))
-    cloud.radii *= WIDER
+    # Wider discs leave no gaps between points that are spread at random.
+    cloud.radii *= 2.0
     return lambda places: cloud.signed(places).abs().to(places)
 
 

@@ -18,8 +18,6 @@ from .shapes import field_shapes
 
 __all__ = ["Pairs"]
 
-HALF = 0.5  # the size of each shape in the scene, so that both unit spheres fit into one
-
 
 class Pairs:
     """Landmarks of two runs, kept in a file while there are any.
@@ -49,11 +47,11 @@ class Pairs:
             texture = texture_of(find_field(run), saved.field)
             mesh = field_shapes(saved.field, texture)[-1]
             names.append(Path(run).resolve().stem)
-            shapes.append(replace(mesh, name=names[-1], vertices=HALF * mesh.vertices + self._shift(side)))
+            shapes.append(replace(mesh, name=names[-1], vertices=0.5 * mesh.vertices + self._shift(side)))
         packed = pack_shapes(shapes, Similarity.identity(), WebOptions(up=self.up), name=" and ".join(names))
         scene = [
             [
-                (HALF * saved.similarity.to_unit(point) + self._shift(side)).tolist()
+                (0.5 * saved.similarity.to_unit(point) + self._shift(side)).tolist()
                 for side, (saved, point) in enumerate(zip(self.saved, pair, strict=True))
             ]
             for pair in self.pairs
@@ -76,7 +74,7 @@ class Pairs:
             raise ValueError("landmarks: expected a list of pairs of finite points")
         places = places.reshape(-1, 2, 3)
         sides = [
-            saved.similarity.to_input((places[:, side] - self._shift(side)) / HALF)
+            saved.similarity.to_input((places[:, side] - self._shift(side)) / 0.5)
             for side, saved in enumerate(self.saved)
         ]
         self.pairs = np.stack(sides, axis=1)
@@ -87,4 +85,4 @@ class Pairs:
 
     @staticmethod
     def _shift(side: int) -> np.ndarray:
-        return np.array([side - HALF, 0.0, 0.0])
+        return np.array([side - 0.5, 0.0, 0.0])

@@ -25,7 +25,6 @@ from .gate import Gate
 __all__ = ["PageServer"]
 
 PORTS = range(8080, 8180)  # of which the first free one is taken
-MOST_CLIENTS = 64
 
 
 class PageServer:
@@ -169,7 +168,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _live(self, page: PageServer) -> None:
         """Name each new field by its checksum until the browser or the server is gone."""
-        if page.num_clients >= MOST_CLIENTS:
+        if page.num_clients >= 64:
             self._refuse(HTTPStatus.SERVICE_UNAVAILABLE, "Too many browsers look at this already.")
             return
         self._send(HTTPStatus.OK, None, "text/event-stream")

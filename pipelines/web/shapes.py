@@ -21,8 +21,6 @@ from .payload import Payload
 __all__ = ["Shape", "add_shape", "distance_cloud", "field_shapes", "read_shape"]
 
 Float64 = NDArray[np.float64]
-MOST_POINTS = 200_000  # of a cloud; more make browsers slow
-GRID = 65535  # steps of a coordinate along the box of a shape
 
 
 @dataclass(frozen=True)
@@ -54,7 +52,7 @@ def add_shape(payload: Payload, shape: Shape, index: int) -> dict[str, Any]:
     """
     low, high = shape.vertices.min(axis=0), shape.vertices.max(axis=0)
     extent = np.where(high > low, high - low, 1.0)
-    payload.add(f"shape{index}.vertices", np.rint((shape.vertices - low) / extent * GRID), "u2")
+    payload.add(f"shape{index}.vertices", np.rint((shape.vertices - low) / extent * 65535), "u2")
     if shape.faces is not None:
         payload.add(f"shape{index}.faces", shape.faces, "u4")
     if shape.normals is not None:
@@ -76,7 +74,8 @@ def add_shape(payload: Payload, shape: Shape, index: int) -> dict[str, Any]:
 def read_shape(file: Path) -> tuple[Shape, Similarity]:
     """The mesh or the cloud of a file in its unit sphere, and the way there.
 
-    A texture is sampled at the corners of the faces. Of a large cloud at most `MOST_POINTS` are taken, evenly.
+    A texture is sampled at the corners of the faces. Of a large cloud at most 200,000 are taken,
+    evenly: more make browsers slow.
 
     Raises:
         InputError: it cannot be read, or has no extent.
@@ -89,7 +88,7 @@ def read_shape(file: Path) -> tuple[Shape, Similarity]:
         corners = np.tile(np.eye(3), (len(surface.faces), 1))
         colors = colors_at(surface, np.repeat(np.arange(len(surface.faces)), 3), corners)
     else:
-        rows = slice(None) if len(faces) else slice(None, None, 1 + (len(surface.vertices) - 1) // MOST_POINTS)
+        rows = slice(None) if len(faces) else slice(None, None, 1 + (len(surface.vertices) - 1) // 200_000)
         vertices = surface.vertices[rows]
         normals, colors = (None if part is None else part[rows] for part in (surface.normals, surface.colors))
     try:

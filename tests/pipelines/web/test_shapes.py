@@ -20,7 +20,6 @@ from mplicits.pipelines.web.assembly import SCRIPTS, field_file
 from mplicits.pipelines.web.export import WebOptions, pack
 from mplicits.pipelines.web.landmarks import Pairs
 from mplicits.pipelines.web.serve import PageServer
-from mplicits.pipelines.web.shapes import GRID
 from pages import rendered, until
 
 PAGE = Path(__file__).parents[3] / "pipelines" / "web" / "page"
@@ -74,7 +73,7 @@ def test_the_page_reads_the_points_of_a_cloud(cloud: Path) -> None:
     (shape,) = header["shapes"]
     assert (shape["kind"], shape["count"], shape["colored"], header["levels"]) == ("points", 500, True, [])
     low, high = np.array(shape["low"]), np.array(shape["high"])
-    places = low + np.array(arrays["shape0.vertices"]).reshape(-1, 3) / GRID * (high - low)
+    places = low + np.array(arrays["shape0.vertices"]).reshape(-1, 3) / 65535 * (high - low)
     found = places * header["unit"] + np.array(header["center"])
     assert np.allclose(np.linalg.norm(found - [10, 0, 0], axis=1), 2, atol=1e-3)
     expected = 255 * np.abs(found / 13).clip(0, 1)
@@ -87,7 +86,7 @@ def test_the_page_reads_the_triangles_of_a_mesh(box: Path) -> None:
     (shape,) = header["shapes"]
     assert (shape["kind"], shape["count"], shape["colored"]) == ("triangles", 12, False)
     assert sorted(set(arrays["shape0.faces"])) == list(range(8))
-    assert np.ptp(np.array(arrays["shape0.vertices"])) == GRID
+    assert np.ptp(np.array(arrays["shape0.vertices"])) == 65535
     extent = (np.array(shape["high"]) - shape["low"]) * header["unit"]
     assert np.allclose(extent, [2, 1, 1])
 
