@@ -345,7 +345,8 @@ def in_one_frame(shapes: Sequence[WorldField], *, margin: float = 0.0) -> tuple[
         ValueError: there are no shapes, or ``margin`` is negative or not finite.
 
     Example:
-        >>> from mplicits.neural_fields import Similarity, Sphere, Union, WorldField, in_one_frame
+        >>> from mplicits.neural_fields import Similarity, Sphere, Union, WorldField
+        >>> from mplicits.neural_fields.shape import in_one_frame
         >>> balls = [WorldField(Sphere(), Similarity((x, 0.0, 0.0), 1.0)) for x in (-1.0, 1.0)]
         >>> fields, frame = in_one_frame(balls)
         >>> frame

@@ -4,26 +4,19 @@ from collections.abc import Callable
 
 import torch
 from mplicits.neural_fields import (
-    Bounded,
     Box,
     Capsule,
-    CarriedKeyframes,
     Difference,
-    EncodedField,
     Field,
     FunctionField,
     Intersection,
     Jet,
-    Keyframes,
     Moving,
     MultiscaleSDF,
     Offset,
-    Placed,
     Plane,
     RigidMotion,
-    SecondJet,
     Shell,
-    ShrinkingSphere,
     Similarity,
     Siren,
     SpaceTimeSDF,
@@ -31,10 +24,14 @@ from mplicits.neural_fields import (
     TimeSlice,
     Torus,
     Union,
-    VelocitySiren,
 )
+from mplicits.neural_fields.fields.csg import Bounded, Placed
+from mplicits.neural_fields.fields.field import SecondJet
+from mplicits.neural_fields.networks.encoded import EncodedField
 from mplicits.neural_fields.networks.hash_encoding import HashEncoding
 from mplicits.neural_fields.networks.neus_mlp import NeusSDF
+from mplicits.neural_fields.spacetime.moving import Keyframes, ShrinkingSphere
+from mplicits.neural_fields.spacetime.velocity import CarriedKeyframes, VelocitySiren
 from torch import Tensor
 
 from benchmarks.motion.figures import DeformingField, Twisting

@@ -6,7 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from mplicits.neural_fields import ColorSiren, MultiscaleSDF, Siren, TextureField, solve_sphere, sphere_trace
+from mplicits.neural_fields import MultiscaleSDF, Siren, TextureField, sphere_trace
+from mplicits.neural_fields.networks.sphere_init import solve_sphere
+from mplicits.neural_fields.networks.texture import ColorSiren
 
 PATIENCE = 60.0
 TITLE = "<img src=x onerror=alert(1)> & ball"

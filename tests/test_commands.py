@@ -32,7 +32,7 @@ from mplicits.pipelines.mesh import finish
 from mplicits.pipelines.mesh.extract import MeshOptions
 from mplicits.pipelines.mesh.files import write_mesh
 from mplicits.pipelines.render import subject
-from mplicits.pipelines.texture import riding
+from mplicits.pipelines.texture import transport
 from mplicits.pipelines.training.settings import TextureConfig
 from mplicits.pipelines.web import export
 from reconstructions import small_reconstructions
@@ -239,7 +239,7 @@ def _small(monkeypatch: pytest.MonkeyPatch) -> None:
     scan = functools.partial(simulate_scan, Sphere(radius=0.7), scanners=3, resolution=24, colors=np.abs)
     monkeypatch.setattr(datasets, "statue_scan", scan)
     monkeypatch.setitem(scene_mesh.__kwdefaults__, "resolution", 48)
-    monkeypatch.setattr(riding, "ASTRAY", 1.0)  # a motion of thirty steps starts anywhere
+    monkeypatch.setattr(transport, "ASTRAY", 1.0)  # a motion of thirty steps starts anywhere
     for module in (subject, export):
         monkeypatch.setattr(module, "FRAME_RESOLUTION", 24)
     texture = TextureConfig(width=16, depth=1, steps=5, batch=64, band_batch=64, samples=500)

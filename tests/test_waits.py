@@ -6,7 +6,8 @@ import pytest
 import standin
 import torch
 import waits
-from mplicits.neural_fields import Sphere, cone_starts
+from mplicits.neural_fields import Sphere
+from mplicits.neural_fields.tracing.cones import cone_starts
 from reconstructions import small_reconstructions
 from waits import Row
 

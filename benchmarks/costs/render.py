@@ -11,7 +11,8 @@ from types import MappingProxyType
 import torch
 from mplicits.datasets import orbit, read_cloud
 from mplicits.datasets.cameras import Camera
-from mplicits.neural_fields import Field, Siren, levels_of
+from mplicits.neural_fields import Field, Siren
+from mplicits.neural_fields.networks.multiscale import levels_of
 from mplicits.neural_fields.tracing.sphere import BOUNDING_RADIUS
 from mplicits.pipelines.render.trace import Seen, trace_view
 from mplicits.pipelines.training.settings import FitConfig

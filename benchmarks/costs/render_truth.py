@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from mplicits.datasets.cameras import Camera
-from mplicits.neural_fields import Field, InputError, cone_starts, sphere_trace
-from mplicits.neural_fields.meshing.extract import Mesh, NoSurfaceError, extract_mesh
+from mplicits.neural_fields import Field, InputError, Mesh, sphere_trace
+from mplicits.neural_fields.meshing.extract import NoSurfaceError, extract_mesh
+from mplicits.neural_fields.tracing.cones import cone_starts
 from mplicits.pipelines.render.rasterise import mesh_view
 from mplicits.pipelines.render.shade import shade
 from mplicits.pipelines.render.trace import Seen
-from mplicits.pipelines.surface.surface import Surface, from_mesh
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -70,7 +70,7 @@ class Truth:
         report: Callable[[str], None],
     ) -> None:
         self._fields, self._resolution, self._device, self._report = fields, resolution, device, report
-        self._meshes: dict[tuple[str, int], Surface] = {}
+        self._meshes: dict[tuple[str, int], Mesh] = {}
         self._traces: dict[tuple[str, int, Camera], Seen] = {}
         self._casts: dict[tuple[str, int, Camera], NDArray[np.float32]] = {}
 
@@ -146,7 +146,7 @@ class Truth:
             mesh = (name, level)
             if mesh not in self._meshes:
                 self._report(f"mesh of {name}, level {level}")
-                self._meshes[mesh] = from_mesh(self._mesh(name, level, self._resolution))
+                self._meshes[mesh] = self._mesh(name, level, self._resolution)
             self._casts[key] = _depths(mesh_view(self._meshes[mesh], camera)).numpy()
         return self._casts[key]
 

@@ -9,9 +9,10 @@ from pathlib import Path
 
 import numpy as np
 from mplicits.datasets.cameras import Camera, orbit
-from mplicits.neural_fields import Field, Hits, InputError, SpaceTimeSDF, extract_mesh, load_field, sphere_trace
+from mplicits.neural_fields import Field, InputError, SpaceTimeSDF, extract_mesh, load_field, sphere_trace
 from mplicits.neural_fields.meshing.extract import DEFAULT_BOUNDS
 from mplicits.neural_fields.spacetime.dynamic_tracing import DynamicTracer, moment
+from mplicits.neural_fields.tracing.sphere import Hits
 from mplicits.pipelines.render.trace import PRECISION, pixel_size, trace_hits
 from mplicits.pipelines.training.folder import find_field
 

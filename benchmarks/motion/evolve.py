@@ -17,7 +17,6 @@ from mplicits.neural_fields import (
     Moving,
     NoSurfaceError,
     RigidMotion,
-    ShrinkingSphere,
     Sphere,
     TimeSlice,
     Torus,
@@ -25,11 +24,12 @@ from mplicits.neural_fields import (
     extract_mesh,
     load_field,
 )
+from mplicits.neural_fields.spacetime.moving import ShrinkingSphere
 from mplicits.pipelines.evolve.checks import slope_figures
 from mplicits.pipelines.evolve.shapes import Placed, Placement
 from mplicits.pipelines.evolve.train import evolve
 from mplicits.pipelines.surface.measure import evaluate_surfaces
-from mplicits.pipelines.surface.surface import components, from_mesh, read_reference
+from mplicits.pipelines.surface.surface import components, read_reference
 from mplicits.pipelines.training.folder import find_field
 from mplicits.pipelines.training.settings import EvolveConfig, FitConfig
 from torch import Tensor
@@ -208,7 +208,7 @@ def measure_exact(name: str, field: Field, case: ExactCase, seconds: float) -> E
     for time in times:
         still = TimeSlice(field, time)
         try:
-            surface = from_mesh(extract_mesh(still, resolution=RESOLUTION))
+            surface = extract_mesh(still, resolution=RESOLUTION)
         except NoSurfaceError:
             counts.append(0)
             errors.append(torch.full((1,), math.inf))
@@ -319,7 +319,7 @@ class MorphBench(Benchmark[MorphRow]):
             moved = read_reference(path).moved(similarity)
             back = Placement.from_dict(run.record["placements"][time]).inverse()
             for found, into in ((fitted, fits), (Placed(run.field.at(float(time)), back), ends)):
-                mesh = from_mesh(extract_mesh(found, resolution=self.resolution))
+                mesh = extract_mesh(found, resolution=self.resolution)
                 # The volumes are not asked for.
                 metrics = evaluate_surfaces(mesh, moved, samples=self.samples, columns=16)
                 into.append(metrics.chamfer)

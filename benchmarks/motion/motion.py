@@ -21,24 +21,23 @@ from mplicits.datasets.synthetic.scanner import simulate_scan
 from mplicits.neural_fields import (
     Field,
     InputError,
-    IntegrationError,
-    Keyframes,
+    Mesh,
     NoSurfaceError,
     Similarity,
-    Solver,
     TimeSlice,
     extract_mesh,
     project_to_surface,
-    trajectories,
 )
 from mplicits.neural_fields.spacetime.evolution import VectorField
+from mplicits.neural_fields.spacetime.flow import IntegrationError, Solver, trajectories
+from mplicits.neural_fields.spacetime.moving import Keyframes
 from mplicits.neural_fields.spacetime.surface_velocity import CarriedVelocity
 from mplicits.pipelines.evolve.checks import volume
 from mplicits.pipelines.evolve.problem import build_problem
 from mplicits.pipelines.evolve.shapes import StaticShape, aligned, into_unit_sphere, read_shape
 from mplicits.pipelines.evolve.train import train_evolution
 from mplicits.pipelines.surface.distance import MeshDistance
-from mplicits.pipelines.surface.surface import Surface, components, face_normals, from_mesh, sample_points
+from mplicits.pipelines.surface.surface import components, face_normals, sample_points
 from mplicits.pipelines.training.settings import EvolveConfig, FitConfig
 from numpy.typing import NDArray
 from torch import Tensor
@@ -307,15 +306,15 @@ class _Frame(NamedTuple):
 
 
 def _frame(
-    field: Field, truth: DeformingField, rest: Surface, place: Similarity, time: float, resolution: int
+    field: Field, truth: DeformingField, rest: Mesh, place: Similarity, time: float, resolution: int
 ) -> _Frame | None:
     """The surface of a moment against the true one; None without a surface."""
-    exact = Surface(_moved(truth, rest.vertices, time), rest.faces)
+    exact = Mesh(_moved(truth, rest.vertices, time), rest.faces)
     try:
-        mesh = from_mesh(extract_mesh(TimeSlice(field, time), resolution=resolution, normals=False))
+        mesh = extract_mesh(TimeSlice(field, time), resolution=resolution, normals=False)
     except NoSurfaceError:
         return None
-    found = Surface(place.to_input(mesh.vertices), mesh.faces)
+    found = Mesh(place.to_input(mesh.vertices), mesh.faces)
     both = (_mean_distance(found, exact) + _mean_distance(exact, found)) / 2
     return _Frame(both, volume(found) / volume(exact), _area(found) / _area(exact), components(found))
 
@@ -346,20 +345,20 @@ def _metric(corners: Float64) -> Float64:
     return np.stack([(a * a).sum(axis=1), (a * b).sum(axis=1), (b * b).sum(axis=1)], axis=1)
 
 
-def _rest(truth: DeformingField, resolution: int) -> Surface:
+def _rest(truth: DeformingField, resolution: int) -> Mesh:
     """The mesh of the rest shape, its vertices on the surface."""
-    mesh = from_mesh(extract_mesh(truth.field, resolution=resolution, normals=False))
+    mesh = extract_mesh(truth.field, resolution=resolution, normals=False)
     points = project_to_surface(truth.field, torch.from_numpy(mesh.vertices), steps=3)[0]
-    return Surface(points.double().numpy(), mesh.faces)
+    return Mesh(points.double().numpy(), mesh.faces)
 
 
 def _key_shape(truth: DeformingField, name: str, time: float, resolution: int) -> StaticShape:
     rest = _rest(truth, resolution)
-    surface = Surface(_moved(truth, rest.vertices, time), rest.faces)
+    surface = Mesh(_moved(truth, rest.vertices, time), rest.faces)
     return StaticShape(f"{name} at {time:g}", TimeSlice(truth, time), Similarity.identity(), surface)
 
 
-def _diagonal(surface: Surface) -> float:
+def _diagonal(surface: Mesh) -> float:
     return float(np.linalg.norm(np.ptp(surface.vertices, axis=0)))
 
 
@@ -404,11 +403,11 @@ def carried_points(
     return [place.to_input(rows.double().numpy()) for rows in path[1:]]
 
 
-def _mean_distance(surface: Surface, other: Surface) -> float:
+def _mean_distance(surface: Mesh, other: Mesh) -> float:
     """How far points of one surface are from the other one, on average."""
     points, _ = sample_points(surface, SAMPLES, np.random.default_rng(0))
     return float(np.abs(MeshDistance(other).with_slope(points, certain=False)[0]).mean())
 
 
-def _area(surface: Surface) -> float:
+def _area(surface: Mesh) -> float:
     return float(face_normals(surface)[1].sum())

@@ -18,7 +18,7 @@ from time import process_time
 import numpy as np
 import torch
 from mplicits.datasets.cameras import Camera
-from mplicits.neural_fields import Field, InputError, TimeSlice
+from mplicits.neural_fields import Field, InputError, Mesh, TimeSlice
 from mplicits.neural_fields.spacetime.evolution import VectorField
 from mplicits.pipelines.evolve.checks import volume
 from mplicits.pipelines.evolve.problem import build_problem
@@ -28,8 +28,8 @@ from mplicits.pipelines.evolve.train import train_evolution
 from mplicits.pipelines.render.picture import contact_sheet, in_rows, write_picture
 from mplicits.pipelines.render.rasterise import mesh_view, picture_of
 from mplicits.pipelines.render.subject import Orbit, orbit_cameras
-from mplicits.pipelines.surface.surface import Surface, face_normals, read_reference
-from mplicits.pipelines.texture.riding import Colors, RidingColors
+from mplicits.pipelines.surface.surface import face_normals, read_reference
+from mplicits.pipelines.texture.transport import Colors, TransportedColors
 from mplicits.pipelines.training.settings import EvolveConfig, FitConfig
 from numpy.typing import NDArray
 from torch import Tensor
@@ -235,8 +235,8 @@ def measure_pair(
     cameras = orbit_cameras(
         np.concatenate([mesh.vertices for mesh in seen]), Orbit(), size=(PIXELS, PIXELS), frames=VIEWS
     )
-    riding = RidingColors(field, paint(0), last=paint(1), motion=velocity)
-    colors = [_carried(riding, time) for time in times]
+    transported = TransportedColors(field, paint(0), last=paint(1), motion=velocity)
+    colors = [_carried(transported, time) for time in times]
     steps = [
         None if mesh is None or at is None else np.concatenate([color_jumps(mesh, at, camera) for camera in cameras])
         for mesh, at in zip(meshes, colors, strict=True)
@@ -277,7 +277,7 @@ def paint(seed: int) -> Colors:
     return colors
 
 
-def color_jumps(mesh: Surface, colors: Colors, camera: Camera) -> Float64:
+def color_jumps(mesh: Mesh, colors: Colors, camera: Camera) -> Float64:
     """How far apart the colours of neighbouring pixels of a picture are, ``(N,)``: lengths of differences.
 
     Neighbours beside and below each other count, where both see the surface and their points are no further apart than
@@ -303,10 +303,10 @@ def color_jumps(mesh: Surface, colors: Colors, camera: Camera) -> Float64:
     return np.linalg.norm(found[first[near]] - found[second[near]], axis=1)
 
 
-def _carried(riding: RidingColors, time: float) -> Colors | None:
+def _carried(transported: TransportedColors, time: float) -> Colors | None:
     """None where colours cannot be carried."""
     try:
-        return riding.at(time)
+        return transported.at(time)
     except InputError:
         return None
 
@@ -314,7 +314,7 @@ def _carried(riding: RidingColors, time: float) -> Colors | None:
 def _draw(
     path: Path,
     times: Sequence[float],
-    meshes: Sequence[Surface | None],
+    meshes: Sequence[Mesh | None],
     colors: Sequence[Colors | None],
     camera: Camera,
 ) -> None:
@@ -326,5 +326,5 @@ def _draw(
         painted = None
         if at is not None:
             painted = at(torch.from_numpy(mesh.vertices).float()).double().numpy()
-        tiles.append((f"t = {time:.2f}", picture_of(Surface(mesh.vertices, mesh.faces, None, painted), small)))
+        tiles.append((f"t = {time:.2f}", picture_of(Mesh(mesh.vertices, mesh.faces, None, painted), small)))
     write_picture(path, contact_sheet(*in_rows(tiles, ACROSS)))

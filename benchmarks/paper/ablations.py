@@ -15,13 +15,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from mplicits.neural_fields import MultiscaleSDF, Similarity
 from mplicits.pipelines.fit.cloud import CloudDistance
 from mplicits.pipelines.fit.samples import Weights, banded_sources
-from mplicits.pipelines.surface.distance import Float64, MeshDistance, approximation_error, near_surface
+from mplicits.pipelines.surface.distance import Float64, MeshDistance
 from mplicits.pipelines.training.settings import FitConfig
 from mplicits.pipelines.training.trainer import Report
 
 from ..harness.cells import Findings, Method, Record, Workplace
 from ..harness.plots import Plot, Series
 from ..harness.tables import Column, Row, Table, Value, mean
+from ..shapes.sampled_error import approximation_error, near_surface
 from .base import base_cell, base_of, delta_after, generator_for, train_level, up_to
 from .cells import PaperCell, TableSpec, select, shapes_of
 from .judge import reference_of

@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 import torch
 from mplicits.datasets import OrientedCloud, PointCloud, add_noise, add_outliers, orbit, prepare_cloud, read_cloud
-from mplicits.neural_fields import Field, InputError, Similarity, sphere_trace
-from mplicits.neural_fields.meshing.extract import Mesh, NoSurfaceError, extract_mesh
+from mplicits.neural_fields import Field, InputError, Mesh, Similarity, sphere_trace
+from mplicits.neural_fields.meshing.extract import NoSurfaceError, extract_mesh
 from mplicits.pipelines.mesh.files import write_mesh
 from mplicits.pipelines.render.picture import write_picture
 from mplicits.pipelines.render.rasterise import picture_of
 from mplicits.pipelines.surface.measure import evaluate_surfaces
-from mplicits.pipelines.surface.surface import Surface, from_mesh, read_reference
+from mplicits.pipelines.surface.surface import read_reference
 from mplicits.pipelines.surface.trim import Support, drop_unsupported
 from mplicits.pipelines.training.config import load_config
 from mplicits.pipelines.training.settings import FitConfig
@@ -45,7 +45,7 @@ STEEP = 2.0
 FIRST_STEPS, MORE_STEPS = 20, 5
 
 
-def reference_of(cell: PaperCell) -> Surface:
+def reference_of(cell: PaperCell) -> Mesh:
     """The surface that a cell's results are measured against.
 
     Raises:
@@ -128,7 +128,7 @@ class Judge:
         if mesh is None or not len(mesh.faces):
             return figures
         write_mesh(self.work.mesh(name), mesh, similarity)
-        surface = from_mesh(replace(mesh, vertices=similarity.to_input(mesh.vertices)))
+        surface = replace(mesh, vertices=similarity.to_input(mesh.vertices))
         tile = self.protocol.tile
         camera = orbit(self.reference.vertices, width=tile, height=tile)
         write_picture(self.work.picture(name), picture_of(surface, camera))

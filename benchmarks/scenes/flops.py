@@ -23,7 +23,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
-from mplicits.neural_fields import Field, Jet, levels_of
+from mplicits.neural_fields import Field, Jet
+from mplicits.neural_fields.networks.multiscale import levels_of
 from mplicits.neural_fields.networks.radiance import Outside, ViewColor
 from mplicits.pipelines.reconstruct.model.model import RayPool, SceneModel
 from mplicits.pipelines.reconstruct.model.objective import SceneObjective

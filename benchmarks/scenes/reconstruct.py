@@ -14,15 +14,14 @@ import imageio.v3 as iio
 import numpy as np
 from mplicits.datasets.synthetic.scenes import SCENES, Scene, render_scene, scene_mesh
 from mplicits.datasets.views.images import PosedImage, PosedImages, read_posed_images
-from mplicits.neural_fields import InputError, NoSurfaceError
-from mplicits.neural_fields.meshing.extract import Mesh, extract_mesh
+from mplicits.neural_fields import InputError, Mesh, NoSurfaceError
+from mplicits.neural_fields.meshing.extract import extract_mesh
 from mplicits.neural_fields.networks.neus_mlp import NeusSDF
 from mplicits.pipelines.mesh.files import write_mesh
 from mplicits.pipelines.reconstruct.model.model import RayPool, SceneModel, build_scene
 from mplicits.pipelines.reconstruct.views import ViewImage, comparison_sheet, held_out, measure, render_image
 from mplicits.pipelines.render.picture import Image, contact_sheet, write_picture
 from mplicits.pipelines.surface.measure import Metrics, evaluate_surfaces
-from mplicits.pipelines.surface.surface import Surface, from_mesh
 from mplicits.pipelines.surface.trim import in_region, keep_largest
 from mplicits.pipelines.training.config import closest
 from mplicits.pipelines.training.folder import digest_of
@@ -77,9 +76,9 @@ class BenchScene:
 
 
 @lru_cache(maxsize=4)  # of the scenes that are trained at a time
-def _exact_surface(scene: BenchScene, resolution: int) -> Surface | None:
+def _exact_surface(scene: BenchScene, resolution: int) -> Mesh | None:
     """In the coordinates of the unit sphere; None where it is not known."""
-    return None if scene.exact is None else from_mesh(scene_mesh(scene.exact, resolution=resolution))
+    return None if scene.exact is None else scene_mesh(scene.exact, resolution=resolution)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -188,8 +187,7 @@ class ReconstructBench(Benchmark[ReconstructRow]):
         report(Progress(stage, 0, config.steps, 0.0, {}))
         started, has_masks = time.perf_counter(), all(view.mask is not None for view in train)
         model = self.build(config, has_masks=has_masks, views=len(train)).to(device)
-        whole, flat = model.outside is not None, config.smooth_weight > 0
-        pool = RayPool(train, similarity, device, whole=whole, flat=flat)
+        pool = RayPool(train, similarity, device, whole=model.outside is not None)
         start_seconds = time.perf_counter() - started
 
         def told(progress: Progress) -> None:
@@ -307,7 +305,7 @@ def late_rates(late: LateRows | None, rays: int) -> LateRates | None:
     )
 
 
-def surface_figures(mesh: Mesh, truth: Surface, *, samples: int, columns: int = 512, seed: int = 0) -> SurfaceFigures:
+def surface_figures(mesh: Mesh, truth: Mesh, *, samples: int, columns: int = 512, seed: int = 0) -> SurfaceFigures:
     """A mesh, and its largest component, against the exact surface; both in the same coordinates.
 
     Args:
@@ -319,7 +317,7 @@ def surface_figures(mesh: Mesh, truth: Surface, *, samples: int, columns: int = 
     """
 
     def judge(part: Mesh) -> Metrics:
-        return evaluate_surfaces(from_mesh(part), truth, samples=samples, seed=seed, columns=columns)
+        return evaluate_surfaces(part, truth, samples=samples, seed=seed, columns=columns)
 
     whole = judge(mesh)
     largest = whole if whole.components == 1 else judge(keep_largest(mesh))

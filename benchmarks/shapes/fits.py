@@ -20,22 +20,14 @@ import numpy as np
 import torch
 from mplicits.datasets import Camera, OrientedCloud, PointCloud, add_isotropic_noise, add_noise, orbit, read_cloud
 from mplicits.datasets.synthetic.statue import Statue
-from mplicits.neural_fields import InputError, MultiscaleSDF, Similarity, load_field
-from mplicits.neural_fields.meshing.extract import Mesh, NoSurfaceError, extract_mesh
+from mplicits.neural_fields import InputError, Mesh, MultiscaleSDF, Similarity, load_field
+from mplicits.neural_fields.meshing.extract import NoSurfaceError, extract_mesh
 from mplicits.pipelines.fit.cloud import load_cloud
 from mplicits.pipelines.fit.train import Run, fit, prepare
 from mplicits.pipelines.render.picture import contact_sheet, write_picture
 from mplicits.pipelines.render.rasterise import picture_of
 from mplicits.pipelines.surface.measure import Metrics, evaluate_surfaces
-from mplicits.pipelines.surface.surface import (
-    Surface,
-    face_normals,
-    from_cloud,
-    from_mesh,
-    read_reference,
-    read_surface,
-    sample_points,
-)
+from mplicits.pipelines.surface.surface import face_normals, from_cloud, read_reference, read_surface, sample_points
 from mplicits.pipelines.surface.trim import drop_unsupported, read_support
 from mplicits.pipelines.training.folder import STATE_FILE, find_field, is_fitted, read_record
 from mplicits.pipelines.training.machine import peak_memory
@@ -45,6 +37,7 @@ from mplicits.pipelines.training.trainer import Report
 from ..harness.benchmark import Benchmark, Part, plain
 from ..harness.cells import Workplace, key_of
 from ..harness.tables import Column, Figure, Table, tabulated
+from .roughness import Roughness, surface_roughness
 
 __all__ = [
     "FitBench",
@@ -117,6 +110,7 @@ class FitRow:
         mesh_seconds: extraction; 0 for Poisson, whose result is a mesh.
         metrics: against the shape; None where the method found no surface.
         isotropic: whether the noise has no direction: Gaussian, along the normals as strong as the other.
+        rough: what it has at high frequency; None where there is no surface.
     """
 
     shape: str
@@ -126,6 +120,7 @@ class FitRow:
     mesh_seconds: float
     metrics: Metrics | None
     isotropic: bool = False
+    rough: Roughness | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -177,16 +172,17 @@ class FitBench(Benchmark[FitRow]):
         about = {"points": self.points, "noise": self.noise, "isotropic": self.isotropic, "seed": seed}
         _, cloud = clouds_of(path, **about)
         rows: list[FitRow] = []
-        drawn: list[tuple[str, Surface]] = [("input", from_cloud(cloud))]
+        drawn: list[tuple[str, Mesh]] = [("input", from_cloud(cloud))]
         drawing: dict[str, Any] = {} if self.points is None else {"points": self.points}
         drawing |= {"isotropic": True} if self.isotropic else {}
         home = fit_home(work.out, path, self.config, noise=self.noise, **drawing)
         for method, seconds, mesh_seconds, mesh in self.reconstructions(cloud, home, work.stage(path.stem)):
-            metrics = None
+            metrics = rough = None
             if mesh is not None:
                 metrics = evaluate_surfaces(mesh, reference, samples=self.samples, seed=seed)
+                rough = surface_roughness(mesh, reference, samples=self.samples, seed=seed)
                 drawn.append((method, mesh))
-            rows.append(FitRow(path.stem, self.noise, method, seconds, mesh_seconds, metrics, self.isotropic))
+            rows.append(FitRow(path.stem, self.noise, method, seconds, mesh_seconds, metrics, self.isotropic, rough))
         if self.pictures is not None:
             self.pictures.mkdir(parents=True, exist_ok=True)
             camera = orbit(reference.vertices)
@@ -201,14 +197,14 @@ class FitBench(Benchmark[FitRow]):
 
     def reconstructions(
         self, cloud: PointCloud, home: Path, progress: Report
-    ) -> Iterator[tuple[str, float, float, Surface | None]]:
+    ) -> Iterator[tuple[str, float, float, Mesh | None]]:
         """Method, its seconds, seconds of meshing, and the mesh in input coordinates."""
         run = kept_fit(home, cloud, self.config, progress=progress)
         seconds = 0.0
         for level, stage in enumerate(run.record["stages"]):
             seconds += stage["sampling_seconds"] + stage["training_seconds"]
             mesh, meshing = timed_mesh(run, self.resolution, level)
-            surface = None if mesh is None else _in_input(from_mesh(mesh), run.similarity)
+            surface = None if mesh is None else _in_input(mesh, run.similarity)
             yield f"level {level}", seconds, meshing, surface
         if not has_poisson():
             return
@@ -232,6 +228,9 @@ class FitBench(Benchmark[FitRow]):
         def of(name: str) -> Callable[[FitRow], Any]:
             return lambda row: None if row.metrics is None else getattr(row.metrics, name)
 
+        def peel(name: str) -> Callable[[FitRow], Any]:
+            return lambda row: None if row.rough is None else getattr(row.rough, name)
+
         def above(row: FitRow) -> float | None:
             """What of the distance is the mesh's, and not the samples'."""
             floor = of("chamfer_floor")(row)
@@ -246,10 +245,10 @@ class FitBench(Benchmark[FitRow]):
             (Column("IoU", ".4f"), of("iou")),
             (Column("shell IoU", ".3f"), of("shell_iou")),
             (Column("normals", ".4f"), of("normal_consistency")),
-            (Column("flat, °", ".2f"), of("flat_angle")),
-            (Column("90 %", ".2f"), of("flat_angle_90")),
-            (Column("edges, °", ".2f"), of("edge_angle")),
-            (Column("ripple", ".1e"), of("ripple")),
+            (Column("flat, °", ".2f"), peel("flat_angle")),
+            (Column("90 %", ".2f"), peel("flat_angle_90")),
+            (Column("edges, °", ".2f"), peel("edge_angle")),
+            (Column("ripple", ".1e"), peel("ripple")),
             (Column("parts", "d"), of("components")),
             (Column("fit, s", ".1f"), lambda row: row.seconds),
             (Column("mesh, s", ".1f"), lambda row: row.mesh_seconds or None),
@@ -259,7 +258,7 @@ class FitBench(Benchmark[FitRow]):
         return (tabulated(self.name, "How near fits come", "shape", figures, items),)
 
 
-def facing_camera(surface: Surface) -> Camera:
+def facing_camera(surface: Mesh) -> Camera:
     """A camera that looks at the side of a mesh with most area in one direction, or nearly, a little from above."""
     normals, areas = face_normals(surface)
     owner = np.unique(np.round(SIDES * normals), axis=0, return_inverse=True)[1].reshape(-1)
@@ -270,12 +269,12 @@ def facing_camera(surface: Surface) -> Camera:
     return orbit(surface.vertices, azimuth=float(np.degrees(np.arctan2(x, z))), elevation=float(elevation))
 
 
-def _faceted(surface: Surface) -> Surface:
+def _faceted(surface: Mesh) -> Mesh:
     """The mesh with every face on its own: no normal is a mean of those of two sides of an edge."""
     corners = surface.faces.ravel()
     normals = np.repeat(face_normals(surface)[0], 3, axis=0)
     colors = None if surface.colors is None else surface.colors[corners]
-    return Surface(surface.vertices[corners], np.arange(len(corners)).reshape(-1, 3), normals, colors)
+    return Mesh(surface.vertices[corners], np.arange(len(corners)).reshape(-1, 3), normals, colors)
 
 
 def clouds_of(
@@ -321,8 +320,8 @@ def timed_mesh(run: Run, resolution: int, level: int = -1) -> tuple[Mesh | None,
     return mesh, time.perf_counter() - started
 
 
-def _in_input(surface: Surface, similarity: Similarity) -> Surface:
-    return Surface(similarity.to_input(surface.vertices), surface.faces, surface.normals, surface.colors)
+def _in_input(surface: Mesh, similarity: Similarity) -> Mesh:
+    return Mesh(similarity.to_input(surface.vertices), surface.faces, surface.normals, surface.colors)
 
 
 @dataclass(frozen=True)
@@ -397,7 +396,7 @@ class ScaleBench(Benchmark[ScaleRow]):
         count = cell.parameters["points"]
         path = (self.folder or work.out) / f"cloud_{count}.ply"
         work.say(cell.name)
-        surface = read_surface(self.shape) if self.shape else from_mesh(extract_mesh(Statue(), resolution=384))
+        surface = read_surface(self.shape) if self.shape else extract_mesh(Statue(), resolution=384)
         try:
             write_noisy_cloud(path, surface, count, noise=self.noise, seed=self.config.seed)
             with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as other:
@@ -435,7 +434,7 @@ class ScaleBench(Benchmark[ScaleRow]):
 
 
 def write_noisy_cloud(
-    path: Path, surface: Surface, count: int, *, noise: float, seed: int = 0, rows: int = 1_000_000
+    path: Path, surface: Mesh, count: int, *, noise: float, seed: int = 0, rows: int = 1_000_000
 ) -> None:
     """Write ``count`` points of a mesh, uniform by area, as binary PLY of floats, ``rows`` at a time.
 
@@ -463,7 +462,7 @@ def write_noisy_cloud(
             file.write(table[random.permutation(len(table))].tobytes())
 
 
-def _measured(path: Path, config: FitConfig, resolution: int) -> tuple[Mapping[str, Any], Surface | None]:
+def _measured(path: Path, config: FitConfig, resolution: int) -> tuple[Mapping[str, Any], Mesh | None]:
     """Fit and mesh a file → figures of `ScaleRow`, and the mesh in the coordinates of the file."""
     started = time.perf_counter()
     cloud, merging = load_cloud(path, limit=config.merge_above, isolation=config.isolation)
@@ -485,8 +484,8 @@ def _measured(path: Path, config: FitConfig, resolution: int) -> tuple[Mapping[s
     }
     if mesh is None:
         return figures, None
-    surface = from_mesh(mesh)
-    return figures, Surface(run.similarity.to_input(surface.vertices), surface.faces)
+    surface = mesh
+    return figures, Mesh(run.similarity.to_input(surface.vertices), surface.faces)
 
 
 def has_poisson() -> bool:
@@ -494,7 +493,7 @@ def has_poisson() -> bool:
     return importlib.util.find_spec("pymeshlab") is not None
 
 
-def screened_poisson(cloud: OrientedCloud, *, depth: int = 10, trim: float = 0.0, own_normals: bool = False) -> Surface:
+def screened_poisson(cloud: OrientedCloud, *, depth: int = 10, trim: float = 0.0, own_normals: bool = False) -> Mesh:
     """Reconstruct a cloud, with MeshLab's defaults except for the octree's depth (10 in the paper).
 
     Args:
@@ -530,4 +529,4 @@ def screened_poisson(cloud: OrientedCloud, *, depth: int = 10, trim: float = 0.0
         density = np.asarray(mesh.vertex_scalar_array(), np.float64)
         kept = density >= np.quantile(density, trim)
         faces = faces[kept[faces].all(axis=1)]
-    return Surface(vertices, faces)
+    return Mesh(vertices, faces)

@@ -12,13 +12,14 @@ from typing import Any
 
 import torch
 from mplicits.datasets import Camera, turntable
-from mplicits.neural_fields import Field, InputError, levels_of, load_field
+from mplicits.neural_fields import Field, InputError, Mesh, load_field
 from mplicits.neural_fields.meshing.extract import NoSurfaceError, extract_mesh, map_normals
+from mplicits.neural_fields.networks.multiscale import levels_of
 from mplicits.pipelines.render.picture import check_picture_path, contact_sheet, write_picture
 from mplicits.pipelines.render.rasterise import mesh_view
 from mplicits.pipelines.render.shade import ShadeOptions, compose, shade
 from mplicits.pipelines.render.trace import Seen, trace_view
-from mplicits.pipelines.surface.surface import Surface, from_mesh, read_reference
+from mplicits.pipelines.surface.surface import read_reference
 from mplicits.pipelines.training.folder import find_field
 from mplicits.pipelines.training.machine import choose_device
 from mplicits.pipelines.training.trainer import parameter_count
@@ -179,7 +180,7 @@ class NormalMapBench(Benchmark[NormalMapRow]):
         return (tabulated(self.name, "Normals of a fine level on a coarse surface", "method", figures, items),)
 
 
-def _check_place(field: Field, original: Surface, name: str, device: torch.device) -> None:
+def _check_place(field: Field, original: Mesh, name: str, device: torch.device) -> None:
     points = torch.from_numpy(original.used_vertices().clip(-1.5, 1.5)).float()
     probed = points[:: max(1, len(points) // PROBED)]
     with torch.inference_mode():
@@ -209,8 +210,8 @@ def _methods(
     return [
         _Method("level 0", 1, 0.0, partial(traced, level=0)),
         _Method(f"level 0 + {fine}", finest + 1, 0.0, partial(traced, level=0, normal_level=finest)),
-        _Method("mesh of level 0", 1, extracted - started, partial(mesh_view, from_mesh(mesh))),
-        _Method(f"mesh of level 0 + {fine}", finest + 1, done - started, partial(mesh_view, from_mesh(mapped))),
+        _Method("mesh of level 0", 1, extracted - started, partial(mesh_view, mesh)),
+        _Method(f"mesh of level 0 + {fine}", finest + 1, done - started, partial(mesh_view, mapped)),
         *(_Method(f"level {level}", level + 1, 0.0, partial(traced, level=level)) for level in range(1, finest + 1)),
     ]
 

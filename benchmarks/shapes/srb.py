@@ -18,10 +18,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from mplicits.datasets import PointCloud, read_cloud
-from mplicits.neural_fields import Field, InputError, Similarity
+from mplicits.neural_fields import Field, InputError, Mesh, Similarity
 from mplicits.pipelines.fit.train import prepare
-from mplicits.pipelines.surface.distance import MeshDistance, approximation_error, near_surface
-from mplicits.pipelines.surface.surface import Surface, components, from_mesh, is_closed, read_surface, sample_points
+from mplicits.pipelines.surface.distance import MeshDistance
+from mplicits.pipelines.surface.surface import components, is_closed, read_surface, sample_points
 from mplicits.pipelines.training.settings import FitConfig
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
@@ -30,6 +30,7 @@ from ..harness.benchmark import Benchmark, Part
 from ..harness.cells import Workplace
 from ..harness.tables import Column, Figure, Row, Table, tabulated
 from .fits import fit_home, has_poisson, kept_fit, screened_poisson, timed_mesh
+from .sampled_error import approximation_error, near_surface
 
 __all__ = ["PUBLISHED", "Distances", "Scan", "SrbBench", "SrbRow", "distances", "find_scans"]
 
@@ -269,7 +270,7 @@ class SrbBench(Benchmark[SrbRow]):
 
     def reconstructions(
         self, cloud: PointCloud, home: Path, config: FitConfig, judge: _Judge, work: Workplace
-    ) -> Iterator[tuple[str, float, Surface | None, float | None]]:
+    ) -> Iterator[tuple[str, float, Mesh | None, float | None]]:
         """Method, its seconds, the mesh in the scan's coordinates, and the error of the field in the band."""
         run = kept_fit(home, cloud, config, progress=work.stage(home.name))
         seconds = 0.0
@@ -279,7 +280,7 @@ class SrbBench(Benchmark[SrbRow]):
             yield (
                 f"level {level}",
                 seconds,
-                None if mesh is None else _in_input(from_mesh(mesh), run.similarity),
+                None if mesh is None else _in_input(mesh, run.similarity),
                 judge.sdf_error(run.field, run.similarity, level),
             )
         if has_poisson():
@@ -338,14 +339,14 @@ class SrbBench(Benchmark[SrbRow]):
         return ours, published
 
 
-def _in_input(surface: Surface, similarity: Similarity) -> Surface:
-    return Surface(similarity.to_input(surface.vertices), surface.faces)
+def _in_input(surface: Mesh, similarity: Similarity) -> Mesh:
+    return Mesh(similarity.to_input(surface.vertices), surface.faces)
 
 
 class _Judge:
     """The truth of a scan, sampled once for all methods."""
 
-    def __init__(self, truth: Surface, cloud: PointCloud, samples: int, seed: int) -> None:
+    def __init__(self, truth: Mesh, cloud: PointCloud, samples: int, seed: int) -> None:
         self.truth, self.samples = truth, samples
         self.scan = cloud.points[np.isfinite(cloud.points).all(axis=1)]
         self.similarity = Similarity.to_unit_sphere(truth.used_vertices())
@@ -362,13 +363,13 @@ class _Judge:
             places = near_surface(unit, BAND_SAMPLES, reach=BAND, seed=seed)
             self.near = places, MeshDistance(unit).signed(places)
 
-    def _drawn(self, surface: Surface, which: int) -> tuple[Float64, Float64]:
+    def _drawn(self, surface: Mesh, which: int) -> tuple[Float64, Float64]:
         """Samples of a surface in raw units, and fewer of them in the truth's unit sphere."""
         points, _ = sample_points(surface, self.samples, np.random.default_rng(self.seeds[which]))
         few, _ = sample_points(surface, NORMALISED_SAMPLES, np.random.default_rng(self.seeds[which + 2]))
         return points, self.similarity.to_unit(few)
 
-    def figures(self, mesh: Surface | None) -> dict[str, Any]:
+    def figures(self, mesh: Mesh | None) -> dict[str, Any]:
         """All that `SrbRow` says of a mesh in the scan's coordinates."""
         names = ("chamfer", "hausdorff", "scan_chamfer", "scan_hausdorff", "normalised", "normalised_hausdorff")
         found: dict[str, Any] = dict.fromkeys((*names, "parts", "closed"))

@@ -12,12 +12,20 @@ from typing import Any
 import numpy as np
 import torch
 from mplicits.datasets import Camera, TexturedMesh, read_textured, sample_textured, turntable
-from mplicits.neural_fields import Field, InputError, Similarity, TextureField, load_field, load_texture, map_colors
+from mplicits.neural_fields import (
+    Field,
+    InputError,
+    Mesh,
+    Similarity,
+    TextureField,
+    load_field,
+    load_texture,
+    map_colors,
+)
 from mplicits.neural_fields.meshing.extract import NoSurfaceError, extract_mesh
 from mplicits.pipelines.render.picture import Image, as_bytes, contact_sheet, write_picture
 from mplicits.pipelines.render.rasterise import mesh_view
 from mplicits.pipelines.render.trace import trace_view
-from mplicits.pipelines.surface.surface import Surface, from_mesh
 from mplicits.pipelines.texture.train import texture_run
 from mplicits.pipelines.training.folder import TEXTURE_FILE, digest_of, find_field, read_record
 from mplicits.pipelines.training.machine import choose_device
@@ -189,7 +197,7 @@ class TextureBench(Benchmark[TextureRow]):
             series.append(_Series(fitted, "traced", fitted, [_traced(fitted, fitted, c, samples) for c in cameras]))
         say(f"{shape}: the mesh of {coarse.name}")
         try:
-            mesh = from_mesh(extract_mesh(coarse.field, resolution=self.resolution))
+            mesh = extract_mesh(coarse.field, resolution=self.resolution)
         except NoSurfaceError as error:
             raise InputError(f"{shape}: the coarse fit has no surface ({error}); give it more steps") from error
         series.append(_Series(coarse, "mesh", coarse, [_rasterised(mesh, coarse, c, samples) for c in cameras]))
@@ -255,7 +263,7 @@ def _traced(surface: Fitted, painted: Fitted, camera: Camera, samples: int) -> D
 
 
 @torch.inference_mode()
-def _rasterised(mesh: Surface, painted: Fitted, camera: Camera, samples: int) -> Drawing:
+def _rasterised(mesh: Mesh, painted: Fitted, camera: Camera, samples: int) -> Drawing:
     """A mesh in unit-sphere coordinates, with the texture looked up for every pixel."""
     fine = camera.moved(painted.similarity).resized(camera.width * samples, camera.height * samples)
     seen = mesh_view(mesh, fine)

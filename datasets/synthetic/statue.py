@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from ...neural_fields import Jet, OneLevelField
+from ...neural_fields import Jet
+from ...neural_fields.fields.field import OneLevelField
 from . import solids
 from .samples import distinct_starts, refine_closest, sample_surface
 from .solids import Solid, Vector

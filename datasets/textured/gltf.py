@@ -3,8 +3,8 @@
 Files of our own are y-up and in metres by their node, which also says where the mesh was: they are read back in the
 coordinates of the input that they were made from. Written again by another program, they are where that says.
 
-Format: Khronos, "glTF 2.0 Specification". Read here and not with trimesh, which takes COLOR_0 for display colours
-and loses it beside a material, and forgets how textures go on beyond their sides.
+Format: Khronos, "glTF 2.0 Specification". Read here and not with trimesh, which rounds base colours to 8 bits of linear
+light, and loses how textures go on beyond their sides and how KHR_texture_transform moves them.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def read_gltf(path: Path, *, textures: bool = True) -> TexturedMesh:
         mesh = _joined(pieces, list(materials.values()), str(path))
     except InputError:
         raise
-    except (AttributeError, ValueError, KeyError, IndexError, TypeError, struct.error) as error:
+    except (AttributeError, ValueError, KeyError, IndexError, TypeError, RecursionError, struct.error) as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         kind = path.suffix[1:].upper()
         raise InputError(f"{path}: cannot be read as a {kind} mesh ({reason}); export it again") from error
@@ -92,7 +92,9 @@ class _Document:
             return cls(path, json.loads(data), b"")
         if struct.unpack_from("<I", data, 4)[0] != 2:
             raise InputError(f"{path}: glTF 1 is not read; export it as glTF 2")
-        length = struct.unpack_from("<I", data, 12)[0]
+        whole, length = struct.unpack_from("<I", data, 8)[0], struct.unpack_from("<I", data, 12)[0]
+        if len(data) < whole:
+            raise InputError(f"{path}: is cut off after {len(data):,} of {whole:,} bytes; copy or export it again")
         header = json.loads(data[20 : 20 + length])
         return cls(path, header, data[28 + length :])
 
@@ -111,7 +113,10 @@ class _Document:
     def view(self, number: int) -> tuple[bytes, int, int]:
         """A bufferView → its buffer, where it starts and its stride (0: tight)."""
         view = self.header["bufferViews"][number]
-        return self.buffer(view["buffer"]), view.get("byteOffset", 0), view.get("byteStride", 0)
+        data, start, stride = self.buffer(view["buffer"]), _whole(view, "byteOffset"), _whole(view, "byteStride")
+        if start + _whole(view, "byteLength") > len(data):
+            raise ValueError(f"bufferViews[{number}] goes beyond the {len(data):,} bytes of its buffer")
+        return data, start, stride
 
     def accessor(self, number: int) -> NDArray[Any]:
         """An accessor → ``(count, width)``; normalised integers become fractions."""
@@ -121,12 +126,14 @@ class _Document:
         data, start, stride = self.view(accessor["bufferView"])
         kind, width = np.dtype(_KINDS[accessor["componentType"]]), _WIDTHS[accessor["type"]]
         rows = np.ndarray(
-            (accessor["count"], width),
+            (_whole(accessor, "count"), width),
             kind,
             data,
-            start + accessor.get("byteOffset", 0),
+            start + _whole(accessor, "byteOffset"),
             (stride or width * kind.itemsize, kind.itemsize),
         )
+        if kind.kind == "f" and not np.isfinite(rows).all():
+            raise ValueError(f"accessors[{number}] has a number that is not finite")
         if accessor.get("normalized", False):
             return (rows / np.float64(np.iinfo(kind).max)).clip(-1, 1)
         return rows
@@ -142,6 +149,21 @@ class _Document:
             return decode_texture(data)
         except ValueError as error:
             raise InputError(f"{self.path}: images[{number}]: {error}; export it with PNG or JPEG images") from error
+
+
+def _whole(record: dict[str, Any], name: str) -> int:
+    """A number of bytes or rows; 0 where there is none."""
+    value = record.get(name, 0)
+    if not isinstance(value, int) or isinstance(value, bool) or value < 0:
+        raise ValueError(f"{name}: {value!r} is no whole number")
+    return value
+
+
+def _finite(numbers: object, name: str) -> Float64:
+    found = np.array(numbers, np.float64)
+    if not np.isfinite(found).all():
+        raise ValueError(f"{name} has a number that is not finite")
+    return found
 
 
 def _pieces(document: _Document, materials: dict[str, Paint], *, textures: bool) -> Iterator[_Piece]:
@@ -174,15 +196,14 @@ def _pieces(document: _Document, materials: dict[str, Paint], *, textures: bool)
 
 def _transform(node: dict[str, Any], *, ours: bool) -> Float64:
     if "matrix" in node:
-        return np.array(node["matrix"], np.float64).reshape(4, 4).T
+        return _finite(node["matrix"], "matrix").reshape(4, 4).T
     placed = np.eye(4)
     if ours and "origin" in node.get("extras", {}):  # what positions are relative to, in input coordinates
-        placed[:3, 3] = node["extras"]["origin"]
+        placed[:3, 3] = _finite(node["extras"]["origin"], "origin")
         return placed
-    placed[:3, :3] = Rotation.from_quat(node.get("rotation", (0, 0, 0, 1))).as_matrix() * np.array(
-        node.get("scale", (1, 1, 1)), np.float64
-    )
-    placed[:3, 3] = node.get("translation", (0, 0, 0))
+    turned = Rotation.from_quat(_finite(node.get("rotation", (0, 0, 0, 1)), "rotation")).as_matrix()
+    placed[:3, :3] = turned * _finite(node.get("scale", (1, 1, 1)), "scale")
+    placed[:3, 3] = _finite(node.get("translation", (0, 0, 0)), "translation")
     return placed
 
 
@@ -233,16 +254,15 @@ def _texture_coordinates(document: _Document, attributes: dict[str, int], info: 
     if name not in attributes:
         raise ValueError(f"{name} is missing, which its texture needs")
     uv = document.accessor(attributes[name]).astype(np.float64)
-    if not np.isfinite(uv).all():
-        raise ValueError(f"{name} has numbers that are not finite")
-    cos, sin = np.cos(moved.get("rotation", 0.0)), np.sin(moved.get("rotation", 0.0))
-    turned = (uv * np.array(moved.get("scale", (1, 1)), np.float64)) @ np.array([[cos, -sin], [sin, cos]])
-    return turned + np.array(moved.get("offset", (0, 0)), np.float64)
+    angle = _finite(moved.get("rotation", 0.0), "rotation")
+    cos, sin = np.cos(angle), np.sin(angle)
+    turned = (uv * _finite(moved.get("scale", (1, 1)), "scale")) @ np.array([[cos, -sin], [sin, cos]])
+    return turned + _finite(moved.get("offset", (0, 0)), "offset")
 
 
 def _paint(document: _Document, material: dict[str, Any]) -> Paint:
     """The base colour of a material: its texture (display) times its factor (linear)."""
-    factor = np.array(material.get("baseColorFactor", (1, 1, 1, 1))[:3], np.float32)
+    factor = _finite(material.get("baseColorFactor", (1, 1, 1, 1))[:3], "baseColorFactor").astype(np.float32)
     info = material.get("baseColorTexture")
     if info is None and (factor == 1).all():
         return Paint(np.ones((1, 1, 3), np.float32))  # exactly, so that it is known for what it is

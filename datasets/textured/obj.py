@@ -126,12 +126,12 @@ def _read_mtl(file: Path) -> dict[str, _Material]:
 
 def _color(words: str, file: Path, name: str) -> tuple[float, ...]:
     try:
-        color = tuple(min(max(float(word), 0.0), 1.0) for word in words.split()[:3])
+        color = tuple(float(word) for word in words.split()[:3])
     except ValueError as error:
         raise InputError(f"{file}: {name}: Kd: expected three numbers, not {words!r}") from error
-    if len(color) not in (1, 3):
+    if len(color) not in (1, 3) or not np.isfinite(color).all():
         raise InputError(f"{file}: {name}: Kd: expected three numbers, not {words!r}")
-    return color * (3 // len(color))
+    return tuple(min(max(part, 0.0), 1.0) for part in color) * (3 // len(color))
 
 
 def _with_map(material: _Material, words: str, file: Path, name: str) -> _Material:
@@ -144,6 +144,8 @@ def _with_map(material: _Material, words: str, file: Path, name: str) -> _Materi
         if option in ("-s", "-o") and values and is_number(values[0]):
             default = (1.0, 1.0) if option == "-s" else (0.0, 0.0)
             pair = (*map(float, values[:2]), *default[len(values[:2]) :])
+            if not np.isfinite(pair).all():
+                raise InputError(f"{file}: {name}: map_Kd: {option} has a number that is not finite; export it again")
             material = material._replace(scale=pair) if option == "-s" else material._replace(offset=pair)
         elif option == "-clamp":
             material = material._replace(clamp=values == ["on"])

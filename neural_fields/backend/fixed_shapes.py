@@ -161,7 +161,8 @@ def fixed_shapes(
 
     Example:
         >>> import torch
-        >>> from mplicits.neural_fields import MultiscaleSDF, fixed_shapes
+        >>> from mplicits.neural_fields import MultiscaleSDF
+        >>> from mplicits.neural_fields.backend.fixed_shapes import fixed_shapes
         >>> sdf = MultiscaleSDF.from_widths([(16, 1), (16, 1)], omegas=[5, 10])
         >>> x = torch.zeros(4, 3)
         >>> with fixed_shapes():

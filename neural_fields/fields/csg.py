@@ -50,6 +50,11 @@ class Combined(Field):
         return tuple(self.parts)  # pyright: ignore[reportReturnType]
 
     @property
+    def same_rows(self) -> bool:
+        """Whether it holds for every part."""
+        return all(field.same_rows for field in self.fields)
+
+    @property
     def deltas(self) -> Tensor:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Half-widths of the bands: the widest of the parts at each level, and what the combination adds to it."""
         bands = [field.deltas for field in self.fields]
@@ -361,7 +366,8 @@ class Placed(Combined):
 
     Example:
         >>> import torch
-        >>> from mplicits.neural_fields import Placed, Similarity, Sphere
+        >>> from mplicits.neural_fields import Similarity, Sphere
+        >>> from mplicits.neural_fields.fields.csg import Placed
         >>> Placed(Sphere(radius=0.5), Similarity((1.0, 0.0, 0.0), 2.0))(torch.tensor([[3.0, 0.0, 0.0]]))
         tensor([1.])
     """
@@ -406,7 +412,8 @@ class Bounded(Combined):
 
     Example:
         >>> import torch
-        >>> from mplicits.neural_fields import Bounded, Plane
+        >>> from mplicits.neural_fields import Plane
+        >>> from mplicits.neural_fields.fields.csg import Bounded
         >>> Bounded(Plane(), radius=1.0)(torch.tensor([[0.0, 0.0, -0.5], [0.0, 0.0, -3.0], [0.0, 0.0, 3.0]]))
         tensor([-0.5000,  2.0000,  2.2361])
     """

@@ -166,6 +166,15 @@ class Field(nn.Module, ABC):
         """A tensor of this field's precision, where the field is: ``points.to(field.like)`` can be asked for."""
         return next(self.parameters(), self.deltas)
 
+    @property
+    def same_rows(self) -> bool:
+        """Whether every field inside this one is evaluated at the same rows, in the same order.
+
+        Tracing on a GPU is faster then. The default is true for a field whose modules include no other `Field`.
+        A field that wraps others and evaluates them at every point may return true too.
+        """
+        return sum(isinstance(module, Field) for module in self.modules()) == 1
+
     def level_values(self, x: Tensor, *, level: int = -1) -> list[Tensor]:
         """The values of all levels up to ``level`` at ``x`` ``(..., d)``, coarse to fine, ``(...,)`` each.
 

@@ -44,6 +44,11 @@ class FunctionField(Field):
         """What is called, and the dimension of its domain."""
         return f"function={getattr(self.function, '__qualname__', type(self.function).__name__)}, in_dim={self.in_dim}"
 
+    @property
+    def same_rows(self) -> bool:
+        """False: the function may evaluate other fields at any points."""
+        return False
+
     def value(self, x: Tensor, *, level: int = -1) -> Tensor:
         """See `Field.value`.
 

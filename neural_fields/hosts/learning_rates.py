@@ -47,7 +47,8 @@ def parameter_groups(field: Field, lr: float = HOST_RATE, *, pace: Pace = 1.0) -
         ValueError: a rate or a pace is not positive.
 
     Example:
-        >>> from mplicits.neural_fields import MultiscaleSDF, parameter_groups
+        >>> from mplicits.neural_fields import MultiscaleSDF
+        >>> from mplicits.neural_fields.hosts.learning_rates import parameter_groups
         >>> sdf = MultiscaleSDF.from_widths([(128, 4), (256, 5)], omegas=[10, 30])
         >>> [f"{group['lr']:.1e}" for group in parameter_groups(sdf, 5e-4)]
         ['3.0e-04', '1.0e-04', '1.0e-04', '1.0e-04']
@@ -78,7 +79,8 @@ def share_rate(field: Field, lr: float = HOST_RATE, *, pace: Pace = 1.0) -> None
 
     Example:
         >>> import torch
-        >>> from mplicits.neural_fields import Siren, share_rate
+        >>> from mplicits.neural_fields import Siren
+        >>> from mplicits.neural_fields.hosts.learning_rates import share_rate
         >>> siren, x = Siren(16, 2, omega=30.0), torch.rand(5, 3)
         >>> before = siren.value(x)
         >>> share_rate(siren, 5e-4)

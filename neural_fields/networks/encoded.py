@@ -35,7 +35,8 @@ class EncodedField(Field):
 
     Example:
         >>> import torch
-        >>> from mplicits.neural_fields import EncodedField, MultiscaleSDF
+        >>> from mplicits.neural_fields import MultiscaleSDF
+        >>> from mplicits.neural_fields.networks.encoded import EncodedField
         >>> sdf = MultiscaleSDF.from_widths([(128, 2), (256, 3)], omegas=[10, 20], num_features=8)
         >>> EncodedField(sdf).jet(torch.zeros(5, 3)).features.shape
         torch.Size([5, 32])
@@ -55,6 +56,11 @@ class EncodedField(Field):
             with torch.no_grad():  # features begin as small as those of an encoding without a gain
                 grid.table.div_(gain)
         self.grid = grid
+
+    @property
+    def same_rows(self) -> bool:
+        """Whether it holds for the field that is encoded."""
+        return self.field.same_rows
 
     @property
     def deltas(self) -> Tensor:  # pyright: ignore[reportIncompatibleVariableOverride]

@@ -74,6 +74,11 @@ class MultiscaleSDF(Field):
         self.in_dim, self.num_levels = base.in_dim, 1 + len(residuals)
         self.register_buffer("deltas", widths)
 
+    @property
+    def same_rows(self) -> bool:
+        """True: gating by bands keeps track of the rows."""
+        return True
+
     @classmethod
     def from_widths(
         cls,

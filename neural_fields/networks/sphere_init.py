@@ -84,7 +84,8 @@ def solve_sphere(network: Siren, radius: float = 0.5) -> None:
 
     Example:
         >>> import torch
-        >>> from mplicits.neural_fields import Siren, solve_sphere
+        >>> from mplicits.neural_fields import Siren
+        >>> from mplicits.neural_fields.networks.sphere_init import solve_sphere
         >>> _ = torch.manual_seed(0)
         >>> siren = Siren(128, 4, omega=10.0)
         >>> solve_sphere(siren, radius=0.4)

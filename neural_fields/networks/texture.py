@@ -40,7 +40,7 @@ class ColorSiren(nn.Module):
 
     Example:
         >>> import torch
-        >>> from mplicits.neural_fields import ColorSiren
+        >>> from mplicits.neural_fields.networks.texture import ColorSiren
         >>> network = ColorSiren(256, 3)
         >>> value, along = network.derivative_along(torch.zeros(5, 3), torch.ones(5, 3))
         >>> value.shape, along.shape
@@ -133,7 +133,8 @@ class TextureField(OneLevelField):
 
     Example:
         >>> import torch
-        >>> from mplicits.neural_fields import ColorSiren, Sphere, TextureField
+        >>> from mplicits.neural_fields import Sphere, TextureField
+        >>> from mplicits.neural_fields.networks.texture import ColorSiren
         >>> texture = TextureField(Sphere(radius=0.5), ColorSiren(64, 2), delta=0.1)
         >>> texture.value(torch.tensor([0.9, 0.0, 0.0])).tolist()
         [0.5, 0.5, 0.5]

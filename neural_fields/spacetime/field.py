@@ -100,6 +100,11 @@ class SpaceTimeSDF(Field):
         self.in_dim, self.num_levels = 4, sdf.num_levels
 
     @property
+    def same_rows(self) -> bool:
+        """True: gating by bands keeps track of the rows."""
+        return True
+
+    @property
     def deltas(self) -> Tensor:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Half-widths of the bands, in units of space."""
         return self.sdf.deltas
@@ -223,6 +228,11 @@ class TimeSlice(Field):
             raise ValueError(f"t has shape {tuple(t.shape)}; expected one number")
         self.field, self.t = field, t
         self.in_dim, self.num_levels = 3, field.num_levels
+
+    @property
+    def same_rows(self) -> bool:
+        """Whether it holds for the field in space-time."""
+        return self.field.same_rows
 
     @property
     def deltas(self) -> Tensor:  # pyright: ignore[reportIncompatibleVariableOverride]

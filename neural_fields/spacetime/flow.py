@@ -131,7 +131,8 @@ def flow(
 
     Example:
         >>> import torch
-        >>> from mplicits.neural_fields import RigidMotion, Solver, flow
+        >>> from mplicits.neural_fields import RigidMotion, flow
+        >>> from mplicits.neural_fields.spacetime.flow import Solver
         >>> turn = RigidMotion(angle=torch.pi)
         >>> there = flow(turn.velocity, torch.tensor([[1.0, 0.0, 0.5]]), 0.0, 1.0)
         >>> bool((there - torch.tensor([[-1.0, 0.0, 0.5]])).abs().max() < 1e-4)
@@ -265,7 +266,8 @@ def track(
 
     Example:
         >>> import torch
-        >>> from mplicits.neural_fields import ShrinkingSphere, track
+        >>> from mplicits.neural_fields.spacetime.flow import track
+        >>> from mplicits.neural_fields.spacetime.moving import ShrinkingSphere
         >>> tracks = track(ShrinkingSphere(radius=0.8, alpha=0.12), torch.tensor([[0.8, 0.0, 0.0]]), [0.0, 0.5, 1.0])
         >>> [round(float(x), 4) for x in tracks.points[:, 0, 0]]
         [0.8, 0.6325, 0.4]

@@ -15,12 +15,7 @@ import torch
 from torch import Tensor
 
 from ..backend.fixed_shapes import first_rows, fixed_shapes
-from ..fields.csg import Combined
 from ..fields.field import Field
-from ..fields.primitives import ClosedForm
-from ..networks.multiscale import MultiscaleSDF
-from ..networks.siren import Siren
-from ..spacetime.field import SpaceTimeSDF, TimeSlice
 from ._march import PATIENCE, Found, Rays, Rule, Stand, look
 
 __all__ = ["march_ahead"]
@@ -52,15 +47,6 @@ def march_ahead(
         passes = PASSES
 
 
-def _asks_at_all_points(field: Field) -> bool:
-    """Whether every `MultiscaleSDF` inside is asked at the very points that ``field`` is asked at, in their order."""
-    if isinstance(field, Combined):
-        return all(map(_asks_at_all_points, field.fields))
-    if isinstance(field, TimeSlice):
-        return _asks_at_all_points(field.field)
-    return isinstance(field, MultiscaleSDF | SpaceTimeSDF | Siren | ClosedForm)
-
-
 class _Chunk:
     """Some passes of rays, none of which leaves.
 
@@ -80,7 +66,7 @@ class _Chunk:
     def run(self, passes: int, found: Found, reach: float | None, capacity: Sequence[int]) -> list[Tensor]:
         """So many passes; then what the rays that ended have found is noted → how much room bands were asked for."""
         demand: list[Tensor] = []
-        if _asks_at_all_points(self.field):
+        if self.field.same_rows:
             with fixed_shapes(capacity) as shapes:
                 for _ in range(passes):
                     shapes.wanted = ~self.ended
@@ -89,7 +75,7 @@ class _Chunk:
                         value, shapes.wanted if shapes.lost is None else shapes.wanted & ~shapes.lost, found, reach
                     )
             demand = shapes.demand
-        else:  # who asks another field at fewer points could not say who found no room
+        else:  # a field that is evaluated at other rows could not tell which rows overflow
             for _ in range(passes):
                 self._pass(self._values(), ~self.ended, found, reach)
         ray, stand = self.rays.ray, self.stand

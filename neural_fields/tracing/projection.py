@@ -105,7 +105,8 @@ def map_attribute(
 
     Example:
         >>> import torch
-        >>> from mplicits.neural_fields import Torus, map_attribute
+        >>> from mplicits.neural_fields import Torus
+        >>> from mplicits.neural_fields.tracing.projection import map_attribute
         >>> fine = Torus(major=0.5, minor=0.2)
         >>> mesh = torch.rand(100, 3)
         >>> normals = map_attribute(fine, lambda x: fine.jet(x).gradient, mesh, delta=0.1)

@@ -112,11 +112,10 @@ def _faults(arguments: argparse.Namespace) -> dict[str, Any]:
 
 def _solid(arguments: argparse.Namespace) -> int:
     from ...datasets.synthetic.prisms import PRISMS
-    from ...neural_fields import Similarity
-    from ..mesh.files import Triangles, write_triangles
+    from ...neural_fields import Mesh
+    from ..mesh.files import write_mesh
 
-    vertices, faces = PRISMS[arguments.name]()
-    write_triangles(arguments.out, Triangles(vertices, faces, None, None), Similarity.identity())
+    write_mesh(arguments.out, Mesh(*PRISMS[arguments.name]()))
     command = f"python -m benchmarks fit {arguments.out} --points 12000"
     print(f"{arguments.out}: an exact mesh; in a checkout of mplicits, `{command}` fits points drawn on it")
     return 0

@@ -24,16 +24,17 @@ from ...datasets import (
     write_cloud_ply,
 )
 from ...datasets.synthetic.samples import feet_and_normals
-from ...neural_fields import Field, InputError, Placement, Similarity
+from ...neural_fields import Field, InputError, Similarity
 from ...neural_fields.backend.files import check_place
 from ...neural_fields.meshing.extract import Mesh, NoSurfaceError, extract_mesh
+from ...neural_fields.meshing.placement import Placement
 from ..fit.train import Run, fit
 from ..mesh.files import write_mesh
 from ..render.picture import Image, contact_sheet, write_picture
 from ..render.rasterise import picture_of
 from ..render.shade import ShadeOptions, compose, shade
 from ..render.trace import trace_view
-from ..surface.surface import from_cloud, from_mesh
+from ..surface.surface import from_cloud
 from ..training.machine import format_table
 from ..training.progress import progress_bars
 from ..training.report import Progress, Report, reported
@@ -175,7 +176,7 @@ def draw_levels(
     drawn += [_traced(field, camera, level) for level in range(len(drawn), field.num_levels)]
     pictures += [(f"level {level}, traced", image) for level, image in enumerate(drawn)]
     if mesh is not None and mesh.colors is not None:
-        pictures.append((f"mesh: {len(mesh.faces):,} faces", picture_of(from_mesh(mesh), camera)))
+        pictures.append((f"mesh: {len(mesh.faces):,} faces", picture_of(mesh, camera)))
     return contact_sheet(pictures)
 
 

@@ -69,13 +69,14 @@ class _Parser(argparse.ArgumentParser):
 
     def check_flags(self, arguments: Sequence[str]) -> None:
         """Name the nearest flag of a mistyped one, before argparse complains of what is then missing."""
-        known = set(re.findall(r"--[a-z][\w-]*", self.format_help()))
+        known = {flag: action.help for flag, action in self._option_string_actions.items() if flag.startswith("--")}
         for argument in arguments:
             if argument == "--":
                 return
             flag = argument.split("=", 1)[0]
             if flag.startswith("--") and flag not in known:
-                self.error(f"unknown flag {flag}{closest(flag, known)}")
+                shown = (name for name, text in known.items() if text != argparse.SUPPRESS)
+                self.error(f"unknown flag {flag}{closest(flag, shown)}")
 
 
 @dataclass(frozen=True)

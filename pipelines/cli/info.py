@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from ...neural_fields import Siren, levels_of, load_field
-from ..surface.surface import Surface, components, is_closed, read_surface
+from ...neural_fields import Mesh, Siren, load_field
+from ...neural_fields.networks.multiscale import levels_of
+from ..surface.surface import components, is_closed, read_surface
 from ..training.folder import RECORD_FILE, find_field, is_field, read_record, resumes_with
 from ..training.trainer import parameter_count
 
@@ -120,7 +121,7 @@ def _describe_signs(signs: dict[str, Any], count: int) -> str:
     return f"{what} (slope along them {signs['slope']:.2f})"
 
 
-def _describe_surface(surface: Surface) -> Rows:
+def _describe_surface(surface: Mesh) -> Rows:
     points = surface.used_vertices()
     low, high = points.min(axis=0), points.max(axis=0)
     rows: Rows = []

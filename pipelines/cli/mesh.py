@@ -40,7 +40,7 @@ def _mesh_arguments(parser: argparse.ArgumentParser) -> None:
     what = "of the input: a GLB is in metres (default: m), others are scaled (STL to mm, else to m) if this is given"
     add("--unit", choices=UNITS, help=what)
     add("--center", action="store_true", help="put the middle of the mesh at the origin")
-    what = "look at it as a printer would: closed, parts, volume, thinnest part, overhang (default: for .stl)"
+    what = "look at it as a printer would: closed, parts, volume, thinnest part (default: for .stl)"
     add("--report", action=argparse.BooleanOptionalAction, help=what)
     add_flags(parser, "--json", help="write the figures as JSON (implies --report)")
 
@@ -80,7 +80,7 @@ MESH = Command(
 def _evaluate_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("mesh", metavar="MESH", help="the mesh to judge")
     parser.add_argument("reference", metavar="REFERENCE", help="the true mesh, or a point cloud")
-    about = "posed photographs: say, too, how near the mesh is where so many of them see the reference"
+    about = "posed photographs: say, too, how near the mesh is where two of them see the reference"
     parser.add_argument("--photos", metavar="DATA", help=about)
     add_flags(parser, "--samples", type=whole(1), default=500_000, help="on each surface (500000)")
     add_flags(parser, "--seed", help="of the samples (0)")
@@ -100,8 +100,8 @@ def _evaluate(arguments: argparse.Namespace) -> int:
 
         cameras = [camera for _, camera in read_cameras(arguments.photos)]
         with counter_bar("photographs") as progress:
-            witnesses = functools.partial(count_witnesses, cameras, progress=progress)
-            metrics = evaluate_files(arguments.mesh, arguments.reference, witnesses=witnesses, **options)
+            view_counts = functools.partial(count_witnesses, cameras, progress=progress)
+            metrics = evaluate_files(arguments.mesh, arguments.reference, view_counts=view_counts, **options)
     print(format_metrics(metrics))
     if arguments.json:
         write_metrics(arguments.json, metrics)

@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ...datasets.cameras import Camera
-from ...neural_fields import Field, InputError, Placement, Similarity, load_field
+from ...neural_fields import Field, InputError, Similarity, load_field
 from ...neural_fields.backend.files import check_place
 from ...neural_fields.meshing.extract import NoSurfaceError, extract_mesh
+from ...neural_fields.meshing.placement import Placement
 from ...neural_fields.spacetime.dynamic_tracing import DynamicTracer, moment
 from ..mesh.files import write_mesh, write_moving
 from ..render.film import ANIMATIONS, write_animation
@@ -24,7 +25,7 @@ from ..render.picture import Image, contact_sheet, in_rows, write_picture
 from ..render.shade import ShadeOptions, compose, downsample, shade
 from ..render.subject import Orbit, orbit_cameras, traced_part
 from ..render.trace import PRECISION, fine_strips, pixel_size, see_hits
-from ..texture.riding import Colors, RidingColors, borrowed_texture, pinned_texture, start_texture
+from ..texture.transport import Colors, TransportedColors, borrowed_texture, pinned_texture, start_texture
 from ..training.folder import FIELD_FILE, RECORD_FILE, chosen_level, find_field, read_record
 from ..training.machine import choose_device
 from ..training.motion import load_motion
@@ -132,27 +133,27 @@ def animate_run(
     if field.in_dim != 4:
         raise InputError(f"{file}: does not move; use `mplicits render` or `mplicits mesh`")
     level = chosen_level(field, file, options.level)
-    riding = _riding(file, field, similarity, level, options)
-    if options.shading == "color" and riding is None:
+    transported = _transported(file, field, similarity, level, options)
+    if options.shading == "color" and transported is None:
         raise InputError(f"--shading color: {file} has no texture; name a textured run with --colors RUN")
     if out.suffix.lower() in ANIMATIONS:
-        frames = film_frames(file, field, riding, level, options, progress)
+        frames = film_frames(file, field, transported, level, options, progress)
         write_animation(out, there_and_back(frames) if options.loop else frames, fps=options.fps)
         count = max(2 * options.frames - 2, 1) if options.loop else options.frames
         return f"{count} frames of {options.size[0]}×{options.size[1]}"
     if out.suffix.lower() == SHEET:
-        frames = film_frames(file, field, riding, level, options, progress)
+        frames = film_frames(file, field, transported, level, options, progress)
         moments = [(f"t = {time:.2f}", frame) for time, frame in zip(options.times, frames, strict=True)]
         write_picture(out, contact_sheet(*in_rows(moments, ACROSS)))
         return f"{options.frames} moments of {options.size[0]}×{options.size[1]}"
     if out.suffix:
-        return _write_moving_mesh(out, file, field, riding, similarity, level, options, progress)
-    return _write_series(out, file, field, riding, similarity, level, options, progress)
+        return _write_moving_mesh(out, file, field, transported, similarity, level, options, progress)
+    return _write_series(out, file, field, transported, similarity, level, options, progress)
 
 
-def _riding(
+def _transported(
     file: Path, field: Field, similarity: Similarity, level: int, options: SequenceOptions
-) -> RidingColors | None:
+) -> TransportedColors | None:
     """The colours that ride along, if there are any."""
     if options.no_colors:
         return None
@@ -168,7 +169,7 @@ def _riding(
         raise InputError(f"--last-colors: {file} has no colours at the start; name the first shape's run with --colors")
     if texture is None:
         return None
-    return RidingColors(field, texture, placed=placed, last=last, level=level, motion=motion)
+    return TransportedColors(field, texture, placed=placed, last=last, level=level, motion=motion)
 
 
 def last_colors(run: str | Path, file: Path, field: Field) -> Colors:
@@ -189,7 +190,7 @@ def last_colors(run: str | Path, file: Path, field: Field) -> Colors:
 def film_frames(
     file: Path,
     field: Field,
-    riding: RidingColors | None,
+    transported: TransportedColors | None,
     level: int,
     options: SequenceOptions,
     progress: Tell | None = None,
@@ -201,7 +202,7 @@ def film_frames(
     lit = ShadeOptions(shadows=options.shadows, occlusion=options.shadows)
     for index, time in enumerate(options.times, start=1):
         still = moment(field, time)
-        colors = None if riding is None else riding.at(time)
+        colors = None if transported is None else transported.at(time)
         parts = []
         for strip, tracer in strips:
             directions = strip.rays(device=device)[1]
@@ -255,7 +256,7 @@ def _write_series(
     folder: Path,
     file: Path,
     field: Field,
-    riding: RidingColors | None,
+    transported: TransportedColors | None,
     similarity: Similarity,
     level: int,
     options: SequenceOptions,
@@ -270,9 +271,9 @@ def _write_series(
             mesh = extract_mesh(moment(field, time), resolution=options.resolution, level=level)
         except NoSurfaceError:
             continue
-        if riding is not None:
+        if transported is not None:
             points = torch.from_numpy(mesh.vertices).to(field.like)
-            mesh = dataclasses.replace(mesh, colors=riding.at(time)(points).cpu().numpy())
+            mesh = dataclasses.replace(mesh, colors=transported.at(time)(points).cpu().numpy())
         write_mesh(folder / f"frame_{index:0{digits}d}.ply", mesh, similarity)
         written += 1
         if progress is not None:
@@ -288,7 +289,7 @@ def _write_moving_mesh(
     out: Path,
     file: Path,
     field: Field,
-    riding: RidingColors | None,
+    transported: TransportedColors | None,
     similarity: Similarity,
     level: int,
     options: SequenceOptions,
@@ -300,9 +301,9 @@ def _write_moving_mesh(
         field, options.times, resolution=options.resolution, level=level, name=str(file), progress=progress
     )
     colors = None
-    if riding is not None:
+    if transported is not None:
         points = torch.from_numpy(tracked.vertices[0]).to(field.like)
-        colors = riding.at(0.0)(points).cpu().numpy()
+        colors = transported.at(0.0)(points).cpu().numpy()
     write_moving(
         out,
         tracked.faces,

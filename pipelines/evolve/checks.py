@@ -13,12 +13,12 @@ from torch import Tensor
 
 from ...neural_fields import Field, NoSurfaceError, Similarity, TimeSlice, extract_mesh
 from ..surface.measure import chamfer
-from ..surface.surface import Surface, from_mesh, sample_points
+from ..surface.surface import sample_points, volume
 from .problem import End
 from .samples import band_points
 from .topology import Change, Topology, find_changes, surface_of, topology_of
 
-__all__ = ["FrameFigures", "check_evolution", "end_figures", "frame_figures", "slope_figures", "volume", "warnings"]
+__all__ = ["FrameFigures", "check_evolution", "end_figures", "frame_figures", "slope_figures", "warnings"]
 
 END_RESOLUTION = 192
 # A surface that shall be met counts as missed where its Chamfer distance is so much above what it would score itself.
@@ -112,7 +112,7 @@ def end_figures(field: Field, end: End) -> dict[str, Any]:
         "floor": sum(chamfer(*(points.double().numpy() for points in (end.points, end.others)))),
     }
     try:
-        mesh = from_mesh(extract_mesh(at, resolution=END_RESOLUTION, normals=False))
+        mesh = extract_mesh(at, resolution=END_RESOLUTION, normals=False)
     except NoSurfaceError:
         return figures | {"ratio": None}
     found, _ = sample_points(mesh, len(end.points), np.random.default_rng(0))
@@ -178,13 +178,6 @@ def _as_dict(change: Change, similarity: Similarity) -> dict[str, Any]:
         "after": change.after._asdict(),
         "place": None if change.place is None else similarity.to_input(np.array([change.place]))[0].tolist(),
     }
-
-
-def volume(surface: Surface) -> float:
-    """Volume inside a closed surface: the sum of signed tetrahedra from its middle."""
-    vertices = surface.vertices - surface.vertices.mean(axis=0)
-    a, b, c = (vertices[surface.faces[:, k]] for k in range(3))
-    return float((a * np.cross(b, c)).sum() / 6)
 
 
 def frame_figures(field: Field, time: float, resolution: int) -> FrameFigures:

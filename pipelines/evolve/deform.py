@@ -28,7 +28,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import huber_loss, normalize, pad
 
-from ...neural_fields import CarriedKeyframes, Field, VelocitySiren, at_time, flow
+from ...neural_fields import Field, at_time, flow
+from ...neural_fields.spacetime.velocity import CarriedKeyframes, VelocitySiren
 from ..training.budget import LEAST_SECONDS, Budget
 from ..training.report import Report
 from ..training.settings import EvolveConfig

@@ -10,9 +10,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ...neural_fields import Field, InputError, IntegrationError, Solver, flow, project_to_surface
+from ...neural_fields import Field, InputError, flow, project_to_surface
 from ...neural_fields.meshing.extract import NoSurfaceError, extract_mesh
 from ...neural_fields.spacetime.dynamic_tracing import moment
+from ...neural_fields.spacetime.flow import IntegrationError, Solver
 from ...neural_fields.spacetime.surface_velocity import CarriedVelocity
 from .topology import surface_of, topology_of
 
@@ -33,13 +34,13 @@ class TrackedMesh:
     """A mesh, and where its vertices are at some times.
 
     Attributes:
-        faces: ``(F, 3)`` int32, the same at all times.
+        faces: ``(F, 3)``, the same at all times.
         times: ``(T,)``.
         vertices: ``(T, V, 3)``.
         normals: ``(T, V, 3)``, of unit length.
     """
 
-    faces: NDArray[np.int32]
+    faces: NDArray[np.integer]
     times: tuple[float, ...]
     vertices: NDArray[np.float32]
     normals: NDArray[np.float32]

@@ -5,9 +5,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ...neural_fields import Jet, Siren, SpaceTimeSDF, key_loss, law_loss, spacetime_jet
+from ...neural_fields import Jet, Siren, SpaceTimeSDF
 from ...neural_fields.backend.devices import upload
 from ...neural_fields.fields.losses import eikonal_loss
+from ...neural_fields.spacetime.evolution import key_loss, law_loss
+from ...neural_fields.spacetime.field import spacetime_jet
 from ..training.focus import Focus
 from ..training.settings import EvolveConfig
 from ..training.trainer import Group, Objective, Report, Trainer, seeded, warm_cosine

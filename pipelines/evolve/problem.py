@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,30 +11,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...neural_fields import (
-    Field,
-    InputError,
-    IntegrationError,
-    Keyframes,
-    Law,
-    RigidMotion,
-    Similarity,
-    VelocitySiren,
-    at_time,
-    flow,
-    mean_curvature,
-    normal_speed,
-    trajectories,
-    transport,
-)
-from ...neural_fields.spacetime.evolution import VectorField
+from ...neural_fields import Field, InputError, RigidMotion, Similarity, at_time, flow
+from ...neural_fields.spacetime.evolution import Law, VectorField, mean_curvature, normal_speed, transport
+from ...neural_fields.spacetime.flow import IntegrationError, trajectories
+from ...neural_fields.spacetime.moving import Keyframes
+from ...neural_fields.spacetime.velocity import CarriedKeyframes, VelocitySiren
 from ..training.budget import SAMPLING_SHARE, Budget, affordable
 from ..training.report import Report
 from ..training.settings import EvolveConfig
 from .deform import carried_samples, learn_motion, motion_figures
 from .samples import Bounds, Carried, Known, around, joined, known_at, no_bounds, signs, uniform, values_at
 from .shapes import Placement, StaticShape, aligned, into_unit_sphere
-from .source import PacedKeyframes, pace_of
 
 __all__ = ["End", "Problem", "between", "build_problem", "morph_law", "velocity_field"]
 
@@ -179,9 +165,7 @@ def _deform(
     keys = config.key_times()
     motion = motion or learn_motion(placed, keys, config, progress, budget=budget)
     frames = Keyframes(keys, [shape.field for shape in placed])
-    between_keys = zip(itertools.pairwise(placed), itertools.pairwise(keys), strict=True)
-    paces = [pace_of([shape.field for shape in pair], times, motion) for pair, times in between_keys]
-    carried = PacedKeyframes(frames, motion, paces)
+    carried = CarriedKeyframes(frames, motion)
     made = _sampled(lambda count: carried_samples(carried, placed, count, config.seed), config, budget)
     ends = tuple(_end(shape, time, config.seed) for shape, time in zip(placed, keys, strict=True))
     similarity, figures = _composed(shapes[0].similarity, region), tuple(motion_figures(motion, placed, keys))

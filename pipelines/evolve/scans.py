@@ -15,10 +15,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ...neural_fields import load_field
+from ...neural_fields import Mesh, load_field
 from ...neural_fields.backend.files import write_whole
 from ..fit.train import fit
-from ..surface.surface import Surface, read_surface
+from ..surface.surface import read_surface
 from ..training.config import load_config
 from ..training.folder import FIELD_FILE, STATE_FILE, find_field, is_fitted, read_record
 from ..training.report import Report
@@ -30,7 +30,7 @@ __all__ = ["fits_beside", "fitted_scans", "scans_among"]
 PAIRS = 400  # vertices that are landmarks; more say nothing new of a smooth motion
 
 
-def scans_among(shapes: Sequence[str]) -> dict[str, Surface]:
+def scans_among(shapes: Sequence[str]) -> dict[str, Mesh]:
     """Those of the shapes that are files of points or triangles, read.
 
     Raises:
@@ -47,7 +47,7 @@ def fits_beside(run: Path) -> Path:
 
 def fitted_scans(
     config: EvolveConfig,
-    scans: Mapping[str, Surface],
+    scans: Mapping[str, Mesh],
     folder: Path,
     fits: FitConfig,
     *,
@@ -92,9 +92,7 @@ def _is_of(run: Path, scan: Path, fits: FitConfig) -> bool:
     return record.get("cloud") == str(scan.absolute()) and load_config(FitConfig, None, record["config"]) == fits
 
 
-def _pairs(
-    config: EvolveConfig, scans: Mapping[str, Surface], runs: Mapping[str, Path], folder: Path
-) -> tuple[str, ...]:
+def _pairs(config: EvolveConfig, scans: Mapping[str, Mesh], runs: Mapping[str, Path], folder: Path) -> tuple[str, ...]:
     """Files of vertices that are the same, for each two shapes; none where shapes are no poses of one mesh."""
     poses = [scans.get(text) for text in config.shapes]
     first = poses[0] if poses else None

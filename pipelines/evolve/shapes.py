@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ...neural_fields import (
-    Bounded,
     Box,
     Capsule,
     Field,
     InputError,
     Jet,
+    Mesh,
     NoSurfaceError,
     Similarity,
     Sphere,
@@ -30,7 +30,8 @@ from ...neural_fields import (
     load_field,
     project_to_surface,
 )
-from ..surface.surface import Surface, from_mesh, sample_points
+from ...neural_fields.fields.csg import Bounded
+from ..surface.surface import sample_points
 from ..training.folder import find_field
 
 __all__ = ["Placed", "Placement", "StaticShape", "aligned", "into_unit_sphere", "read_shape"]
@@ -139,7 +140,7 @@ class StaticShape:
     name: str
     field: Field
     similarity: Similarity
-    surface: Surface
+    surface: Mesh
     placement: Placement = dataclasses.field(default_factory=Placement)
 
     def points(self, count: int, seed: int) -> Tensor:
@@ -152,7 +153,7 @@ class StaticShape:
         return dataclasses.replace(
             self,
             field=Placed(self.field, placement),
-            surface=Surface(placement.apply(self.surface.vertices), self.surface.faces),
+            surface=Mesh(placement.apply(self.surface.vertices), self.surface.faces),
             placement=self.placement.then(placement),
         )
 
@@ -245,7 +246,7 @@ def _meshed(name: str, field: Field, similarity: Similarity) -> StaticShape:
         mesh = extract_mesh(field, resolution=MESH_RESOLUTION, normals=False)
     except NoSurfaceError as error:
         raise InputError(f"{name}: has no surface in the unit sphere ({error})") from error
-    return StaticShape(name, field, similarity, from_mesh(mesh))
+    return StaticShape(name, field, similarity, mesh)
 
 
 def _turned(first: StaticShape, shape: StaticShape) -> Float64:
@@ -261,7 +262,7 @@ def _turned(first: StaticShape, shape: StaticShape) -> Float64:
     return rotations[int(np.argmax(common))]
 
 
-def _axes(surface: Surface) -> Float64:
+def _axes(surface: Mesh) -> Float64:
     """Principal axes as columns, of a right-handed system, the longest last."""
     points, _ = sample_points(surface, 20_000, np.random.default_rng(0))
     _, axes = np.linalg.eigh(np.cov(points.T))

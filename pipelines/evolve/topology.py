@@ -17,9 +17,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...neural_fields import Field, NoSurfaceError, TimeSlice, at_time, extract_mesh
+from ...neural_fields import Field, Mesh, NoSurfaceError, TimeSlice, at_time, extract_mesh
 from ...neural_fields.fields.function import FieldLike
-from ..surface.surface import Surface, components, from_mesh
+from ..surface.surface import components
 
 __all__ = ["Change", "Topology", "find_changes", "surface_of", "topology_of"]
 
@@ -66,7 +66,7 @@ class Change:
     place: tuple[float, float, float] | None
 
 
-def topology_of(surface: Surface | None) -> Topology:
+def topology_of(surface: Mesh | None) -> Topology:
     """Pieces and holes of a closed mesh; none where there is no surface. Smaller parts than its cells do not count."""
     if surface is None:
         return Topology(0, 0)
@@ -76,10 +76,10 @@ def topology_of(surface: Surface | None) -> Topology:
     return Topology(pieces, pieces - euler // 2)
 
 
-def surface_of(field: FieldLike, *, resolution: int, level: int = -1) -> Surface | None:
+def surface_of(field: FieldLike, *, resolution: int, level: int = -1) -> Mesh | None:
     """The mesh of a static field, or of a function of points; None without a surface."""
     try:
-        return from_mesh(extract_mesh(field, resolution=resolution, level=level, normals=False))
+        return extract_mesh(field, resolution=resolution, level=level, normals=False)
     except NoSurfaceError:
         return None
 

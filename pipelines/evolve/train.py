@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ...neural_fields import InputError, MultiscaleSDF, Similarity, SpaceTimeSDF
+from ...neural_fields import InputError, MultiscaleSDF, SpaceTimeSDF
 from ..fit.band import delta_of
 from ..fit.level import new_level
 from ..training.budget import LEAST_SECONDS, Budget, step_seconds
@@ -22,6 +22,7 @@ from ..training.folder import RunFolder, digest_of
 from ..training.machine import choose_device, environment
 from ..training.motion import VELOCITY_FILE, load_motion
 from ..training.report import Progress, Report, reported, silent
+from ..training.result import Run
 from ..training.settings import EvolveConfig
 from ..training.trainer import (
     Interrupted,
@@ -49,20 +50,8 @@ FEWEST_FRAMES, END_FRAMES = 3, 3
 
 
 @dataclass(frozen=True)
-class Evolution:
-    """A finished evolution.
-
-    Attributes:
-        field: trained, in unit-sphere coordinates, on the CPU.
-        similarity: the way back to the input coordinates of the first shape.
-        directory: where it was written, or None.
-        record: what ``run.json`` holds.
-    """
-
-    field: SpaceTimeSDF
-    similarity: Similarity
-    directory: Path | None
-    record: dict[str, Any]
+class Evolution(Run[SpaceTimeSDF]):
+    """A finished evolution; its coordinates are those of the first shape."""
 
 
 def evolve(
@@ -91,7 +80,7 @@ def evolve(
     """
     started, folder = time.monotonic(), RunFolder(out, resume=resume)
     config, report = folder.config(EvolveConfig, config), progress or silent
-    budget = Budget(config.time_budget, choose_device(config.device), started=started)
+    budget = Budget(config.time_budget, started=started)
     count, shapes = len(config.shapes), []
     for path in config.landmarks:
         read_landmarks(path)  # before the shapes, which take their time
@@ -125,7 +114,7 @@ def train_evolution(
     """
     names, folder = [shape.name for shape in shapes or []], RunFolder(out, resume=resume)
     device = choose_device(config.device)
-    budget = budget or Budget(config.time_budget, device)
+    budget = budget or Budget(config.time_budget)
     training = _Evolving(problem, names, config, device, folder, progress or silent, budget)
     with folder.writing(VELOCITY_FILE), stop_on_signals() as flag:
         if resume:

@@ -9,7 +9,6 @@ import dataclasses
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,14 +19,14 @@ from torch import Tensor, nn
 
 from ...datasets import OrientedCloud, PointCloud, prepare_cloud, spacing_of
 from ...datasets.clouds.large import Merging
-from ...neural_fields import InputError, MultiscaleSDF, Similarity, Siren, WorldField, save_field
+from ...neural_fields import InputError, MultiscaleSDF, Similarity, Siren
 from ..surface.trim import thinned
 from ..training.budget import SAMPLING_SHARE, Budget, affordable, least_share, step_seconds
 from ..training.folder import SUPPORT_FILE, RunFolder, digest_of, named_cloud
 from ..training.machine import choose_device, environment, peak_memory
 from ..training.report import reported, silent
+from ..training.result import Run
 from ..training.settings import FitConfig
-from ..training.team import agreed
 from ..training.trainer import (
     Interrupted,
     Report,
@@ -63,44 +62,6 @@ Cloud = PointCloud | str | Path | NDArray[np.floating]
 LevelDone = Callable[[MultiscaleSDF, Similarity], object]
 
 
-@dataclass(frozen=True)
-class Run:
-    """A finished fit.
-
-    Attributes:
-        field: the trained field, in unit-sphere coordinates, on the CPU.
-        similarity: the way back to input coordinates.
-        directory: where it was written, or None.
-        record: what ``run.json`` holds.
-    """
-
-    field: MultiscaleSDF
-    similarity: Similarity
-    directory: Path | None
-    record: dict[str, Any]
-
-    @property
-    def world(self) -> WorldField:
-        """The field in the coordinates and units of the cloud: distances, normals, closest points, rays, meshes."""
-        return WorldField(self.field, self.similarity)
-
-    def save(self, path: str | Path) -> None:
-        """Write the field, and where it belongs, to a .safetensors file, whole or not at all.
-
-        Raises:
-            InputError: the file cannot be written.
-        """
-        save_field(path, self.field, similarity=self.similarity, metadata={"run": self.record})
-
-    def show(self, *, up: str = "y", block: bool = True, browser: bool = True) -> Any:
-        """Look at the fit, in the browser or in a notebook; see `WorldField.show`.
-
-        Raises:
-            InputError: no port is free.
-        """
-        return self.world.show(up=up, block=block, browser=browser)
-
-
 def fit(
     cloud: Cloud,
     config: FitConfig | None = None,
@@ -109,7 +70,7 @@ def fit(
     resume: bool = False,
     progress: Report | None = None,
     level_done: LevelDone | None = None,
-) -> Run:
+) -> Run[MultiscaleSDF]:
     """Fit a multiscale SDF to a point cloud.
 
     Args:
@@ -133,14 +94,16 @@ def fit(
     return _fit(RunFolder(out, resume=resume), cloud, config, progress=progress, level_done=level_done)
 
 
-def fit_moved(file: Path, config: FitConfig, *, out: Path, name: str, progress: Report | None = None) -> Run:
+def fit_moved(
+    file: Path, config: FitConfig, *, out: Path, name: str, progress: Report | None = None
+) -> Run[MultiscaleSDF]:
     """`fit` a cloud that was made for the run, and lies in its directory.
 
     Args:
         file: the cloud.
         config: settings.
         out: run directory.
-        name: what the file is called there from the first checkpoint on; until then that may be another run's.
+        name: of its copy there, from the first checkpoint on.
         progress: see `fit`.
 
     Raises:
@@ -148,7 +111,7 @@ def fit_moved(file: Path, config: FitConfig, *, out: Path, name: str, progress: 
         Interrupted: see `fit`.
     """
     folder = RunFolder(out)
-    folder.keep(name, file)
+    folder.keep(name, file.read_bytes())
     return _fit(folder, file, config, source=str(out / name), progress=progress)
 
 
@@ -160,10 +123,10 @@ def _fit(
     source: str | None = None,
     progress: Report | None = None,
     level_done: LevelDone | None = None,
-) -> Run:
+) -> Run[MultiscaleSDF]:
     config = folder.config(FitConfig, config)
     device = choose_device(config.device)
-    budget, points = Budget(config.time_budget, device), _as_cloud(cloud)
+    budget, points = Budget(config.time_budget), _as_cloud(cloud)
     with reported(progress, "reading the cloud"):
         raw, merging = load_cloud(points, limit=config.merge_above, isolation=config.isolation, cache=folder.path)
     with reported(progress, "preparing the cloud"):
@@ -238,7 +201,7 @@ class _Fitting:
         # Of the level under way, and of the cloud's index; fewer than the settings' where a time budget leaves no more.
         self.samples = self.filling = config.samples
 
-    def run(self, flag: StopFlag) -> Run:
+    def run(self, flag: StopFlag) -> Run[MultiscaleSDF]:
         if not self.stages and not self.trainer_state:
             self.find_signs(flag)
         self.keep_support()
@@ -402,8 +365,9 @@ class _Fitting:
         if not self.config.between or full <= len(self.points):
             return full
         index, generator = CloudDistance(self.points, self.normals), torch.Generator().manual_seed(0)
-        return self.affordable(
+        return affordable(
             lambda count: self.sources(index, None, dataclasses.replace(self.config, samples=count), generator),
+            full,
             SAMPLING_SHARE / 2 * share,
         )
 
@@ -415,19 +379,15 @@ class _Fitting:
             return self.config.samples
         spare = share - self.config.steps[level] * self.cost(level)
         generator, full = torch.Generator().manual_seed(0), self.config.samples
-        count = self.affordable(
+        count = affordable(
             lambda count: self.sources(index, delta, dataclasses.replace(self.config, samples=count), generator),
+            full,
             max(SAMPLING_SHARE * share, spare) - (time.monotonic() - started),
         )
         if count < full:
             note = f"level {level} learns from {count:,} samples of each kind instead of {full:,}"
             self.budget.notes.append(note)
         return count
-
-    def affordable(self, make: Callable[[int], object], seconds: float) -> int:
-        """`affordable` samples, the same number for all processes of a team."""
-        count = affordable(make, self.config.samples, seconds)
-        return int(agreed(False, count, self.device)[1])
 
     def training_seconds(self, level: int, left: float) -> float:
         """Seconds for the steps of a level of which ``left`` remain: at least so many that there is a surface."""
@@ -437,7 +397,7 @@ class _Fitting:
         least = least_share(steps) * steps * self.cost(level)
         if left < least:
             self.budget.notes.append(f"the time was up before level {level}, which is trained briefly all the same")
-        return took + agreed(False, max(left, least), self.device)[1]
+        return took + max(left, least)
 
     def distances(self, level: int) -> CloudDistance:
         """The points that are trained on, and where they are sparse, what they say of the places between them.

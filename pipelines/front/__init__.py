@@ -2,7 +2,8 @@
 
     import mplicits
 
-    run = mplicits.fit("scan.ply")
+    run = mplicits.fit("scan.ply")  # and reconstruct, evolve and texture, which return a `Run` as well
+    run.mesh().export("scan_mesh.ply")
     shape = mplicits.load("runs/scan")
     shape.distance(points)  # in the scan's coordinates and units
 
@@ -41,13 +42,31 @@ if TYPE_CHECKING:
         save_field,
         sphere_trace,
     )
-    from mplicits.pipelines.fit import FitConfig, Run, fit  # pyright: ignore[reportMissingImports]
+    from mplicits.pipelines.evolve import evolve  # pyright: ignore[reportMissingImports]
+    from mplicits.pipelines.fit import fit  # pyright: ignore[reportMissingImports]
+    from mplicits.pipelines.reconstruct import reconstruct  # pyright: ignore[reportMissingImports]
+    from mplicits.pipelines.texture import texture_run as texture  # pyright: ignore[reportMissingImports]
+    from mplicits.pipelines.training.result import Run  # pyright: ignore[reportMissingImports]
+    from mplicits.pipelines.training.settings import (  # pyright: ignore[reportMissingImports]
+        EvolveConfig,
+        FitConfig,
+        ReconstructConfig,
+        TextureConfig,
+    )
     from torch import device as Device  # noqa: N812
 
     __version__: str
 
-# Names of `mplicits.pipelines.fit`; what else of ``__all__`` is not defined here is of `mplicits.neural_fields`.
-OF_FIT = ("FitConfig", "Run", "fit")
+# Where names come from; what else of ``__all__`` is not defined here is of `mplicits.neural_fields`.
+_CONFIGS = ("EvolveConfig", "FitConfig", "ReconstructConfig", "TextureConfig")
+HOMES = {
+    "Run": "pipelines.training.result.Run",
+    "evolve": "pipelines.evolve.evolve",
+    "fit": "pipelines.fit.fit",
+    "reconstruct": "pipelines.reconstruct.reconstruct",
+    "texture": "pipelines.texture.texture_run",
+    **{name: f"pipelines.training.settings.{name}" for name in _CONFIGS},
+}
 PACKAGES = ("configs", "datasets", "neural_fields", "pipelines")
 
 __all__ = [  # noqa: RUF022
@@ -55,6 +74,7 @@ __all__ = [  # noqa: RUF022
     "load",
     "save",
     "Difference",
+    "EvolveConfig",
     "Field",
     "FitConfig",
     "FunctionField",
@@ -65,20 +85,25 @@ __all__ = [  # noqa: RUF022
     "MultiscaleSDF",
     "NeuSGeometry",
     "Offset",
+    "ReconstructConfig",
     "Run",
     "Shell",
     "Similarity",
     "Siren",
     "Sphere",
+    "TextureConfig",
     "TextureField",
     "Union",
     "WorldField",
+    "evolve",
     "extract_mesh",
     "fit",
     "load_field",
+    "reconstruct",
     "render_volume",
     "save_field",
     "sphere_trace",
+    "texture",
 ]
 
 
@@ -103,7 +128,7 @@ def save(path: str | Path, shape: WorldField | Run | Field) -> None:
 
     Args:
         path: the file.
-        shape: what `load` or `fit` returned, or a field, which is then taken to be in input coordinates.
+        shape: what `load` or a training returned, or a field, which is then taken to be in input coordinates.
 
     Raises:
         InputError: the file cannot be written.
@@ -119,7 +144,7 @@ def __getattr__(name: str) -> Any:
     if name in PACKAGES:
         return importlib.import_module(f"mplicits.{name}")
     if name in __all__:
-        home = "pipelines.fit" if name in OF_FIT else "neural_fields"
+        home, _, name = HOMES.get(name, f"neural_fields.{name}").rpartition(".")
         return getattr(importlib.import_module(f"mplicits.{home}"), name)
     raise AttributeError(f"module 'mplicits' has no attribute {name!r}")
 

@@ -8,16 +8,14 @@ vertices and are not mixed in.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
 
 from ...datasets.clouds.point_cloud import unit_rows
 from ...datasets.clouds.readers.meshes import vertex_normals
-from ...neural_fields import InputError
+from ...neural_fields import InputError, Mesh
 
-__all__ = ["Unwrapped", "check_unwrap_tools", "decimate", "from_frame", "to_frame", "unwrap", "vertex_tangents"]
+__all__ = ["check_unwrap_tools", "decimate", "from_frame", "to_frame", "unwrap", "vertex_tangents"]
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
@@ -27,26 +25,6 @@ Int64 = NDArray[np.int64]
 AGGRESSION = 4
 # Texels between charts, as a share of the texture's side: five mip levels stay clear of the neighbours.
 PADDING = 1 / 256
-
-
-class Unwrapped(NamedTuple):
-    """A mesh cut into charts; vertices on seams are repeated, once per chart.
-
-    Attributes:
-        vertices: ``(V, 3)``.
-        faces: ``(F, 3)``, the same triangles in the same order as before.
-        uv: ``(V, 2)`` in [0, 1], v upwards.
-        vertex_map: ``(V,)`` which vertex of the mesh before each one was.
-        normals: ``(V, 3)`` of unit length, those of the faces around averaged by area, across seams too.
-        tangents: ``(V, 4)``, see `vertex_tangents`.
-    """
-
-    vertices: Float64
-    faces: Int64
-    uv: Float64
-    vertex_map: Int64
-    normals: Float64
-    tangents: Float64
 
 
 def check_unwrap_tools() -> None:
@@ -87,7 +65,7 @@ def decimate(vertices: Float64, faces: NDArray[np.integer], count: int) -> tuple
     return points[used].astype(np.float64) * size + middle, index.reshape(-1, 3).astype(np.int64)
 
 
-def unwrap(vertices: Float64, faces: NDArray[np.integer], *, size: int = 2048, padding: int | None = None) -> Unwrapped:
+def unwrap(vertices: Float64, faces: NDArray[np.integer], *, size: int = 2048, padding: int | None = None) -> Mesh:
     """Cut a mesh into charts that lie flat, and pack them into the unit square.
 
     Args:
@@ -95,6 +73,10 @@ def unwrap(vertices: Float64, faces: NDArray[np.integer], *, size: int = 2048, p
         faces: ``(F, 3)``.
         size: of the texture to be, in texels.
         padding: texels between charts, about; by default a 256th of ``size``.
+
+    Returns:
+        The same triangles in the same order, with normals (those of the faces around averaged by area, across seams
+        too), texture coordinates and tangents; vertices on seams are repeated, once per chart.
 
     Raises:
         ValueError: there is no triangle with an area.
@@ -121,7 +103,7 @@ def unwrap(vertices: Float64, faces: NDArray[np.integer], *, size: int = 2048, p
     points = vertices[index]
     normals = vertex_normals(points, corners).astype(np.float64)
     normals[~normals.any(axis=1)] = (0.0, 0.0, 1.0)  # of faces without area; a normal of no length is not legal glTF
-    return Unwrapped(points, corners, uv, index, normals, vertex_tangents(points, corners, uv, normals))
+    return Mesh(points, corners, normals, uv=uv, tangents=vertex_tangents(points, corners, uv, normals))
 
 
 def _box(vertices: Float64) -> tuple[Float64, float]:

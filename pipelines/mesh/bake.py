@@ -15,7 +15,7 @@ from ...neural_fields import InputError, Similarity
 from ...neural_fields.meshing.extract import Mesh
 from ...neural_fields.meshing.placement import Placement
 from ..surface.raster import cover
-from .atlas import Unwrapped, decimate, to_frame, unwrap
+from .atlas import decimate, to_frame, unwrap
 from .files import check_textured_path, write_textured
 
 __all__ = ["Baked", "bake", "check_texture_size", "textured_mesh"]
@@ -44,7 +44,7 @@ class Baked(NamedTuple):
 
 
 def bake(
-    mesh: Unwrapped,
+    mesh: Mesh,
     colors_at: Attribute | None,
     normals_at: Attribute | None,
     *,
@@ -64,10 +64,12 @@ def bake(
         progress: told "bake", how many triangles are done, and of how many.
 
     Raises:
-        ValueError: there is nothing to bake, or a texture so small that no triangle covers a texel.
+        ValueError: there is nothing to bake, the mesh is not unwrapped, or no triangle covers a texel.
     """
     if colors_at is None and normals_at is None:
         raise ValueError("colors_at, normals_at: expected at least one")
+    if mesh.uv is None or mesh.normals is None or mesh.tangents is None:
+        raise ValueError("mesh: expected texture coordinates, normals and tangents, as `unwrap` makes them")
     color = None if colors_at is None else np.zeros((size * size, 3), np.uint8)
     normal = None if normals_at is None else np.zeros((size * size, 3), np.uint8)
     covered = np.zeros(size * size, bool)
@@ -93,7 +95,7 @@ def bake(
     return Baked(*(None if i is None else i.reshape(size, size, 3)[rows, columns] for i in (color, normal)))
 
 
-def _interpolated(rows: Float64, corners: NDArray[np.int64], weights: Float64) -> Float64:
+def _interpolated(rows: NDArray[np.floating], corners: NDArray[np.integer], weights: Float64) -> Float64:
     return np.einsum("nk,nkc->nc", weights, rows[corners])
 
 
@@ -125,7 +127,7 @@ def textured_mesh(
     faces: int = 50_000,
     placement: Placement | None = None,
     progress: Progress | None = None,
-) -> Unwrapped:
+) -> Mesh:
     """Decimate, unwrap, bake, and write a textured GLB, or an OBJ with its MTL and PNG files.
 
     Args:

@@ -9,10 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...neural_fields import InputError
-from ...neural_fields.meshing.extract import Mesh
+from ...neural_fields import InputError, Mesh
 from ..surface.distance import MeshDistance
-from ..surface.surface import Surface, is_closed
+from ..surface.surface import is_closed
 from .atlas import decimate
 
 __all__ = ["Decimated", "Decimation", "check_decimation_tool", "decimated", "deviation"]
@@ -85,26 +84,26 @@ def decimated(mesh: Mesh, faces: int) -> Decimated:
         mesh: in any coordinates; a mesh of no more triangles stays as it is.
         faces: about how many triangles to keep.
     """
-    full = Surface(mesh.vertices, mesh.faces.astype(np.int64))
+    full = Mesh(mesh.vertices, mesh.faces.astype(np.int64))
     closed = is_closed(full)
     if len(mesh.faces) <= faces:
         bare = dataclasses.replace(mesh, normals=None, colors=None)
         return Decimated(bare, Decimation(len(mesh.faces), len(mesh.faces), 0.0, 0.0, closed, closed))
     vertices, corners = decimate(mesh.vertices, mesh.faces, faces)
-    left = Surface(vertices, corners)
+    left = Mesh(vertices, corners)
     largest, mean = deviation(full, left)
     cost = Decimation(len(mesh.faces), len(corners), largest, mean, closed, is_closed(left))
     return Decimated(Mesh(vertices, corners.astype(np.int32)), cost)
 
 
-def deviation(full: Surface, left: Surface) -> tuple[float, float]:
+def deviation(full: Mesh, left: Mesh) -> tuple[float, float]:
     """Largest and mean distance between two meshes, both ways; where it is measured says `Decimation`."""
     there = np.abs(MeshDistance(left).signed(_thinned(full.used_vertices())))
     back = np.abs(MeshDistance(full).signed(_thinned(_probes(left))))
     return float(max(there.max(), back.max())), float(there.mean() + back.mean()) / 2
 
 
-def _probes(surface: Surface) -> Float64:
+def _probes(surface: Mesh) -> Float64:
     """Vertices, edge midpoints and face centres."""
     corners = surface.vertices[surface.faces]  # (F, 3, 3)
     ends = np.concatenate([surface.faces[:, [k, (k + 1) % 3]] for k in range(3)])

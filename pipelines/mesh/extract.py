@@ -16,10 +16,12 @@ from numpy.typing import NDArray
 from ...datasets import read_cloud
 from ...datasets.clouds.point_cloud import unit_rows
 from ...datasets.clouds.readers.meshes import vertex_normals
-from ...neural_fields import Field, InputError, Placement, Similarity, map_attribute
+from ...neural_fields import Field, InputError, Similarity
 from ...neural_fields.meshing.extract import Mesh, NoSurfaceError, extract_mesh, map_normals
+from ...neural_fields.meshing.placement import Placement
+from ...neural_fields.tracing.projection import map_attribute
 from ..surface.trim import Support, drop_unsupported, in_region, keep_largest, read_support, seen_part, trim_distance
-from ..texture.riding import Colors, colors_of_run
+from ..texture.transport import Colors, colors_of_run
 from ..training.folder import chosen_level, find_field, fitted_cloud, load_still
 from .bake import check_texture_size, textured_mesh
 from .decimation import Decimation, check_decimation_tool, decimated

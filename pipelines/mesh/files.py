@@ -1,11 +1,12 @@
 """Meshes out, in input coordinates, complete or not at all: PLY, OBJ, STL and GLB; with textures; and moving, as GLB.
 
 `write_mesh` has colours at the vertices, `write_textured` in images (in a GLB, or beside an OBJ with its MTL), and
-`write_moving` a mesh whose vertices move. The formats themselves are in ``neural_fields/meshing/writers.py``.
+`write_moving` a mesh whose vertices move. The formats themselves are in ``neural_fields/meshing/mesh.py``.
 """
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -17,9 +18,7 @@ from numpy.typing import NDArray
 from ...neural_fields import InputError, Mesh, Similarity
 from ...neural_fields.backend.files import whole_file
 from ...neural_fields.meshing.glb import MATERIAL, Motion
-from ...neural_fields.meshing.placement import Placement
-from ...neural_fields.meshing.writers import (
-    Triangles,
+from ...neural_fields.meshing.mesh import (
     check_mesh_path,
     glb_attributes,
     glb_origin,
@@ -28,7 +27,8 @@ from ...neural_fields.meshing.writers import (
     write_obj,
     write_triangles,
 )
-from .atlas import Unwrapped, check_unwrap_tools
+from ...neural_fields.meshing.placement import Placement
+from .atlas import check_unwrap_tools
 
 __all__ = [
     "check_mesh_path",
@@ -81,8 +81,8 @@ def write_mesh(
         InputError: see `check_mesh_path`; or the disk is full.
     """
     similarity = similarity or Similarity.identity()
-    vertices = similarity.to_input(mesh.vertices)
-    write_triangles(path, Triangles(vertices, mesh.faces, mesh.normals, mesh.colors), similarity, placement)
+    placed = dataclasses.replace(mesh, vertices=similarity.to_input(mesh.vertices))
+    write_triangles(path, placed, similarity, placement)
 
 
 def write_moving(
@@ -112,20 +112,18 @@ def write_moving(
         InputError: the disk is full.
     """
     placement = placement or Placement()
-    frames = [
-        Triangles(similarity.to_input(rows), faces, across) for rows, across in zip(vertices, normals, strict=True)
-    ]
+    frames = [Mesh(similarity.to_input(rows), faces, across) for rows, across in zip(vertices, normals, strict=True)]
     origin = glb_origin(frames[0].vertices, similarity, placement)
     first, *later = (glb_attributes(frame, origin) for frame in frames)
     targets = [{name: target[name] - first[name] for name in first} for target in later]
     motion = Motion(seconds.astype("<f4"), targets)
     with whole_file(path) as partial:
-        write_glb_mesh(partial, frames[0]._replace(colors=colors), similarity, placement, motion=motion)
+        write_glb_mesh(partial, dataclasses.replace(frames[0], colors=colors), similarity, placement, motion=motion)
 
 
 def write_textured(
     path: str | Path,
-    mesh: Unwrapped,
+    mesh: Mesh,
     similarity: Similarity,
     *,
     color: Image | None,
@@ -139,7 +137,7 @@ def write_textured(
 
     Args:
         path: the .glb or .obj file.
-        mesh: in unit-sphere coordinates.
+        mesh: with texture coordinates, in unit-sphere coordinates.
         similarity: from input to unit-sphere coordinates. Far from the origin, positions in a GLB are relative to its
             centre; see `write_mesh`.
         color: ``(H, W, 3)`` display RGB, or None.
@@ -151,8 +149,7 @@ def write_textured(
     """
     path, placement = check_textured_path(path, similarity), placement or Placement()
     images = {name: _png(image) for name, image in (("color", color), ("normal", normal)) if image is not None}
-    vertices = similarity.to_input(mesh.vertices)
-    triangles = Triangles(vertices, mesh.faces, mesh.normals, uv=mesh.uv, tangents=mesh.tangents)
+    triangles = dataclasses.replace(mesh, vertices=similarity.to_input(mesh.vertices))
     if path.suffix.lower() == ".glb":
         with whole_file(path) as partial:
             write_glb_mesh(partial, triangles, similarity, placement, images=images)

@@ -14,23 +14,24 @@ import torch
 from numpy.typing import NDArray
 
 from ...neural_fields import (
-    Bounded,
     Difference,
     Field,
     InputError,
     Intersection,
+    Mesh,
     Offset,
     Shell,
     Similarity,
     Union,
     WorldField,
-    in_one_frame,
     save_field,
 )
-from ...neural_fields.meshing.extract import Mesh, NoSurfaceError, extract_mesh
+from ...neural_fields.fields.csg import Bounded
+from ...neural_fields.meshing.extract import NoSurfaceError, extract_mesh
 from ...neural_fields.meshing.placement import METRES, Placement
+from ...neural_fields.shape import in_one_frame
 from ..surface.solid import MeshField
-from ..surface.surface import Surface, from_mesh, is_closed, read_surface
+from ..surface.surface import is_closed, read_surface
 from ..surface.trim import Support, drop_unsupported, read_support
 from ..training.folder import chosen_level, find_field, is_field, load_still
 from .files import check_mesh_path, write_mesh
@@ -272,7 +273,7 @@ def _read(part: str | Path, options: SolidOptions) -> Operand:
     return Operand(name, _as_solid(surface, Similarity.to_unit_sphere(surface.used_vertices()), name), None)
 
 
-def _as_solid(surface: Surface, similarity: Similarity, name: str) -> WorldField:
+def _as_solid(surface: Mesh, similarity: Similarity, name: str) -> WorldField:
     try:
         return WorldField(MeshField(surface.moved(similarity)), similarity)
     except ValueError as error:
@@ -286,9 +287,7 @@ def _measured(operand: Operand, options: SolidOptions, say: Callable[[str], None
     mesh = _extracted(operand.shape.field, options, operand.name)
     mesh = _supported(mesh, [operand], [operand.shape.field], operand.shape.similarity, say)
     similarity = operand.shape.similarity
-    return _as_solid(
-        dataclasses.replace(from_mesh(mesh), vertices=similarity.to_input(mesh.vertices)), similarity, operand.name
-    )
+    return _as_solid(dataclasses.replace(mesh, vertices=similarity.to_input(mesh.vertices)), similarity, operand.name)
 
 
 def _extracted(field: Field, options: SolidOptions, what: str, level: int | None = None) -> Mesh:
@@ -340,7 +339,7 @@ def _made(mesh: Mesh, frame: Similarity) -> Made:
     vertices = frame.to_input(mesh.vertices)
     corners = (vertices - np.asarray(frame.center))[mesh.faces]
     volume = float((corners[:, 0] * np.cross(corners[:, 1], corners[:, 2])).sum() / 6)
-    return Made(dataclasses.replace(mesh, vertices=vertices), is_closed(from_mesh(mesh)), volume)
+    return Made(dataclasses.replace(mesh, vertices=vertices), is_closed(mesh), volume)
 
 
 def _written(

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ...datasets.cameras import Camera
 from ...neural_fields import InputError, Mesh, NerfstudioField, NoSurfaceError, Similarity
-from ...neural_fields.meshing.writers import check_mesh_path
+from ...neural_fields.meshing.mesh import check_mesh_path
 from ..mesh.bake import check_texture_size, textured_mesh
 from ..mesh.extract import normals_near
 from ..mesh.files import check_textured_path
@@ -126,8 +126,7 @@ def _textured(path: Path, mesh: Mesh, field: NerfstudioField, move: Move, size: 
         return normals_near(field.field, _moved(points, *move) * field.scale, level=level) @ rotation
 
     identity = Similarity((0.0, 0.0, 0.0), 1.0)
-    written = textured_mesh(path, mesh, identity, colors_at, normals_at, size=size, faces=faces)
-    return Mesh(written.vertices, written.faces.astype(np.int32), written.normals.astype(np.float32))
+    return textured_mesh(path, mesh, identity, colors_at, normals_at, size=size, faces=faces)
 
 
 @torch.no_grad()

@@ -11,8 +11,9 @@ import numpy as np
 import torch
 
 from ...datasets.cameras import Camera
-from ...neural_fields import InputError, Similarity, load_radiance
+from ...neural_fields import InputError, Similarity
 from ...neural_fields.backend.files import damage
+from ...neural_fields.checkpoint import load_radiance
 from ...neural_fields.networks.value_grid import ValueGrid
 from ...neural_fields.volume.render import Sampling
 from ..render.draw import RenderOptions, render_run

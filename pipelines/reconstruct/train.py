@@ -20,18 +20,18 @@ from torch import Tensor
 from ...datasets import PointCloud
 from ...datasets.views.formats.depth_maps import DepthSource
 from ...datasets.views.images import PosedImage, PosedImages, read_posed_images
-from ...neural_fields import InputError, Jet, NoSurfaceError, TextureField, extract_mesh
+from ...neural_fields import Field, InputError, Jet, NoSurfaceError, TextureField, extract_mesh
 from ...neural_fields.checkpoint import radiance_bytes, texture_bytes
 from ..render.picture import Image, picture_bytes, write_picture
-from ..surface.surface import from_mesh, sample_points
+from ..surface.surface import sample_points
 from ..surface.trim import in_region, thinned
 from ..texture.train import FittedTexture, fit_texture, texture_step_seconds
 from ..training.budget import LEAST_SECONDS, Budget
 from ..training.folder import RADIANCE_FILE, SUPPORT_FILE, TEXTURE_FILE, RunFolder, digest_of
 from ..training.machine import choose_device, environment
 from ..training.report import Progress, Report, reported, silent
+from ..training.result import Run
 from ..training.settings import ReconstructConfig, TextureConfig
-from ..training.team import agreed, apart, is_leader
 from ..training.trainer import Interrupted, load_compiler, parameter_count, stop_on_signals
 from .data.measured import MeasuredDepths
 from .data.seen import seen_points
@@ -70,22 +70,18 @@ AFTER_SHARE, TIMED_PIXELS, TEXTURE_FACTOR = 0.15, 1024, 2
 
 
 @dataclass(frozen=True)
-class Reconstruction:
-    """A finished reconstruction.
+class Reconstruction(Run[Field]):
+    """A finished reconstruction; its field is the geometry of the model.
 
     Attributes:
         model: geometry, colour and background, on the CPU.
         texture: the colours of the surface as a field, or None.
         images: what it was trained on, and held-out views.
-        directory: where it was written, or None.
-        record: what ``run.json`` holds.
     """
 
     model: SceneModel
     texture: TextureField | None
     images: PosedImages
-    directory: Path | None
-    record: dict[str, Any]
 
 
 def reconstruct(
@@ -105,9 +101,6 @@ def reconstruct(
         resume: continue the interrupted run in ``out`` with its own settings; ``config`` is then ignored.
         progress: called now and then with how far the training is.
 
-    Within a `team` of processes each renders its share of the rays. All end with the same model; only the first one
-    measures, makes the texture and writes.
-
     Raises:
         InputError: the data cannot be read or used, or there is nothing to resume.
         Interrupted: Ctrl-C or SIGTERM; ``out`` then holds a checkpoint and a usable field.
@@ -119,7 +112,7 @@ def reconstruct(
     started, folder = time.monotonic(), RunFolder(out, resume=resume)
     config = folder.config(ReconstructConfig, config)
     device = choose_device(config.device)
-    budget = Budget(config.time_budget, device, started=started)
+    budget = Budget(config.time_budget, started=started)
     with reported(progress, "reading the pictures"):
         maps = None if config.depth_maps is None else Path(config.depth_maps)
         depths = DepthSource(maps, config.depth_kind, config.depth_scale)
@@ -156,9 +149,9 @@ class _Reconstruction:
             agreement = agreement.without(self.odd)
             self.train_views = [*agreement.views]
         self.model = build_scene(config, has_masks=has_masks, views=len(self.train_views)).to(device)
-        whole, flat = self.model.outside is not None, config.smooth_weight > 0
+        whole = self.model.outside is not None
         self.holes = agreement.holes() if agreement else {}
-        pool = RayPool(self.train_views, images.similarity, device, whole=whole, flat=flat, left_out=self.holes)
+        pool = RayPool(self.train_views, images.similarity, device, whole=whole, left_out=self.holes)
         measured = MeasuredDepths(self.train_views, images, device, seed=config.seed) if config.depth_weight else None
         self.measured = measured or None
         with reported(report, "a surface to begin with"):
@@ -179,10 +172,8 @@ class _Reconstruction:
         left = self.budget.left()
         if left is None:
             return None
-        after = self.after_seconds(left) if is_leader() else 0.0
-        left = max((self.budget.left() or 0.0) - min(after, AFTER_SHARE * left), LEAST_SECONDS)
-        # A team agrees, or one would go on while another has ended.
-        return agreed(False, left, self.device)[1]
+        after = self.after_seconds(left)
+        return max((self.budget.left() or 0.0) - min(after, AFTER_SHARE * left), LEAST_SECONDS)
 
     def after_seconds(self, left: float) -> float:
         """Seconds for the held-out views and the texture, from the time of a small picture and a few steps."""
@@ -210,10 +201,7 @@ class _Reconstruction:
             # What was trained is safe before pictures and texture are made, which may be interrupted or fail too.
             self._save()
         self.model.requires_grad_(False)
-        if not is_leader():
-            return Reconstruction(self.model.cpu(), None, self.images, None, self._record(finished=True))
-        with apart():
-            return self._finish()
+        return self._finish()
 
     def _finish(self) -> Reconstruction:
         """Measure, colour, write."""
@@ -236,7 +224,11 @@ class _Reconstruction:
         if pairs:
             self.folder.keep(HELD_OUT_FILE, picture_bytes(self._sheet(pairs[:SHEET_VIEWS])))
         record = self.folder.finish(self.model.geometry, self.images.similarity, record, gone=(PREVIEW_FILE,))
-        return Reconstruction(self.model, texture, self.images, out, record)
+        return self._result(out, texture, record)
+
+    def _result(self, out: Path | None, texture: TextureField | None, record: dict[str, Any]) -> Reconstruction:
+        model, images = self.model.cpu(), self.images
+        return Reconstruction(model.geometry, images.similarity, out, record, model, texture, images)
 
     def _report(self, progress: Progress) -> None:
         self.report(progress)
@@ -421,7 +413,7 @@ def scene_texture(
         mesh = in_region(extract_mesh(model.geometry, resolution=TEXTURE_RESOLUTION))
         if mesh is None:
             raise NoSurfaceError("all of it is outside the region of interest")
-        points, _ = sample_points(from_mesh(mesh), TEXTURE_SAMPLES, np.random.default_rng(config.seed))
+        points, _ = sample_points(mesh, TEXTURE_SAMPLES, np.random.default_rng(config.seed))
         random = np.random.default_rng(config.seed)
         eyes = np.stack([view.camera.eye.numpy() for view in images.views])[random.permutation(len(images.views))]
         seen_from = torch.from_numpy(images.similarity.to_unit(eyes)).float()

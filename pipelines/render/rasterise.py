@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from ...datasets.cameras import Camera
 from ...datasets.clouds.readers.meshes import vertex_normals
 from ...datasets.textured.reading import TexturedMesh, colors_at, read_textured
-from ...neural_fields import InputError
+from ...neural_fields import InputError, Mesh
 from ..surface.raster import clip, cover
-from ..surface.surface import Surface, read_surface
+from ..surface.surface import read_surface
 from .picture import Image
 from .shade import ShadeOptions, compose, default_shading, downsample, shade
 from .trace import Seen
@@ -26,7 +26,7 @@ __all__ = ["Painted", "cloud_view", "mesh_view", "picture_of", "read_painted"]
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
-Painted = Surface | TexturedMesh
+Painted = Mesh | TexturedMesh
 
 
 def read_painted(path: str | Path) -> Painted:
@@ -73,7 +73,7 @@ def mesh_view(mesh: Painted, camera: Camera) -> Seen:
     def interpolated(rows: NDArray[np.floating]) -> Float64:
         return sum((weights[:, k, None] * rows[corners[:, k]] for k in range(3)), np.zeros((len(face), 3)))
 
-    normals = mesh.normals if isinstance(mesh, Surface) else None
+    normals = mesh.normals if isinstance(mesh, Mesh) else None
     if normals is None:
         normals = vertex_normals(mesh.vertices, mesh.faces)
     if isinstance(mesh, TexturedMesh):
@@ -83,7 +83,7 @@ def mesh_view(mesh: Painted, camera: Camera) -> Seen:
     return _rows_seen(camera, pixel, interpolated(mesh.vertices), interpolated(normals), colors)
 
 
-def cloud_view(surface: Surface, camera: Camera, *, point_size: float | None = None) -> Seen:
+def cloud_view(surface: Mesh, camera: Camera, *, point_size: float | None = None) -> Seen:
     """What the pixels see of a cloud whose points are discs of one size on the screen.
 
     All pixels of a disc see its point. Where there is no normal, the surface is taken to face the camera.
@@ -113,7 +113,7 @@ def _near(z: Float64) -> float:
     return 1e-4 * max(float(z.max(initial=0.0)), 0.0)
 
 
-def _visible(vertices: Float64, faces: Int64, camera: Camera) -> tuple[Int64, Int64, Float64]:
+def _visible(vertices: Float64, faces: NDArray[np.integer], camera: Camera) -> tuple[Int64, Int64, Float64]:
     """Pixels ``(P,)`` that see a face, the nearest face ``(P,)``, and weights ``(P, 3)`` of its corners in space."""
     z = camera.project(torch.from_numpy(vertices))[1].numpy()
     cut = clip(z - _near(z), faces)
@@ -131,7 +131,7 @@ def _visible(vertices: Float64, faces: Int64, camera: Camera) -> tuple[Int64, In
     return pixel, face, whole
 
 
-def _nearest_faces(vertices: Float64, faces: Int64, camera: Camera) -> tuple[Int64, Int64, Float64]:
+def _nearest_faces(vertices: Float64, faces: NDArray[np.integer], camera: Camera) -> tuple[Int64, Int64, Float64]:
     """`_visible`, of faces that are in front of the camera as a whole."""
     xy, z = (array.numpy() for array in camera.project(torch.from_numpy(vertices)))
     count = camera.width * camera.height
@@ -152,7 +152,7 @@ def _nearest_faces(vertices: Float64, faces: Int64, camera: Camera) -> tuple[Int
 
 
 def _rows_seen(
-    camera: Camera, pixel: Int64, position: Float64, normal: Float64, color: NDArray[np.floating] | None
+    camera: Camera, pixel: Int64, position: Float64, normal: NDArray[np.floating], color: NDArray[np.floating] | None
 ) -> Seen:
     """Round to float32, after the eye has been taken off; a normal of length zero becomes one that faces the eye."""
     offset = torch.from_numpy(position) - camera.eye
@@ -200,7 +200,7 @@ def _nearest_points(xy: Float64, z: Float64, size: tuple[int, int], diameter: fl
 
 
 def picture_of(
-    surface: Surface,
+    surface: Mesh,
     camera: Camera,
     *,
     point_size: float | None = None,

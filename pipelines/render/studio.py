@@ -19,7 +19,7 @@ from ...datasets.textured.mesh import TexturedMesh
 from ...datasets.views.formats.depth_maps import DepthMap
 from ...datasets.views.images import PosedImage, PosedImages
 from ...neural_fields import InputError, Mesh, Similarity
-from ..surface.surface import Surface, read_reference, sample_points
+from ..surface.surface import read_reference, sample_points
 from .rasterise import Painted, mesh_view, read_painted
 from .trace import Seen, fine_strips
 
@@ -76,7 +76,7 @@ def photograph_mesh(
     mesh = dataclasses.replace(mesh, vertices=ball.to_unit(mesh.vertices))
     light = _Light(shaded=shaded or not _has_colors(mesh), glossy=glossy)
     # About as many as structure from motion would give.
-    points, _ = sample_points(Surface(mesh.vertices, mesh.faces), 1000, np.random.default_rng(seed))
+    points, _ = sample_points(Mesh(mesh.vertices, mesh.faces), 1000, np.random.default_rng(seed))
     images: list[PosedImage] = []
     observed: list[NDArray[np.bool_]] = []
     placed = cameras_around(ball.scale, up=up, views=views, size=size, seed=seed, middle=ball.center)
@@ -105,9 +105,7 @@ def true_mesh(path: str | Path) -> Mesh:
         InputError: it cannot be read, or has no faces.
     """
     surface = read_reference(path)
-    colors = None if surface.colors is None else surface.colors.astype(np.float32)
-    normals = vertex_normals(surface.vertices, surface.faces)
-    return Mesh(surface.vertices, surface.faces.astype(np.int32), normals, colors)
+    return dataclasses.replace(surface, normals=vertex_normals(surface.vertices, surface.faces))
 
 
 def sees(camera: Camera, seen: Seen, points: Float64) -> NDArray[np.bool_]:

@@ -21,7 +21,7 @@ from ...neural_fields.meshing.extract import NoSurfaceError, extract_mesh
 from ...neural_fields.tracing.sphere import BOUNDING_RADIUS
 from ..fit.cloud import CloudDistance
 from ..surface.surface import read_surface, sample_points
-from ..texture.riding import Colors, colors_of_run
+from ..texture.transport import Colors, colors_of_run
 from ..training.folder import chosen_level, find_field, fitted_cloud, is_field, load_still
 from .rasterise import cloud_view, mesh_view, read_painted
 from .trace import Seen, trace_view

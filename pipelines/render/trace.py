@@ -15,10 +15,10 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from ...datasets.cameras import Camera
-from ...neural_fields import Field, Hits, Siren, TextureField, cone_starts, levels_of, map_colors, sphere_trace
-from ...neural_fields.networks.multiscale import as_levels, choose_levels
-from ...neural_fields.tracing.cones import CONE_LIPSCHITZ, CONE_STEPS
-from ...neural_fields.tracing.sphere import BOUNDING_RADIUS, MAX_STEPS, march_constants
+from ...neural_fields import Field, Siren, TextureField, map_colors, sphere_trace
+from ...neural_fields.networks.multiscale import as_levels, choose_levels, levels_of
+from ...neural_fields.tracing.cones import CONE_LIPSCHITZ, CONE_STEPS, cone_starts
+from ...neural_fields.tracing.sphere import BOUNDING_RADIUS, MAX_STEPS, Hits, march_constants
 
 __all__ = [
     "Seen",

@@ -1,23 +1,18 @@
-"""Exact signed distances to a triangle mesh, and how far a field is from them: the error of the paper's ablations."""
+"""Exact signed distances to a triangle mesh."""
 
 from __future__ import annotations
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from ...neural_fields import Field
-from .surface import Surface, face_normals, sample_points
+from ...neural_fields import Mesh
+from .surface import face_normals
 
-__all__ = ["MeshDistance", "approximation_error", "barycentric_of_nearest", "near_surface"]
+__all__ = ["MeshDistance", "barycentric_of_nearest"]
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
-
-# Rows times candidates looked at together: about 100 MiB of temporaries.
-PAIRS_AT_ONCE = 1 << 19
-MOST_PIECES = 200_000
 
 
 class MeshDistance:
@@ -29,19 +24,21 @@ class MeshDistance:
     a hole it is the side of the nearest face.
 
     Args:
-        surface: a mesh; equal vertices are made one.
+        mesh: equal vertices are made one.
 
     Raises:
-        ValueError: the surface has no faces of any area.
+        ValueError: the mesh has no faces of any area.
     """
 
-    def __init__(self, surface: Surface) -> None:
-        whole = surface.merged
+    pairs_at_once = 1 << 19  # rows times candidates looked at together: about 100 MiB of temporaries
+
+    def __init__(self, mesh: Mesh) -> None:
+        whole = mesh.merged
         normals, areas = face_normals(whole)
         kept = areas > 0
         if not kept.any():
-            raise ValueError("surface: has no faces to measure from")
-        whole, normals = Surface(whole.vertices, whole.faces[kept]), normals[kept]
+            raise ValueError("mesh: has no faces to measure from")
+        whole, normals = Mesh(whole.vertices, whole.faces[kept]), normals[kept]
         self.corners: Float64 = whole.vertices[whole.faces]  # (F, 3, 3)
         self.pseudo_normals = _pseudo_normals(whole, normals, self.corners)
         centers, self.owner, self.radius = _pieces(self.corners, float(areas.sum()))
@@ -65,14 +62,14 @@ class MeshDistance:
         """
         if not certain:
             nearest = np.reshape(self.tree.query(points, k=min(8, len(self.owner)), workers=-1)[1], (len(points), -1))
-            parts = np.array_split(np.arange(len(points)), 1 + nearest.size // PAIRS_AT_ONCE)
+            parts = np.array_split(np.arange(len(points)), 1 + nearest.size // self.pairs_at_once)
             found = [self._nearest_of(points[part], self.owner[nearest[part]]) for part in parts]
             return np.concatenate([signed for signed, _ in found]), np.concatenate([slope for _, slope in found])
         result, slopes = np.empty(len(points)), np.empty((len(points), 3))
         rows, count = np.arange(len(points)), min(16, len(self.owner))
         while len(rows):
             unsure = []
-            for part in np.array_split(rows, 1 + len(rows) * count // PAIRS_AT_ONCE):
+            for part in np.array_split(rows, 1 + len(rows) * count // self.pairs_at_once):
                 reach, nearest = self.tree.query(points[part], k=count, workers=-1)
                 reach, nearest = np.reshape(reach, (len(part), -1)), np.reshape(nearest, (len(part), -1))
                 result[part], slopes[part] = self._nearest_of(points[part], self.owner[nearest])
@@ -125,7 +122,7 @@ def barycentric_of_nearest(points: Float64, corners: Float64) -> Float64:
     return best
 
 
-def _pseudo_normals(mesh: Surface, normals: Float64, corners: Float64) -> Float64:
+def _pseudo_normals(mesh: Mesh, normals: Float64, corners: Float64) -> Float64:
     """``(F, 8, 3)``: for each face and each set of its corners, as bits, the normal of the feature they span."""
     faces, size = mesh.faces, len(mesh.vertices)
     result = np.zeros((len(faces), 8, 3))
@@ -143,7 +140,7 @@ def _pseudo_normals(mesh: Surface, normals: Float64, corners: Float64) -> Float6
     return result
 
 
-def _summed(owner: Int64, vectors: Float64, size: int = 0) -> Float64:
+def _summed(owner: NDArray[np.integer], vectors: Float64, size: int = 0) -> Float64:
     """Sums ``(K, 3)`` of the vectors ``(N, 3)`` of each owner."""
     sums = [np.bincount(owner, weights=vectors[:, i], minlength=size) for i in range(3)]
     return np.stack(sums, axis=1).astype(np.float64)
@@ -161,7 +158,7 @@ def _pieces(corners: Float64, area: float) -> tuple[Float64, Int64, float]:
     Faces much longer than is usual are halved across their longest edge until none is.
     """
     lengths = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2)  # (F, 3): edges ab, bc, ca
-    limit = max(float(np.median(lengths.max(axis=1))), (area / MOST_PIECES) ** 0.5)
+    limit = max(float(np.median(lengths.max(axis=1))), (area / 200_000) ** 0.5)  # at most some 200,000 pieces
     owner = np.arange(len(corners))
     done: list[tuple[Float64, Int64]] = []
     while len(corners):
@@ -178,19 +175,3 @@ def _pieces(corners: Float64, area: float) -> tuple[Float64, Int64, float]:
     pieces, owner = np.concatenate([p for p, _ in done]), np.concatenate([o for _, o in done])
     centers = pieces.mean(axis=1)
     return centers, owner, float(np.linalg.norm(pieces - centers[:, None], axis=2).max())
-
-
-def near_surface(surface: Surface, count: int, *, reach: float, seed: int = 0) -> Float64:
-    """Points ``(count, 3)`` uniform on a mesh, each moved along its face's normal by U(−reach, reach)."""
-    rng = np.random.default_rng(seed)
-    points, normals = sample_points(surface, count, rng)
-    assert normals is not None
-    return points + rng.uniform(-reach, reach, (count, 1)) * normals
-
-
-@torch.no_grad()
-def approximation_error(field: Field, points: Float64, distances: Float64, *, level: int = -1) -> float:
-    """The mean of |f_level(x) − d(x)| over points ``(N, 3)`` with their exact distances ``(N,)``."""
-    rows = torch.from_numpy(points).float().to(field.like.device)
-    values = torch.cat([field.value(part, level=level) for part in rows.split(1 << 18)])
-    return float((values.cpu().double() - torch.from_numpy(distances)).abs().mean())

@@ -9,6 +9,7 @@ exact, and only the choice of columns is a discretisation.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -17,12 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from ...neural_fields import InputError, Similarity
+from ...neural_fields import InputError, Mesh, Similarity
 from ...neural_fields.backend.files import write_json
 from .raster import cover
-from .roughness import feet_among, roughness
-from .surface import Surface, components, is_closed, read_surface, sample_points
-from .witnessed import Seen, Ways, Witnesses, seen_figures, seen_lines
+from .surface import components, is_closed, read_surface, sample_points
 
 __all__ = [
     "Metrics",
@@ -38,11 +37,24 @@ __all__ = [
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 
-# Where a column stands in its cell. Not the middle: models like to have their edges there.
-OFFSET = (0.5 + 0.0372036, 0.5 - 0.0618034)
+ViewCounts = Callable[[Mesh, Float64], Int64]
+"""How many photographs see points ``(N, 3)`` of the reference, both in its own coordinates; ``(N,)``."""
 
-# Samples of the mesh that may be the foot of one of the reference.
-FEET = 4
+
+@dataclass(frozen=True)
+class Visible:
+    """Figures of the part of the reference that two photographs or more see; distances as in `Metrics`.
+
+    Attributes:
+        share: of the reference's area.
+        chamfer: mesh → reference of the samples whose nearest one is visible, plus reference → mesh of those that are.
+            None if nothing is.
+        chamfer_floor: the same of another sampling of the reference.
+    """
+
+    share: float
+    chamfer: float | None
+    chamfer_floor: float | None
 
 
 @dataclass(frozen=True)
@@ -73,15 +85,7 @@ class Metrics:
         samples: samples on each surface.
         seed: seed of the samples.
         notes: what the reader of the figures should know.
-        flat_share: share of the reference's area that is flat; see `roughness` for this and all that follow. None for
-            a cloud.
-        flat_angle: median angle, in degrees, between the normals on flat places, both without their low frequencies:
-            orange peel. None where no place is flat.
-        flat_angle_90: what nine tenths of those angles are below.
-        edge_angle: the median near the reference's sharp edges. None where there are none.
-        edge_angle_90: what nine tenths of those are below.
-        ripple: the residual noise: median height of the waves on flat places.
-        seen: the same distances by how many photographs see the place; None if nobody asked.
+        visible: the same where two photographs or more see the reference; None if that was not asked for.
     """
 
     chamfer: float
@@ -104,13 +108,7 @@ class Metrics:
     samples: int
     seed: int
     notes: tuple[str, ...]
-    flat_share: float | None = None
-    flat_angle: float | None = None
-    flat_angle_90: float | None = None
-    edge_angle: float | None = None
-    edge_angle_90: float | None = None
-    ripple: float | None = None
-    seen: Seen | None = None
+    visible: Visible | None = None
 
 
 def evaluate_files(
@@ -119,7 +117,7 @@ def evaluate_files(
     *,
     samples: int = 500_000,
     seed: int = 0,
-    witnesses: Witnesses | None = None,
+    view_counts: ViewCounts | None = None,
 ) -> Metrics:
     """``evaluate_surfaces`` on two files; the reference may be a point cloud.
 
@@ -128,30 +126,30 @@ def evaluate_files(
         reference: that of the truth.
         samples: see `evaluate_surfaces`.
         seed: of the samples.
-        witnesses: see `evaluate_surfaces`.
+        view_counts: see `evaluate_surfaces`.
 
     Raises:
-        InputError: a file cannot be read, or the first one holds no faces; or the second, where there are witnesses.
+        InputError: a file cannot be read, or has no faces: the first one, or the second where photographs are counted.
     """
     surface = read_surface(mesh)
     if not len(surface.faces):
         raise InputError(f"{mesh}: holds points but no faces, so it is no mesh to evaluate; give the mesh first")
     truth = read_surface(reference)
-    if witnesses is not None and not len(truth.faces):
+    if view_counts is not None and not len(truth.faces):
         raise InputError(f"{reference}: points hide nothing, so nobody knows what photographs see of them; give a mesh")
-    return evaluate_surfaces(surface, truth, samples=samples, seed=seed, witnesses=witnesses)
+    return evaluate_surfaces(surface, truth, samples=samples, seed=seed, view_counts=view_counts)
 
 
 def evaluate_surfaces(
-    mesh: Surface,
-    reference: Surface,
+    mesh: Mesh,
+    reference: Mesh,
     *,
     samples: int = 500_000,
     seed: int = 0,
     threshold: float = 0.01,
     voxel: float = 0.01,
     columns: int = 512,
-    witnesses: Witnesses | None = None,
+    view_counts: ViewCounts | None = None,
 ) -> Metrics:
     """Compare a mesh with a reference surface or cloud, both in the same coordinates.
 
@@ -163,16 +161,16 @@ def evaluate_surfaces(
         threshold: for the F-score, in units of the reference's bounding sphere.
         voxel: for the shell IoU (0.01 in the paper's code), same units.
         columns: for the volumetric IoU, columns along the longest side.
-        witnesses: who says how many photographs see points of the reference, which then has faces; None asks nobody.
+        view_counts: how many photographs see points of the reference, which then has faces.
 
     Raises:
-        ValueError: ``samples`` is not positive, or there are witnesses of a cloud.
+        ValueError: ``samples`` is not positive, or photographs are counted of a cloud.
     """
     if samples < 1:
         raise ValueError(f"samples={samples}: expected > 0")
     is_cloud = not len(reference.faces)
-    if is_cloud and witnesses is not None:
-        raise ValueError("witnesses: points hide nothing; expected a reference with faces")
+    if is_cloud and view_counts is not None:
+        raise ValueError("view_counts: points hide nothing; expected a reference with faces")
     given, similarity = reference, Similarity.to_unit_sphere(reference.used_vertices())
     mesh, reference = mesh.moved(similarity), reference.moved(similarity)
     of_mesh, of_reference, of_floor = np.random.default_rng(seed).spawn(3)
@@ -180,9 +178,7 @@ def evaluate_surfaces(
     target, target_normals = sample_points(reference, samples, of_reference)
 
     forward, nearest = KDTree(target, balanced_tree=False).query(points, workers=-1)
-    reach, candidates = KDTree(points, balanced_tree=False).query(target, k=min(FEET, len(points)), workers=-1)
-    candidates = np.asarray(candidates).reshape(len(target), -1)
-    backward, nearest_back = np.asarray(reach).reshape(len(target), -1)[:, 0], candidates[:, 0]
+    backward, nearest_back = KDTree(points, balanced_tree=False).query(target, workers=-1)
     consistency = None
     if normals is not None and target_normals is not None:
         there = np.abs((normals * target_normals[nearest]).sum(axis=1)).mean()
@@ -190,20 +186,18 @@ def evaluate_surfaces(
         consistency = float(there + back) / 2
 
     notes, closed = [], is_closed(mesh)
-    floor = iou = rough = seen = None
+    floor = iou = visible = None
     if is_cloud:
-        notes.append("the reference is a point cloud: distances are to its points; no floor, no iou, no roughness")
+        notes.append("the reference is a point cloud: distances are to its points; no floor, no iou")
     else:
         again = _ways(sample_points(reference, samples, of_floor)[0], target)
         floor = float(again.there.mean() + again.back.mean())
-        if witnesses is not None:
-            counts = witnesses(given, similarity.to_input(target))
-            seen = seen_figures(counts, Ways(forward**2, np.asarray(nearest), backward**2), again)
+        if view_counts is not None:
+            seen = view_counts(given, similarity.to_input(target)) >= 2
+            ways = (_Ways(forward**2, np.asarray(nearest), backward**2), again)
+            visible = Visible(float(seen.mean()), *(_chamfer_where(seen, way) for way in ways))
         iou, iou_notes = _iou(mesh, reference, columns, closed=closed)
         notes.extend(iou_notes)
-        if normals is not None and target_normals is not None:
-            feet = feet_among(target, points, normals, candidates)
-            rough = roughness(target, target_normals, points[feet], normals[feet], reference)
     precision, recall = float((forward < threshold).mean()), float((backward < threshold).mean())
     accuracy, completeness = float((forward**2).mean()), float((backward**2).mean())
     return Metrics(
@@ -227,8 +221,7 @@ def evaluate_surfaces(
         samples=samples,
         seed=seed,
         notes=tuple(notes),
-        seen=seen,
-        **({} if rough is None else rough._asdict()),
+        visible=visible,
     )
 
 
@@ -241,11 +234,30 @@ def chamfer(a: Float64, b: Float64) -> tuple[float, float]:
     return float(ways.there.mean()), float(ways.back.mean())
 
 
-def _ways(a: Float64, b: Float64) -> Ways:
+class _Ways(NamedTuple):
+    """Squared distances between samples of a surface and of the reference.
+
+    Attributes:
+        there: ``(N,)`` of the surface's samples to the reference.
+        nearest: ``(N,)`` which of the reference's samples is next to each of them.
+        back: ``(M,)`` of the reference's samples to the surface.
+    """
+
+    there: Float64
+    nearest: Int64
+    back: Float64
+
+
+def _ways(a: Float64, b: Float64) -> _Ways:
     """From samples of a surface ``(N, 3)`` to those of the reference ``(M, 3)``, and back."""
     forward, nearest = KDTree(b, balanced_tree=False).query(a, workers=-1)
     backward, _ = KDTree(a, balanced_tree=False).query(b, workers=-1)
-    return Ways(np.asarray(forward) ** 2, np.asarray(nearest), np.asarray(backward) ** 2)
+    return _Ways(np.asarray(forward) ** 2, np.asarray(nearest), np.asarray(backward) ** 2)
+
+
+def _chamfer_where(seen: NDArray[np.bool_], ways: _Ways) -> float | None:
+    there, back = ways.there[seen[ways.nearest]], ways.back[seen]
+    return float(there.mean() + back.mean()) if len(there) and len(back) else None
 
 
 def shell_iou(a: Float64, b: Float64, *, voxel: float = 0.01) -> float:
@@ -261,7 +273,7 @@ def shell_iou(a: Float64, b: Float64, *, voxel: float = 0.01) -> float:
     return common / (len(keys[0]) + len(keys[1]) - common)
 
 
-def _iou(mesh: Surface, reference: Surface, columns: int, *, closed: bool) -> tuple[float | None, list[str]]:
+def _iou(mesh: Mesh, reference: Mesh, columns: int, *, closed: bool) -> tuple[float | None, list[str]]:
     """Volumetric IoU, with a note where it is approximate or cannot be had."""
     volumes = overlap(mesh, reference, columns=columns)
     both = {"the mesh": closed, "the reference": is_closed(reference)}
@@ -280,10 +292,10 @@ def format_metrics(metrics: Metrics) -> str:
     def optional(value: float | None, form: str) -> str:
         return "n/a" if value is None else format(value, form)
 
-    def below(median: float | None, most: float | None, where: str) -> tuple[str, str]:
-        return optional(median, ".2f"), where if most is None else f"{where}, degrees; nine tenths below {most:.2f}"
-
-    flat = "flat places" if m.flat_share is None else f"flat places ({m.flat_share:.0%})"
+    visible = []
+    if m.visible is not None:
+        about = f"floor {optional(m.visible.chamfer_floor, '.3e')}; {m.visible.share:.2%} of the area"
+        visible = [("chamfer where 2 photographs see", optional(m.visible.chamfer, ".3e"), about)]
     lines = [
         ("chamfer (squared L2, both ways)", f"{m.chamfer:.3e}", f"sampling floor {optional(m.chamfer_floor, '.3e')}"),
         ("  mesh → reference", f"{m.accuracy:.3e}", ""),
@@ -291,14 +303,11 @@ def format_metrics(metrics: Metrics) -> str:
         ("hausdorff (squared)", f"{m.hausdorff:.3e}", ""),
         ("f_score", f"{m.f_score:.4f}", f"within {m.threshold:g}"),
         ("normal_consistency", optional(m.normal_consistency, ".4f"), "mean |n·n'|"),
-        ("high-frequency normal error", *below(m.flat_angle, m.flat_angle_90, flat)),
-        ("", *below(m.edge_angle, m.edge_angle_90, "near sharp edges")),
-        ("ripple", optional(m.ripple, ".2e"), "height of the waves on flat places"),
         ("iou", optional(m.iou, ".4f"), "of volumes"),
         ("shell_iou", f"{m.shell_iou:.4f}", f"of surface voxels of {m.voxel:g}"),
         ("components", f"{m.components}", "closed" if m.closed else "with open edges"),
         ("vertices, faces", f"{m.vertices:,}", f"{m.faces:,}"),
-        *(() if m.seen is None else seen_lines(m.seen)),
+        *visible,
         ("mean distance, input units", f"{m.mean_distance:.4g}", f"1 unit above = {m.scale:.6g} input units"),
     ]
     rows = [f"{name:<32} {value:>10}  {remark}".rstrip() for name, value, remark in lines]
@@ -329,7 +338,7 @@ class Overlap(NamedTuple):
     broken: float
 
 
-def overlap(first: Surface, second: Surface, *, columns: int = 512) -> Overlap:
+def overlap(first: Mesh, second: Mesh, *, columns: int = 512) -> Overlap:
     """Measure two meshes; inside is where the winding number is not zero.
 
     Args:
@@ -363,11 +372,12 @@ def overlap(first: Surface, second: Surface, *, columns: int = 512) -> Overlap:
 
 
 def _crossings(
-    mesh: Surface, order: list[int], low: Float64, step: float, shape: tuple[int, int]
+    mesh: Mesh, order: list[int], low: Float64, step: float, shape: tuple[int, int]
 ) -> tuple[Int64, Float64, NDArray[np.int8]]:
     """Column, height and sign of every crossing, each ``(K,)``."""
     placed = mesh.vertices[:, order]
-    xy = (placed[:, :2] - low[order[:2]]) / step - OFFSET
+    # Columns do not stand in the middle of their cells: models like to have their edges there.
+    xy = (placed[:, :2] - low[order[:2]]) / step - (0.5 + 0.0372036, 0.5 - 0.0618034)
     column, height, sign = [np.empty(0, np.int64)], [np.empty(0)], [np.empty(0, np.int8)]
     for found in cover(xy, mesh.faces, shape):
         column.append(found.column)

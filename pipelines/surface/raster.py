@@ -15,8 +15,7 @@ __all__ = ["Clipped", "Coverage", "clip", "cover"]
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
-
-CHUNK = 1 << 20  # candidate (triangle, column) pairs held at a time: about 200 MB
+Faces = NDArray[np.integer]
 
 
 class Coverage(NamedTuple):
@@ -46,14 +45,14 @@ class Clipped(NamedTuple):
         share: ``(K,)`` how far from the first to the second the plane is.
     """
 
-    faces: Int64
+    faces: Faces
     owner: Int64
     kept: Int64
     dropped: Int64
     share: Float64
 
 
-def clip(height: Float64, faces: Int64) -> Clipped:
+def clip(height: Float64, faces: Faces) -> Clipped:
     """Cut triangles where ``height`` ``(V,)``, linear over each, is zero, and keep where it is positive.
 
     A corner cut off leaves a quadrilateral, which becomes two triangles; two corners cut off leave one.
@@ -85,7 +84,9 @@ def clip(height: Float64, faces: Int64) -> Clipped:
     return Clipped(np.concatenate(parts), np.concatenate(owner), kept, dropped, share)
 
 
-def cover(xy: Float64, faces: Int64, shape: tuple[int, int], *, chunk: int = CHUNK) -> Iterator[Coverage]:
+def cover(
+    xy: NDArray[np.floating], faces: Faces, shape: tuple[int, int], *, chunk: int = 1 << 20
+) -> Iterator[Coverage]:
     """Yield the columns that triangles cover; column (i, j) is the point (i, j) of the plane.
 
     Two triangles with a common edge never both claim or both leave a point on it, because the side of
@@ -96,7 +97,7 @@ def cover(xy: Float64, faces: Int64, shape: tuple[int, int], *, chunk: int = CHU
         xy: ``(V, 2)`` vertices, in units of the grid.
         faces: ``(F, 3)`` vertex indices.
         shape: columns along x and y.
-        chunk: how many pairs to test at a time, of a triangle and a column between its edges.
+        chunk: how many pairs to test at a time, of a triangle and a column between its edges: a million take 200 MB.
     """
     corners = xy[faces]  # (F, 3, 2)
     top = np.asarray(shape) - 1
@@ -133,7 +134,7 @@ def _within(count: Int64) -> Int64:
     return np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
 
 
-def _between(corners: Float64, row: Int64, i: Int64, low: Int64, high: Int64) -> tuple[Int64, Int64]:
+def _between(corners: NDArray[np.floating], row: Int64, i: Int64, low: Int64, high: Int64) -> tuple[Int64, Int64]:
     """Where the line x = ``i`` runs through the triangle ``corners[row]``: the first column to be tested, and how many.
 
     The two edges that the line crosses bound it. The interval is widened by what the test of a column can be wrong by:
@@ -156,7 +157,7 @@ def _between(corners: Float64, row: Int64, i: Int64, low: Int64, high: Int64) ->
     return first, np.maximum(last - first + 1, 0)
 
 
-def _inside(xy: Float64, faces: Int64, some: Int64, row: Int64, i: Int64, j: Int64, ny: int) -> Coverage:
+def _inside(xy: NDArray[np.floating], faces: Faces, some: Int64, row: Int64, i: Int64, j: Int64, ny: int) -> Coverage:
     """Those of the columns (``i``, ``j``) that are in the triangle ``faces[row]``, number ``some[row]`` of all."""
     sides = np.empty((len(row), 3))  # twice the signed area of the point with each edge
     left = np.empty((len(row), 3), dtype=bool)

@@ -6,9 +6,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...neural_fields import Jet, OneLevelField
+from ...neural_fields import Jet, Mesh
+from ...neural_fields.fields.field import OneLevelField
 from .distance import MeshDistance
-from .surface import Surface, is_closed
+from .surface import is_closed
 
 __all__ = ["MeshField"]
 
@@ -19,22 +20,22 @@ class MeshField(OneLevelField):
     Evaluated in float64 on the CPU, without a graph. A mesh that is turned inside out is turned back.
 
     Args:
-        surface: in the coordinates of the field.
+        mesh: in the coordinates of the field.
 
     Raises:
         ValueError: the mesh is not closed, or encloses nothing.
     """
 
-    def __init__(self, surface: Surface) -> None:
+    def __init__(self, mesh: Mesh) -> None:
         super().__init__()
-        if not is_closed(surface):
-            raise ValueError("surface: is not closed, so that it has no inside")
-        a, b, c = (surface.vertices[surface.faces[:, k]] for k in range(3))
+        if not is_closed(mesh):
+            raise ValueError("mesh: is not closed, so that it has no inside")
+        a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
         volume = float((a * np.cross(b, c)).sum() / 6)
         if volume == 0:
-            raise ValueError("surface: encloses nothing")
-        faces = surface.faces if volume > 0 else surface.faces[:, ::-1]
-        self.volume, self.distance = abs(volume), MeshDistance(Surface(surface.vertices, faces))
+            raise ValueError("mesh: encloses nothing")
+        faces = mesh.faces if volume > 0 else mesh.faces[:, ::-1]
+        self.volume, self.distance = abs(volume), MeshDistance(Mesh(mesh.vertices, faces))
 
     def extra_repr(self) -> str:
         """How many triangles there are."""

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -17,21 +15,19 @@ from ...datasets import PointCloud, read_cloud
 from ...datasets.clouds.point_cloud import unit_rows
 from ...datasets.clouds.readers.meshes import spread_on_faces
 from ...datasets.textured.gltf import read_gltf
-from ...neural_fields import InputError, Similarity
-from ...neural_fields.meshing.extract import Mesh
+from ...neural_fields import InputError, Mesh
 
 __all__ = [
     "MESH_SUFFIXES",
-    "Surface",
     "component_of_faces",
     "components",
     "face_normals",
     "from_cloud",
-    "from_mesh",
     "is_closed",
     "read_reference",
     "read_surface",
     "sample_points",
+    "volume",
 ]
 
 Float64 = NDArray[np.float64]
@@ -40,48 +36,7 @@ Int64 = NDArray[np.int64]
 MESH_SUFFIXES = (".ply", ".obj", ".stl", ".off", ".glb", ".gltf")
 
 
-@dataclass(frozen=True)
-class Surface:
-    """A triangle mesh, or with no faces a cloud of points: what is read from files, measured and drawn.
-
-    A `Mesh` is what was extracted from a field: in its coordinates, and in the number types of files. A `TexturedMesh`
-    was read with images, an `Unwrapped` mesh has texture coordinates and waits for them to be baked.
-
-    Attributes:
-        vertices: ``(V, 3)``.
-        faces: ``(F, 3)``; F is 0 for a cloud.
-        normals: ``(V, 3)`` unit normals at the vertices, where known; those of a mesh file are worked out anew.
-        colors: ``(V, 3)`` in [0, 1], where the file gives them.
-    """
-
-    vertices: Float64
-    faces: Int64
-    normals: Float64 | None = None
-    colors: Float64 | None = None
-
-    def used_vertices(self) -> Float64:
-        """The vertices that a face uses; of a cloud, all."""
-        return self.vertices[np.unique(self.faces)] if len(self.faces) else self.vertices
-
-    @cached_property
-    def merged(self) -> Surface:
-        """The surface with exactly equal vertices made one, and faces that collapse by it dropped; without normals."""
-        order = np.lexsort(self.vertices.T[::-1])
-        rows = self.vertices[order]
-        first = np.ones(len(rows), bool)
-        first[1:] = (rows[1:] != rows[:-1]).any(axis=1)
-        index = np.empty(len(rows), np.int64)
-        index[order] = np.cumsum(first) - 1
-        faces = index[self.faces]
-        whole = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
-        return Surface(rows[first], faces[whole])
-
-    def moved(self, similarity: Similarity) -> Surface:
-        """The same surface in unit-sphere coordinates."""
-        return Surface(similarity.to_unit(self.vertices), self.faces, self.normals, self.colors)
-
-
-def read_surface(path: str | Path) -> Surface:
+def read_surface(path: str | Path) -> Mesh:
     """Read a mesh, or any cloud that ``datasets.read_cloud`` knows.
 
     Raises:
@@ -97,7 +52,7 @@ def read_surface(path: str | Path) -> Surface:
     return from_cloud(read_cloud(path))
 
 
-def read_reference(path: str | Path, *, fix: str = "give a mesh") -> Surface:
+def read_reference(path: str | Path, *, fix: str = "give a mesh") -> Mesh:
     """`read_surface` of something to compare with.
 
     Args:
@@ -113,7 +68,7 @@ def read_reference(path: str | Path, *, fix: str = "give a mesh") -> Surface:
     return surface
 
 
-def from_cloud(cloud: PointCloud) -> Surface:
+def from_cloud(cloud: PointCloud) -> Mesh:
     """The finite points of a cloud, as a surface without faces; normals of unit length, or zero."""
     finite = np.isfinite(cloud.points).all(axis=1)
     normals = colors = None
@@ -122,10 +77,10 @@ def from_cloud(cloud: PointCloud) -> Surface:
         normals = unit_rows(normals)
     if cloud.colors is not None:
         colors = cloud.colors[finite].astype(np.float64)
-    return Surface(cloud.points[finite], np.empty((0, 3), np.int64), normals, colors)
+    return Mesh(cloud.points[finite], np.empty((0, 3), np.int64), normals, colors)
 
 
-def _load_mesh(path: Path) -> Surface | None:
+def _load_mesh(path: Path) -> Mesh | None:
     """The triangles of a file; None where it has no faces."""
     if not path.is_file():
         raise InputError(f"{path}: no such file")
@@ -141,18 +96,18 @@ def _load_mesh(path: Path) -> Surface | None:
     colors = None
     if loaded.visual.kind == "vertex":
         colors = np.asarray(loaded.visual.vertex_colors, np.float64)[:, :3] / 255
-    return _checked(path, Surface(np.asarray(loaded.vertices, np.float64), faces, None, colors))
+    return _checked(path, Mesh(np.asarray(loaded.vertices, np.float64), faces, None, colors))
 
 
-def _load_gltf(path: Path) -> Surface:
+def _load_gltf(path: Path) -> Mesh:
     if not path.is_file():
         raise InputError(f"{path}: no such file")
     mesh = read_gltf(path, textures=False)
     colors = None if mesh.vertex_colors is None else mesh.vertex_colors.astype(np.float64)
-    return _checked(path, Surface(mesh.vertices, mesh.faces, None, colors))
+    return _checked(path, Mesh(mesh.vertices, mesh.faces, None, colors))
 
 
-def _checked(path: Path, surface: Surface) -> Surface:
+def _checked(path: Path, surface: Mesh) -> Mesh:
     """The surface, if it is one.
 
     Raises:
@@ -168,14 +123,7 @@ def _checked(path: Path, surface: Surface) -> Surface:
     return surface
 
 
-def from_mesh(mesh: Mesh) -> Surface:
-    """A mesh that `extract_mesh` made, in its own coordinates."""
-    normals = None if mesh.normals is None else mesh.normals.astype(np.float64)
-    colors = None if mesh.colors is None else mesh.colors.astype(np.float64)
-    return Surface(mesh.vertices, mesh.faces.astype(np.int64), normals, colors)
-
-
-def face_normals(mesh: Surface | Mesh) -> tuple[Float64, Float64]:
+def face_normals(mesh: Mesh) -> tuple[Float64, Float64]:
     """Unit normals ``(F, 3)`` (zero for a face without area) and areas ``(F,)``."""
     a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
     cross = np.cross(b - a, c - a)
@@ -183,7 +131,7 @@ def face_normals(mesh: Surface | Mesh) -> tuple[Float64, Float64]:
     return np.divide(cross, length[:, None], out=np.zeros_like(cross), where=length[:, None] > 0), length / 2
 
 
-def sample_points(surface: Surface, count: int, rng: np.random.Generator) -> tuple[Float64, Float64 | None]:
+def sample_points(surface: Mesh, count: int, rng: np.random.Generator) -> tuple[Float64, NDArray[np.floating] | None]:
     """Points uniform by area ``(count, 3)`` with the normals of their faces.
 
     Of a cloud, its own points (at most ``count``, chosen at random) with their own normals.
@@ -202,12 +150,12 @@ def sample_points(surface: Surface, count: int, rng: np.random.Generator) -> tup
     return np.asarray(points), normals[face]
 
 
-def components(surface: Surface) -> int:
+def components(surface: Mesh) -> int:
     """Connected components of the faces, through shared vertices, equal vertices merged."""
     return len(np.unique(component_of_faces(surface.merged)))
 
 
-def component_of_faces(mesh: Surface | Mesh) -> NDArray[np.int32]:
+def component_of_faces(mesh: Mesh) -> NDArray[np.int32]:
     """The number ``(F,)`` of the connected component of each face, through vertices that faces share."""
     a, b = mesh.faces[:, [0, 1]].ravel(), mesh.faces[:, [1, 2]].ravel()
     size = len(mesh.vertices)
@@ -215,7 +163,7 @@ def component_of_faces(mesh: Surface | Mesh) -> NDArray[np.int32]:
     return connected_components(graph, directed=False)[1][mesh.faces[:, 0]]
 
 
-def is_closed(surface: Surface) -> bool:
+def is_closed(surface: Mesh) -> bool:
     """Whether each edge is run through as often in one direction as in the other, equal vertices merged."""
     whole = surface.merged
     if not len(whole.faces):
@@ -225,3 +173,10 @@ def is_closed(surface: Surface) -> bool:
     size = len(whole.vertices)
     there, back = np.sort(a * size + b), np.sort(b * size + a)
     return bool((there == back).all())
+
+
+def volume(mesh: Mesh) -> float:
+    """Volume inside a closed mesh: the sum of signed tetrahedra from its middle."""
+    vertices = mesh.vertices - mesh.vertices.mean(axis=0)
+    a, b, c = (vertices[mesh.faces[:, k]] for k in range(3))
+    return float((a * np.cross(b, c)).sum() / 6)

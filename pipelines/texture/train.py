@@ -8,27 +8,21 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from ...datasets import PointCloud
-from ...neural_fields import (
-    ColorSiren,
-    Field,
-    InputError,
-    Similarity,
-    TextureField,
-    load_field,
-    load_texture,
-)
+from ...neural_fields import Field, InputError, Similarity, TextureField, load_field, load_texture
 from ...neural_fields.backend.devices import upload
 from ...neural_fields.backend.files import write_whole
 from ...neural_fields.checkpoint import texture_bytes
 from ...neural_fields.fields.losses import color_loss, tangential_loss
+from ...neural_fields.networks.texture import ColorSiren
 from ...neural_fields.spacetime.dynamic_tracing import moment
+from ..training.atomic import prune
 from ..training.budget import SAMPLING_SHARE, Budget, affordable, step_seconds
 from ..training.config import load_config
 from ..training.folder import (
@@ -44,8 +38,8 @@ from ..training.folder import (
 from ..training.lock import locked
 from ..training.machine import choose_device, environment
 from ..training.report import Report, reported
+from ..training.result import Run
 from ..training.settings import TextureConfig
-from ..training.swap import sweep
 from ..training.trainer import Group, Objective, Trainer, parameter_count, seeded, stop_on_signals, warm_cosine
 from .samples import BandSamples, ColorSamples, band_directions, match_colors, read_colors
 
@@ -70,16 +64,14 @@ JUDGED = 100_000
 
 
 @dataclass(frozen=True)
-class FittedTexture:
-    """A trained texture.
+class FittedTexture(Run[Field]):
+    """A trained texture; ``record`` is what ``run.json`` holds under ``texture``, not ``finished`` after Ctrl-C.
 
     Attributes:
         texture: on the CPU, around its geometry.
-        record: what ``run.json`` holds under ``texture``; ``finished`` is False after Ctrl-C.
     """
 
     texture: TextureField
-    record: dict[str, Any]
 
 
 def texture_step_seconds(config: TextureConfig, device: torch.device, left: float) -> float:
@@ -135,7 +127,7 @@ def fit_texture(
     device = choose_device(config.device)
     level = geometry.resolve_level(level)
     delta = config.delta or default_delta(geometry)
-    budget, band_samples = Budget(config.time_budget, device, started=started), config.samples // 2
+    budget, band_samples = Budget(config.time_budget, started=started), config.samples // 2
     home = geometry.like.device
     geometry = geometry.to(device)
 
@@ -192,7 +184,8 @@ def fit_texture(
     }
     network.requires_grad_(False)
     texture = TextureField(geometry.to(home), network.to(home), delta=delta, geometry_level=level, outside=mean)
-    return FittedTexture(texture.to(home), record)
+    texture = texture.to(home)
+    return FittedTexture(texture.geometry, similarity or Similarity.identity(), None, record, texture)
 
 
 def texture_run(
@@ -228,7 +221,7 @@ def texture_run(
     state_file = texture_state_file(target)
     with locked(file.parent if beside else target):
         if beside:
-            sweep(file.parent)
+            prune(file.parent)
         before = _interrupted(state_file) if resume else None
         if before is not None:
             config, level = before.config, before.level
@@ -264,7 +257,7 @@ def texture_run(
             write_whole(target, content)
             if finished:
                 state_file.unlink(missing_ok=True)
-        return fitted
+        return dataclasses.replace(fitted, directory=target.parent)
 
 
 def _thinned(cloud: PointCloud, share: float, seed: int) -> PointCloud:

@@ -1,4 +1,4 @@
-"""Typed settings: flat dataclasses whose fields say what is allowed, filled from a YAML preset and then from flags."""
+"""Typed settings: flat frozen dataclasses, filled from a YAML preset and then from flags by one mapping."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
-from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, ClassVar, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 __all__ = [
     "Settings",
@@ -27,11 +27,9 @@ __all__ = [
 ]
 
 T = TypeVar("T")
-Pairs = Mapping[object, object]
 
-
-class _MismatchError(Exception):
-    """A value does not fit its annotation; the message says what would."""
+_KINDS = {bool: "true or false", int: "a whole number", float: "a finite number", str: "text"}
+_PLURALS = {bool: "true or false", int: "whole numbers", float: "finite numbers", str: "texts"}
 
 
 def setting(
@@ -43,71 +41,72 @@ def setting(
     at_most: float | None = None,
     per_level: bool = False,
 ) -> Any:
-    """A field of `Settings`.
+    """A field of `Settings`, with its help text and its bounds as metadata.
 
     Args:
         default: its value where nothing else is said.
         help: what it is, for the help of its flag.
         above: the number, or every number of a list, must be larger; None, no number, is under no bound.
         at_least: it must not be smaller.
-        at_most: it must not be larger; goes with one of the others.
+        at_most: it must not be larger.
         per_level: a list with an entry for each level; the first such field of a class says how many there are.
     """
-    low = at_least if above is None else above
-    if low is None:
-        allowed = ""
-    elif at_most is not None:
-        allowed = f"in {'[' if above is None else '('}{low:g}, {at_most:g}]"
-    else:
-        allowed = f"> {low:g}" if above is not None else f"at least {low:g}" if low else "≥ 0"
-
-    def holds(number: float) -> bool:  # not of NaN
-        return (
-            (above is None or number > above)
-            and (at_least is None or number >= at_least)
-            and (at_most is None or number <= at_most)
-        )
-
-    metadata = {"help": help, "allowed": allowed, "holds": holds, "per_level": per_level}
+    metadata = {"help": help, "above": above, "at_least": at_least, "at_most": at_most, "per_level": per_level}
     return dataclasses.field(default=default, metadata=metadata)
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What all settings share: their fields are made by `setting`, and checked when an instance is made.
+    """Base of all settings: their fields are made by `setting` and checked when an instance is made.
+
+    Attributes:
+        gone: settings of earlier versions, each with what a user does instead.
 
     Raises:
         ValueError: lists of different lengths, a word that is no choice, or a number out of range; the message names
             the field, what came and what is allowed.
     """
 
+    gone: ClassVar[Mapping[str, str]] = {}
+
     def __post_init__(self) -> None:
-        fields = dataclasses.fields(self)
-        lists = {field.name: len(getattr(self, field.name)) for field in fields if field.metadata["per_level"]}
-        first, count = next(iter(lists.items()), ("", 1))
-        if count == 0:
-            raise ValueError(f"{first}: expected at least one level")
-        for name, entries in lists.items():
-            if entries != count:
-                raise ValueError(f"{name}: {entries} entries for {count} {first}; expected one for each")
-        for field in fields:
-            kind, value = _hints(type(self))[field.name], getattr(self, field.name)
-            allowed = None if value is None else _refused(value, _without_none(kind), field.metadata)
-            if allowed is not None:
-                choice = ", or none" * (kind is not _without_none(kind))
-                raise ValueError(f"{field.name}: {value}; expected {allowed}{choice}")
+        first, count = "", 1
+        for field in dataclasses.fields(self):
+            name, value, kind = field.name, getattr(self, field.name), _hints(type(self))[field.name]
+            if field.metadata["per_level"]:
+                first, count = (first, count) if first else (name, len(value))
+                if count == 0:
+                    raise ValueError(f"{first}: expected at least one level")
+                if len(value) != count:
+                    raise ValueError(f"{name}: {len(value)} entries for {count} {first}; expected one for each")
+            if value is not None and not _allows(value, _without_none(kind), field.metadata):
+                raise ValueError(f"{name}: {value}; expected {_described(kind, field.metadata)}")
 
 
-def _refused(value: Any, kind: Any, metadata: Mapping[str, Any]) -> str | None:
-    """What is allowed in place of a value; None where it is allowed itself."""
+def _allows(value: Any, kind: Any, limits: Mapping[str, Any]) -> bool:
+    """Whether a value is one of the choices, of the right length and within bounds."""
     if get_origin(kind) is Literal:
-        return None if value in get_args(kind) else "one of " + ", ".join(get_args(kind))
-    numbers, count = value if isinstance(value, list | tuple) else (value,), _length(kind)
-    if count in (None, len(numbers)) and all(map(metadata["holds"], numbers)):
-        return None
-    if get_origin(kind) is tuple:
-        return f"{count or ''} numbers {metadata['allowed']}".strip()
-    return f"{'a number ' * metadata['allowed'].startswith('in')}{metadata['allowed']}"
+        return value in get_args(kind)
+    numbers, args = value if isinstance(value, list | tuple) else (value,), get_args(kind)
+    above, least, most = limits["above"], limits["at_least"], limits["at_most"]
+    return (not args or args[-1] is Ellipsis or len(numbers) == len(args)) and all(
+        (above is None or number > above) and (least is None or number >= least) and (most is None or number <= most)
+        for number in numbers
+    )
+
+
+def _described(kind: Any, limits: Mapping[str, Any] = types.MappingProxyType({})) -> str:
+    """What values an annotation and the bounds of its field allow, in words."""
+    inner, signs = _without_none(kind), {"above": ">", "at_least": "≥", "at_most": "≤"}
+    args = get_args(inner)
+    if get_origin(inner) is Literal:
+        text = "one of " + ", ".join(map(str, args))
+    elif get_origin(inner) is tuple:
+        text = f"a list of {'' if args[-1] is Ellipsis else f'{len(args)} '}{_PLURALS[args[0]]}"
+    else:
+        text = _KINDS[inner]
+    bounds = " and ".join(f"{sign} {limits[name]:g}" for name, sign in signs.items() if limits.get(name) is not None)
+    return f"{text} {bounds}".rstrip() + ", or none" * (inner is not kind)
 
 
 @functools.cache
@@ -135,18 +134,22 @@ def load_config(
         InputError: no such preset or file, not YAML, an unknown key, or a value of the wrong kind. The
             message names the file or flag, the key, what came and what is allowed.
     """
-    hints = _hints(cls)
-    fields = [field.name for field in dataclasses.fields(cls)]  # pyright: ignore[reportArgumentType]
+    hints, names = _hints(cls), _names(cls)
     source, pairs = _read_preset(preset, thing or thing_of(cls))
     values: dict[str, Any] = {}
-    for key, value in pairs.items():
-        if key not in hints or not isinstance(key, str):
-            raise input_error(f"{source}: unknown key {str(key)!r}{closest(str(key), fields)}")
-        values[key] = _checked(value, hints[key], f"{source}: {key}")
-    for key, value in (overrides or {}).items():
-        if key not in hints:
-            raise input_error(f"unknown flag {_flag(key)}{closest(_flag(key), map(_flag, fields))}")
-        values[key] = _checked(value, hints[key], _flag(key))
+    given = [(f"{source}: {key}", f"{source}: unknown key {str(key)!r}", key, value) for key, value in pairs.items()]
+    given += [(_flag(key), f"unknown flag {_flag(key)}", key, value) for key, value in (overrides or {}).items()]
+    for place, unknown, key, value in given:
+        if key in getattr(cls, "gone", {}):
+            raise input_error(f"{place}: is gone; {cls.gone[key]}")  # pyright: ignore[reportAttributeAccessIssue]
+        if key not in names:
+            near = closest(_flag(str(key)), map(_flag, names)) if place[0] == "-" else closest(str(key), names)
+            raise input_error(unknown + near)
+        try:
+            values[key] = _convert(value, hints[key])
+        except (ValueError, OverflowError) as error:
+            shown = " ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
+            raise input_error(f"{place}: got {shown!r}, expected {_described(hints[key])}") from error
     try:
         return cls(**values)
     except ValueError as error:  # a check of the dataclass itself, which begins with a field
@@ -159,8 +162,9 @@ def load_config(
 def add_config_flags(parser: argparse.ArgumentParser, cls: type, *, about: str = "each overrides the preset") -> None:
     """Add one flag per field of ``cls`` (``learning_rates`` → ``--learning-rates 1e-3 5e-4``).
 
-    A flag that is not given leaves no trace in the namespace, so that only given ones override. Values
-    stay text: ``load_config`` checks them with the same rules as a file's.
+    A flag that is not given leaves no trace in the namespace, so that only given ones override. Values stay text:
+    `load_config` checks them with the same rules as a file's. Settings that are gone have hidden flags, which it
+    refuses.
 
     Args:
         parser: gets the flags.
@@ -168,17 +172,20 @@ def add_config_flags(parser: argparse.ArgumentParser, cls: type, *, about: str =
         about: a few words above them in the help.
     """
     group = parser.add_argument_group("settings", about)
-    hints = _hints(cls)
     for field in dataclasses.fields(cls):
-        kind = hints[field.name]
+        kind = _without_none(_hints(cls)[field.name])
         text = str(field.metadata.get("help", "")).replace("%", "%%")
         options: dict[str, Any] = {"default": argparse.SUPPRESS, "help": text, "dest": field.name}
-        if _without_none(kind) is bool:
-            group.add_argument(_flag(field.name), action=argparse.BooleanOptionalAction, **options)
+        item = get_args(kind)[0] if get_origin(kind) is tuple else kind
+        if kind is bool:
+            options["action"] = argparse.BooleanOptionalAction
+        elif get_origin(item) is Literal:
+            options["metavar"] = "{" + ",".join(map(str, get_args(item))) + "}"
         else:
-            many = get_origin(_without_none(kind)) is tuple
-            options["metavar"] = _metavar(kind)
-            group.add_argument(_flag(field.name), nargs="+" if many else None, **options)
+            options |= {"metavar": {int: "N", float: "X"}.get(item, "TEXT"), "nargs": None if item is kind else "+"}
+        group.add_argument(_flag(field.name), **options)
+    for name in getattr(cls, "gone", {}):
+        group.add_argument(_flag(name), dest=name, nargs="*", default=argparse.SUPPRESS, help=argparse.SUPPRESS)
 
 
 def given_flags(arguments: argparse.Namespace, cls: type) -> dict[str, Any]:
@@ -187,9 +194,8 @@ def given_flags(arguments: argparse.Namespace, cls: type) -> dict[str, Any]:
     Those of `add_config_flags` are ready for ``load_config``'s ``overrides``; those of flags of another kind for the
     class itself, whose defaults then hold for the rest.
     """
-    given = {field.name: getattr(arguments, field.name, None) for field in dataclasses.fields(cls)}
-    given = {name: value for name, value in given.items() if value is not None}
-    return {name: tuple(value) if isinstance(value, list) else value for name, value in given.items()}
+    given = {name: getattr(arguments, name, None) for name in (*_names(cls), *getattr(cls, "gone", {}))}
+    return {name: tuple(x) if isinstance(x, list) else x for name, x in given.items() if x is not None}
 
 
 def thing_of(cls: type) -> str:
@@ -210,99 +216,60 @@ def closest(name: str, known: Iterable[str]) -> str:
     return f"; did you mean {near[0]!r}?" if near else f"; known: {', '.join(known)}"
 
 
-def _read_preset(preset: str | Path | None, thing: str) -> tuple[str, Pairs]:
+def _read_preset(preset: str | Path | None, thing: str) -> tuple[str, Mapping[Any, object]]:
     """Name for messages, and the key-value pairs of a preset."""
     import yaml  # late, as all that --help can do without
 
     if preset is None:
         return thing, {}
     if isinstance(preset, Path) or preset.endswith((".yaml", ".yml")):
-        source = str(preset)
-        try:
-            text = Path(preset).read_text(encoding="utf-8")
-        except (OSError, UnicodeDecodeError) as error:
-            reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
-            raise input_error(f"{source}: cannot read the configuration ({reason})") from error
-    else:
-        names = preset_names(thing)
-        if preset not in names:
-            raise input_error(f"no preset {preset!r} for {thing}{closest(preset, names)} (a file: --config FILE)")
+        source, file = str(preset), Path(preset)
+    elif preset in (names := preset_names(thing)):
         source = f"{thing}_{preset}.yaml"
-        text = (resources.files("mplicits.configs") / source).read_text(encoding="utf-8")
+        file = resources.files("mplicits.configs") / source
+    else:
+        raise input_error(f"no preset {preset!r} for {thing}{closest(preset, names)} (a file: --config FILE)")
     try:
-        pairs = yaml.safe_load(text)
+        pairs = yaml.safe_load(file.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
+        raise input_error(f"{source}: cannot read the configuration ({reason})") from error
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         place = f", line {mark.line + 1}, column {mark.column + 1}" if mark else ""
-        problem = getattr(error, "problem", None) or "unreadable"
-        raise input_error(f"{source}{place}: not YAML ({problem})") from error
+        raise input_error(f"{source}{place}: not YAML ({getattr(error, 'problem', None) or 'unreadable'})") from error
     except (RecursionError, ValueError) as error:  # a year of 400 digits, a date of the 45th of May
         reason = "nested too deeply" if isinstance(error, RecursionError) else " ".join(str(error).split())[:160]
         raise input_error(f"{source}: not settings ({reason}); expected lines of 'key: value'") from error
-    if pairs is None:
-        return source, {}
-    if not isinstance(pairs, dict):
+    if pairs is not None and not isinstance(pairs, dict):
         raise input_error(f"{source}: expected lines of 'key: value', got a {type(pairs).__name__}")
-    return source, pairs
-
-
-def _checked(value: object, kind: Any, place: str) -> Any:
-    try:
-        return _convert(value, kind)
-    except _MismatchError as error:
-        shown = " ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
-        raise input_error(f"{place}: got {shown!r}, expected {error}") from error
+    return source, pairs or {}
 
 
 def _convert(value: object, kind: Any) -> Any:
-    """``value``, or the text of one, as an instance of the annotation ``kind``."""
-    origin, args = get_origin(kind), get_args(kind)
-    if origin is Literal:
-        if value in args:
-            return value
-        raise _MismatchError("one of " + ", ".join(map(str, args)))
-    if origin is tuple:
-        return _convert_tuple(value, kind)
-    if origin is types.UnionType or origin is Union:
-        if value is None or value in ("none", ["none"], ("none",)):
-            return None
-        try:
-            return _convert(value, _without_none(kind))
-        except _MismatchError as error:
-            raise _MismatchError(f"{error}, or none") from error
-    if kind in (int, float):
-        return _convert_number(value, kind)
-    if isinstance(value, kind):
+    """``value``, or the text of one, as an instance of the annotation ``kind``; ValueError if it is none.
+
+    Numbers may be text: YAML itself reads ``1e-3``, which has no point, as text.
+    """
+    args, inner = get_args(kind), _without_none(kind)
+    if inner is not kind:
+        return None if value in (None, "none", ["none"], ("none",)) else _convert(value, inner)
+    if get_origin(kind) is Literal and value in args:
         return value
-    raise _MismatchError({bool: "true or false", str: "text"}[kind])
-
-
-def _convert_number(value: object, kind: type[int] | type[float]) -> int | float:
-    """Numbers, and their text: YAML itself reads ``1e-3``, which has no point, as text."""
-    allowed = "a whole number" if kind is int else "a finite number"
-    if isinstance(value, bool) or not isinstance(value, int | float | str):
-        raise _MismatchError(allowed)
-    if kind is int and isinstance(value, int):
+    if get_origin(kind) is tuple and isinstance(value, list | tuple):
+        kinds = args[:1] * len(value) if args[-1] is Ellipsis else args
+        return tuple(_convert(item, part) for item, part in zip(value, kinds, strict=True))
+    if kind in (bool, str) and isinstance(value, kind):
         return value
-    try:
-        number = float(value)
-    except ValueError as error:
-        raise _MismatchError(allowed) from error
-    if not math.isfinite(number) or (kind is int and not number.is_integer()):
-        raise _MismatchError(allowed)
-    return kind(number)
+    if kind in (int, float) and isinstance(value, int | float | str) and not isinstance(value, bool):
+        number = value if kind is int and isinstance(value, int) else float(value)
+        if isinstance(number, int) or (math.isfinite(number) and (kind is float or number.is_integer())):
+            return kind(number)
+    raise ValueError
 
 
-def _convert_tuple(value: object, kind: Any) -> tuple[Any, ...]:
-    args = get_args(kind)
-    count = _length(kind)
-    allowed = f"a list of {'' if count is None else f'{count} '}{_plural(args[0])}"
-    if not isinstance(value, list | tuple) or len(value) not in (count or len(value),):
-        raise _MismatchError(allowed)
-    try:
-        return tuple(_convert(item, args[0] if count is None else args[i]) for i, item in enumerate(value))
-    except _MismatchError as error:
-        raise _MismatchError(allowed) from error
+def _names(cls: type) -> list[str]:
+    return [field.name for field in dataclasses.fields(cls)]
 
 
 def _without_none(kind: Any) -> Any:
@@ -310,25 +277,6 @@ def _without_none(kind: Any) -> Any:
     if get_origin(kind) is types.UnionType or get_origin(kind) is Union:
         (kind,) = (arg for arg in get_args(kind) if arg is not types.NoneType)
     return kind
-
-
-def _length(kind: Any) -> int | None:
-    """How many items ``tuple[X, Y]`` has; None for ``tuple[X, ...]`` and for what is no tuple."""
-    args = get_args(kind)
-    return len(args) if get_origin(kind) is tuple and args[-1] is not Ellipsis else None
-
-
-def _plural(kind: Any) -> str:
-    return {int: "whole numbers", float: "finite numbers", bool: "true or false"}.get(kind, "texts")
-
-
-def _metavar(kind: Any) -> str:
-    kind = _without_none(kind)
-    if get_origin(kind) is tuple:
-        kind = get_args(kind)[0]
-    if get_origin(kind) is Literal:
-        return "{" + ",".join(map(str, get_args(kind))) + "}"
-    return {int: "N", float: "X"}.get(kind, "TEXT")
 
 
 def _flag(name: str) -> str:

@@ -11,7 +11,6 @@ __all__ = ["Focus"]
 
 EVERY = 16  # steps after which a training draws by newer errors
 STRIP = 16  # neighbouring pixels of a line share one error; samples that are no neighbours have one each
-TINY = 1e-30  # of a sum of errors: what is nowhere wrong
 
 
 class Focus:
@@ -31,19 +30,17 @@ class Focus:
     Attributes:
         errors: ``(S,)`` of the strips, running means; 1 in the beginning.
         bounds: ``(S,)`` their running sums when `refresh` was called last, in float64 on the CPU.
-        drawn: ``(S,)`` shares of the draws by errors that strips have had since then, on the device.
     """
 
     def __init__(self, pixels: int, share: float, device: torch.device, *, strip: int = STRIP) -> None:
         self.pixels, self.share, self.strip = pixels, share, strip
         self.errors = torch.ones(-(-pixels // strip), device=device)
-        self.drawn = torch.empty_like(self.errors)
         self.refresh()
 
     @property
     def kept(self) -> Mapping[str, Tensor]:
         """What later steps depend on, for `Objective.kept`."""
-        return {"errors": self.errors, "bounds": self.bounds, "drawn": self.drawn}
+        return {"errors": self.errors, "bounds": self.bounds}
 
     def watched(self, step: int, kept: MutableMapping[str, Tensor]) -> Focus:
         """This one at a step of a training, which may be resumed, brought up to date now and then.
@@ -52,7 +49,7 @@ class Focus:
             step: number of the step.
             kept: the objective's, with what `kept` has put there.
         """
-        self.errors, self.bounds, self.drawn = kept["errors"], kept["bounds"], kept["drawn"]
+        self.errors, self.bounds = kept["errors"], kept["bounds"]
         if step % EVERY == 0:
             self.refresh()
             kept["bounds"] = self.bounds
@@ -61,7 +58,6 @@ class Focus:
     def refresh(self) -> None:
         """Draw by the errors as they are now; a GPU is waited for."""
         self.bounds = self.errors.double().cumsum(0).cpu()
-        self.drawn.copy_(self.errors / self.errors.sum().clamp_min(TINY))
 
     def rows(self, count: int, generator: torch.Generator) -> Tensor:
         """``(count,)`` numbers of pixels on the CPU, with replacement."""
@@ -74,12 +70,6 @@ class Focus:
         length = (self.pixels - strips * self.strip).clamp_max(self.strip)  # the last one may be shorter
         rows = strips * self.strip + (within * length).long()
         return torch.where(place < 1 - self.share, (within * self.pixels).long(), rows)
-
-    def odds(self, rows: Tensor) -> Tensor:
-        """How many times as often as evenly the pixels ``(R,)``, on the device of the errors, are drawn ``(R,)``."""
-        strips = rows // self.strip
-        length = (self.pixels - strips * self.strip).clamp_max(self.strip)
-        return 1 - self.share + self.share * self.pixels * self.drawn[strips] / length
 
     def learn(self, rows: Tensor, errors: Tensor) -> None:
         """Take note of how wrong pixels were: the mean of what is said and of what was known, for each strip.

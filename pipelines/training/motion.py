@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ...neural_fields import InputError, VelocitySiren
+from ...neural_fields import InputError
+from ...neural_fields.spacetime.velocity import VelocitySiren
 from .folder import load_state, read_record
 
 __all__ = ["VELOCITY_FILE", "load_motion"]

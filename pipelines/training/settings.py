@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import itertools
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 from .config import Settings, setting
 
@@ -18,9 +18,18 @@ __all__ = ["SHADINGS", "EvolveConfig", "FitConfig", "ReconstructConfig", "ShadeO
 _per_level = functools.partial(setting, above=0, per_level=True)
 
 
+@dataclass(frozen=True, kw_only=True)
+class TrainingSettings(Settings):
+    """Settings of every training."""
+
+    time_budget: float | None = setting(None, "end training after about this many seconds", above=0)
+    seed: int = setting(0, "random seed")
+    device: str = setting("auto", "torch device: auto, cpu, cuda, ...")
+
+
 @dataclass(frozen=True)
-class FitConfig(Settings):
-    """Settings of ``fit``; the defaults are the ``default`` preset. Raises as `Settings` does."""
+class FitConfig(TrainingSettings):
+    """Settings of ``fit``; the defaults are the ``default`` preset."""
 
     widths: tuple[int, ...] = _per_level((128, 256, 400), "neurons per layer, one number per level")
     depths: tuple[int, ...] = _per_level((2, 2, 2), "sine layers, one number per level")
@@ -29,74 +38,56 @@ class FitConfig(Settings):
     learning_rates: tuple[float, ...] = _per_level((4e-3, 5e-4, 3e-4), "peak learning rate of each level")
     batch: int = setting(8192, "samples per training step", above=0)
     levels: int | None = setting(None, "train only this many levels, coarse to fine")
-    data_weight: float = setting(
-        1e4, "level 0's weight of (f(x) - d)^2 where the distance d is known (Eq. 4)", at_least=0
-    )
+    data_weight: float = setting(1e4, "level 0: weight of (f(x) - d)^2, the distance d known (Eq. 4)", at_least=0)
     residual_data_weight: float = setting(
         1.0,
-        "the other levels' weight of (f(x) - d)^2, in units of the mean square error of the level before, or of the "
-        "variance of the noise that was smoothed off if that is larger",
+        "the same of other levels, over the larger of the mean square error of the level before and the noise's",
         at_least=0,
     )
-    normal_weight: float = setting(
-        300.0, "weight of 1 - cos(grad f, N) where the normal N is known (Eq. 4)", at_least=0
-    )
+    normal_weight: float = setting(300.0, "weight of 1 - cos(grad f, N), the normal N known (Eq. 4)", at_least=0)
     robust_normals: bool = setting(
-        True,
-        "residual levels of sparse clouds: errors of angles, distances and lengths far above the usual ones count as "
-        "they are, not squared, so that sharp edges do not outweigh faces",
+        True, "residual levels of sparse clouds: large errors count linearly, so that sharp edges do not outweigh faces"
     )
     eikonal_weight: float = setting(50.0, "weight of (|grad f| - 1)^2 (Eq. 4)", at_least=0)
     domain_weight: float = setting(0.1, "factor on data_weight for level 0's distances away from the cloud", at_least=0)
     epsilon: float = setting(0.3, "margin of the bands (Eq. 5)", above=0)
     quantile: float | None = setting(
         None,
-        "quantile of |f(x_j)| that a band must hold; 1 is the maximum of Eq. 5, none the maximum but for strays",
+        "quantile of |f(x_j)| that a band holds; 1: the maximum (Eq. 5), none: the maximum but for strays",
         above=0,
         at_most=1,
     )
     samples: int = setting(400_000, "samples made per level and kind, drawn from at every step", above=0)
     normals: Literal["auto", "file", "estimate", "none"] = setting(
-        "auto",
-        "where normals come from: auto, file, estimate, or none: level 0 learns from points alone, and says which way "
-        "their normals point",
+        "auto", "where normals come from; none: level 0 learns from points alone, and orients their normals"
     )
     sensor_origin: tuple[float, float, float] | None = setting(
         None, "x y z of the sensor, in input units: estimated normals face it"
     )
     isolation: float | None = setting(
-        30.0,
-        "drop lone points whose 8th neighbour is this many times further away than is usual; none keeps them",
-        above=1,
+        30.0, "drop points whose 8th neighbour is this many times further away than usual; none keeps them", above=1
     )
     merge_above: int | None = setting(
         1_000_000,
-        "clouds of more points are merged, as they are read, to at most so many means of voxels; none: never",
+        "clouds of more points are merged, as they are read, to at most so many voxel means; none: never",
         above=0,
     )
     drop_outliers: bool = setting(
-        True, "drop points that belong to no surface, by their neighbours and after level 0 by how far it passes them"
+        True, "drop points that belong to no surface, by their neighbours and their distance to level 0"
     )
-    turn_normals: bool = setting(
-        True, "turn single normals round that point the other way than their neighbours' (not with --normals file)"
-    )
+    turn_normals: bool = setting(True, "turn single normals that oppose their neighbours' (not with --normals file)")
     smooth_noise: bool = setting(
-        True, "move points along their normals to where their neighbours agree, if there is more noise than spacing"
+        True, "move points along their normals to where their neighbours agree, if noise exceeds spacing"
     )
     between: bool = setting(
-        True, "learn between the points too, where neighbouring points and their normals agree on the surface"
+        True, "learn between the points too, where neighbours and their normals agree on the surface"
     )
     hold_out: float = setting(
         0.01,
-        "share of the points that are held out: they say when a level was best, and whether it is kept; 0 for none",
+        "share of the points held out to choose the best step of a level, and whether to keep it; 0: none",
         at_least=0,
         at_most=0.1,
     )
-    time_budget: float | None = setting(
-        None, "end training after about this many seconds, all levels together", above=0
-    )
-    seed: int = setting(0, "random seed")
-    device: str = setting("auto", "torch device: auto, cpu, cuda, ...")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -120,8 +111,8 @@ class FitConfig(Settings):
 
 
 @dataclass(frozen=True)
-class TextureConfig(Settings):
-    """Settings of ``texture``; the defaults are the ``default`` preset. Raises as `Settings` does."""
+class TextureConfig(TrainingSettings):
+    """Settings of ``texture``; the defaults are the ``default`` preset."""
 
     width: int = setting(256, "neurons per layer", above=0)
     depth: int = setting(3, "sine layers", above=0)
@@ -131,25 +122,20 @@ class TextureConfig(Settings):
     batch: int = setting(8192, "points with colours per training step", above=0)
     band_batch: int = setting(2048, "points of the band per training step", above=0)
     tangential_weight: float = setting(0.3, "weight of the change of colour along the normals", at_least=0)
-    samples: int = setting(
-        400_000, "points sampled on a mesh, and half as many in the band, drawn from at every step", above=0
-    )
+    samples: int = setting(400_000, "points on a mesh, and half as many in the band, to draw from", above=0)
     delta: float | None = setting(
-        None,
-        "half-width of the band in units of the field; none is that of the coarsest level, but at least 0.02",
-        above=0,
+        None, "half-width of the band in units of the field; none: the coarsest level's, at least 0.02", above=0
     )
-    time_budget: float | None = setting(None, "end training after about this many seconds", above=0)
-    seed: int = setting(0, "random seed")
-    device: str = setting("auto", "torch device: auto, cpu, cuda, ...")
 
 
 @dataclass(frozen=True)
-class ReconstructConfig(Settings):
-    """Settings of ``reconstruct``; the defaults are the ``default`` preset. Raises as `Settings` does."""
+class ReconstructConfig(TrainingSettings):
+    """Settings of ``reconstruct``; the defaults are the ``default`` preset."""
+
+    gone: ClassVar = {"smooth_weight": "it had no gain on shapes that it was not made for; leave it out"}
 
     geometry: Literal["multiscale", "neus"] = setting(
-        "multiscale", "multiscale (a coarse SIREN and residuals in bands) or neus (the 8 x 256 softplus network)"
+        "multiscale", "a coarse SIREN and residuals in bands, or the 8 x 256 softplus network"
     )
     widths: tuple[int, ...] = _per_level((128, 256), "neurons per layer, one number per level")
     depths: tuple[int, ...] = _per_level((4, 3), "sine layers, one number per level")
@@ -163,90 +149,65 @@ class ReconstructConfig(Settings):
     least_delta: float = setting(0.02, "half-width that a band keeps, in units of the region's radius", above=0)
     start: Literal["auto", "hull", "depths", "sphere"] = setting(
         "auto",
-        "what the geometry begins as: hull (of the masks), depths (what no measured ray passes) or sphere; auto is the "
-        "first of them that there is",
+        "initial geometry: hull of the masks, what no measured ray passes, or a sphere; auto: the first there is",
     )
-    radius: float = setting(0.5, "of the sphere that the geometry begins as, in units of the region's radius", above=0)
+    radius: float = setting(0.5, "initial sphere, in units of the region's radius", above=0)
     color_width: int = setting(128, "neurons per layer of the colour network", above=0)
     color_depth: int = setting(2, "layers of the colour network", above=0)
-    color_frequencies: int = setting(4, "octaves of the position that the colour network sees; NeuS has 0", at_least=0)
+    color_frequencies: int = setting(4, "octaves of the colour network's position; NeuS has 0", at_least=0)
     color_grid: int = setting(
-        512, "cells along the finest grid of the hash encoding that the colour network sees; 0 for none", at_least=0
+        512, "cells along the finest grid of the colour network's hash encoding; 0: none", at_least=0
     )
     background: Literal["auto", "black", "white", "outside"] = setting(
-        "auto", "what is behind the object: black, white, or a learnt outside; auto is white with masks, else outside"
+        "auto", "what is behind the object; outside is learnt; auto: white with masks, else outside"
     )
     depth_maps: str | None = setting(
-        None, "folder with a depth map for each photograph; by default those that the data set names, if it does"
+        None, "folder with a depth map for each photograph; by default those that the data set names"
     )
     depth_kind: Literal["metric", "relative", "disparity"] = setting(
-        "metric",
-        "what depth maps hold: depths in the units of the cameras; relative ones, of unknown scale and shift; or "
-        "inverse ones of that kind, as networks give for one picture",
+        "metric", "depths in the units of the cameras; of unknown scale and shift; or inverse ones of that kind"
     )
     depth_scale: float | None = setting(
         None, "numbers of the depth maps per unit of the cameras; by default 1000 for integers, else 1", above=0
     )
     exposure: Literal["off", "affine"] = setting(
-        "off", "affine: each photograph has a gain and an offset for each colour, as automatic exposure makes them"
+        "off", "affine: learn a gain and an offset of each photograph and colour"
     )
-    cameras: Literal["given", "refined"] = setting(
-        "given", "refined: a small rotation and shift of each camera is learnt with the scene"
-    )
+    cameras: Literal["given", "refined"] = setting("given", "refined: learn a small rotation and shift of each camera")
     steps: int = setting(5000, "training steps", above=0)
     rays: int = setting(256, "rays per training step", above=0)
     jets: int = setting(
         3072,
-        "sections of rays that a step evaluates, about; it has fewer rays, down to a quarter, while the surface is "
-        "unsure; 0: as many always",
+        "samples that a step evaluates, about: fewer rays, down to a quarter, while the surface is unsure; 0: no limit",
         at_least=0,
     )
     focus: float = setting(
-        0.5, "share of the rays that go by how wrong the picture was there; 0: all by chance", at_least=0, at_most=1
+        0.5, "share of the rays drawn by the error of their pixels; 0: all evenly", at_least=0, at_most=1
     )
     uniform: int = setting(48, "evenly spaced samples per ray", at_least=2)
     importance: int = setting(8, "samples per ray near the surface", at_least=0)
-    texture_steps: int = setting(
-        500, "training steps of the texture of the finished surface; 0 leaves it uncoloured", at_least=0
-    )
+    texture_steps: int = setting(500, "training steps of the surface's texture; 0: uncoloured", at_least=0)
     learning_rate: float = setting(1e-4, "peak learning rate of the geometry", above=0)
-    color_rate: float = setting(36.0, "learning rate of the colours, in units of the geometry's", above=0)
-    grid_rate: float = setting(2.5, "learning rate of the hash encoding, in units of the colours'", above=0)
-    sharpening: float = setting(24.0, "learning rate of the surface's uncertainty, in units of the others'", above=0)
+    color_rate: float = setting(36.0, "learning rate of the colours, over the geometry's", above=0)
+    grid_rate: float = setting(2.5, "learning rate of the hash encoding, over the colours'", above=0)
+    sharpening: float = setting(24.0, "learning rate of the surface's uncertainty, over the geometry's", above=0)
     eikonal_weight: float = setting(0.05, "weight of (|grad f| - 1)^2", at_least=0)
-    smooth_weight: float = setting(
-        0.0,
-        "weight of how unevenly normals turn where the photographs show no detail; 1 is for things of plain colours",
-        at_least=0,
-    )
     mask_weight: float = setting(0.1, "weight of the masks' cross-entropy, where there are masks", at_least=0)
-    depth_weight: float = setting(
-        0.5,
-        "weight of measured depths (depth maps, COLMAP's points), where there are any; 0 leaves them out",
-        at_least=0,
-    )
-    anneal: float = setting(
-        0.2, "share of the training in which slopes are annealed (cos_anneal)", at_least=0, at_most=1
-    )
+    depth_weight: float = setting(0.5, "weight of measured depths (depth maps, COLMAP's points); 0: unused", at_least=0)
+    anneal: float = setting(0.2, "share of the training with annealed slopes", at_least=0, at_most=1)
     least_weight: float = setting(1e-4, "samples that contribute less to their pixel get no colour", at_least=0)
     skip: float = setting(
-        1e-3, "sections of a ray whose estimated weight is smaller are not evaluated; 0: all are", at_least=0, at_most=1
+        1e-3, "samples of smaller estimated weight are not evaluated; 0: all are", at_least=0, at_most=1
     )
     skip_share: float = setting(
-        0.03,
-        "share of the skipped sections that is evaluated nevertheless, for the eikonal term",
-        at_least=0,
-        at_most=1,
+        0.03, "share of the skipped samples evaluated for the eikonal term", at_least=0, at_most=1
     )
     march_grid: int = setting(
-        64, "cells along the grid of coarse values by which samples are placed; 0 asks the network", at_least=0
+        64, "cells along the grid of coarse values that places samples; 0: the network", at_least=0
     )
     graphs: bool = setting(True, "on a GPU, record each kind of step once, and replay it as one CUDA graph")
     width: int | None = setting(None, "shrink the pictures to this many pixels across before training", above=0)
     test_every: int = setting(8, "every n-th picture is held out and measured; 0 trains on all", at_least=0)
-    time_budget: float | None = setting(None, "end training after about this many seconds", above=0)
-    seed: int = setting(0, "random seed")
-    device: str = setting("auto", "torch device: auto, cpu, cuda, ...")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -257,23 +218,16 @@ class ReconstructConfig(Settings):
 
 
 @dataclass(frozen=True)
-class EvolveConfig(Settings):
-    """Settings of ``evolve``; the defaults are the ``default`` preset. Raises as `Settings` does."""
+class EvolveConfig(TrainingSettings):
+    """Settings of ``evolve``; the defaults are the ``default`` preset."""
 
     kind: Literal["morph", "deform", "transport", "smooth"] = setting(
-        "morph",
-        "morph (from shape to shape along normals), deform (from shape to shape by a motion that is learnt), transport "
-        "(by a vector field) or smooth (by mean curvature)",
+        "morph", "from shape to shape along normals, or by a learnt motion; by a vector field; by mean curvature"
     )
-    shapes: tuple[str, ...] = setting(
-        (), "run directories, .safetensors files, or exact shapes such as sphere:0.4@0.2,0,0"
-    )
-    times: tuple[float, ...] = setting(
-        (), "morph, deform: when each shape is reached, from 0 to 1 (default: evenly spaced)"
-    )
+    shapes: tuple[str, ...] = setting((), "runs, .safetensors files, or exact shapes such as sphere:0.4@0.2,0,0")
+    times: tuple[float, ...] = setting((), "morph, deform: when each shape is reached, 0 to 1 (evenly spaced)")
     align: Literal["none", "center", "pca"] = setting(
-        "center",
-        "morph, deform: leave the shapes where they are, lay their unit spheres on each other, or turn them as well",
+        "center", "morph, deform: leave shapes in place, lay their unit spheres on each other, or turn them too"
     )
     velocity: tuple[float, ...] = setting((0.0, 0.0, 0.0), "transport: way per unit of time, three numbers per shape")
     axis: tuple[float, ...] = setting((0.0, 0.0, 1.0), "transport: axis of rotation, three numbers per shape")
@@ -282,7 +236,7 @@ class EvolveConfig(Settings):
     twist: tuple[float, ...] = setting((0.0,), "transport: radians more per unit along the axis, one number per shape")
     alpha: float = setting(0.02, "smooth: how fast; a sphere has r(t)^2 = r^2 - 4 alpha t, in units of the field")
     landmarks: tuple[str, ...] = setting(
-        (), "deform: a file of points that are the same for each two shapes; a line is x y z of one, x y z of the next"
+        (), "deform: a file for each two shapes of matching points; a line is x y z of one, x y z of the next"
     )
     landmark_weight: float = setting(2.0, "deform: weight of the landmarks' squared distances", at_least=0)
     motion_steps: int = setting(600, "deform: steps in which the motion is learnt, for each two shapes", above=0)
@@ -298,28 +252,19 @@ class EvolveConfig(Settings):
     steps: tuple[int, ...] = _per_level((1000, 500), "training steps, one number per level")
     learning_rates: tuple[float, ...] = _per_level((4e-3, 5e-4), "peak learning rate of each level")
     data_weights: tuple[float, ...] = _per_level((100.0, 1000.0), "weight of known values and gradients, per level")
-    start_steps: int = setting(
-        300, "steps in which level 0 learns the first shape, before it learns to move", at_least=0
-    )
-    batch: int = setting(
-        4096, "samples per training step: half of them known ones, the others near the surface", above=0
-    )
+    start_steps: int = setting(300, "steps in which level 0 learns the first shape alone", at_least=0)
+    batch: int = setting(4096, "samples per step: half known ones, half near the surface", above=0)
     samples: int = setting(100_000, "known samples to draw from", above=0)
-    near: float = setting(0.1, "half-width of the band in which level 0 obeys the law, in units of the field", above=0)
+    near: float = setting(0.1, "half-width of the band of level 0's law, in units of the field", above=0)
     law_weight: float = setting(1.0, "weight of the squared error of the normal speed", at_least=0)
     eikonal_weight: float = setting(0.3, "weight of (|grad f| - 1)^2", at_least=0)
     bound_weight: float = setting(10.0, "weight of values outside of known bounds", at_least=0)
     length: float = setting(0.05, "what a known gradient counts beside a known value, as a length", at_least=0)
-    time_gain: float = setting(
-        0.3, "initial weights of the time in a residual level, in units of the usual ones", above=0
-    )
-    epsilon: float = setting(0.5, "room in the bands beyond the largest error of the level before (Eq. 5)", at_least=0)
+    time_gain: float = setting(0.3, "initial weights of time in a residual level, over the usual ones", above=0)
+    epsilon: float = setting(0.5, "margin of the bands over the largest error before (Eq. 5)", at_least=0)
     least_delta: float = setting(0.01, "half-width that a band has at least, in units of the field", above=0)
     frames: int = setting(21, "times at which the result is checked", at_least=2)
     resolution: int = setting(96, "cells along each side of the meshes of those checks", at_least=16)
-    time_budget: float | None = setting(None, "end training after about this many seconds", above=0)
-    seed: int = setting(0, "random seed")
-    device: str = setting("auto", "torch device: auto, cpu, cuda, ...")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -375,13 +320,11 @@ SHADINGS: dict[str, str] = {
 
 @dataclass(frozen=True)
 class ShadeOptions(Settings):
-    """Settings of `shade`; each one matters only to the shadings it names. Raises as `Settings` does."""
+    """Settings of `shade`; each one matters only to the shadings it names."""
 
     shadows: bool = setting(False, "lambert: soft shadows, traced in the field")
     occlusion: bool = setting(False, "lambert: darker hollows (ambient occlusion), traced in the field")
-    light_level: int | None = setting(
-        0, "level in which shadows and occlusion are traced: a coarse one is fast; none is the one shown"
-    )
+    light_level: int | None = setting(0, "level in which shadows and occlusion are traced; none: the one shown")
     softness: float = setting(0.15, "how fast shadows blur with the distance they fall; 0.001 is sharp", above=0)
     reach: float = setting(0.12, "how far around a point occlusion looks, in units of the field", above=0)
     clay: tuple[float, float, float] = setting(
@@ -391,13 +334,11 @@ class ShadeOptions(Settings):
     detail: float = setting(4e-3, "curvature: how wide a patch it is measured on, in units of the field", above=0)
     matcap: str = setting("clay", "clay, chrome, or a PNG or JPEG of a sphere that fills it")
     limits: tuple[float, float] | None = setting(
-        None, "values at the ends of the colour map (depth, curvature, error); none fits them to what is seen"
+        None, "values at the ends of the colour map (depth, curvature, error); none: fitted"
     )
-    quantile: float = setting(
-        0.95, "share of what is seen that fitted limits hold (curvature, error)", above=0, at_most=1
-    )
+    quantile: float = setting(0.95, "share of pixels within fitted limits (curvature, error)", above=0, at_most=1)
     relief: float = setting(
-        0.35, "how much a headlight shades the colours of curvature and error, in [0, 1]", at_least=0, at_most=1
+        0.35, "shading of the colours of curvature and error by a headlight, in [0, 1]", at_least=0, at_most=1
     )
 
     def __post_init__(self) -> None:

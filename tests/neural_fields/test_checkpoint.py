@@ -7,7 +7,6 @@ import pytest
 import torch
 from fields import small_multiscale, small_spacetime
 from mplicits.neural_fields import (
-    Bounded,
     Box,
     Capsule,
     Difference,
@@ -16,7 +15,6 @@ from mplicits.neural_fields import (
     InputError,
     Intersection,
     Offset,
-    Placed,
     Plane,
     Shell,
     Similarity,
@@ -27,6 +25,7 @@ from mplicits.neural_fields import (
     load_field,
     save_field,
 )
+from mplicits.neural_fields.fields.csg import Bounded, Placed
 from safetensors.torch import save_file
 
 

@@ -6,18 +6,10 @@ from pathlib import Path
 import pytest
 import torch
 from fields import small_multiscale
-from mplicits.neural_fields import (
-    InputError,
-    Outside,
-    Radiance,
-    Siren,
-    ViewColor,
-    load_radiance,
-    render_volume,
-    save_field,
-    save_radiance,
-)
+from mplicits.neural_fields import InputError, Siren, ViewColor, render_volume, save_field
+from mplicits.neural_fields.checkpoint import load_radiance, save_radiance
 from mplicits.neural_fields.networks.hash_encoding import HashEncoding
+from mplicits.neural_fields.networks.radiance import Outside, Radiance
 from safetensors import safe_open
 from safetensors.torch import save_file
 

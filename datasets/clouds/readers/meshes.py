@@ -121,7 +121,7 @@ def triangulate(lengths: Int64, corners: Int64) -> Int64:
     return np.stack((corners[first], corners[first + step + 1], corners[first + step + 2]), axis=1)
 
 
-def vertex_normals(vertices: Float64, faces: Int64) -> NDArray[np.float32]:
+def vertex_normals(vertices: Float64, faces: NDArray[np.integer]) -> NDArray[np.float32]:
     """Area-weighted vertex normals ``(N, 3)``, of unit length; zero where no face with an area meets.
 
     Vertices at the same place count as one, so seams of texture coordinates do not split the normals.

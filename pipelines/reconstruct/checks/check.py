@@ -150,7 +150,7 @@ def check_cameras(images: PosedImages) -> CameraCheck:
     # Where the cameras are wrong, what the masks and depth maps see of the region says nothing.
     warnings += [
         *_masks(images.views, None if warnings else mask_inside),
-        *([] if warnings else _silhouettes(images)),
+        *([] if warnings or (mask_inside or 0) < 1 - PAST_REGION else _silhouettes(images)),
         *([] if warnings or depths is None else depths.warnings),
         *_exposure(images.views),
     ]
@@ -275,20 +275,20 @@ def _silhouettes(images: PosedImages) -> Iterator[str]:
     if not views:
         return
     agreement = Agreement.of(views, images.similarity)
-    inverted, odd = agreement.contradictions()
-    if inverted:
-        yield "the masks cover the borders of the pictures and not their middles: they look inverted; white is object"
-    elif turned := agreement.how_turned():
-        yield f"the silhouettes contradict each other, and would not if the pictures were not {turned}"
+    if agreement.is_inverted:
+        yield "the masks cover the borders of the pictures: they look inverted; white is object"
+    elif agreement.misfit() > agreement.limits.bare:
+        yield "the silhouettes fit no shape: are pictures mirrored or upside down, or camera axes reversed?"
     else:
-        if odd:
+        if odd := agreement.contradictions():
             names = named([view.name for view in odd])
             yield (
                 f"{len(odd)} of {len(views)} silhouettes contradict the others: {names}; is that the right picture, "
                 "the right way round, and its pose and mask right?"
             )
+            agreement = agreement.without(odd)
         if torn := agreement.holes():
-            names = named([views[index].name for index in torn])
+            names = named([agreement.views[index].name for index in torn])
             yield f"{len(torn)} of {len(views)} masks have a hole where all others see object: {names}; fill it"
 
 

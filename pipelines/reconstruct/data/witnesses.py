@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ....datasets.cameras import Camera
+from ....neural_fields import Mesh
 from ...render.rasterise import mesh_view
 from ...render.studio import sees
-from ...surface.surface import Surface
 
 __all__ = ["count_witnesses"]
 
@@ -19,7 +19,7 @@ FINEST = 1024
 
 def count_witnesses(
     cameras: Sequence[Camera],
-    surface: Surface,
+    surface: Mesh,
     points: NDArray[np.float64],
     *,
     finest: int = FINEST,

@@ -22,16 +22,10 @@ from ....neural_fields.volume.render import Rendered, Sampling, render_volume
 from ....neural_fields.volume.weights import sphere_span
 from ...training.focus import Focus
 from ...training.settings import ReconstructConfig
-from ...training.team import my_share
 from ...training.trainer import seeded
-from .smoothness import flatness
 
 __all__ = ["Exposures", "PoseCorrections", "RayPool", "Rays", "SceneModel", "build_scene", "camera_rays"]
 
-# s = exp(10 v): one learning rate serves this number and the networks (NeuS begins at v = 0.3, s = 20).
-SHARPENING = 10.0
-FIRST_VARIANCE = 0.3
-TINY_ANGLE = 1e-10  # in radians
 # Kinds of devices on which matrix products of colours are in bfloat16.
 HALF_PRECISION = ("cuda",)
 
@@ -77,7 +71,7 @@ class PoseCorrections(nn.Module):
         turns, shifts = self()
         # Rodrigues: v cos θ + (ω × v) sin θ / θ + ω ⟨ω, v⟩ (1 − cos θ) / θ², the last factor as half a sinc squared.
         # (PyTorch's exponential of matrices would make a GPU wait.) The root has a slope at 0, too.
-        angle = (turns.square().sum(dim=1, keepdim=True) + TINY_ANGLE**2).sqrt()
+        angle = (turns.square().sum(dim=1, keepdim=True) + 1e-20).sqrt()
         first, second = torch.sinc(angle / math.pi), 0.5 * torch.sinc(0.5 * angle / math.pi).square()
         turn, cosine, first, second, shift = (
             part.index_select(0, view) for part in (turns, angle.cos(), first, second, shifts)
@@ -111,7 +105,7 @@ class SceneModel(nn.Module):
         super().__init__()
         self.geometry, self.color, self.outside = geometry, color, outside
         self.exposures, self.poses = exposures, poses
-        self.variance = nn.Parameter(torch.tensor(FIRST_VARIANCE))
+        self.variance = nn.Parameter(torch.tensor(0.3))  # NeuS's, so that s begins at 20
         self.register_buffer("background", background)
         self.background: Tensor
 
@@ -120,7 +114,7 @@ class SceneModel(nn.Module):
         """A scene that was trained, of its geometry and its `Radiance`."""
         model = cls(geometry, radiance.color, radiance.outside, radiance.background).to(radiance.background.device)
         with torch.no_grad():
-            model.variance.fill_(math.log(radiance.inv_std) / SHARPENING)
+            model.variance.fill_(math.log(radiance.inv_std) / 10)
         return model.requires_grad_(False)
 
     def radiance(self) -> Radiance:
@@ -129,8 +123,8 @@ class SceneModel(nn.Module):
 
     @property
     def inv_std(self) -> Tensor:
-        """S of NeuS, a 0-d tensor."""
-        return (SHARPENING * self.variance).exp().clamp(max=1e6)
+        """The s of NeuS, exp(10 v), 0-d: one learning rate serves v and the networks."""
+        return (10 * self.variance).exp().clamp(max=1e6)
 
     def widen(self, band: float, least: float) -> None:
         """Make all bands ``band`` / s wide, but at least ``least``: as wide as the surface is unsure."""
@@ -242,7 +236,6 @@ class Rays(NamedTuple):
         mask: ``(R,)`` how much of the pixel is object; 1 everywhere if nobody said.
         view: ``(R,)`` number of the picture.
         row: ``(R,)`` number of the pixel in the pool.
-        flat: ``(R,)`` how little the picture shows there, see `flatness`; 1 everywhere if nobody asked.
     """
 
     origins: Tensor
@@ -251,7 +244,6 @@ class Rays(NamedTuple):
     mask: Tensor
     view: Tensor
     row: Tensor
-    flat: Tensor
 
 
 def camera_rays(camera: Camera) -> tuple[Tensor, Tensor]:
@@ -270,7 +262,6 @@ class RayPool:
         similarity: from world to unit-sphere coordinates.
         device: where the rays are wanted.
         whole: keep the pixels that do not see the region, too.
-        flat: keep how little the pictures show at each pixel.
         left_out: by the number of a view, pixels of it that are not kept ``(H, W)``.
 
     Raises:
@@ -284,7 +275,6 @@ class RayPool:
         device: torch.device,
         *,
         whole: bool = False,
-        flat: bool = False,
         left_out: Mapping[int, np.ndarray] | None = None,
     ) -> None:
         self.device, self.has_masks = device, all(view.mask is not None for view in views)
@@ -294,7 +284,7 @@ class RayPool:
         lens = [camera.intrinsics[[0, 1, 0, 1], [0, 1, 2, 2]] for camera in cameras]
         self.lens = torch.stack(lens).float().to(device)  # (V, 4): fx, fy, cx, cy
         self.widths = torch.tensor([camera.width for camera in cameras], device=device)
-        colors, masks, flats, pixels, owners, hits = [], [], [], [], [], 0
+        colors, masks, pixels, owners, hits = [], [], [], [], 0
         for index, (view, camera) in enumerate(zip(views, cameras, strict=True)):
             near, far = sphere_span(*camera_rays(camera))
             hit = far > near
@@ -307,13 +297,10 @@ class RayPool:
             owners.append(torch.full_like(kept, index, dtype=torch.int16))
             # Eight bits hold what pictures hold; a pool of float32 would be four times as large.
             colors.append(_bytes(view.color.reshape(-1, 3))[kept])
-            if flat:
-                flats.append(_bytes(flatness(view.color, view.mask).reshape(-1))[kept])
             if self.has_masks and view.mask is not None:
                 masks.append(_bytes(view.mask.reshape(-1))[kept])
         self.colors, self.pixels = torch.cat(colors).to(device), torch.cat(pixels).to(device)
         self.owners = torch.cat(owners).to(device)
-        self.flats = torch.cat(flats).to(device) if flats else None
         self.masks = torch.cat(masks).to(device) if masks else None
         if not hits:
             raise InputError("no pixel of any picture sees the region of interest; see `mplicits check-cameras`")
@@ -322,12 +309,12 @@ class RayPool:
         return len(self.pixels)
 
     def draw(self, count: int, generator: torch.Generator, focus: Focus | None = None) -> Rays:
-        """``count`` rays at random, with replacement, or a team's share of them; ``focus`` says where."""
+        """``count`` rays at random, with replacement; ``focus`` says where."""
 
         def draw() -> Tensor:
             if focus is None:
-                return my_share(torch.randint(len(self), (count,), generator=generator))
-            return my_share(focus.rows(count, generator))
+                return torch.randint(len(self), (count,), generator=generator)
+            return focus.rows(count, generator)
 
         rows = handed(draw, self.device)
         view, pixel = self.owners[rows].long(), self.pixels[rows].long()
@@ -335,11 +322,8 @@ class RayPool:
         x, y = pixel % self.widths[view], pixel // self.widths[view]
         seen = torch.stack(((x - cx) / fx, (y - cy) / fy, torch.ones_like(fx)), dim=1)
         directions = torch.nn.functional.normalize(torch.einsum("rij,rj->ri", self.axes[view], seen), dim=1)
-        mask, flat = (
-            torch.ones(len(rows), device=self.device) if known is None else known[rows] / 255
-            for known in (self.masks, self.flats)
-        )
-        return Rays(self.eyes[view], directions, self.colors[rows] / 255, mask, view, rows, flat)
+        mask = torch.ones(len(rows), device=self.device) if self.masks is None else self.masks[rows] / 255
+        return Rays(self.eyes[view], directions, self.colors[rows] / 255, mask, view, rows)
 
 
 def _bytes(numbers: np.ndarray) -> Tensor:

@@ -4,31 +4,50 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from ....neural_fields import fixed_shapes
 from ....neural_fields.backend.devices import handed
-from ....neural_fields.backend.fixed_shapes import FixedShapes
+from ....neural_fields.backend.fixed_shapes import FixedShapes, fixed_shapes
 from ...training.replay import CudaGraphs, Recorder, Replays
 from ...training.settings import ReconstructConfig
-from ...training.team import is_alone
 from ...training.trainer import Trainer
 from ..data.measured import MeasuredDepths
 from .model import RayPool, SceneModel
-from .objective import NEAR_EVERY, Kind, SceneObjective
+from .objective import Kind, SceneObjective
 
 __all__ = ["ReplayedTrainer", "Rooms", "scene_trainer"]
 
-# Room for so many times what was asked for of late, and for some more, in whole steps. There is no new room as long as
-# what was asked for lies between these shares of the old one.
-SPARE, MORE, STEP = 1.25, 64, 256
-FULL, EMPTY = 0.95, 0.5
-# Numbers of rays are multiples of this share of the most, or there would be as many kinds of steps as numbers.
-PART = 8
 CHOICES = ("sections", "colors", "outside")
+
+
+@dataclass(frozen=True)
+class Capacity:
+    """How many rows a recorded step has room for: for n requested, ``spare`` n + ``more``, in multiples of ``step``.
+
+    Attributes:
+        full: share of the capacity that may be requested before it is enlarged.
+        empty: share of the capacity below which a new one has to lie to replace it.
+        ray_counts: numbers of rays are multiples of this share of the most, 1 / ``ray_counts``.
+    """
+
+    spare: float = 1.25
+    more: int = 64
+    step: int = 256
+    full: float = 0.95
+    empty: float = 0.5
+    ray_counts: int = 8
+
+    def of(self, need: float) -> int:
+        """Rows to reserve."""
+        return self.step * math.ceil((self.spare * need + self.more) / self.step)
+
+    def suits(self, room: int, need: float) -> bool:
+        """Whether reserved rows are neither too few for what is requested now, nor far too many."""
+        return need <= self.full * room and self.of(need) >= self.empty * room
 
 
 # How many rows each of the CHOICES of a step has room for, and then each band; None for all.
@@ -47,6 +66,8 @@ class ReplayedTrainer(Trainer[SceneObjective]):
         recorder: how steps are recorded; None for CUDA's graphs.
         others: of `Trainer`.
     """
+
+    capacity = Capacity()
 
     def __init__(self, objective: SceneObjective, *, recorder: Recorder | None = None, **others: Any) -> None:
         super().__init__(objective, **others)
@@ -72,7 +93,7 @@ class ReplayedTrainer(Trainer[SceneObjective]):
 
     def _step(self) -> dict[str, Tensor]:
         kind = self.objective.ahead(self.step, self.fraction)
-        part = math.ceil(self.objective.config.rays / PART)
+        part = math.ceil(self.objective.config.rays / self.capacity.ray_counts)
         kind = kind._replace(rays=math.ceil(kind.rays / part) * part)
         rooms = self._rooms(kind)
         found = dict(self.replays.do((kind, rooms), lambda: self._work(kind, rooms)))
@@ -81,7 +102,7 @@ class ReplayedTrainer(Trainer[SceneObjective]):
         sections = found.pop("sections")
         self.objective.behind(self.step, sections)
         self.step += 1
-        if self.step % NEAR_EVERY == 0:
+        if self.step % self.objective.schedule.near_every == 0:
             self._learn(kind)
         return found
 
@@ -119,8 +140,8 @@ class ReplayedTrainer(Trainer[SceneObjective]):
         if asked is None:
             return old
         wanted = [kind.rays * each for each in asked]
-        if old is None or not all(map(_suits, old, wanted)):
-            self.rooms[kind] = tuple(map(_room, wanted))
+        if old is None or not all(map(self.capacity.suits, old, wanted)):
+            self.rooms[kind] = tuple(map(self.capacity.of, wanted))
         return self.rooms[kind]
 
     def _learn(self, kind: Kind) -> None:
@@ -131,15 +152,6 @@ class ReplayedTrainer(Trainer[SceneObjective]):
         self.peaks.zero_()
 
 
-def _room(need: float) -> int:
-    return STEP * math.ceil((SPARE * need + MORE) / STEP)
-
-
-def _suits(room: int, need: float) -> bool:
-    """Whether a room that was given is neither too small for what is asked for now, nor much too large."""
-    return need <= FULL * room and _room(need) >= EMPTY * room
-
-
 def scene_trainer(
     model: SceneModel,
     pool: RayPool,
@@ -148,7 +160,7 @@ def scene_trainer(
     measured: MeasuredDepths | None = None,
     seconds: float | None = None,
 ) -> Trainer[SceneObjective]:
-    """The training of a scene; see `SceneObjective` and `Trainer`. Alone on a GPU, it is replayed."""
+    """The training of a scene; see `SceneObjective` and `Trainer`. On a GPU, it is replayed."""
     objective = SceneObjective(model, pool, config, measured)
-    kind = ReplayedTrainer if config.graphs and pool.device.type == "cuda" and is_alone() else Trainer
+    kind = ReplayedTrainer if config.graphs and pool.device.type == "cuda" else Trainer
     return kind(objective, stage="reconstruct", steps=config.steps, seconds=seconds, network_name="model")

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 import torch
 from evolutions import QUICK, fails, few_points
-from mplicits.neural_fields import Keyframes, Solver, TimeSlice
+from mplicits.neural_fields import TimeSlice
+from mplicits.neural_fields.spacetime.flow import Solver
+from mplicits.neural_fields.spacetime.moving import Keyframes
 from mplicits.pipelines.training.settings import FitConfig
 from torch import Tensor
 

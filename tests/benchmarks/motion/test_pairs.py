@@ -5,13 +5,14 @@ from pathlib import Path
 
 import pytest
 from evolutions import QUICK, fails, few_points
-from mplicits.neural_fields import Box, Keyframes, Moving, RigidMotion, Similarity, Solver, Sphere, extract_mesh
+from mplicits.neural_fields import Box, Moving, RigidMotion, Similarity, Sphere, extract_mesh
+from mplicits.neural_fields.spacetime.flow import Solver
+from mplicits.neural_fields.spacetime.moving import Keyframes
 from mplicits.pipelines.evolve import deform
 from mplicits.pipelines.evolve.shapes import read_shape
 from mplicits.pipelines.mesh.files import write_mesh
 from mplicits.pipelines.render.subject import Orbit, orbit_cameras
-from mplicits.pipelines.surface.surface import from_mesh
-from mplicits.pipelines.texture import riding
+from mplicits.pipelines.texture import transport
 from torch import Tensor
 
 from benchmarks.cli import main
@@ -30,8 +31,8 @@ def _small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pairs, "PIXELS", 48)
     monkeypatch.setattr(pairs, "TILE", 32)
     for name in ("CARRIED", "SPREAD"):
-        monkeypatch.setattr(riding, name, 12)
-    for module, name in ((riding, "RIDE"), (motion, "CARRY")):
+        monkeypatch.setattr(transport, name, 12)
+    for module, name in ((transport, "RIDE"), (motion, "CARRY")):
         monkeypatch.setattr(module, name, Solver(method="rk4", step=0.25))
 
 
@@ -51,7 +52,7 @@ def test_a_rigid_motion_has_no_jumps(tmp_path: Path):
 
 
 def test_steps_are_those_of_the_places_at_the_start():
-    mesh = from_mesh(extract_mesh(Sphere(radius=0.5), resolution=RESOLUTION))
+    mesh = extract_mesh(Sphere(radius=0.5), resolution=RESOLUTION)
     (camera,) = orbit_cameras(mesh.vertices, Orbit(), size=(48, 48), frames=1)
     still = color_jumps(mesh, lambda points: points, camera)
     assert len(still) > 500
@@ -69,7 +70,7 @@ def test_steps_are_those_of_the_places_at_the_start():
 
 def test_colours_that_cannot_be_carried_are_none(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(pairs, "carried_points", lambda *_: None)
-    monkeypatch.setattr(pairs, "_carried", lambda _riding, time: None if time else lambda points: points)
+    monkeypatch.setattr(pairs, "_carried", lambda _transported, time: None if time else lambda points: points)
     field = Keyframes([0.0, 1.0], [Sphere(radius=0.5), Sphere(radius=0.4)])
     row = measure_pair("a", "blend", field, (0.0, 1.0), resolution=RESOLUTION)
     assert (row.calm, row.jumps, row.cracked) == (None, (1.0, None), (0.0, None))

@@ -10,13 +10,12 @@ import pytest
 import torch
 from imageio.v3 import imread
 from mplicits.datasets import read_cloud
-from mplicits.neural_fields import Box, InputError, MultiscaleSDF, Similarity, Siren, Sphere, extract_mesh
+from mplicits.neural_fields import Box, InputError, Mesh, MultiscaleSDF, Similarity, Siren, Sphere, extract_mesh
 from mplicits.pipelines.fit.cloud import CloudDistance
 from mplicits.pipelines.fit.samples import Weights, banded_sources
 from mplicits.pipelines.fit.train import fit, prepare
 from mplicits.pipelines.mesh.files import write_mesh
-from mplicits.pipelines.surface.distance import MeshDistance, approximation_error, barycentric_of_nearest, near_surface
-from mplicits.pipelines.surface.surface import Surface, from_mesh
+from mplicits.pipelines.surface.distance import MeshDistance, barycentric_of_nearest
 
 from benchmarks.harness.cells import make_folder
 from benchmarks.harness.run import run_cell
@@ -45,10 +44,11 @@ from benchmarks.paper.judge import fit_config
 from benchmarks.paper.methods import CATALOGUE
 from benchmarks.paper.sheets import write_sheets
 from benchmarks.paper.speed import MARCHING_CUBES, NORMALS, grid_seconds, marching_cubes_tables, normals_tables
+from benchmarks.shapes.sampled_error import approximation_error, near_surface
 
 HALF = np.array([0.5, 0.3, 0.4])
 # Two triangles a side, outward.
-CUBOID = Surface(
+CUBOID = Mesh(
     HALF * [[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)],
     np.array(
         [
@@ -96,14 +96,14 @@ def test_long_faces_beside_many_small_ones_hide_nobody() -> None:
     corner = np.arange(30 * 30).reshape(30, 30)[:-1, :-1].reshape(-1)
     faces = np.concatenate((corner[:, None] + [0, 30, 1], corner[:, None] + [1, 30, 31]))
     vertices = np.concatenate((patch, [[-1, -1, 0], [1, -1, 0], [0, 2, 0]]))
-    both = Surface(vertices, np.concatenate((faces, len(patch) + np.array([[0, 1, 2]]))))
+    both = Mesh(vertices, np.concatenate((faces, len(patch) + np.array([[0, 1, 2]]))))
     points = np.array([[0.0, -0.9, 0.03], [0.03, 0.02, 0.06], [0.03, 0.02, 0.14], [0.0, 0.0, 0.25]])
     np.testing.assert_allclose(MeshDistance(both).signed(points), [0.03, 0.06, -0.06, 0.05], atol=1e-14)
 
 
 def test_sign_at_a_sharp_tip_is_that_of_all_faces_around_it() -> None:
     # Past the tip of a flat needle two of its faces, taken alone, would say inside.
-    tip = Surface(
+    tip = Mesh(
         np.array([[1.0, 0, 0], [0, 0.2, 0], [0, -0.1, 0.17], [0, -0.1, -0.17]]),
         np.array([[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]]),
     )
@@ -115,7 +115,7 @@ def test_sign_at_a_sharp_tip_is_that_of_all_faces_around_it() -> None:
 
 def test_a_surface_without_faces_has_no_distances() -> None:
     with pytest.raises(ValueError, match="no faces"):
-        MeshDistance(Surface(np.eye(3), np.array([[0, 0, 1]])))
+        MeshDistance(Mesh(np.eye(3), np.array([[0, 0, 1]])))
 
 
 def test_approximation_error_of_an_exact_and_of_a_shifted_field() -> None:
@@ -131,7 +131,7 @@ def test_approximation_error_of_an_exact_and_of_a_shifted_field() -> None:
 
 
 def test_error_of_a_sphere_field_against_its_own_mesh() -> None:
-    mesh = from_mesh(extract_mesh(Sphere(radius=0.6), resolution=48))
+    mesh = extract_mesh(Sphere(radius=0.6), resolution=48)
     points = near_surface(mesh, 3000, reach=0.02)
     distances = MeshDistance(mesh).signed(points)
     sag = (2.04 / 48) ** 2 * 3 / (8 * 0.6)  # of a cell's diagonal, the longest edge that a face can have

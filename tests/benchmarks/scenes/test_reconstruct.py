@@ -14,7 +14,6 @@ from mplicits.neural_fields.networks.radiance import Outside, ViewColor
 from mplicits.pipelines.reconstruct.model.model import RayPool, SceneModel, build_scene
 from mplicits.pipelines.reconstruct.model.objective import SceneObjective
 from mplicits.pipelines.reconstruct.model.replayed import ReplayedTrainer, scene_trainer
-from mplicits.pipelines.surface.surface import from_mesh
 from mplicits.pipelines.surface.trim import in_region
 from mplicits.pipelines.training.replay import Again
 from mplicits.pipelines.training.settings import ReconstructConfig
@@ -218,7 +217,7 @@ def test_all_rows_see_the_same_rays(bench):
 
 
 def test_surfaces_are_held_against_the_exact_one(bench):
-    truth = from_mesh(extract_mesh(Sphere(radius=0.6), resolution=48))
+    truth = extract_mesh(Sphere(radius=0.6), resolution=48)
     ball = surface_figures(extract_mesh(Sphere(radius=0.5), resolution=48), truth, samples=5000, columns=48)
     # In units of the exact sphere, all distances are a sixth.
     assert ball.chamfer == pytest.approx(2 / 36, rel=0.03)
@@ -398,7 +397,7 @@ def test_the_command_goes_on_after_an_interruption(tmp_path, capsys, monkeypatch
         (["figure", "--views", "2", "--size", "8", "--test-every", "0"], "figure: no picture is held out"),
         (["figure", "--json", "rows.txt"], "rows.txt: unknown extension '.txt'"),
         (["figure", "--equaltime"], "unknown flag --equaltime; did you mean '--equal-time'?"),
-        (["figure", "--steps", "0"], "steps: 0; expected > 0"),
+        (["figure", "--steps", "0"], "steps: 0; expected a whole number > 0"),
     ],
 )
 def test_mistakes_are_one_line(arguments, message, capsys, tmp_path, monkeypatch):

@@ -11,7 +11,7 @@ from mplicits.datasets import add_isotropic_noise, read_cloud
 from mplicits.datasets.synthetic.prisms import PRISMS
 from mplicits.neural_fields import InputError, Mesh, MultiscaleSDF, Similarity, Sphere, Union, extract_mesh
 from mplicits.pipelines.mesh.files import write_mesh
-from mplicits.pipelines.surface.surface import Surface, components, face_normals, from_mesh
+from mplicits.pipelines.surface.surface import components, face_normals
 from mplicits.pipelines.training.settings import FitConfig
 
 from benchmarks.harness.report import as_text
@@ -70,7 +70,7 @@ def test_blobs_go_as_mplicits_mesh_drops_them(ball: Path, tmp_path: Path, monkey
     for kept, parts in ((replace(run, directory=None), 2), (run, 1)):
         mesh, _ = module.timed_mesh(kept, 64, level=0)
         assert mesh is not None
-        assert components(from_mesh(mesh)) == parts
+        assert components(mesh) == parts
 
 
 def test_noise_reaches_the_fit(ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -143,11 +143,11 @@ def test_a_cloud_is_no_reference(tmp_path: Path) -> None:
 
 
 def test_the_camera_faces_the_widest_side() -> None:
-    gear = Surface(*PRISMS["gear"]())  # the two flat sides
+    gear = Mesh(*PRISMS["gear"]())  # the two flat sides
     normals, areas = face_normals(gear)
     flat = normals[((normals @ normals.T > 0.999) @ areas).argmax()]
     assert float(facing_camera(gear).forward @ torch.from_numpy(flat)) == pytest.approx(-1, abs=1e-6)
     # Of a slab that lies the camera stands a little before it, not in its axis: up would have no direction.
-    slab = Surface(np.array([[-2.0, 0, -1], [2, 0, -1], [2, 0, 1], [-2, 0, 1]]), np.array([[0, 2, 1], [0, 3, 2]]))
+    slab = Mesh(np.array([[-2.0, 0, -1], [2, 0, -1], [2, 0, 1], [-2, 0, 1]]), np.array([[0, 2, 1], [0, 3, 2]]))
     down = facing_camera(slab).forward
     assert float(down[1]) == pytest.approx(-np.sin(np.radians(STEEPEST)), abs=1e-6)

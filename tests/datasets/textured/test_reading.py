@@ -1,5 +1,7 @@
 import base64
 import json
+import math
+import os
 import struct
 
 import cv2
@@ -203,6 +205,8 @@ def test_obj_with_vertex_colours(tmp_path):
         ({"mtl": "newmtl paint\nmap_Kd gone.png\n"}, r"square\.mtl: paint: map_Kd: .*gone\.png is not there"),
         ({"mtl": "newmtl paint\nmap_Kd square.obj\n"}, r"square\.obj: not an image that can be read; save it as PNG"),
         ({"mtl": "newmtl paint\nKd red\n"}, r"square\.mtl: paint: Kd: expected three numbers, not 'red'"),
+        ({"mtl": "newmtl paint\nKd nan 0 0\n"}, r"square\.mtl: paint: Kd: expected three numbers, not 'nan 0 0'"),
+        ({"mtl": "newmtl paint\nmap_Kd -s inf 1 paint.png\n"}, r"square\.mtl: paint: map_Kd: -s has a number"),
         ({"mtl": "newmtl other\nKd 1 0 0\n"}, r"square\.obj: usemtl: no material 'paint' in its MTL file"),
         ({"faces": "f 1/1 2/2 3"}, r"square\.obj: f: a corner of a textured face has no vt index"),
         ({"faces": "f 1/1 2/2 3/9"}, r"square\.obj: f: names a vt beyond the 4 there are"),
@@ -365,6 +369,15 @@ def test_gltf_textures_wrap_and_move_as_they_say(tmp_path):
         (lambda h: h["images"].__setitem__(0, {"bufferView": 0}), r"images\[0\]: not an image that can be read"),
         (lambda h: h["nodes"][0].update(children=[0]), "its own ancestor"),
         (lambda h: h["accessors"][0].update(count=99), "cannot be read as a GLB mesh"),
+        (lambda h: h["accessors"][0].update(byteOffset=True), "byteOffset: True is no whole number"),
+        (lambda h: h["bufferViews"][0].update(byteOffset=True), "byteOffset: True is no whole number"),
+        (lambda h: h["bufferViews"][3].update(byteLength=10**6), "goes beyond the"),
+        (lambda h: h["nodes"][0].update(matrix=[math.nan] * 16), "matrix has a number that is not finite"),
+        (lambda h: h["nodes"][0].update(scale=[math.inf, 1, 1]), "scale has a number that is not finite"),
+        (
+            lambda h: h["materials"][0]["pbrMetallicRoughness"].update(baseColorFactor=[math.nan, 1, 1, 1]),
+            "baseColorFactor has a number that is not finite",
+        ),
         (lambda h: h["accessors"][0].update(count=2), "a face names vertex 5, but there are only 2"),
         (lambda h: h["meshes"][0]["primitives"][0].update(mode=1), "no triangles in it"),
         (lambda h: h["materials"][0].clear(), "neither a texture nor vertex colours"),
@@ -378,6 +391,34 @@ def test_bad_gltf_is_one_line(tmp_path, break_it, message):
         read_textured(path)
     assert "\n" not in str(error.value)
     assert "square.glb" in str(error.value)
+
+
+def test_damaged_numbers_and_a_cut_glb_are_one_line(tmp_path):
+    header, body = gltf(image=QUARTERS, colors=np.ones((6, 3), "<f4"))
+    path = write_gltf(tmp_path / "square.glb", header, body)
+    data = path.read_bytes()
+    cases = [(data[: len(data) * 9 // 10], "is cut off after")]
+    for accessor in (0, 3):  # positions, colours
+        start = header["bufferViews"][accessor]["byteOffset"]
+        broken = body[:start] + struct.pack("<f", math.nan) + body[start + 4 :]
+        cases.append((write_gltf(tmp_path / "other.glb", header, broken).read_bytes(), "number that is not finite"))
+    for content, message in cases:
+        path.write_bytes(content)
+        for read in (read_textured, read_surface):
+            with pytest.raises(InputError, match=message) as error:
+                read(path)
+            assert "\n" not in str(error.value)
+            assert "square.glb" in str(error.value)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no named pipes here")
+def test_a_pipe_in_place_of_an_mtl_file_is_not_waited_for(tmp_path):
+    write_png(tmp_path / "paint.png", QUARTERS)
+    path = write_obj(tmp_path)
+    (tmp_path / "square.mtl").unlink()
+    os.mkfifo(tmp_path / "square.mtl")
+    with pytest.raises(InputError, match=r"square\.mtl is not there"):
+        read_textured(path)
 
 
 # PLY, and what is common

@@ -7,18 +7,9 @@ import standin
 import torch
 from bounds import assert_within, rounding
 from fields import small_multiscale, small_spacetime
-from mplicits.neural_fields import (
-    Field,
-    FixedShapes,
-    MultiscaleSDF,
-    Placed,
-    Similarity,
-    Sphere,
-    TimeSlice,
-    Union,
-    fixed_shapes,
-)
-from mplicits.neural_fields.backend.fixed_shapes import first_rows
+from mplicits.neural_fields import Field, MultiscaleSDF, Similarity, Sphere, TimeSlice, Union
+from mplicits.neural_fields.backend.fixed_shapes import FixedShapes, first_rows, fixed_shapes
+from mplicits.neural_fields.fields.csg import Placed
 from torch import Tensor
 
 

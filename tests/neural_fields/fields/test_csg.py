@@ -8,7 +8,6 @@ import pytest
 import torch
 from fields import FIELDS
 from mplicits.neural_fields import (
-    Bounded,
     Box,
     Difference,
     Field,
@@ -17,7 +16,6 @@ from mplicits.neural_fields import (
     Mesh,
     MultiscaleSDF,
     Offset,
-    Placed,
     Plane,
     Shell,
     Similarity,
@@ -27,9 +25,10 @@ from mplicits.neural_fields import (
     Union,
     WorldField,
     extract_mesh,
-    in_one_frame,
     sphere_trace,
 )
+from mplicits.neural_fields.fields.csg import Bounded, Placed
+from mplicits.neural_fields.shape import in_one_frame
 from torch import Tensor
 
 A = Sphere(radius=0.5, center=(-0.25, 0.0, 0.0))

@@ -7,7 +7,6 @@ from mplicits.neural_fields import (
     Field,
     FunctionField,
     Jet,
-    Keyframes,
     Moving,
     MultiscaleSDF,
     NeuSGeometry,
@@ -18,13 +17,14 @@ from mplicits.neural_fields import (
     Torus,
     Union,
     WorldField,
-    cone_starts,
     extract_mesh,
-    map_normals,
     project_to_surface,
     render_volume,
     sphere_trace,
 )
+from mplicits.neural_fields.meshing.extract import map_normals
+from mplicits.neural_fields.spacetime.moving import Keyframes
+from mplicits.neural_fields.tracing.cones import cone_starts
 from torch import Tensor, nn
 
 

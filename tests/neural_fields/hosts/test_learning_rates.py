@@ -4,17 +4,8 @@ import copy
 
 import pytest
 import torch
-from mplicits.neural_fields import (
-    MultiscaleSDF,
-    NeuSGeometry,
-    Siren,
-    SpaceTimeSDF,
-    Sphere,
-    Union,
-    parameter_groups,
-    share_rate,
-)
-from mplicits.neural_fields.hosts.learning_rates import OUTPUT_RATE, SINE_RATE
+from mplicits.neural_fields import MultiscaleSDF, NeuSGeometry, Siren, SpaceTimeSDF, Sphere, Union
+from mplicits.neural_fields.hosts.learning_rates import OUTPUT_RATE, SINE_RATE, parameter_groups, share_rate
 from torch import Tensor, nn
 
 

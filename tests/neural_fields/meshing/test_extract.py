@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 import torch
 from fields import Scaled
-from mplicits.neural_fields import Box, Capsule, Jet, MultiscaleSDF, OneLevelField, Plane, Siren, Sphere, Torus, Union
+from mplicits.neural_fields import Box, Capsule, Jet, MultiscaleSDF, Plane, Siren, Sphere, Torus, Union
+from mplicits.neural_fields.fields.field import OneLevelField
 from mplicits.neural_fields.meshing._cube import CORNERS, cube_tables
 from mplicits.neural_fields.meshing._lattice import Lattice
 from mplicits.neural_fields.meshing.extract import Mesh, NoSurfaceError, extract_mesh, map_normals

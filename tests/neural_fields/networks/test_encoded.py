@@ -5,7 +5,8 @@ from pathlib import Path
 import pytest
 import torch
 from fields import small_encoded, small_multiscale
-from mplicits.neural_fields import EncodedField, NeuSGeometry, Plane, Siren, load_field, save_field
+from mplicits.neural_fields import NeuSGeometry, Plane, Siren, load_field, save_field
+from mplicits.neural_fields.networks.encoded import EncodedField
 from mplicits.neural_fields.networks.hash_encoding import HashEncoding
 
 

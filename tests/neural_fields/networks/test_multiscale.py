@@ -6,18 +6,9 @@ import pytest
 import torch
 from bounds import assert_within, rounding
 from fields import Watched, small_multiscale
-from mplicits.neural_fields import (
-    Field,
-    Jet,
-    Moving,
-    MultiscaleSDF,
-    OneLevelField,
-    RigidMotion,
-    Siren,
-    Sphere,
-    TimeSlice,
-    levels_of,
-)
+from mplicits.neural_fields import Field, Jet, Moving, MultiscaleSDF, RigidMotion, Siren, Sphere, TimeSlice
+from mplicits.neural_fields.fields.field import OneLevelField
+from mplicits.neural_fields.networks.multiscale import levels_of
 from torch import Tensor
 
 

@@ -2,9 +2,9 @@
 
 import pytest
 import torch
-from mplicits.neural_fields import Jet, Outside, Sphere, ViewColor
+from mplicits.neural_fields import Jet, Sphere, ViewColor
 from mplicits.neural_fields.networks.hash_encoding import HashEncoding
-from mplicits.neural_fields.networks.radiance import encode, encoded_size
+from mplicits.neural_fields.networks.radiance import Outside, encode, encoded_size
 
 
 def test_encoding_is_octaves_of_sines_and_cosines() -> None:

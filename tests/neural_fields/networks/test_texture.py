@@ -7,7 +7,6 @@ import torch
 from bounds import assert_within, rounding
 from fields import Watched, small_multiscale
 from mplicits.neural_fields import (
-    ColorSiren,
     Field,
     InputError,
     Jet,
@@ -19,9 +18,10 @@ from mplicits.neural_fields import (
     load_field,
     load_texture,
     save_field,
-    save_texture,
 )
+from mplicits.neural_fields.checkpoint import save_texture
 from mplicits.neural_fields.fields.losses import color_loss, tangential_loss
+from mplicits.neural_fields.networks.texture import ColorSiren
 from torch import Tensor
 
 

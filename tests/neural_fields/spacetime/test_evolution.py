@@ -5,17 +5,9 @@ import math
 import pytest
 import torch
 from fields import SCREW, small_spacetime
-from mplicits.neural_fields import (
-    Box,
-    Keyframes,
+from mplicits.neural_fields import Box, Moving, Siren, SpaceTimeSDF, Sphere, Torus, at_time
+from mplicits.neural_fields.spacetime.evolution import (
     Law,
-    Moving,
-    ShrinkingSphere,
-    Siren,
-    SpaceTimeSDF,
-    Sphere,
-    Torus,
-    at_time,
     curvature,
     key_loss,
     law_loss,
@@ -23,9 +15,10 @@ from mplicits.neural_fields import (
     morph,
     near_surface,
     normal_speed,
-    spacetime_jet,
     transport,
 )
+from mplicits.neural_fields.spacetime.field import spacetime_jet
+from mplicits.neural_fields.spacetime.moving import Keyframes, ShrinkingSphere
 from torch import Tensor
 
 

@@ -10,12 +10,10 @@ from fields import FIELDS, SCREW, small_multiscale, small_spacetime
 from mplicits.neural_fields import (
     Box,
     Field,
-    Keyframes,
     Moving,
     MultiscaleSDF,
     Plane,
     RigidMotion,
-    ShrinkingSphere,
     Siren,
     SpaceTimeSDF,
     Sphere,
@@ -25,9 +23,10 @@ from mplicits.neural_fields import (
     extract_mesh,
     load_field,
     save_field,
-    spacetime_jet,
     sphere_trace,
 )
+from mplicits.neural_fields.spacetime.field import spacetime_jet
+from mplicits.neural_fields.spacetime.moving import Keyframes, ShrinkingSphere
 from torch import Tensor
 
 TRAVEL = RigidMotion(velocity=(0.4, 0.2, 0.0), center=(-0.2, 0.0, 0.1), angle=2.0)

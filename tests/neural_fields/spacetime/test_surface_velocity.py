@@ -3,7 +3,8 @@
 import pytest
 import torch
 from fields import SCREW
-from mplicits.neural_fields import Box, Moving, ShrinkingSphere, Sphere, Torus, flow
+from mplicits.neural_fields import Box, Moving, Sphere, Torus, flow
+from mplicits.neural_fields.spacetime.moving import ShrinkingSphere
 from mplicits.neural_fields.spacetime.surface_velocity import CarriedVelocity
 
 ON_BOX = Box(half_size=(0.4, 0.25, 0.3))

@@ -5,20 +5,10 @@ import math
 import pytest
 import torch
 from fields import SCREW
-from mplicits.neural_fields import (
-    Box,
-    CarriedKeyframes,
-    Keyframes,
-    Moving,
-    Solver,
-    Sphere,
-    TimeSlice,
-    VelocityJet,
-    VelocitySiren,
-    at_time,
-    flow,
-    flow_jacobian,
-)
+from mplicits.neural_fields import Box, Moving, Sphere, TimeSlice, at_time, flow
+from mplicits.neural_fields.spacetime.flow import Solver, flow_jacobian
+from mplicits.neural_fields.spacetime.moving import Keyframes
+from mplicits.neural_fields.spacetime.velocity import CarriedKeyframes, VelocityJet, VelocitySiren
 from torch import Tensor
 
 ROTATION = ((0.0, -1.5, 0.0), (1.5, 0.0, 0.0), (0.0, 0.0, 0.0))

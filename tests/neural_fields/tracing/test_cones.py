@@ -3,7 +3,8 @@
 import pytest
 import torch
 from fields import FIELDS, Scaled
-from mplicits.neural_fields import Sphere, cone_starts, sphere_trace
+from mplicits.neural_fields import Sphere, sphere_trace
+from mplicits.neural_fields.tracing.cones import cone_starts
 from torch.nn.functional import normalize
 
 THREE_D = {name: make for name, make in FIELDS.items() if make().in_dim == 3}

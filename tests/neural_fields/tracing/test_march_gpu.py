@@ -2,8 +2,9 @@
 
 import pytest
 import torch
-from fields import FIELDS, small_multiscale
-from mplicits.neural_fields import Field, Sphere, Torus, sphere_trace
+from fields import FIELDS, Watched, small_multiscale
+from mplicits.neural_fields import Field, FunctionField, Sphere, Torus, sphere_trace
+from mplicits.neural_fields.backend.fixed_shapes import current_shapes
 from mplicits.neural_fields.tracing import _march_gpu as _ahead
 from mplicits.neural_fields.tracing import sphere as tracing
 from mplicits.neural_fields.tracing.sphere import Expected, trace_expected
@@ -106,6 +107,43 @@ def test_fields_of_fields(name: str, few: int, both, monkeypatch: pytest.MonkeyP
     first, second = both(sphere_trace, field, origins, directions, max_steps=64)
     assert torch.equal(first.mask, second.mask)
     assert float((first.depth - second.depth)[first.mask].abs().max()) < 2e-5
+
+
+class Own(Watched):
+    """A user's field around another, which notes whether shapes are fixed."""
+
+    def __init__(self, inner: Field, *, same_rows: bool) -> None:
+        super().__init__(inner)
+        self.fixed: list[bool] = []
+        self._same = same_rows
+
+    @property
+    def same_rows(self) -> bool:
+        return self._same
+
+    def value(self, x: Tensor, *, level: int = -1) -> Tensor:
+        self.fixed.append(current_shapes() is not None)
+        return super().value(x, level=level)
+
+
+def test_a_users_field_chooses_its_path(both) -> None:
+    """It takes the fast one if it says that fields inside see its rows; by default one that holds none does."""
+    origins, directions = rays(torch.float64)
+    for same in (True, False):
+        field = Own(three_levels().double(), same_rows=same)
+        first, second = both(sphere_trace, field, origins, directions, tolerance=1e-7)
+        assert torch.equal(first.mask, second.mask)
+        assert float((first.depth - second.depth)[first.mask].abs().max()) < 2e-7
+        assert any(field.fixed) == same
+    assert Sphere().same_rows
+    assert not Watched(Sphere()).same_rows
+    assert not FunctionField(lambda x: x.norm(dim=-1)).same_rows
+
+
+@pytest.mark.parametrize(("name", "same"), [("difference-of-multiscale", True), ("slice", True), ("function", False)])
+def test_same_rows_of_fields_of_fields(name: str, same: bool) -> None:
+    field = FIELDS[name]()
+    assert field.same_rows == same
 
 
 def test_no_rays(both) -> None:

@@ -4,18 +4,8 @@ import numpy as np
 import pytest
 import torch
 from fields import FIELDS, Scaled, Watched, small_multiscale
-from mplicits.neural_fields import (
-    Box,
-    Field,
-    Jet,
-    MultiscaleSDF,
-    OneLevelField,
-    Plane,
-    Siren,
-    Sphere,
-    Torus,
-    sphere_trace,
-)
+from mplicits.neural_fields import Box, Field, Jet, MultiscaleSDF, Plane, Siren, Sphere, Torus, sphere_trace
+from mplicits.neural_fields.fields.field import OneLevelField
 from torch import Tensor
 
 from benchmarks.peers import BaconSDF

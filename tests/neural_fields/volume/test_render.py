@@ -5,22 +5,13 @@ from typing import Any
 import pytest
 import torch
 from fields import FIELDS
-from mplicits.neural_fields import (
-    Jet,
-    MultiscaleSDF,
-    OneLevelField,
-    Rendered,
-    Sampling,
-    Siren,
-    Sphere,
-    ViewColor,
-    fixed_shapes,
-    render_volume,
-)
+from mplicits.neural_fields import Jet, MultiscaleSDF, Siren, Sphere, ViewColor, render_volume
+from mplicits.neural_fields.backend.fixed_shapes import fixed_shapes
+from mplicits.neural_fields.fields.field import OneLevelField
 from mplicits.neural_fields.fields.function import as_field
 from mplicits.neural_fields.networks.radiance import Outside
 from mplicits.neural_fields.networks.value_grid import ValueGrid
-from mplicits.neural_fields.volume.render import sample_depths
+from mplicits.neural_fields.volume.render import Rendered, Sampling, sample_depths
 from mplicits.neural_fields.volume.weights import sphere_span
 from torch import Tensor
 

@@ -5,7 +5,9 @@ import numpy as np
 import pytest
 import torch
 from mplicits.datasets import look_at, read_textured, sample_textured
-from mplicits.neural_fields import ColorSiren, MultiscaleSDF, Siren, TextureField, load_field, save_field, save_texture
+from mplicits.neural_fields import MultiscaleSDF, Siren, TextureField, load_field, save_field
+from mplicits.neural_fields.checkpoint import save_texture
+from mplicits.neural_fields.networks.texture import ColorSiren
 from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.render.trace import trace_view
 from mplicits.pipelines.surface.surface import read_surface

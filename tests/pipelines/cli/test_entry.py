@@ -128,7 +128,7 @@ def test_neither_help_nor_mistakes_wait_for_torch():
         ("fit a.ply -o b --steps many", "--steps: got 'many', expected a list of whole numbers"),
         ("fit a.ply -o b --normals maybe", "--normals: got 'maybe', expected one of auto, file, estimate"),
         ("fit a.ply -o b --batch 1.5", "--batch: got '1.5', expected a whole number"),
-        ("fit a.ply -o b --batch 0", "batch: 0; expected > 0"),
+        ("fit a.ply -o b --batch 0", "batch: 0; expected a whole number > 0"),
         ("fit a.ply -o b --resume --seed 3", "--resume: continues with the run's own settings"),
         ("fit a.ply -o b --resume --force", "not allowed with"),
         ("mesh run -o mesh.ply --resolution 9000", "got '9000', expected a whole number from 8 to 2048"),
@@ -301,8 +301,8 @@ def test_an_stl_comes_with_what_a_printer_asks(capsys, run, tmp_path):
     found = json.loads(figures.read_text())["printing"]
     mesh = trimesh.load_mesh(out)  # in millimetres
     assert found["unit"] == "mm"
-    assert found["shells"]["parts"] == 1
-    assert found["shells"]["volume"] == pytest.approx(mesh.volume, rel=1e-5)
+    assert found["parts"] == 1
+    assert found["volume"] == pytest.approx(mesh.volume, rel=1e-5)
     np.testing.assert_allclose(found["size"], mesh.extents, rtol=1e-5)
     assert found["thinnest"] == pytest.approx(60, rel=0.1)  # a ball of radius 3 cm, fitted in a moment
     assert main(["mesh", str(run), "-o", str(out), "--resolution", "24", "--no-report"]) == 0

@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 import trimesh
 from mplicits.datasets import DepthCamera, PointCloud, read_cloud, write_cloud_ply
+from mplicits.neural_fields import Mesh
 from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.mesh import finish as fit_mesh
 from mplicits.pipelines.mesh.extract import MeshOptions
-from mplicits.pipelines.surface.surface import Surface, read_surface
+from mplicits.pipelines.surface.surface import read_surface
 from mplicits.pipelines.training.progress import Lines
 from mplicits.pipelines.training.settings import TextureConfig
 from scipy.spatial import KDTree
@@ -57,7 +58,7 @@ def run_fit(*words: object) -> int:
     return main(["fit", *map(str, words), *SMALL, "--quiet"])
 
 
-def check_colours(mesh: Surface) -> None:
+def check_colours(mesh: Mesh) -> None:
     out = (mesh.vertices - CENTER) / 2
     assert np.abs(np.linalg.norm(out, axis=1) - 1).mean() < 0.05
     assert mesh.colors is not None

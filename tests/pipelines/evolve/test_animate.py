@@ -14,12 +14,9 @@ import torch
 import trimesh
 from mplicits.datasets import linear_to_srgb
 from mplicits.neural_fields import (
-    ColorSiren,
     InputError,
-    Keyframes,
     Moving,
     RigidMotion,
-    ShrinkingSphere,
     Similarity,
     Siren,
     SpaceTimeSDF,
@@ -31,9 +28,11 @@ from mplicits.neural_fields import (
     load_field,
     load_texture,
     save_field,
-    save_texture,
 )
+from mplicits.neural_fields.checkpoint import save_texture
+from mplicits.neural_fields.networks.texture import ColorSiren
 from mplicits.neural_fields.spacetime.dynamic_tracing import moment
+from mplicits.neural_fields.spacetime.moving import Keyframes, ShrinkingSphere
 from mplicits.neural_fields.tracing.projection import project_to_surface
 from mplicits.pipelines.cli.draw import ANIMATE as COMMAND
 from mplicits.pipelines.evolve.animate import (
@@ -49,8 +48,8 @@ from mplicits.pipelines.mesh.extract import MeshOptions, mesh_run
 from mplicits.pipelines.render.draw import RenderOptions, render_run
 from mplicits.pipelines.render.subject import Orbit
 from mplicits.pipelines.surface.surface import read_surface
-from mplicits.pipelines.texture.riding import RidingColors, borrowed_texture
 from mplicits.pipelines.texture.spread import CELL
+from mplicits.pipelines.texture.transport import TransportedColors, borrowed_texture
 from mplicits.pipelines.training.folder import load_still
 
 RADIUS, DRIFT = 0.3, torch.tensor([0.5, 0.0, 0.0])
@@ -283,11 +282,11 @@ def test_a_mesh_is_not_followed_through_a_merger(speed, when):
 def test_colours_ride_along_with_a_rigid_motion(run):
     field = load_field(run / "field.safetensors").field
     texture = load_texture(run / "texture.safetensors", moment(field, 0.0))
-    riding = RidingColors(field, texture)
+    transported = TransportedColors(field, texture)
     points = torch.from_numpy(extract_mesh(moment(field, 0.0), resolution=16).vertices).float()
     there = torch.from_numpy(extract_mesh(moment(field, 1.0), resolution=16).vertices).float()
-    torch.testing.assert_close(riding.at(0.0)(points), texture.colors(points))
-    torch.testing.assert_close(riding.at(1.0)(there), texture.colors(there - DRIFT), atol=0.01, rtol=0)
+    torch.testing.assert_close(transported.at(0.0)(points), texture.colors(points))
+    torch.testing.assert_close(transported.at(1.0)(there), texture.colors(there - DRIFT), atol=0.01, rtol=0)
 
 
 def test_colours_ride_along_a_velocity_that_was_learnt(run):
@@ -296,7 +295,7 @@ def test_colours_ride_along_a_velocity_that_was_learnt(run):
     texture = load_texture(run / "texture.safetensors", moment(field, 0.0))
     motion = RigidMotion(angle=1.0, center=tuple(START.tolist()), velocity=tuple(DRIFT.tolist()))
     there = torch.from_numpy(extract_mesh(moment(field, 1.0), resolution=16).vertices).float()
-    found = RidingColors(field, texture, motion=motion.velocity).at(1.0)(there)
+    found = TransportedColors(field, texture, motion=motion.velocity).at(1.0)(there)
     start, home = moment(field, 0.0), motion.inverse(there, 1.0)
     back = project_to_surface(start, home)[0]
     near = start.value(home).abs() < 0.4 * CELL  # from half a cell on colours are averaged
@@ -321,7 +320,7 @@ def test_colours_are_borrowed_from_a_run_in_other_units(run, tmp_path):
     borrowed, placed = borrowed_texture(tmp_path, field, place)
     points = torch.from_numpy(extract_mesh(moment(field, 0.0), resolution=16).vertices).float()
     same = torch.from_numpy(own.to_unit(place.to_input(points.numpy()))).float()
-    found = RidingColors(field, borrowed, placed=placed).at(0.0)(points)
+    found = TransportedColors(field, borrowed, placed=placed).at(0.0)(points)
     torch.testing.assert_close(found, texture.colors(same), atol=1e-4, rtol=0)
     with torch.no_grad():
         first.weight *= 1.5
@@ -365,18 +364,18 @@ def test_colours_ride_along_the_normals():
     assert float(expected.std(dim=0).min()) > 0.01
     for t in (0.0, 0.3, 1.0):
         points = towards * field.radius_at(torch.tensor(t))
-        torch.testing.assert_close(RidingColors(field, texture).at(t)(points), expected, atol=2e-3, rtol=0)
+        torch.testing.assert_close(TransportedColors(field, texture).at(t)(points), expected, atol=2e-3, rtol=0)
 
 
 def test_colours_of_both_ends_fade_into_each_other():
     """On a sphere that a velocity turns: a point of time t was elsewhere t before, and will be 1 − t after."""
     field = Keyframes([0.0, 1.0], [Sphere(radius=0.5), Sphere(radius=0.5)])
     turn = RigidMotion(angle=1.0)
-    riding = RidingColors(field, lambda x: 0.5 + x, last=lambda x: 0.5 - x, motion=turn.velocity)
+    transported = TransportedColors(field, lambda x: 0.5 + x, last=lambda x: 0.5 - x, motion=turn.velocity)
     points = 0.5 * torch.nn.functional.normalize(torch.randn(100, 3), dim=-1)
     for t in (0.0, 0.25, 1.0):
         before, after = turn.inverse(points, t), turn.forward(points, 1 - t)
-        torch.testing.assert_close(riding.at(t)(points), 0.5 + (1 - t) * before - t * after, atol=1e-5, rtol=0)
+        torch.testing.assert_close(transported.at(t)(points), 0.5 + (1 - t) * before - t * after, atol=1e-5, rtol=0)
 
 
 def test_colours_do_not_tear_where_points_leave_the_surface():
@@ -384,10 +383,10 @@ def test_colours_do_not_tear_where_points_leave_the_surface():
     sphere = Sphere(radius=0.5)
     field, shift = Keyframes([0.0, 1.0], [sphere, sphere]), RigidMotion(velocity=(0.5, 0.0, 0.0))
     across = torch.tensor([0.5, 0.0, 0.0]) + torch.linspace(-1e-3, 1e-3, 20)[:, None] * torch.tensor([0.0, 1.0, 0.0])
-    torn = RidingColors(field, lambda x: (x[:, 1:2] > 0).float().expand(-1, 3), motion=shift.velocity)
+    torn = TransportedColors(field, lambda x: (x[:, 1:2] > 0).float().expand(-1, 3), motion=shift.velocity)
     # Between cells of a half the slope is at most 2 for each unit.
     assert torn.at(1.0)(across).diff(dim=0).abs().max() < 4 * 2e-3 / 19
-    plain = RidingColors(field, lambda x: torch.full_like(x, 0.7), motion=shift.velocity)
+    plain = TransportedColors(field, lambda x: torch.full_like(x, 0.7), motion=shift.velocity)
     torch.testing.assert_close(plain.at(1.0)(across), torch.full_like(across, 0.7))
 
 

@@ -9,7 +9,9 @@ from pathlib import Path
 import pytest
 import torch
 from evolutions import BRIEF, few_points
-from mplicits.neural_fields import CarriedKeyframes, Keyframes, VelocitySiren, at_time, flow, load_field
+from mplicits.neural_fields import at_time, flow, load_field
+from mplicits.neural_fields.spacetime.moving import Keyframes
+from mplicits.neural_fields.spacetime.velocity import CarriedKeyframes, VelocitySiren
 from mplicits.pipelines.evolve import deform
 from mplicits.pipelines.evolve.deform import carried_samples, learn_motion, match
 from mplicits.pipelines.evolve.shapes import read_shape
@@ -121,7 +123,7 @@ def test_a_run_keeps_its_motion_and_resumes_to_the_same_bits(tmp_path: Path, mon
 
 
 def test_a_time_budget_shortens_the_motion():
-    budget = Budget(1.0, torch.device("cpu"))
+    budget = Budget(1.0)
     config = EvolveConfig(kind="deform", shapes=(LEFT, RIGHT), motion_steps=10**6)
     started = time.monotonic()
     learn_motion([read_shape(text) for text in config.shapes], (0.0, 1.0), config, budget=budget)

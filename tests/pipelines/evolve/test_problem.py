@@ -15,10 +15,8 @@ from mplicits.neural_fields import (
     Moving,
     MultiscaleSDF,
     RigidMotion,
-    ShrinkingSphere,
     Similarity,
     Siren,
-    Solver,
     SpaceTimeSDF,
     Sphere,
     Torus,
@@ -26,14 +24,14 @@ from mplicits.neural_fields import (
     at_time,
     extract_mesh,
     save_field,
-    spacetime_jet,
-    trajectories,
 )
+from mplicits.neural_fields.spacetime.field import spacetime_jet
+from mplicits.neural_fields.spacetime.flow import Solver, trajectories
+from mplicits.neural_fields.spacetime.moving import ShrinkingSphere
 from mplicits.pipelines.evolve import problem as evolve_problem
 from mplicits.pipelines.evolve.objective import EvolveObjective
 from mplicits.pipelines.evolve.problem import between, build_problem, velocity_field
 from mplicits.pipelines.evolve.shapes import Placed, Placement, StaticShape, aligned, into_unit_sphere, read_shape
-from mplicits.pipelines.surface.surface import from_mesh
 from mplicits.pipelines.training.settings import EvolveConfig
 
 CONFIG = EvolveConfig(samples=2000)
@@ -49,7 +47,7 @@ def _few_points(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def shape_of(field, *, similarity: Similarity | None = None) -> StaticShape:
     mesh = extract_mesh(field, resolution=48)
-    return StaticShape("made", field, similarity or Similarity.identity(), from_mesh(mesh))
+    return StaticShape("made", field, similarity or Similarity.identity(), mesh)
 
 
 def test_a_placement_and_its_inverse() -> None:
@@ -319,10 +317,10 @@ def test_the_number_of_shapes_is_checked(kind, count: int) -> None:
         ({"axis": (0.0, 0.0, 0.0)}, "axis: (0.0, 0.0, 0.0); expected a vector of non-zero length"),
         ({"depths": (2,)}, "depths: 1 entries for 2 widths"),
         ({"widths": ()}, "widths: expected at least one level"),
-        ({"batch": 0}, "batch: 0; expected > 0"),
-        ({"law_weight": -1.0}, "law_weight: -1.0; expected ≥ 0"),
+        ({"batch": 0}, "batch: 0; expected a whole number > 0"),
+        ({"law_weight": -1.0}, "law_weight: -1.0; expected a finite number ≥ 0"),
         ({"frames": 1}, "frames: 1"),
-        ({"time_budget": 0.0}, "time_budget: 0.0; expected > 0, or none"),
+        ({"time_budget": 0.0}, "time_budget: 0.0; expected a finite number > 0, or none"),
     ],
 )
 def test_settings_out_of_range_are_named(settings: dict, message: str) -> None:

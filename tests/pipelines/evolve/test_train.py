@@ -17,7 +17,6 @@ from mplicits.neural_fields import (
     MultiscaleSDF,
     Plane,
     RigidMotion,
-    ShrinkingSphere,
     Similarity,
     Siren,
     SpaceTimeSDF,
@@ -26,6 +25,7 @@ from mplicits.neural_fields import (
     load_field,
 )
 from mplicits.neural_fields.fields.primitives import Evaluated
+from mplicits.neural_fields.spacetime.moving import ShrinkingSphere
 from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.evolve.checks import check_evolution, slope_figures
 from mplicits.pipelines.evolve.problem import End

@@ -6,15 +6,16 @@ import numpy as np
 import pytest
 import trimesh
 from mplicits.datasets import read_textured, sample_textured
-from mplicits.neural_fields import InputError, MultiscaleSDF, Placement, Plane, Similarity, Sphere
-from mplicits.neural_fields.meshing.extract import Mesh, extract_mesh
+from mplicits.neural_fields import InputError, Mesh, MultiscaleSDF, Plane, Similarity, Sphere
+from mplicits.neural_fields.meshing.extract import extract_mesh
+from mplicits.neural_fields.meshing.placement import Placement
 from mplicits.pipelines.mesh import atlas as unwrap_module
 from mplicits.pipelines.mesh.atlas import decimate, from_frame, to_frame, unwrap, vertex_tangents
 from mplicits.pipelines.mesh.bake import bake, check_texture_size, textured_mesh
 from mplicits.pipelines.mesh.extract import normals_near
 from mplicits.pipelines.mesh.files import check_textured_path
 from mplicits.pipelines.surface.raster import cover
-from mplicits.pipelines.surface.surface import Surface, is_closed, read_surface
+from mplicits.pipelines.surface.surface import is_closed, read_surface
 
 pytest.importorskip("xatlas", reason="the extra mplicits[texture] is not installed")
 
@@ -54,8 +55,7 @@ def edges(vertices, faces):
 def test_unwrap_keeps_every_triangle(knot, scale):
     vertices, faces = knot[0] * scale, knot[1]
     mesh = unwrap(vertices, faces, size=256)
-    np.testing.assert_array_equal(mesh.vertex_map[mesh.faces], faces)  # the same corners in the same order
-    np.testing.assert_array_equal(mesh.vertices, vertices[mesh.vertex_map])
+    np.testing.assert_array_equal(mesh.vertices[mesh.faces], vertices[faces])  # the same corners in the same order
     assert mesh.uv.min() >= 0
     assert mesh.uv.max() <= 1
     s, t = edges(mesh.uv, mesh.faces)
@@ -108,7 +108,7 @@ def test_decimation_keeps_shape_and_place():
     assert set(np.unique(faces)) == set(range(len(vertices)))
     radius = np.linalg.norm(vertices - 1000 - (0.1, 0, 0), axis=1)
     assert np.abs(radius - 0.7).max() < 0.005
-    assert is_closed(Surface(vertices, faces))
+    assert is_closed(Mesh(vertices, faces))
     facing = np.cross(*edges(vertices, faces))
     assert ((vertices[faces].mean(axis=1) - (1000.1, 1000, 1000)) * facing).sum(axis=1).min() > 0
     same, kept = decimate(mesh.vertices, mesh.faces, len(mesh.faces))

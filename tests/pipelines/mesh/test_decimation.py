@@ -10,7 +10,6 @@ from mplicits.neural_fields import Mesh, Sphere, extract_mesh
 pytest.importorskip("fast_simplification", reason="the extra mplicits[texture] is not installed")
 
 from mplicits.pipelines.mesh.decimation import Decimation, decimated, deviation
-from mplicits.pipelines.surface.surface import Surface
 
 ROUNDING = 1e-6  # the decimation works in float32, on a mesh of unit size
 
@@ -66,8 +65,8 @@ def test_both_ways_count():
     """Of a box and a tip 0.4 above it only the box is left: both see that."""
     box = trimesh.creation.box((1.0, 1.0, 1.0))
     tip = np.array([[0.0, 0.0, 0.9], [0.1, 0.0, 0.9], [0.0, 0.1, 0.9]])
-    alone = Surface(np.asarray(box.vertices), np.asarray(box.faces, np.int64))
-    both = Surface(np.concatenate((alone.vertices, tip)), np.concatenate((alone.faces, [[8, 9, 10]])))
+    alone = Mesh(np.asarray(box.vertices), np.asarray(box.faces, np.int64))
+    both = Mesh(np.concatenate((alone.vertices, tip)), np.concatenate((alone.faces, [[8, 9, 10]])))
     assert deviation(both, alone) == (pytest.approx(0.4), pytest.approx(0.4 * 3 / 11 / 2))
     # Of 11 vertices, 19 + 3 edges and 13 faces of the larger mesh, 3, 3 and 1 are on the tip.
     edges = len(box.edges_unique) + 3

@@ -6,10 +6,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from mplicits.neural_fields import Box, InputError, Similarity, Sphere, Union, extract_mesh, load_field, save_field
+from mplicits.neural_fields import (
+    Box,
+    InputError,
+    Mesh,
+    Similarity,
+    Sphere,
+    Union,
+    extract_mesh,
+    load_field,
+    save_field,
+)
 from mplicits.pipelines.cli import entry as cli
 from mplicits.pipelines.mesh.solids import length_in
-from mplicits.pipelines.surface import Surface
 from mplicits.pipelines.surface.solid import MeshField
 from mplicits.pipelines.training.trainer import parameter_count
 
@@ -122,7 +131,7 @@ def test_a_hollow_ball(balls: Path, by: str, inner: float, outer: float) -> None
 
 def test_a_mesh_is_an_exact_distance() -> None:
     box = trimesh.creation.box((1.0, 0.6, 0.8))
-    surface = Surface(np.asarray(box.vertices), np.asarray(box.faces)[:, ::-1].astype(np.int64))  # inside out
+    surface = Mesh(np.asarray(box.vertices), np.asarray(box.faces)[:, ::-1].astype(np.int64))  # inside out
     field, exact = MeshField(surface), Box(half_size=(0.5, 0.3, 0.4))
     import torch
 
@@ -135,7 +144,7 @@ def test_a_mesh_is_an_exact_distance() -> None:
     on_face = torch.tensor([[0.5, 0.1, 0.1]], dtype=torch.float64)
     assert field.jet(on_face).gradient.tolist() == [[1.0, 0.0, 0.0]]
     with pytest.raises(ValueError, match="not closed"):
-        MeshField(Surface(surface.vertices, surface.faces[1:]))
+        MeshField(Mesh(surface.vertices, surface.faces[1:]))
 
 
 @pytest.mark.parametrize(
@@ -181,7 +190,8 @@ def test_one_line_says_what_is_wrong(balls: Path, capsys: pytest.CaptureFixture[
 
 def test_blobs_are_not_joined(tmp_path: Path) -> None:
     """What no points of a run support is left out of the union, unless the mesh beside it reaches there."""
-    from mplicits.neural_fields import WorldField, in_one_frame
+    from mplicits.neural_fields import WorldField
+    from mplicits.neural_fields.shape import in_one_frame
     from mplicits.pipelines.mesh import solids
     from mplicits.pipelines.surface.trim import Support
 

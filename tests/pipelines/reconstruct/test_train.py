@@ -384,7 +384,8 @@ def test_a_picture_that_the_others_contradict_is_not_learnt_from(
 def test_what_is_behind_holes_of_masks_is_not_learnt(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(silhouettes, "FEW", 4)
+    limits = silhouettes.Limits(few=4)
+    monkeypatch.setattr(silhouettes, "Limits", lambda: limits)
     torn = with_fault(render_scene(SCENES["painted-sphere"](), views=6, size=24, samples=1), "holes")
     write_neus(tmp_path / "torn", torn)
     assert main(f"reconstruct {tmp_path / 'torn'} -o {tmp_path / 'run'} {FLAGS} --texture-steps 0".split()) == 0
@@ -415,16 +416,16 @@ def test_the_command_says_how_to_go_on(
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
-        ("--uniform 1", "uniform: 1; expected at least 2"),
+        ("--uniform 1", "uniform: 1; expected a whole number ≥ 2"),
         ("--geometry grid", "--geometry: got 'grid', expected one of multiscale, neus"),
         ("--background red", "--background: got 'red', expected one of auto, black, white, outside"),
         ("--widths 16", "depths: 2 entries for 1 widths; expected one for each"),
         ("--starts 0.5 0.6", "starts: (0.5, 0.6); expected 0 first"),
         ("--starts 0 1", "starts: (0.0, 1.0); expected 0 first, then growing shares below 1"),
-        ("--steps 0", "steps: 0; expected > 0"),
-        ("--taper 1.5", "taper: 1.5; expected a number in [0, 1]"),
-        ("--anneal -1", "anneal: -1.0; expected a number in [0, 1]"),
-        ("--width 0", "width: 0; expected > 0, or none"),
+        ("--steps 0", "steps: 0; expected a whole number > 0"),
+        ("--taper 1.5", "taper: 1.5; expected a finite number ≥ 0 and ≤ 1"),
+        ("--anneal -1", "anneal: -1.0; expected a finite number ≥ 0 and ≤ 1"),
+        ("--width 0", "width: 0; expected a whole number > 0, or none"),
         ("--rays many", "--rays: got 'many', expected a whole number"),
         ("--ryas 8", "unknown flag --ryas; did you mean '--rays'?"),
         ("--preset fats", "no preset 'fats' for reconstruct; did you mean 'fast'?"),

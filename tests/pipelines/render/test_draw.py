@@ -24,7 +24,6 @@ from mplicits.pipelines.render.rasterise import mesh_view
 from mplicits.pipelines.render.shade import SHADINGS
 from mplicits.pipelines.render.subject import choose_frame, open_subject, reference_distance
 from mplicits.pipelines.render.trace import pixel_size, trace_view
-from mplicits.pipelines.surface.surface import from_mesh
 from torch.nn.functional import normalize
 
 CENTER = (0.1, 0.05, -0.1)
@@ -193,7 +192,7 @@ def test_levels_are_seen_at_their_own_depths():
 def test_a_field_and_its_mesh_are_seen_alike():
     torus, camera = Torus(major=0.5, minor=0.2), VIEWS["whole"].resized(183, 141)
     traced = trace_view(torus, camera)
-    meshed = mesh_view(from_mesh(extract_mesh(torus, resolution=128)), camera)
+    meshed = mesh_view(extract_mesh(torus, resolution=128), camera)
     depths = torch.full((2, 183 * 141), torch.nan)
     depths[0, traced.pixel], depths[1, meshed.pixel] = traced.depth, meshed.depth
     one = depths.isnan().sum(0) == 1

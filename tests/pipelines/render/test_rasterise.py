@@ -5,6 +5,7 @@ import pytest
 import torch
 import trimesh
 from mplicits.datasets import Camera, look_at, orbit
+from mplicits.neural_fields import Mesh
 from mplicits.pipelines.render.rasterise import (
     cloud_view,
     mesh_view,
@@ -12,16 +13,15 @@ from mplicits.pipelines.render.rasterise import (
 )
 from mplicits.pipelines.render.shade import LAMPS, ShadeOptions
 from mplicits.pipelines.surface.raster import clip
-from mplicits.pipelines.surface.surface import Surface
 
 NO_FACES = np.empty((0, 3), np.int64)
 SQUARE = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
 TWO_FACES = np.array([[0, 1, 2], [0, 2, 3]], np.int64)
 
 
-def sphere(radius: float = 1.0) -> Surface:
+def sphere(radius: float = 1.0) -> Mesh:
     mesh = trimesh.creation.icosphere(4, radius=radius)
-    return Surface(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64))
+    return Mesh(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64))
 
 
 def from_front(distance: float, *, fov: float, size: tuple[int, int]) -> Camera:
@@ -45,7 +45,7 @@ def test_a_sphere_is_a_disc_of_the_right_size_without_holes():
 def test_pixels_see_a_tilted_square_where_their_rays_meet_it():
     normal = np.array([0.6, 0.0, 0.8])
     vertices = SQUARE @ np.array([[0.8, 0, -0.6], [0, 1, 0], [0.6, 0, 0.8]])
-    mesh = Surface(vertices, TWO_FACES, colors=SQUARE / 2 + 0.5)
+    mesh = Mesh(vertices, TWO_FACES, colors=SQUARE / 2 + 0.5)
     camera = look_at((0.3, 0.4, 3), (0, 0, 0), up=(0.1, 1, 0), fov=50, width=60, height=40)
     seen = mesh_view(mesh, camera)
     eye, rays = camera.rays(dtype=torch.float64)
@@ -67,7 +67,7 @@ def test_normals_are_interpolated_to_unit_length_and_do_not_turn_to_the_camera()
     seen = mesh_view(ball, camera)
     torch.testing.assert_close(seen.normal.norm(dim=1), torch.ones(len(seen.pixel)))
     assert float((seen.normal * seen.position).sum(dim=1).min()) > 0.998
-    inside_out = mesh_view(Surface(ball.vertices, ball.faces[:, ::-1]), camera)
+    inside_out = mesh_view(Mesh(ball.vertices, ball.faces[:, ::-1]), camera)
     torch.testing.assert_close(inside_out.normal, -seen.normal)
 
 
@@ -77,7 +77,7 @@ def test_the_nearer_of_two_squares_hides_the_other():
     colors = np.repeat([[1.0, 0, 0], [0, 0, 1]], 4, axis=0)
     camera = from_front(5, fov=40, size=(100, 100))
     for order in (faces, faces[::-1]):
-        image = picture_of(Surface(vertices, order, colors=colors), camera).astype(int)
+        image = picture_of(Mesh(vertices, order, colors=colors), camera).astype(int)
         assert image[50, 50, 2] > image[50, 50, 0] + 100
         assert image[70, 70, 0] > image[70, 70, 2] + 100
         assert (image[2, 2] == 255).all()
@@ -87,7 +87,7 @@ def test_back_faces_show_as_such():
     ball = sphere()
     camera = orbit(ball.vertices, width=64, height=64)
     front = picture_of(ball, camera)[32, 32].astype(float)
-    back = picture_of(Surface(ball.vertices, ball.faces[:, ::-1]), camera)[32, 32].astype(float)
+    back = picture_of(Mesh(ball.vertices, ball.faces[:, ::-1]), camera)[32, 32].astype(float)
     # Under the same light, albedos differ as their linear values do.
     expected = (np.array(LAMPS.back) / ShadeOptions().clay) * front
     np.testing.assert_allclose(back, expected, rtol=0.02)
@@ -126,7 +126,7 @@ def test_cutting_triangles_keeps_their_area_in_front_and_closes_up():
 def test_a_floor_under_the_camera_is_drawn_up_to_the_horizon(turned):
     """Two triangles that reach far behind the camera fill exactly the lower half of the picture."""
     corners = np.array([[-1e4, 0, -1e4], [-1e4, 0, 1e4], [1e4, 0, 1e4], [1e4, 0, -1e4]])
-    floor = Surface(corners, np.roll(TWO_FACES, turned, axis=1), colors=np.ones((4, 3)))
+    floor = Mesh(corners, np.roll(TWO_FACES, turned, axis=1), colors=np.ones((4, 3)))
     camera = look_at((0.1, 2, 0.2), (0.1, 2, -5), fov=60, width=40, height=40)
     seen = mesh_view(floor, camera)
     assert seen.pixel.tolist() == list(range(20 * 40, 40 * 40))
@@ -138,9 +138,9 @@ def test_a_floor_under_the_camera_is_drawn_up_to_the_horizon(turned):
 @pytest.mark.parametrize("faces", [TWO_FACES, NO_FACES])
 def test_what_is_behind_the_camera_is_not_drawn(faces):
     camera = look_at((0, 0, 5), (0, 0, 10), fov=60, width=20, height=20)
-    behind = Surface(SQUARE, faces)
+    behind = Mesh(SQUARE, faces)
     assert (picture_of(behind, camera) == 255).all()
-    ahead = Surface(np.concatenate((SQUARE, SQUARE + np.array([0, 0, 8]))), np.concatenate((faces, faces + 4)))
+    ahead = Mesh(np.concatenate((SQUARE, SQUARE + np.array([0, 0, 8]))), np.concatenate((faces, faces + 4)))
     view = mesh_view if len(faces) else cloud_view
     assert set(view(ahead, camera).position[:, 2].tolist()) == {8.0}
 
@@ -154,7 +154,7 @@ def test_a_view_from_inside_a_closed_mesh_sees_it_everywhere():
 
 
 def test_a_cloud_is_discs_of_the_size_asked_for():
-    point = Surface(np.array([[0.0, 0, 0]]), NO_FACES, colors=np.array([[0.0, 0, 0]]))
+    point = Mesh(np.array([[0.0, 0, 0]]), NO_FACES, colors=np.array([[0.0, 0, 0]]))
     image = picture_of(point, from_front(4, fov=40, size=(65, 65)), point_size=11)
     ink = (255 - image[..., 0].astype(float)).sum() / 255
     assert ink == pytest.approx(np.pi * 5.5**2, rel=0.1)
@@ -166,7 +166,7 @@ def test_the_pixels_of_a_disc_see_its_point():
     normals = np.array([[0.0, 0, 1], [0, 1, 0], [0, 0, 0]])
     colors = np.array([[0.1, 0.2, 0.3], [0.4, 0.5, 0.6], [0.7, 0.8, 0.9]])
     camera = from_front(4, fov=40, size=(81, 61))
-    seen = cloud_view(Surface(points, NO_FACES, normals, colors), camera, point_size=3)
+    seen = cloud_view(Mesh(points, NO_FACES, normals, colors), camera, point_size=3)
     pixels, _ = camera.project(torch.from_numpy(points))
     x, y = (pixels[:, k].round().long() for k in (0, 1))
     rows = dict(zip(seen.pixel.tolist(), range(len(seen.pixel)), strict=True))
@@ -181,13 +181,13 @@ def test_the_pixels_of_a_disc_see_its_point():
         torch.testing.assert_close(seen.direction[row], (offset / offset.norm()).float())
         expected = torch.from_numpy(normals[index]) if normals[index].any() else -offset / offset.norm()
         torch.testing.assert_close(seen.normal[row], expected.float())
-    without = cloud_view(Surface(points, NO_FACES), camera, point_size=3)
+    without = cloud_view(Mesh(points, NO_FACES), camera, point_size=3)
     torch.testing.assert_close(without.normal, -without.direction)
 
 
 def test_a_dense_cloud_looks_like_its_surface():
     ball = sphere()
-    cloud = Surface(ball.vertices, NO_FACES, ball.vertices)
+    cloud = Mesh(ball.vertices, NO_FACES, ball.vertices)
     camera = orbit(ball.vertices, width=96, height=96)
     mesh, points = (picture_of(shape, camera).astype(float) for shape in (ball, cloud))
     both = drawn(mesh) & drawn(points)
@@ -197,7 +197,7 @@ def test_a_dense_cloud_looks_like_its_surface():
 
 def test_a_cloud_without_normals_is_darker_where_it_is_further():
     points = np.array([[-1.0, 0, 1], [1.0, 0, -1]])
-    image = picture_of(Surface(points, NO_FACES), from_front(6, fov=40, size=(100, 100)), point_size=8)
+    image = picture_of(Mesh(points, NO_FACES), from_front(6, fov=40, size=(100, 100)), point_size=8)
     near, far = (half[drawn(half)].mean() for half in (image[:, :50], image[:, 50:]))
     assert near > far + 30
 
@@ -205,7 +205,7 @@ def test_a_cloud_without_normals_is_darker_where_it_is_further():
 def test_pictures_of_the_same_thing_far_from_the_origin_are_the_same():
     ball, home = sphere(), np.array([5e5, 5.4e6, 300])
     camera = orbit(ball.vertices, width=48, height=48)
-    far = Surface(ball.vertices + home, ball.faces)
+    far = Mesh(ball.vertices + home, ball.faces)
     np.testing.assert_allclose(
         picture_of(far, orbit(far.vertices, width=48, height=48)).astype(int),
         picture_of(ball, camera).astype(int),

@@ -7,11 +7,10 @@ import cv2
 import numpy as np
 import pytest
 from mplicits.datasets.synthetic.scenes import SCENES, render_scene, scene_mesh
-from mplicits.neural_fields import InputError, Similarity
+from mplicits.neural_fields import InputError, Mesh, Similarity
 from mplicits.pipelines.mesh.files import write_mesh
 from mplicits.pipelines.render.rasterise import read_painted
 from mplicits.pipelines.render.studio import CLAY, photograph_mesh, true_mesh
-from mplicits.pipelines.surface.surface import Surface
 
 WORLD = Similarity((400_000.0, 5_600_000.0, 90.0), 30.0)  # map coordinates, in metres
 RADIUS, CELLS = 0.6, 96
@@ -120,7 +119,7 @@ def test_what_has_no_colours_is_lit_clay(tmp_path: Path) -> None:
 def test_materials_that_are_missing_are_left_out(quad: Path) -> None:
     quad.with_suffix(".png").unlink()
     mesh = read_painted(quad)
-    assert isinstance(mesh, Surface)
+    assert isinstance(mesh, Mesh)
     assert len(mesh.faces) == 2
     assert len(true_mesh(quad).faces) == 2
 

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 import trimesh
-from mplicits.neural_fields import InputError, Similarity
+from mplicits.neural_fields import InputError, Mesh, Similarity
 from mplicits.pipelines.surface.measure import (
     chamfer,
     evaluate_files,
@@ -17,31 +17,29 @@ from mplicits.pipelines.surface.measure import (
     write_metrics,
 )
 from mplicits.pipelines.surface.raster import cover
-from mplicits.pipelines.surface.surface import Surface, components, is_closed, read_surface, sample_points
+from mplicits.pipelines.surface.surface import components, is_closed, read_surface, sample_points
 
 
-def surface(mesh: trimesh.Trimesh) -> Surface:
-    return Surface(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64))
+def surface(mesh: trimesh.Trimesh) -> Mesh:
+    return Mesh(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64))
 
 
-def sphere(radius: float = 1.0, subdivisions: int = 5) -> Surface:
+def sphere(radius: float = 1.0, subdivisions: int = 5) -> Mesh:
     return surface(trimesh.creation.icosphere(subdivisions, radius=radius))
 
 
-def box(
-    size: tuple[float, float, float] = (1.0, 1.0, 1.0), at: tuple[float, float, float] = (0.0, 0.0, 0.0)
-) -> Surface:
+def box(size: tuple[float, float, float] = (1.0, 1.0, 1.0), at: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Mesh:
     return surface(trimesh.creation.box(size).apply_translation(at))
 
 
-def joined(*parts: Surface) -> Surface:
+def joined(*parts: Mesh) -> Mesh:
     starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
     faces = [part.faces + start for part, start in zip(parts, starts, strict=False)]
-    return Surface(np.concatenate([part.vertices for part in parts]), np.concatenate(faces))
+    return Mesh(np.concatenate([part.vertices for part in parts]), np.concatenate(faces))
 
 
-def without_face(shape: Surface, index: int = 0) -> Surface:
-    return Surface(shape.vertices, np.delete(shape.faces, index, axis=0))
+def without_face(shape: Mesh, index: int = 0) -> Mesh:
+    return Mesh(shape.vertices, np.delete(shape.faces, index, axis=0))
 
 
 # --- distances ---------------------------------------------------------------------------------------
@@ -95,10 +93,8 @@ def test_figures_do_not_change_with_the_units_and_the_place_of_the_input():
 
 
 def test_parallel_squares_are_as_far_apart_as_their_gap():
-    square = Surface(
-        np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]), np.array([[0, 1, 2], [0, 2, 3]], np.int64)
-    )
-    lifted = Surface(square.vertices + np.array([0, 0, 0.5]), square.faces)
+    square = Mesh(np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]), np.array([[0, 1, 2], [0, 2, 3]], np.int64))
+    lifted = Mesh(square.vertices + np.array([0, 0, 0.5]), square.faces)
     metrics = evaluate_surfaces(lifted, square, samples=20_000, columns=32)
     radius = math.sqrt(0.5)
     assert metrics.scale == pytest.approx(radius)
@@ -139,7 +135,7 @@ def test_volume_of_boxes_is_that_of_their_sides():
 @pytest.mark.parametrize("columns", [1, 7, 64, 300])
 def test_columns_through_edges_and_vertices_are_never_broken(columns):
     fine = sphere(1.0, 4)
-    rounded = Surface(np.round(fine.vertices * 20) / 20, fine.faces)  # many faces edge-on to the axes, many ties
+    rounded = Mesh(np.round(fine.vertices * 20) / 20, fine.faces)  # many faces edge-on to the axes, many ties
     assert overlap(rounded, box((2, 2, 2)), columns=columns).broken == 0
 
 
@@ -147,7 +143,7 @@ def test_overlapping_parts_of_one_mesh_and_bubbles_in_it_are_told_apart():
     twice = joined(box(), box(at=(0.25, 0, 0)))  # wound twice in the middle: still inside
     assert overlap(twice, twice, columns=128).first == pytest.approx(1.25, rel=0.01)
     bubble = box((0.5, 0.5, 0.5))
-    hollow = joined(box(), Surface(bubble.vertices, bubble.faces[:, ::-1]))
+    hollow = joined(box(), Mesh(bubble.vertices, bubble.faces[:, ::-1]))
     assert overlap(hollow, hollow, columns=128).first == pytest.approx(1 - 0.125, rel=0.01)
 
 
@@ -219,17 +215,17 @@ def test_components_and_closedness():
     assert components(two) == 2
     assert is_closed(two)
     assert not is_closed(without_face(two))
-    soup = Surface(two.vertices[two.faces].reshape(-1, 3), np.arange(3 * len(two.faces)).reshape(-1, 3))
+    soup = Mesh(two.vertices[two.faces].reshape(-1, 3), np.arange(3 * len(two.faces)).reshape(-1, 3))
     assert components(soup) == 2
     assert is_closed(soup)
     assert len(soup.merged.vertices) == 16
-    flipped = Surface(two.vertices, np.concatenate((two.faces[:1, ::-1], two.faces[1:])))
+    flipped = Mesh(two.vertices, np.concatenate((two.faces[:1, ::-1], two.faces[1:])))
     assert not is_closed(flipped)
 
 
 def test_samples_are_uniform_by_area():
     square = np.array([[0.0, 0, 0], [4, 0, 0], [4, 1, 0], [0, 1, 0], [1, 0, 0]])
-    uneven = Surface(square, np.array([[0, 4, 3], [4, 1, 2], [4, 2, 3]], np.int64))
+    uneven = Mesh(square, np.array([[0, 4, 3], [4, 1, 2], [4, 2, 3]], np.int64))
     points, normals = sample_points(uneven, 100_000, np.random.default_rng(0))
     counts, _, _ = np.histogram2d(points[:, 0], points[:, 1], bins=(8, 4), range=((0, 4), (0, 1)))
     assert abs(counts / 100_000 * 32 - 1).max() < 0.1
@@ -299,3 +295,32 @@ def test_the_table_and_the_json_hold_the_figures(tmp_path):
 def test_samples_must_be_positive():
     with pytest.raises(ValueError, match="samples=0"):
         evaluate_surfaces(box(), box(), samples=0)
+
+
+def test_what_no_photograph_sees_does_not_count() -> None:
+    """Half of a square is missing, and no photograph has seen that half."""
+
+    def square(side: float) -> Mesh:
+        corners = [(0.0, 0.0, 3.0), (side, 0.0, 3.0), (side, 1.0, 3.0), (0.0, 1.0, 3.0)]
+        return Mesh(np.array(corners), np.array([(0, 1, 2), (0, 2, 3)]))
+
+    truth, asked = square(1.0), []
+
+    def view_counts(mesh: Mesh, points: np.ndarray) -> np.ndarray:
+        assert mesh is truth
+        asked.append(points)
+        return np.where(points[:, 0] < 0.49, 5, 1)
+
+    metrics = evaluate_surfaces(square(0.5), truth, samples=4000, view_counts=view_counts)
+    assert np.allclose(asked[0][:, 2], 3.0)  # in the reference's own coordinates
+    assert metrics.visible is not None
+    assert metrics.visible.chamfer is not None
+    assert metrics.chamfer_floor is not None
+    assert metrics.visible.share == pytest.approx(0.49, abs=0.03)
+    # The missing half is up to 1/2 away, in units of the square's radius 1/√2: half has a mean of 2 (1/2)² / 3.
+    assert metrics.completeness == pytest.approx(0.5 * 0.5**2 / 3 * 2, rel=0.1)
+    # Samples of half a square are twice as dense as those of a whole one, so both are within two of its floors.
+    assert metrics.visible.chamfer < 2 * metrics.chamfer_floor
+    assert "chamfer where 2 photographs see" in format_metrics(metrics)
+    with pytest.raises(ValueError, match="points hide nothing"):
+        evaluate_surfaces(truth, Mesh(truth.vertices, truth.faces[:0]), samples=10, view_counts=view_counts)

@@ -4,7 +4,7 @@ import argparse
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import pytest
 from mplicits.neural_fields import InputError
@@ -26,6 +26,7 @@ class Settings(config.Settings):
     weight: float = setting(1.0, "of a term", at_least=0)
     device: str = setting("cpu", "where")
     verbose: bool = setting(False, "whether to say more")
+    gone: ClassVar = {"sharpness": "take --share"}
 
 
 def write(folder: Path, text: str) -> Path:
@@ -77,9 +78,11 @@ def test_an_empty_file_is_the_defaults(tmp_path):
         ("normals: sometimes", r"normals: got 'sometimes', expected one of auto, file$"),
         ("verbose: 1", r"verbose: got '1', expected true or false$"),
         ("device: 0", r"device: got '0', expected text$"),
-        ("batch: -1", r"mine.yaml: batch: -1; expected > 0$"),
+        ("batch: -1", r"mine.yaml: batch: -1; expected a whole number > 0$"),
         ("widths: [1]", r"mine.yaml: rates: 2 entries for 1 widths; expected one for each$"),
         ("- 1\n- 2", r"mine.yaml: expected lines of 'key: value', got a list$"),
+        ("sharpness: 1", r"mine.yaml: sharpness: is gone; take --share$"),
+        ("weight: " + "9" * 400, r"weight: got '9+', expected a finite number$"),
         ("a: b: c", r"mine.yaml, line 1, column 5: not YAML"),
     ],
 )
@@ -94,7 +97,8 @@ def test_each_mistake_in_a_file_is_one_line_that_names_it(tmp_path, text, messag
     [
         ({"rates": ["fast"]}, r"^--rates: got 'fast', expected a list of finite numbers$"),
         ({"batch": "0.5"}, r"^--batch: got '0.5', expected a whole number$"),
-        ({"batch": "0"}, r"^--batch: 0; expected > 0$"),
+        ({"batch": "0"}, r"^--batch: 0; expected a whole number > 0$"),
+        ({"sharpness": ["1"]}, r"^--sharpness: is gone; take --share$"),
         ({"bacht": "1"}, r"^unknown flag --bacht; did you mean '--batch'\?$"),
     ],
 )
@@ -108,16 +112,19 @@ def test_mistakes_in_flags_are_named_as_flags(overrides, message):
     [
         ({"widths": ()}, "widths: expected at least one level"),
         ({"rates": (1e-3,)}, "rates: 1 entries for 2 widths; expected one for each"),
-        ({"widths": (8, 0)}, "widths: (8, 0); expected numbers > 0"),
-        ({"rates": (0.5, 1.5)}, "rates: (0.5, 1.5); expected numbers in (0, 1]"),
+        ({"widths": (8, 0)}, "widths: (8, 0); expected a list of whole numbers > 0"),
+        ({"rates": (0.5, 1.5)}, "rates: (0.5, 1.5); expected a list of finite numbers > 0 and ≤ 1"),
         ({"normals": "none"}, "normals: none; expected one of auto, file"),
-        ({"origin": (1.0, 2.0)}, "origin: (1.0, 2.0); expected 3 numbers in [-3, 3], or none"),
-        ({"origin": (1.0, 2.0, 4.0)}, "origin: (1.0, 2.0, 4.0); expected 3 numbers in [-3, 3], or none"),
-        ({"budget": 0.0}, "budget: 0.0; expected > 0, or none"),
-        ({"budget": math.nan}, "budget: nan; expected > 0, or none"),
-        ({"views": 1}, "views: 1; expected at least 2"),
-        ({"share": 0.0}, "share: 0.0; expected a number in (0, 1]"),
-        ({"weight": -1e-9}, "weight: -1e-09; expected ≥ 0"),
+        ({"origin": (1.0, 2.0)}, "origin: (1.0, 2.0); expected a list of 3 finite numbers ≥ -3 and ≤ 3, or none"),
+        (
+            {"origin": (1.0, 2.0, 4.0)},
+            "origin: (1.0, 2.0, 4.0); expected a list of 3 finite numbers ≥ -3 and ≤ 3, or none",
+        ),
+        ({"budget": 0.0}, "budget: 0.0; expected a finite number > 0, or none"),
+        ({"budget": math.nan}, "budget: nan; expected a finite number > 0, or none"),
+        ({"views": 1}, "views: 1; expected a whole number ≥ 2"),
+        ({"share": 0.0}, "share: 0.0; expected a finite number > 0 and ≤ 1"),
+        ({"weight": -1e-9}, "weight: -1e-09; expected a finite number ≥ 0"),
     ],
 )
 def test_fields_say_what_is_allowed(wrong: dict[str, Any], message: str) -> None:
@@ -163,6 +170,8 @@ def test_flags_come_from_the_dataclass_and_only_given_ones_override():
     none = given_flags(parser.parse_args(["--origin", "none", "--budget", "none"]), Settings)
     assert load_config(Settings, None, none) == Settings()
     assert given_flags(parser.parse_args([]), Settings) == {}
+    assert given_flags(parser.parse_args(["--sharpness", "1"]), Settings) == {"sharpness": ("1",)}
+    assert "sharpness" not in parser.format_help()
     assert given_flags(argparse.Namespace(batch=None, verbose=False, other=3), Settings) == {"verbose": False}
     assert "width of each level" in parser.format_help()
     assert "{auto,file}" in parser.format_help()

@@ -25,7 +25,6 @@ def test_strips_are_drawn_by_their_errors_and_their_pixels_alike(share: float) -
     # Five standard deviations of a binomial count: of 83 of them one is outside in 20,000 seeds.
     assert len(count) == PIXELS
     assert ((count - DRAWS * chance).abs() <= 5 * (DRAWS * chance).sqrt()).all()
-    torch.testing.assert_close(focus.odds(torch.arange(PIXELS)), PIXELS * chance)
 
 
 def test_errors_count_once_they_are_looked_at() -> None:

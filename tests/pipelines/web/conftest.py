@@ -2,7 +2,8 @@
 
 import pytest
 from browser import start_browser
-from mplicits.neural_fields import Similarity, save_field, save_texture
+from mplicits.neural_fields import Similarity, save_field
+from mplicits.neural_fields.checkpoint import save_texture
 from mplicits.pipelines.cli import main
 from pages import TITLE, bumpy, painted, until
 

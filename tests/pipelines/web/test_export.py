@@ -9,7 +9,8 @@ import zlib
 import numpy as np
 import pytest
 import torch
-from mplicits.neural_fields import MultiscaleSDF, Similarity, Siren, save_field, solve_sphere
+from mplicits.neural_fields import MultiscaleSDF, Similarity, Siren, save_field
+from mplicits.neural_fields.networks.sphere_init import solve_sphere
 from mplicits.neural_fields.spacetime.field import SpaceTimeSDF
 from mplicits.pipelines.cli import main
 from mplicits.pipelines.web.export import BITS
@@ -131,7 +132,7 @@ def test_mistakes_are_one_line(run, tmp_path, capsys):
         (run, "-o", tmp_path / "page.png"): "unknown extension",
         (run, "-o", foreign): "no page of this command",
         (tmp_path / "none", "-o", out): "no such file",
-        (run, "-o", out, "--no-highlights"): "unknown flag --no-highlights",
+        (run, "-o", out, "--no-highlights"): "--no-highlights: pages",
         (moving, "-o", out, "--cloud", foreign): "--cloud",
         (run, "-o", out, "--levels", 3): "has levels 0 to 1",
         (run, "-o", out, "--time", 0.5): "does not move",

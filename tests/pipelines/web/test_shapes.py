@@ -13,8 +13,9 @@ import trimesh
 from mplicits.datasets import PointCloud, sample_sphere, write_cloud_ply
 from mplicits.datasets.cameras import look_at
 from mplicits.datasets.landmarks import read_landmarks
-from mplicits.neural_fields import Similarity, Siren, Sphere, extract_mesh, save_field, solve_sphere
+from mplicits.neural_fields import Similarity, Siren, Sphere, extract_mesh, save_field
 from mplicits.neural_fields.backend.errors import InputError
+from mplicits.neural_fields.networks.sphere_init import solve_sphere
 from mplicits.pipelines.cli import main
 from mplicits.pipelines.web.assembly import SCRIPTS, field_file
 from mplicits.pipelines.web.export import WebOptions, pack

@@ -63,7 +63,8 @@ original, JITFunction.run = JITFunction.run, compile_only
 
 from mplicits.datasets.cameras import look_at
 from mplicits.neural_fields import MultiscaleSDF
-from mplicits.neural_fields.backend.kernels import ieee, levels, packing, picture, siren, training as back
+from mplicits.neural_fields.backend.kernels import ieee, levels, packing, siren, training as back
+from mplicits.neural_fields.tracing import picture
 from mplicits.neural_fields.backend.kernels.launch import Network
 from mplicits.neural_fields.networks.multiscale import as_levels
 from mplicits.pipelines.render import trace

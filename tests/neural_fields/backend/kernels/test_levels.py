@@ -8,7 +8,8 @@ import mplicits.neural_fields.backend.kernels.levels as fused
 import pytest
 import torch
 from bounds import assert_within
-from mplicits.neural_fields import Jet, MultiscaleSDF, Siren, fixed_shapes
+from mplicits.neural_fields import Jet, MultiscaleSDF, Siren
+from mplicits.neural_fields.backend.fixed_shapes import fixed_shapes
 from mplicits.neural_fields.backend.kernels.rounding import gated_bound, rounding_bound
 from torch import Tensor
 

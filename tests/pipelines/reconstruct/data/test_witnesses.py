@@ -10,20 +10,20 @@ import trimesh
 from mplicits.datasets.cameras import Camera, look_at
 from mplicits.datasets.synthetic.scenes import SCENES, render_scene
 from mplicits.datasets.views.writing import write_transforms
+from mplicits.neural_fields import Mesh
 from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.reconstruct.data.witnesses import count_witnesses
-from mplicits.pipelines.surface.surface import Surface
 
 BALLS = (np.array([0.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.5]))
 RADII = (0.5, 0.3)
 
 
-def balls() -> Surface:
+def balls() -> Mesh:
     parts = [trimesh.creation.icosphere(4, radius=r) for r in RADII]
     for part, center in zip(parts, BALLS, strict=True):
         part.apply_translation(center)
     both = trimesh.util.concatenate(parts)
-    return Surface(np.asarray(both.vertices), np.asarray(both.faces))
+    return Mesh(np.asarray(both.vertices), np.asarray(both.faces))
 
 
 def hidden_by(eye: np.ndarray, points: np.ndarray, margin: float) -> np.ndarray:

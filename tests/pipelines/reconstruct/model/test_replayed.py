@@ -27,7 +27,7 @@ KINDS = {
     "outside": replace(TINY, background="outside"),
     "neus": replace(TINY, geometry="neus", steps=20, march_grid=0),
     "cameras": replace(TINY, exposure="affine", cameras="refined"),
-    "depths": replace(TINY, smooth_weight=1.0),
+    "depths": TINY,
 }
 
 
@@ -45,9 +45,7 @@ def images() -> PosedImages:
 def scene(images: PosedImages, name: str, device: torch.device) -> SceneObjective:
     config = KINDS[name]
     views = images.views if name != "outside" else [replace(view, mask=None) for view in images.views]
-    pool = RayPool(
-        views, images.similarity, device, whole=config.background == "outside", flat=config.smooth_weight > 0
-    )
+    pool = RayPool(views, images.similarity, device, whole=config.background == "outside")
     model = build_scene(config, has_masks=pool.has_masks, views=len(views)).to(device)
     measured = MeasuredDepths(views, images, device) if name == "depths" else None
     assert measured is None or len(measured)

@@ -12,17 +12,19 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from mplicits.neural_fields import Mesh, Similarity
+from mplicits.pipelines.surface.surface import face_normals, sample_points
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from .surface import Surface, face_normals
-
-__all__ = ["Roughness", "feet_among", "roughness", "sharp_edge_points"]
+__all__ = ["Roughness", "feet_among", "roughness", "sharp_edge_points", "surface_roughness"]
 
 Float64 = NDArray[np.float64]
 
 # Samples looked at in a disc of the low-pass: the mean of as many adds a hundredth to what it is taken from.
 IN_DISC = 48
+# Samples of the mesh that may be the foot of one of the reference.
+FEET = 4
 # A figure needs as many samples: the 90 % of fewer is that of a handful.
 FEWEST = 200
 
@@ -49,10 +51,10 @@ class Roughness(NamedTuple):
 
 def roughness(
     points: Float64,
-    normals: Float64,
+    normals: NDArray[np.floating],
     feet: Float64,
-    feet_normals: Float64,
-    reference: Surface,
+    feet_normals: NDArray[np.floating],
+    reference: Mesh,
     *,
     reach: float = 0.03,
     radius: float = 0.05,
@@ -115,6 +117,27 @@ def roughness(
     )
 
 
+def surface_roughness(mesh: Mesh, reference: Mesh, *, samples: int, seed: int) -> Roughness:
+    """The roughness of a mesh at the samples of the reference that `evaluate_surfaces` draws.
+
+    Args:
+        mesh: the surface to judge.
+        reference: the truth, a mesh in the same coordinates; its bounding sphere is the unit of length.
+        samples: points drawn on each surface.
+        seed: of the samples.
+    """
+    similarity = Similarity.to_unit_sphere(reference.used_vertices())
+    mesh, reference = mesh.moved(similarity), reference.moved(similarity)
+    of_mesh, of_reference = np.random.default_rng(seed).spawn(2)
+    points, normals = sample_points(mesh, samples, of_mesh)
+    target, target_normals = sample_points(reference, samples, of_reference)
+    assert normals is not None
+    assert target_normals is not None
+    _, nearest = KDTree(points, balanced_tree=False).query(target, k=min(FEET, len(points)), workers=-1)
+    feet = feet_among(target, points, normals, np.asarray(nearest).reshape(len(target), -1))
+    return roughness(target, target_normals, points[feet], normals[feet], reference)
+
+
 def _spread(angles: Float64) -> tuple[float | None, float | None]:
     """Median and 90 % of angles, if there are enough of them."""
     if len(angles) < FEWEST:
@@ -123,7 +146,7 @@ def _spread(angles: Float64) -> tuple[float | None, float | None]:
 
 
 def feet_among(
-    points: Float64, others: Float64, normals: Float64, candidates: NDArray[np.integer]
+    points: Float64, others: Float64, normals: NDArray[np.floating], candidates: NDArray[np.integer]
 ) -> NDArray[np.int64]:
     """Of a few samples near each point, the one whose tangent plane passes nearest to it.
 
@@ -143,7 +166,7 @@ def feet_among(
     return chosen
 
 
-def sharp_edge_points(surface: Surface, *, spacing: float, least: float = 30.0) -> Float64:
+def sharp_edge_points(surface: Mesh, *, spacing: float, least: float = 30.0) -> Float64:
     """Points ``(E, 3)`` along the edges whose two faces meet at more than ``least`` degrees.
 
     Args:

@@ -19,21 +19,11 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from ...neural_fields import (
-    Field,
-    InputError,
-    IntegrationError,
-    Similarity,
-    Solver,
-    TextureField,
-    extract_mesh,
-    flow,
-    load_field,
-    map_colors,
-)
+from ...neural_fields import Field, InputError, Similarity, TextureField, extract_mesh, flow, load_field, map_colors
 from ...neural_fields.meshing.extract import NoSurfaceError
 from ...neural_fields.spacetime.dynamic_tracing import moment
 from ...neural_fields.spacetime.evolution import VectorField
+from ...neural_fields.spacetime.flow import IntegrationError, Solver
 from ...neural_fields.spacetime.surface_velocity import CarriedVelocity
 from ...neural_fields.tracing.projection import project_to_surface
 from ..training.folder import find_field
@@ -43,10 +33,10 @@ from .train import texture_of
 
 __all__ = [
     "RIDE",
+    "Backward",
     "Colors",
-    "Homeward",
-    "RidingColors",
-    "RidingPoints",
+    "TransportedColors",
+    "TransportedPoints",
     "borrowed_texture",
     "colors_of_run",
     "pinned_texture",
@@ -57,7 +47,7 @@ __all__ = [
 # Points (N, 3) to display colours (N, 3).
 Colors = Callable[[Tensor], Tensor]
 # Points (N, 3) of a moment to where they were at another time, (N, 3).
-Homeward = Callable[[Tensor], Tensor]
+Backward = Callable[[Tensor], Tensor]
 # A fixed step: near a change of topology adaptive ones would shrink to nothing, for the sake of a few points.
 RIDE = Solver(method="rk4", step=0.05)
 # Along a velocity that was learnt: smooth, so that in float32 more steps are no nearer; so many points at once.
@@ -148,7 +138,7 @@ def _texture_at(
     return texture
 
 
-class RidingPoints:
+class TransportedPoints:
     """Where points of a surface that moves were at time 0, or will be at another.
 
     They go along the velocity that the run has learnt, or else along what the normal speeds say (`CarriedVelocity`).
@@ -163,7 +153,7 @@ class RidingPoints:
         self._field, self._level, self._motion = field, level, motion
 
     @torch.no_grad()
-    def home(self, time: float, to: float = 0.0) -> Homeward:
+    def home(self, time: float, to: float = 0.0) -> Backward:
         """The way from one time to another, for points ``(N, 3)`` of the surface at the first.
 
         Where surface is made or vanishes on the way they arrive beside the other surface.
@@ -195,7 +185,7 @@ class RidingPoints:
         return CarriedVelocity(self._field, level=self._level)
 
 
-class RidingColors:
+class TransportedColors:
     """The colours of a surface that moves: those that its points had at time 0.
 
     Args:
@@ -204,7 +194,7 @@ class RidingColors:
         placed: from the texture's coordinates to the field's.
         last: colours of the points of its surface at time 1, for a blend: they weigh t, those of the start 1 − t.
         level: whose surface.
-        motion: the velocity that was learnt; see `RidingPoints`.
+        motion: the velocity that was learnt; see `TransportedPoints`.
     """
 
     def __init__(
@@ -217,7 +207,7 @@ class RidingColors:
         level: int = -1,
         motion: VectorField | None = None,
     ) -> None:
-        self._points = RidingPoints(field, level=level, motion=motion)
+        self._points = TransportedPoints(field, level=level, motion=motion)
         first = texture_colors(texture, placed) if isinstance(texture, TextureField) else texture
         self._ends = [_Pinned(field, 0.0, first, level)]
         if last is not None:
@@ -329,4 +319,4 @@ def colors_of_run(run: str | Path, field: Field, time: float | None) -> Colors |
     if moving is None or time is None:
         return lambda points: map_colors(texture, points).values
     motion = load_motion(find_field(run))
-    return RidingColors(moving, texture, motion=None if motion is None else motion.to(moving.like)).at(time)
+    return TransportedColors(moving, texture, motion=None if motion is None else motion.to(moving.like)).at(time)

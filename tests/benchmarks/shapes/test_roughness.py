@@ -5,20 +5,18 @@ import math
 import numpy as np
 import pytest
 import trimesh
-from mplicits.pipelines.surface.measure import evaluate_surfaces, format_metrics
-from mplicits.pipelines.surface.roughness import IN_DISC, roughness, sharp_edge_points
-from mplicits.pipelines.surface.surface import Surface
+from mplicits.neural_fields import Mesh
 from scipy.special import j1
 
+from benchmarks.shapes.roughness import IN_DISC, roughness, sharp_edge_points, surface_roughness
+
 RADIUS = 0.05
-SQUARE = Surface(
-    np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]), np.array([[0, 1, 2], [0, 2, 3]], np.int64)
-)
+SQUARE = Mesh(np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]), np.array([[0, 1, 2], [0, 2, 3]], np.int64))
 
 
-def box(side: float) -> Surface:
+def box(side: float) -> Mesh:
     mesh = trimesh.creation.box((side, side, side))
-    return Surface(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64))
+    return Mesh(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64))
 
 
 def rippled(wavelength: float, slope: float, *, sign: float = 1.0):
@@ -65,7 +63,7 @@ def test_long_waves_are_not_roughness() -> None:
 def test_a_chamfer_is_an_error_at_the_edge_and_nowhere_else() -> None:
     width, reach, turn = 0.02, 0.03, math.radians(45)
     x = np.array([[0.0, -1, 0], [1, -1, 0], [1, 1, 0], [0, 1, 0], [0, 1, -1], [0, -1, -1]])
-    wedge = Surface(x, np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 5]], np.int64))
+    wedge = Mesh(x, np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 5]], np.int64))
     random = np.random.default_rng(1)
     t, y, top = random.uniform(0, 1, 60_000), random.uniform(-1, 1, 60_000), random.random(60_000) < 0.5
     points = np.where(top[:, None], np.stack((t, y, 0 * t), 1), np.stack((0 * t, y, -t), 1))
@@ -96,19 +94,16 @@ def test_edges_are_where_faces_meet_at_an_angle() -> None:
     assert len(points) == 12 * 21  # the diagonals of its sides are none
     assert np.abs(np.sort(np.abs(points), axis=1)[:, 1:] - 1).max() < 1e-12
     cylinder = trimesh.creation.cylinder(1.0, 2.0, sections=128)  # its sides meet at 2.8°
-    rims = sharp_edge_points(Surface(np.asarray(cylinder.vertices), np.asarray(cylinder.faces, np.int64)), spacing=0.01)
+    rims = sharp_edge_points(Mesh(np.asarray(cylinder.vertices), np.asarray(cylinder.faces, np.int64)), spacing=0.01)
     assert np.abs(np.abs(rims[:, 2]) - 1).max() < 1e-12
     assert len(sharp_edge_points(SQUARE, spacing=0.1)) == 0
 
 
-def test_a_box_against_itself_is_smooth_and_a_cloud_is_not_judged() -> None:
-    metrics = evaluate_surfaces(box(3.0), box(3.0), samples=60_000, columns=32)
+def test_a_box_against_itself_is_smooth() -> None:
+    found = surface_roughness(box(3.0), box(3.0), samples=60_000, seed=0)
     side, reach = 2 / math.sqrt(3), 0.03  # in the unit sphere
-    assert metrics.flat_share == pytest.approx((1 - 2 * reach / side) ** 2, abs=0.01)
-    assert metrics.flat_angle == metrics.flat_angle_90 == 0
-    assert metrics.ripple == pytest.approx(0, abs=1e-12)
-    assert metrics.edge_angle is not None
-    assert metrics.edge_angle < 0.1  # where all four candidates are on the other face, in the corners
-    assert "flat places (90%)" in format_metrics(metrics)
-    cloud = Surface(box(3.0).vertices, np.empty((0, 3), np.int64))
-    assert evaluate_surfaces(box(3.0), cloud, samples=1000).flat_angle is None
+    assert found.flat_share == pytest.approx((1 - 2 * reach / side) ** 2, abs=0.01)
+    assert found.flat_angle == found.flat_angle_90 == 0
+    assert found.ripple == pytest.approx(0, abs=1e-12)
+    assert found.edge_angle is not None
+    assert found.edge_angle < 0.1  # where all four candidates are on the other face, in the corners

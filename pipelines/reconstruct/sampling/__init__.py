@@ -1,1 +1,0 @@
-"""Which rays a reconstruction trains on."""
