@@ -11,7 +11,7 @@ N ?= 200
 export PYTHONDONTWRITEBYTECODE :=
 PIP := $(BIN)/python -m pip install --quiet --quiet --no-compile --disable-pip-version-check -c constraints.txt
 
-.PHONY: demo test test-all fuzz kills clients lint docs clean
+.PHONY: demo test test-all fuzz kills lint docs clean
 
 # What using it needs; the stamps below add what developing it and its site need.
 $(VENV)/.installed: pyproject.toml constraints.txt
@@ -39,9 +39,6 @@ fuzz: $(VENV)/.dev
 
 kills: $(VENV)/.dev
 	OMP_NUM_THREADS=1 $(BIN)/python tests/kills.py --number $(N)
-
-clients: $(VENV)/.dev
-	$(BIN)/python tests/clients.py --minutes $(MINUTES)
 
 # The type checker does not follow setuptools' names of folders, which benchmarks import: it finds them by links.
 lint: $(VENV)/.dev

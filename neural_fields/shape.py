@@ -222,21 +222,21 @@ class WorldField:
         return upward("render")(self, path, size=size, level=level, up=up, azimuth=azimuth, elevation=elevation)
 
     def show(self, *, up: str = "y", block: bool = True, browser: bool = True) -> Any:
-        """Look at the surface: in the browser, or in a notebook as a picture.
+        """Open the surface in the browser, or in a notebook's cell.
 
-        In a script the viewer opens in the browser (it needs ``mplicits[view]``), and this returns when its page is
-        closed, or at Ctrl-C.
+        In a script this returns when the page is closed, or at Ctrl-C.
 
         Args:
             up: the axis that points up, "y" or "z".
-            block: whether to wait; otherwise the running `Viewer` is returned, for the caller to close.
+            block: whether to wait; otherwise the running `PageServer` is returned, for the caller to close.
             browser: whether to open one; otherwise only the address is printed.
 
         Returns:
-            The `Viewer`, or None once it is closed; in a notebook what shows the picture there.
+            The `PageServer`, or None once it is closed; in a notebook what shows the page there.
 
         Raises:
-            InputError: viser is not installed, or there is no surface.
+            NoSurfaceError: there is no surface.
+            InputError: no port is free.
         """
         return upward("show")(self, up=up, block=block, browser=browser)
 

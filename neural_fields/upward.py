@@ -13,7 +13,7 @@ __all__ = ["upward"]
 
 OFFERED = {
     "render": ("pipelines.render.draw", "render_shape"),
-    "show": ("pipelines.viewer.window", "show"),
+    "show": ("pipelines.web.window", "show"),
 }
 
 

@@ -5,7 +5,6 @@ there results are equal to the last bit. On CUDA itself, which rounds otherwise,
 same shape; how good they are is asked elsewhere.
 """
 
-import copy
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -47,8 +46,6 @@ from mplicits.pipelines.fit.unoriented import SIGNING, give_signs
 from mplicits.pipelines.mesh.files import write_mesh
 from mplicits.pipelines.training.config import load_config
 from mplicits.pipelines.training.settings import FitConfig
-from mplicits.pipelines.viewer.frames import Look
-from mplicits.pipelines.viewer.paint import Painter
 from reconstructions import small_reconstructions
 from test_commands import EVOLVE, FIT, RECONSTRUCT, TEXTURE
 from torch import Tensor, nn
@@ -190,18 +187,6 @@ def in_input_units(device: torch.device) -> Result:
     return world.distance(points), world.normals(points), *hits, *closest, world.mesh(resolution=16).vertices
 
 
-def painted(device: torch.device) -> Result:
-    found = []
-    for field, shading in ((small_multiscale(0.3), "lambert"), (Sphere(radius=0.5), "curvature")):
-        field = copy.deepcopy(field).to(device)
-        painter = Painter(field, reference=lambda: np.zeros((1, 3), np.float32))
-        level = field.num_levels - 1
-        look = Look(level=level, normal_level=level, shading=shading, shadows=True, occlusion=True)
-        found += painter(CAMERA, look, lambda: None)
-        found.append(painter.picture(CAMERA, look, lambda: None, transparent=True))
-    return found
-
-
 def begun_as_spheres(device: torch.device) -> Result:
     solved, trained = Siren(32, 2, omega=10.0).to(device), Siren(32, 2, omega=10.0).to(device)
     solve_sphere(solved)
@@ -218,7 +203,6 @@ CONSUMERS = (
     in_instant_nsr,
     in_nerfstudio,
     in_input_units,
-    painted,
     begun_as_spheres,
 )
 

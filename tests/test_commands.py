@@ -273,7 +273,7 @@ def reason_to_skip(line: str) -> str | None:
         return (
             "COLMAP finds nothing in pictures so small; tests/datasets/views/poses/test_find_cameras.py has larger ones"
         )
-    needs = {"view": "websockets", "poisson": "pymeshlab", "--texture": "xatlas"}
+    needs = {"poisson": "pymeshlab", "--texture": "xatlas"}
     for word, module in needs.items():
         if word in words and find_spec(module) is None:
             return f"{module} is not installed"

@@ -42,7 +42,6 @@ ROOMS = (
     "pipelines/texture",
     "pipelines/mesh",
     "pipelines/render",
-    "pipelines/viewer",
     "pipelines/web",
     "pipelines/evolve",
     "pipelines/reconstruct",

@@ -13,7 +13,7 @@ from mplicits.neural_fields import Field, InputError, SpaceTimeSDF, extract_mesh
 from mplicits.neural_fields.meshing.extract import DEFAULT_BOUNDS
 from mplicits.neural_fields.spacetime.dynamic_tracing import DynamicTracer, moment
 from mplicits.neural_fields.tracing.sphere import Hits
-from mplicits.pipelines.render.trace import RESOLUTION, TOLERANCE, pixel_size, trace_hits
+from mplicits.pipelines.render.trace import PRECISION, pixel_size, trace_hits
 from mplicits.pipelines.training.folder import find_field
 
 from ..costs.speed import counted, evaluate_slabs, peer_mesher
@@ -142,7 +142,7 @@ def dynamic_rows(
     times = [START + index / FRAMES_OF_MOTION for index in range(frames)]
     camera = _camera(field, times, size)
     eye, directions = camera.rays(device=field.deltas.device)
-    tolerance, resolution = TOLERANCE * pixel_size(camera), RESOLUTION * pixel_size(camera)
+    tolerance, resolution = PRECISION.tolerance * pixel_size(camera), PRECISION.resolution * pixel_size(camera)
 
     def dynamic(field: Field) -> Draw:
         return DynamicTracer(field, eye, directions, level=level, tolerance=tolerance, resolution=resolution).trace

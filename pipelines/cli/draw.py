@@ -6,8 +6,8 @@ import argparse
 import re
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -289,19 +289,15 @@ ANIMATE = Command(
 
 def _view_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add_flags(parser, "run")
+    add("run", metavar="RUN|FILE", help="run directory, .safetensors file, mesh or cloud")
     add("other", nargs="?", metavar="OTHER", help="with --landmarks: the run to pick the same points on")
     add("--landmarks", type=Path, metavar="FILE", help="click pairs of points on RUN and OTHER, kept for `evolve`")
     add_flags(parser, "--time")
     add_flags(parser, "--up", default="y")
+    add("--cloud", metavar="FILE", help="a cloud beside the field (default: what the run was fitted to)")
     add("--host", default="127.0.0.1", help="address to listen on (127.0.0.1: this machine only)")
     add("--port", type=_port, metavar="N", help="port to listen on (default: a free one from 8080 up)")
     add("--open", action=argparse.BooleanOptionalAction, default=False, help="open a browser")
-    add("--stream", action="store_true", help="trace here, and send pictures: for browsers without a graphics adapter")
-    add("--cloud", metavar="FILE", help="streamed: what errors are measured from (default: what the run was fitted to)")
-    what = "streamed: images of about N × N pixels (512)"
-    add("--size", type=whole(64, 4096), metavar="N", help=what)
-    add_flags(parser, "--device", default=None, help="streamed: where to trace (auto)")
 
 
 def _port(text: str) -> int | None:
@@ -310,27 +306,34 @@ def _port(text: str) -> int | None:
 
 
 def _view(arguments: argparse.Namespace) -> int:
-    streamed = ("cloud", "size", "device")
-    stream = arguments.stream or any(getattr(arguments, name) is not None for name in streamed)
-    if stream and arguments.time is not None:
-        raise input_error("--time: is a slider in the streaming viewer; leave it out")
     if (arguments.other is None) != (arguments.landmarks is None):
         raise input_error("--landmarks: goes with two runs, `mplicits view RUN OTHER --landmarks FILE`")
+    for name in ("cloud", "time"):
+        if arguments.landmarks is not None and getattr(arguments, name) is not None:
+            raise input_error(f"--{name}: does not go with --landmarks; leave one of the two out")
+    from ..web.export import WebOptions, pack
+    from ..web.landmarks import Pairs
+    from ..web.serve import PageServer
+    from ..web.watch import Watcher
+
+    place = {"host": arguments.host, "port": arguments.port}
     if arguments.landmarks is not None:
-        for name in ("cloud", "time"):
-            if getattr(arguments, name) is not None:
-                raise input_error(f"--{name}: does not go with --landmarks; leave one of the two out")
         from ...neural_fields.backend.files import check_place
 
         check_place(arguments.landmarks)
-        stream = True
-    with _streamed(arguments) if stream else _served(arguments) as url:
+        pairs = Pairs((arguments.run, arguments.other), arguments.landmarks, up=arguments.up)
+        shown = server = PageServer(pairs.pack, keep=pairs.keep, **place)
+    else:
+        options = WebOptions(time=arguments.time, up=arguments.up, cloud=arguments.cloud or "auto")
+        server = PageServer(lambda: pack(arguments.run, options), **place)
+        shown = Watcher(Path(arguments.run), server=server)
+    with shown:
         try:
-            print(f"{arguments.run}: open {url} in a browser; Ctrl-C ends it", flush=True)
+            print(f"{arguments.run}: open {server.url} in a browser; Ctrl-C ends it", flush=True)
             if arguments.open:
                 import webbrowser
 
-                webbrowser.open(url)
+                webbrowser.open(server.url)
             while not threading.Event().wait(3600):  # with a time limit, or Windows would not notice Ctrl-C
                 pass
         except KeyboardInterrupt:
@@ -338,53 +341,16 @@ def _view(arguments: argparse.Namespace) -> int:
     return 0
 
 
-@contextmanager
-def _served(arguments: argparse.Namespace) -> Iterator[str]:
-    """The page of a run, and where it is; of a field that no shader knows, pictures."""
-    from ..web.export import WebOptions
-    from ..web.networks import NoShaderError
-    from ..web.serve import PageServer
-    from ..web.watch import Watcher
-
-    options = WebOptions(time=arguments.time, up=arguments.up)
-    try:
-        server = PageServer(arguments.run, options, host=arguments.host, port=arguments.port)
-    except NoShaderError:
-        print(f"{arguments.run}: no shader knows this kind of field; it is traced here, and pictures are sent")
-        with _streamed(arguments) as url:
-            yield url
-        return
-    with Watcher(Path(arguments.run), options, server=server):
-        yield server.url
-
-
-@contextmanager
-def _streamed(arguments: argparse.Namespace) -> Iterator[str]:
-    """The viewer that traces on this machine, and where it is."""
-    from ..training.machine import choose_device
-    from ..viewer.picks import open_picks
-    from ..viewer.server import Viewer, open_run, show_field
-
-    device, side = choose_device(arguments.device or "auto"), arguments.size or 512
-    if arguments.landmarks is None:
-        shown = open_run(arguments.run, cloud=arguments.cloud, side=side, device=device)
-    else:
-        picks = open_picks((arguments.run, arguments.other), arguments.landmarks, device=device)
-        shown = show_field(picks.field, name="landmarks", side=side, picks=picks)
-    with Viewer(shown, host=arguments.host, port=arguments.port, up=arguments.up) as viewer:
-        yield viewer.url
-
-
 VIEW = Command(
-    "look at a fit in the browser",
+    "look at a fit, a mesh or a cloud in the browser",
     """  mplicits view runs/scan
   mplicits view runs/scan --up z --open
   mplicits view runs/scan --port 9000
-  mplicits view runs/scan --stream
+  mplicits view scan.ply
   mplicits view runs/cat runs/dog --landmarks pairs.txt""",
     _view_arguments,
     _view,
-    "Look at a fit in the browser: the page of `mplicits web`, traced by the browser's own graphics adapter, with each "
-    "new checkpoint of a run that is still fitted. With --stream this machine traces, and shows meshes, bands and "
-    "errors too. With --landmarks two fits stand side by side, and pairs of clicks are kept for `evolve --landmarks`.",
+    "Look at a fit, a mesh or a cloud in the browser: the page of `mplicits web`, drawn by the browser's own graphics "
+    "adapter, with each new checkpoint of a run that is still fitted. With --landmarks two fits stand side by side; "
+    "pairs of clicks are kept for `evolve --landmarks`.",
 )

@@ -50,7 +50,7 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     what = "then learn the colours, if there are any, and write the mesh (.ply, .obj, .stl, .glb)"
     add("--mesh", type=Path, metavar="FILE", help=what)
     add("--no-colors", action="store_true", help="leave the colours out of --mesh")
-    what = "show the growing field in the browser, checkpoint by checkpoint; needs mplicits[view]"
+    what = "show the growing field in the browser, checkpoint by checkpoint"
     add("--watch", action="store_true", help=what)
     add_settings(parser, FitConfig)
     _depth_arguments(parser)

@@ -18,10 +18,12 @@ MARK = 'id="header">{"format":"mplicits-web"'
 
 def _web_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add_flags(parser, "run", "--time")
+    add("run", metavar="RUN|FILE", help="run directory, .safetensors file, mesh or cloud")
+    add_flags(parser, "--time")
     add_flags(parser, "--out", help=f"{', '.join(PAGES)}, or a folder: field, module and page")
     add("--levels", type=whole(1), metavar="N", help="only the N coarsest levels (default: all)")
     add("--no-colors", dest="colors", action="store_false", help="leave out the colours of the run's texture")
+    add("--cloud", metavar="FILE", help="show this cloud too, coloured by its distance from the surface")
     add("--no-highlights", action="store_true", help=argparse.SUPPRESS)
     add("--float32", action="store_true", help="keep the weights as they are (default: 13 bits each)")
     add_flags(parser, "--up")
@@ -58,21 +60,24 @@ def _web(arguments: argparse.Namespace) -> int:
     started = time.monotonic()
     with stoppable("nothing was written", at_any_time=True):
         done = web_run(arguments.run, out, WebOptions(**given_flags(arguments, WebOptions)), say=print)
-    levels = f"{done.levels} level{'s' if done.levels > 1 else ''}"
+    levels = f"{done.levels} level{'s' if done.levels > 1 else ''}" if done.levels else "no field to trace"
     levels += " with colours" if done.colored else ""
+    around = " around them" if done.levels else ""
     seconds = time.monotonic() - started
-    print(f"{out}: {done.size / 1024:,.0f} KiB, {levels}, {done.triangles:,} triangles around them, in {seconds:.1f} s")
+    print(f"{out}: {done.size / 1024:,.0f} KiB, {levels}, {done.triangles:,} triangles{around}, in {seconds:.1f} s")
     return 0
 
 
 WEB = Command(
-    "write a fit as one HTML file, traced in the browser of who opens it",
+    "write a fit, a mesh or a cloud as one HTML file",
     """  mplicits web runs/scan -o scan.html
   mplicits web runs/scan -o small.html --levels 1
   mplicits web runs/scan -o exact.html --float32 --up z
+  mplicits web scan.ply -o cloud.html
   mplicits web runs/scan -o site/scan""",
     _web_arguments,
     _web,
     "Write a fit as one HTML file that needs no network, no server and no Python: the networks themselves, traced by "
-    "the GPU of whoever opens it (WebGPU or WebGL 2). With a folder's name it writes an element for other pages.",
+    "the GPU of whoever opens it (WebGPU or WebGL 2). Meshes, clouds and other fields are shown as "
+    "triangles and points. With a folder's name it writes an element for other pages.",
 )

@@ -24,7 +24,7 @@ from ..render.film import ANIMATIONS, write_animation
 from ..render.picture import Image, contact_sheet, in_rows, write_picture
 from ..render.shade import ShadeOptions, compose, downsample, shade
 from ..render.subject import Orbit, orbit_cameras, traced_part
-from ..render.trace import RESOLUTION, TOLERANCE, fine_strips, pixel_size, see_hits
+from ..render.trace import PRECISION, fine_strips, pixel_size, see_hits
 from ..texture.transport import Colors, TransportedColors, borrowed_texture, pinned_texture, start_texture
 from ..training.folder import FIELD_FILE, RECORD_FILE, chosen_level, find_field, read_record
 from ..training.machine import choose_device
@@ -225,7 +225,14 @@ def there_and_back(frames: Iterable[Image]) -> Iterator[Image]:
 def _tracer(field: Field, camera: Camera, level: int) -> DynamicTracer:
     eye, directions = camera.rays(device=field.deltas.device)
     size = pixel_size(camera)
-    return DynamicTracer(field, eye, directions, level=level, tolerance=TOLERANCE * size, resolution=RESOLUTION * size)
+    return DynamicTracer(
+        field,
+        eye,
+        directions,
+        level=level,
+        tolerance=PRECISION.tolerance * size,
+        resolution=PRECISION.resolution * size,
+    )
 
 
 def _outline(file: Path, field: Field, options: SequenceOptions) -> NDArray[np.float64]:

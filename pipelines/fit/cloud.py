@@ -137,7 +137,7 @@ def _about(path: Path, **options: Any) -> dict[str, Any]:
     """What a merged cloud depends on."""
     facts = path.stat()
     return {
-        "version": 1,  # of what merging does; a cloud that was merged otherwise is made again
+        "version": 2,  # of what merging does; a cloud that was merged otherwise is made again
         "file": str(path.absolute()),
         "bytes": facts.st_size,
         "changed": facts.st_mtime_ns,

@@ -30,9 +30,6 @@ Color = tuple[float, float, float]
 Painter = Callable[[Camera, int], Image]
 """What a camera, in unit-sphere coordinates, sees of a level: a picture of its size."""
 
-PREVIEW = 160  # pixels on the longer side of the pictures from which colour maps take their limits
-PREVIEWS = 12  # of a film
-PAINTED = 1 << 14  # pixels that a painter is given at a time, between two reports
 # What colours show, as the legend calls it, and the power of the input's unit it is measured in.
 MEASURES = {
     "depth": ("distance from the camera", 1),
@@ -221,8 +218,9 @@ class _Artist:
         if self.shading not in MEASURES or self.shade_options.limits is not None:
             return
         values = []
-        for camera in cameras[:: math.ceil(len(cameras) / PREVIEWS)]:
-            share = min(1.0, PREVIEW / max(camera.width, camera.height))
+        # Limits come from at most 12 small pictures, of 160 pixels on the longer side.
+        for camera in cameras[:: math.ceil(len(cameras) / 12)]:
+            share = min(1.0, 160 / max(camera.width, camera.height))
             small = camera.resized(math.ceil(share * camera.width), math.ceil(share * camera.height))
             values += [self._measure(self.subject.view(small, panel), panel) for panel in self.panels]
         limits = value_limits(torch.cat(values), self.shading, self.shade_options)
@@ -275,7 +273,8 @@ class _Artist:
 
     def _strips(self, camera: Camera) -> list[Camera]:
         """What is drawn at a time; little by little, where each ray costs as much as a painter's."""
-        return fine_strips(camera, self.options.samples, pixels=PAINTED if self.painter else None)
+        # A painter gets so many pixels between two reports.
+        return fine_strips(camera, self.options.samples, pixels=1 << 14 if self.painter else None)
 
     def _draw(self, camera: Camera, panel: Panel) -> Image:
         if self.painter is not None:

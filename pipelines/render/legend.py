@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .picture import Image, as_bytes
-from .slice import FADE, FINEST, LINE, TINT, Color, Slice, distance_color, level_color, round_step
+from .slice import FINEST, STYLE, Color, Slice, distance_color, level_color, round_step
 from .text import text_mask, text_width
 
 __all__ = ["with_color_bar", "with_legend"]
@@ -19,9 +19,6 @@ Floats = NDArray[np.float32]
 
 DARK: Color = (0.20, 0.22, 0.27)  # ink on light paper
 LIGHT: Color = (0.92, 0.93, 0.95)  # and on dark paper
-LONGEST = 36  # of the bar, in text heights
-LABEL = 7  # room for the number under a tick, in text heights
-CAPTION_WIDTH = 9.5  # in text heights: a place wide enough for any number, so that nothing moves in an animation
 SUBSCRIPTS = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
 
 
@@ -45,7 +42,8 @@ def with_color_bar(
     height, width = picture.shape[:2]
     text = round(float(np.clip(min(width, 2 * height) / 48, 9, 64)))
     margin = text
-    length = max(2, min(width - 2 * margin, LONGEST * text))
+    # Lengths are in text heights.
+    length = max(2, min(width - 2 * margin, 36 * text))
     paper = (1.0, 1.0, 1.0) if background is None else background
     ink = DARK if float(np.mean(paper)) > 0.5 else LIGHT
     strip = np.empty((round(5.4 * text), width, 4), np.float32)
@@ -57,7 +55,7 @@ def with_color_bar(
     strip[top:bottom, margin : margin + length, :3] = colors[index, :3][: max(0, width - margin)]
     strip[top:bottom, margin : margin + length, 3] = 1
     _write(strip, title, (margin, round(1.2 * text)), text, ink)
-    for value, label in _ticks(limits, max(2, length // (LABEL * text))):
+    for value, label in _ticks(limits, max(2, length // (7 * text))):
         low, high = limits
         x = margin + round((value - low) / (high - low) * (length - 1))
         strip[bottom : bottom + text // 3, x : x + max(1, text // 8)] = (*ink, 1)
@@ -127,12 +125,15 @@ def _entries(
     height = taken.levels[-1].shape[0]
     bar = round_step(0.12 * width * taken.pixel * unit)
     pixels = max(1, round(bar / (taken.pixel * unit)))
-    reach = FADE * taken.pixel * height / 2
+    reach = STYLE.fade * taken.pixel * height / 2
     entries = [
-        _Entry(0, caption, lambda _area: None, least=round(CAPTION_WIDTH * text)),
+        # Wide enough for any number, so that nothing moves in an animation.
+        _Entry(0, caption, lambda _area: None, least=round(9.5 * text)),
         _Entry(pixels, f"{bar:g}", _scale_bar),
         _Entry(5 * text, "inside, outside", lambda area: _ramp(area, reach)),
-        _Entry(2 * text, f"iso-lines every {iso_step * unit:.6g}", lambda area: _line(area, (0.45, 0.45, 0.45), LINE)),
+        _Entry(
+            2 * text, f"iso-lines every {iso_step * unit:.6g}", lambda area: _line(area, (0.45, 0.45, 0.45), STYLE.line)
+        ),
     ]
     count = len(taken.levels)
     for index in range(count):
@@ -171,7 +172,7 @@ def _swatch(area: Floats, color: Color) -> None:
     box[:] = color
     inner = box[1:-1, 1:-1]
     distance = np.linspace(-1, 1, inner.shape[1]).astype(np.float32)
-    inner[:] = (1 - TINT) * distance_color(distance, reach=20.0, slope=0.1) + np.multiply(TINT, color)
+    inner[:] = (1 - STYLE.tint) * distance_color(distance, reach=20.0, slope=0.1) + np.multiply(STYLE.tint, color)
 
 
 def _write(strip: Floats, words: str, place: tuple[int, int], text: int, ink: Color) -> None:

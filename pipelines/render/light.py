@@ -23,9 +23,6 @@ __all__ = ["MATCAPS", "ambient_occlusion", "level_set_curvature", "load_matcap",
 Float32 = NDArray[np.float32]
 
 MATCAPS = ("clay", "chrome")
-SIZE = 256  # of those, in pixels
-# Steps inside the penumbra, in radii of the cone: with 0.5 streaks show on curved surfaces.
-STRIDE = 0.2
 # u below which a ray is given up as dark: v is 0.001 there, and steps only get smaller.
 DARK = 0.02
 
@@ -91,7 +88,8 @@ def soft_shadow(
         f = field.value(start + t[:, None] * lamp, level=level)
         least = torch.minimum(least, f / (slope * t))
         near = f - torch.where(f[:, None] >= slack, slack, 0).amax(1)
-        step = torch.maximum((near - slope * t) / (1 + slope), STRIDE * softness * t)
+        # Steps inside the penumbra, in radii of the cone: with 0.5 streaks show on curved surfaces.
+        step = torch.maximum((near - slope * t) / (1 + slope), 0.2 * softness * t)
         step = torch.minimum(torch.maximum(step, near / 2), near)
         t = t + step.clamp(min=offset / 4)
         going = (least > DARK) & (t < left)
@@ -193,7 +191,7 @@ def load_matcap(name: str | Path) -> Tensor:
         InputError: no such file, or it is not an image.
     """
     if str(name) in MATCAPS:
-        normals = _sphere(SIZE)
+        normals = _sphere(256)
         return torch.from_numpy(_clay(normals) if str(name) == "clay" else _chrome(normals))
     path = Path(name)
     if not path.is_file():

@@ -28,9 +28,6 @@ Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 Painted = Mesh | TexturedMesh
 
-SUPERSAMPLING = 2
-NEAR = 1e-4  # what is nearer than this share of the furthest depth is not drawn: it would fill the image
-
 
 def read_painted(path: str | Path) -> Painted:
     """Read a mesh or a cloud to be drawn: with the image over it, where an OBJ or glTF file has one.
@@ -112,7 +109,8 @@ def cloud_view(surface: Mesh, camera: Camera, *, point_size: float | None = None
 
 
 def _near(z: Float64) -> float:
-    return NEAR * max(float(z.max(initial=0.0)), 0.0)
+    # What is nearer than this share of the furthest depth would fill the image.
+    return 1e-4 * max(float(z.max(initial=0.0)), 0.0)
 
 
 def _visible(vertices: Float64, faces: NDArray[np.integer], camera: Camera) -> tuple[Int64, Int64, Float64]:
@@ -206,7 +204,7 @@ def picture_of(
     camera: Camera,
     *,
     point_size: float | None = None,
-    samples: int = SUPERSAMPLING,
+    samples: int = 2,
     shading: str | None = None,
 ) -> Image:
     """Draw a mesh, its back faces reddish, or a cloud as discs, on white, as ``mplicits render`` does by default.

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -36,26 +37,41 @@ __all__ = [
 ]
 
 Float32 = NDArray[np.float32]
+Color = tuple[float, float, float]
 
 GAMMA = 2.2  # between display values, in which images are stored, and light, which adds up
 
-# Directions to the lamps in the camera's axes: right, up, towards the eye.
-KEY_LAMP = (-0.55, 0.70, 0.60)
-FILL_LAMP = (0.75, 0.05, 0.65)
-# Twelve degrees above a face that looks at the camera, which a wave of one degree then makes a twelfth brighter.
-RAKING_LAMP = (-math.cos(math.radians(12)), 0.0, math.sin(math.radians(12)))
-# Their light, and that of sky and ground, on a surface that faces them; a little warm against a little cool.
-KEY_LIGHT = (0.96, 0.93, 0.88)
-FILL_LIGHT = (0.17, 0.18, 0.20)
-SKY_LIGHT = (0.34, 0.36, 0.39)
-GROUND_LIGHT = (0.15, 0.14, 0.13)
-BACK_TINT = (0.62, 0.36, 0.33)
-# Cosine of the view with a normal beyond which it is the back that is seen, not a rim with a finer level's normal.
-SEEN_FROM_BEHIND = 0.2
 
+@dataclass(frozen=True)
+class Lamps:
+    """The studio of all pictures: directions in the camera's axes (right, up, towards the eye), and linear light.
+
+    Attributes:
+        key: direction to the key lamp.
+        fill: direction to the fill lamp.
+        raking: direction to a lamp twelve degrees above a face that looks at the camera, which a wave of one degree
+            makes a twelfth brighter.
+        key_light: on a surface that faces the lamp.
+        fill_light: likewise.
+        sky_light: from above; a little cool.
+        ground_light: from below; a little warm.
+        back: display colour of back faces.
+        behind: cosine of the view with a normal beyond which the back is seen, not a rim with a finer level's normal.
+    """
+
+    key: Color = (-0.55, 0.70, 0.60)
+    fill: Color = (0.75, 0.05, 0.65)
+    raking: Color = (-math.cos(math.radians(12)), 0.0, math.sin(math.radians(12)))
+    key_light: Color = (0.96, 0.93, 0.88)
+    fill_light: Color = (0.17, 0.18, 0.20)
+    sky_light: Color = (0.34, 0.36, 0.39)
+    ground_light: Color = (0.15, 0.14, 0.13)
+    back: Color = (0.62, 0.36, 0.33)
+    behind: float = 0.2
+
+
+LAMPS = Lamps()
 _MAPS = {"depth": "viridis", "curvature": "diverging", "error": "magma"}
-# Blue – pale – red, in display RGB: the ends equally dark, the middle almost the white of the page.
-_DIVERGING = ((0.09, 0.25, 0.55), (0.36, 0.60, 0.83), (0.94, 0.94, 0.92), (0.90, 0.52, 0.34), (0.60, 0.10, 0.14))
 
 
 def _from_opencv(name: int) -> Float32:
@@ -63,7 +79,7 @@ def _from_opencv(name: int) -> Float32:
     return np.ascontiguousarray(cv2.applyColorMap(ramp, name)[:, 0, ::-1]) / np.float32(255)
 
 
-def _between(anchors: tuple[tuple[float, float, float], ...]) -> Float32:
+def _between(anchors: tuple[Color, ...]) -> Float32:
     at = np.linspace(0, 1, len(anchors))
     ramp = np.linspace(0, 1, 257)
     return np.stack([np.interp(ramp, at, channel) for channel in zip(*anchors, strict=True)], 1).astype(np.float32)
@@ -73,7 +89,10 @@ def _between(anchors: tuple[tuple[float, float, float], ...]) -> Float32:
 COLOR_MAPS: dict[str, Float32] = {
     "viridis": _from_opencv(cv2.COLORMAP_VIRIDIS),
     "magma": _from_opencv(cv2.COLORMAP_MAGMA),
-    "diverging": _between(_DIVERGING),
+    # Blue – pale – red: the ends equally dark, the middle almost the white of the page.
+    "diverging": _between(
+        ((0.09, 0.25, 0.55), (0.36, 0.60, 0.83), (0.94, 0.94, 0.92), (0.90, 0.52, 0.34), (0.60, 0.10, 0.14))
+    ),
 }
 
 
@@ -262,7 +281,7 @@ def _lambert(seen: Seen, camera: Camera, field: Field | None, level: int, option
         raise ValueError("shading='lambert': shadows and occlusion are traced in a field, and there is none")
     normal = _towards_viewer(seen)
     axes = torch.stack((camera.right, -camera.down, -camera.forward)).to(normal)
-    lamps = torch.nn.functional.normalize(normal.new_tensor((KEY_LAMP, FILL_LAMP)), dim=1) @ axes
+    lamps = torch.nn.functional.normalize(normal.new_tensor((LAMPS.key, LAMPS.fill)), dim=1) @ axes
     key, fill = (normal @ lamps.T).clamp(min=0).unbind(1)
     lower = 0.5 - 0.5 * (normal @ axes[1])  # 0 for what faces the sky, 1 for what faces the ground
     open_ = None
@@ -273,11 +292,11 @@ def _lambert(seen: Seen, camera: Camera, field: Field | None, level: int, option
         if options.occlusion:
             open_ = ambient_occlusion(field, seen.position, normal, level=where, reach=options.reach)
             key = key * (0.5 + 0.5 * open_)
-    ambient = torch.lerp(_light(SKY_LIGHT, normal), _light(GROUND_LIGHT, normal), lower[:, None])
-    rest = torch.addcmul(ambient, fill[:, None], _light(FILL_LIGHT, normal))
+    ambient = torch.lerp(_light(LAMPS.sky_light, normal), _light(LAMPS.ground_light, normal), lower[:, None])
+    rest = torch.addcmul(ambient, fill[:, None], _light(LAMPS.fill_light, normal))
     if open_ is not None:
         rest = rest * open_[:, None]
-    light = torch.addcmul(rest, key[:, None], _light(KEY_LIGHT, normal))
+    light = torch.addcmul(rest, key[:, None], _light(LAMPS.key_light, normal))
     return _to_display(_albedo(seen, options) * light)
 
 
@@ -285,7 +304,7 @@ def _raking(seen: Seen, camera: Camera, options: ShadeOptions) -> Tensor:
     """Albedo times the light of a lamp at the left: half of it on what faces the camera, all at twice its cosine."""
     normal = _towards_viewer(seen)
     axes = torch.stack((camera.right, -camera.down, -camera.forward)).to(normal)
-    light = normal @ (normal.new_tensor(RAKING_LAMP) @ axes) / (2 * RAKING_LAMP[2])
+    light = normal @ (normal.new_tensor(LAMPS.raking) @ axes) / (2 * LAMPS.raking[2])
     return _to_display(_albedo(seen, options) * light.clamp(0.02, 1)[:, None])
 
 
@@ -293,15 +312,15 @@ def _towards_viewer(seen: Seen) -> Tensor:
     """Normals ``(P, 3)`` that face the viewer: a back's is turned round, that of a rim (a finer level's) mirrored."""
     cosine = _cosine(seen)[:, None]
     mirrored = seen.normal - 2 * cosine * seen.direction
-    return torch.where(cosine > SEEN_FROM_BEHIND, -seen.normal, torch.where(cosine > 0, mirrored, seen.normal))
+    return torch.where(cosine > LAMPS.behind, -seen.normal, torch.where(cosine > 0, mirrored, seen.normal))
 
 
 def _albedo(seen: Seen, options: ShadeOptions) -> Tensor:
     """What the surface reflects, in linear light: ``(P, 3)``, or ``(3,)`` where it is the same everywhere."""
     albedo = _light(options.clay, seen.normal) if seen.color is None else seen.color
     if options.back_faces:
-        behind = _cosine(seen) > SEEN_FROM_BEHIND
-        albedo = torch.where(behind[:, None], _light(BACK_TINT, seen.normal), albedo)
+        behind = _cosine(seen) > LAMPS.behind
+        albedo = torch.where(behind[:, None], _light(LAMPS.back, seen.normal), albedo)
     return albedo**GAMMA
 
 
@@ -309,7 +328,7 @@ def _to_display(light: Tensor) -> Tensor:
     return light.clamp(0, 1) ** (1 / GAMMA)
 
 
-def _light(color: tuple[float, float, float], like: Tensor) -> Tensor:
+def _light(color: Color, like: Tensor) -> Tensor:
     return torch.tensor(color, dtype=like.dtype, device=like.device)
 
 

@@ -39,10 +39,28 @@ OUTSIDE: tuple[Color, Color] = ((0.91, 0.95, 0.98), (0.42, 0.60, 0.79))
 INSIDE: tuple[Color, Color] = ((1.00, 0.93, 0.84), (0.87, 0.53, 0.27))
 FINEST: Color = (0.11, 0.13, 0.19)
 COARSER: tuple[Color, ...] = ((0.05, 0.53, 0.42), (0.63, 0.20, 0.58), (0.78, 0.14, 0.20), (0.35, 0.35, 0.70))
-TINT = 0.34  # how much of its colour a band lays over what is below
-FADE = 0.35  # distance, as a share of the picture's half height, at which 1 − 1/e of the far colour is reached
-LINE, ZERO_LINE, OUTLINE = 0.9, 2.2, 1.0  # widths in pixels of a picture 640 pixels high
-EVERY_FIFTH = 5  # iso-lines that are drawn stronger
+
+
+@dataclass(frozen=True)
+class Style:
+    """How slices are drawn; widths are in pixels of a picture 640 pixels high.
+
+    Attributes:
+        tint: the share of its colour that a band lays over what is below.
+        fade: distance, as a share of the half height, at which 1 − 1/e of the far colour is reached.
+        line: width of an iso-line; every fifth is drawn stronger.
+        zero_line: width of the surface.
+        outline: width of a band's edge.
+    """
+
+    tint: float = 0.34
+    fade: float = 0.35
+    line: float = 0.9
+    zero_line: float = 2.2
+    outline: float = 1.0
+
+
+STYLE = Style()
 
 
 def plane_axes(normal: Vector, *, up: str = "y") -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -183,28 +201,28 @@ def draw_slice(taken: Slice, *, iso_step: float, bands: bool = True) -> Image:
     height = values.shape[0]
     stroke = max(height / 640, 0.75)
     slope = _slope(values, taken.pixel)
-    image = distance_color(values, reach=FADE * taken.pixel * height / 2, slope=slope)
+    image = distance_color(values, reach=STYLE.fade * taken.pixel * height / 2, slope=slope)
 
     nearest = np.rint(values / iso_step)
     far = np.abs(values - nearest * iso_step) / slope
-    strong = nearest % EVERY_FIFTH == 0
-    lines = _stroke(far, LINE * stroke * np.where(strong, 1.25, 1.0)) * np.where(strong, 0.50, 0.26)
+    strong = nearest % 5 == 0
+    lines = _stroke(far, STYLE.line * stroke * np.where(strong, 1.25, 1.0)) * np.where(strong, 0.50, 0.26)
     lines[nearest == 0] = 0
     ink = np.where((values < 0)[..., None], np.multiply(INSIDE[1], 0.45), np.multiply(OUTSIDE[1], 0.45))
     image += lines[..., None] * (ink - image)
 
     if bands:
         for index, (band, delta) in enumerate(zip(taken.bands, taken.deltas, strict=True)):
-            _lay(image, level_color(index), TINT * band)
+            _lay(image, level_color(index), STYLE.tint * band)
             level = taken.levels[index]
             edge = np.abs(np.abs(level) - delta) / _slope(level, taken.pixel)
             # A band ends where its own level leaves it; where a coarser band ends first, so does the line.
             allowed = taken.bands[index - 1] if index else np.ones_like(band)
-            _lay(image, level_color(index), 0.8 * _stroke(edge, OUTLINE * stroke) * allowed)
+            _lay(image, level_color(index), 0.8 * _stroke(edge, STYLE.outline * stroke) * allowed)
     for index, level in enumerate(taken.levels):
         last = index == len(taken.levels) - 1
         color = FINEST if last and taken.finest else level_color(index)
-        width = ZERO_LINE * stroke * (1.0 if last else 0.75)
+        width = STYLE.zero_line * stroke * (1.0 if last else 0.75)
         _lay(image, color, _stroke(np.abs(level) / _slope(level, taken.pixel), width))
     return as_bytes(image)
 

@@ -24,9 +24,6 @@ __all__ = ["SliceOptions", "slice_run"]
 Float64 = NDArray[np.float64]
 Triple = tuple[float, float, float]
 
-MARGIN = 1.16  # the picture is this much larger than the shape
-BOX_RESOLUTION = 64  # of the mesh that says where the shape is
-
 
 @dataclass(frozen=True)
 class SliceOptions:
@@ -115,7 +112,7 @@ class _View:
         self.u, self.v = plane_axes(self.normal, up=options.up)
         self.normal = self.normal / np.linalg.norm(self.normal)
         try:
-            shape = extract_mesh(field, resolution=BOX_RESOLUTION, level=level).vertices.astype(np.float64)
+            shape = extract_mesh(field, resolution=64, level=level).vertices.astype(np.float64)
         except NoSurfaceError as error:
             raise InputError(f"{file}: no surface to slice ({error})") from error
         axes = np.stack((self.u, self.v, self.normal), axis=1)
@@ -124,7 +121,8 @@ class _View:
         self.middle = (self.begin + self.end) / 2
         half = (high - low) / 2
         width, height = options.size
-        self.half_size = float(max(half[0] * height / width, half[1])) * MARGIN / options.zoom
+        # The picture is larger than the shape by a margin.
+        self.half_size = float(max(half[0] * height / width, half[1])) * 1.16 / options.zoom
         self.iso_step = round_step(2 * self.half_size * similarity.scale / options.lines) / similarity.scale
         center = (low + high)[:2] / 2
         if options.center is not None:

@@ -28,10 +28,7 @@ __all__ = ["photograph_mesh", "sees", "true_mesh"]
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 
-PIXELS = 1 << 21  # that are drawn at once, before they are averaged
 CLAY = 0.7  # display grey of a mesh without colours
-REGION = 1.05  # radius of the region of interest, in radii of the mesh
-SPARSE_POINTS = 1000  # as many as structure from motion would give, more or less
 # Pixels from a point that is seen to the tangent plane of what the middle of its pixel sees, and to that place itself,
 # at most: on a slope the latter is further.
 FLAT, NEAR = 1.0, 10.0
@@ -78,7 +75,8 @@ def photograph_mesh(
     ball = Similarity.to_unit_sphere(mesh.vertices[np.unique(mesh.faces)])
     mesh = dataclasses.replace(mesh, vertices=ball.to_unit(mesh.vertices))
     light = _Light(shaded=shaded or not _has_colors(mesh), glossy=glossy)
-    points, _ = sample_points(Mesh(mesh.vertices, mesh.faces), SPARSE_POINTS, np.random.default_rng(seed))
+    # About as many as structure from motion would give.
+    points, _ = sample_points(Mesh(mesh.vertices, mesh.faces), 1000, np.random.default_rng(seed))
     images: list[PosedImage] = []
     observed: list[NDArray[np.bool_]] = []
     placed = cameras_around(ball.scale, up=up, views=views, size=size, seed=seed, middle=ball.center)
@@ -91,7 +89,8 @@ def photograph_mesh(
         images.append(PosedImage(f"{index:03d}.png", camera, color, mask, depth))
         if progress is not None:
             progress(index + 1, views)
-    region = Similarity(ball.center, REGION * ball.scale)
+    # The region of interest is a little larger than the mesh.
+    region = Similarity(ball.center, 1.05 * ball.scale)
     seen = np.argwhere(np.stack(observed))
     return PosedImages(tuple(images), region, "around the mesh", ball.to_input(points), Path(path), seen)
 
@@ -144,7 +143,7 @@ def _has_colors(mesh: Painted) -> bool:
 
 def _photograph(mesh: Painted, camera: Camera, samples: int, light: _Light) -> tuple[Float32, Float32]:
     """Display RGB ``(H, W, 3)`` with straight alpha, and the mask ``(H, W)``."""
-    parts = [_strip(mesh, fine, samples, light) for fine in fine_strips(camera, samples, pixels=PIXELS)]
+    parts = [_strip(mesh, fine, samples, light) for fine in fine_strips(camera, samples, pixels=1 << 21)]
     color, mask = (np.concatenate(part) for part in zip(*parts, strict=True))
     return color, mask
 

@@ -31,6 +31,7 @@ __all__ = [
     "Panel",
     "Subject",
     "choose_frame",
+    "disc_size",
     "open_subject",
     "orbit_cameras",
     "posed_cameras",
@@ -41,9 +42,6 @@ __all__ = [
 Float64 = NDArray[np.float64]
 
 FRAME_RESOLUTION = 128  # of the mesh that says what the camera has to look at
-SAMPLES = 500_000  # on a reference that is a mesh
-WIDER = 2.0  # discs of a reference, so that they leave no gaps between points that are spread at random
-DISC = 2.2  # diameter of a cloud's discs, in distances between neighbouring points
 
 
 @dataclass(frozen=True)
@@ -209,13 +207,13 @@ def _surface_subject(file: Path) -> Subject:
     except ValueError as error:
         raise InputError(f"{file}: {error}") from error
     moved = dataclasses.replace(surface, vertices=similarity.to_unit(surface.vertices))
-    spacing = 0.0 if solid else _spacing(moved.vertices)
+    disc = 0.0 if solid else disc_size(moved.vertices)
 
     def view(camera: Camera, _panel: Panel) -> Seen:
         if isinstance(moved, TexturedMesh) or solid:
             return mesh_view(moved, camera)
         distance = max(float(camera.eye.norm()), 1e-3)
-        size = DISC * spacing * float(camera.intrinsics[1, 1]) / distance
+        size = disc * float(camera.intrinsics[1, 1]) / distance
         return cloud_view(moved, camera, point_size=max(size, 1.0))
 
     return Subject(
@@ -231,10 +229,10 @@ def _surface_subject(file: Path) -> Subject:
     )
 
 
-def _spacing(points: Float64) -> float:
-    """A distance within which most points have a neighbour."""
+def disc_size(points: NDArray[np.floating]) -> float:
+    """The diameter of the discs that stand for points ``(N, 3)``: 2.2 times the distance of most neighbours."""
     chosen = points[:: max(1, len(points) // 20_000)]
-    return float(np.quantile(KDTree(points).query(chosen, k=2)[0][:, 1], 0.9))
+    return 2.2 * float(np.quantile(KDTree(points).query(chosen, k=2)[0][:, 1], 0.9))
 
 
 def reference_distance(subject: Subject, reference: str | Path | None) -> Callable[[Tensor], Tensor]:
@@ -259,7 +257,7 @@ def reference_distance(subject: Subject, reference: str | Path | None) -> Callab
     surface = read_surface(reference)
     points, normals = surface.vertices, surface.normals
     if len(surface.faces):
-        points, normals = sample_points(surface, SAMPLES, np.random.default_rng(0))
+        points, normals = sample_points(surface, 500_000, np.random.default_rng(0))
     points = subject.similarity.to_unit(points)
     if normals is None:
         tree = KDTree(points)
@@ -268,7 +266,8 @@ def reference_distance(subject: Subject, reference: str | Path | None) -> Callab
     if known.sum() < 2:
         raise InputError(f"{reference}: fewer than two points with normals; nothing can be measured from it")
     cloud = CloudDistance(torch.from_numpy(points[known]), torch.from_numpy(normals[known]))
-    cloud.radii *= WIDER
+    # Wider discs leave no gaps between points that are spread at random.
+    cloud.radii *= 2.0
     return lambda places: cloud.signed(places).abs().to(places)
 
 

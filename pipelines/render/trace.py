@@ -32,16 +32,28 @@ __all__ = [
 ]
 
 STRIP = 1 << 19  # pixels that are worked on at a time: about a third of a gigabyte
-# A trace ends within this share of a pixel; the jet's Newton step, which costs nothing, then leaves about its square.
-TOLERANCE = 0.1
-# Two crossings within this share of a pixel may be overlooked.
-RESOLUTION = 0.75
-# No Newton step is longer than this, in pixels: a hit on the jump at a gate's edge is right where it is.
-NEWTON_REACH = 2 * TOLERANCE
-# Below this slope along the ray a Newton step is not to be trusted: the surface may turn away before it arrives.
-SHALLOW = 0.05
-# A camera in the shape looks at things at least this far away, in the field's units.
-NEAREST = 0.05
+
+
+@dataclass(frozen=True)
+class Precision:
+    """How exactly pictures are traced.
+
+    Attributes:
+        tolerance: of depths, in pixels; the jet's Newton step, which costs nothing, leaves about its square.
+        resolution: of the march, in pixels: two crossings nearer to each other may be overlooked.
+        newton: the longest Newton step, in pixels; a hit on the jump at a gate's edge is right where it is.
+        shallow: slope along the ray below which no Newton step is made: the surface may turn away before it arrives.
+        nearest: least distance of what a camera in the shape looks at, in the field's units.
+    """
+
+    tolerance: float = 0.1
+    resolution: float = 0.75
+    newton: float = 0.2
+    shallow: float = 0.05
+    nearest: float = 0.05
+
+
+PRECISION = Precision()
 
 
 @dataclass(frozen=True)
@@ -166,7 +178,7 @@ def _draw(
 
     pixel, eye = pixel_size(camera), camera.eye.tolist()
     axes = camera.world_from_camera[:3, :3].flatten().tolist()
-    march = (TOLERANCE * pixel, RESOLUTION * pixel, 1.0, NEWTON_REACH * pixel)
+    march = (PRECISION.tolerance * pixel, PRECISION.resolution * pixel, 1.0, PRECISION.newton * pixel)
     view = [*camera.fx_fy_cx_cy, *axes, *eye, *march, BOUNDING_RADIUS, math.hypot(*eye) + BOUNDING_RADIUS]
     setting = Setting(
         camera.width,
@@ -175,7 +187,7 @@ def _draw(
         max_steps=MAX_STEPS,
         cone_steps=CONE_STEPS,
         lipschitz=CONE_LIPSCHITZ,
-        shallow=SHALLOW,
+        shallow=PRECISION.shallow,
         march=tuple(march_constants(torch.float32).items()),
     )
     traced = as_levels(field, level)
@@ -203,8 +215,8 @@ def see_hits(
     jet = field.jet(position, level=normal_level)
     if normal_level == level:
         slope = (jet.gradient * direction).sum(dim=-1)
-        trusted = slope.abs() > SHALLOW * jet.gradient.norm(dim=-1)
-        reach = NEWTON_REACH * pixel_size(camera)
+        trusted = slope.abs() > PRECISION.shallow * jet.gradient.norm(dim=-1)
+        reach = PRECISION.newton * pixel_size(camera)
         step = torch.where(trusted, -jet.value / slope, 0).clamp(-reach, reach)
         depth, position = depth + step, torch.addcmul(position, step[:, None], direction)
     color = None if colors is None else colors(position)
@@ -228,11 +240,17 @@ def trace_hits(
     size = pixel_size(camera)
     near = cone_starts(field, eye, directions, level=level, lipschitz=CONE_LIPSCHITZ)
     return sphere_trace(
-        field, eye, directions, level=level, near=near, tolerance=TOLERANCE * size, resolution=RESOLUTION * size
+        field,
+        eye,
+        directions,
+        level=level,
+        near=near,
+        tolerance=PRECISION.tolerance * size,
+        resolution=PRECISION.resolution * size,
     )
 
 
 def pixel_size(camera: Camera) -> float:
     """Width of a pixel at the near side of the ball that holds the surface, in the field's units."""
-    distance = max(math.hypot(*camera.eye.tolist()) - BOUNDING_RADIUS, NEAREST)
+    distance = max(math.hypot(*camera.eye.tolist()) - BOUNDING_RADIUS, PRECISION.nearest)
     return distance / max(camera.fx_fy_cx_cy[:2])

@@ -1,5 +1,6 @@
-"""``web``: a fitted field as one HTML file, traced on the GPU of whoever opens it."""
+"""``web`` and ``view``: a field, a mesh or a cloud as a page that the browser draws."""
 
 from .export import WebOptions, WebPage, web_run
+from .serve import PageServer
 
-__all__ = ["WebOptions", "WebPage", "web_run"]
+__all__ = ["PageServer", "WebOptions", "WebPage", "web_run"]

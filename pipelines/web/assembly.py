@@ -20,6 +20,7 @@ __all__ = ["field_file", "fill_page", "write_folder"]
 SCRIPTS = (
     "decode.js",
     "network.js",
+    "raster.js",
     "tracer.js",
     "camera.js",
     "kernels.js",
@@ -41,7 +42,7 @@ POLICY = (
     "default-src 'none'; script-src 'sha256-{boot}' 'sha256-{script}'; style-src 'sha256-{style}'; "
     "img-src blob: data:; base-uri 'none'; form-action 'none'"
 )
-# A page that is served live hears of new fields, from where it came from and from nowhere else.
+# A page that is served fetches new fields from where it came from, and from nowhere else.
 LIVE_POLICY = "; connect-src 'self'"
 
 
@@ -49,7 +50,7 @@ def fill_page(header: Mapping[str, Any], data: bytes, *, live: bool = False) -> 
     """The page with a header and its bytes in it, and a policy that lets its own script and styles run, and no others.
 
     What comes from the run stands in blocks of data, which browsers do not run, and in which no "<" is left.
-    A ``live`` page also asks where it came from for new fields, by a WebSocket.
+    A ``live`` page also asks where it came from for new fields.
     """
     scripts = (*SCRIPTS, "main.js", *(("file.js", "live.js") if live else ()))
     script = "\n" + "\n".join(_bare(_source(name)) for name in scripts)

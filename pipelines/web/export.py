@@ -1,40 +1,36 @@
-"""From a run to the page: what is shown of it, rounded and packed."""
+"""Packs what a page shows: a run, a field, a mesh or a cloud."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, overload
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...datasets.cameras import turntable
-from ...neural_fields import Field, InputError, MultiscaleSDF, Siren, TextureField, extract_mesh, load_field
+from ...neural_fields import Field, InputError, MultiscaleSDF, Similarity, TextureField, extract_mesh, load_field
 from ...neural_fields.backend.files import write_whole
-from ...neural_fields.checkpoint import SavedField
 from ...neural_fields.meshing.extract import NoSurfaceError
-from ...neural_fields.networks.multiscale import levels_of
 from ...neural_fields.spacetime.field import SpaceTimeSDF
 from ...neural_fields.tracing.sphere import BOUNDING_RADIUS
 from ..render.subject import FRAME_RESOLUTION, traced_part
 from ..texture.train import texture_of
-from ..training.folder import chosen_level, find_field, load_still
+from ..training.folder import chosen_level, find_field, fitted_cloud, is_field, load_still
 from .assembly import fill_page, write_folder
 from .film import MOMENTS, band_reach, swept_shell
 from .networks import Rounding, network_layers, rounding_error, shader_levels, taper_of
 from .payload import Payload
+from .shapes import Shape, add_shape, distance_cloud, field_shapes, read_shape
 from .shell import GRID, shell_mesh, surface_reach
 
-__all__ = ["BITS", "PAGES", "Packed", "WebOptions", "WebPage", "pack_run", "web_run"]
+__all__ = ["BITS", "PAGES", "Packed", "WebOptions", "WebPage", "pack", "pack_field", "pack_shapes", "web_run"]
 
 PAGES = (".html", ".htm")
 BITS = 13
-VERSION = 1
-CHANNELS = 3
-ERROR_POINTS = 4000  # at which rounding is measured
 
 
 @dataclass(frozen=True)
@@ -46,14 +42,16 @@ class WebOptions:
         time: the moment, of a run that moves; None shows all of its moments.
         colors: whether the colours of the run's texture are in it, if it has one and does not move.
         float32: whether the weights are kept as they are; else they are rounded to `BITS` bits.
+        cloud: a cloud beside the field, coloured by its distance; "auto" is what the run was fitted to, if it is found.
         up: the axis that points up, "y" or "z".
-        title: of the page; None is the name of the run.
+        title: of the page; None is the name of the run or file.
     """
 
     levels: int | None = None
     time: float | None = None
     colors: bool = True
     float32: bool = False
+    cloud: str | Path | None = None
     up: str = "y"
     title: str | None = None
 
@@ -64,9 +62,9 @@ class WebPage:
 
     Attributes:
         size: of the file, or of what the element fetches: ``field.bin`` and its module; in bytes.
-        levels: that it shows.
+        levels: of the field that it traces; 0 if it shows clouds or meshes alone.
         colored: whether it has colours.
-        triangles: of the mesh between which rays are sought.
+        triangles: of the mesh between which rays are sought, or of the meshes that it shows.
         rounding: what rounding the weights has changed, for each level; empty if they are exact.
     """
 
@@ -78,12 +76,12 @@ class WebPage:
 
 
 class Packed(NamedTuple):
-    """A run as a page carries it.
+    """What a page carries.
 
     Attributes:
-        header: what is shown, and what stands where among the bytes.
-        data: deflated.
-        page: what is told of it; the size is not known yet.
+        header: describes what is shown, and where it is among the bytes.
+        data: deflated bytes.
+        page: figures of it; the size is not known yet.
     """
 
     header: dict[str, Any]
@@ -92,27 +90,32 @@ class Packed(NamedTuple):
 
 
 def web_run(
-    run: str | Path, out: str | Path, options: WebOptions | None = None, *, say: Callable[[str], None] | None = None
+    source: str | Path,
+    out: str | Path,
+    options: WebOptions | None = None,
+    *,
+    say: Callable[[str], None] | None = None,
 ) -> WebPage:
-    """Write a page that shows a run, and needs nothing but itself; or a folder, to show it in another page.
+    """Write a page that shows a run, a mesh or a cloud, and needs nothing but itself; or a folder for another page.
 
     Args:
-        run: run directory or .safetensors file.
+        source: run directory, .safetensors file, mesh or cloud.
         out: a file of `PAGES`; any other name is a folder's, see `write_folder`.
         options: what to show.
         say: called with a line about what rounding has cost, and what is shown.
 
     Raises:
-        InputError: there is no such run, it has no surface or is of a kind that no shader knows, or the file cannot be
-            written.
+        InputError: see `pack`, or the file cannot be written.
     """
-    header, data, page = pack_run(run, options)
+    header, data, page = pack(source, options)
     out = Path(out)
-    if out.suffix.lower() in PAGES:
+    alone = out.suffix.lower() in PAGES
+    if alone:
         write_whole(out, fill_page(header, data))
     else:
         write_folder(out, header, data)
-    done = dataclasses.replace(page, size=sum(part.stat().st_size for part in _fetched(out)))
+    fetched = [out] if alone else [out / "field.bin", out / "mplicits-field.js"]
+    done = dataclasses.replace(page, size=sum(part.stat().st_size for part in fetched))
     if say is not None and header["moves"]:
         say("it moves: all of its moments are on the page; --time T shows one")
     if say is not None and done.rounding:
@@ -122,107 +125,183 @@ def web_run(
     return done
 
 
-def pack_run(run: str | Path, options: WebOptions | None = None) -> Packed:
-    """What a page shows of a run.
+def pack(source: str | Path, options: WebOptions | None = None) -> Packed:
+    """Pack a run, a mesh or a cloud.
 
     Args:
-        run: run directory or .safetensors file.
+        source: run directory, .safetensors file, mesh or cloud.
         options: what to show.
 
     Raises:
-        NoShaderError: no shader knows this kind of field.
-        InputError: there is no such run, or it has no surface.
+        InputError: it cannot be read, has no surface, or an option does not go with it.
     """
     options = options or WebOptions()
-    file = find_field(run)
-    saved = _shown(file, options.time)
-    shown = saved.field
-    still = shown.in_dim == 3 and options.time is None
-    texture = texture_of(file, shown) if options.colors and still else None
+    if not is_field(source):
+        for name in ("levels", "time", "cloud"):
+            if getattr(options, name) not in (None, "auto"):
+                raise InputError(f"--{name}: goes with a run; {source} is a mesh or a cloud")
+        shape, similarity = read_shape(Path(source))
+        return pack_shapes([shape], similarity, options, name=Path(source).stem)
+    file = find_field(source)
+    field, similarity, metadata = _loaded(file, options.time)
+    texture = texture_of(file, field) if options.colors and field.in_dim == 3 and options.time is None else None
     if options.levels is not None:
-        chosen_level(shown, file, options.levels - 1, flag="--levels")
-        shown = _coarse(shown, options.levels)
-    return _content(shown, texture, saved, file, options)
-
-
-def _fetched(out: Path) -> list[Path]:
-    """What a browser fetches: the page, or of a folder the field and the module."""
-    return [out] if out.suffix.lower() in PAGES else [out / "field.bin", out / "mplicits-field.js"]
-
-
-def _shown(file: Path, time: float | None) -> SavedField:
-    """A field that stands still, frozen at its time if it moves and there is one; else a `SpaceTimeSDF`."""
-    saved = load_field(file)
-    if time is None and isinstance(saved.field, SpaceTimeSDF):
-        return saved
-    return load_still(file, time)
-
-
-@overload
-def _coarse(shown: MultiscaleSDF, levels: int) -> MultiscaleSDF: ...
-@overload
-def _coarse(shown: Field, levels: int) -> Field: ...
-def _coarse(shown: Field, levels: int) -> Field:
-    """The first levels of a field."""
-    if isinstance(shown, SpaceTimeSDF):
-        return SpaceTimeSDF(_coarse(shown.sdf, levels))
-    if not isinstance(shown, MultiscaleSDF) or levels == shown.num_levels:
-        return shown
-    residuals = list(shown.levels[1:levels])
-    return MultiscaleSDF(shown.base, residuals, shown.deltas[: levels - 1], taper=shown.taper)
-
-
-def _name_of(file: Path) -> str:
-    return file.resolve().parent.name if file.name == "field.safetensors" else file.stem
-
-
-def _content(shown: Field, texture: TextureField | None, saved: SavedField, file: Path, options: WebOptions) -> Packed:
-    moving = shown if isinstance(shown, SpaceTimeSDF) else None
-    stills: list[Field] = [shown] if moving is None else [moving.at(float(t)) for t in MOMENTS]
-    shader_levels(stills[0], file)
-    networks = [part for part in levels_of(shown if moving is None else moving.sdf) if isinstance(part, Siren)]
+        chosen_level(field, file, options.levels - 1, flag="--levels")
+        field = _coarse(field, options.levels)
+    cloud = None if options.cloud in (None, "auto") else Path(str(options.cloud))
+    if options.cloud == "auto" and metadata.get("run", {}).get("cloud"):
+        try:
+            cloud = fitted_cloud(file, metadata, remedy="")
+        except InputError:
+            cloud = None
+    if cloud is not None and field.in_dim != 3:
+        raise InputError(f"--cloud: {file} moves; add --time T, or leave it out")
+    name = file.resolve().parent.name if file.name == "field.safetensors" else file.stem
     try:
-        outlines = _outlines(stills)
-        shell = shell_mesh(shown) if moving is None else swept_shell(moving)
+        return pack_field(field, similarity, options, name=name, texture=texture, cloud=cloud)
     except NoSurfaceError as error:
         raise InputError(f"{file}: no surface to show ({error})") from error
-    outline = np.concatenate([points for _, points in outlines])
+
+
+def pack_field(
+    field: Field,
+    similarity: Similarity,
+    options: WebOptions | None = None,
+    *,
+    name: str = "field",
+    texture: TextureField | None = None,
+    cloud: Path | None = None,
+) -> Packed:
+    """Pack a field: levels of SIRENs as networks that the page traces, any other as meshes of its levels.
+
+    Args:
+        field: three-dimensional, or levels of SIRENs in space and time.
+        similarity: from input coordinates to the field's.
+        options: what to show.
+        name: the title, if ``options`` has none.
+        texture: colours of the surface.
+        cloud: a file of points to show beside it.
+
+    Raises:
+        NoSurfaceError: there is no surface.
+        InputError: it moves and no shader traces it, or the cloud cannot be read.
+    """
+    options = options or WebOptions()
+    shapes = [] if cloud is None else [distance_cloud(cloud, field, similarity)]
+    moving = field if isinstance(field, SpaceTimeSDF) else None
+    stills: list[Field] = [field] if moving is None else [moving.at(float(t)) for t in MOMENTS]
+    networks = shader_levels(field if moving is None else moving.sdf)
+    if networks is None:
+        if moving is not None:
+            raise InputError(f"{name}: a page shows only SIRENs at all times; choose one with --time T")
+        return pack_shapes([*field_shapes(field, texture), *shapes], similarity, options, name=name)
+    outlines = _outlines(stills)
+    shell = shell_mesh(field) if moving is None else swept_shell(moving)
     bits = None if options.float32 else BITS
     rounding = [] if bits is None else _rounding(outlines, bits)
     payload = Payload()
     levels = [payload.add_network(f"level{index}", network_layers(part, bits)) for index, part in enumerate(networks)]
     colors = None
     if texture is not None:
-        colors = payload.add_network("colors", network_layers(texture.network.siren, bits, channels=CHANNELS))
+        colors = payload.add_network("colors", network_layers(texture.network.siren, bits, channels=3))
         # Of a page with fewer levels, the finest that it has stands for the one that was coloured.
-        colors["level"] = min(texture.geometry_level, shown.num_levels - 1)
+        colors["level"] = min(texture.geometry_level, field.num_levels - 1)
         colors |= {"delta": float(texture.delta), "outside": texture.outside.tolist()}
     low, high = shell.vertices.min(axis=0), shell.vertices.max(axis=0)
     payload.add_steps("shell.vertices", np.rint((shell.vertices - low) / (high - low) * GRID).T)
     payload.add_steps("shell.faces", shell.faces)
-    data, described = payload.content()
+    page = WebPage(0, len(levels), colors is not None, len(shell.faces), tuple(rounding))
+    outline = np.concatenate([points for _, points in outlines])
     header = {
-        "format": "mplicits-web",
-        "version": VERSION,
-        "title": options.title or _name_of(file),
         "moves": moving is not None,
         "levels": levels,
         "colors": colors,
-        "deltas": [float(delta) for delta in shown.deltas],
+        "deltas": [float(delta) for delta in field.deltas],
         "taper": taper_of(stills[0]),
         # What a film's levels reach at every moment is not known; their bands are.
-        "reach": surface_reach(shown) if moving is None else band_reach(shown),
-        "radius": BOUNDING_RADIUS,
+        "reach": surface_reach(field) if moving is None else band_reach(field),
         "shell": {"low": low.tolist(), "high": high.tolist(), "grid": GRID, "triangles": len(shell.faces)},
-        "view": _view(outline, options.up),
-        "unit": saved.similarity.scale,
-        "center": list(saved.similarity.center),
         "bits": bits,
         "rounding": [dataclasses.asdict(part) for part in rounding],
-        **described,
     }
-    page = WebPage(0, len(levels), colors is not None, len(shell.faces), tuple(rounding))
-    return Packed(header, data, page)
+    return _packed(payload, header, shapes, page, outline, similarity, options.title or name, options.up)
+
+
+def pack_shapes(
+    shapes: Sequence[Shape], similarity: Similarity, options: WebOptions | None = None, *, name: str
+) -> Packed:
+    """Pack clouds and meshes, without a field.
+
+    Args:
+        shapes: at least one, in unit-sphere coordinates.
+        similarity: from input coordinates to those.
+        options: ``up`` and ``title`` are used.
+        name: the title, if ``options`` has none.
+    """
+    options = options or WebOptions()
+    outline = np.concatenate([shape.vertices for shape in shapes if not shape.hidden])
+    header = {
+        "moves": False,
+        "levels": [],
+        "colors": None,
+        "deltas": [],
+        "taper": 0.0,
+        "reach": [],
+        "shell": {"low": outline.min(axis=0).tolist(), "high": outline.max(axis=0).tolist()},
+        "bits": None,
+        "rounding": [],
+    }
+    triangles = sum(0 if shape.faces is None else len(shape.faces) for shape in shapes)
+    page = WebPage(0, 0, any(shape.colors is not None for shape in shapes), triangles, ())
+    return _packed(Payload(), header, shapes, page, outline, similarity, options.title or name, options.up)
+
+
+def _packed(
+    payload: Payload,
+    header: dict[str, Any],
+    shapes: Sequence[Shape],
+    page: WebPage,
+    outline: NDArray[np.floating],
+    similarity: Similarity,
+    title: str,
+    up: str,
+) -> Packed:
+    described = [add_shape(payload, shape, index) for index, shape in enumerate(shapes)]
+    data, blocks = payload.content()
+    # The camera stands first where `mplicits render` would put it for a picture as wide as high.
+    middle = (outline.min(axis=0) + outline.max(axis=0)) / 2
+    distance = float(np.linalg.norm(turntable(outline, 1, up=up)[0].eye.numpy() - middle))
+    view = {"middle": middle.tolist(), "distance": distance, "azimuth": 30.0, "elevation": 15.0, "up": up, "fov": 25.0}
+    whole = {
+        "format": "mplicits-web",
+        "version": 2,
+        "title": title,
+        **header,
+        "shapes": described,
+        "radius": BOUNDING_RADIUS,
+        "view": view,
+        "unit": similarity.scale,
+        "center": list(similarity.center),
+        **blocks,
+    }
+    return Packed(whole, data, page)
+
+
+def _loaded(file: Path, time: float | None) -> tuple[Field, Similarity, dict[str, Any]]:
+    """A field that stands still, frozen at its time if it moves and there is one; else a `SpaceTimeSDF`."""
+    saved = load_field(file)
+    return saved if time is None and isinstance(saved.field, SpaceTimeSDF) else load_still(file, time)
+
+
+def _coarse(field: Field, levels: int) -> Field:
+    """The first levels of a field."""
+    if isinstance(field, SpaceTimeSDF):
+        sdf = _coarse(field.sdf, levels)
+        return SpaceTimeSDF(sdf) if isinstance(sdf, MultiscaleSDF) else field
+    if not isinstance(field, MultiscaleSDF) or levels == field.num_levels:
+        return field
+    residuals = list(field.levels[1:levels])
+    return MultiscaleSDF(field.base, residuals, field.deltas[: levels - 1], taper=field.taper)
 
 
 def _outlines(stills: list[Field]) -> list[tuple[Field, NDArray[np.floating]]]:
@@ -244,18 +323,10 @@ def _outlines(stills: list[Field]) -> list[tuple[Field, NDArray[np.floating]]]:
 
 
 def _rounding(outlines: list[tuple[Field, NDArray[np.floating]]], bits: int) -> list[Rounding]:
-    """What rounding changes, for each level: the most of all moments."""
-    every = max(1, sum(len(points) for _, points in outlines) // ERROR_POINTS)
+    """What rounding changes at about 4,000 points, for each level: the most of all moments."""
+    every = max(1, sum(len(points) for _, points in outlines) // 4000)
     found = [rounding_error(still, bits, points[::every]) for still, points in outlines]
     return [
         Rounding(max(part.value for part in parts), max(part.angle for part in parts))
         for parts in zip(*found, strict=True)
     ]
-
-
-def _view(outline: NDArray[np.floating], up: str) -> dict[str, Any]:
-    """Where the camera stands first: where ``mplicits render`` would put it for a picture as wide as high."""
-    camera = turntable(outline, 1, up=up)[0]
-    middle = (outline.min(axis=0) + outline.max(axis=0)) / 2
-    distance = float(np.linalg.norm(camera.eye.numpy() - middle))
-    return {"middle": middle.tolist(), "distance": distance, "azimuth": 30.0, "elevation": 15.0, "up": up, "fov": 25.0}

@@ -22,9 +22,7 @@ __all__ = ["MOMENTS", "Swept", "band_reach", "fastest_change", "swept_shell"]
 
 MOMENTS = np.linspace(0.0, 1.0, 5)  # at which surfaces are looked at: the first view, what rounding changes
 LATTICE, TIMES = 24, 9  # along the box and in time: where changes are measured
-NEAR = 0.2  # from the band: how far changes are of interest
 CELL = 2 * BOUNDING_RADIUS / CELLS
-MOST_MOMENTS = 65
 
 
 class Swept(Field):
@@ -35,7 +33,7 @@ class Swept(Field):
         f(x) = min_k f(x, t_k) − ½ Δt s,  Δt = t_(k+1) − t_k,
 
     which is no more than f(x, t) at any t, if no value changes faster than s. So its offset surfaces hold those of
-    every moment. There are so many moments that ½ Δt s is at most half a cell of the mesh, and at most `MOST_MOMENTS`.
+    every moment. There are so many moments that ½ Δt s is at most half a cell of the mesh, and at most 65.
 
     Args:
         field: that moves.
@@ -44,7 +42,7 @@ class Swept(Field):
 
     def __init__(self, field: SpaceTimeSDF, speed: float) -> None:
         super().__init__()
-        count = min(MOST_MOMENTS, 2 + math.floor(speed / CELL))
+        count = min(65, 2 + math.floor(speed / CELL))
         self.in_dim, self.num_levels = 3, field.num_levels
         self.stills = torch.nn.ModuleList(field.at(float(t)) for t in np.linspace(0, 1, count))
         self.margin = 0.5 * speed / (count - 1)
@@ -80,7 +78,8 @@ def fastest_change(field: SpaceTimeSDF) -> float:
     line = torch.linspace(-BOUNDING_RADIUS, BOUNDING_RADIUS, LATTICE, dtype=field.like.dtype, device=field.like.device)
     places = torch.cartesian_prod(line, line, line)
     places = places[places.norm(dim=-1) <= BOUNDING_RADIUS]
-    near = NEAR + (float(field.deltas[0]) if field.num_levels > 1 else 0.0)
+    # Changes are of interest up to 0.2 from the band.
+    near = 0.2 + (float(field.deltas[0]) if field.num_levels > 1 else 0.0)
     fastest = 0.0
     for t in np.linspace(0, 1, TIMES):
         jet = field.jet(at_time(places, float(t)), level=0)

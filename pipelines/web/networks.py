@@ -15,12 +15,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ...neural_fields import Field, InputError, MultiscaleSDF, Siren
+from ...neural_fields import Field, MultiscaleSDF, Siren
 from ...neural_fields.networks.multiscale import levels_of
 
 __all__ = [
     "Layer",
-    "NoShaderError",
     "Rounding",
     "network_layers",
     "rounded_field",
@@ -30,10 +29,6 @@ __all__ = [
 ]
 
 TURN = 2 * math.pi
-
-
-class NoShaderError(InputError):
-    """A field of a kind that the page's shaders do not know."""
 
 
 @dataclass(frozen=True)
@@ -68,25 +63,11 @@ class Rounding:
     angle: float
 
 
-def shader_levels(field: Field, name: object) -> list[Siren]:
-    """The networks of a field's levels, coarse to fine.
-
-    Args:
-        field: three-dimensional.
-        name: of its file, for the message.
-
-    Raises:
-        NoShaderError: a level is no SIREN, and no shader here knows it.
-    """
+def shader_levels(field: Field) -> list[Siren] | None:
+    """The networks of a field's levels, coarse to fine; None if a level is no SIREN, which no shader traces."""
     levels = levels_of(field)
     networks = [level for level in levels if isinstance(level, Siren)]
-    if field.in_dim != 3 or len(networks) != len(levels):
-        odd = next((level for level in levels if not isinstance(level, Siren)), field)
-        raise NoShaderError(
-            f"{name}: a page traces SIRENs and their levels, not a {type(odd).__name__}; "
-            "look at it with `mplicits view --stream`, or fit its mesh"
-        )
-    return networks
+    return networks if len(networks) == len(levels) else None
 
 
 def network_layers(network: Siren, bits: int | None, *, channels: int = 1) -> list[Layer]:
@@ -128,7 +109,7 @@ def _layer(weight: NDArray[np.float64], bias: NDArray[np.float64], bits: int | N
 def rounded_field(field: Field, bits: int) -> Field:
     """A copy of a field with the weights that a page of ``bits`` bits has; on its device, in its precision."""
     rounded = copy.deepcopy(field)
-    for network in shader_levels(rounded, "field"):
+    for network in shader_levels(rounded) or []:
         frequency = network.omega * network.units[0] / TURN
         for linear, layer in zip(network.layers, network_layers(network, bits), strict=False):
             assert isinstance(linear, torch.nn.Linear)

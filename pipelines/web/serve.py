@@ -1,64 +1,61 @@
-"""``mplicits view``: the page of a run on this machine, and each new checkpoint of it by a WebSocket.
+"""A page on this machine, and each new version of what it shows: ``mplicits view``, ``fit --watch`` and ``show()``.
 
-The browser draws. What is served is the page of `web_run` with one script more, and the bytes of new fields: nothing is
-evaluated here but what a page needs once, and nothing that a browser says is listened to.
+The browser draws. The server sends the page, and events that name the newest field, which the page then fetches.
 """
 
 from __future__ import annotations
 
-import logging
+import errno
+import json
+import socket
 import threading
+from collections.abc import Callable
+from contextlib import suppress
 from http import HTTPStatus
-from pathlib import Path
+from http.server import BaseHTTPRequestHandler
+from socketserver import ThreadingTCPServer
 from typing import Any
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import urlsplit
 
 from ...neural_fields import InputError
-from ..viewer.gate import Gate, Verdict
-from ..viewer.server import free_port
 from .assembly import field_file, fill_page
-from .export import Packed, WebOptions, pack_run
+from .export import Packed
+from .gate import Gate
 
-__all__ = ["PageServer", "import_websockets"]
+__all__ = ["PageServer"]
 
-MOST_CLIENTS = 64
-LARGEST = 1 << 10  # bytes of a message; there should be none
-LOOK = 0.25  # seconds between looks at whether there is something new for a browser
-LIVE = "/live"
+PORTS = range(8080, 8180)  # of which the first free one is taken
 
 
 class PageServer:
-    """A run's page, served until it is closed; a context manager.
+    """Serves a page until it is closed; a context manager.
 
-    Only who knows the token in its `url` is let in, and no other page than its own (`Gate`). A browser that says
-    anything at all is disconnected: the page does not.
+    Only clients with the token of its `url` are admitted, and no page of another origin (`Gate`).
 
     Args:
-        run: run directory or .safetensors file.
-        options: what the page shows.
+        pack: makes what the page shows.
         host: the address to listen on.
         port: the port, or None for the first free one from 8080 upwards.
+        keep: called with the JSON that the page posts to ``/landmarks``; None refuses it.
 
     Raises:
-        NoShaderError: no shader knows this kind of field.
-        InputError: there is no such run, it has no surface, websockets is not installed, or the address or the port
-            cannot be had.
+        InputError: what ``pack`` raises, or the address or the port cannot be had.
     """
 
     def __init__(
-        self, run: str | Path, options: WebOptions | None = None, *, host: str = "127.0.0.1", port: int | None = None
+        self,
+        pack: Callable[[], Packed],
+        *,
+        host: str = "127.0.0.1",
+        port: int | None = None,
+        keep: Callable[[Any], None] | None = None,
     ) -> None:
-        websockets = import_websockets()
-        self._run, self._options = run, options or WebOptions()
-        self._packed = pack_run(run, self._options)
-        self._clients: set[Any] = set()
-        self._lock = threading.Lock()
-        port = free_port(host, port)
-        self.gate = Gate(host, port)
-        self._server = websockets.serve(
-            self._tell, host, port, process_request=self._answer, max_size=LARGEST, logger=_silent_logger()
-        )
-        self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
+        self._pack, self.packed, self.keep = pack, pack(), keep
+        self.clients: set[object] = set()
+        self.closed = threading.Event()
+        self._server = _listen(host, port, self)
+        self.gate = Gate(host, self._server.server_address[1])
+        self._thread = threading.Thread(target=self._server.serve_forever, args=(0.1,), daemon=True)
         self._thread.start()
 
     @property
@@ -68,29 +65,22 @@ class PageServer:
 
     @property
     def num_clients(self) -> int:
-        """How many browsers look."""
-        return len(self._clients)
-
-    @property
-    def packed(self) -> Packed:
-        """What is shown now."""
-        return self._packed
+        """The number of browsers that are connected."""
+        return len(self.clients)
 
     def update(self) -> None:
-        """Show the run as it is now to all browsers, from where they stand.
+        """Show the newest version to all browsers, from where they stand.
 
         Raises:
-            InputError: it is not there, or has no surface.
+            InputError: see `PageServer`.
         """
-        self._packed = pack_run(self._run, self._options)
+        self.packed = self._pack()
 
     def close(self) -> None:
         """Stop serving."""
+        self.closed.set()
         self._server.shutdown()
-        with self._lock:
-            clients = list(self._clients)
-        for client in clients:
-            client.close_socket()
+        self._server.server_close()
         self._thread.join()
 
     def __enter__(self) -> PageServer:
@@ -99,76 +89,111 @@ class PageServer:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _answer(self, connection: Any, request: Any) -> Any:
-        """The answer to a request; None lets the handshake of a WebSocket go on."""
-        verdict = self.gate.admit(request.path, request.headers)
-        path = urlsplit(request.path).path
-        shakes_hands = "websocket" in request.headers.get("Upgrade", "").lower()
-        if not verdict.admitted:
-            return _response(connection, verdict, verdict.body)
-        if shakes_hands and path == LIVE:
-            if self.num_clients < MOST_CLIENTS:
-                return None
-            verdict = Verdict(HTTPStatus.SERVICE_UNAVAILABLE, "", verdict.headers)
-            return _response(connection, verdict, "Too many browsers look at this already.\n")
-        if shakes_hands or path != "/":
-            return _response(connection, Verdict(HTTPStatus.NOT_FOUND, "", verdict.headers), "There is nothing here.\n")
-        header, data, _ = self._packed
-        kind = {"Content-Type": "text/html; charset=utf-8"}
-        verdict = verdict._replace(headers={**verdict.headers, **kind})
-        return _response(connection, verdict, fill_page(header, data, live=True))
 
-    def _tell(self, connection: Any) -> None:
-        """Send a browser each field that it does not have; runs in a thread of its own."""
-        from websockets.exceptions import ConnectionClosed
+class _Server(ThreadingTCPServer):
+    """The sockets of a `PageServer`, a thread for each request."""
 
-        had = parse_qs(urlsplit(connection.request.path).query).get("have", [""])[0]
-        with self._lock:
-            self._clients.add(connection)
+    daemon_threads = True
+    block_on_close = False
+    allow_reuse_address = True
+
+    def __init__(self, address: tuple[Any, ...], family: int, page: PageServer) -> None:
+        self.address_family, self.page = family, page
+        super().__init__(address, _Handler)
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Ignore a client that went away."""
+
+
+class _Handler(BaseHTTPRequestHandler):
+    """Answers one request."""
+
+    timeout = 10  # seconds that a client may take to ask, or to read
+
+    def do_GET(self) -> None:
+        path, (header, data, _) = self._admitted(), self._page.packed
+        if path == "/":
+            self._send(HTTPStatus.OK, fill_page(header, data, live=True).encode(), "text/html; charset=utf-8")
+        elif path == "/field.bin":
+            self._send(HTTPStatus.OK, field_file(header, data), "application/octet-stream")
+        elif path == "/live":
+            self._live(self._page)
+        elif path is not None:
+            self._refuse(HTTPStatus.NOT_FOUND, "There is nothing here.")
+
+    def do_POST(self) -> None:
+        keep = self._page.keep
+        if (path := self._admitted()) is None:
+            return
+        length = self.headers.get("Content-Length", "")
+        if path != "/landmarks" or keep is None:
+            self._refuse(HTTPStatus.NOT_FOUND, "There is nothing here.")
+        elif not length.isdecimal() or int(length) > 1 << 20:
+            self._refuse(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "Expected at most a megabyte.")
+        else:
+            try:
+                keep(json.loads(self.rfile.read(int(length))))
+            except ValueError as error:  # an InputError, too
+                self._refuse(HTTPStatus.BAD_REQUEST, str(error))
+            else:
+                self._send(HTTPStatus.OK, b"", "text/plain")
+
+    def log_message(self, format: str, *args: object) -> None:
+        """Say nothing."""
+
+    @property
+    def _page(self) -> PageServer:
+        assert isinstance(self.server, _Server)
+        return self.server.page
+
+    def _admitted(self) -> str | None:
+        """The path of the request; None if it was refused."""
+        self.verdict = self._page.gate.admit(self.path, self.headers)  # pyright: ignore[reportArgumentType]
+        if self.verdict.admitted:
+            return urlsplit(self.path).path
+        self._send(self.verdict.status, self.verdict.body.encode())
+        return None
+
+    def _refuse(self, status: HTTPStatus, text: str) -> None:
+        self._send(status, f"{text}\n".encode(), "text/plain; charset=utf-8")
+
+    def _send(self, status: HTTPStatus, body: bytes | None, kind: str | None = None) -> None:
+        self.send_response(status)
+        for name, text in (*self.verdict.headers.items(), *([] if kind is None else [("Content-Type", kind)])):
+            self.send_header(name, text)
+        if body is not None:
+            self.send_header("Content-Length", str(len(body)))
+        self.end_headers()
+        self.wfile.write(body or b"")
+
+    def _live(self, page: PageServer) -> None:
+        """Name each new field by its checksum until the browser or the server is gone."""
+        if page.num_clients >= 64:
+            self._refuse(HTTPStatus.SERVICE_UNAVAILABLE, "Too many browsers look at this already.")
+            return
+        self._send(HTTPStatus.OK, None, "text/event-stream")
+        told, page.clients = None, page.clients | {self}
+        with suppress(OSError):
+            while not page.closed.wait(0.25):
+                newest = page.packed.header["crc32"]
+                # A comment shows whether the browser is still there.
+                self.wfile.write(b": \n\n" if newest == told else f"data: {newest}\n\n".encode())
+                told = newest
+        page.clients = page.clients - {self}
+
+
+def _listen(host: str, port: int | None, page: PageServer) -> _Server:
+    for candidate in PORTS if port is None else (port,):
         try:
-            while True:
-                packed = self._packed
-                if str(packed.header["crc32"]) != had:
-                    connection.send(field_file(packed.header, packed.data))
-                    had = str(packed.header["crc32"])
-                try:
-                    connection.recv(timeout=LOOK)
-                except TimeoutError:
-                    continue
-                connection.close(1008, "not a message of this page")
-        except ConnectionClosed:
-            pass
-        finally:
-            with self._lock:
-                self._clients.discard(connection)
-
-
-def import_websockets() -> Any:
-    """What serves: the threads of websockets.
-
-    Raises:
-        InputError: it is not installed.
-    """
-    try:
-        import websockets.sync.server
-    except ModuleNotFoundError as error:
-        raise InputError("the viewer needs websockets; pip install mplicits[view]") from error
-    return websockets.sync.server
-
-
-def _response(connection: Any, verdict: Verdict, body: str) -> Any:
-    response = connection.respond(verdict.status, body)
-    for name, text in verdict.headers.items():
-        if name in response.headers:
-            del response.headers[name]
-        response.headers[name] = text
-    return response
-
-
-def _silent_logger() -> logging.Logger:
-    """Where websockets says what clients did wrong: nowhere."""
-    logger = logging.getLogger("mplicits.web")
-    logger.propagate = False
-    if not logger.handlers:
-        logger.addHandler(logging.NullHandler())
-    return logger
+            found = socket.getaddrinfo(host, candidate, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
+            return _Server(found[4], found[0], page)
+        except OSError as error:
+            if error.errno == errno.EADDRINUSE and port is None:
+                continue
+            if error.errno == errno.EADDRINUSE:
+                raise InputError(f"--port {port}: is in use; leave out --port to take a free one") from error
+            if error.errno == errno.EACCES:
+                raise InputError(f"--port {port}: may not be used; take one above 1023") from error
+            said = error.strerror or error
+            raise InputError(f"--host {host}: cannot listen there ({said}); try 127.0.0.1") from error
+    raise InputError(f"no port from {PORTS[0]} to {PORTS[-1]} is free; name one with --port")

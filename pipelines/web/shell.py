@@ -18,7 +18,6 @@ from ...neural_fields.tracing.sphere import BOUNDING_RADIUS
 
 __all__ = ["CELLS", "GRID", "shell_mesh", "surface_reach"]
 
-RESOLUTION = 96  # of the meshes on which values of coarser levels are looked at
 # Between the corners of those meshes a coarser level may be this much further from zero.
 MARGIN = 1.25
 CELLS = 36  # along the box: a few thousand triangles
@@ -73,7 +72,7 @@ def surface_reach(field: Field) -> list[list[float]]:
     """
     found: list[list[float]] = [[]]
     for level in range(1, field.num_levels):
-        mesh = extract_mesh(field, resolution=RESOLUTION, level=level, normals=False)
+        mesh = extract_mesh(field, resolution=96, level=level, normals=False)
         corners = torch.from_numpy(np.asarray(mesh.vertices)).to(field.like)
         before = [*found[-1], 0.0]
         reaches = [MARGIN * float(field.value(corners, level=j).abs().max()) for j in range(level)]

@@ -8,12 +8,10 @@ from pathlib import Path
 
 from ...neural_fields import InputError
 from ..training.folder import FIELD_FILE
-from .export import WebOptions
-from .serve import PageServer, import_websockets
+from .export import WebOptions, pack
+from .serve import PageServer
 
 __all__ = ["Watcher"]
-
-LOOK_EVERY = 1.0  # seconds
 
 
 class Watcher:
@@ -31,9 +29,6 @@ class Watcher:
         port: the server's, or None for the first free one.
         say: told where to look, and what went wrong.
         look_every: seconds between two looks.
-
-    Raises:
-        InputError: websockets is not installed.
     """
 
     def __init__(
@@ -45,9 +40,8 @@ class Watcher:
         resume: bool = False,
         port: int | None = None,
         say: Callable[[str], object] = print,
-        look_every: float = LOOK_EVERY,
+        look_every: float = 1.0,
     ) -> None:
-        import_websockets()
         self.run, self.options, self.port, self.say = run, options, port, say
         self.server = server
         self.shown = 0  # how many checkpoints were shown
@@ -87,7 +81,7 @@ class Watcher:
             return
         try:
             if self.server is None:
-                self.server = PageServer(self.run, self.options, port=self.port)
+                self.server = PageServer(lambda: pack(self.run, self.options), port=self.port)
                 self.say(f"--watch: open {self.server.url} in a browser")
             else:
                 self.server.update()

@@ -19,17 +19,30 @@ class Controls {
   // What the field has: levels, colours, moments; again when another takes its place.
   fill() {
     const { ui, page } = this;
-    const { levels, colors, moves } = page.saved.header;
-    const last = levels.length - 1;
+    const { levels, colors, shapes, moves } = page.saved.header, { last } = page;
     ui.level.max = last;
     ui.levels.hidden = !last;
     ui.normals.replaceChildren(...levels.map((_, index) => new Option(index === last ? `${index} (finest)` : index, index)));
     ui.normals.parentNode.hidden = !last;
     for (const option of [...ui.shading.options]) if (option.value > 2) option.remove();
-    if (colors) ui.shading.prepend(new Option('colours', 3), new Option('bare colours', 4));
+    if (colors || page.painted) ui.shading.prepend(new Option('bare colours', 4));
+    if (colors) ui.shading.prepend(new Option('colours', 3));
+    const names = [...(levels.length ? [FIELD] : []), ...shapes.map(({ name }) => name)];
+    ui.parts.replaceChildren(...(names.length > 1 ? names.map((name) => this.part(name)) : []));
     ui.times.hidden = !moves;
     if (moves) ui.saveFilm.textContent = 'Save film';
     this.show();
+  }
+
+  // A box that shows or hides the field, a cloud or a mesh.
+  part(name) {
+    const { page } = this, box = make('input', { type: 'checkbox' });
+    box.checked = !page.hidden.includes(name);
+    box.addEventListener('change', () => {
+      page.hidden = page.hidden.filter((other) => other !== name).concat(box.checked ? [] : [name]);
+      page.changed();
+    });
+    return make('label', {}, box, ` ${name}`);
   }
 
   // Light or dark, as the system is.
@@ -206,6 +219,7 @@ class Controls {
         ArrowLeft: () => move(-1, 0), ArrowRight: () => move(1, 0), ArrowUp: () => move(0, -1), ArrowDown: () => move(0, 1),
         '+': () => orbit.zoom(1.15), '=': () => orbit.zoom(1.15), '-': () => orbit.zoom(1 / 1.15), Home: () => orbit.reset(),
         ' ': () => this.play(),
+        Backspace: () => this.tools.landmarks?.undo(),
         r: () => this.tools.toggleRuler(), Escape: () => this.tools.toggleRuler(false),
         Enter: () => this.tools.tap(page.canvas.clientWidth / 2, page.canvas.clientHeight / 2).catch((error) => this.ui.failed(error)),
       };

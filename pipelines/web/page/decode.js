@@ -34,7 +34,7 @@ async function decodeField(headerText, packed) {
     throw new PageError('This page is not complete. Copy it again, or write it again with `mplicits web`.');
   }
   if (header?.format !== 'mplicits-web') throw new PageError('The data in this page is no field of mplicits.');
-  if (header.version !== 1) throw new PageError(`The field in this page is of version ${header.version}; this page reads 1.`);
+  if (header.version !== 2) throw new PageError(`The field in this page is of version ${header.version}; this page reads 2.`);
   const bytes = await inflated(packed);
   if (bytes.length !== header.bytes || checksum(bytes) !== header.crc32) {
     throw new PageError('The field in this page is damaged or cut off. Copy the page again, or write it again with `mplicits web`.');
@@ -48,6 +48,7 @@ async function decodeField(headerText, packed) {
 
 function numbersOf(bytes, kind, count, start) {
   if (kind === 'f4') return new Float32Array(bytes.buffer, start, count);
+  if (kind === 'u1') return new Uint8Array(bytes.buffer, start, count);
   if (kind === 'u2') return new Uint16Array(bytes.buffer, start, count);
   if (kind === 'u4') return new Uint32Array(bytes.buffer, start, count);
   // Signed codes: the upper eight bits of each, then the lower ones without gaps; of kind d, what each adds to the last.

@@ -21,6 +21,7 @@ class Interface {
       make('span', { class: 'row' },
         label('Slice', make('select', { id: 'axis' }, ...['none', 'x', 'y', 'z'].map((name, index) => new Option(name, index - 1)))),
         range('place', 1, 'any', 'Place of the slice'), make('output', { id: 'placeName' })),
+      make('span', { id: 'parts', class: 'row' }),
       make('button', { id: 'ruler', type: 'button', 'aria-pressed': false }, 'Ruler'),
       button('savePicture', 'Save picture'),
       button('saveFilm', 'Save turntable'),

@@ -28,20 +28,19 @@ function packNetwork(layers) {
   };
   // Rows of zeros up to the padded width: what the kernels multiply there must not be another matrix.
   const square = (at) => add(4 * quads, (row, n) => (row < width ? at(row, n) : 0));
-  const inputs = layers[0].weight.length / width;
   layers.slice(0, depth).forEach(({ weight, bias }, index) => {
-    starts.columns.push(index ? square((column, n) => weight[n * width + column]) : add(inputs, (column, n) => weight[inputs * n + column]));
+    starts.columns.push(index ? square((column, n) => weight[n * width + column]) : add(3, (column, n) => weight[3 * n + column]));
     starts.bias.push(add(1, (_, n) => bias[n]));
     starts.rows.push(index ? square((row, n) => weight[row * width + n]) : 0);
   });
   starts.output = add(layers[depth].bias.length, (row, n) => layers[depth].weight[row * width + n]);
   const all = new Float32Array(4 * size);
   parts.reduce((at, part) => { all.set(part, at); return at + part.length; }, 0);
-  return { numbers: all, starts, width, depth, inputs, outputs: Array.from(layers[depth].bias), bias: layers[0].bias, rate: layers[0].rate };
+  return { numbers: all, starts, width, depth, outputs: Array.from(layers[depth].bias), bias: layers[0].bias, rate: layers[0].rate };
 }
 
 // The kernel of a packed network: kind 'value', 'jet', or 'color' (three outputs instead of one).
-function networkKernel({ starts, width, depth, inputs, outputs }, kind, parts) {
+function networkKernel({ starts, width, depth, outputs }, kind, parts) {
   const quads = quadsOf(width), jet = kind === 'jet', color = kind === 'color';
   const points = [0, 1, 2, 3], part = 'xyzw';
   const number = (value) => { const text = Math.fround(value).toPrecision(9); return /[.e]/.test(text) ? text : `${text}.0`; };
@@ -73,7 +72,7 @@ function networkKernel({ starts, width, depth, inputs, outputs }, kind, parts) {
     let c=mat4x4f(weights[w+1u],weights[w+${quads + 1}u],weights[w+${2 * quads + 1}u],weights[w+${3 * quads + 1}u]);
     ${each((p) => `y${p}+=a*h${p};z${p}+=c*h${p};`)}}
     ${then('n', 'y')}${then('(n+1u)', 'z')}}`;
-  const columns = Array.from({ length: inputs }, (_, c) => `let w${c}=weights[${starts.columns[0] + c * quads}u+n];`).join('');
+  const columns = [0, 1, 2].map((c) => `let w${c}=weights[${starts.columns[0] + c * quads}u+n];`).join('');
   const lines = [`for(var n=0u;n<${quads}u;n++){${columns}
     ${each((p) => `var y${p}=w0*x${p}.x+w1*x${p}.y+w2*x${p}.z;`)}
     ${finish(0, 0, 'n', 'y')}}`];

@@ -11,7 +11,7 @@ async function start() {
     window.mplicits = { render: (wanted) => page.render(wanted), bench: (wanted) => page.bench(wanted), turntable: (wanted) => turntable(page, wanted), get renderer() { return page.renderer; }, get header() { return page.saved.header; } };
     if (search.has('bench')) {
       const size = Math.min(1024, Math.max(16, Number(search.get('bench')) || 512));
-      page.bench({ size, rate: Math.max(0, Number(search.get('rate')) || 0) }).then((found) => page.describeBench(found)).catch((error) => ui.failed(error));
+      page.bench({ size }).then((found) => page.describeBench(found)).catch((error) => ui.failed(error));
     }
     return page;
   } catch (error) {

@@ -37,6 +37,8 @@ export interface Wanted {
   normalLevel?: number;
   precision?: number | null;
   colored?: boolean;
+  /** Names of clouds and meshes that are left out; "surface" is the field. */
+  hidden?: string[];
 }
 
 /** One ray of the last picture. */
@@ -61,7 +63,7 @@ export class MplicitsField extends HTMLElement {
   readonly header: Record<string, unknown> | null;
   readonly renderer: Renderer | null;
   render(wanted: Wanted): Promise<Picture>;
-  bench(wanted?: { size?: number; frames?: number; level?: number; rate?: number }): Promise<Record<string, unknown>>;
+  bench(wanted?: { size?: number; frames?: number; level?: number }): Promise<Record<string, unknown>>;
   turntable(wanted?: { frames?: number; side?: number; rate?: number }): Promise<{ blob: Blob; ending: string }>;
 }
 

@@ -178,7 +178,7 @@ class Networks {
     this.staged = new Float32Array(4 * ROW * this.rows);
   }
 
-  // Points (x, y, z for each) as the shaders want them.
+  // Uploads points (x, y, z for each) as the shaders want them.
   load(points, count) {
     const { gl } = this;
     const rows = Math.ceil(count / ROW);
@@ -219,7 +219,7 @@ class Networks {
       const first = index === 0;
       const free = this.work.find((one) => one !== held);
       const into = keep ? this.phases[index] : free;
-      const program = this.programs[first ? (keep ? 'firstPhase' : 'firstSine') : keep ? 'phase' : 'sine'];
+      const program = this.programs[first ? `first${keep ? 'Phase' : 'Sine'}` : keep ? 'phase' : 'sine'];
       this.pass(program, into.buffer, [0, 0, wide, net.quads], {
         arrays: first ? {} : { source: held.texture },
         planes: { weights: layer.forward, bias: layer.bias, ...(first ? { points: this.points } : {}) },

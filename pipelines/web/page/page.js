@@ -31,13 +31,13 @@ class Page {
     ({ saved } = this);
     this.orbit = new Orbit(saved.header.view);
     if (camera) Object.assign(this.orbit, { azimuth: camera[0], elevation: Math.min(90, Math.max(-90, camera[1])) });
-    this.level = this.normals = saved.header.levels.length - 1;
+    this.level = this.normals = this.last;
     this.time = 0;          // of a field that moves, from 0 to 1
     this.waiters = [];      // for the finest picture
     this.occlusion = true;
     this.section = new Section(saved.header);
-    // 3 is colours in light, 4 bare colours; both want the network of colours.
-    this.shading = saved.header.colors ? 3 : 2;
+    this.hidden = saved.header.shapes.filter(({ hidden }) => hidden).map(({ name }) => name);
+    this.shading = saved.header.colors ? 3 : 2; // 3 is colours in light, 4 bare colours
     this.factor = COARSEST; // canvas pixels per ray while it moves; less as soon as the adapter shows how fast it is
     this.speed = 200;     // pixels per millisecond
     this.finest = pixel > 0 ? Math.min(COARSEST, Math.max(FINEST, pixel)) : FINEST; // coarser at rest, for slow adapters
@@ -68,6 +68,15 @@ class Page {
     Object.assign(this, { saved, left });
   }
 
+  get last() {
+    return Math.max(0, this.saved.header.levels.length - 1);
+  }
+
+  // Whether there are colours beside those of a field's network.
+  get painted() {
+    return this.saved.header.shapes.some(({ colored }) => colored);
+  }
+
   // All that is in the context; again after it was lost.
   open() {
     this.renderer = openRenderer(this.gl, this.parts, this.saved);
@@ -82,15 +91,16 @@ class Page {
     const renderer = openRenderer(this.gl, this.parts, saved);
     await renderer.open();
     if (this.lost) return renderer.close();
-    const before = this.renderer, finest = this.saved.header.levels.length - 1, last = saved.header.levels.length - 1;
+    const before = this.renderer, finest = this.last;
     const { axis, at } = this.section;
     this.section.drop();
     Object.assign(this, { saved, left, renderer, section: new Section(saved.header) });
     Object.assign(this.section, { axis, at });
     before.close();
+    const { last } = this;
     this.level = this.level === finest ? last : Math.min(this.level, last);
     this.normals = this.normals === finest ? last : Math.min(this.normals, last);
-    this.shading = Math.min(this.shading, saved.header.colors ? 4 : 2);
+    this.shading = Math.min(this.shading, saved.header.colors || this.painted ? 4 : 2);
     this.describe();
     this.controls.fill();
     this.version++;
@@ -101,12 +111,17 @@ class Page {
   describe() {
     const { header } = this.saved;
     this.ui.title.textContent = header.title;
+    const shown = header.shapes.map(({ name, kind, count }) => `${name}: ${count.toLocaleString('en')} ${kind}`);
+    if (!header.levels.length) {
+      this.ui.facts.textContent = shown.join(' · ');
+      return;
+    }
     const sizes = header.levels.map(({ width, depth }) => `${width} × ${depth}`).join(', ');
     const bands = header.deltas.length ? ` · bands δ = ${header.deltas.map((delta) => digits(delta * header.unit)).join(', ')} input units` : '';
     const exact = header.bits === null
       ? 'weights in float32'
       : `weights of ${header.bits} bits: off by ≤ ${digits(Math.max(...header.rounding.map((part) => part.value)) * header.unit)} units, ${digits(Math.max(...header.rounding.map((part) => part.angle)))}°`;
-    this.ui.facts.textContent = `${this.left}SIRENs ${sizes}${bands} · ${exact}`;
+    this.ui.facts.textContent = [`${this.left}SIRENs ${sizes}${bands}`, exact, ...shown].join(' · ');
   }
 
   // The size of the canvas, and the adapter, may change under us.
@@ -188,7 +203,13 @@ class Page {
   }
 
   wanted() {
-    return { level: this.level, normalLevel: this.normals, colored: this.shading > 2, clip: this.section.clip, time: this.time };
+    const { level, normals, hidden, time } = this;
+    return { level, normalLevel: normals, colored: this.shading > 2 && this.renderer.colored, clip: this.section.clip, hidden, time };
+  }
+
+  // Whether pictures have colours of their own.
+  get colored() {
+    return this.wanted().colored || this.saved.header.shapes.length > 0;
   }
 
   // The whole picture at once, in rays of `factor` pixels.
@@ -207,7 +228,7 @@ class Page {
     if (await this.section.refresh(this.gl, this.renderer, this.level, true)) this.present();
     for (let factor = 2 ** Math.floor(Math.log2(this.factor) - 1e-9); factor >= this.finest; factor /= 2) {
       const grid = this.grid(factor);
-      this.paint.begin(grid, this.shading > 2);
+      this.paint.begin(grid, this.colored);
       for (let first = 0; first < grid.height;) {
         await new Promise((resolve) => { setTimeout(resolve, 0); });
         if (this.version !== version || this.lost || document.hidden) return;
@@ -248,7 +269,7 @@ class Page {
     const camera = this.orbit.camera(width, height);
     await this.renderer.at(this.time);
     await this.section.refresh(this.gl, this.renderer, this.level);
-    const { colored } = this.wanted(), size = 4 * width * height;
+    const { colored } = this, size = 4 * width * height;
     const made = { seen: new Float32Array(size), color: new Float32Array(colored ? size : 0) };
     for (let first = 0; first < height;) {
       await new Promise((resolve) => { setTimeout(resolve, 0); });
@@ -279,36 +300,30 @@ class Page {
   }
 
   // One picture of any camera, for tests and for other scripts: arrays of its pixels, and what they have cost.
-  render({ camera, level = this.level, normalLevel = level, precision = null, colored = false, time = this.time }) {
-    return this.renderer.frame(camera, { level, normalLevel, precision, colored, time });
+  render({ camera, level = this.level, normalLevel = level, precision = null, colored = false, hidden = this.hidden, time = this.time }) {
+    return this.renderer.frame(camera, { level, normalLevel, precision, colored, hidden, time });
   }
 
-  // Pictures of a camera that goes around, one in each frame: how many in a second, and what one costs; how long one takes
-  // by `frameTime`, here and on an adapter of `rate` TFLOP a second whose passes cost what they do here.
-  async bench({ size = 512, frames = 12, level = this.level, rate = 0 } = {}) {
+  // Pictures of a camera that goes around, one in each frame: how many in a second, and what one costs.
+  async bench({ size = 512, frames = 12, level = this.level } = {}) {
     const orbit = new Orbit(this.saved.header.view);
-    let adapter = null, milliseconds = 0, operations = 0, passes = 0, read = 0;
+    let milliseconds = 0, operations = 0, passes = 0, read = 0;
     const evaluations = this.renderer.counts().values.map(() => 0);
     for (let frame = 0; frame < frames; frame++) {
       await new Promise((resolve) => { setTimeout(resolve, 0); });
       orbit.azimuth = (360 * frame) / frames;
-      const camera = orbit.camera(size, size), made = await this.render({ camera, level });
-      const { counts, milliseconds: took } = made;
+      const { counts, milliseconds: took } = await this.render({ camera: orbit.camera(size, size), level });
       milliseconds += took / frames;
       passes += counts.passes / frames;
       read += counts.read / frames;
       operations += this.renderer.operations(counts) / frames;
       evaluations.forEach((_, index) => { evaluations[index] += (counts.values[index] + counts.jets[index]) / frames / size ** 2; });
-      if (frame === frames - 1) adapter = await this.renderer.adapter(camera, made, level);
     }
-    const model = frameTime({ operations, passes }, adapter);
-    const elsewhere = rate ? frameTime({ operations, passes }, { ...adapter, rate: 1e9 * rate }) : null;
-    return { size, level, frames, fps: 1000 / milliseconds, milliseconds, evaluations, passes, read, operations, ...adapter, model, elsewhere, wanted: rate };
+    return { size, level, frames, fps: 1000 / milliseconds, milliseconds, evaluations, passes, read, operations };
   }
 
-  describeBench({ size, level, fps, evaluations, passes, read, operations, rate, pass, model, elsewhere, wanted }) {
+  describeBench({ size, level, fps, evaluations, passes, read, operations }) {
     const each = evaluations.map(digits).join(' + ');
-    const other = elsewhere === null ? '' : `; ${digits(elsewhere)} ms at ${digits(wanted)} TFLOP/s`;
-    this.ui.facts.textContent = `level ${level} at ${size} × ${size}: ${digits(fps)} pictures a second; ${each} evaluations per pixel, ${digits(operations / 1e9)} GFLOP, ${digits(passes)} passes, ${digits(read / 2 ** 20)} MiB read back, each picture; by ${digits(rate / 1e6)} GFLOP/s and ${digits(1000 * pass)} µs a pass it would take ${digits(model)} ms${other}`;
+    this.ui.facts.textContent = `level ${level} at ${size} × ${size}: ${digits(fps)} pictures a second; ${each} evaluations per pixel, ${digits(operations / 1e9)} GFLOP, ${digits(passes)} passes, ${digits(read / 2 ** 20)} MiB read back, each picture`;
   }
 }

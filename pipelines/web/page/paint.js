@@ -1,8 +1,8 @@
 // From what was traced to colours on the canvas: two pictures, a coarse one that is whole and a fine one that grows over it.
 
-const THEMES = {
-  dark: { paper: [0.086, 0.094, 0.114], clay: [0.77, 0.72, 0.66] },
-  light: { paper: [0.957, 0.949, 0.933], clay: [0.77, 0.72, 0.66] },
+const PAPERS = {
+  dark: [0.086, 0.094, 0.114],
+  light: [0.957, 0.949, 0.933],
 };
 
 class Paint {
@@ -60,7 +60,6 @@ class Paint {
   // What is there, onto the canvas, as `look` wants it: theme, shading, occlusion and section.
   present(camera, { theme, shading, occlusion, section }) {
     const { gl, shade } = this;
-    const { paper, clay } = THEMES[theme];
     gl.useProgram(shade.program);
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     gl.viewport(0, 0, camera.width, camera.height);
@@ -74,13 +73,13 @@ class Paint {
       gl.uniform1i(shade.at(name), unit);
     });
     gl.uniform1i(shade.at('ready'), this.ready);
-    gl.uniform1i(shade.at('shading'), Math.min(shading, 4)); // colours as they are seen have their light in them
+    gl.uniform1i(shade.at('shading'), shading);
     gl.uniform1i(shade.at('occluded'), occlusion);
     gl.uniform2f(shade.at('size'), camera.width, camera.height);
     gl.uniformMatrix3fv(shade.at('axes'), false, [...camera.right, ...camera.down, ...camera.forward]);
     gl.uniform4f(shade.at('lens'), camera.fx, camera.fy, camera.cx, camera.cy);
-    gl.uniform3f(shade.at('paper'), ...paper);
-    gl.uniform3f(shade.at('clay'), ...clay);
+    gl.uniform3f(shade.at('paper'), ...PAPERS[theme]);
+    gl.uniform3f(shade.at('clay'), ...CLAY);
     gl.uniform3f(shade.at('eye'), ...camera.eye);
     gl.uniform1i(shade.at('cut'), section.texture ? 1 : 0);
     if (section.texture) {

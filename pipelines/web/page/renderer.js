@@ -1,10 +1,12 @@
-// What the page asks of whatever traces: pictures, single points, values, and what they have cost. Each call is answered
+// What the page asks of what traces and what rasterises: pictures, single points, values, and their cost. Each call is answered
 // by a promise, one after the other, so that none meets the buffers of another half used.
+
+const FIELD = 'surface'; // the field among the names of shapes
 
 class Renderer {
   // `gl` is there for adapters that know no WebGPU.
   constructor(gl, parts, saved) {
-    Object.assign(this, { gl, parts, saved, header: saved.header, tracer: null, camera: null, options: null });
+    Object.assign(this, { gl, parts, saved, header: saved.header, tracer: null, shapes: null, camera: null, options: null });
     const networks = networksOf(this.header);
     this.tally = { values: networks.map(() => 0), jets: networks.map(() => 0), passes: 0, read: 0 };
     this.time = 0;
@@ -22,12 +24,15 @@ class Renderer {
 
   // What traces, or null before the first picture.
   get kind() {
-    return this.tracer?.kind ?? null;
+    return this.tracer?.kind ?? this.shapes?.kind ?? null;
   }
 
   // Ends what is under way on the adapter; no other call may follow.
   close() {
-    this.queue(() => this.tracer?.close());
+    this.queue(() => {
+      this.tracer?.close();
+      this.shapes?.close();
+    });
   }
 
   // Work with the tracer; where its device was lost meanwhile, it is done again with another.
@@ -40,6 +45,17 @@ class Renderer {
       await this.open();
       return work(this.tracer);
     }
+  }
+
+  // What a camera sees of the field, and of clouds and meshes; whichever is nearer.
+  async look(camera, options) {
+    const { levels, shapes } = this.header;
+    const blank = () => ({ seen: new Float32Array(4 * camera.width * (options.rows ?? camera.height)), color: new Float32Array(0) });
+    const traced = levels.length && !options.hidden?.includes(FIELD);
+    const made = traced ? await this.traced((tracer) => tracer.trace(camera, options)) : blank();
+    if (!shapes.length) return made;
+    this.shapes ??= new Shapes(this.gl, this.parts, this.saved);
+    return nearer(made, this.shapes.draw(camera, options), this.shapes.slack);
   }
 
   get colored() {
@@ -56,9 +72,9 @@ class Renderer {
   // the normal and the depth along the ray, 0 where nothing is; `color` its own colours where they were asked for; and
   // what it has cost, see `counts`.
   //
-  // Options: level, normalLevel (whose normals), first, rows, colored, and precision: of depths, in units of the field;
-  // null is a tenth of a pixel; clip: {axis, at}, a plane before which nothing is seen;
-  // time: of a field that moves, which single rays and values then stay at.
+  // Options: level, normalLevel (whose normals), first, rows, colored, and precision: of depths, in units of the field; null is
+  // a tenth of a pixel; clip: {axis, at}, a plane before which nothing is seen; hidden: names of shapes, or `FIELD`, that are
+  // left out; time: of a field that moves, which single rays and values then stay at.
   frame(camera, options) {
     if (options.colored && !this.colored) throw new PageError('This page has no colours.');
     return this.queue(async () => {
@@ -66,7 +82,7 @@ class Renderer {
       this.clear();
       this.turn(options.time ?? this.time);
       const started = performance.now();
-      const made = await this.traced((tracer) => tracer.trace(camera, options));
+      const made = await this.look(camera, options);
       const milliseconds = performance.now() - started;
       return { width: camera.width, height: camera.height, ...made, milliseconds, counts: structuredClone(this.tally) };
     });
@@ -89,7 +105,7 @@ class Renderer {
     const { camera, options } = this;
     if (!camera) return null;
     const one = { ...camera, cx: camera.cx - x, cy: camera.cy - y, width: 1, height: 1 };
-    const { seen } = await this.queue(() => this.traced((tracer) => tracer.trace(one, { ...options, first: 0, rows: 1, colored: false })));
+    const { seen } = await this.queue(() => this.look(one, { ...options, first: 0, rows: 1, colored: false }));
     const [nx, ny, nz, depth] = seen;
     if (!depth) return null;
     const across = -one.cx / one.fx, down = -one.cy / one.fy, length = Math.hypot(across, down, 1);
@@ -108,26 +124,6 @@ class Renderer {
     return structuredClone(this.tally);
   }
 
-  // What `frameTime` wants to know of this adapter, measured: the networks up to a level at what a picture saw, and a
-  // picture of nothing.
-  async adapter(camera, { seen }, level) {
-    const { points } = hitsOf(camera, seen, 0), least = 3 * 16384;
-    const many = new Float32Array(points.length * Math.max(1, Math.ceil(least / Math.max(1, points.length))));
-    for (let at = 0; at < many.length; at += points.length) many.set(points, at);
-    const timed = async (work) => {
-      await work(); // once for what is made at the first time
-      this.clear();
-      const started = performance.now();
-      await work();
-      return performance.now() - started;
-    };
-    const computing = await timed(() => this.values(many, level));
-    const done = this.operations(this.counts());
-    const away = { ...camera, forward: camera.forward.map((part) => -part), right: camera.right.map((part) => -part) };
-    const empty = await timed(() => this.frame(away, { level }));
-    return { rate: done / computing, pass: empty / Math.max(1, this.counts().passes) };
-  }
-
   clear() {
     for (const kind of ['values', 'jets']) this.tally[kind].fill(0);
     Object.assign(this.tally, { passes: 0, read: 0 });
@@ -141,10 +137,6 @@ class Renderer {
     }, 0);
   }
 }
-
-// How long a picture takes by its counts, in milliseconds: an adapter does so many operations in one of them, and each
-// pass costs so much even if it has nothing to do.
-const frameTime = ({ operations, passes }, { rate, pass }) => operations / rate + passes * pass;
 
 // What of a field an adapter can hold whose textures are so many texels wide: the levels up to the first that is wider,
 // and a sentence about what is left out, or nothing. The widest of its textures has a column for each neuron.

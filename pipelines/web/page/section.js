@@ -61,6 +61,7 @@ class Section {
 
   // A grid of values, coarse at first; `finer` one that takes some tenths of a second. Says whether there is a new one.
   async refresh(gl, renderer, level, finer = false) {
+    if (!renderer.header.levels.length) return false; // a mesh has no values: it is cut, and that is all
     const state = `${this.version} ${level}`;
     if (this.axis === null || this.made === `${state} ${finer}` || (!finer && this.made?.startsWith(`${state} `) && this.texture)) return false;
     const side = finer ? this.finer ?? FIRST_GRID : FIRST_GRID;
@@ -85,7 +86,7 @@ class Section {
 
   // Where a ray meets the plane, if it does on the grid: the depth.
   meets(eye, direction) {
-    if (this.axis === null) return Infinity;
+    if (!this.texture) return Infinity;
     const depth = (this.at - eye[this.axis]) / direction[this.axis];
     const [low1, low2, high1, high2] = this.extent;
     const [one, two] = [1, 2].map((step) => eye[(this.axis + step) % 3] + depth * direction[(this.axis + step) % 3]);

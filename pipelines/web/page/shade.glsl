@@ -66,10 +66,15 @@ float open(ivec2 at, vec4 seen, vec3 n) {
   }
   return clamp(1.0 - shut / 3.2, 0.15, 1.0);
 }
-vec3 shaded(ivec2 at, vec4 seen, vec3 own, vec3 along) {
+// The own colour of what is seen; alpha is 1 where it has that in plain light too.
+vec4 ownAt(ivec2 at) {
+  if (at.y < ready) return texelFetch(fineColor, min(at, textureSize(fineColor, 0) - 1), 0);
+  return texelFetch(coarseColor, min(before(at), textureSize(coarseColor, 0) - 1), 0);
+}
+vec3 shaded(ivec2 at, vec4 seen, vec4 own, vec3 along) {
   if (seen.w <= 0.0) return light(paper);
   vec3 n = seen.xyz;
-  if (shading == 4) return light(own);
+  if (shading == 4) return light(own.rgb);
   if (shading == 1) return light(0.5 + 0.5 * n);
   if (dot(n, along) > 0.2) n = -n;
   else if (dot(n, along) > 0.0) n -= 2.0 * dot(n, along) * along;
@@ -80,7 +85,7 @@ vec3 shaded(ivec2 at, vec4 seen, vec3 own, vec3 along) {
   float fill = max(dot(v, normalize(vec3(0.75, 0.05, 0.65))), 0.0);
   vec3 ambient = mix(vec3(0.15, 0.14, 0.13), vec3(0.34, 0.36, 0.39), 0.5 + 0.5 * v.y);
   vec3 lamps = key * vec3(0.96, 0.93, 0.88) + fill * vec3(0.17, 0.18, 0.20);
-  return light(shading == 3 ? own : clay) * (lamps * (0.4 + 0.6 * clear) + ambient * clear);
+  return light(shading == 3 || own.a > 0.5 ? own.rgb : clay) * (lamps * (0.4 + 0.6 * clear) + ambient * clear);
 }
 vec4 sectionAt(vec2 share) {
   ivec2 last = textureSize(section, 0) - 1;
@@ -122,9 +127,7 @@ void main() {
     for (int i = 0; i < many.x; i++) {
       ivec2 here = min(first + ivec2(i, j), grid - 1);
       vec4 seen = seenAt(here);
-      vec3 own = clay;
-      if (shading > 2) own = here.y < ready ? texelFetch(fineColor, here, 0).rgb : texelFetch(coarseColor, before(here), 0).rgb;
-      sum += shaded(here, seen, own, ray(pixelOf(here)));
+      sum += shaded(here, seen, ownAt(here), ray(pixelOf(here)));
     }
   }
   sum /= float(many.x * many.y);

@@ -160,16 +160,36 @@ void main() {
   result = vec4(sum, 1.0);
 }
 
-#part hull
-// The mesh around the band, as the camera sees it: row 0 of the target is the upper row of the picture.
+#part corner
+// A corner of a triangle, or of the square around a point, as the camera sees it: row 0 of the target is the upper row of
+// the picture. The position of a SHAPE counts from 0 to 1 along its box.
 uniform vec3 eye;
 uniform mat3 axes;
 uniform vec4 lens;
 uniform vec4 frame;
 in vec3 position;
 out vec3 way;
+#ifdef SHAPE
+uniform vec3 low;
+uniform vec3 extent;
+uniform float radius;
+in vec3 normal;
+in vec4 color;
+out vec3 facing;
+out vec4 own;
+out vec2 disc;
+#endif
 void main() {
+#ifdef SHAPE
+  facing = normal;
+  own = color;
+  way = low + extent * position - eye;
+  disc = radius > 0.0 ? 2.0 * vec2(gl_VertexID & 1, gl_VertexID >> 1) - 1.0 : vec2(0.0);
+  // At least as wide as a pixel, or far points would be missed.
+  way += axes * vec3(disc * max(radius, 0.71 * dot(way, axes[2]) / lens.x), 0.0);
+#else
   way = position - eye;
+#endif
   vec3 seen = way * axes;
   vec2 pixel = lens.xy * seen.xy + lens.zw * seen.z;
   vec2 place = 2.0 * (pixel + 0.5 * seen.z) / frame.xy - seen.z;
@@ -182,4 +202,27 @@ in vec3 way;
 out vec4 result;
 void main() {
   result = vec4(length(way));
+}
+
+#part shape
+// Normal and distance of a triangle or a disc, and its colour; what has no normals has those of its faces.
+uniform vec3 eye;
+uniform int across;
+uniform float place;
+in vec3 way;
+in vec3 facing;
+in vec4 own;
+in vec2 disc;
+layout(location = 0) out vec4 seen;
+layout(location = 1) out vec4 color;
+void main() {
+  vec3 face = cross(dFdx(way), dFdy(way));
+  if (dot(disc, disc) > 1.0) discard;
+  if (across >= 0) { // what stands before a plane is cut away
+    float plane = place - eye[across];
+    if ((way[across] - plane) * plane < 0.0) discard;
+  }
+  vec3 normal = dot(facing, facing) > 0.0 ? facing : dot(face, way) > 0.0 ? -face : face;
+  seen = vec4(dot(normal, normal) > 0.0 ? normalize(normal) : -normalize(way), length(way));
+  color = own;
 }

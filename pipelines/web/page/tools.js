@@ -28,6 +28,7 @@ class Tools {
     this.page = page;
     this.ui = page.ui;
     this.ruler = { on: false, ends: [] };
+    this.landmarks = null; // where two shapes are compared
     this.asked = 0;
     const { unit, center } = page.saved.header;
     this.unit = unit;
@@ -48,7 +49,7 @@ class Tools {
     if (onPlane) hit = { position: point, normal: null, depth: crossed };
     if (!hit) return null;
     const distances = [];
-    for (let one = 0; one <= level; one++) distances.push((await renderer.values(Float32Array.from(hit.position), one))[0] * this.unit);
+    for (let one = 0; one <= level && page.saved.header.levels.length; one++) distances.push((await renderer.values(Float32Array.from(hit.position), one))[0] * this.unit);
     return { ...hit, position: this.input(hit.position), place: hit.position, depth: hit.depth * this.unit, distances, onPlane };
   }
 
@@ -77,7 +78,7 @@ class Tools {
     if (!found) return;
     const lines = [`${found.onPlane ? 'on the plane' : 'on the surface'}: ${coordinates(found.position, this.unit)}`];
     if (found.normal) lines.push(`normal ${found.normal.map((part) => part.toFixed(3)).join(', ')}`);
-    lines.push(`distance ${found.distances.map((distance, level) => `f${level} = ${distance.toPrecision(3)}`).join(', ')}`);
+    if (found.distances.length) lines.push(`distance ${found.distances.map((distance, level) => `f${level} = ${distance.toPrecision(3)}`).join(', ')}`);
     lines.push(`from the eye ${digits(found.depth)}`);
     reading.textContent = lines.join('\n');
   }
@@ -86,6 +87,7 @@ class Tools {
   async tap(x, y) {
     const found = await this.probe(x, y);
     this.say(found);
+    if (found && this.landmarks && !this.ruler.on) this.landmarks.pick(found.place);
     if (!found || !this.ruler.on) return;
     this.ruler.ends = [...(this.ruler.ends.length === 2 ? [] : this.ruler.ends), found];
     this.measure();
@@ -109,6 +111,7 @@ class Tools {
     const differences = b ? ` (${coordinates(b.position.map((part, c) => part - a.position[c]), this.unit)})` : '';
     this.ui.length.textContent = !on ? '' : b ? `${this.length.toPrecision(5)} input units${differences}` : `Ruler: ${ends.length ? 'now the other end' : 'click on one end'}`;
     this.ui.length.hidden = !on;
+    if (!on) this.landmarks?.tell();
     this.draw();
   }
 
@@ -133,11 +136,15 @@ class Tools {
     };
     line(4, 'rgba(0, 0, 0, .6)');
     line(2, '#ffd34d');
-    if (ends.length < 2) return;
-    const text = this.length.toPrecision(4);
     Object.assign(pen, { font: `600 ${13 * thick}px system-ui, sans-serif`, lineWidth: 4 * thick, strokeStyle: 'rgba(0, 0, 0, .75)', fillStyle: '#fff', textAlign: 'center' });
-    const [x, y] = [0, 1].map((c) => (ends[0][c] + ends[1][c]) / 2);
-    pen.strokeText(text, x, y - 10 * thick);
-    pen.fillText(text, x, y - 10 * thick);
+    const write = (text, x, y) => {
+      pen.strokeText(text, x, y);
+      pen.fillText(text, x, y);
+    };
+    if (ends.length === 2) write(this.length.toPrecision(4), (ends[0][0] + ends[1][0]) / 2, (ends[0][1] + ends[1][1]) / 2 - 10 * thick);
+    for (const { number, place } of this.landmarks?.marks ?? []) {
+      const [x, y] = project(this.page.camera, place) ?? [-99, -99];
+      write(`\u2022 ${number}`, x, y + 4 * thick);
+    }
   }
 }

@@ -108,7 +108,7 @@ class Field {
 // Display colours around a surface: those of a network at points in the band of a level, the others first moved onto the
 // surface by x - f g / |g|^2; what does not arrive there has the colour of what lies outside.
 class Colors {
-  // `source` answers value(points, count, level), jet(…), color(points, count), or promises to.
+  // `source` answers value(points, count, level), jet(…) and color(points, count), or promises to.
   constructor(source, { level, delta, outside }) {
     Object.assign(this, { source, level, delta, outside });
   }
@@ -134,86 +134,9 @@ class Colors {
     const found = await source.color(moved, count);
     const colors = new Float32Array(3 * count);
     for (let i = 0; i < count; i++) {
-      for (let c = 0; c < 3; c++) {
-        colors[3 * i + c] = reached[i] ? Math.min(1, Math.max(0, found[4 * i + c])) : this.outside[c];
-      }
+      for (let c = 0; c < 3; c++) colors[3 * i + c] = reached[i] ? Math.min(1, Math.max(0, found[4 * i + c])) : this.outside[c];
     }
     return colors;
-  }
-}
-
-// The mesh around the band, rasterised: where the ray of each pixel enters it first and leaves it last.
-class Hull {
-  constructor(gl, parts, arrays, header) {
-    this.gl = gl;
-    this.program = compile(gl, parts, 'hull', 'depth');
-    const { places, faces } = shellArrays(header, arrays);
-    this.places = gl.createVertexArray();
-    gl.bindVertexArray(this.places);
-    gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
-    gl.bufferData(gl.ARRAY_BUFFER, places, gl.STATIC_DRAW);
-    gl.enableVertexAttribArray(gl.getAttribLocation(this.program.program, 'position'));
-    gl.vertexAttribPointer(gl.getAttribLocation(this.program.program, 'position'), 3, gl.FLOAT, false, 0, 0);
-    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
-    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, faces, gl.STATIC_DRAW);
-    gl.bindVertexArray(null);
-    this.corners = faces.length;
-    this.target = null;
-  }
-
-  close() {
-    const { gl, target } = this;
-    gl.deleteVertexArray(this.places);
-    gl.deleteProgram(this.program.program);
-    if (!target) return;
-    gl.deleteTexture(target.texture);
-    gl.deleteFramebuffer(target.buffer);
-    gl.deleteRenderbuffer(this.depth);
-  }
-
-  // For each pixel of rows [first, first + rows): r = nearest front face, g = farthest back face; 0 where there is none.
-  crossings(camera, first, rows) {
-    const { gl, program } = this;
-    const { width } = camera;
-    if (this.target?.width !== width || this.target.height < rows) {
-      if (this.target) {
-        gl.deleteTexture(this.target.texture);
-        gl.deleteFramebuffer(this.target.buffer);
-        gl.deleteRenderbuffer(this.depth);
-      }
-      this.target = target2d(gl, width, rows);
-      this.depth = gl.createRenderbuffer();
-      gl.bindRenderbuffer(gl.RENDERBUFFER, this.depth);
-      gl.renderbufferStorage(gl.RENDERBUFFER, gl.DEPTH_COMPONENT24, width, rows);
-      gl.framebufferRenderbuffer(gl.FRAMEBUFFER, gl.DEPTH_ATTACHMENT, gl.RENDERBUFFER, this.depth);
-    }
-    const far = Math.hypot(...camera.eye) + 3, near = far / 4096;
-    gl.useProgram(program.program);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, this.target.buffer);
-    gl.viewport(0, 0, width, rows);
-    gl.uniform3f(program.at('eye'), ...camera.eye);
-    gl.uniformMatrix3fv(program.at('axes'), false, [...camera.right, ...camera.down, ...camera.forward]);
-    gl.uniform4f(program.at('lens'), camera.fx, camera.fy, camera.cx, camera.cy - first);
-    gl.uniform4f(program.at('frame'), width, rows, near, far);
-    gl.bindVertexArray(this.places);
-    gl.enable(gl.DEPTH_TEST);
-    gl.enable(gl.CULL_FACE);
-    gl.frontFace(gl.CW); // y points down in the target
-    gl.clearBufferfv(gl.COLOR, 0, [0, 0, 0, 0]);
-    for (const [face, test, clear, red] of [[gl.BACK, gl.LESS, 1, true], [gl.FRONT, gl.GREATER, 0, false]]) {
-      gl.colorMask(red, !red, false, false);
-      gl.clearBufferfv(gl.DEPTH, 0, [clear]);
-      gl.cullFace(face);
-      gl.depthFunc(test);
-      gl.drawElements(gl.TRIANGLES, this.corners, gl.UNSIGNED_INT, 0);
-    }
-    gl.colorMask(true, true, true, true);
-    gl.disable(gl.DEPTH_TEST);
-    gl.disable(gl.CULL_FACE);
-    gl.bindVertexArray(null);
-    const numbers = new Float32Array(4 * width * rows);
-    gl.readPixels(0, 0, width, rows, gl.RGBA, gl.FLOAT, numbers);
-    return numbers;
   }
 }
 

@@ -176,7 +176,7 @@ class GpuTracer {
       first: [asked(0, this.lists[0], even), asked(0, this.lists[1], odd)],
       finer: this.nets.map((_, j) => (j && j < levels ? asked(j, this.lists[1 + j], this.slots.finer[j]) : null)),
       host: asked(0, this.identity, this.slots.asked),
-      color: this.header.colors && asked(levels, this.identity, this.slots.asked),
+      colors: this.header.colors && asked(levels, this.identity, this.slots.asked),
     };
     const marched = (here, there) => this.group(
       this.layouts.march, whole(this.frame), whole(this.rays), whole(this.places), whole(this.lists[here]),
@@ -251,7 +251,7 @@ class GpuTracer {
       const pass = encoder.beginComputePass();
       if (kind === 'color') {
         pass.setPipeline(this.kernels[net][0]);
-        pass.setBindGroup(0, this.asks.color, [0, 0]);
+        pass.setBindGroup(0, this.asks.colors, [0, 0]);
         pass.dispatchWorkgroups(this.crew(net, many));
         this.counts.passes++;
       } else {

@@ -11,6 +11,7 @@ from mplicits.neural_fields.networks.texture import ColorSiren
 from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.render.trace import trace_view
 from mplicits.pipelines.surface.surface import read_surface
+from mplicits.pipelines.web.export import pack
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +68,7 @@ def test_points_outside_the_band_get_the_colour_of_the_surface_below_them(run):
     assert float((seen.color - texture.colors(seen.position)).abs().max()) < 1e-3
 
 
-def test_render_shows_colours_and_the_viewer_offers_them(run, tmp_path):
+def test_render_and_the_page_show_colours(run, tmp_path):
     directory, _ = run
     for shading in ("color", "lambert"):
         out = tmp_path / f"{shading}.png"
@@ -75,10 +76,7 @@ def test_render_shows_colours_and_the_viewer_offers_them(run, tmp_path):
         assert main([*arguments, "--fast"]) == 0
         image = iio.imread(out).astype(float)
         assert np.ptp(image, axis=2).max() > 20  # not grey
-    pytest.importorskip("viser")
-    from mplicits.pipelines.viewer.server import open_run
-
-    assert "color" in open_run(directory).shadings
+    assert pack(directory).page.colored
 
 
 def test_a_baked_mesh_has_the_colours_of_the_texture(run, tmp_path):

@@ -478,10 +478,9 @@ def test_doctor_knows_all_extras(monkeypatch, tmp_path):
     monkeypatch.setattr(doctor.importlib.metadata, "requires", lambda name: [*project["dependencies"], *lines])
     monkeypatch.setattr(doctor, "_installed", lambda name: None)
     report = doctor.format_findings(doctor.examine(tmp_path))
-    for extra in ("las", "poisson", "texture", "view"):
+    for extra in ("las", "poisson", "texture"):
         assert f"optional, not installed; pip install 'mplicits[{extra}]'" in report
     assert "mplicits[dev]" not in report
-    assert "viser" in report
     assert "xatlas" in report
 
 

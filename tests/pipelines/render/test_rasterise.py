@@ -11,7 +11,7 @@ from mplicits.pipelines.render.rasterise import (
     mesh_view,
     picture_of,
 )
-from mplicits.pipelines.render.shade import BACK_TINT, ShadeOptions
+from mplicits.pipelines.render.shade import LAMPS, ShadeOptions
 from mplicits.pipelines.surface.raster import clip
 
 NO_FACES = np.empty((0, 3), np.int64)
@@ -89,7 +89,7 @@ def test_back_faces_show_as_such():
     front = picture_of(ball, camera)[32, 32].astype(float)
     back = picture_of(Mesh(ball.vertices, ball.faces[:, ::-1]), camera)[32, 32].astype(float)
     # Under the same light, albedos differ as their linear values do.
-    expected = (np.array(BACK_TINT) / ShadeOptions().clay) * front
+    expected = (np.array(LAMPS.back) / ShadeOptions().clay) * front
     np.testing.assert_allclose(back, expected, rtol=0.02)
 
 

@@ -27,10 +27,8 @@ from mplicits.pipelines.render.legend import with_legend
 from mplicits.pipelines.render.slice import (
     FINEST,
     INSIDE,
-    LINE,
     OUTSIDE,
-    TINT,
-    ZERO_LINE,
+    STYLE,
     draw_slice,
     level_color,
     plane_axes,
@@ -149,12 +147,12 @@ def test_lines_are_as_wide_at_any_gradient(tilt):
     row = image[320]
     paper = 255 * np.where(np.arange(640)[:, None] < 320, INSIDE[0], OUTSIDE[0])
     cover = ((paper - row) / (paper - INK)).mean(axis=1)[316:324]
-    assert cover.sum() == pytest.approx(ZERO_LINE, abs=0.2)  # as wide as it says, in a picture 640 pixels high
+    assert cover.sum() == pytest.approx(STYLE.zero_line, abs=0.2)  # as wide as it says, in a picture 640 pixels high
     # So is the first iso-line outside, 128 pixels from the middle, whatever the gradient.
     at = round(319.5 + 128)
     cover = ((row[at - 6] + row[at + 6]) / 2 - row[at - 5 : at + 6]).sum(axis=0)
     strength = 0.26 * (row[at - 6] - 255 * 0.45 * np.array(OUTSIDE[1]))
-    np.testing.assert_allclose(cover / strength, LINE, atol=0.15)
+    np.testing.assert_allclose(cover / strength, STYLE.line, atol=0.15)
     # Iso-lines stand at multiples of the step: 0.2 is 128 pixels from the middle of 640 pixels for 1.
     notch = np.convolve(row.sum(axis=1), [0.5, -1, 0.5], mode="same")
     lines = np.flatnonzero(notch[2:-2] > 6) + 2
@@ -197,7 +195,7 @@ def test_each_level_has_its_own_line_and_an_inner_band_ends_with_the_outer_one()
     for radius, colors in ((0.33, [0]), (0.42, [0, 1]), (0.65, [0]), (0.75, []), (0.2, [])):
         tinted = plain[round(radius / 0.005)]
         for index in colors:
-            tinted = tinted + TINT * (255 * np.array(level_color(index)) - tinted)
+            tinted = tinted + STYLE.tint * (255 * np.array(level_color(index)) - tinted)
         np.testing.assert_allclose(at(radius), tinted, atol=1.5)
     coarse = draw_slice(take_slice(field, **view, level=0), iso_step=0.5)
     assert not is_ink(coarse).any()  # the finest level's colour is kept for it

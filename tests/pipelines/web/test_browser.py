@@ -142,7 +142,7 @@ def test_a_single_ray_finds_what_the_picture_shows(opened):
 
 def test_the_bench_counts_what_networks_are_asked(opened):
     found = opened.execute_async_script(
-        "const done = arguments[0]; window.mplicits.bench({size: 24, frames: 2, level: 1, rate: 2}).then(done);"
+        "const done = arguments[0]; window.mplicits.bench({size: 24, frames: 2, level: 1}).then(done);"
     )
     base, fine, none, colors = found["evaluations"]
     assert base > fine > 0
@@ -152,12 +152,6 @@ def test_the_bench_counts_what_networks_are_asked(opened):
     assert once < found["operations"] < 2 * once
     assert found["fps"] > 0
     assert found["read"] > 0
-    # The model of the time: operations at a rate, and passes.
-    assert found["rate"] > 0
-    assert found["pass"] > 0
-    passes = found["pass"] * found["passes"]
-    assert found["model"] == pytest.approx(found["operations"] / found["rate"] + passes)
-    assert found["elsewhere"] == pytest.approx(found["operations"] / 2e9 + passes)
 
 
 def test_what_a_person_sees_and_does(opened):

@@ -9,7 +9,7 @@ import zlib
 import numpy as np
 import pytest
 import torch
-from mplicits.neural_fields import MultiscaleSDF, Similarity, Siren, Sphere, save_field
+from mplicits.neural_fields import MultiscaleSDF, Similarity, Siren, save_field
 from mplicits.neural_fields.networks.sphere_init import solve_sphere
 from mplicits.neural_fields.spacetime.field import SpaceTimeSDF
 from mplicits.pipelines.cli import main
@@ -125,14 +125,15 @@ def test_a_moment_of_a_field_that_moves(tmp_path):
 def test_mistakes_are_one_line(run, tmp_path, capsys):
     foreign = tmp_path / "letter.html"
     foreign.write_text("<p>mine")
-    sphere = tmp_path / "sphere.safetensors"
-    save_field(sphere, Sphere(radius=0.5))
+    moving = tmp_path / "moving.safetensors"
+    save_field(moving, SpaceTimeSDF.from_static(ball()))
     out = tmp_path / "page.html"
     mistakes = {
         (run, "-o", tmp_path / "page.png"): "unknown extension",
         (run, "-o", foreign): "no page of this command",
-        (tmp_path / "none", "-o", out): "no such run",
-        (sphere, "-o", out): "not a Sphere",
+        (tmp_path / "none", "-o", out): "no such file",
+        (run, "-o", out, "--no-highlights"): "--no-highlights: pages",
+        (moving, "-o", out, "--cloud", foreign): "--cloud",
         (run, "-o", out, "--levels", 3): "has levels 0 to 1",
         (run, "-o", out, "--time", 0.5): "does not move",
     }

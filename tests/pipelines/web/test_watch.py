@@ -1,6 +1,5 @@
 """A run that grows is shown from its first checkpoint on, and a training never notices; see also `test_serve`."""
 
-import sys
 import time
 from pathlib import Path
 
@@ -25,7 +24,6 @@ def checkpoint(run: Path) -> None:
 
 
 def test_the_page_comes_with_the_first_checkpoint_of_this_run(tmp_path: Path) -> None:
-    pytest.importorskip("websockets")
     checkpoint(tmp_path)  # another run's, which will be replaced
     said: list[str] = []
     with Watcher(tmp_path, say=said.append, look_every=0.01) as watcher:
@@ -39,7 +37,6 @@ def test_the_page_comes_with_the_first_checkpoint_of_this_run(tmp_path: Path) ->
 
 
 def test_what_fails_is_said_once_and_no_more(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("websockets")
 
     def fail(*_: object, **__: object) -> object:
         raise RuntimeError("no such screen")
@@ -54,7 +51,6 @@ def test_what_fails_is_said_once_and_no_more(tmp_path: Path, monkeypatch: pytest
 
 def test_a_fit_is_watched(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """With nobody connected, and with the same result."""
-    pytest.importorskip("websockets")
     write_cloud_ply(tmp_path / "ball.ply", sample_sphere(500))
     runs = [tmp_path / "plain", tmp_path / "watched"]
     for run, watch in zip(runs, ([], ["--watch"]), strict=True):
@@ -62,13 +58,3 @@ def test_a_fit_is_watched(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     capsys.readouterr()
     plain, watched = (load_field(run / "field.safetensors").field.state_dict() for run in runs)
     assert all(bool((plain[name] == watched[name]).all()) for name in plain)
-
-
-def test_without_websockets_nothing_is_begun(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    write_cloud_ply(tmp_path / "ball.ply", sample_sphere(100))
-    monkeypatch.setitem(sys.modules, "websockets.sync.server", None)
-    assert main(["fit", str(tmp_path / "ball.ply"), "-o", str(tmp_path / "run"), "--watch"]) == 2
-    assert capsys.readouterr().err == "mplicits: error: the viewer needs websockets; pip install mplicits[view]\n"
-    assert not (tmp_path / "run").exists()

@@ -9,7 +9,7 @@ import torch
 from mplicits.datasets.cameras import Camera, look_at
 from mplicits.neural_fields import Field, MultiscaleSDF, Siren, Sphere
 from mplicits.neural_fields.networks.sphere_init import solve_sphere
-from mplicits.pipelines.render.trace import TOLERANCE, Seen, pixel_size, trace_view
+from mplicits.pipelines.render.trace import PRECISION, Seen, pixel_size, trace_view
 
 
 @pytest.fixture
@@ -53,8 +53,8 @@ def assert_same(ours: Seen, theirs: Seen, view: Camera) -> None:
     kept, others = torch.isin(ours.pixel, theirs.pixel), torch.isin(theirs.pixel, ours.pixel)
     assert int((~kept).sum()) + int((~others).sum()) <= 1
     assert bool((ours.pixel.diff() > 0).all())  # in their order
-    assert float((ours.depth[kept] - theirs.depth[others]).abs().max()) <= TOLERANCE * size
-    assert float((ours.position[kept] - theirs.position[others]).norm(dim=-1).max()) <= TOLERANCE * size
+    assert float((ours.depth[kept] - theirs.depth[others]).abs().max()) <= PRECISION.tolerance * size
+    assert float((ours.position[kept] - theirs.position[others]).norm(dim=-1).max()) <= PRECISION.tolerance * size
     assert float((ours.direction[kept] - theirs.direction[others]).abs().max()) <= 1e-6
     off = (ours.normal[kept] - theirs.normal[others]).norm(dim=-1)
     assert float(off.median()) <= 1e-4

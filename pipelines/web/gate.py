@@ -1,9 +1,7 @@
-"""Who may talk to a server of ours: who knows the token of its address, from its own page, by a name of this machine.
+"""Access control of a local server: a token, the origin, and the names of this machine.
 
-A server on 127.0.0.1 is open to every user of the machine, and by way of their browsers to every page that they
-visit: such a page may open a WebSocket to any address (it is not held back by the same-origin policy), and with a name
-of its own that it lets point to 127.0.0.1 it may read what is served there. Hence three checks of every request. They
-know nothing of any server: headers in, an answer out.
+A server on 127.0.0.1 is open to every user of the machine and, through their browsers, to every page that they visit.
+So each request is checked three times: its Host header, its Origin header and its token.
 """
 
 from __future__ import annotations
@@ -19,7 +17,7 @@ from urllib.parse import parse_qs, urlsplit
 
 __all__ = ["Gate", "Verdict"]
 
-# What a page of ours may do at most with what it came by: nobody frames it, nobody learns its address.
+# Nobody frames a page of ours, caches it or learns its address.
 HEADERS: Mapping[str, str] = {
     "Referrer-Policy": "no-referrer",
     "X-Content-Type-Options": "nosniff",
@@ -34,11 +32,11 @@ ASKING = """<!doctype html><meta charset="utf-8"><title>mplicits</title>
 
 
 class Verdict(NamedTuple):
-    """What becomes of a request.
+    """The decision about a request.
 
     Attributes:
-        status: 200 to let it in; any other is the answer to it.
-        body: what to answer; empty where it is let in.
+        status: 200 admits it; any other is the answer to it.
+        body: the answer; empty where it is admitted.
         headers: to be sent along, whatever the status.
     """
 
@@ -48,7 +46,7 @@ class Verdict(NamedTuple):
 
     @property
     def admitted(self) -> bool:
-        """Whether it is let in."""
+        """Whether the request is let in."""
         return self.status == HTTPStatus.OK
 
 
@@ -58,7 +56,7 @@ class Gate:
     Args:
         host: the address that it listens on.
         port: its port.
-        token: what its address ends with; drawn at random if it is None.
+        token: the end of its address; random if it is None.
 
     Example:
         >>> gate = Gate("127.0.0.1", 8080, token="secret")
@@ -76,18 +74,16 @@ class Gate:
 
     @property
     def url(self) -> str:
-        """What a browser on this machine opens."""
+        """The address for a browser on this machine."""
         local = "127.0.0.1" if self.host in ("0.0.0.0", "::", "") else self.host
         return f"http://{f'[{local}]' if ':' in local else local}:{self.port}/?token={self.token}"
 
     def admit(self, path: str, headers: Mapping[str, str]) -> Verdict:
-        """Whether a request may come in; a page as well as the handshake of a WebSocket.
-
-        Whoever comes with the token in the address gets it as a cookie, by which the page's own requests are known.
+        """Decide about a request. A token in the address is answered with a cookie, which the page's own requests send.
 
         Args:
             path: with what follows the question mark.
-            headers: of the request, looked up by their usual names.
+            headers: of the request, by their usual names.
         """
         host, origin = headers.get("Host", ""), headers.get("Origin")
         if _is_loopback(self.host) and not _is_loopback(_name_of(host)):

@@ -1,7 +1,7 @@
 """Who is let in by the gate: every refusal that it promises, and nothing else refused."""
 
 import pytest
-from mplicits.pipelines.viewer.gate import Gate
+from mplicits.pipelines.web.gate import Gate
 
 OWN = {"Host": "127.0.0.1:8080"}
 

@@ -1,0 +1,88 @@
+"""Two runs side by side on a page, and the pairs of points that are clicked there: ``mplicits view --landmarks``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...datasets.landmarks import read_landmarks, write_landmarks
+from ...neural_fields import Similarity
+from ..texture.train import texture_of
+from ..training.folder import find_field, load_still
+from .export import Packed, WebOptions, pack_shapes
+from .shapes import field_shapes
+
+__all__ = ["Pairs"]
+
+
+class Pairs:
+    """Landmarks of two runs, kept in a file while there are any.
+
+    The first run stands about (−½, 0, 0) at half its size, the second about (½, 0, 0), each as the mesh of its finest
+    level.
+
+    Args:
+        runs: run directories or .safetensors files.
+        path: the file; pairs that it has already are kept.
+
+    Raises:
+        InputError: there is no such run, one moves or has no surface, or the file holds no landmarks.
+    """
+
+    def __init__(self, runs: Sequence[str | Path], path: str | Path, *, up: str = "y") -> None:
+        self.path, self.runs, self.up = Path(path), runs, up
+        self.saved = [load_still(run) for run in runs]
+        self.pairs = np.zeros((0, 2, 3))
+        if self.path.exists():
+            self.pairs = np.stack(read_landmarks(self.path), axis=1)
+
+    def pack(self) -> Packed:
+        """Pack both shapes and the pairs."""
+        shapes, names = [], []
+        for side, (run, saved) in enumerate(zip(self.runs, self.saved, strict=True)):
+            texture = texture_of(find_field(run), saved.field)
+            mesh = field_shapes(saved.field, texture)[-1]
+            names.append(Path(run).resolve().stem)
+            shapes.append(replace(mesh, name=names[-1], vertices=0.5 * mesh.vertices + self._shift(side)))
+        packed = pack_shapes(shapes, Similarity.identity(), WebOptions(up=self.up), name=" and ".join(names))
+        scene = [
+            [
+                (0.5 * saved.similarity.to_unit(point) + self._shift(side)).tolist()
+                for side, (saved, point) in enumerate(zip(self.saved, pair, strict=True))
+            ]
+            for pair in self.pairs
+        ]
+        packed.header["landmarks"] = {"names": names, "pairs": scene}
+        return packed
+
+    def keep(self, pairs: Any) -> None:
+        """Write pairs ``(P, 2, 3)`` of places in the scene, in the input coordinates of either run.
+
+        Raises:
+            ValueError: they are none.
+            InputError: the file cannot be written.
+        """
+        try:
+            places = np.array(pairs, np.float64)
+        except (TypeError, ValueError) as error:
+            raise ValueError("landmarks: expected a list of pairs of points") from error
+        if places.shape not in ((0,), (len(places), 2, 3)) or not np.isfinite(places).all():
+            raise ValueError("landmarks: expected a list of pairs of finite points")
+        places = places.reshape(-1, 2, 3)
+        sides = [
+            saved.similarity.to_input((places[:, side] - self._shift(side)) / 0.5)
+            for side, saved in enumerate(self.saved)
+        ]
+        self.pairs = np.stack(sides, axis=1)
+        if len(places):
+            write_landmarks(self.path, *sides)
+        else:
+            self.path.unlink(missing_ok=True)
+
+    @staticmethod
+    def _shift(side: int) -> np.ndarray:
+        return np.array([side - 0.5, 0.0, 0.0])
