@@ -1,6 +1,6 @@
 """What the tests of evolutions share: small settings, a fit that takes no time, bad input."""
 
-import inspect
+import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +10,7 @@ import torch
 from mplicits.neural_fields import MultiscaleSDF, Similarity, Siren, Sphere, save_field
 from mplicits.pipelines.cli.entry import main as mplicits_command
 from mplicits.pipelines.evolve import checks as evolve_checks
-from mplicits.pipelines.evolve import deform, source
+from mplicits.pipelines.evolve import deform
 from mplicits.pipelines.evolve import problem as evolve_problem
 from mplicits.pipelines.training.settings import EvolveConfig
 
@@ -49,9 +49,7 @@ def few_points(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(evolve_problem, "END_POINTS", 1000)
     patch.setattr(evolve_problem, "REACH_POINTS", 200)
     patch.setattr(evolve_checks, "END_RESOLUTION", 32)
-    patch.setattr(deform, "MATCHED", 200)
-    patch.setattr(deform, "POOL", 2000)
-    patch.setitem(inspect.unwrap(source.pace_of).__kwdefaults__, "cells", 24)
+    patch.setattr(deform, "MOTION", dataclasses.replace(deform.MOTION, matched=200, pool=2000))
 
 
 def ball(path: Path, radius: float, *, levels: bool = False) -> None:

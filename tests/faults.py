@@ -1,6 +1,6 @@
 """A disk that fails, or a process that is killed, at a chosen one of the operations that change a disk for good.
 
-Every such operation of the package goes through `neural_fields.backend.disk`. `Faults` counts them, and at one of them
+Every such operation of the package goes through `neural_fields.backend.files`. `Faults` counts them, and at one of them
 
 - "killed": nothing of it happens, nor of any that would follow: no clean-up, as after SIGKILL or a power cut;
 - "torn": half of it happens, if it is a write, and nothing after it;
@@ -10,23 +10,19 @@ Every such operation of the package goes through `neural_fields.backend.disk`. `
 from __future__ import annotations
 
 import errno
-import functools
-import json
 import os
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
-from mplicits.neural_fields.backend import disk
+from mplicits.neural_fields.backend import files as disk
 
-__all__ = ["KINDS", "Faults", "Killed", "dead_holder"]
+__all__ = ["KINDS", "Faults", "Killed"]
 
 KINDS = ("killed", "torn", "full")
-OPERATIONS = ("write", "sync", "rename", "remove", "make_folder", "remove_tree")
+OPERATIONS = ("write", "sync", "rename", "remove")
 
 
 class Killed(BaseException):
@@ -71,17 +67,3 @@ class Faults:
                 raise Killed
 
         return run
-
-
-@functools.cache
-def _ended() -> int:
-    """The number of a process that is no more."""
-    with subprocess.Popen([sys.executable, "-S", "-c", ""]) as process:
-        pass
-    return process.pid
-
-
-def dead_holder(run: Path) -> None:
-    """Leave a lock in a directory as a process that was killed leaves it."""
-    holder = {"pid": _ended(), "host": os.uname().nodename, "since": "noon", "started": 1}
-    (run / "run.lock").write_text(json.dumps(holder))

@@ -235,7 +235,7 @@ class Trial:
         with contextlib.suppress(FileNotFoundError):
             if not is_same(result(command, run), self.wanted[command]):
                 return f"bad: other bits than without the kill, after {', '.join(found)}"
-        left = [str(file) for file in run.rglob("*") if file.name.startswith(".") or file.name.endswith(".lock")]
+        left = [str(file) for file in run.rglob("*") if file.name.startswith(".")]
         if left:
             return f"bad: left over {left}"
         shutil.rmtree(run)
@@ -257,7 +257,7 @@ class Trial:
         if command == "bench":
             runs = list(run.glob("runs/*")) if run.is_dir() else []
             for each in runs:
-                if (each / "run.json").is_file() or (each / ".ready").is_dir():
+                if (each / "run.json").is_file() or (each / ".journal").is_file():
                     check_whole(each)
             return "resumable" if any((each / "resume.safetensors").is_file() for each in runs) else "bench"
         if not run.is_dir():

@@ -6,6 +6,7 @@ two flags counts, and `SMALLER` replaces the values of flags that not every line
 here is skipped, visibly, with its reason.
 """
 
+import dataclasses
 import functools
 import json
 import re
@@ -239,7 +240,8 @@ def _small(monkeypatch: pytest.MonkeyPatch) -> None:
     scan = functools.partial(simulate_scan, Sphere(radius=0.7), scanners=3, resolution=24, colors=np.abs)
     monkeypatch.setattr(datasets, "statue_scan", scan)
     monkeypatch.setitem(scene_mesh.__kwdefaults__, "resolution", 48)
-    monkeypatch.setattr(transport, "ASTRAY", 1.0)  # a motion of thirty steps starts anywhere
+    # A motion of thirty steps starts anywhere.
+    monkeypatch.setattr(transport, "TRANSPORT", dataclasses.replace(transport.TRANSPORT, astray=1.0))
     for module in (subject, export):
         monkeypatch.setattr(module, "FRAME_RESOLUTION", 24)
     texture = TextureConfig(width=16, depth=1, steps=5, batch=64, band_batch=64, samples=500)

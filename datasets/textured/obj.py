@@ -21,7 +21,6 @@ __all__ = ["read_textured_obj"]
 
 Float64 = NDArray[np.float64]
 
-WHITE = (1.0, 1.0, 1.0)
 # Options of map_Kd and how many words follow each; those with several numbers may have fewer.
 _OPTIONS = {"-blendu": 1, "-blendv": 1, "-boost": 1, "-mm": 2, "-o": 3, "-s": 3, "-t": 3, "-texres": 1, "-clamp": 1}
 _OPTIONS |= {"-bm": 1, "-imfchan": 1, "-type": 1, "-cc": 1}
@@ -30,7 +29,7 @@ _OPTIONS |= {"-bm": 1, "-imfchan": 1, "-type": 1, "-cc": 1}
 class _Material(NamedTuple):
     """What a material says: a colour, and perhaps an image with ``uv * scale + offset``."""
 
-    color: tuple[float, ...] = WHITE
+    color: tuple[float, ...] = (1.0, 1.0, 1.0)
     image: Path | None = None
     clamp: bool = False
     scale: tuple[float, ...] = (1.0, 1.0)

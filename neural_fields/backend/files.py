@@ -1,4 +1,8 @@
-"""Files that are written whole or not at all, and folders that are listed without what is being written."""
+"""Files that are written whole or not at all, and folders that are listed without what is being written.
+
+All that must survive a kill or a full disk goes through `write`, `sync`, `rename` and `remove`, so that tests can make
+each of these operations fail, or be the last one of a process (`tests/faults.py`).
+"""
 
 from __future__ import annotations
 
@@ -13,7 +17,6 @@ from typing import Any
 
 import numpy as np
 
-from . import disk
 from .errors import InputError
 
 __all__ = [
@@ -23,10 +26,43 @@ __all__ = [
     "json_bytes",
     "natural",
     "partial_of",
+    "remove",
+    "rename",
+    "sync",
     "whole_file",
+    "write",
     "write_json",
     "write_whole",
 ]
+
+
+def write(path: Path, content: bytes) -> None:
+    """Write a file, and wait until the disk has it."""
+    with path.open("wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def sync(folder: Path) -> None:
+    """Wait until the disk has the names in a folder; does nothing on Windows, where folders cannot be opened."""
+    if os.name == "nt":
+        return
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def rename(path: Path, target: Path) -> None:
+    """Give a file another name; a file of that name is replaced."""
+    path.replace(target)
+
+
+def remove(path: Path) -> None:
+    """Remove a file, if it is there."""
+    path.unlink(missing_ok=True)
 
 
 def check_place(path: str | Path) -> None:
@@ -103,12 +139,12 @@ def whole_file(path: str | Path) -> Iterator[Path]:
     path = Path(path)
     partial = partial_of(path)
     try:
-        disk.make_folder(path.parent)
+        path.parent.mkdir(parents=True, exist_ok=True)
         try:
             yield partial
-            disk.rename(partial, path)
+            rename(partial, path)
         finally:
-            disk.remove(partial)
+            remove(partial)
     except OSError as error:
         reason = error.strerror or error
         raise InputError(f"{path}: cannot be written ({reason}); choose another place") from error
@@ -121,7 +157,7 @@ def write_whole(path: str | Path, content: str | bytes) -> None:
         InputError: see `whole_file`.
     """
     with whole_file(path) as partial:
-        disk.write(partial, content.encode() if isinstance(content, str) else content)
+        write(partial, content.encode() if isinstance(content, str) else content)
 
 
 def json_bytes(data: Any) -> bytes:

@@ -84,11 +84,7 @@ def _fit(arguments: argparse.Namespace) -> int:
     config = None if arguments.resume else read_settings(arguments, FitConfig)
     if len(arguments.clouds) > 1 or arguments.jobs is not None:
         return _fit_many(arguments, config)
-    from ..training.team import team
-
-    with team(device="auto" if config is None else config.device) as leads:
-        work = _fit_one if leads else _follow
-        return work(arguments, arguments.clouds[0], config)
+    return _fit_one(arguments, arguments.clouds[0], config)
 
 
 def _fit_one(arguments: argparse.Namespace, cloud: str, config: FitConfig | None) -> int:
@@ -159,20 +155,6 @@ def _planned(arguments: argparse.Namespace, source: Path | DepthInput, columns: 
 
     options = {"colors": not arguments.no_colors, "resume": arguments.resume}
     return plan_mesh(arguments.mesh, arguments.out, source, columns=columns, **options)
-
-
-def _follow(arguments: argparse.Namespace, cloud: str, config: FitConfig | None) -> int:
-    """Help the process that does the rest, and speaks for all; see `team`."""
-    from ..fit.train import fit
-    from ..training.trainer import Interrupted
-
-    if _depth_input(arguments, cloud) is not None:
-        raise input_error(f"{cloud}: depth maps are fitted by one process; leave out torchrun")
-    try:
-        fit(cloud, config, out=arguments.out, resume=arguments.resume)
-    except Interrupted:
-        return 130
-    return 0
 
 
 def _fit_many(arguments: argparse.Namespace, config: FitConfig | None) -> int:

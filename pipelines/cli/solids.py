@@ -91,12 +91,6 @@ def _offset(arguments: argparse.Namespace) -> int:
     options = SolidOptions(**given_flags(arguments, SolidOptions))
     made = offset(arguments.run, arguments.by, arguments.out, options, shell=arguments.shell, say=print)
     _report(arguments, made, started)
-    if made.distances is not None:
-        low, high = made.distances
-        print(
-            f"its vertices lie {low:.6g} to {high:.6g} from the surface of {arguments.run} "
-            "(input units, negative inside)"
-        )
     return 0
 
 

@@ -143,28 +143,6 @@ def _reconstruct(arguments: argparse.Namespace) -> int:
     if arguments.resume and were_given(arguments, ReconstructConfig):
         raise input_error("--resume: continues with the run's own settings; leave out --preset, --config and the rest")
     config = None if arguments.resume else read_settings(arguments, ReconstructConfig)
-    from ..training.team import is_alone, team
-
-    with team(device="auto" if config is None else config.device) as leads:
-        if arguments.poses == "colmap" and not is_alone():
-            raise input_error("--poses colmap: cameras are found by one process; run `mplicits find-cameras` before")
-        return (_reconstruct_here if leads else _help_reconstruct)(arguments, config)
-
-
-def _help_reconstruct(arguments: argparse.Namespace, config: ReconstructConfig | None) -> int:
-    """Help the process that does the rest, and speaks for all; see `team`."""
-    from ..reconstruct.train import reconstruct
-    from ..training.trainer import Interrupted
-
-    try:
-        reconstruct(arguments.data, config, out=arguments.out, resume=arguments.resume)
-    except Interrupted:
-        return 130
-    return 0
-
-
-def _reconstruct_here(arguments: argparse.Namespace, config: ReconstructConfig | None) -> int:
-    """Train, measure and mesh."""
     from ...datasets.views.poses.find_cameras import find_cameras
     from ..mesh.extract import mesh_run
     from ..reconstruct.posing import colmap_report

@@ -36,11 +36,7 @@ __all__ = ["SequenceOptions", "animate_run", "check_sequence_path", "film_frames
 
 Tell = Callable[[int, int], None]
 
-OUTLINE_RESOLUTION = 48
-OUTLINES = 9  # of the times from which the camera takes what it has to have in view
-WHITE = (1.0, 1.0, 1.0)
 SHEET = ".png"
-ACROSS = 7  # pictures in a row of a sheet
 
 
 @dataclass(frozen=True)
@@ -144,7 +140,7 @@ def animate_run(
     if out.suffix.lower() == SHEET:
         frames = film_frames(file, field, transported, level, options, progress)
         moments = [(f"t = {time:.2f}", frame) for time, frame in zip(options.times, frames, strict=True)]
-        write_picture(out, contact_sheet(*in_rows(moments, ACROSS)))
+        write_picture(out, contact_sheet(*in_rows(moments, 7)))  # 7 in a row
         return f"{options.frames} moments of {options.size[0]}×{options.size[1]}"
     if out.suffix:
         return _write_moving_mesh(out, file, field, transported, similarity, level, options, progress)
@@ -211,7 +207,7 @@ def film_frames(
             rgb = seen.position
             if len(seen.pixel):
                 rgb = shade(seen, options.shading, camera=strip, field=still, level=level, options=lit)
-            parts.append(downsample(compose(seen, rgb, background=WHITE), samples))
+            parts.append(downsample(compose(seen, rgb, background=(1.0, 1.0, 1.0)), samples))
         if progress is not None:
             progress(index, options.frames)
         yield np.concatenate(parts)
@@ -235,9 +231,9 @@ def _tracer(field: Field, camera: Camera, level: int) -> DynamicTracer:
 def _outline(file: Path, field: Field, options: SequenceOptions) -> NDArray[np.float64]:
     """Points that the camera has to have in view at all times."""
     seen = []
-    for time in np.linspace(0, 1, min(OUTLINES, options.frames)).tolist():
+    for time in np.linspace(0, 1, min(9, options.frames)).tolist():
         try:
-            seen.append(extract_mesh(moment(field, time), resolution=OUTLINE_RESOLUTION, normals=False).vertices)
+            seen.append(extract_mesh(moment(field, time), resolution=48, normals=False).vertices)
         except NoSurfaceError:
             continue  # a surface may come and go
     if not seen:

@@ -21,8 +21,6 @@ from .topology import Change, Topology, find_changes, surface_of, topology_of
 __all__ = ["FrameFigures", "check_evolution", "end_figures", "frame_figures", "slope_figures", "warnings"]
 
 END_RESOLUTION = 192
-# A surface that shall be met counts as missed where its Chamfer distance is so much above what it would score itself.
-MISSED = 1.5
 
 
 @dataclass(frozen=True)
@@ -147,7 +145,9 @@ def warnings(checks: dict[str, Any]) -> list[str]:
         )
     found.extend(_loose_parts(checks))
     for end in checks["ends"]:
-        if end["ratio"] is None or end["ratio"] > MISSED:
+        # A surface that shall be met counts as missed where its Chamfer distance is so much above what it would score
+        # itself.
+        if end["ratio"] is None or end["ratio"] > 1.5:
             how = "nothing is there" if end["ratio"] is None else f"Chamfer {end['ratio']:.2f} times its floor"
             found.append(f"{end['name']} is not met at t = {end['time']:g} ({how}); train longer (--steps)")
     return found

@@ -23,6 +23,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -39,33 +40,73 @@ from .samples import Bounds, Known, around, joined, known_at, uniform
 from .shapes import StaticShape
 
 __all__ = [
+    "MOTION",
     "MotionObjective",
+    "MotionOptions",
     "carried_samples",
     "learn_motion",
     "match",
     "motion_figures",
 ]
 
-POOL = 20_000  # points of each shape
-MATCHED = 1000  # of them, which the guide has partners for
-STEPS = 8  # of the midpoint rule between two keys, while it is learnt
-# Per step of the training: points with a partner and others, of each end; places where the regularity is asked for.
-GUIDED, LOOSE, REGULAR = 256, 512, 1024
-AROUND = 0.05  # how far from the paths it is asked for
-FADES = 0.6  # of the steps, after which the guide is gone
-FAR = 0.1  # residuals count linearly from here on: what has no partner does not pull at all others
-DATA = 20.0  # weight of the ends
-INSIDE = 0.98  # radius that no path should leave
-# The cost of a pair is the squared way, and this much for opposite normals; and for other surroundings.
-NORMALS, SURROUNDINGS = 0.1, 0.06
-MARKED = 4.0  # for the squared differences of their nearness to landmarks, added up
-DEPTHS = (0.05, 0.1, 0.2, 0.3)
-# Entropic optimal transport: from a blur of √0.1 to one of √0.003. To leave mass without a partner costs more than the
-# longest way in the unit sphere, 2²: where it costs less, of a shape that has travelled the rear stays behind.
-BLUR, LEAST_BLUR, COOLING, ROUNDS, LEFT = 0.1, 0.003, 0.93, 100, 5.0
-NEWTON = 2
-MOVING_SHARE = 0.3  # of a time budget, for learning the motion
-ROWS = 8192
+
+@dataclass(frozen=True)
+class MotionOptions:
+    """Numbers of the motion's training; lengths are in units of the field.
+
+    Attributes:
+        pool: points of each shape.
+        matched: of them, which the guide has partners for.
+        steps: of the midpoint rule between two keys, while it is learnt.
+        guided: points with a partner, per end and step of the training.
+        loose: others, likewise.
+        regular: places at which the regularity is evaluated, per step.
+        around: how far these are from the paths.
+        fades: share of the steps after which the guide is gone.
+        far: residuals count linearly from here on: what has no partner does not pull at all others.
+        data: weight of the ends.
+        inside: radius that no path should leave.
+        normals: cost of a pair with opposite normals; the squared way is added to it.
+        surroundings: cost of a pair with other surroundings.
+        marked: weight of the squared differences of nearness to landmarks, added up.
+        depths: at which the surroundings are compared, inward and outward.
+        blur: first blur of the optimal transport, squared length.
+        least_blur: the last one.
+        cooling: factor of the blur, per round.
+        rounds: of Sinkhorn's iterations.
+        left: cost of mass without a partner. More than the longest way in the unit sphere, 2²: where it is less, the
+            rear of a shape that has travelled stays behind.
+        newton: steps to f = 0 of points that were carried.
+        share: of a time budget, for learning the motion.
+        rows: points per call.
+    """
+
+    pool: int = 20_000
+    matched: int = 1000
+    steps: int = 8
+    guided: int = 256
+    loose: int = 512
+    regular: int = 1024
+    around: float = 0.05
+    fades: float = 0.6
+    far: float = 0.1
+    data: float = 20.0
+    inside: float = 0.98
+    normals: float = 0.1
+    surroundings: float = 0.06
+    marked: float = 4.0
+    depths: tuple[float, ...] = (0.05, 0.1, 0.2, 0.3)
+    blur: float = 0.1
+    least_blur: float = 0.003
+    cooling: float = 0.93
+    rounds: int = 100
+    left: float = 5.0
+    newton: int = 2
+    share: float = 0.3
+    rows: int = 8192
+
+
+MOTION = MotionOptions()
 
 
 def match(
@@ -78,14 +119,14 @@ def match(
     """
     sides = [_surroundings(shape, seed + index) for index, shape in enumerate((first, second))]
     (x, n, a), (y, m, b) = sides
-    cost = torch.cdist(x, y).square() + NORMALS / 2 * (1 - n @ m.T)
-    cost = cost + SURROUNDINGS * torch.cdist(a, b).square() / a.shape[1]
+    cost = torch.cdist(x, y).square() + MOTION.normals / 2 * (1 - n @ m.T)
+    cost = cost + MOTION.surroundings * torch.cdist(a, b).square() / a.shape[1]
     if landmarks is not None and len(landmarks.before):
-        cost = cost + MARKED * torch.cdist(nearness(x, landmarks.before), nearness(y, landmarks.after)).square()
-    rows, columns, blur = torch.zeros(len(x)), torch.zeros(len(y)), BLUR
-    for step in range(ROUNDS):
-        blur = max(LEAST_BLUR, BLUR * COOLING**step)
-        damped = -blur * LEFT / (LEFT + blur)
+        cost = cost + MOTION.marked * torch.cdist(nearness(x, landmarks.before), nearness(y, landmarks.after)).square()
+    rows, columns, blur = torch.zeros(len(x)), torch.zeros(len(y)), MOTION.blur
+    for step in range(MOTION.rounds):
+        blur = max(MOTION.least_blur, MOTION.blur * MOTION.cooling**step)
+        damped = -blur * MOTION.left / (MOTION.left + blur)
         rows = damped * (torch.logsumexp((columns - cost) / blur, dim=1) - math.log(len(y)))
         columns = damped * (torch.logsumexp((rows[:, None] - cost) / blur, dim=0) - math.log(len(x)))
     plan = (rows[:, None] + columns - cost) / blur
@@ -95,9 +136,9 @@ def match(
 @torch.no_grad()
 def _surroundings(shape: StaticShape, seed: int) -> tuple[Tensor, Tensor, Tensor]:
     """Points, normals, and ``(M, 8)`` of what the field says inward and outward, over what a plane would: 1."""
-    points = shape.points(MATCHED, seed)
+    points = shape.points(MOTION.matched, seed)
     normals = normalize(shape.field.jet(points).gradient, dim=-1)
-    ways = [sign * depth for depth in DEPTHS for sign in (-1.0, 1.0)]
+    ways = [sign * depth for depth in MOTION.depths for sign in (-1.0, 1.0)]
     said = [shape.field.value(points + way * normals) / way for way in ways]
     return points, normals, torch.stack(said, dim=1)
 
@@ -124,7 +165,7 @@ class MotionObjective(Objective):
         rate = warm_cosine(config.motion_rate)
         super().__init__(velocity, [Group(list(velocity.parameters()), rate)], generator)
         self.velocity, self.shapes, self.keys, self.config = velocity, shapes, keys, config
-        self.pools = [shape.points(POOL, config.seed + index) for index, shape in enumerate(shapes)]
+        self.pools = [shape.points(MOTION.pool, config.seed + index) for index, shape in enumerate(shapes)]
         self.landmarks = placed_landmarks(config.landmarks, shapes)
         pairs = zip(itertools.pairwise(shapes), self.landmarks, strict=True)
         self.guides = [match(*pair, config.seed + 17 * index, own) for index, (pair, own) in enumerate(pairs)]
@@ -134,25 +175,25 @@ class MotionObjective(Objective):
         config, before = self.config, step % len(self.guides)
         x, wanted_x, y, wanted_y = self.guides[before]
         own = self.landmarks[before]
-        marked = self._draw(len(own.before), min(len(own.before), GUIDED))
+        marked = self._draw(len(own.before), min(len(own.before), MOTION.guided))
         here, there = own.before[marked], own.after[marked]
         ends = ((before, before + 1, x, wanted_x, here, there), (before + 1, before, y, wanted_y, there, here))
         met, guided, places, times, missed = [], [], [], [], [x.new_zeros(())]
         for start, end, points, wanted, leaves, arrives in ends:
-            chosen, pool = self._draw(len(points), GUIDED), self.pools[start]
-            begun = torch.cat((points[chosen], pool[self._draw(len(pool), LOOSE)], leaves))
+            chosen, pool = self._draw(len(points), MOTION.guided), self.pools[start]
+            begun = torch.cat((points[chosen], pool[self._draw(len(pool), MOTION.loose)], leaves))
             path, when = self._path(begun, self.keys[start], self.keys[end])
-            left = self.shapes[end].field.value(path[-1][: GUIDED + LOOSE])
+            left = self.shapes[end].field.value(path[-1][: MOTION.guided + MOTION.loose])
             if len(leaves):
-                missed.append((path[-1][GUIDED + LOOSE :] - arrives).square().sum(dim=1).mean())
-            met.append(huber_loss(left, torch.zeros_like(left), delta=FAR))
-            guided.append((path[-1][:GUIDED] - wanted[chosen]).square().sum(dim=1).mean())
+                missed.append((path[-1][MOTION.guided + MOTION.loose :] - arrives).square().sum(dim=1).mean())
+            met.append(huber_loss(left, torch.zeros_like(left), delta=MOTION.far))
+            guided.append((path[-1][: MOTION.guided] - wanted[chosen]).square().sum(dim=1).mean())
             places.append(path.reshape(-1, 3))
             times.append(when[:, None].expand(path.shape[:2]).reshape(-1))
         x, t = torch.cat(places), torch.cat(times)
-        beyond = (x.norm(dim=1) - INSIDE).clamp(min=0).square().mean()
-        chosen = self._draw(len(x), REGULAR)
-        aside = AROUND * torch.randn(REGULAR, 3, generator=self.generator)
+        beyond = (x.norm(dim=1) - MOTION.inside).clamp(min=0).square().mean()
+        chosen = self._draw(len(x), MOTION.regular)
+        aside = MOTION.around * torch.randn(MOTION.regular, 3, generator=self.generator)
         jet = self.velocity.jet(x[chosen].detach() + aside, t[chosen])
         terms = {
             "ends": met[0] + met[1],
@@ -162,19 +203,20 @@ class MotionObjective(Objective):
             "volume": jet.divergence.square().mean(),
             "steady": jet.rate.square().sum(dim=1).mean(),
         }
-        total = DATA / 2 * terms["ends"] + config.guide_weight * max(0.0, 1 - done / FADES) * terms["guide"]
+        guide_weight = config.guide_weight * max(0.0, 1 - done / MOTION.fades)
+        total = MOTION.data / 2 * terms["ends"] + guide_weight * terms["guide"]
         total = total + config.rigid_weight * terms["rigid"] + config.volume_weight * terms["volume"]
         total = total + config.landmark_weight * terms["landmarks"]
-        return terms, total + 1e-3 * terms["steady"] + DATA * beyond
+        return terms, total + 1e-3 * terms["steady"] + MOTION.data * beyond
 
     def _path(self, points: Tensor, start: float, end: float) -> tuple[Tensor, Tensor]:
         """Places ``(S + 1, N, 3)`` by the midpoint rule, and times ``(S + 1,)``."""
-        step, path = (end - start) / STEPS, [points]
-        for index in range(STEPS):
+        step, path = (end - start) / MOTION.steps, [points]
+        for index in range(MOTION.steps):
             time = points.new_full((), start + index * step)
             half = path[-1] + step / 2 * self.velocity(path[-1], time)
             path.append(path[-1] + step * self.velocity(half, time + step / 2))
-        return torch.stack(path), torch.linspace(start, end, STEPS + 1)
+        return torch.stack(path), torch.linspace(start, end, MOTION.steps + 1)
 
     def _draw(self, count: int, wanted: int) -> Tensor:
         return torch.randint(max(count, 1), (wanted,), generator=self.generator)
@@ -190,7 +232,7 @@ def learn_motion(
 ) -> VelocitySiren:
     """A velocity that takes each of the shapes to the next one, on the CPU.
 
-    Of a time ``budget`` it takes `MOVING_SHARE` at most.
+    Of a time ``budget`` it takes `MotionOptions.share` at most.
     """
     with seeded(config.seed):
         velocity = VelocitySiren(config.motion_width, 2, omega=config.motion_omega)
@@ -199,7 +241,7 @@ def learn_motion(
         shape.field.requires_grad_(False)
     objective = MotionObjective(velocity, shapes, keys, config, generator)
     left = None if budget is None else budget.left()
-    seconds = None if left is None else max(MOVING_SHARE * left, LEAST_SECONDS)
+    seconds = None if left is None else max(MOTION.share * left, LEAST_SECONDS)
     trainer = Trainer(objective, stage="motion", steps=config.motion_steps * (len(keys) - 1), seconds=seconds)
     trainer.run(report=progress)
     if budget is not None and trainer.ended_early:
@@ -230,7 +272,7 @@ def carried_samples(
     anywhere = at_time(uniform(count // 2, generator), torch.rand(count // 2, generator=generator))
     points = torch.cat((*sides, anywhere))
     with torch.no_grad():
-        value = torch.cat([carried.value(part) for part in points.split(ROWS)])
+        value = torch.cat([carried.value(part) for part in points.split(MOTION.rows)])
     sure = value.abs() > 1e-3
     positive = value[sure] > 0
     zero = torch.zeros(len(positive))
@@ -239,18 +281,18 @@ def carried_samples(
 
 
 def _parts(points: Tensor, start: float, end: Tensor) -> list[tuple[Tensor, float, Tensor]]:
-    return [(x, start, t) for x, t in zip(points.split(ROWS), end.split(ROWS), strict=True)]
+    return [(x, start, t) for x, t in zip(points.split(MOTION.rows), end.split(MOTION.rows), strict=True)]
 
 
 def _on_surface(carried: Field, points: Tensor) -> Known:
     """Those of the points that Newton's steps along ∇f bring to f = 0, with value 0 and unit normals."""
     found = []
-    for part in points.split(ROWS):
+    for part in points.split(MOTION.rows):
         here = part
-        for _ in range(NEWTON):
+        for _ in range(MOTION.newton):
             value, gradient, _ = carried.jet(here)
             slope = gradient[:, :3].square().sum(dim=1).clamp(min=0.25)
-            here = here - pad((value / slope).clamp(-FAR, FAR)[:, None] * gradient[:, :3], (0, 1))
+            here = here - pad((value / slope).clamp(-MOTION.far, MOTION.far)[:, None] * gradient[:, :3], (0, 1))
         value, gradient, _ = carried.jet(here)
         arrived = (value.abs() < 1e-3) & (gradient[:, :3].norm(dim=1) > 0.2)
         normals = normalize(gradient[:, :3], dim=1)

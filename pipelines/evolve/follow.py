@@ -19,12 +19,8 @@ from .topology import surface_of, topology_of
 
 __all__ = ["TrackedMesh", "follow_mesh"]
 
-# Vertices further from the surface than this, in cells of the mesh, have lost it.
-LOST = 0.5
 # So many cells on a side show how many pieces and holes a surface has; smaller ones than theirs do not count.
 TOPOLOGY_RESOLUTION = 64
-# Triangles that look inward: more of them than this, as a share of the area, and the mesh is folded.
-FOLDED = 0.02
 # A fixed step: near a change of topology adaptive ones would shrink to nothing before we can say when that was.
 FOLLOW = Solver(method="rk4", step=0.02)
 
@@ -97,12 +93,14 @@ def follow_mesh(
             raise _lost(name, time, str(error)) from error
         points, arrived = project_to_surface(still, moved, level=level)
         away = float((points - moved).norm(dim=-1).max())
-        if not away <= LOST * cell or not bool(arrived.all()):
+        # Vertices further from the surface than this, in cells of the mesh, have lost it.
+        if not away <= 0.5 * cell or not bool(arrived.all()):
             raise _lost(name, time, f"a vertex is {away:.2g} from it")
         path.append(points)
         normals.append(_normals(still, path[-1], level))
         share = _folded(path[-1], normals[-1], faces)
-        if share > FOLDED:
+        # Triangles that look inward: more of them than this, as a share of the area, and the mesh is folded.
+        if share > 0.02:
             raise _lost(name, time, f"{share:.0%} of the mesh has folded over")
         if progress is not None:
             progress(index, len(times) - 1)

@@ -22,7 +22,6 @@ __all__ = ["FAR_OUT", "Landmarks", "nearness", "placed_landmarks", "read_landmar
 
 Float64 = NDArray[np.float64]
 FAR_OUT = 0.1  # how far from its surface a landmark may lie, in units of the field: fits and picks are not exact
-SPREAD = 0.3  # within which a landmark says something about its neighbours
 
 
 class Landmarks(NamedTuple):
@@ -55,7 +54,8 @@ def placed_landmarks(paths: Sequence[str], shapes: Sequence[StaticShape]) -> lis
 
 def nearness(points: Tensor, landmarks: Tensor) -> Tensor:
     """exp(−|x − a|² / 2σ²) of points ``(N, 3)`` and landmarks ``(P, 3)``, ``(N, P)``: alike for points that match."""
-    return torch.exp(-torch.cdist(points, landmarks).square() / (2 * SPREAD**2))
+    # 0.3: the distance within which a landmark says something about its neighbours.
+    return torch.exp(-torch.cdist(points, landmarks).square() / (2 * 0.3**2))
 
 
 @torch.no_grad()

@@ -18,11 +18,6 @@ from .samples import Known, band_points, indices_in_band, uniform_spacetime
 
 __all__ = ["LONGEST_GRADIENT", "EvolveObjective", "learn_start"]
 
-REFRESH = 25  # steps after which the points near the surface are drawn anew, since it has moved
-POOL_STEPS = 6  # batches that a pool near the surface holds
-# Of the known samples of a batch, where nothing but them says what lies between the shapes: the share that is drawn by
-# how wrong the field was there. Thin parts are few samples of many, and smoothed away where all count alike.
-FOCUS = 0.5
 # Norm of the gradient by the weights. Second derivatives have spikes, and a single one, at the peak of the learning
 # rate, would throw the field so far from any distance that it does not come back.
 LONGEST_GRADIENT = 1.0
@@ -62,14 +57,17 @@ class EvolveObjective(Objective):
             self.known = self.known.take(indices_in_band(field, self.known.points, level))
             if not len(self.known):
                 raise ValueError(f"level {level}: no known samples in its band")
-        self.focus = Focus(len(self.known), 0.0 if self.law else FOCUS, device, strip=1)
+        # Without a law, half of a batch of known samples is drawn by the error of the field there. Thin parts are few
+        # samples of many, and smoothed away where all count alike.
+        self.focus = Focus(len(self.known), 0.0 if self.law else 0.5, device, strip=1)
         self.kept |= self.focus.kept
 
     def losses(self, step: int, done: float) -> tuple[dict[str, Tensor], Tensor]:
         """See `Objective.losses`."""
         config = self.config
-        if step % REFRESH == 0:
-            count = POOL_STEPS * config.batch // 2
+        # The points near the surface are drawn anew every 25 steps, since it has moved: a pool of 6 batches.
+        if step % 25 == 0:
+            count = 6 * config.batch // 2
             self.kept["pool"] = band_points(self.field, count, self.width, self.generator, level=self.level)
         pool = self.kept["pool"]
         half, part = config.batch // 2, config.batch // 16

@@ -26,9 +26,7 @@ from .shapes import Placement, StaticShape, aligned, into_unit_sphere
 __all__ = ["End", "Problem", "between", "build_problem", "morph_law", "velocity_field"]
 
 END_POINTS = 50_000  # on a surface that shall be met
-REACH_TIMES = 9
 REACH_POINTS = 2000
-STILL = 0.25  # share of the known samples of a transport at its first moment
 # Fitted fields are distances only about so far from their surfaces; a bound from them is taken for so much less.
 CAUTION = 0.8
 
@@ -254,7 +252,8 @@ def _transport(shapes: list[StaticShape], config: EvolveConfig, budget: Budget |
         points = []
         for index, (shape, velocity) in enumerate(zip(placed, velocities, strict=True)):
             y = around(shape, each, config.seed + index, generator)
-            t = torch.rand(each, generator=generator) * (torch.rand(each, generator=generator) > STILL)
+            # A quarter of the known samples is at the first moment.
+            t = torch.rand(each, generator=generator) * (torch.rand(each, generator=generator) > 0.25)
             points.append(at_time(flow(velocity, y, 0.0, t), t))
         known = carried.samples(torch.cat(points))
         return (known, no_bounds()) if rigid else signs(known)
@@ -305,7 +304,7 @@ def _end(shape: StaticShape, time: float, seed: int) -> End:
 
 
 def _reach_times() -> list[float]:
-    return [index / (REACH_TIMES - 1) for index in range(REACH_TIMES)]
+    return [index / 8 for index in range(9)]
 
 
 def _placements(shapes: Sequence[StaticShape]) -> tuple[Placement, ...]:

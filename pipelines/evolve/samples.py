@@ -30,9 +30,6 @@ __all__ = [
     "values_at",
 ]
 
-FLOW_ROWS = 8192  # characteristics that are differentiated at a time
-CANDIDATES = 6  # points tried for one that is near the surface
-
 
 @dataclass(frozen=True, eq=False)
 class Known(Rows):
@@ -72,7 +69,7 @@ class Carried:
 
     def samples(self, points: Tensor) -> Known:
         """Value f_i(x at time 0) of the nearest part at ``(N, 4)`` points, and its gradient by space."""
-        parts = [self._nearest(rows) for rows in points.split(FLOW_ROWS)]
+        parts = [self._nearest(rows) for rows in points.split(8192)]  # differentiated at a time
         value, gradient = (torch.cat(part) for part in zip(*parts, strict=True))
         return Known(points, value, gradient)
 
@@ -189,7 +186,7 @@ def band_points(
         reach: how near, |f| of the coarsest level, a point must be to be moved.
     """
     level, device = field.resolve_level(level), field.deltas.device
-    points = uniform_spacetime(CANDIDATES * count, generator).to(device)
+    points = uniform_spacetime(6 * count, generator).to(device)  # tried: few are near the surface
     points = _first_near(field, points, count, max(reach, width))
     value, gradient, _ = field.jet(points, level=level)
     slope = gradient[:, :3].square().sum(dim=1).clamp(min=0.25)

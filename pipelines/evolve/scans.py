@@ -27,8 +27,6 @@ from .landmarks import FAR_OUT
 
 __all__ = ["fits_beside", "fitted_scans", "scans_among"]
 
-PAIRS = 400  # vertices that are landmarks; more say nothing new of a smooth motion
-
 
 def scans_among(shapes: Sequence[str]) -> dict[str, Mesh]:
     """Those of the shapes that are files of points or triangles, read.
@@ -101,7 +99,8 @@ def _pairs(config: EvolveConfig, scans: Mapping[str, Mesh], runs: Mapping[str, P
     same = [pose is not None and np.array_equal(pose.faces, first.faces) for pose in poses]
     if not all(same):
         return ()
-    chosen = np.sort(np.random.default_rng(0).permutation(np.unique(first.faces))[:PAIRS])
+    # 400 vertices are landmarks; more say nothing new of a smooth motion.
+    chosen = np.sort(np.random.default_rng(0).permutation(np.unique(first.faces))[:400])
     near = np.ones(len(chosen), bool)
     for text, pose in zip(config.shapes, poses, strict=True):
         if pose is not None:

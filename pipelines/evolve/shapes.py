@@ -37,8 +37,6 @@ from ..training.folder import find_field
 __all__ = ["Placed", "Placement", "StaticShape", "aligned", "into_unit_sphere", "read_shape"]
 
 Float64 = NDArray[np.float64]
-MESH_RESOLUTION = 128
-ROOM = 1.001  # a mesh leaves its unit sphere by less
 
 _SIZES: Mapping[str, int] = MappingProxyType({"sphere": 1, "torus": 2, "box": 3, "capsule": 2})
 _EXACT: Mapping[str, Callable[..., Field]] = MappingProxyType(
@@ -216,7 +214,8 @@ def into_unit_sphere(shapes: list[StaticShape], reach: Float64) -> tuple[list[St
         shapes: in one frame.
         reach: points ``(N, 3)`` of the surfaces at all times.
     """
-    if np.linalg.norm(reach, axis=1).max() <= ROOM:
+    # A mesh leaves its unit sphere by less than a thousandth.
+    if np.linalg.norm(reach, axis=1).max() <= 1.001:
         return shapes, Similarity.identity()
     region = Similarity.to_unit_sphere(reach)
     shrunk = Placement(scale=1 / region.scale, shift=-np.asarray(region.center) / region.scale)
@@ -243,7 +242,7 @@ def _numbers(text: str, numbers: str, count: int) -> Float64:
 
 def _meshed(name: str, field: Field, similarity: Similarity) -> StaticShape:
     try:
-        mesh = extract_mesh(field, resolution=MESH_RESOLUTION, normals=False)
+        mesh = extract_mesh(field, resolution=128, normals=False)
     except NoSurfaceError as error:
         raise InputError(f"{name}: has no surface in the unit sphere ({error})") from error
     return StaticShape(name, field, similarity, mesh)

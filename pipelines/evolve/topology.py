@@ -21,13 +21,29 @@ from ...neural_fields import Field, Mesh, NoSurfaceError, TimeSlice, at_time, ex
 from ...neural_fields.fields.function import FieldLike
 from ..surface.surface import components
 
-__all__ = ["Change", "Topology", "find_changes", "surface_of", "topology_of"]
+__all__ = ["CHANGES", "Change", "ChangeOptions", "Topology", "find_changes", "surface_of", "topology_of"]
 
-NARROW = 2e-3  # a change is sought until it lies between two moments that are no further apart
-ONE = 1e-2  # changes that follow each other so soon are one: on a lattice a neck closes in several places
-MOST = 60  # moments that are looked at on the way, of all changes together
-PLACED = 6  # changes whose place is sought, of the first ones; a field of more was not trained long enough
-CELLS = 2  # a place is sought until it lies in a box of so many cells
+
+@dataclass(frozen=True)
+class ChangeOptions:
+    """How changes of topology are searched for.
+
+    Attributes:
+        narrow: a change is searched for until it lies between two moments that are no further apart.
+        one: changes that follow each other so soon are one: on a lattice a neck closes in several places.
+        most: moments that are meshed on the way, of all changes together.
+        placed: changes whose place is searched for, of the first ones; a field of more was not trained long enough.
+        cells: a place is searched for until it lies in a box of so many cells.
+    """
+
+    narrow: float = 2e-3
+    one: float = 1e-2
+    most: int = 60
+    placed: int = 6
+    cells: int = 2
+
+
+CHANGES = ChangeOptions()
 
 
 class Topology(NamedTuple):
@@ -112,19 +128,19 @@ def find_changes(
     looked = 0
     while pending:
         start, end, before, after = bracket = pending.pop()
-        if end - start > NARROW and looked < MOST and monotonic() < until:
+        if end - start > CHANGES.narrow and looked < CHANGES.most and monotonic() < until:
             looked += 1
             middle = (start + end) / 2
             now = topology_of(surface_of(TimeSlice(field, middle), resolution=resolution))
             halves = (_Bracket(middle, end, now, after), _Bracket(start, middle, before, now))
             pending.extend(half for half in halves if half.before != half.after)
-        elif narrow and start - narrow[-1].end < ONE:
+        elif narrow and start - narrow[-1].end < CHANGES.one:
             narrow[-1] = _Bracket(narrow[-1].start, end, narrow[-1].before, after)
         else:
             narrow.append(bracket)
     changes: list[Change] = []
     for start, end, before, after in (bracket for bracket in narrow if bracket.before != bracket.after):
-        placed = len(changes) < PLACED and monotonic() < until
+        placed = len(changes) < CHANGES.placed and monotonic() < until
         place = _place(field, start, end, before, resolution) if placed else None
         changes.append(Change((start + end) / 2, (end - start) / 2, before, after, place))
     return changes
@@ -147,7 +163,7 @@ def _place(field: Field, start: float, end: float, before: Topology, resolution:
     """
     low, high = [-1.0] * 3, [1.0] * 3
     for axis in range(3):
-        while high[axis] - low[axis] > CELLS * 2 / resolution:
+        while high[axis] - low[axis] > CHANGES.cells * 2 / resolution:
             middle = (low[axis] + high[axis]) / 2
             passing = _Passing(field, start, end, tuple(low[:axis]), tuple(high[:axis]), middle)
             changed = topology_of(surface_of(passing, resolution=resolution)) != before

@@ -80,7 +80,7 @@ def evolve(
     """
     started, folder = time.monotonic(), RunFolder(out, resume=resume)
     config, report = folder.config(EvolveConfig, config), progress or silent
-    budget = Budget(config.time_budget, choose_device(config.device), started=started)
+    budget = Budget(config.time_budget, started=started)
     count, shapes = len(config.shapes), []
     for path in config.landmarks:
         read_landmarks(path)  # before the shapes, which take their time
@@ -114,7 +114,7 @@ def train_evolution(
     """
     names, folder = [shape.name for shape in shapes or []], RunFolder(out, resume=resume)
     device = choose_device(config.device)
-    budget = budget or Budget(config.time_budget, device)
+    budget = budget or Budget(config.time_budget)
     training = _Evolving(problem, names, config, device, folder, progress or silent, budget)
     with folder.writing(VELOCITY_FILE), stop_on_signals() as flag:
         if resume:

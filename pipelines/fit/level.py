@@ -12,7 +12,6 @@ from ...neural_fields import Siren
 from ...neural_fields.backend.devices import upload
 from ...neural_fields.fields.losses import data_loss, eikonal_loss, normal_loss, pseudo_huber
 from ..training.settings import EvolveConfig, FitConfig
-from ..training.team import my_share, whole_batch
 from ..training.trainer import Group, Objective, seeded, warm_cosine
 from .heldout import LOOKS, Judge, Verdict
 from .samples import Source
@@ -145,5 +144,5 @@ class LevelObjective(Objective):
         return self.judge.verdict(best, float(self.kept["at"]))
 
     def _draw(self, source: Source) -> Tensor:
-        index = torch.randint(len(source.samples), (whole_batch(source.batch),), generator=self.generator)
-        return upload(my_share(index), source.samples.points.device)
+        index = torch.randint(len(source.samples), (source.batch,), generator=self.generator)
+        return upload(index, source.samples.points.device)

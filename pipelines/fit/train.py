@@ -27,7 +27,6 @@ from ..training.machine import choose_device, environment, peak_memory
 from ..training.report import reported, silent
 from ..training.result import Run
 from ..training.settings import FitConfig
-from ..training.team import agreed
 from ..training.trainer import (
     Interrupted,
     Report,
@@ -104,7 +103,7 @@ def fit_moved(
         file: the cloud.
         config: settings.
         out: run directory.
-        name: what the file is called there from the first checkpoint on; until then that may be another run's.
+        name: of its copy there, from the first checkpoint on.
         progress: see `fit`.
 
     Raises:
@@ -112,7 +111,7 @@ def fit_moved(
         Interrupted: see `fit`.
     """
     folder = RunFolder(out)
-    folder.keep(name, file)
+    folder.keep(name, file.read_bytes())
     return _fit(folder, file, config, source=str(out / name), progress=progress)
 
 
@@ -127,7 +126,7 @@ def _fit(
 ) -> Run[MultiscaleSDF]:
     config = folder.config(FitConfig, config)
     device = choose_device(config.device)
-    budget, points = Budget(config.time_budget, device), _as_cloud(cloud)
+    budget, points = Budget(config.time_budget), _as_cloud(cloud)
     with reported(progress, "reading the cloud"):
         raw, merging = load_cloud(
             points,
@@ -375,8 +374,9 @@ class _Fitting:
         if not self.config.between or full <= len(self.points):
             return full
         index, generator = CloudDistance(self.points, self.normals), torch.Generator().manual_seed(0)
-        return self.affordable(
+        return affordable(
             lambda count: self.sources(index, None, dataclasses.replace(self.config, samples=count), generator),
+            full,
             SAMPLING_SHARE / 2 * share,
         )
 
@@ -388,19 +388,15 @@ class _Fitting:
             return self.config.samples
         spare = share - self.config.steps[level] * self.cost(level)
         generator, full = torch.Generator().manual_seed(0), self.config.samples
-        count = self.affordable(
+        count = affordable(
             lambda count: self.sources(index, delta, dataclasses.replace(self.config, samples=count), generator),
+            full,
             max(SAMPLING_SHARE * share, spare) - (time.monotonic() - started),
         )
         if count < full:
             note = f"level {level} learns from {count:,} samples of each kind instead of {full:,}"
             self.budget.notes.append(note)
         return count
-
-    def affordable(self, make: Callable[[int], object], seconds: float) -> int:
-        """`affordable` samples, the same number for all processes of a team."""
-        count = affordable(make, self.config.samples, seconds)
-        return int(agreed(False, count, self.device)[1])
 
     def training_seconds(self, level: int, left: float) -> float:
         """Seconds for the steps of a level of which ``left`` remain: at least so many that there is a surface."""
@@ -410,7 +406,7 @@ class _Fitting:
         least = least_share(steps) * steps * self.cost(level)
         if left < least:
             self.budget.notes.append(f"the time was up before level {level}, which is trained briefly all the same")
-        return took + agreed(False, max(left, least), self.device)[1]
+        return took + max(left, least)
 
     def distances(self, level: int) -> CloudDistance:
         """The points that are trained on, and where they are sparse, what they say of the places between them.

@@ -20,12 +20,6 @@ __all__ = ["check_unwrap_tools", "decimate", "from_frame", "to_frame", "unwrap",
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 
-# How eagerly edges are collapsed, 0 to 10. Above 5 the error doubles and closed meshes come back with holes; below 3
-# it stops early, with more triangles than asked for.
-AGGRESSION = 4
-# Texels between charts, as a share of the texture's side: five mip levels stay clear of the neighbours.
-PADDING = 1 / 256
-
 
 def check_unwrap_tools() -> None:
     """Ask, before any long work, whether the extra ``mplicits[texture]`` is installed.
@@ -57,7 +51,9 @@ def decimate(vertices: Float64, faces: NDArray[np.integer], count: int) -> tuple
 
     middle, size = _box(vertices)
     unit = (vertices - middle) / size
-    collapsed = fast_simplification.simplify(unit, faces.astype(np.int32), target_count=count, agg=AGGRESSION)
+    # How eagerly edges are collapsed, 0 to 10. Above 5 the error doubles and closed meshes come back with holes; below
+    # 3 it stops early, with more triangles than asked for.
+    collapsed = fast_simplification.simplify(unit, faces.astype(np.int32), target_count=count, agg=4)
     points, left = collapsed[0], collapsed[1]
     corners = points[left]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
@@ -89,7 +85,8 @@ def unwrap(vertices: Float64, faces: NDArray[np.integer], *, size: int = 2048, p
     atlas.add_mesh(((vertices - middle) / extent).astype(np.float32), faces.astype(np.uint32))
     charts, packing = xatlas.ChartOptions(), xatlas.PackOptions()
     packing.resolution = size
-    packing.padding = round(size * PADDING) if padding is None else padding
+    # Texels between charts, as a share of the texture's side: five mip levels stay clear of the neighbours.
+    packing.padding = round(size / 256) if padding is None else padding
     packing.bilinear = True  # a texel that the filter reaches from two charts belongs to neither
     atlas.generate(charts, packing)
     if not atlas.atlas_count:

@@ -25,11 +25,6 @@ Image = NDArray[np.uint8]
 Attribute = Callable[[Float64], NDArray[np.floating]]
 Progress = Callable[[str, int, int], None]
 
-BATCH = 1 << 17  # points per call
-SIZES = (16, 16384)
-# A normal map holds normals of the front only: what is steeper, or turned away, is laid down to this height.
-LOWEST = 0.05
-
 
 class Baked(NamedTuple):
     """Images ``(size, size, 3)`` uint8, first row on top.
@@ -50,6 +45,7 @@ def bake(
     *,
     size: int = 2048,
     progress: Progress | None = None,
+    batch: int = 1 << 17,
 ) -> Baked:
     """Ask for the colour and the normal at the point of the mesh under the centre of every texel.
 
@@ -62,6 +58,7 @@ def bake(
         normals_at: the same → normals ``(N, 3)``, of any length, outward.
         size: texels along each side.
         progress: told "bake", how many triangles are done, and of how many.
+        batch: points per call.
 
     Raises:
         ValueError: there is nothing to bake, the mesh is not unwrapped, or no triangle covers a texel.
@@ -75,8 +72,8 @@ def bake(
     covered = np.zeros(size * size, bool)
     # With rows first, the columns of the raster are texels in row-major order; texel 0 has its centre at half a texel.
     place = np.stack((1 - mesh.uv[:, 1], mesh.uv[:, 0]), axis=1) * size - 0.5
-    for found in cover(place, mesh.faces, (size, size), chunk=BATCH):
-        for part in np.array_split(np.arange(len(found.face)), -(-len(found.face) // BATCH) or 1):
+    for found in cover(place, mesh.faces, (size, size), chunk=batch):
+        for part in np.array_split(np.arange(len(found.face)), -(-len(found.face) // batch) or 1):
             corners, weights, texel = mesh.faces[found.face[part]], found.weights[part], found.column[part]
             points = _interpolated(mesh.vertices, corners, weights)
             covered[texel] = True
@@ -102,7 +99,8 @@ def _interpolated(rows: NDArray[np.floating], corners: NDArray[np.integer], weig
 def _encoded(coordinates: Float64) -> Image:
     """Tangent-space normals → bytes; one of no length becomes that of the mesh."""
     upright = coordinates.copy()
-    upright[:, 2] = np.where(coordinates.any(axis=1), coordinates[:, 2].clip(min=LOWEST), 1.0)
+    # A normal map holds normals of the front only: what is steeper, or turned away, is laid down to this height.
+    upright[:, 2] = np.where(coordinates.any(axis=1), coordinates[:, 2].clip(min=0.05), 1.0)
     return np.rint((unit_rows(upright) + 1) * 127.5).astype(np.uint8)
 
 
@@ -112,8 +110,8 @@ def check_texture_size(size: int) -> None:
     Raises:
         InputError: it is one.
     """
-    if not SIZES[0] <= size <= SIZES[1]:
-        raise InputError(f"--texture {size}: expected {SIZES[0]} to {SIZES[1]} texels along each side, 2048 say")
+    if not 16 <= size <= 16384:
+        raise InputError(f"--texture {size}: expected 16 to 16384 texels along each side, 2048 say")
 
 
 def textured_mesh(

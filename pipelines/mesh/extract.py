@@ -16,22 +16,19 @@ from numpy.typing import NDArray
 from ...datasets import read_cloud
 from ...datasets.clouds.point_cloud import unit_rows
 from ...datasets.clouds.readers.meshes import vertex_normals
-from ...neural_fields import Field, InputError, Similarity
-from ...neural_fields.meshing.extract import Mesh, NoSurfaceError, extract_mesh, map_normals
-from ...neural_fields.meshing.placement import Placement
+from ...neural_fields import Field, InputError, Mesh, Similarity
+from ...neural_fields.meshing.extract import NoSurfaceError, extract_mesh, map_normals
 from ...neural_fields.tracing.projection import map_attribute
-from ..surface.trim import Support, drop_unsupported, in_region, keep_largest, read_support, seen_part, trim_distance
+from ..surface.trim import Support, in_region, keep_largest, read_support, seen_part, trim_distance, without_blobs
 from ..texture.transport import Colors, colors_of_run
 from ..training.folder import chosen_level, find_field, fitted_cloud, load_still
 from .bake import check_texture_size, textured_mesh
 from .decimation import Decimation, check_decimation_tool, decimated
-from .files import check_mesh_path, check_textured_path, write_mesh
-from .fineness import LEAST, RESOLUTIONS, fineness, thin_share
+from .files import check_mesh_path, check_textured_path, placement_of, write_mesh
+from .fineness import RESOLUTIONS, THIN_SHARE, fineness, thin_share
 from .printing import PrintReport, print_report
 
 __all__ = ["Exported", "MeshOptions", "export_run", "mesh_run", "normals_near"]
-
-MUCH = 0.05  # share of a surface that photographs have not seen, above which that is said
 
 
 @dataclass(frozen=True)
@@ -77,18 +74,6 @@ class MeshOptions:
     up: str | None = None
     unit: str | None = None
     center: bool = False
-
-    @property
-    def placement(self) -> Placement:
-        """What is known of the input's coordinates.
-
-        Raises:
-            InputError: there is no such axis or unit.
-        """
-        try:
-            return Placement(self.up, self.unit, self.center)
-        except ValueError as error:
-            raise InputError(f"--{error}") from error
 
 
 class Exported(NamedTuple):
@@ -140,7 +125,7 @@ def export_run(
     options = options or MeshOptions()
     check = check_mesh_path if options.texture is None else check_textured_path
     check(out)
-    placement = options.placement
+    placement = placement_of(options.up, options.unit, options.center)
     if options.texture is not None:
         check_texture_size(options.texture)
         if options.faces is not None or options.report:
@@ -172,7 +157,7 @@ def export_run(
         if mesh is None:
             raise InputError(f"{file}: no surface in the region of interest; train it longer (--steps)")
     if support is not None and not options.keep_unsupported:
-        mesh = _supported(mesh, support, say)
+        mesh = without_blobs(mesh, support.points, support.radius, say)
     if support is not None and support.seen:
         mesh = _seen(mesh, support, say, cut=options.seen)
     if normal_level != level:
@@ -220,7 +205,7 @@ def _resolution(
             )
         return chosen.resolution
     missed = thin_share(field, support.points, asked, level=level)
-    if missed > LEAST and asked < RESOLUTIONS[-1]:
+    if missed > THIN_SHARE and asked < RESOLUTIONS[-1]:
         say(
             f"{missed:.0%} of the points lie on parts thinner than the cells of --resolution {asked}, and may come out "
             f"torn; leave it out, or take {RESOLUTIONS[-1]}"
@@ -228,20 +213,11 @@ def _resolution(
     return asked
 
 
-def _supported(mesh: Mesh, support: Support, say: Callable[[str], None] | None) -> Mesh:
-    """The mesh without its blobs; ``say`` hears how many there were."""
-    left = drop_unsupported(mesh, support.points, radius=support.radius)
-    if left.dropped and say is not None:
-        parts = f"{left.dropped:,} component{'s' * (left.dropped > 1)}"
-        say(f"removed {parts} that no points support ({left.area:.2g} of the area); --keep-unsupported keeps them")
-    return left.mesh
-
-
 def _seen(mesh: Mesh, support: Support, say: Callable[[str], None] | None, *, cut: bool) -> Mesh:
     """What photographs have seen of a mesh, if that is wanted; ``say`` hears how much they have not, if it is much."""
     part, missed = seen_part(mesh, support)
     if not cut or part is None:
-        if say is not None and missed > MUCH:
+        if say is not None and missed > 0.05:
             say(f"{missed:.0%} of the surface is seen by fewer than two photographs; --seen leaves it out")
         return mesh
     if say is not None and missed > 0:
@@ -302,5 +278,5 @@ def _write_textured(
         lambda points: normals_near(field, points, level=level),
         size=size,
         faces=options.texture_faces,
-        placement=options.placement,
+        placement=placement_of(options.up, options.unit, options.center),
     )

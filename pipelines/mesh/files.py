@@ -34,12 +34,25 @@ __all__ = [
     "check_mesh_path",
     "check_textured_path",
     "needs_doubles",
+    "placement_of",
     "write_mesh",
     "write_moving",
     "write_textured",
 ]
 
 Image = NDArray[np.uint8]
+
+
+def placement_of(up: str | None, unit: str | None, center: bool) -> Placement:
+    """What flags say of the input's coordinates; see `Placement`.
+
+    Raises:
+        InputError: there is no such axis or unit.
+    """
+    try:
+        return Placement(up, unit, center)
+    except ValueError as error:
+        raise InputError(f"--{error}") from error
 
 
 def check_textured_path(path: str | Path, similarity: Similarity | None = None, *, centered: bool = False) -> Path:

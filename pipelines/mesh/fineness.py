@@ -16,17 +16,12 @@ from numpy.typing import NDArray
 from ...neural_fields import Field
 from ...neural_fields.backend.devices import upload
 
-__all__ = ["LEAST", "RESOLUTIONS", "Fineness", "fineness", "thin_share"]
+__all__ = ["RESOLUTIONS", "THIN_SHARE", "Fineness", "fineness", "thin_depth", "thin_share"]
 
 # Cells per side that are tried, coarse to fine. The work grows with the square: the last is 16 times the first.
 RESOLUTIONS = (256, 512, 1024)
-SIDE = 2.04  # of the mesher's box
-# A part counts as thin if it is no thicker than so many cells. On each line of corners along the axis nearest to its
-# normal, a plate as thick as one cell has a corner inside; the diagonal leaves room for bars, and for a field's errors.
-CELLS = 3**0.5
 # Less of the points than this is an edge or a tip, not a part.
-LEAST = 0.02
-POINTS = 20_000  # of them are asked
+THIN_SHARE = 0.02
 
 
 class Fineness(NamedTuple):
@@ -39,6 +34,15 @@ class Fineness(NamedTuple):
 
     resolution: int
     missed: float
+
+
+def thin_depth(resolution: int) -> float:
+    """The thickness √3 h up to which a part is thin for cells of side h, in unit-sphere lengths.
+
+    On each line of corners along the axis nearest to its normal, a plate as thick as one cell has a corner inside; the
+    diagonal leaves room for bars, and for a field's errors. The mesher's box has a side of 2.04.
+    """
+    return 3**0.5 * 2.04 / resolution
 
 
 @torch.no_grad()
@@ -55,8 +59,8 @@ def thin_share(field: Field, points: NDArray[np.floating], resolution: int, *, l
         resolution: cells along each side of the mesher's box.
         level: whose surface.
     """
-    depth = CELLS * SIDE / resolution
-    asked = torch.from_numpy(np.asarray(points[:: 1 + len(points) // POINTS], np.float32))
+    depth = thin_depth(resolution)
+    asked = torch.from_numpy(np.asarray(points[:: 1 + len(points) // 20_000], np.float32))
     places = upload(asked, field.like.device)
     jet = field.jet(places, level=level)
     slope = jet.gradient.norm(dim=-1, keepdim=True).clamp_min(1e-12)
@@ -75,9 +79,9 @@ def fineness(field: Field, points: NDArray[np.floating], *, level: int = -1) -> 
         level: whose surface.
     """
     missed = thin_share(field, points, RESOLUTIONS[0], level=level)
-    if missed <= LEAST:
+    if missed <= THIN_SHARE:
         return Fineness(RESOLUTIONS[0], missed)
     for resolution in RESOLUTIONS[1:-1]:
-        if thin_share(field, points, resolution, level=level) <= LEAST:
+        if thin_share(field, points, resolution, level=level) <= THIN_SHARE:
             return Fineness(resolution, missed)
     return Fineness(RESOLUTIONS[-1], missed)

@@ -28,13 +28,13 @@ from ...neural_fields import (
 )
 from ...neural_fields.fields.csg import Bounded
 from ...neural_fields.meshing.extract import NoSurfaceError, extract_mesh
-from ...neural_fields.meshing.placement import METRES, Placement
+from ...neural_fields.meshing.placement import METRES
 from ...neural_fields.shape import in_one_frame
 from ..surface.solid import MeshField
-from ..surface.surface import is_closed, read_surface
-from ..surface.trim import Support, drop_unsupported, read_support
+from ..surface.surface import is_closed, read_surface, volume
+from ..surface.trim import Support, read_support, without_blobs
 from ..training.folder import chosen_level, find_field, is_field, load_still
-from .files import check_mesh_path, write_mesh
+from .files import check_mesh_path, placement_of, write_mesh
 
 __all__ = ["OPERATIONS", "Made", "SolidOptions", "boolean", "length_in", "offset"]
 
@@ -48,8 +48,6 @@ OPERATIONS: dict[str, type[Union | Intersection | Difference]] = {
 HALF_BOX = 1.07
 # Fewest cells across a wall: with less than a cell's diagonal, holes open where no corner lies in it.
 CELLS_IN_WALL = 2
-# Vertices at which the distance to the original is measured.
-MEASURED = 5000
 LENGTH = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([a-z]*)")
 
 
@@ -75,18 +73,6 @@ class SolidOptions:
     unit: str | None = None
     center: bool = False
 
-    @property
-    def placement(self) -> Placement:
-        """What is known of the input's coordinates.
-
-        Raises:
-            InputError: there is no such axis or unit.
-        """
-        try:
-            return Placement(self.up, self.unit, self.center)
-        except ValueError as error:
-            raise InputError(f"--{error}") from error
-
 
 @dataclass(frozen=True)
 class Made:
@@ -96,14 +82,11 @@ class Made:
         mesh: in input coordinates.
         closed: whether it is watertight.
         volume: what it encloses, in cubic input units.
-        distances: for an offset, the least and the greatest distance of its vertices from the original, negative
-            inside; None for a boolean.
     """
 
     mesh: Mesh
     closed: bool
     volume: float
-    distances: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -245,12 +228,7 @@ def offset(
     reach = length / frame.scale
     field = Shell(*fields, inside=max(-reach, 0.0), outside=max(reach, 0.0)) if shell else Offset(*fields, by=reach)
     mesh = _extracted(field, options, f"{operand.name} by {by}", level=0)
-    made = _written(out, mesh, frame, options, say)
-    rows = np.random.default_rng(0).permutation(len(made.mesh.vertices))[:MEASURED]
-    exact = shape.field
-    assert isinstance(exact, MeshField)
-    away = exact.distance.signed(shape.similarity.to_unit(made.mesh.vertices[rows])) * shape.similarity.scale
-    return dataclasses.replace(made, distances=(float(away.min()), float(away.max())))
+    return _written(out, mesh, frame, options, say)
 
 
 def _read(part: str | Path, options: SolidOptions) -> Operand:
@@ -321,11 +299,7 @@ def _supported(
     away = np.stack([_distances(field, mesh.vertices) for field in fields])
     trusted = np.array([operand.support is None for operand in operands])
     points.append(mesh.vertices[trusted[away.argmin(axis=0)]])
-    left = drop_unsupported(mesh, np.concatenate(points), radius=radius)
-    if left.dropped and say is not None:
-        parts = f"{left.dropped:,} component{'s' * (left.dropped > 1)}"
-        say(f"removed {parts} that no points support ({left.area:.2g} of the area); --keep-unsupported keeps them")
-    return left.mesh
+    return without_blobs(mesh, np.concatenate(points), radius, say)
 
 
 @torch.no_grad()
@@ -336,17 +310,16 @@ def _distances(field: Field, points: NDArray[np.float64]) -> NDArray[np.float64]
 
 def _made(mesh: Mesh, frame: Similarity) -> Made:
     """The mesh in input coordinates, and what is said about it."""
-    vertices = frame.to_input(mesh.vertices)
-    corners = (vertices - np.asarray(frame.center))[mesh.faces]
-    volume = float((corners[:, 0] * np.cross(corners[:, 1], corners[:, 2])).sum() / 6)
-    return Made(dataclasses.replace(mesh, vertices=vertices), is_closed(mesh), volume)
+    placed = dataclasses.replace(mesh, vertices=frame.to_input(mesh.vertices))
+    return Made(placed, is_closed(mesh), volume(mesh) * frame.scale**3)
 
 
 def _written(
     out: str | Path, mesh: Mesh, frame: Similarity, options: SolidOptions, say: Callable[[str], None] | None
 ) -> Made:
-    line = options.placement.describe(Path(out).suffix)
+    placement = placement_of(options.up, options.unit, options.center)
+    line = placement.describe(Path(out).suffix)
     if line is not None and say is not None:
         say(f"coordinates: {line}")
-    write_mesh(out, mesh, frame, options.placement)
+    write_mesh(out, mesh, frame, placement)
     return _made(mesh, frame)

@@ -32,7 +32,6 @@ from ..training.machine import choose_device, environment
 from ..training.report import Progress, Report, reported, silent
 from ..training.result import Run
 from ..training.settings import ReconstructConfig, TextureConfig
-from ..training.team import agreed, apart, is_leader
 from ..training.trainer import Interrupted, load_compiler, parameter_count, stop_on_signals
 from .data.measured import MeasuredDepths
 from .data.seen import seen_points
@@ -102,9 +101,6 @@ def reconstruct(
         resume: continue the interrupted run in ``out`` with its own settings; ``config`` is then ignored.
         progress: called now and then with how far the training is.
 
-    Within a `team` of processes each renders its share of the rays. All end with the same model; only the first one
-    measures, makes the texture and writes.
-
     Raises:
         InputError: the data cannot be read or used, or there is nothing to resume.
         Interrupted: Ctrl-C or SIGTERM; ``out`` then holds a checkpoint and a usable field.
@@ -116,7 +112,7 @@ def reconstruct(
     started, folder = time.monotonic(), RunFolder(out, resume=resume)
     config = folder.config(ReconstructConfig, config)
     device = choose_device(config.device)
-    budget = Budget(config.time_budget, device, started=started)
+    budget = Budget(config.time_budget, started=started)
     with reported(progress, "reading the pictures"):
         maps = None if config.depth_maps is None else Path(config.depth_maps)
         depths = DepthSource(maps, config.depth_kind, config.depth_scale)
@@ -180,10 +176,8 @@ class _Reconstruction:
         left = self.budget.left()
         if left is None:
             return None
-        after = self.after_seconds(left) if is_leader() else 0.0
-        left = max((self.budget.left() or 0.0) - min(after, AFTER_SHARE * left), LEAST_SECONDS)
-        # A team agrees, or one would go on while another has ended.
-        return agreed(False, left, self.device)[1]
+        after = self.after_seconds(left)
+        return max((self.budget.left() or 0.0) - min(after, AFTER_SHARE * left), LEAST_SECONDS)
 
     def after_seconds(self, left: float) -> float:
         """Seconds for the held-out views and the texture, from the time of a small picture and a few steps."""
@@ -211,10 +205,7 @@ class _Reconstruction:
             # What was trained is safe before pictures and texture are made, which may be interrupted or fail too.
             self._save()
         self.model.requires_grad_(False)
-        if not is_leader():
-            return self._result(None, None, self._record(finished=True))
-        with apart():
-            return self._finish()
+        return self._finish()
 
     def _finish(self) -> Reconstruction:
         """Measure, colour, write."""

@@ -7,6 +7,7 @@ cloud.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -35,18 +36,13 @@ __all__ = [
     "support_radius",
     "thinned",
     "trim_distance",
+    "without_blobs",
     "without_voids",
 ]
 
 # Voxels of this size, in the unit sphere, keep one point each: some 60,000 of a surface of area 4, in half precision
 # (off by 0.0003 at most) 400 KB.
-VOXEL = 1 / 128
-# Least share of a component's area near some point. A part that was measured has nearly all of it there, an open scan
-# that the fit closed behind still a third or so; a blob has none, or what a stray point or a neighbouring part touches.
-LEAST_SUPPORT = 0.05
-# And fewest points that it must be the nearest component to, if it is as large as twice their share of the surface:
-# around one or two strays a fit may close a bubble as small as their spacing.
-FEWEST_POINTS = 3
+SUPPORT_VOXEL = 1 / 128
 
 
 def keep_faces(mesh: Mesh, kept: NDArray[np.bool_]) -> Mesh:
@@ -85,7 +81,7 @@ class Supported(NamedTuple):
 
 
 def drop_unsupported(
-    mesh: Mesh, points: NDArray[np.floating], *, radius: float | None = None, least: float = LEAST_SUPPORT
+    mesh: Mesh, points: NDArray[np.floating], *, radius: float | None = None, least: float = 0.05
 ) -> Supported:
     """Drop the connected components that no input points support: blobs, which nothing was measured of.
 
@@ -97,7 +93,8 @@ def drop_unsupported(
         mesh: with points and radius in the same coordinates.
         points: ``(N, 3)``, without the outliers.
         radius: see `support_radius`, which is taken for None.
-        least: in [0, 1].
+        least: in [0, 1]. A part that was measured has nearly all of its area near points, an open scan that the fit
+            closed behind a third or so; a blob has none, or what a stray point or a neighbouring part touches.
 
     Raises:
         ValueError: ``radius`` is not positive, or there are no points.
@@ -122,10 +119,22 @@ def drop_unsupported(
         near, whose = KDTree(mesh.vertices[used]).query(points, distance_upper_bound=reach, workers=-1)
         own = np.bincount(of_vertex[used[np.asarray(whose)[np.isfinite(near)]]], minlength=len(whole))
         usual = whole / max(spacing_of(np.asarray(points, np.float64)), 1e-300) ** 2
-        kept &= own >= np.minimum(FEWEST_POINTS, usual / 2)
+        # Around one or two strays a fit may close a bubble as small as their spacing.
+        kept &= own >= np.minimum(3, usual / 2)
     if kept.all() or not kept.any():
         return Supported(mesh, 0, 0.0)
     return Supported(keep_faces(mesh, kept[number]), int((~kept).sum()), float(whole[~kept].sum() / whole.sum()))
+
+
+def without_blobs(
+    mesh: Mesh, points: NDArray[np.floating], radius: float, say: Callable[[str], None] | None = None
+) -> Mesh:
+    """What `drop_unsupported` leaves of a mesh; ``say`` is called with a line about what it drops."""
+    left = drop_unsupported(mesh, points, radius=radius)
+    if left.dropped and say is not None:
+        parts = f"{left.dropped:,} component{'s' * (left.dropped > 1)}"
+        say(f"removed {parts} that no points support ({left.area:.2g} of the area); --keep-unsupported keeps them")
+    return left.mesh
 
 
 def support_radius(points: NDArray[np.floating], *, error: float = 0.0) -> float:
@@ -206,8 +215,8 @@ def thinned(points: NDArray[np.floating], *, seen_within: float | None = None) -
         points: in the unit sphere.
         seen_within: of what photographs see, how far from some point that may be.
     """
-    kept = points[voxel_representatives(np.asarray(points, np.float64), VOXEL)]
-    seen = {} if seen_within is None else {"seen_within": torch.tensor(float(np.hypot(seen_within, VOXEL)))}
+    kept = points[voxel_representatives(np.asarray(points, np.float64), SUPPORT_VOXEL)]
+    seen = {} if seen_within is None else {"seen_within": torch.tensor(float(np.hypot(seen_within, SUPPORT_VOXEL)))}
     return {"points": torch.from_numpy(kept).half(), **seen}
 
 

@@ -18,11 +18,6 @@ from ..fit.samples import DOMAIN
 
 __all__ = ["BandSamples", "ColorSamples", "band_directions", "has_colors", "match_colors", "read_colors"]
 
-# With fewer points than this in the band, the colours are those of something else.
-LEAST_SHARE = 0.5
-# Points per call of the geometry.
-BATCH = 1 << 17
-
 
 class ColorSamples(NamedTuple):
     """Points of the band with known colours.
@@ -118,7 +113,8 @@ def match_colors(
     unit = similarity.to_unit(cloud.points[finite])
     distances = _distances(unit, geometry, level=level)
     inside = distances < delta
-    if inside.mean() < LEAST_SHARE:
+    # With fewer points in the band, the colours are those of something else.
+    if inside.mean() < 0.5:
         far, near = np.median(distances) * similarity.scale, delta * similarity.scale
         raise InputError(
             f"{cloud.source}: points: {inside.mean():.0%} of them lie within {near:.3g} of the surface of the run, "
@@ -135,7 +131,7 @@ def _distances(unit: NDArray[np.float64], geometry: Field, *, level: int) -> NDA
     """|f|, and beyond the cube in which fields are trained the way back into it as well → ``(N,)``."""
     clamped = unit.clip(-DOMAIN, DOMAIN)
     points = torch.from_numpy(clamped).to(geometry.like)
-    values = torch.cat([geometry.value(part, level=level).abs() for part in points.split(BATCH)])
+    values = torch.cat([geometry.value(part, level=level).abs() for part in points.split(1 << 17)])
     return values.double().cpu().numpy() + np.linalg.norm(unit - clamped, axis=1)
 
 
@@ -156,6 +152,6 @@ def band_directions(
     index = torch.randint(len(samples.points), (count,), generator=generator)
     shift = (2 * torch.rand(count, 3, generator=generator) - 1) * delta
     points = samples.points[index.to(samples.points.device)] + shift.to(samples.points)
-    jets = [geometry.jet(part, level=level) for part in points.split(BATCH)]
+    jets = [geometry.jet(part, level=level) for part in points.split(1 << 17)]
     kept = (torch.cat([jet.value for jet in jets]).abs() < delta).nonzero()[:, 0]
     return BandSamples(points[kept], torch.cat([jet.gradient for jet in jets])[kept])

@@ -15,8 +15,8 @@ from torch.nn.functional import avg_pool3d, grid_sample, interpolate
 
 __all__ = ["CELL", "SpreadColors"]
 
-FINEST = 128  # cells on each side of the cube [-1, 1]³
-CELL = 2.0 / FINEST
+SPREAD_CELLS = 128  # cells on each side of the cube [-1, 1]³
+CELL = 2.0 / SPREAD_CELLS
 
 
 class SpreadColors:
@@ -57,8 +57,8 @@ class SpreadColors:
 
 
 def _gathered(points: Tensor, rows: Tensor) -> Tensor:
-    """Sums ``(C, FINEST, FINEST, FINEST)`` of rows ``(N, C)`` over the cells that their points lie in."""
-    cell = ((points + 1) / CELL).floor().long().clamp(0, FINEST - 1)
-    index = (cell[:, 0] * FINEST + cell[:, 1]) * FINEST + cell[:, 2]
-    sums = rows.new_zeros(FINEST**3, rows.shape[1]).index_add(0, index, rows)
-    return sums.T.reshape(-1, FINEST, FINEST, FINEST)
+    """Sums ``(C, n, n, n)`` of rows ``(N, C)`` over the n = `SPREAD_CELLS` cells per side that their points lie in."""
+    cell = ((points + 1) / CELL).floor().long().clamp(0, SPREAD_CELLS - 1)
+    index = (cell[:, 0] * SPREAD_CELLS + cell[:, 1]) * SPREAD_CELLS + cell[:, 2]
+    sums = rows.new_zeros(SPREAD_CELLS**3, rows.shape[1]).index_add(0, index, rows)
+    return sums.T.reshape(-1, SPREAD_CELLS, SPREAD_CELLS, SPREAD_CELLS)

@@ -22,6 +22,7 @@ from ...neural_fields.checkpoint import texture_bytes
 from ...neural_fields.fields.losses import color_loss, tangential_loss
 from ...neural_fields.networks.texture import ColorSiren
 from ...neural_fields.spacetime.dynamic_tracing import moment
+from ..training.atomic import prune
 from ..training.budget import SAMPLING_SHARE, Budget, affordable, step_seconds
 from ..training.config import load_config
 from ..training.folder import (
@@ -39,7 +40,6 @@ from ..training.machine import choose_device, environment
 from ..training.report import Report, reported
 from ..training.result import Run
 from ..training.settings import TextureConfig
-from ..training.swap import sweep
 from ..training.trainer import Group, Objective, Trainer, parameter_count, seeded, stop_on_signals, warm_cosine
 from .samples import BandSamples, ColorSamples, band_directions, match_colors, read_colors
 
@@ -55,12 +55,7 @@ __all__ = [
 
 # A band at least this wide (in units of the field) holds decimated meshes, and the surfaces of small networks.
 LEAST_DELTA = 0.02
-# The default for a field of one level, which has no band of its own that says how near it is to its points.
-SINGLE_LEVEL_DELTA = 0.05
-LEAST_SHARE = 0.1  # of a time budget, that the steps get in any case
-FEWEST = 2_000  # points that are left where time is short
-# Points of the pool at which the final error is measured.
-JUDGED = 100_000
+FEWEST_COLORED = 2_000  # points that are left where time is short
 
 
 @dataclass(frozen=True)
@@ -127,7 +122,7 @@ def fit_texture(
     device = choose_device(config.device)
     level = geometry.resolve_level(level)
     delta = config.delta or default_delta(geometry)
-    budget, band_samples = Budget(config.time_budget, device, started=started), config.samples // 2
+    budget, band_samples = Budget(config.time_budget, started=started), config.samples // 2
     home = geometry.like.device
     geometry = geometry.to(device)
 
@@ -139,14 +134,14 @@ def fit_texture(
     def part(count: int) -> tuple[PointCloud, int]:
         """So many of the points, and as large a part of the band's."""
         share = count / max(len(cloud), 1)
-        return _thinned(cloud, share, config.seed), max(int(share * band_samples), FEWEST)
+        return _thinned(cloud, share, config.seed), max(int(share * band_samples), FEWEST_COLORED)
 
     generator = torch.Generator()
     with reported(progress, "texture: samples"):
         left = budget.left()
         if left is not None:
             seconds = SAMPLING_SHARE * left
-            count = affordable(lambda count: made(*part(count)), len(cloud), seconds, fewest=FEWEST)
+            count = affordable(lambda count: made(*part(count)), len(cloud), seconds, fewest=FEWEST_COLORED)
             if count < len(cloud):
                 cloud, band_samples = part(count)
                 note = f"learns from {len(cloud):,} points and {band_samples:,} of the band, for want of time"
@@ -158,7 +153,8 @@ def fit_texture(
     sampling_seconds = time.monotonic() - started
     left, seconds = budget.left(), None
     if left is not None and config.time_budget is not None:
-        seconds = max(left, LEAST_SHARE * config.time_budget)
+        # The steps get a tenth of a time budget in any case.
+        seconds = max(left, 0.1 * config.time_budget)
     objective = TextureObjective(network, samples, band, config, delta=delta, generator=generator)
     trainer = Trainer(objective, stage="texture", steps=config.steps, seconds=seconds)
     if state is not None:
@@ -221,7 +217,7 @@ def texture_run(
     state_file = texture_state_file(target)
     with locked(file.parent if beside else target):
         if beside:
-            sweep(file.parent)
+            prune(file.parent)
         before = _interrupted(state_file) if resume else None
         if before is not None:
             config, level = before.config, before.level
@@ -261,8 +257,8 @@ def texture_run(
 
 
 def _thinned(cloud: PointCloud, share: float, seed: int) -> PointCloud:
-    """That share of the points, but at least `FEWEST`, drawn by the seed."""
-    count = min(len(cloud), max(int(share * len(cloud)), FEWEST))
+    """That share of the points, but at least `FEWEST_COLORED`, drawn by the seed."""
+    count = min(len(cloud), max(int(share * len(cloud)), FEWEST_COLORED))
     kept = np.sort(np.random.default_rng(seed).permutation(len(cloud))[:count])
     normals, colors = (None if rows is None else rows[kept] for rows in (cloud.normals, cloud.colors))
     return dataclasses.replace(cloud, points=cloud.points[kept], normals=normals, colors=colors)
@@ -310,7 +306,7 @@ def texture_of(run: str | Path, geometry: Field) -> TextureField | None:
 def default_delta(geometry: Field) -> float:
     """The band that holds the surfaces of all levels, in units of the field."""
     if geometry.num_levels == 1:
-        return SINGLE_LEVEL_DELTA
+        return 0.05  # it has no band of its own that says how near it is to its points
     return max(LEAST_DELTA, float(geometry.deltas.max()))
 
 
@@ -355,6 +351,6 @@ class TextureObjective(Objective):
 @torch.no_grad()
 def _psnr(network: ColorSiren, samples: ColorSamples, generator: torch.Generator) -> float:
     """Peak signal-to-noise ratio of the colours at points that were trained on, in dB."""
-    index = torch.randperm(len(samples.points), generator=generator)[:JUDGED].to(samples.points.device)
+    index = torch.randperm(len(samples.points), generator=generator)[:100_000].to(samples.points.device)
     error = color_loss(network.value(samples.points[index]).clamp(0, 1), samples.colors[index]).mean()
     return round(-10 * math.log10(max(float(error), 1e-12)), 3)

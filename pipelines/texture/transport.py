@@ -1,4 +1,4 @@
-"""Colours that ride along with a surface that moves: a texture is asked where a point was at the start.
+"""Texture transport: the colours of a surface that moves are those that its points had at the start.
 
 Where it was is integrated back in time along the velocity that was learnt, or else for the vertices of a coarse mesh of
 the moment; what lies between them then moves by the affine map that fits the nearest ones best: displacements are
@@ -10,6 +10,7 @@ end too, both are carried and fade into each other with time.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
@@ -32,9 +33,10 @@ from .spread import CELL, SpreadColors
 from .train import texture_of
 
 __all__ = [
-    "RIDE",
+    "TRANSPORT",
     "Backward",
     "Colors",
+    "TransportOptions",
     "TransportedColors",
     "TransportedPoints",
     "borrowed_texture",
@@ -48,20 +50,41 @@ __all__ = [
 Colors = Callable[[Tensor], Tensor]
 # Points (N, 3) of a moment to where they were at another time, (N, 3).
 Backward = Callable[[Tensor], Tensor]
-# A fixed step: near a change of topology adaptive ones would shrink to nothing, for the sake of a few points.
-RIDE = Solver(method="rk4", step=0.05)
-# Along a velocity that was learnt: smooth, so that in float32 more steps are no nearer; so many points at once.
-ALONG, ROWS = Solver(method="rk4", step=1 / 12), 8192
-# The mesh whose vertices are carried, in cells along the box, and how many of them a point looks to.
-CARRIED = 48
-NEIGHBORS = 8
-# Neighbours lie nearly in a plane: across it the affine map is held back by this share of their spread.
-RIDGE = 1e-3
-# Whether a texture is that of the start is looked at on so coarse a mesh; its vertices may be this far off on average.
-CHECKED = 48
-ASTRAY = 0.03
-# The mesh from which colours are spread, in cells along the box.
-SPREAD = 128
+
+
+@dataclass(frozen=True)
+class TransportOptions:
+    """How colours are carried; resolutions are cells along the mesher's box.
+
+    Attributes:
+        step: of Runge and Kutta 4 along the surface's own velocity. Fixed: near a change of topology adaptive steps
+            would shrink to nothing, for the sake of a few points.
+        learned_step: along a velocity that was learnt: smooth, so that in float32 more steps are no nearer.
+        rows: points that are carried along that at once.
+        carried: resolution of the mesh whose vertices are carried.
+        neighbors: of these, which a point between them looks to.
+        ridge: neighbours lie nearly in a plane: across it the affine map is held back by this share of their spread.
+        checked: resolution of the mesh on which a texture is compared with the start.
+        astray: mean distance of its vertices from the texture's surface up to which they are the same, in field units.
+        spread: resolution of the mesh from which colours are spread.
+    """
+
+    step: float = 0.05
+    learned_step: float = 1 / 12
+    rows: int = 8192
+    carried: int = 48
+    neighbors: int = 8
+    ridge: float = 1e-3
+    checked: int = 48
+    astray: float = 0.03
+    spread: int = 128
+
+
+TRANSPORT = TransportOptions()
+
+
+def _solver(step: float) -> Solver:
+    return Solver(method="rk4", step=step)
 
 
 def start_texture(run: str | Path, field: Field) -> TextureField | None:
@@ -127,12 +150,12 @@ def _texture_at(
     if texture is None:
         raise InputError(f"{flag} {run}: has no texture; make one with `mplicits texture {run} COLORS`")
     try:
-        mesh = extract_mesh(moment(field, time), resolution=CHECKED, normals=False)
+        mesh = extract_mesh(moment(field, time), resolution=TRANSPORT.checked, normals=False)
     except NoSurfaceError:
         return texture  # there is nothing to be coloured
     points = own(torch.from_numpy(mesh.vertices).to(field.like))
     points = points[points.norm(dim=-1) < 1]  # what the texture's fit says elsewhere is no surface of anything
-    if not len(points) or float(geometry.value(points).abs().mean()) > ASTRAY:
+    if not len(points) or float(geometry.value(points).abs().mean()) > TRANSPORT.astray:
         which = ("starts", "first") if time == 0 else ("ends", "last")
         raise InputError(f"{flag} {run}: is not where the motion {which[0]}; name the run of its {which[1]} shape")
     return texture
@@ -166,15 +189,20 @@ class TransportedPoints:
         motion = self._motion
         if motion is not None:
             return lambda points: torch.cat(
-                [flow(motion, part, time, to, solver=ALONG) for part in points.split(ROWS)] or [points]
+                [
+                    flow(motion, part, time, to, solver=_solver(TRANSPORT.learned_step))
+                    for part in points.split(TRANSPORT.rows)
+                ]
+                or [points]
             )
         try:
-            mesh = extract_mesh(moment(self._field, time), resolution=CARRIED, level=self._level, normals=False)
+            still = moment(self._field, time)
+            mesh = extract_mesh(still, resolution=TRANSPORT.carried, level=self._level, normals=False)
         except NoSurfaceError:
             return lambda points: points  # there is nothing that could have come from anywhere
         vertices = torch.from_numpy(mesh.vertices).to(self._field.like)
         try:
-            displacement = flow(self._velocity, vertices, time, to, solver=RIDE) - vertices
+            displacement = flow(self._velocity, vertices, time, to, solver=_solver(TRANSPORT.step)) - vertices
         except IntegrationError as error:
             raise InputError(f"colours cannot ride along to time {time:.3g} ({error}); leave them out") from error
         between = _Between(mesh.vertices, displacement.double().cpu().numpy())
@@ -256,7 +284,7 @@ class _Pinned:
     def _spread(self) -> SpreadColors | None:
         """None without a surface."""
         try:
-            mesh = extract_mesh(self._still, resolution=SPREAD, level=self._level, normals=False)
+            mesh = extract_mesh(self._still, resolution=TRANSPORT.spread, level=self._level, normals=False)
         except NoSurfaceError:
             return None
         points = project_to_surface(self._still, torch.from_numpy(mesh.vertices).to(self._still.like))[0]
@@ -288,7 +316,7 @@ class _Between:
 
     def __call__(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """Displacements ``(N, 3)`` of points ``(N, 3)``."""
-        away, near = self._tree.query(x, k=min(NEIGHBORS, len(self._points)), workers=-1)
+        away, near = self._tree.query(x, k=min(TRANSPORT.neighbors, len(self._points)), workers=-1)
         away, near = np.reshape(away, (len(x), -1)), np.reshape(near, (len(x), -1))
         weights = 1 / (away**2 + 0.1 * away[:, -1:] ** 2 + 1e-20)
         weights = (weights / weights.sum(axis=1, keepdims=True))[..., None]
@@ -296,7 +324,7 @@ class _Between:
         place, shift = (weights * places).sum(axis=1), (weights * shifts).sum(axis=1)
         across = places - place[:, None]
         spread = np.einsum("nki,nkj->nij", weights * across, across)
-        spread += (RIDGE * np.trace(spread, axis1=1, axis2=2) + 1e-20)[:, None, None] * np.eye(3)
+        spread += (TRANSPORT.ridge * np.trace(spread, axis1=1, axis2=2) + 1e-20)[:, None, None] * np.eye(3)
         slope = np.linalg.solve(spread, np.einsum("nki,nkj->nij", weights * across, shifts - shift[:, None]))
         return shift + np.einsum("ni,nij->nj", x - place, slope)
 

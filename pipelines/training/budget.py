@@ -9,8 +9,6 @@ from typing import Any
 
 import torch
 
-from .team import agreed
-
 __all__ = ["FEWEST_SAMPLES", "LEAST_SECONDS", "SAMPLING_SHARE", "Budget", "affordable", "least_share", "step_seconds"]
 
 # A level is not worth fewer steps, or fewer than a quarter of its own: its learning rate would hardly be warm.
@@ -28,7 +26,6 @@ class Budget:
 
     Args:
         seconds: for the whole work; None for no limit.
-        device: that trains.
         started: beginning of the work, by `time.monotonic`; None is now.
 
     Attributes:
@@ -37,8 +34,8 @@ class Budget:
         notes: sentences on what has changed.
     """
 
-    def __init__(self, seconds: float | None, device: torch.device, *, started: float | None = None) -> None:
-        self.seconds, self.device = seconds, device
+    def __init__(self, seconds: float | None, *, started: float | None = None) -> None:
+        self.seconds = seconds
         self.started = time.monotonic() if started is None else started
         self.before = 0.0
         self.left_out: list[int] = []
@@ -85,11 +82,9 @@ class Budget:
             levels.append(each)
         while levels and training * seconds < math.fsum(work) * max(least_share(steps[each]) for each in levels):
             del levels[-1], work[-1]
-        share = seconds if begun or level == 0 else -1.0
         if levels:
-            share = seconds * work[0] / math.fsum(work)
-        share = agreed(False, share, self.device)[1]  # all processes of a team train the same levels
-        return None if share < 0 else share
+            return seconds * work[0] / math.fsum(work)
+        return seconds if begun or level == 0 else None
 
     def leave_out(self, first: int, levels: int) -> None:
         """Record that the levels from ``first`` up to ``levels`` are not trained."""

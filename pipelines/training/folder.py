@@ -1,9 +1,8 @@
 """Run directories: what an argument ``RUN|FILE`` means, and what a training writes and finds again.
 
 All files of a directory belong to one run, whose *generation*, a random name, is in each of them. A checkpoint replaces
-them all at once (`swap`), so that a kill leaves the one before or this one; the first checkpoint of a new run replaces
-those of an old one, which is whole until then. The record has the SHA-256 of the others, and the tensors in each have
-one of their own.
+all of them at once (`replace_files`). An old run stays whole until the first checkpoint of a new one. The record has
+the SHA-256 of the field, and each file has one of its tensors.
 """
 
 from __future__ import annotations
@@ -29,10 +28,9 @@ from ...neural_fields import Field, InputError, Similarity, load_field
 from ...neural_fields.backend.files import check_place, damage, json_bytes, write_whole
 from ...neural_fields.checkpoint import SavedField, checksum_of, field_bytes
 from ...neural_fields.spacetime.dynamic_tracing import moment
+from .atomic import is_scratch, prune, recovered, replace_files
 from .config import command_line, load_config
 from .lock import check_unlocked, locked
-from .swap import is_scratch, settled, swap, sweep
-from .team import is_leader
 
 __all__ = [
     "CLOUD_FILE",
@@ -76,7 +74,6 @@ CLOUD_FILE = "cloud.ply"  # what was made of depth maps
 MERGED_FILE = "merged_cloud.npz"  # of a large cloud, made again where it is missing
 # What a resumed run may do otherwise than it began; all else would make another run of it.
 MAY_CHANGE = ("device", "time_budget")
-LOOKS = 20  # at files that are being replaced
 # What is in the record alone: too long for the head of a field's file.
 LONG = ("checks", "held_out")
 
@@ -84,7 +81,7 @@ LONG = ("checks", "held_out")
 def find_field(path: str | Path) -> Path:
     """The checkpoint that ``RUN|FILE`` names.
 
-    What a kill has left half done in a run directory is done now.
+    A change of a run directory that a kill has interrupted is ended now.
 
     Raises:
         InputError: there is nothing there, it is neither a run directory with a field nor a .safetensors file, or the
@@ -154,7 +151,7 @@ def chosen_level(field: Field, file: Path, level: int | None, *, otherwise: int 
 
 def is_fitted(run: Path) -> bool:
     """Whether the training in a directory went to its end."""
-    settled(run)
+    recovered(run)
     if not (run / FIELD_FILE).is_file() or not (run / RECORD_FILE).is_file() or (run / STATE_FILE).is_file():
         return False
     return bool(read_record(run).get("finished"))
@@ -228,11 +225,13 @@ def check_new_run(path: str | Path, *, resume: bool, force: bool) -> Path:
             resume.
     """
     path = Path(path)
+    if int(os.environ.get("WORLD_SIZE", "1")) > 1:  # set by torchrun
+        raise InputError("torchrun: a training runs in one process; start mplicits without it")
     if path.exists() and not path.is_dir():
         raise InputError(f"{path}: is a file; name a directory for the run")
     check_place(path)
     check_unlocked(path)
-    settled(path)
+    recovered(path)
     if resume:
         if not (path / STATE_FILE).is_file():
             finished = (path / FIELD_FILE).is_file()
@@ -264,7 +263,7 @@ class RunFolder:
         resume: whether the interrupted run there is continued.
 
     Attributes:
-        out: where to write, ``path``; None where nothing is kept, or another process of a team writes.
+        out: where to write, ``path``; None where nothing is kept, nothing.
 
     Raises:
         InputError: there is no directory to resume from.
@@ -274,12 +273,11 @@ class RunFolder:
         if resume and path is None:
             raise InputError("resume: needs the run directory (out=...)")
         self.path, self.resume = None if path is None else Path(path), resume
-        self.out = self.path if is_leader() else None
+        self.out = self.path
         self._found = None if self.path is None else _generation_in(self.path)
         self._generation = secrets.token_hex(8)
         self._gone: set[str] = set()  # of an older run, until the next checkpoint
-        self._kept: dict[str, bytes | Path] = {}  # for the next checkpoint
-        self._digests: dict[str, str] = {}  # of what the files of this run hold
+        self._kept: dict[str, bytes] = {}  # for the next checkpoint
 
     def config(self, kind: type[C], given: C | None) -> C:
         """Settings of the run: its own if it is resumed, else those given, else the defaults.
@@ -311,7 +309,7 @@ class RunFolder:
             return
         self.out.mkdir(parents=True, exist_ok=True)
         with locked(self.out):
-            sweep(self.out)
+            prune(self.out)
             if _generation_in(self.out) != self._found:
                 raise InputError(
                     f"{self.out}: another run was written there meanwhile; look at it, or choose another -o"
@@ -319,7 +317,6 @@ class RunFolder:
             if self.resume:
                 record = read_record(self.out)
                 self._generation = record.get("generation", self._generation)
-                self._digests = dict(record.get("files", {}))
             else:
                 self._gone = {SUPPORT_FILE, CLOUD_FILE, *also}
             yield
@@ -329,8 +326,8 @@ class RunFolder:
         """Whether what lies in the directory is of this run."""
         return self.resume or not self._gone
 
-    def keep(self, name: str, content: bytes | Path) -> None:
-        """Have a file in the directory from the next checkpoint on: bytes, or a file there that is renamed."""
+    def keep(self, name: str, content: bytes) -> None:
+        """Have a file in the directory from the next checkpoint on."""
         if self.out is not None:
             self._kept[name] = content
 
@@ -350,7 +347,7 @@ class RunFolder:
         if self.out is not None:
             about = {**progress, "config": record["config"], "generation": self._generation}
             self.keep(STATE_FILE, state_bytes(tensors, about))
-            self._swap(self.out, field, similarity, record)
+            self._replace(self.out, field, similarity, record)
 
     def finish(
         self, field: Field, similarity: Similarity, record: Mapping[str, Any], *, gone: Iterable[str] = ()
@@ -359,21 +356,19 @@ class RunFolder:
         if self.out is None:
             return dict(record)
         self._gone |= {STATE_FILE, *gone}
-        return self._swap(self.out, field, similarity, record)
+        return self._replace(self.out, field, similarity, record)
 
-    def _swap(self, out: Path, field: Field, similarity: Similarity, record: Mapping[str, Any]) -> dict[str, Any]:
-        """Replace all that is in the directory by what this run has come to; colours are never those of a new field."""
+    def _replace(self, out: Path, field: Field, similarity: Similarity, record: Mapping[str, Any]) -> dict[str, Any]:
+        """Replace the files of the directory at once; the texture of an older field is removed."""
         record = {"generation": self._generation, **record}
         short = {name: value for name, value in record.items() if name not in LONG}
         files = {**self._kept, FIELD_FILE: field_bytes(field, similarity=similarity, metadata={"run": short})}
         gone = {*self._gone, TEXTURE_FILE, RADIANCE_FILE, texture_state_file(Path(TEXTURE_FILE)).name} - {*files}
         if record.get("cloud") == str((out / CLOUD_FILE).absolute()):
             gone.discard(CLOUD_FILE)  # it is what is fitted
-        digests = {name: old for name, old in self._digests.items() if name not in gone}
-        digests |= {name: _digest(content) for name, content in files.items()}
-        record = {**record, "files": digests}
-        swap(out, {**files, RECORD_FILE: json_bytes(record)}, gone)
-        self._kept, self._gone, self._digests = {}, set(), digests
+        record = {**record, "files": {FIELD_FILE: _digest(files[FIELD_FILE])}}
+        replace_files(out, {**files, RECORD_FILE: json_bytes(record)}, gone)
+        self._kept, self._gone = {}, set()
         return record
 
     def restore(self, fingerprint: str, mismatch: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
@@ -405,12 +400,10 @@ def write_texture(run: Path, content: bytes, record: Mapping[str, Any], *, finis
     Raises:
         InputError: the directory cannot be written, or its record is damaged.
     """
-    files: dict[str, bytes | Path] = {TEXTURE_FILE: content}
+    files = {TEXTURE_FILE: content}
     if (run / RECORD_FILE).is_file():
-        whole = read_record(run)
-        digests = {**whole.get("files", {}), TEXTURE_FILE: _digest(content)}
-        files[RECORD_FILE] = json_bytes({**whole, "texture": dict(record), "files": digests})
-    swap(run, files, [texture_state_file(Path(TEXTURE_FILE)).name] * finished)
+        files[RECORD_FILE] = json_bytes({**read_record(run), "texture": dict(record)})
+    replace_files(run, files, [texture_state_file(Path(TEXTURE_FILE)).name] * finished)
 
 
 def _check_unchanged(run: Path, config: Mapping[str, Any], began: Mapping[str, Any]) -> None:
@@ -424,7 +417,7 @@ def _check_unchanged(run: Path, config: Mapping[str, Any], began: Mapping[str, A
 
 def _generation_in(run: Path) -> object:
     """What tells the run in a directory from any other; None where there is none."""
-    settled(run)
+    recovered(run)
     if not (run / RECORD_FILE).is_file():
         return None
     try:
@@ -440,8 +433,8 @@ def _check_whole(run: Path) -> None:
     Raises:
         InputError: they do not belong together.
     """
-    for _ in range(LOOKS):
-        settled(run)
+    for _ in range(20):
+        recovered(run)
         try:
             digest = json.loads((run / RECORD_FILE).read_text(encoding="utf-8"))["files"][FIELD_FILE]
             held = (run / FIELD_FILE).read_bytes()
@@ -456,8 +449,8 @@ def _check_whole(run: Path) -> None:
     )
 
 
-def _digest(content: bytes | Path) -> str:
-    return hashlib.sha256(content if isinstance(content, bytes) else content.read_bytes()).hexdigest()
+def _digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
 
 
 def digest_of(arrays: Iterable[NDArray[Any]]) -> str:

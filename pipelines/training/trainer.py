@@ -19,7 +19,6 @@ from torch import Tensor, nn
 
 from ...neural_fields.backend.devices import precise
 from .report import Progress, Report, silent
-from .team import agreed, as_the_leader, average_gradients, is_alone
 
 __all__ = [
     "Group",
@@ -184,7 +183,7 @@ F = TypeVar("F", bound=nn.Module)
 
 
 class Trainer(Generic[O]):
-    """Minimises an objective with Adam; interruptible, resumable, and by several processes where there is a team.
+    """Minimises an objective with Adam; interruptible and resumable.
 
     Args:
         objective: what is minimised.
@@ -262,17 +261,14 @@ class Trainer(Generic[O]):
         start, saved = time.monotonic() - self.elapsed, time.monotonic()
         told = saved
         device = self.trained[0].device
-        as_the_leader(self.trained)
-        stop, self.elapsed = agreed(flag.requested, self.elapsed, device)
         if self.fraction < 1:
             report(self.progress)  # so that displays know when it began
         while self.fraction < 1:
-            if stop:
+            if flag.requested:
                 save()
                 return False
             terms = self._step()
-            # A team agrees here, so that its clocks tell all alike whether this was the last step.
-            stop, self.elapsed = agreed(flag.requested, time.monotonic() - start, device)
+            self.elapsed = time.monotonic() - start
             late = time.monotonic() - told > report_seconds
             if self.step % report_every == 0 or self.fraction >= 1 or late:
                 read = torch.stack([term.to(precise(device)) for term in terms.values()]).tolist()  # one wait for all
@@ -282,7 +278,6 @@ class Trainer(Generic[O]):
             if time.monotonic() - saved > save_every:
                 save()
                 saved = time.monotonic()
-            stop = stop or (is_alone() and flag.requested)
         return True
 
     def _step(self) -> dict[str, Tensor]:
@@ -298,7 +293,6 @@ class Trainer(Generic[O]):
         """One step of Adam down the gradient of ``total``."""
         self.adam.zero_grad(set_to_none=True)
         total.backward()
-        average_gradients(self.trained)
         if self.clip is not None:
             nn.utils.clip_grad_norm_(self.trained, self.clip)
         self.adam.step()

@@ -22,7 +22,6 @@ from ....neural_fields import Field, InputError, sphere_trace
 from ....neural_fields.backend.devices import handed, uniform
 from ....neural_fields.fields.function import FieldLike
 from ....neural_fields.volume.weights import sphere_span
-from ...training.team import my_share
 from .silhouettes import OBJECT
 
 __all__ = ["DepthRays", "MeasuredDepths", "depth_loss", "fit_scale_shift", "said_outside"]
@@ -141,8 +140,8 @@ class MeasuredDepths:
         return DepthRays(self.eyes[view], along / length[:, None], depths * length, self.exact[rows], view)
 
     def draw(self, count: int, generator: torch.Generator) -> DepthRays:
-        """``count`` measurements at random, with replacement, or a team's share of them."""
-        return self.at(handed(lambda: my_share(torch.randint(len(self), (count,), generator=generator)), self.device))
+        """``count`` measurements at random, with replacement."""
+        return self.at(handed(lambda: torch.randint(len(self), (count,), generator=generator), self.device))
 
     @torch.no_grad()
     def settle(self, distance: FieldLike) -> None:

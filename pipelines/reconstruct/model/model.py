@@ -22,7 +22,6 @@ from ....neural_fields.volume.render import Rendered, Sampling, render_volume
 from ....neural_fields.volume.weights import sphere_span
 from ...training.focus import Focus
 from ...training.settings import ReconstructConfig
-from ...training.team import my_share
 from ...training.trainer import seeded
 
 __all__ = ["Exposures", "PoseCorrections", "RayPool", "Rays", "SceneModel", "build_scene", "camera_rays"]
@@ -310,12 +309,12 @@ class RayPool:
         return len(self.pixels)
 
     def draw(self, count: int, generator: torch.Generator, focus: Focus | None = None) -> Rays:
-        """``count`` rays at random, with replacement, or a team's share of them; ``focus`` says where."""
+        """``count`` rays at random, with replacement; ``focus`` says where."""
 
         def draw() -> Tensor:
             if focus is None:
-                return my_share(torch.randint(len(self), (count,), generator=generator))
-            return my_share(focus.rows(count, generator))
+                return torch.randint(len(self), (count,), generator=generator)
+            return focus.rows(count, generator)
 
         rows = handed(draw, self.device)
         view, pixel = self.owners[rows].long(), self.pixels[rows].long()

@@ -17,7 +17,6 @@ from ....neural_fields.networks.value_grid import ValueGrid
 from ....neural_fields.volume.render import Sampling
 from ...training.focus import Focus
 from ...training.settings import ReconstructConfig
-from ...training.team import gathered, mean_of_all, own_generator, whole_batch
 from ...training.trainer import Group, Objective, warm_cosine
 from ..data.measured import MeasuredDepths, depth_loss
 from .model import RayPool, SceneModel
@@ -214,7 +213,7 @@ class SceneObjective(Objective):
                 measured.settle(self.grid or (lambda x: self.model.geometry.value(x, level=0)))
                 self.kept["affine"] = measured.affine
         return Kind(
-            rays=whole_batch(self.batch()),
+            rays=self.batch(),
             level=self.level_at(done),
             annealing=done < self.config.anneal,
             measured=measured is not None and (done < self.schedule.faded or measured.is_exact),
@@ -235,7 +234,6 @@ class SceneObjective(Objective):
         config, pool = self.config, self.pool
         self.model.widen(config.band, config.least_delta)
         rays = pool.draw(kind.rays, self.generator, self.focus)
-        generator = own_generator(self.generator)
         origins, directions = rays.origins, rays.directions
         if self.model.poses is not None:
             origins, directions = self.model.poses.moved(origins, directions, rays.view)
@@ -249,17 +247,17 @@ class SceneObjective(Objective):
             skip=config.skip,
             skip_share=config.skip_share,
             guide=self.grid,
-            generator=generator,
+            generator=self.generator,
         )
-        sections = mean_of_all((seen.counts > 0).sum() / len(origins))
+        sections = (seen.counts > 0).sum() / len(origins)
         target = rays.color
         if pool.has_masks:
             target = torch.lerp(self.model.background.expand_as(target), target, rays.mask[:, None])
         wrong = (self.model.photographed(seen, rays.view) - target).abs().mean(dim=1)
-        self.focus.learn(gathered(rays.row), gathered(wrong.detach()))
+        self.focus.learn(rays.row, wrong.detach())
         color = wrong.mean()
         # A mean over all sections within the region, those that were skipped included: some stand for the others.
-        within = mean_of_all((seen.counts > 0).any(dim=1).sum().to(wrong)).clamp(min=1) * seen.counts.shape[1]
+        within = (seen.counts > 0).any(dim=1).sum().to(wrong).clamp(min=1) * seen.counts.shape[1]
         eikonal = (seen.counts * eikonal_loss(seen.jet.gradient)).sum() / within
         terms = {"color": color, "eikonal": eikonal}
         total = color + config.eikonal_weight * eikonal
@@ -277,10 +275,10 @@ class SceneObjective(Objective):
 
     def depth_term(self, measured: MeasuredDepths, level: int) -> Tensor:
         """How far the surface is from what was measured: the mean of `depth_loss` over rays at random."""
-        rays = measured.draw(whole_batch(self.schedule.depth_rays), self.generator)
+        rays = measured.draw(self.schedule.depth_rays, self.generator)
         if self.model.poses is not None:
             origins, directions = self.model.poses.moved(rays.origins, rays.directions, rays.view)
             rays = rays._replace(origins=origins, directions=directions)
-        missed = depth_loss(self.model.geometry, rays, level=level, generator=own_generator(self.generator))
+        missed = depth_loss(self.model.geometry, rays, level=level, generator=self.generator)
         left = self.by_time(lambda done: max(1 - done / self.schedule.faded, 0.0))
         return torch.where(rays.exact, missed, left * missed).mean()

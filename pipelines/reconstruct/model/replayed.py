@@ -14,7 +14,6 @@ from ....neural_fields.backend.devices import handed
 from ....neural_fields.backend.fixed_shapes import FixedShapes, fixed_shapes
 from ...training.replay import CudaGraphs, Recorder, Replays
 from ...training.settings import ReconstructConfig
-from ...training.team import is_alone
 from ...training.trainer import Trainer
 from ..data.measured import MeasuredDepths
 from .model import RayPool, SceneModel
@@ -161,7 +160,7 @@ def scene_trainer(
     measured: MeasuredDepths | None = None,
     seconds: float | None = None,
 ) -> Trainer[SceneObjective]:
-    """The training of a scene; see `SceneObjective` and `Trainer`. Alone on a GPU, it is replayed."""
+    """The training of a scene; see `SceneObjective` and `Trainer`. On a GPU, it is replayed."""
     objective = SceneObjective(model, pool, config, measured)
-    kind = ReplayedTrainer if config.graphs and pool.device.type == "cuda" and is_alone() else Trainer
+    kind = ReplayedTrainer if config.graphs and pool.device.type == "cuda" else Trainer
     return kind(objective, stage="reconstruct", steps=config.steps, seconds=seconds, network_name="model")

@@ -1,5 +1,6 @@
 """Motions between meshes: what moves rigidly has no jumps, what is torn has, and bad input is named."""
 
+import dataclasses
 from dataclasses import replace
 from pathlib import Path
 
@@ -30,10 +31,9 @@ def _small(monkeypatch: pytest.MonkeyPatch) -> None:
     few_points(monkeypatch)
     monkeypatch.setattr(pairs, "PIXELS", 48)
     monkeypatch.setattr(pairs, "TILE", 32)
-    for name in ("CARRIED", "SPREAD"):
-        monkeypatch.setattr(transport, name, 12)
-    for module, name in ((transport, "RIDE"), (motion, "CARRY")):
-        monkeypatch.setattr(module, name, Solver(method="rk4", step=0.25))
+    coarse = dataclasses.replace(transport.TRANSPORT, carried=12, spread=12, step=0.25)
+    monkeypatch.setattr(transport, "TRANSPORT", coarse)
+    monkeypatch.setattr(motion, "CARRY", Solver(method="rk4", step=0.25))
 
 
 def test_a_rigid_motion_has_no_jumps(tmp_path: Path):
@@ -84,8 +84,11 @@ def test_meshes_are_fitted_and_measured(tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr(pairs, "kept_fit", lambda *_, **__: None)
     boxes = {"flat": "box:0.6,0.2,0.5", "tall": "box:0.3,0.6,0.3"}
     monkeypatch.setattr(pairs, "read_shape", lambda home: read_shape(boxes[Path(home).name.partition("-")[0]]))
-    for name, value in {"POOL": 500, "MATCHED": 100, "GUIDED": 32, "LOOSE": 32, "REGULAR": 64, "STEPS": 2}.items():
-        monkeypatch.setattr(deform, name, value)
+    monkeypatch.setattr(
+        deform,
+        "MOTION",
+        dataclasses.replace(deform.MOTION, pool=500, matched=100, guided=32, loose=32, regular=64, steps=2),
+    )
     config = replace(
         QUICK, motion_steps=3, motion_width=8, steps=(5,), samples=200, start_steps=5, batch=64, frames=2, resolution=16
     )

@@ -1,5 +1,6 @@
 """Deformations: a motion is learnt that takes each shape to the next, and the run keeps it."""
 
+import dataclasses
 import os
 import signal
 import time
@@ -48,8 +49,11 @@ SMALL = replace(
 @pytest.fixture(autouse=True)
 def _small(monkeypatch: pytest.MonkeyPatch) -> None:
     few_points(monkeypatch)
-    for name, value in {"POOL": 1000, "MATCHED": 200, "GUIDED": 64, "LOOSE": 64, "REGULAR": 128, "STEPS": 4}.items():
-        monkeypatch.setattr(deform, name, value)
+    monkeypatch.setattr(
+        deform,
+        "MOTION",
+        dataclasses.replace(deform.MOTION, pool=1000, matched=200, guided=64, loose=64, regular=128, steps=4),
+    )
 
 
 def test_points_of_a_moved_shape_are_matched_with_their_own_images():
@@ -123,7 +127,7 @@ def test_a_run_keeps_its_motion_and_resumes_to_the_same_bits(tmp_path: Path, mon
 
 
 def test_a_time_budget_shortens_the_motion():
-    budget = Budget(1.0, torch.device("cpu"))
+    budget = Budget(1.0)
     config = EvolveConfig(kind="deform", shapes=(LEFT, RIGHT), motion_steps=10**6)
     started = time.monotonic()
     learn_motion([read_shape(text) for text in config.shapes], (0.0, 1.0), config, budget=budget)

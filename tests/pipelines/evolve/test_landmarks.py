@@ -1,5 +1,6 @@
 """Landmarks: what a file may hold, where it lands, and that a ball turns which nothing else would turn."""
 
+import dataclasses
 from dataclasses import replace
 from pathlib import Path
 
@@ -32,8 +33,11 @@ SMALL = replace(
 @pytest.fixture(autouse=True)
 def _small(monkeypatch: pytest.MonkeyPatch) -> None:
     few_points(monkeypatch)
-    for name, value in {"POOL": 500, "MATCHED": 150, "GUIDED": 64, "LOOSE": 32, "REGULAR": 64, "STEPS": 4}.items():
-        monkeypatch.setattr(deform, name, value)
+    monkeypatch.setattr(
+        deform,
+        "MOTION",
+        dataclasses.replace(deform.MOTION, pool=500, matched=150, guided=64, loose=32, regular=64, steps=4),
+    )
 
 
 def corners() -> torch.Tensor:

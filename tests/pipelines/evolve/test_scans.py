@@ -1,5 +1,6 @@
 """Clouds and meshes as shapes: each is fitted once, and poses of one mesh are landmarks of each other."""
 
+import dataclasses
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -88,8 +89,11 @@ def test_a_series_of_scans_on_the_command_line(
     poses: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ):
     few_points(monkeypatch)
-    for name, value in {"POOL": 500, "MATCHED": 100, "GUIDED": 32, "LOOSE": 32, "REGULAR": 64, "STEPS": 2}.items():
-        monkeypatch.setattr(deform, name, value)
+    monkeypatch.setattr(
+        deform,
+        "MOTION",
+        dataclasses.replace(deform.MOTION, pool=500, matched=100, guided=32, loose=32, regular=64, steps=2),
+    )
     fits = tmp_path / "fits.yaml"
     fits.write_text(
         "widths: [16]\ndepths: [1]\nomegas: [4]\nsteps: [30]\nlearning_rates: [1.0e-2]\nbatch: 256\nsamples: 1000\n"

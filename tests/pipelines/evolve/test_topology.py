@@ -1,12 +1,14 @@
 """Changes of topology against closed forms: when spheres touch, when a torus closes, and where."""
 
+import dataclasses
+
 import pytest
 import torch
 from mplicits.neural_fields import FunctionField, Similarity, TimeSlice
 from mplicits.pipelines.evolve import topology
 from mplicits.pipelines.evolve.checks import check_evolution, warnings
 from mplicits.pipelines.evolve.problem import End
-from mplicits.pipelines.evolve.topology import NARROW, ONE, Topology, find_changes, surface_of, topology_of
+from mplicits.pipelines.evolve.topology import CHANGES, Topology, find_changes, surface_of, topology_of
 from torch import Tensor
 
 RESOLUTION = 32
@@ -41,9 +43,9 @@ def changes_of(field: FunctionField, times: list[float]):
 def test_a_change_is_found_when_and_where_it_is(function, when, where, before, after, speed):
     (change,) = changes_of(FunctionField(function, in_dim=4), [0.0, 0.35, 1.0])
     assert (change.before, change.after) == (before, after)
-    assert change.within <= ONE
+    assert change.within <= CHANGES.one
     # A gap or neck thinner than a cell's diagonal is not seen; both sides of a gap come nearer with ``speed``.
-    assert abs(change.time - when) < 3**0.5 * CELL / speed / 2 + ONE
+    assert abs(change.time - when) < 3**0.5 * CELL / speed / 2 + CHANGES.one
     # The box of two cells; and the gap is thinner than a cell, between curvatures of 1 / 0.25, within √(0.25 CELL).
     assert torch.dist(torch.tensor(change.place), torch.tensor(where)) < (0.25 * CELL) ** 0.5 + 3**0.5 * CELL
 
@@ -58,7 +60,7 @@ def test_what_vanishes_is_found_where_it_was():
 
     (change,) = changes_of(FunctionField(shrinking, in_dim=4), [0.0, 1.0])
     assert (change.before, change.after) == (Topology(1, 0), Topology(0, 0))
-    assert abs(change.time - 0.8) < CELL / 0.5 * 3**0.5 + NARROW  # a ball within a cell is not seen
+    assert abs(change.time - 0.8) < CELL / 0.5 * 3**0.5 + CHANGES.narrow  # a ball within a cell is not seen
     assert torch.dist(torch.tensor(change.place), torch.full((3,), 0.3)) < 2 * CELL
 
 
@@ -83,7 +85,7 @@ def test_more_pieces_than_at_either_end_are_warned_about():
 
 
 def test_of_many_changes_the_first_ones_have_a_place(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(topology, "PLACED", 1)
+    monkeypatch.setattr(topology, "CHANGES", dataclasses.replace(CHANGES, placed=1))
 
     def blinking(x: Tensor) -> Tensor:
         return x[..., :3].norm(dim=-1) - 0.3 - 0.6 * torch.sin(5 * torch.pi * x[..., 3])

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from mplicits.neural_fields import Box, Similarity, Sphere, Union, save_field
 from mplicits.pipelines.mesh import MeshOptions, export_run, extract
-from mplicits.pipelines.mesh.fineness import CELLS, RESOLUTIONS, SIDE, fineness, thin_share
+from mplicits.pipelines.mesh.fineness import RESOLUTIONS, fineness, thin_depth, thin_share
 from mplicits.pipelines.surface.trim import Support
 
-DEPTHS = {resolution: CELLS * SIDE / resolution for resolution in RESOLUTIONS}
+DEPTHS = {resolution: thin_depth(resolution) for resolution in RESOLUTIONS}
 
 
 def sides(thickness: float, count: int = 500) -> np.ndarray:

@@ -95,9 +95,7 @@ def test_a_field_of_two_runs_is_meshed_later(balls: Path, capsys: pytest.Capture
     ("by", "flags"), [("2mm", "--unit mm"), ("0.2cm", "--unit mm"), ("2", ""), ("-2mm", "--unit mm")]
 )
 @pytest.mark.parametrize("source", ["a.safetensors", "a.stl"])
-def test_a_ball_is_grown_and_shrunk(
-    balls: Path, capsys: pytest.CaptureFixture[str], by: str, flags: str, source: str
-) -> None:
+def test_a_ball_is_grown_and_shrunk(balls: Path, by: str, flags: str, source: str) -> None:
     assert cli.main(f"mesh a.safetensors -o a.stl --resolution {RESOLUTION}".split()) == 0
     words = f"offset {source} --by {by} -o out.ply --resolution {RESOLUTION} {flags}"
     assert cli.main(words.split()) == 0
@@ -112,10 +110,6 @@ def test_a_ball_is_grown_and_shrunk(
     radii = np.linalg.norm(mesh.vertices - AT, axis=1)
     assert expected - 2 * chord < radii.min()
     assert radii.max() < expected + chord / 4
-    low, high = (float(word) for word in capsys.readouterr().out.splitlines()[-1].split()[3:6:2])
-    wanted = expected - RADIUS
-    assert abs(low - wanted) < chord
-    assert abs(high - wanted) < chord
 
 
 @pytest.mark.parametrize(("by", "inner", "outer"), [("-5", RADIUS - 5, RADIUS), ("5", RADIUS, RADIUS + 5)])

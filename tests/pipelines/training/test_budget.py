@@ -20,7 +20,7 @@ def now(monkeypatch: pytest.MonkeyPatch) -> list[float]:
 
 
 def budget_of(seconds: float | None) -> Budget:
-    return Budget(seconds, torch.device("cpu"))
+    return Budget(seconds)
 
 
 def test_what_is_left(now: list[float]) -> None:
