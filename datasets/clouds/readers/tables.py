@@ -57,7 +57,7 @@ def read_text(path: Path, columns: str | None = None) -> PointCloud:
     body = "\n".join(lines[skipped:])
     if count:
         body = re.sub(r"^[ \t]*\d+[ \t]*$", "", body, flags=re.MULTILINE)
-    if re.search(r"^[ \t]*[;%!]", body, re.MULTILINE):
+    if any(mark in body for mark in ";%!"):
         body = re.sub(r"^[ \t]*[;%!]", "#", body, flags=re.MULTILINE)
     body = body.replace("//", "#").replace(",", decimal).replace(";", " ")
     rows = numbers(body, path, first_line=skipped + 1, what="line")
