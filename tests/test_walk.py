@@ -2,15 +2,15 @@
 
 from mplicits.pipelines.surface import read_surface
 from mplicits.pipelines.training.jobs import run_jobs
-from test_layout import ROOT, room
-from walk import WALKS, report, walk
+from test_layout import ROOT
+from walk import WALKS, report, top_room, walk
 
 
 def test_a_point_goes_one_way() -> None:
     stays = WALKS["jet"]()
     assert stays[0].caller is None
     assert stays[0].file == ROOT / "neural_fields/networks/multiscale.py"
-    assert {room(stay.file) for stay in stays} == {"neural_fields"}
+    assert {top_room(stay.file) for stay in stays} == {"neural_fields"}
     assert not any(stay.climbs for stay in stays)
 
 

@@ -90,7 +90,12 @@ def _place(code: CodeType) -> Path | None:
 
 @cache
 def _floor(path: Path) -> int:
-    return ROOMS.index(room(path))
+    return ROOMS.index(top_room(path))
+
+
+def top_room(path: Path) -> str:
+    """The room of a file, the sub-packages of neural_fields counted as one."""
+    return "neural_fields" if path.is_relative_to(ROOT / "neural_fields") else room(path)
 
 
 def report(name: str, stays: list[Stay]) -> str:
@@ -98,7 +103,7 @@ def report(name: str, stays: list[Stay]) -> str:
     first = {stay.file: stay for stay in reversed(stays)}
     files = list(dict.fromkeys(stay.file for stay in stays))
     climbs = [stay for stay in stays if stay.climbs]
-    lines = [f"{name}: {len({room(file) for file in files})} rooms, {len(files)} files, {len(stays)} stays, "]
+    lines = [f"{name}: {len({top_room(file) for file in files})} rooms, {len(files)} files, {len(stays)} stays, "]
     lines[0] += f"{len(climbs)} climbs"
     lines += [f"  {_said(file)}  from {_said(first[file].caller)}" for file in files]
     return "\n".join([*lines, *(f"  climb: {_said(stay.caller)} → {_said(stay.file)}" for stay in climbs)])

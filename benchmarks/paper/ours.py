@@ -57,8 +57,9 @@ class Ours(Method[PaperCell]):
     )
 
     def settings(self, cell: PaperCell) -> Mapping[str, Any]:
-        """All settings of the fit but the device."""
-        return {"fit": {k: v for k, v in dataclasses.asdict(our_config(cell)).items() if k != "device"}}
+        """All settings of the fit but the device, and but those of how a file is read, which these clouds do not need."""
+        left_out = ("device", "columns", "drop_noise")
+        return {"fit": {k: v for k, v in dataclasses.asdict(our_config(cell)).items() if k not in left_out}}
 
     def run(self, cell: PaperCell, work: Workplace) -> Findings:
         """Fit, and measure every level; an interrupted fit goes on, and a finished one is taken as it is."""

@@ -253,7 +253,7 @@ def test_a_yaml_file_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureF
         ("sphere nothing -o RUN", "nothing: no such run directory or file"),
         ("sphere torus --shapes box -o RUN", "--shapes: the shapes are given already"),
         ("sphere torus --kind melt -o RUN", "--kind: got 'melt', expected one of morph, deform, transport, smooth"),
-        ("sphere -o RUN --resume", "--resume: continues with the run's own shapes and settings"),
+        ("sphere -o RUN --resume", "--resume: continues with the run's own settings"),
         ("sphere torus -o RUN --alpha x", "--alpha: got 'x', expected a finite number"),
     ],
 )

@@ -418,7 +418,7 @@ def test_the_command_resumes(
     (run / TEXTURE_FILE).unlink()
     with pytest.raises(InputError, match="an interrupted training; --resume continues it, --force replaces it"):
         command(run, cloud, *words)
-    with pytest.raises(InputError, match="--resume: continues with its own settings"):
+    with pytest.raises(InputError, match="--resume: continues with the run's own settings"):
         command(run, cloud, "--resume", "--steps", 7)
     assert command(run, cloud, "--resume", "--quiet") == 0
     assert "(16, 1), 115 parameters, 60 steps" in capsys.readouterr().out
