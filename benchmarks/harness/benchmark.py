@@ -170,6 +170,8 @@ def from_figures(kind: Any, figures: Any) -> Any:
         hints = get_type_hints(kind)
         names = [field.name for field in dataclasses.fields(kind)]
         return kind(**{name: from_figures(hints[name], figures[name]) for name in names if name in figures})  # type: ignore[operator]
+    if isinstance(kind, type) and issubclass(kind, tuple) and hasattr(kind, "_fields"):
+        return kind(*figures)  # JSON keeps a NamedTuple as a list
     return tuple(figures) if get_origin(kind) is tuple else figures
 
 

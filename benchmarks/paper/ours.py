@@ -57,7 +57,7 @@ class Ours(Method[PaperCell]):
     )
 
     def settings(self, cell: PaperCell) -> Mapping[str, Any]:
-        """All settings of the fit but the device, and but those of how a file is read, which these clouds do not need."""
+        """All settings of the fit but the device, and those of how a table is read."""
         left_out = ("device", "columns", "drop_noise")
         return {"fit": {k: v for k, v in dataclasses.asdict(our_config(cell)).items() if k not in left_out}}
 
