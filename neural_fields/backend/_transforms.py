@@ -1,10 +1,18 @@
-"""Whether `torch.func.vmap` looks on, which takes neither results of unknown size nor writing into buffers."""
+"""Whether `torch.func.vmap` or `torch.compile` traces a call; neither takes writing into buffers."""
 
 from __future__ import annotations
 
 import torch
 
-__all__ = ["under_vmap"]
+__all__ = ["is_traced", "under_vmap"]
+
+
+def is_traced() -> bool:
+    """Whether plain operations are needed: under `torch.func.vmap`, or while `torch.compile` traces.
+
+    Inductor turns writes into parts of uninitialised buffers into wrong numbers.
+    """
+    return torch.compiler.is_compiling() or under_vmap()
 
 
 def under_vmap() -> bool:

@@ -25,7 +25,7 @@ from torch import Tensor, nn
 
 from ..backend._checks import at_least, positive
 from ..backend._parallel import Step, over_blocks
-from ..backend._transforms import under_vmap
+from ..backend._transforms import is_traced
 from ..backend.kernels.switch import choose
 from ..fields.field import Jet, OneLevelField, SecondJet
 
@@ -146,7 +146,7 @@ class Siren(OneLevelField):
         """The first outputs ``(N, channels)`` at points ``(..., d)``."""
         self.resolve_level(level)
         rows = self.check_points(x).reshape(-1, self.in_dim)
-        if under_vmap():
+        if is_traced():
             return forward(rows, self.folded())[0][:, :channels]
         parameters = list(self.parameters())
         if not needs_graph(rows, parameters):
@@ -176,7 +176,7 @@ class Siren(OneLevelField):
         """
         self.resolve_level(level)
         rows = self.check_points(x).reshape(-1, self.in_dim)
-        if under_vmap():
+        if is_traced():
             output, gradients = plain_jet(rows, self.folded(), 1)
             shape = x.shape[:-1]
             features = output[:, 1:].reshape(*shape, self.num_features)

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 from bounds import assert_within, rounding
-from mplicits.neural_fields import Siren
+from mplicits.neural_fields import MultiscaleSDF, Siren
 from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
@@ -134,3 +134,22 @@ def test_a_second_jet_costs_two_and_a_half_jets(training: bool, times: float) ->
         counts.append(counter.get_total_flops())
     assert counts[0] > 0
     assert counts[1] <= (times + 3 * 3 / 64) * counts[0]
+
+
+@pytest.mark.filterwarnings("ignore")  # those of PyTorch's compiler
+@pytest.mark.parametrize("backend", ["aot_eager", pytest.param("inductor", marks=pytest.mark.slow)])
+def test_compiled_jets_are_those_of_eager(backend: str) -> None:
+    """Values, gradients and the gradients of a loss by the parameters, with points inside and outside the band."""
+    torch.compiler.reset()
+    sdf = MultiscaleSDF.from_widths([(16, 2), (24, 2)], omegas=[10, 20], deltas=[0.3], taper=0.3, num_features=4)
+    x = 2 * torch.rand(64, 3) - 1
+    assert 0 < int(sdf.in_band(x, level=1).sum()) < 64
+    plain, compiled = sdf.jet(x), torch.compile(sdf.jet, backend=backend)(x)
+    for ours, theirs in zip(compiled, plain, strict=True):
+        assert torch.allclose(ours, theirs, atol=1e-5)
+    losses = [(jet.gradient.norm(dim=-1) - 1).square().mean() for jet in (compiled, plain)]
+    parameters = list(sdf.parameters())
+    ours, theirs = (torch.autograd.grad(loss, parameters, allow_unused=True) for loss in losses)
+    for a, b in zip(ours, theirs, strict=True):
+        assert (a is None) == (b is None)
+        assert a is None or b is None or torch.allclose(a, b, atol=1e-4)
