@@ -308,9 +308,8 @@ def _port(text: str) -> int | None:
 def _view(arguments: argparse.Namespace) -> int:
     if (arguments.other is None) != (arguments.landmarks is None):
         raise input_error("--landmarks: goes with two runs, `mplicits view RUN OTHER --landmarks FILE`")
-    for name in ("cloud", "time"):
-        if arguments.landmarks is not None and getattr(arguments, name) is not None:
-            raise input_error(f"--{name}: does not go with --landmarks; leave one of the two out")
+    if arguments.landmarks is not None:
+        refuse(arguments, ("cloud", "time"), "does not go with --landmarks; leave one of the two out")
     from ..web.export import WebOptions, pack
     from ..web.landmarks import Pairs
     from ..web.serve import PageServer

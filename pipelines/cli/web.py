@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 
 from ..training.config import given_flags, input_error
-from .common import Command, add_flags, check_output, stoppable, whole
+from .common import Command, add_flags, check_output, refuse, stoppable, whole
 
 __all__ = ["WEB"]
 
@@ -45,8 +45,7 @@ def _check_folder(out: Path) -> None:
 
 
 def _web(arguments: argparse.Namespace) -> int:
-    if arguments.no_highlights:
-        raise input_error("--no-highlights: pages have no colours by direction of view any more; leave the option out")
+    refuse(arguments, ["no_highlights"], "pages have no colours by direction of view any more; leave the option out")
     out = arguments.out
     if out.suffix:
         check_output(out, PAGES)
