@@ -39,9 +39,9 @@ def replace_files(folder: Path, contents: Mapping[str, bytes], remove: Iterable[
         InputError: the folder cannot be written. It is then unchanged, or the next `recover` ends the change.
     """
     packed = {name: np.asarray(bytearray(content)) for name, content in contents.items()}
-    metadata = {"remove": json.dumps(sorted({*remove} - {*contents}))}
-    disk.write_whole(folder / JOURNAL, save(packed, metadata))
-    recover(folder)
+    gone = sorted({*remove} - {*contents})
+    disk.write_whole(folder / JOURNAL, save(packed, {"remove": json.dumps(gone)}))
+    _carry_out(folder, contents, gone)
 
 
 def recover(folder: Path) -> None:
@@ -59,6 +59,11 @@ def recover(folder: Path) -> None:
             contents = {name: file.get_tensor(name).tobytes() for name in file.keys()}  # noqa: SIM118
         if any(Path(name).name != name for name in [*contents, *gone]):
             raise ValueError("names a file outside of its folder")
+    _carry_out(folder, contents, gone)
+
+
+def _carry_out(folder: Path, contents: Mapping[str, bytes], gone: Iterable[str]) -> None:
+    """Do what the journal says, and remove it."""
     try:
         disk.sync(folder)  # the journal lasts before anything else changes
         for name, content in contents.items():
@@ -66,7 +71,7 @@ def recover(folder: Path) -> None:
         for name in gone:
             disk.remove(folder / name)
         disk.sync(folder)
-        disk.remove(journal)
+        disk.remove(folder / JOURNAL)
     except OSError as error:
         reason = error.strerror or error
         raise InputError(f"{folder}: cannot be written ({reason}); make room, or choose another -o") from error
