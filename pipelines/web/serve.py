@@ -10,7 +10,6 @@ import json
 import socket
 import threading
 from collections.abc import Callable
-from contextlib import suppress
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler
 from socketserver import ThreadingTCPServer
@@ -172,14 +171,18 @@ class _Handler(BaseHTTPRequestHandler):
             self._refuse(HTTPStatus.SERVICE_UNAVAILABLE, "Too many browsers look at this already.")
             return
         self._send(HTTPStatus.OK, None, "text/event-stream")
-        told, page.clients = None, page.clients | {self}
-        with suppress(OSError):
+        told = None
+        page.clients.add(self)
+        try:
             while not page.closed.wait(0.25):
                 newest = page.packed.header["crc32"]
                 # A comment shows whether the browser is still there.
                 self.wfile.write(b": \n\n" if newest == told else f"data: {newest}\n\n".encode())
                 told = newest
-        page.clients = page.clients - {self}
+        except OSError:
+            pass  # the browser is gone
+        finally:
+            page.clients.discard(self)
 
 
 def _listen(host: str, port: int | None, page: PageServer) -> _Server:
