@@ -232,9 +232,8 @@ class _Reconstruction:
         if texture is not None:
             self.folder.keep(TEXTURE_FILE, texture_bytes(texture, metadata={"texture": record["texture"]}))
         about = {name: getattr(self.config, name) for name in ("uniform", "importance", "march_grid")}
-        eyes = [camera.eye.double().numpy().round(5).tolist() for camera, _ in views]
-        metadata = {"sampling": about, "eyes": eyes}
-        self.folder.keep(RADIANCE_FILE, radiance_bytes(self.model.radiance(), self.model.geometry, metadata=metadata))
+        content = radiance_bytes(self.model.radiance(), self.model.geometry, metadata={"sampling": about})
+        self.folder.keep(RADIANCE_FILE, content)
         if pairs:
             self.folder.keep(HELD_OUT_FILE, picture_bytes(self._sheet(pairs[: FINISH.sheet_views])))
         record = self.folder.finish(self.model.geometry, self.images.similarity, record, gone=(PREVIEW_FILE,))

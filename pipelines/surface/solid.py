@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from ...neural_fields import Jet, Mesh
 from ...neural_fields.fields.field import OneLevelField
 from .distance import MeshDistance
-from .surface import is_closed
+from .surface import is_closed, volume
 
 __all__ = ["MeshField"]
 
@@ -30,12 +29,11 @@ class MeshField(OneLevelField):
         super().__init__()
         if not is_closed(mesh):
             raise ValueError("mesh: is not closed, so that it has no inside")
-        a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
-        volume = float((a * np.cross(b, c)).sum() / 6)
-        if volume == 0:
+        inside = volume(mesh)
+        if inside == 0:
             raise ValueError("mesh: encloses nothing")
-        faces = mesh.faces if volume > 0 else mesh.faces[:, ::-1]
-        self.volume, self.distance = abs(volume), MeshDistance(Mesh(mesh.vertices, faces))
+        faces = mesh.faces if inside > 0 else mesh.faces[:, ::-1]
+        self.volume, self.distance = abs(inside), MeshDistance(Mesh(mesh.vertices, faces))
 
     def extra_repr(self) -> str:
         """How many triangles there are."""
