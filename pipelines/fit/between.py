@@ -128,18 +128,15 @@ def dense_distance(
     noisy = guessed and noise > 0
     found = densified(index.points, index.normals, count - len(points), guessed=noisy, seed=seed, options=options)
     new_points, new_normals = (torch.from_numpy(a.astype(np.float32)) for a in (found.points, found.new_normals))
-    if (
-        noisy
-        and _on_solid(index, index.points[:: 1 + len(points) // options.asked], options=options).mean() > options.closed
-    ):
-        kept = torch.from_numpy(_on_solid(index, new_points.numpy(), options=options))
+    if noisy and _on_solid(index, index.points[:: 1 + len(points) // options.asked], options).mean() > options.closed:
+        kept = torch.from_numpy(_on_solid(index, new_points.numpy(), options))
         new_points, new_normals = new_points[kept], new_normals[kept]
     own_normals = torch.from_numpy(found.normals.astype(np.float32))
     dense = torch.cat((points.cpu(), new_points)), torch.cat((own_normals, new_normals))
     return CloudDistance(*dense, **about, given=len(points), gap=index.spacing, repaired=found.repaired)
 
 
-def _on_solid(index: CloudDistance, x: NDArray[np.float32], options: BetweenOptions = BETWEEN) -> Mask:
+def _on_solid(index: CloudDistance, x: NDArray[np.float32], options: BetweenOptions) -> Mask:
     """Whether both sides of each of ``(M, 3)`` points of a surface have `solid_angle`, by winding numbers."""
     return np.abs(index.winding_number(x, soft=CLOUD.soft_guessed) - 0.5) < 0.5 - options.solid_angle
 
@@ -166,18 +163,16 @@ def densified(
     """
     if len(points) <= options.neighbors:  # too few for a neighbourhood that is not the whole
         return Densified(normals.astype(np.float64), 0, np.empty((0, 3)), np.empty((0, 3)))
-    patches = _Patches(points.astype(np.float64), normals.astype(np.float64), options=options)
+    patches = _Patches(points.astype(np.float64), normals.astype(np.float64), options)
     able = np.flatnonzero(patches.sound)
-    fixed, repaired = _repaired(patches, options=options)
+    fixed, repaired = _repaired(patches)
     found = [(np.empty((0, 3)), np.empty((0, 3)))]
     if len(able):
         random = np.random.default_rng(seed)
         area = np.minimum(patches.reach**2, options.largest_area * np.median(patches.reach) ** 2)[able]
         parents = np.sort(random.choice(able, count, p=area / area.sum()))  # in order: neighbours are near in memory
         for start in range(0, count, options.block):
-            found.append(
-                _placed(patches, parents[start : start + options.block], random, guessed=guessed, options=options)
-            )
+            found.append(_placed(patches, parents[start : start + options.block], random, guessed=guessed))
     new = [np.concatenate(columns) for columns in zip(*found, strict=True)]
     return Densified(fixed, repaired, new[0], new[1])
 
@@ -193,7 +188,7 @@ class _Patches:
         sound: ``(N,)`` whether neighbours on all sides agree with it.
     """
 
-    def __init__(self, points: Float64, normals: Float64, options: BetweenOptions = BETWEEN) -> None:
+    def __init__(self, points: Float64, normals: Float64, options: BetweenOptions) -> None:
         self.options = options
         self.points, self.normals = points, normals
         self.tree = KDTree(points, balanced_tree=False)
@@ -213,12 +208,12 @@ class _Patches:
         near = np.exp(-((distance / scale) ** 2) / 2)
         across = (edge - (edge * own).sum(axis=2, keepdims=True) * own) / scale[..., None]
         turn = theirs - (theirs * own).sum(axis=2, keepdims=True) * own
-        spread, mixed, sound = _fitted(weight, near, across, turn, options=self.options)
+        spread, mixed, sound = _fitted(weight, near, across, turn, self.options)
         # A face as narrow as two spacings has one row of points of its own. Those of its edges have the normals of
         # other faces, but lie in its plane, where it is flat up to them.
         rim = ~weight & (np.abs((edge * own).sum(axis=2)) < self.options.rim * distance)
         turn = np.where(weight[..., None], turn, 0.0)
-        wider, mixed_too, sound_too = _fitted(weight | rim, near, across, turn, options=self.options)
+        wider, mixed_too, sound_too = _fitted(weight | rim, near, across, turn, self.options)
         spread = np.where(sound[:, None, None], spread, wider)
         mixed = np.where(sound[:, None, None], mixed, mixed_too)
         self.sound[rows] = sound | (
@@ -248,7 +243,7 @@ class _Patches:
 
 
 def _fitted(
-    chosen: Mask, near: Float64, across: Float64, turn: Float64, options: BetweenOptions = BETWEEN
+    chosen: Mask, near: Float64, across: Float64, turn: Float64, options: BetweenOptions
 ) -> tuple[Float64, Float64, Mask]:
     """What the shape of patches is solved from, and which have company on all sides.
 
@@ -268,12 +263,12 @@ def _fitted(
     return spread, weighted @ turn, sound
 
 
-def _repaired(patches: _Patches, options: BetweenOptions = BETWEEN) -> tuple[Float64, int]:
+def _repaired(patches: _Patches) -> tuple[Float64, int]:
     """The normals, those of points on an edge replaced by one side's, and how many were.
 
     On an edge is a point through which sound patches of two sides pass, and that is part of no sound one itself.
     """
-    fixed, odd = patches.normals.copy(), np.flatnonzero(~patches.sound)
+    options, fixed, odd = patches.options, patches.normals.copy(), np.flatnonzero(~patches.sound)
     if not len(odd):
         return fixed, 0
     distance, found, _, value, normal = patches.at(patches.points[odd], options.neighbors)
@@ -286,9 +281,7 @@ def _repaired(patches: _Patches, options: BetweenOptions = BETWEEN) -> tuple[Flo
     return fixed, int(torn.sum())
 
 
-def _placed(
-    patches: _Patches, parents: Rows, random: np.random.Generator, *, guessed: bool, options: BetweenOptions = BETWEEN
-) -> tuple[Float64, Float64]:
+def _placed(patches: _Patches, parents: Rows, random: np.random.Generator, *, guessed: bool) -> tuple[Float64, Float64]:
     """New points and their normals, at most one beside each of ``parents``."""
     normal = patches.normals[parents]
     step = random.normal(size=(len(parents), 3))
@@ -297,16 +290,16 @@ def _placed(
     bent = np.einsum("mab,mb->ma", patches.shape[parents], step)
     x = patches.points[parents] + step - 0.5 * (bent * step).sum(axis=1, keepdims=True) * normal
     normal, good = _unit(normal + bent), np.ones(len(parents), bool)
+    one_sided = patches.options.one_sided if guessed else np.inf
     for _ in range(2):  # patches are flat across a spacing: the second move is a hundredth of the first
-        moved, normal, good = _blended(patches, x, normal, options.one_sided if guessed else np.inf, options=options)
+        moved, normal, good = _blended(patches, x, normal, one_sided)
         x = x + moved
     return x[good], normal[good]
 
 
-def _blended(
-    patches: _Patches, x: Float64, normal: Float64, one_sided: float, options: BetweenOptions = BETWEEN
-) -> tuple[Float64, Float64, Mask]:
+def _blended(patches: _Patches, x: Float64, normal: Float64, one_sided: float) -> tuple[Float64, Float64, Mask]:
     """What moves places ``(m, 3)`` onto the blend of patches with their normals; normals there; which are good."""
+    options = patches.options
     distance, found, offset, value, theirs = patches.at(x, options.blended)
     scale, sound = distance[:, 3:4], patches.sound[found]
     cosine = (theirs * normal[:, None]).sum(axis=2)

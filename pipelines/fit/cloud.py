@@ -217,9 +217,7 @@ class CloudDistance:
 
     def nearest(self, x: NDArray[np.floating]) -> NDArray[np.float64]:
         """Distance from each of ``(M, 3)`` to the nearest point of the cloud → ``(M,)``."""
-        return np.concatenate(
-            [self._query(x[start : start + self.options.rows], 1)[0] for start in _starts(len(x), options=self.options)]
-        )
+        return np.concatenate([self._query(part, 1)[0] for part in _parts(x, self.options.rows)])
 
     def signed(self, x: Tensor, *, soft: float = CLOUD.soft) -> Tensor:
         """Signed distance of ``(M, 3)`` points → ``(M,)`` on the CPU, negative inside.
@@ -229,10 +227,7 @@ class CloudDistance:
             soft: softening of the dipoles that the signs are asked of, in standard deviations of the noise.
         """
         query = x.cpu().numpy()
-        parts = [
-            self._query(query[start : start + self.options.rows], self.neighbors)
-            for start in _starts(len(query), options=self.options)
-        ]
+        parts = [self._query(part, self.neighbors) for part in _parts(query, self.options.rows)]
         distance, index = (np.concatenate(part) for part in zip(*parts, strict=True))
         offset = query[:, None] - self.points[index]  # (M, k, 3)
         along = np.einsum("mkd,mkd->mk", offset, self.normals[index])
@@ -272,8 +267,7 @@ class CloudDistance:
             soft: softening of the dipoles, in standard deviations of the noise.
         """
         dipoles = self._softened(soft)
-        starts = range(0, max(len(x), 1), self.options.places)
-        return np.concatenate([dipoles.winding(x[start : start + self.options.places]) for start in starts])
+        return np.concatenate([dipoles.winding(part) for part in _parts(x, self.options.places)])
 
     def _softened(self, soft: float) -> DipoleField:
         """The points as dipoles, softened by so many standard deviations of the noise, or `soft` of their discs."""
@@ -307,6 +301,6 @@ class CloudDistance:
         return np.minimum(areas, self.options.largest_area * np.median(areas)).astype(np.float32)
 
 
-def _starts(count: int, options: CloudOptions = CLOUD) -> range:
-    """Where the parts of so many queries begin; of none there is one."""
-    return range(0, max(count, 1), options.rows)
+def _parts(x: NDArray[Any], rows: int) -> list[NDArray[Any]]:
+    """At most so many rows each; of none there is one part."""
+    return [x[start : start + rows] for start in range(0, max(len(x), 1), rows)]
