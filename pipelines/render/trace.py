@@ -23,7 +23,6 @@ from ...neural_fields.tracing.sphere import BOUNDING_RADIUS, MAX_STEPS, Hits, ma
 __all__ = [
     "Seen",
     "fine_strips",
-    "merge_strips",
     "pixel_size",
     "see_hits",
     "strips",
@@ -103,20 +102,6 @@ def fine_strips(camera: Camera, samples: int, *, pixels: int | None = None) -> l
     """A camera as strips of ``pixels`` (`STRIP`) at most, each with ``samples`` pixels per pixel and direction."""
     parts = (part for _, part in strips(camera, lambda: (pixels or STRIP) // samples**2))
     return [part.resized(part.width * samples, part.height * samples) for part in parts]
-
-
-def merge_strips(size: tuple[int, int], parts: Sequence[tuple[int, Seen]]) -> Seen:
-    """What the whole image sees, from what its strips see and the row that each begins at."""
-    colors = [part.color for _, part in parts if part.color is not None]
-    return Seen(
-        size=size,
-        pixel=torch.cat([part.pixel + first * size[0] for first, part in parts]),
-        depth=torch.cat([part.depth for _, part in parts]),
-        position=torch.cat([part.position for _, part in parts]),
-        normal=torch.cat([part.normal for _, part in parts]),
-        direction=torch.cat([part.direction for _, part in parts]),
-        color=torch.cat(colors) if len(colors) == len(parts) else None,
-    )
 
 
 @torch.inference_mode()

@@ -1,9 +1,25 @@
 """Images in strips: together they see what the whole camera sees."""
 
+from collections.abc import Sequence
+
 import torch
 from mplicits.datasets import look_at
 from mplicits.neural_fields import Sphere
-from mplicits.pipelines.render.trace import fine_strips, merge_strips, strips, trace_view
+from mplicits.pipelines.render.trace import Seen, fine_strips, strips, trace_view
+
+
+def merge_strips(size: tuple[int, int], parts: Sequence[tuple[int, Seen]]) -> Seen:
+    """What the whole image sees, from what its strips see and the row that each begins at."""
+    colors = [part.color for _, part in parts if part.color is not None]
+    return Seen(
+        size=size,
+        pixel=torch.cat([part.pixel + first * size[0] for first, part in parts]),
+        depth=torch.cat([part.depth for _, part in parts]),
+        position=torch.cat([part.position for _, part in parts]),
+        normal=torch.cat([part.normal for _, part in parts]),
+        direction=torch.cat([part.direction for _, part in parts]),
+        color=torch.cat(colors) if len(colors) == len(parts) else None,
+    )
 
 
 def test_strips_see_together_what_the_camera_sees():
