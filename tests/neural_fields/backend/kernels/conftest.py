@@ -1,6 +1,8 @@
 """The kernels by Triton's interpreter where there is no CUDA, which `tests/conftest.py` has switched on."""
 
+from collections.abc import Callable
 from importlib.util import find_spec
+from typing import Any
 
 import pytest
 import torch
@@ -19,3 +21,24 @@ def place(monkeypatch: pytest.MonkeyPatch) -> torch.device:
         return torch.device("cuda")
     monkeypatch.setenv("MPLICITS_KERNELS", "interpret")
     return torch.device("cpu")
+
+
+@pytest.fixture
+def watch(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[Any]]:
+    """``watch(module, name, note)`` → a list of what ``note`` returns of the arguments of each call of a function.
+
+    A test sees by it that it tested the kernels. All functions that it watches share the list.
+    """
+    notes: list[Any] = []
+
+    def begin(module: Any, name: str, note: Callable[..., Any]) -> list[Any]:
+        original: Callable[..., Any] = getattr(module, name)
+
+        def call(*arguments: Any, **options: Any) -> Any:
+            notes.append(note(*arguments))
+            return original(*arguments, **options)
+
+        monkeypatch.setattr(module, name, call)
+        return notes
+
+    return begin

@@ -14,17 +14,9 @@ from torch.nn.functional import normalize
 
 
 @pytest.fixture
-def counted(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+def counted(watch: Callable[..., list[int]]) -> list[int]:
     """How many cones were marched each time."""
-    counts: list[int] = []
-    original: Callable[..., Any] = fused.march_cones
-
-    def call(network: Any, cones: Any, *arguments: Any) -> Any:
-        counts.append(len(cones[1]))
-        return original(network, cones, *arguments)
-
-    monkeypatch.setattr(fused, "march_cones", call)
-    return counts
+    return watch(fused, "march_cones", lambda network, cones, *_: len(cones[1]))
 
 
 def picture(place: torch.device, size: int = 16) -> tuple[Tensor, Tensor]:

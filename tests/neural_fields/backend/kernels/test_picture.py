@@ -13,17 +13,9 @@ from mplicits.pipelines.render.trace import PRECISION, Seen, pixel_size, trace_v
 
 
 @pytest.fixture
-def counted(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int]]:
+def counted(watch: Callable[..., list[tuple[int, int]]]) -> list[tuple[int, int]]:
     """The sizes of the pictures that were drawn at once."""
-    sizes: list[tuple[int, int]] = []
-    original: Callable[..., Any] = fused.draw
-
-    def call(field: Any, traced: Any, shown: Any, setting: Any, view: Any) -> Any:
-        sizes.append((setting.width, setting.height))
-        return original(field, traced, shown, setting, view)
-
-    monkeypatch.setattr(fused, "draw", call)
-    return sizes
+    return watch(fused, "draw", lambda field, traced, shown, setting, view: (setting.width, setting.height))
 
 
 def waves(place: torch.device, taper: float = 0.0) -> MultiscaleSDF:

@@ -22,22 +22,10 @@ COARSE = {"tolerance": 1e-3, "resolution": 1e-2}
 
 
 @pytest.fixture
-def counted(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+def counted(watch: Callable[..., list[int]]) -> list[int]:
     """How many rays were marched each time, by one network or by levels: the latter count as negative."""
-    counts: list[int] = []
-
-    def watch(module: Any, name: str, sign: int) -> None:
-        original: Callable[..., Any] = getattr(module, name)
-
-        def call(levels: Any, rays: Any, *others: Any, **options: Any) -> Any:
-            counts.append(sign * len(rays[0]))
-            return original(levels, rays, *others, **options)
-
-        monkeypatch.setattr(module, name, call)
-
-    watch(fused, "march_rays", 1)
-    watch(banded, "march_levels", -1)
-    return counts
+    watch(fused, "march_rays", lambda levels, rays, *_: len(rays[0]))
+    return watch(banded, "march_levels", lambda levels, rays, *_: -len(rays[0]))
 
 
 def ball(place: torch.device, width: int = 16) -> Siren:

@@ -2,7 +2,6 @@
 
 import copy
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import mplicits.neural_fields.backend.kernels.training as fused
 import pytest
@@ -32,17 +31,9 @@ def gradients_again(network: Siren, x: Tensor) -> Sequence[Tensor]:
 
 
 @pytest.fixture
-def counted(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+def counted(watch: Callable[..., list[int]]) -> list[int]:
     """How many points came to the kernel each time."""
-    counts: list[int] = []
-    original: Callable[..., Any] = fused.jet_backward
-
-    def call(x: Tensor, *others: Any) -> Any:
-        counts.append(len(x))
-        return original(x, *others)
-
-    monkeypatch.setattr(fused, "jet_backward", call)
-    return counts
+    return watch(fused, "jet_backward", lambda x, *_: len(x))
 
 
 @pytest.mark.parametrize(
