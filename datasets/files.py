@@ -73,8 +73,6 @@ def readable(path: Path, *, missing: str = "check the path") -> Iterator[None]:
             yield
         except FileNotFoundError as error:
             raise InputError(f"{error.filename or path}: no such file; {missing}") from None
-        except OSError as error:
-            raise InputError(f"{path}: cannot be read ({error.strerror or error}); check its permissions") from error
 
 
 class _Silence:

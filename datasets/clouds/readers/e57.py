@@ -25,7 +25,9 @@ def read_e57(path: Path, columns: str | None = None) -> PointCloud:
         import pye57
     except ImportError as error:
         raise InputError(f"{path}: E57 needs pye57; pip install 'mplicits[e57]'") from error
-    if path.stat().st_size < 48 or path.open("rb").read(8) != b"ASTM-E57":
+    with path.open("rb") as stream:
+        head = stream.read(48)
+    if len(head) < 48 or head[:8] != b"ASTM-E57":
         raise InputError(f"{path}: does not start with 'ASTM-E57', so it is not an E57 file; check its extension")
     try:
         file = pye57.E57(str(path))

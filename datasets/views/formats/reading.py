@@ -32,7 +32,7 @@ def read_cameras(path: str | Path) -> list[tuple[str, Camera]]:
     - ``*.npz``: NeuS and IDR; ``world_mat_i`` projects onto pixels and is taken apart. The i-th image in name order of
       the folder ``image`` beside the file gives name and size.
     - a folder: one of these in it (cameras_sphere.npz, transforms.json, transforms_train.json), or a COLMAP model,
-      text or binary, in ``sparse/0``, ``sparse`` or the folder itself.
+      text or binary: the largest in ``sparse/*``, or that in ``sparse`` or the folder itself.
 
     Raises:
         InputError: the file is missing, damaged or of another kind, or a camera in it cannot be one.
