@@ -80,7 +80,10 @@ class DynamicTracer:
         directions: ``(..., 3)`` of unit length. The rays ``(H, W, 3)`` of an image with one origin are traced in tiles
             first, as far as whole tiles see nothing.
         level: whose surface to find.
-        tolerance, resolution, lipschitz, radius: see `sphere_trace`.
+        tolerance: see `sphere_trace`.
+        resolution: see `sphere_trace`.
+        lipschitz: see `sphere_trace`.
+        radius: see `sphere_trace`.
         reach: how near to the surface is near; by default 12 resolutions. More makes key frames fewer and the others
             dearer; 0 makes every frame a key frame.
         speed: bound on |∂f/∂t| near the surface; by default a quarter more than the largest one that is measured, for
