@@ -48,7 +48,8 @@ def test_differences_are_noticed(run: Path) -> None:
 
 def test_samples(tmp_path: Path) -> None:
     (row,) = SamplesBench(sizes=((16, 2),), points=300, repeats=2, device="cpu").rows(tmp_path / "out")
-    assert row.jet > row.value > 0
+    assert min(row.jet, row.value) > 0
+    assert row.jet_rate * row.jet > row.value_rate * row.value  # operations; times depend on who else is at work
     assert row.value_rate == pytest.approx(2 * (16 * 16 + 4 * 16) / row.value / 1e3)
 
 
