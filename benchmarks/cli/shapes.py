@@ -46,6 +46,38 @@ def _fit(arguments: argparse.Namespace) -> int:
     return run_benches(arguments, [bench], out=arguments.out)
 
 
+def _uneven_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("shapes", nargs="*", metavar="SHAPE", help="mesh files; without any, eight exact shapes")
+    number(parser, "--points", whole(1000), 30_000, "points drawn on each")
+    parser.add_argument("--density", choices=("curvature", "scanner", "patches"), help="what the density follows")
+    number(parser, "--ratio", positive, 30.0, "largest over smallest density")
+    measured_flags(parser, 512)
+    number(parser, "--poisson-depth", whole(4, 14), 10, "octree depth")
+    parser.add_argument("--pictures", type=Path, metavar="DIR", help="write two pictures of all methods per shape")
+    folder_flag(parser)
+    add_flags(parser, "--json")
+    add_settings(parser, FitConfig)
+
+
+def _uneven(arguments: argparse.Namespace) -> int:
+    config = read_settings(arguments, FitConfig)
+    from ..shapes.uneven import UnevenBench
+
+    bench = UnevenBench(
+        shapes=arguments.shapes,
+        config=config,
+        points=arguments.points,
+        density=arguments.density,
+        ratio=arguments.ratio,
+        folder=(arguments.out or Path()) / "shapes",
+        resolution=arguments.resolution,
+        samples=arguments.eval_samples,
+        poisson_depth=arguments.poisson_depth,
+        pictures=arguments.pictures,
+    )
+    return run_benches(arguments, [bench], out=arguments.out)
+
+
 def _signs_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("shapes", nargs="+", metavar="SHAPE", help="mesh files")
     noisy_flags(parser)
@@ -158,6 +190,14 @@ SHAPES: Mapping[str, Command] = MappingProxyType(
             _fit_arguments,
             _fit,
             "Fit the vertices of each mesh and measure the result against the mesh; Poisson needs mplicits[poisson].",
+        ),
+        "uneven": Command(
+            "fits of clouds whose density varies over the shape",
+            """  python -m benchmarks uneven --preset fast -o uneven --pictures uneven/pictures
+  python -m benchmarks uneven armadillo.ply --density scanner --ratio 30""",
+            _uneven_arguments,
+            _uneven,
+            "Draw uneven points on exact shapes, or on meshes, and compare every level with screened Poisson.",
         ),
         "signs": Command(
             "how many estimated normals point the wrong way",

@@ -169,12 +169,9 @@ class FitBench(Benchmark[FitRow]):
         """See `Benchmark.measure`."""
         (path,), seed = cell.files, self.config.seed
         reference = read_reference(path)
-        about = {"points": self.points, "noise": self.noise, "isotropic": self.isotropic, "seed": seed}
-        _, cloud = clouds_of(path, **about)
+        cloud, drawing = self.cloud_of(path)
         rows: list[FitRow] = []
         drawn: list[tuple[str, Mesh]] = [("input", from_cloud(cloud))]
-        drawing: dict[str, Any] = {} if self.points is None else {"points": self.points}
-        drawing |= {"isotropic": True} if self.isotropic else {}
         home = fit_home(work.out, path, self.config, noise=self.noise, **drawing)
         for method, seconds, mesh_seconds, mesh in self.reconstructions(cloud, home, work.stage(path.stem)):
             metrics = rough = None
@@ -194,6 +191,12 @@ class FitBench(Benchmark[FitRow]):
             raked = [(label, picture_of(surface, facing, shading="raking")) for label, surface in drawn[1:]]
             write_picture(self.pictures / f"{path.stem}{damage}-raking.png", contact_sheet(raked))
         return rows
+
+    def cloud_of(self, path: Path) -> tuple[PointCloud, dict[str, Any]]:
+        """What is fitted of a mesh, and what else than the mesh and the noise decides it."""
+        about = {"points": self.points, "noise": self.noise, "isotropic": self.isotropic, "seed": self.config.seed}
+        drawing: dict[str, Any] = {} if self.points is None else {"points": self.points}
+        return clouds_of(path, **about)[1], drawing | ({"isotropic": True} if self.isotropic else {})
 
     def reconstructions(
         self, cloud: PointCloud, home: Path, progress: Report

@@ -161,5 +161,6 @@ def _wrong_sides(delta: float, cloud: CloudDistance, field: Field, places: Tenso
     points, value = places[beyond].numpy(), value[beyond]
     depth = cloud.winding_number(points) - 0.5
     wrong = (np.abs(depth) > SAMPLING.sure) & ((depth > 0) == (value.numpy() > 0))
-    wrong &= cloud.nearest(points) > SAMPLING.clear * cloud.gap
+    distance, clear = cloud.beyond(points, SAMPLING.clear)
+    wrong &= distance > clear
     return value[torch.from_numpy(wrong)]

@@ -15,6 +15,7 @@ patches contradict each other: the wider the noise, the fewer points there are.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -77,6 +78,7 @@ class BetweenOptions:
     # Radians that the finest level's frequency may turn through between two points. Where four points lie on a wave
     # they hold it down, and nothing is filled in: patches are less exact than the points themselves.
     turn: float = np.pi / 2
+    filling: float = 16.0  # new points for each that would make that turn
 
 
 BETWEEN = BetweenOptions()
@@ -123,17 +125,19 @@ def dense_distance(
     """
     about = {"noise": noise, "guessed": guessed}
     index = CloudDistance(points, normals, **about)
-    if index.spacing * omega <= options.turn or count <= len(points):
+    wanted = options.filling * np.maximum(index.areas * (omega / options.turn) ** 2 - 1, 0)
+    new = min(count - len(points), math.ceil(wanted.sum()))
+    if new <= 0:
         return index
     noisy = guessed and noise > 0
-    found = densified(index.points, index.normals, count - len(points), guessed=noisy, seed=seed, options=options)
+    found = densified(index.points, index.normals, new, share=wanted, guessed=noisy, seed=seed, options=options)
     new_points, new_normals = (torch.from_numpy(a.astype(np.float32)) for a in (found.points, found.new_normals))
     if noisy and _on_solid(index, index.points[:: 1 + len(points) // options.asked], options).mean() > options.closed:
         kept = torch.from_numpy(_on_solid(index, new_points.numpy(), options))
         new_points, new_normals = new_points[kept], new_normals[kept]
     own_normals = torch.from_numpy(found.normals.astype(np.float32))
     dense = torch.cat((points.cpu(), new_points)), torch.cat((own_normals, new_normals))
-    return CloudDistance(*dense, **about, given=len(points), gap=index.spacing, repaired=found.repaired)
+    return CloudDistance(*dense, **about, given=len(points), gaps=index.gaps, repaired=found.repaired)
 
 
 def _on_solid(index: CloudDistance, x: NDArray[np.float32], options: BetweenOptions) -> Mask:
@@ -146,6 +150,7 @@ def densified(
     normals: NDArray[np.floating],
     count: int,
     *,
+    share: NDArray[np.floating] | None = None,
     guessed: bool = False,
     seed: int = 0,
     options: BetweenOptions = BETWEEN,
@@ -164,13 +169,15 @@ def densified(
     if len(points) <= options.neighbors:  # too few for a neighbourhood that is not the whole
         return Densified(normals.astype(np.float64), 0, np.empty((0, 3)), np.empty((0, 3)))
     patches = _Patches(points.astype(np.float64), normals.astype(np.float64), options)
-    able = np.flatnonzero(patches.sound)
+    if share is None:
+        share = np.minimum(patches.reach**2, options.largest_area * np.median(patches.reach) ** 2)
+    able = np.flatnonzero(patches.sound & (share > 0))
     fixed, repaired = _repaired(patches)
     found = [(np.empty((0, 3)), np.empty((0, 3)))]
     if len(able):
         random = np.random.default_rng(seed)
-        area = np.minimum(patches.reach**2, options.largest_area * np.median(patches.reach) ** 2)[able]
-        parents = np.sort(random.choice(able, count, p=area / area.sum()))  # in order: neighbours are near in memory
+        chance = share[able].astype(np.float64)
+        parents = np.sort(random.choice(able, count, p=chance / chance.sum()))  # in order: neighbours are near in memory
         for start in range(0, count, options.block):
             found.append(_placed(patches, parents[start : start + options.block], random, guessed=guessed))
     new = [np.concatenate(columns) for columns in zip(*found, strict=True)]

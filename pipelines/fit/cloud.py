@@ -45,6 +45,9 @@ class CloudOptions:
     # Area of a point's disc over the median one: scans are this much sparser where they graze the surface, hardly
     # more.
     largest_area: float = 100.0
+    # Weight of a point in the samples: its area, but no more than so many times its neighbours', as of a stray that
+    # nobody has found.
+    alone: float = 4.0
     # Queries at a time: between two of them a progress display is told.
     rows: int = 1 << 15
     # Winding numbers at a time: of more places, groups of neighbouring ones are smaller, and fewer points are near
@@ -179,7 +182,7 @@ class CloudDistance:
         noise: standard deviation of the noise that was smoothed off the points.
         guessed: whether the normals were estimated from the points, noisy or not.
         given: how many of the points are the cloud's own, the first ones; None for all. The others fill it in.
-        gap: the spacing of those; None for that of all.
+        gaps: ``(given,)`` the spacing at each of those; None where there are no others.
         repaired: how many normals of points on edges were replaced by one side's.
         options: numbers of the algorithm.
     """
@@ -193,7 +196,7 @@ class CloudDistance:
         noise: float = 0.0,
         guessed: bool = False,
         given: int | None = None,
-        gap: float | None = None,
+        gaps: Float32 | None = None,
         repaired: int = 0,
         options: CloudOptions = CLOUD,
     ) -> None:
@@ -204,20 +207,33 @@ class CloudDistance:
         self.noise, self.guessed = noise, guessed
         self.neighbors = min(neighbors, len(points))
         self._dipoles: dict[float, DipoleField] = {}  # by how much they are softened
-        self.areas: Float32 = self._areas()
+        self.areas, self.weights = self._areas()
         self.radii: Float32 = np.sqrt(self.areas / math.pi)
         self.spacing = float(np.median(np.sqrt(self.areas)))
         self.given, self.repaired = len(points) if given is None else given, repaired
-        self.gap = self.spacing if gap is None else gap
+        self.gaps: Float32 = np.sqrt(self.areas) if gaps is None else gaps
+        if len(self.gaps) < len(self.points):
+            own = KDTree(self.points[: self.given]).query(self.points[self.given :], workers=-1)[1]
+            self.gaps = np.concatenate((self.gaps, self.gaps[np.asarray(own)]))
 
     @property
-    def filled(self) -> bool:
-        """Whether there are points between those of the cloud, which was too sparse for what is fitted to it."""
-        return len(self.points) > self.given
+    def filled(self) -> float:
+        """Share of the surface's area that points between those of the cloud stand for, where it is sparse."""
+        return float(self.areas[self.given :].sum() / self.areas.sum())
+
+    def draw(self, count: int, generator: torch.Generator) -> Tensor:
+        """Indices ``(count,)`` of points drawn with replacement, each in proportion to its weight."""
+        return drawn(torch.from_numpy(self.weights).double().cumsum(0), count, generator)
 
     def nearest(self, x: NDArray[np.floating]) -> NDArray[np.float64]:
         """Distance from each of ``(M, 3)`` to the nearest point of the cloud → ``(M,)``."""
         return np.concatenate([self._query(part, 1)[0] for part in _parts(x, self.options.rows)])
+
+    def beyond(self, x: NDArray[np.floating], gaps: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Distance from ``(M, 3)`` to the nearest point, and ``gaps`` times the cloud's spacing there; each ``(M,)``."""
+        parts = [self._query(part, 1) for part in _parts(x, self.options.rows)]
+        distance, index = (np.concatenate(part) for part in zip(*parts, strict=True))
+        return distance, gaps * self.gaps[index].astype(np.float64)
 
     def signed(self, x: Tensor, *, soft: float = CLOUD.soft) -> Tensor:
         """Signed distance of ``(M, 3)`` points → ``(M,)`` on the CPU, negative inside.
@@ -247,7 +263,7 @@ class CloudDistance:
             & (distance[asked, 0] < self.options.rim)
             & one_side
             & ~chance[asked]
-            & (not self.filled)
+            & (index[asked, 0] < self.given)
         )
         side[asked] = np.where(rim, side[asked], number)
         return torch.from_numpy(np.where(side < 0, -magnitude, magnitude).astype(np.float32))
@@ -276,8 +292,8 @@ class CloudDistance:
             self._dipoles[soft] = DipoleField(self.points, self.normals * self.areas[:, None], softening)
         return self._dipoles[soft]
 
-    def _areas(self) -> Float32:
-        """The area that each point has to itself ``(N,)``: the disc out to neighbours whose normals face its own way.
+    def _areas(self) -> tuple[Float32, Float32]:
+        """The area that each point has to itself ``(N,)``, and its weight: the disc out to neighbours whose normals face its own way.
 
         Those of the far side of a thin part do not share it: with them a bar would have half of its surface, and
         winding numbers of one half inside. Where most of those beside a point face the other way, its own normal is
@@ -298,7 +314,15 @@ class CloudDistance:
         # A normal that hardly any neighbour shares is more likely wrong than its point is alone.
         areas = np.minimum(areas, self.options.sides * math.pi * reach[:, count - 1] ** 2 / count)
         # A few points on their own have nobody near, but no surface of that size either.
-        return np.minimum(areas, self.options.largest_area * np.median(areas)).astype(np.float32)
+        areas = np.minimum(areas, self.options.largest_area * np.median(areas)).astype(np.float32)
+        beside = np.median(areas[near[:, :count]], axis=1)
+        return areas, np.minimum(areas, self.options.alone * beside).astype(np.float32)
+
+
+def drawn(shares: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    """Indices ``(count,)`` drawn with replacement, each in proportion to its step in the sums ``shares`` ``(N,)``."""
+    place = torch.rand(count, generator=generator, dtype=torch.float64) * shares[-1]
+    return torch.searchsorted(shares, place, right=True).clamp_(max=len(shares) - 1)
 
 
 def _parts(x: NDArray[Any], rows: int) -> list[NDArray[Any]]:

@@ -84,24 +84,26 @@ def voxels_of(points: NDArray[np.float32], spacing: float, options: JudgeOptions
     return owner.reshape(-1).astype(np.int64)
 
 
-def standard_errors(falls: Tensor, voxels: Tensor) -> float:
-    """The mean of ``falls`` ``(n,)``, counted in its own standard errors: above 2 it is hardly chance.
+def standard_errors(falls: Tensor, voxels: Tensor, areas: Tensor | None = None) -> float:
+    """The mean of ``falls`` ``(n,)`` over the surface, in units of its standard error: above 2 it is hardly chance.
 
     Points of one voxel are off together. So what is independent is not the points but the K voxels (cluster-robust
-    standard error, Liang and Zeger, Biometrika 1986): with the mean m and the sum e_v of a voxel's falls − m, it is
-    ``√(K / (K − 1) Σ_v e_v²) / n``.
+    standard error, Liang and Zeger, Biometrika 1986). With areas a_i, the mean m = Σ a_i f_i / Σ a_i and the sum e_v of
+    a voxel's a_i (f_i − m), it is ``√(K / (K − 1) Σ_v e_v²) / Σ a_i``.
 
     Args:
         falls: what each point has gained.
         voxels: ``(n,)`` the voxel of each, numbered from 0.
+        areas: ``(n,)`` of the surface that each stands for; None if they are all alike.
     """
     if not len(falls):
         return 0.0
     falls = falls.double().cpu()
-    mean = falls.mean()
-    sums = torch.zeros(int(voxels.max()) + 1, dtype=torch.float64).index_add_(0, voxels.cpu(), falls - mean)
+    areas = torch.ones_like(falls) if areas is None else areas.double().cpu()
+    mean = (areas * falls).sum() / areas.sum()
+    sums = torch.zeros(int(voxels.max()) + 1, dtype=torch.float64).index_add_(0, voxels.cpu(), areas * (falls - mean))
     count = len(voxels.unique())
-    error = float((sums.square().sum() * count / max(count - 1, 1)).sqrt()) / len(falls)
+    error = float((sums.square().sum() * count / max(count - 1, 1)).sqrt() / areas.sum())
     if math.isnan(error):  # what has diverged has not gained
         return -math.inf
     return float(mean) / error if error > 0 else math.copysign(math.inf, mean) if mean else 0.0
@@ -208,14 +210,16 @@ def _sure(fall: float, options: JudgeOptions = JUDGE) -> str:
 
 
 class Each(NamedTuple):
-    """Errors of every held-out point, ``(count,)`` each; their means are an `Error`."""
+    """Errors of every held-out point and the area that it stands for, ``(count,)`` each."""
 
     loss: Tensor
     distance: Tensor
     angle: Tensor
+    areas: Tensor
 
     def mean(self) -> Error:
-        return Error(*(float(error.mean()) for error in self))
+        """The means over the surface."""
+        return Error(*(float((self.areas * error).sum() / self.areas.sum()) for error in self[:3]))
 
 
 class Judge:
@@ -227,6 +231,7 @@ class Judge:
         previous: the frozen levels.
         delta: half-width of the band around the finest of them; points outside it do not count.
         spacing: of the cloud; see `voxels_of`.
+        areas: ``(n,)`` of the surface that each point stands for; None if they are all alike.
         data: weight of f(x)².
         normal: weight of 1 − cos(∇f, N).
         usual: the scales of `pseudo_huber` around them.
@@ -242,6 +247,7 @@ class Judge:
         delta: float,
         *,
         spacing: float,
+        areas: Tensor | None = None,
         data: float,
         normal: float,
         usual: Usual = SQUARES,
@@ -249,7 +255,8 @@ class Judge:
         options: JudgeOptions = JUDGE,
     ) -> None:
         self.options = options
-        samples = Samples(points, distance=torch.zeros(len(points)), normal=normals)
+        areas = torch.ones(len(points)) if areas is None else areas
+        samples = Samples(points, distance=torch.zeros(len(points)), normal=normals, area=areas)
         self.samples = with_previous(samples, previous, delta, device=previous.like.device)
         self.data, self.normal, self.usual, self.count = data, normal, usual, len(self.samples)
         self.guessed = guessed
@@ -270,21 +277,22 @@ class Judge:
 
     def surely_less(self, first: Each, second: Each) -> bool:
         """Whether the first losses are less in the mean, by more than chance makes them."""
-        return standard_errors(second.loss - first.loss, self.voxels) > self.options.surely
+        return standard_errors(second.loss - first.loss, self.voxels, first.areas) > self.options.surely
 
     def verdict(self, each: Each, at: float) -> Verdict:
         """On a level with these errors; see `Verdict`."""
-        pairs = zip(self.without[1:], each[1:], strict=True)
-        fall = Fall(*(standard_errors(before - after, self.voxels) for before, after in pairs))
+        pairs = zip(self.without[1:3], each[1:3], strict=True)
+        fall = Fall(*(standard_errors(before - after, self.voxels, each.areas) for before, after in pairs))
         return Verdict(self.count, self.before, each.mean(), at, fall, guessed=self.guessed)
 
     def _errors(self, value: Tensor, gradient: Tensor) -> Each:
         distance, normal = self.samples.distance, self.samples.normal
         assert distance is not None
         assert normal is not None
+        assert self.samples.area is not None
         data, turn = data_loss(value, distance), normal_loss(gradient, normal)
         # The chord, for the cosine of a small angle rounds to 1.
         chord = (torch.nn.functional.normalize(gradient, dim=1) - normal).norm(dim=1)
         angle = torch.rad2deg(2 * (chord.clamp(max=2) / 2).asin())
         loss = self.data * pseudo_huber(data, self.usual.data) + self.normal * pseudo_huber(turn, self.usual.normal)
-        return Each(loss, data.sqrt(), angle)
+        return Each(loss, data.sqrt(), angle, self.samples.area)

@@ -14,6 +14,7 @@ from ...neural_fields.backend.devices import upload
 from ...neural_fields.fields.losses import data_loss, eikonal_loss, normal_loss, pseudo_huber
 from ..training.settings import EvolveConfig, FitConfig
 from ..training.trainer import Group, Objective, seeded, warm_cosine
+from .cloud import drawn
 from .heldout import JUDGE, Judge, Verdict
 from .samples import Source
 
@@ -93,6 +94,8 @@ class LevelObjective(Objective):
     ) -> None:
         super().__init__(siren, [Group(list(siren.parameters()), warm_cosine(learning_rate))], generator)
         self.siren, self.sources, self.judge = siren, sources, judge
+        areas = (source.samples.area for source in sources)
+        self.shares = [None if area is None else area.cpu().double().cumsum(0) for area in areas]
         if judge is not None:  # in the checkpoints too
             best = {BEST + name: tensor.clone() for name, tensor in siren.state_dict().items()}
             self.kept = {
@@ -106,7 +109,8 @@ class LevelObjective(Objective):
         """See `Objective.losses`: the mean of every term of every source."""
         if self.judge is not None and int(done * JUDGE.looks) > int(self.kept["looks"]):
             self.look(done)
-        batches = [source.samples.take(self._draw(source)) for source in self.sources]
+        pairs = zip(self.sources, self.shares, strict=True)
+        batches = [source.samples.take(self._draw(source, shares)) for source, shares in pairs]
         jet = self.siren.jet(torch.cat([batch.points for batch in batches]))
         lengths = [len(batch) for batch in batches]
         terms: dict[str, Tensor] = {}
@@ -159,6 +163,9 @@ class LevelObjective(Objective):
             return verdict
         return self.judge.verdict(best, float(self.kept["at"]))
 
-    def _draw(self, source: Source) -> Tensor:
-        index = torch.randint(len(source.samples), (source.batch,), generator=self.generator)
+    def _draw(self, source: Source, shares: Tensor | None) -> Tensor:
+        if shares is None:
+            index = torch.randint(len(source.samples), (source.batch,), generator=self.generator)
+        else:
+            index = drawn(shares, source.batch, self.generator)
         return upload(index, source.samples.points.device)

@@ -17,7 +17,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from ...datasets.clouds.cleaning.outliers import agreement
+from ...datasets.clouds.cleaning.outliers import agreement, unsupported
 from ...neural_fields import Field
 
 __all__ = ["Review", "ReviewOptions", "review_points"]
@@ -91,8 +91,8 @@ def review_points(
     """Judge a cloud by the level that was fitted to it.
 
     An outlier is a point that the level passes at more than `far` times the robust scale, that has another normal than
-    the field there, and that fewer than half of its neighbours support: fine parts that the level misses support
-    themselves. A flipped normal opposes the field's gradient and its neighbours' mean normal, which the gradient
+    the field there, and that neither half of its neighbours nor points about as sparse support: fine parts that the
+    level misses support themselves. A flipped normal opposes the field's gradient and its neighbours' mean normal, which the gradient
     follows. A patch of flipped normals opposes the gradient, and the normals beside it.
 
     Args:
@@ -115,8 +115,7 @@ def review_points(
     dropped, turned = np.zeros((2, len(points)), bool)
     if outliers:
         far = ((value.abs() > options.far * scale) & (cosine < 0.5)).nonzero()[:, 0].numpy()
-        support, _ = agreement(places, directions, far)
-        dropped[far] = support < 0.5
+        dropped[far] = unsupported(places, directions, far)
     if turn:
         against = ((cosine < options.against) & torch.from_numpy(~dropped)).nonzero()[:, 0].numpy()
         _, means = agreement(places, directions, against)

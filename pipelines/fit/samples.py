@@ -112,6 +112,7 @@ class Samples(Rows):
     normal: Tensor | None = None
     value: Tensor | None = None
     gradient: Tensor | None = None
+    area: Tensor | None = None
 
 
 class Usual(NamedTuple):
@@ -241,7 +242,7 @@ def banded_sources(
     assert surface.value is not None
     terms = (weights or Weights()).resolved(config, surface.value, index)
     third = config.batch // 3
-    usual = usual_errors(surface, kept["band"]) if config.robust_normals and index.filled else SQUARES
+    usual = usual_errors(surface, kept["band"]) if config.robust_normals else SQUARES
     if previous.num_levels == 1:  # corners and thin parts that a coarse level has missed are far: squares reach them
         usual = usual._replace(data=math.inf)
     sources = [Source(kind, samples, third, *terms, usual) for kind, samples in kept.items()]
@@ -281,7 +282,12 @@ def usual_errors(surface: Samples, band: Samples) -> Usual:
 def surface_samples(index: CloudDistance) -> Samples:
     """The cloud itself: distance 0, and its normals."""
     points = torch.from_numpy(index.points)
-    return Samples(points, distance=torch.zeros(len(points)), normal=torch.from_numpy(index.normals))
+    return Samples(
+        points,
+        distance=torch.zeros(len(points)),
+        normal=torch.from_numpy(index.normals),
+        area=torch.from_numpy(index.weights),
+    )
 
 
 def distance_samples(cloud: CloudDistance, count: int, *, generator: torch.Generator) -> Samples:
@@ -342,8 +348,8 @@ def remote_samples(
         samples = with_previous(Samples(tried), field, delta, device=device)
         points = samples.points.cpu().numpy()
         assert samples.value is not None
-        distance = cloud.nearest(points)
-        far = np.flatnonzero(distance - samples.value.abs().cpu().numpy() > max(delta, options.clear * cloud.gap))
+        distance, clear = cloud.beyond(points, options.clear)
+        far = np.flatnonzero(distance - samples.value.abs().cpu().numpy() > np.maximum(delta, clear))
         depth = cloud.winding_number(points[far]) - 0.5
         sure = np.abs(depth) > (options.sure_guessed if cloud.guessed else options.sure)
         empty, unseen = (samples.take(torch.from_numpy(far[some]).to(device)) for some in (sure, ~sure))
@@ -364,7 +370,7 @@ def spread_points(cloud: CloudDistance, count: int, generator: torch.Generator) 
     """Places ``(count, 3)``, half uniform in the domain, half near the cloud; see `distance_samples`."""
     near_count = count // 2
     uniform = (2 * torch.rand(count - near_count, 3, generator=generator) - 1) * DOMAIN
-    anchors = torch.from_numpy(cloud.points)[torch.randint(len(cloud.points), (near_count,), generator=generator)]
+    anchors = torch.from_numpy(cloud.points)[cloud.draw(near_count, generator)]
     least = min(2 * cloud.spacing, 0.1)
     deviation = least * (0.1 / least) ** torch.rand(near_count, 1, generator=generator)
     near = (anchors + deviation * torch.randn(near_count, 3, generator=generator)).clamp(-DOMAIN, DOMAIN)
@@ -406,7 +412,7 @@ def offset_samples(cloud: CloudDistance, delta: float, count: int, *, generator:
 
     Lengths are found only for what is drawn: of a large cloud that is a small part.
     """
-    index = torch.randint(len(cloud.points), (count,), generator=generator)
+    index = cloud.draw(count, generator)
     side = torch.randint(2, (count,), generator=generator)
     drawn, which = torch.unique(2 * index + side, return_inverse=True)
     lengths = free_lengths(cloud, delta, (drawn // 2).numpy(), (drawn % 2 == 1).numpy())
@@ -426,7 +432,7 @@ def near_samples(cloud: CloudDistance, delta: float, count: int, *, generator: t
 
 def band_samples(cloud: CloudDistance, delta: float, count: int, *, generator: torch.Generator) -> Samples:
     """Cloud points with every coordinate moved by U(−2δ, 2δ); `with_previous` rejects those outside the band."""
-    index = torch.randint(len(cloud.points), (count,), generator=generator)
+    index = cloud.draw(count, generator)
     shift = (2 * torch.rand(count, 3, generator=generator) - 1) * 2 * delta
     return Samples(torch.from_numpy(cloud.points)[index] + shift)
 
@@ -449,5 +455,5 @@ def with_previous(
         unsure = (kept & (size >= field.deltas.min())).nonzero()[:, 0]
         kept[unsure] = field.in_band(points[unsure], level=field.num_levels - 1)
     moved = samples.to(device)
-    full = Samples(points, moved.distance, moved.normal, jet.value, jet.gradient)
+    full = Samples(points, moved.distance, moved.normal, jet.value, jet.gradient, moved.area)
     return full.take(kept.nonzero()[:, 0])

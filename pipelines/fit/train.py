@@ -292,8 +292,8 @@ class _Fitting:
             if not self.trainer_state:
                 self.samples = self.affordable_samples(level, share, started, index, delta)
             config = dataclasses.replace(self.config, samples=self.samples)
-            gain = LEVEL.small_gain if index.filled and config.robust_normals else LEVEL.residual_gain
-            noisy = self.cloud.estimated and not index.filled
+            gain = LEVEL.small_gain if config.robust_normals else LEVEL.residual_gain
+            noisy = self.cloud.estimated and index.filled < 0.5
             omega = calm_omega(config, level, self.cloud.noise if noisy else 0.0)
             siren = new_level(config, level, residual=level > 0, gain=gain, omega=omega).to(self.device)
             sources = self.sources(index, delta, config, generator)
@@ -435,9 +435,10 @@ class _Fitting:
             return None
         assert self.frozen is not None
         points, normals = self.points[self.held], self.normals[self.held]
+        areas = torch.from_numpy(self.indexed(len(self.stages)).beyond(points.numpy(), 1.0)[1].astype(np.float32)) ** 2
         terms = {"data": surface.data, "normal": surface.normal, "usual": surface.usual}
-        guessed = self.cloud.estimated
-        judge = Judge(points, normals, self.frozen, delta, spacing=self.spacing, guessed=guessed, **terms)
+        about = {"spacing": self.spacing, "areas": areas, "guessed": self.cloud.estimated}
+        judge = Judge(points, normals, self.frozen, delta, **about, **terms)
         return judge if judge.count >= JUDGE.fewest / 2 else None
 
     def review(self) -> dict[str, Any]:

@@ -23,7 +23,7 @@ from scipy.spatial import KDTree
 from ..point_cloud import centred
 from .orientation import fit_planes
 
-__all__ = ["Verdict", "agreement", "inspect_points"]
+__all__ = ["Verdict", "agreement", "inspect_points", "unsupported"]
 
 Float64 = NDArray[np.float64]
 Rows = NDArray[np.integer]
@@ -47,6 +47,8 @@ class OutlierOptions:
     lonely: float = 4.0
     lonely_elevation: float = 0.3
     lonely_mirrored: float = 0.9
+    flat: float = 0.25  # deviation from a plane, over that distance, up to which planes are trusted
+    company: float = 0.16  # share of the peers that must support a point as strictly
     majority: float = 0.5  # share of neighbours that must support a sparse point
 
 
@@ -110,6 +112,15 @@ def inspect_points(
     return Verdict(isolated, stray, flipped & cloud.kept)
 
 
+def unsupported(points: Float64, normals: Float64, rows: Rows) -> Mask:
+    """Which of the points ``rows`` ``(m,)`` of a cloud ``(N, 3)`` neither most neighbours nor their peers support."""
+    if len(points) <= 2 * OUTLIERS.neighbors or not len(rows):
+        return np.zeros(len(rows), bool)
+    cloud = _Cloud(points, normals)
+    support = _by_blocks(rows, lambda part: _support(cloud, part, np.zeros(len(part), bool)))
+    return (support < OUTLIERS.majority) & (_peer_support(cloud, rows) < OUTLIERS.company)
+
+
 def agreement(points: Float64, normals: Float64, rows: Rows) -> tuple[Float64, Float64]:
     """What the neighbours of the points ``rows`` ``(m,)`` of a cloud ``(N, 3)`` say of them.
 
@@ -168,11 +179,11 @@ class _Cloud:
             self.reach[part] = np.asarray(distance)[:, min(OUTLIERS.reach, self.near.shape[1])]
             if not self.signed:
                 self.normals[part], spread = fit_planes(self.points[self.near[part]])
-                self.flat[part] = spread < 0.25 * self.reach[part]
+                self.flat[part] = spread < OUTLIERS.flat * self.reach[part]
 
-    def edges(self, rows: Rows) -> tuple[Float64, Float64]:
-        """Vectors to the neighbours ``(m, k, 3)``, and their lengths ``(m, k)``, which are never zero."""
-        edge = self.points[self.near[rows]] - self.points[rows][:, None]
+    def edges(self, rows: Rows, near: Rows | None = None) -> tuple[Float64, Float64]:
+        """Vectors to the neighbours, or to ``near``, ``(m, k, 3)``, and their lengths ``(m, k)``, which are never zero."""
+        edge = self.points[self.near[rows] if near is None else near] - self.points[rows][:, None]
         return edge, np.maximum(np.linalg.norm(edge, axis=2), 1e-300)
 
     def thinning(self, rows: Rows) -> Float64:
@@ -200,6 +211,8 @@ def _outliers(cloud: _Cloud, *, rounds: int = 4) -> Mask:
             lonely = (thinning > OUTLIERS.lonely) | (overall > OUTLIERS.lonely * OUTLIERS.sparse)
             support[part] = _support(cloud, part, lonely)
             dropped[part] = (support[part] < OUTLIERS.majority) & (sparse | _off(cloud, part))
+        suspects = np.flatnonzero(dropped)
+        dropped[suspects] = _peer_support(cloud, suspects) < OUTLIERS.company
         if cloud.kept.sum() - dropped.sum() <= 2 * OUTLIERS.neighbors:
             break  # nothing here is sound enough to judge the rest by
         asked = cloud.drop(dropped)
@@ -207,6 +220,28 @@ def _outliers(cloud: _Cloud, *, rounds: int = 4) -> Mask:
             break
     cloud.drop(_stray_clusters(cloud, support))
     return before & ~cloud.kept
+
+
+def _peer_support(cloud: _Cloud, rows: Rows) -> Float64:
+    """The share of their peers that support points ``(m,)``: the nearest points where the cloud is about as sparse.
+
+    A point at the border of a sparse part has the points of a dense edge for neighbours, whose normals turn within its
+    own spacing. Peers have at least half of its reach, taken in steps of a factor of two.
+    """
+    support = np.zeros(len(rows))
+    octave = np.floor(np.log2(np.maximum(cloud.reach[rows], 1e-300))).astype(np.int64)
+    for step in np.unique(octave):
+        mine = np.flatnonzero(octave == step)
+        peers = np.flatnonzero(cloud.kept & (cloud.reach >= 2.0 ** (step - 1)))
+        count = cloud.near.shape[1]
+        if len(peers) > count:
+            distance, found = KDTree(cloud.points[peers]).query(cloud.points[rows[mine]], k=count + 1, workers=-1)
+            near = peers[np.asarray(found)[:, 1:]]
+            if not cloud.signed:
+                cloud.normals[rows[mine]], spread = fit_planes(cloud.points[near])
+                cloud.flat[rows[mine]] = spread < OUTLIERS.flat * np.asarray(distance)[:, OUTLIERS.reach]
+            support[mine] = _support(cloud, rows[mine], np.ones(len(mine), bool), near)
+    return support
 
 
 def _flipped(cloud: _Cloud, normals: Float64, *, rounds: int = 4) -> Mask:
@@ -251,10 +286,11 @@ def _vote(
     return np.where(voters > 0, alike, 0.5), voters, level.sum(axis=1)
 
 
-def _support(cloud: _Cloud, rows: Rows, lonely: Mask) -> Float64:
-    """The share of neighbours that support points ``(m,)``; of ``lonely`` ones more is asked."""
-    edge, length = cloud.edges(rows)
-    own, theirs = cloud.normals[rows], cloud.normals[cloud.near[rows]]
+def _support(cloud: _Cloud, rows: Rows, lonely: Mask, near: Rows | None = None) -> Float64:
+    """The share of neighbours, or of ``near`` ``(m, k)``, that support points ``(m,)``; of ``lonely`` ones more is asked."""
+    near = cloud.near[rows] if near is None else near
+    edge, length = cloud.edges(rows, near)
+    own, theirs = cloud.normals[rows], cloud.normals[near]
     rise = np.einsum("mkd,mkd->mk", edge, theirs) / length
     mirrored = np.einsum("mkd,md->mk", theirs, own) - 2 * np.einsum("mkd,md->mk", edge, own) / length * rise
     if not cloud.signed:

@@ -177,19 +177,23 @@ def test_guessed_normals_do_not_lead_beyond_a_corner(monkeypatch: pytest.MonkeyP
     assert np.allclose(noisy_filling(sheet, np.tile([0.0, 0.0, 1.0], (len(sheet), 1))), places)
 
 
-def test_dense_clouds_are_left_as_they_are() -> None:
-    points = torch.from_numpy(sample_sphere(3000).points).float()
-    normals = 2 * points
-    plain = CloudDistance(points, normals)
-    enough = 0.99 * BETWEEN.turn / plain.spacing
-    for omega, count in ((enough, 10_000), (80.0, 3000)):
-        index = dense_distance(points, normals, omega=omega, count=count)
-        assert (index.given, len(index.points), index.gap) == (3000, 3000, index.spacing)
-    index = dense_distance(points, normals, omega=1.1 * enough, count=10_000)
-    assert index.given == 3000
-    assert len(index.points) > 9000
-    assert np.array_equal(index.points[:3000], points.numpy())
-    assert index.gap == plain.spacing > index.spacing
+def test_a_cloud_is_filled_in_where_it_is_sparse_for_the_frequency() -> None:
+    """Half a sphere has nine times as many points as the other: only the other is filled in."""
+    ball = torch.from_numpy(sample_sphere(9000).points).float()
+    points = ball[(ball[:, 0] > 0) | (torch.arange(9000) % 9 == 0)]
+    normals, plain = 2 * points, CloudDistance(points, 2 * points)
+    right = points[:, 0].numpy() > 0
+    dense, sparse = np.median(plain.gaps[right]), np.median(plain.gaps[~right])
+    for omega, count in ((0.5 * BETWEEN.turn / dense, 4000), (80.0, len(points))):
+        assert len(dense_distance(points, normals, omega=omega, count=count).points) <= max(count, len(points))
+    assert dense_distance(points, normals, omega=0.5 * BETWEEN.turn / sparse, count=40_000).filled < 0.01
+    index = dense_distance(points, normals, omega=BETWEEN.turn / (sparse * dense) ** 0.5, count=40_000)
+    assert index.given == len(points)
+    assert np.array_equal(index.points[: index.given], points.numpy())
+    new = index.points[index.given :]
+    assert len(new) > 5000
+    assert (new[:, 0] < 2 * sparse).mean() > 0.99
+    assert index.gaps[index.given :].min() >= plain.gaps.min()
     # What fills it in lies on the sphere: distances are nearer to the truth than those to the discs of the points.
     x = 2 * torch.rand(2000, 3, generator=torch.Generator().manual_seed(0)) - 1
     truth = x.norm(dim=1) - 0.5

@@ -209,7 +209,7 @@ def test_a_few_far_points_send_no_level_back(guessed: bool, monkeypatch: pytest.
 
     def errors(siren: Siren) -> Each:
         distance = distances[float(siren.output.bias.detach())]
-        return Each(judge.data * distance.square(), distance, angle)
+        return Each(judge.data * distance.square(), distance, angle, torch.ones_like(distance))
 
     monkeypatch.setattr(judge, "errors", errors)
     for bias, done in ((-0.5, 0.5), (-1.0, 1.0)):
@@ -262,8 +262,8 @@ def test_roughness_of_faces_is_not_paid_for_at_edges() -> None:
     angle[::10], after[::10] = 20.0, 19.0
     judge = judge_of(RADIUS)
     zeros = torch.zeros(len(x))
-    judge.without = Each(angle**2, zeros, angle)
-    verdict = judge.verdict(Each(after**2, zeros, after), 1.0)
+    judge.without = Each(angle**2, zeros, angle, zeros + 1)
+    verdict = judge.verdict(Each(after**2, zeros, after, zeros + 1), 1.0)
     assert verdict.after.loss < judge.without.mean().loss  # by squares it would be
     assert not verdict.better
 
