@@ -9,7 +9,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..neural_fields import InputError
 from ..neural_fields.backend.files import write_whole
-from .clouds.readers.tables import numbers
 from .files import readable
 
 Float64 = NDArray[np.float64]
@@ -23,11 +22,23 @@ def read_landmarks(path: str | Path) -> tuple[Float64, Float64]:
     """
     path = Path(path)
     with readable(path):
-        text = path.read_text(encoding="utf-8").replace(",", " ")
-        pairs = numbers(text, path, first_line=1, what="line")
-    if pairs.shape[1] != 6 or not np.isfinite(pairs).all():
-        raise InputError(f"{path}: expected six finite numbers in a line, x y z of one shape and x y z of the next")
-    return pairs[:, :3], pairs[:, 3:]
+        lines = path.read_text(encoding="utf-8").splitlines()
+    pairs = []
+    for number, line in enumerate(lines, start=1):
+        words = line.partition("#")[0].replace(",", " ").split()
+        if not words:
+            continue
+        try:
+            pair = [float(word) for word in words]
+        except ValueError:
+            pair = []
+        if len(pair) != 6 or not np.isfinite(pair).all():
+            raise InputError(f"{path}, line {number}: expected six numbers, x y z of one shape and x y z of the next")
+        pairs.append(pair)
+    if not pairs:
+        raise InputError(f"{path}: no landmarks; write six numbers in a line, x y z of one shape and x y z of the next")
+    both = np.array(pairs)
+    return both[:, :3], both[:, 3:]
 
 
 def write_landmarks(path: str | Path, before: ArrayLike, after: ArrayLike) -> None:
