@@ -274,7 +274,7 @@ DAMAGES = {
     "header": (lambda text: text[: text.index('"deltas"')], "not complete"),
     "flipped": (lambda text: text.replace('id="data">', 'id="data">AAAA'), "damaged or cut off"),
     "foreign": (lambda text: text.replace('"mplicits-web"', '"something"'), "no field of mplicits"),
-    "newer": (lambda text: text.replace('"version":1', '"version":7'), "version 7"),
+    "newer": (lambda text: text.replace('"version":2', '"version":7'), "version 7"),
     "no base64": (lambda text: text.replace('id="data">', 'id="data">!'), "damaged"),
 }
 
