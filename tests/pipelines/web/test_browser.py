@@ -13,7 +13,7 @@ from mplicits.datasets.cameras import look_at, turntable
 from mplicits.neural_fields import MultiscaleSDF, Siren, extract_mesh, map_colors, save_field
 from mplicits.neural_fields.networks.sphere_init import solve_sphere
 from mplicits.pipelines.web.export import BITS, WebOptions, web_run
-from mplicits.pipelines.web.networks import rounded_field
+from mplicits.pipelines.web.payload import rounded_field
 from pages import TITLE, bumpy, differences, painted, until
 
 pytest.importorskip("selenium")
