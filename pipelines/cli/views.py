@@ -13,8 +13,6 @@ from ..training.config import command_line, input_error
 from ..training.settings import ReconstructConfig
 from .common import Command, add_flags, check_output, positive, refuse, training, whole, write_json
 
-__all__ = ["CHECK_CAMERAS", "FIND_CAMERAS", "FIND_POINTS", "SCENE", "tell_found"]
-
 if TYPE_CHECKING:
     from ...datasets.views.poses.find_cameras import FoundCameras
     from ...datasets.views.poses.find_points import FoundPoints
