@@ -69,7 +69,7 @@ def uneven_cloud(mesh: Mesh, count: int, *, density: str, ratio: float, seed: in
     random = np.random.default_rng(seed)
     points, normals = sample_points(mesh, CANDIDATES * count, random)
     assert normals is not None
-    spacing = DENSITIES[density](points, normals, random)
+    spacing = DENSITIES[density](points, normals.astype(np.float64), random)
     spacing = (spacing / np.quantile(spacing, 0.05)).clip(1, ratio**0.5)
     # One point of each voxel, whose edge goes in steps of √2 with the spacing.
     step = np.round(2 * np.log2(spacing)).astype(np.int64)

@@ -67,7 +67,6 @@ class BetweenOptions:
     # In those units, how far a new point may be from the weighted mean of the points around it. On the rim of a
     # half-plane that is 1/√π = 0.56, and beyond it more.
     one_sided: float = 0.7
-    largest_area: float = 100.0  # that a point stands for, over the median
     # Least part of the sphere of directions that a solid, or the space around it, fills at a new point: half of it on
     # a smooth surface, a fourth on the edge of a cube, and next to nothing where guessed normals have led beyond an
     # edge.
@@ -76,9 +75,10 @@ class BetweenOptions:
     closed: float = 0.95
     asked: int = 4000
     # Radians that the finest level's frequency may turn through between two points. Where four points lie on a wave
-    # they hold it down, and nothing is filled in: patches are less exact than the points themselves.
+    # they hold it down, and nothing is filled in: patches are less exact than the points themselves. Where it turns
+    # through k times as much, `filling` (k² − 1) places are tried for each point.
     turn: float = np.pi / 2
-    filling: float = 16.0  # new points for each that would make that turn
+    filling: float = 16.0
 
 
 BETWEEN = BetweenOptions()
@@ -160,7 +160,8 @@ def densified(
     Args:
         points: ``(N, 3)``, around the origin.
         normals: ``(N, 3)`` unit normals.
-        count: how many places are tried, uniform by area; most of them become points where the cloud is sound.
+        count: how many places are tried; most of them become points where the cloud is sound.
+        share: ``(N,)`` in proportion to which they are tried beside each point; None for the area of each.
         guessed: whether the normals were estimated from noisy points: those beyond an edge may then not contradict
             what runs on beyond it, and new points must have points on all sides.
         seed: of the places.
@@ -169,15 +170,15 @@ def densified(
     if len(points) <= options.neighbors:  # too few for a neighbourhood that is not the whole
         return Densified(normals.astype(np.float64), 0, np.empty((0, 3)), np.empty((0, 3)))
     patches = _Patches(points.astype(np.float64), normals.astype(np.float64), options)
-    if share is None:
-        share = np.minimum(patches.reach**2, options.largest_area * np.median(patches.reach) ** 2)
+    share = patches.reach**2 if share is None else share
     able = np.flatnonzero(patches.sound & (share > 0))
     fixed, repaired = _repaired(patches)
     found = [(np.empty((0, 3)), np.empty((0, 3)))]
     if len(able):
         random = np.random.default_rng(seed)
         chance = share[able].astype(np.float64)
-        parents = np.sort(random.choice(able, count, p=chance / chance.sum()))  # in order: neighbours are near in memory
+        # In order: neighbours are near in memory.
+        parents = np.sort(random.choice(able, count, p=chance / chance.sum()))
         for start in range(0, count, options.block):
             found.append(_placed(patches, parents[start : start + options.block], random, guessed=guessed))
     new = [np.concatenate(columns) for columns in zip(*found, strict=True)]

@@ -230,7 +230,7 @@ class CloudDistance:
         return np.concatenate([self._query(part, 1)[0] for part in _parts(x, self.options.rows)])
 
     def beyond(self, x: NDArray[np.floating], gaps: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Distance from ``(M, 3)`` to the nearest point, and ``gaps`` times the cloud's spacing there; each ``(M,)``."""
+        """Distances ``(M,)`` of ``(M, 3)`` to the nearest point, and ``gaps`` times the cloud's spacing there."""
         parts = [self._query(part, 1) for part in _parts(x, self.options.rows)]
         distance, index = (np.concatenate(part) for part in zip(*parts, strict=True))
         return distance, gaps * self.gaps[index].astype(np.float64)
@@ -293,7 +293,9 @@ class CloudDistance:
         return self._dipoles[soft]
 
     def _areas(self) -> tuple[Float32, Float32]:
-        """The area that each point has to itself ``(N,)``, and its weight: the disc out to neighbours whose normals face its own way.
+        """The area that each point has to itself ``(N,)``, and its weight in the samples ``(N,)``.
+
+        The area is that of the disc out to neighbours whose normals face the point's own way.
 
         Those of the far side of a thin part do not share it: with them a bar would have half of its surface, and
         winding numbers of one half inside. Where most of those beside a point face the other way, its own normal is

@@ -92,8 +92,8 @@ def review_points(
 
     An outlier is a point that the level passes at more than `far` times the robust scale, that has another normal than
     the field there, and that neither half of its neighbours nor points about as sparse support: fine parts that the
-    level misses support themselves. A flipped normal opposes the field's gradient and its neighbours' mean normal, which the gradient
-    follows. A patch of flipped normals opposes the gradient, and the normals beside it.
+    level misses support themselves. A flipped normal opposes the field's gradient and its neighbours' mean normal,
+    which the gradient follows. A patch of flipped normals opposes the gradient, and the normals beside it.
 
     Args:
         points: ``(N, 3)``.

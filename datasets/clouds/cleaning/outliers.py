@@ -48,7 +48,9 @@ class OutlierOptions:
     lonely_elevation: float = 0.3
     lonely_mirrored: float = 0.9
     flat: float = 0.25  # deviation from a plane, over that distance, up to which planes are trusted
-    company: float = 0.16  # share of the peers that must support a point as strictly
+    # Share of the peers that must support a point as strictly, and how far they may be in units of its reach.
+    company: float = 0.16
+    beside: float = 2.0
     majority: float = 0.5  # share of neighbours that must support a sparse point
 
 
@@ -118,7 +120,7 @@ def unsupported(points: Float64, normals: Float64, rows: Rows) -> Mask:
         return np.zeros(len(rows), bool)
     cloud = _Cloud(points, normals)
     support = _by_blocks(rows, lambda part: _support(cloud, part, np.zeros(len(part), bool)))
-    return (support < OUTLIERS.majority) & (_peer_support(cloud, rows) < OUTLIERS.company)
+    return (support < OUTLIERS.majority) & ~_has_company(cloud, rows)
 
 
 def agreement(points: Float64, normals: Float64, rows: Rows) -> tuple[Float64, Float64]:
@@ -182,7 +184,7 @@ class _Cloud:
                 self.flat[part] = spread < OUTLIERS.flat * self.reach[part]
 
     def edges(self, rows: Rows, near: Rows | None = None) -> tuple[Float64, Float64]:
-        """Vectors to the neighbours, or to ``near``, ``(m, k, 3)``, and their lengths ``(m, k)``, which are never zero."""
+        """Vectors to the neighbours or ``near`` ``(m, k, 3)``, and their lengths ``(m, k)``, which are never zero."""
         edge = self.points[self.near[rows] if near is None else near] - self.points[rows][:, None]
         return edge, np.maximum(np.linalg.norm(edge, axis=2), 1e-300)
 
@@ -212,7 +214,7 @@ def _outliers(cloud: _Cloud, *, rounds: int = 4) -> Mask:
             support[part] = _support(cloud, part, lonely)
             dropped[part] = (support[part] < OUTLIERS.majority) & (sparse | _off(cloud, part))
         suspects = np.flatnonzero(dropped)
-        dropped[suspects] = _peer_support(cloud, suspects) < OUTLIERS.company
+        dropped[suspects] = ~_has_company(cloud, suspects)
         if cloud.kept.sum() - dropped.sum() <= 2 * OUTLIERS.neighbors:
             break  # nothing here is sound enough to judge the rest by
         asked = cloud.drop(dropped)
@@ -222,26 +224,27 @@ def _outliers(cloud: _Cloud, *, rounds: int = 4) -> Mask:
     return before & ~cloud.kept
 
 
-def _peer_support(cloud: _Cloud, rows: Rows) -> Float64:
-    """The share of their peers that support points ``(m,)``: the nearest points where the cloud is about as sparse.
+def _has_company(cloud: _Cloud, rows: Rows) -> Mask:
+    """Whether points ``(m,)`` have peers that support them: the nearest points where the cloud is about as sparse.
 
     A point at the border of a sparse part has the points of a dense edge for neighbours, whose normals turn within its
-    own spacing. Peers have at least half of its reach, taken in steps of a factor of two.
+    own spacing. The reach of peers is at least half of its own, in steps of a factor of two.
     """
-    support = np.zeros(len(rows))
+    support, count = np.zeros(len(rows)), cloud.near.shape[1]
     octave = np.floor(np.log2(np.maximum(cloud.reach[rows], 1e-300))).astype(np.int64)
     for step in np.unique(octave):
-        mine = np.flatnonzero(octave == step)
-        peers = np.flatnonzero(cloud.kept & (cloud.reach >= 2.0 ** (step - 1)))
-        count = cloud.near.shape[1]
-        if len(peers) > count:
-            distance, found = KDTree(cloud.points[peers]).query(cloud.points[rows[mine]], k=count + 1, workers=-1)
-            near = peers[np.asarray(found)[:, 1:]]
-            if not cloud.signed:
-                cloud.normals[rows[mine]], spread = fit_planes(cloud.points[near])
-                cloud.flat[rows[mine]] = spread < OUTLIERS.flat * np.asarray(distance)[:, OUTLIERS.reach]
-            support[mine] = _support(cloud, rows[mine], np.ones(len(mine), bool), near)
-    return support
+        mine, peers = np.flatnonzero(octave == step), np.flatnonzero(cloud.kept & (cloud.reach >= 2.0**step))
+        if len(peers) <= count:
+            continue
+        distance, found = KDTree(cloud.points[peers]).query(cloud.points[rows[mine]], k=count + 1, workers=-1)
+        distance, near = np.asarray(distance), peers[np.asarray(found)[:, 1:]]
+        if not cloud.signed:
+            cloud.normals[rows[mine]], spread = fit_planes(cloud.points[near])
+            cloud.flat[rows[mine]] = spread < OUTLIERS.flat * distance[:, OUTLIERS.reach]
+        beside = distance[:, 1:] < OUTLIERS.beside * cloud.reach[rows[mine], None]
+        support[mine] = _support(cloud, rows[mine], np.ones(len(mine), bool), near, beside)
+    # Without signs, chance agrees twice as often.
+    return support >= OUTLIERS.company * (1 if cloud.signed else 2)
 
 
 def _flipped(cloud: _Cloud, normals: Float64, *, rounds: int = 4) -> Mask:
@@ -286,8 +289,11 @@ def _vote(
     return np.where(voters > 0, alike, 0.5), voters, level.sum(axis=1)
 
 
-def _support(cloud: _Cloud, rows: Rows, lonely: Mask, near: Rows | None = None) -> Float64:
-    """The share of neighbours, or of ``near`` ``(m, k)``, that support points ``(m,)``; of ``lonely`` ones more is asked."""
+def _support(cloud: _Cloud, rows: Rows, lonely: Mask, near: Rows | None = None, beside: Mask | None = None) -> Float64:
+    """The share of the neighbours, or ``near``, that support points ``(m,)``; of ``lonely`` ones more is asked.
+
+    Only those of ``near`` ``(m, k)`` that are ``beside`` a point ``(m, k)`` can support it.
+    """
     near = cloud.near[rows] if near is None else near
     edge, length = cloud.edges(rows, near)
     own, theirs = cloud.normals[rows], cloud.normals[near]
@@ -297,6 +303,8 @@ def _support(cloud: _Cloud, rows: Rows, lonely: Mask, near: Rows | None = None) 
         mirrored = np.abs(mirrored)
     supports = np.abs(rise) <= np.where(lonely, OUTLIERS.lonely_elevation, OUTLIERS.elevation)[:, None]
     supports &= mirrored >= np.where(lonely, OUTLIERS.lonely_mirrored, OUTLIERS.mirrored)[:, None]
+    if beside is not None:
+        supports &= beside
     return supports.mean(axis=1) * cloud.flat[rows]
 
 

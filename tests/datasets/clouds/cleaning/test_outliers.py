@@ -26,7 +26,21 @@ def thin_box(count: int = 8000, *, thickness: float = 0.02) -> PointCloud:
     return sample_surface(Box(half_size=(0.7, 0.5, thickness / 2)), count, shell=0.002)
 
 
+def ball_on_sparse_ground() -> PointCloud:
+    """A dense half ball, and around it ground that is six times as sparse: its nearest points see little else."""
+    random = np.random.default_rng(0)
+    x, y = np.meshgrid(*[np.arange(-1, 1, 0.06)] * 2)
+    ground = np.c_[x.ravel(), y.ravel()] + random.uniform(-0.015, 0.015, (x.size, 2))
+    ground = np.c_[ground, np.zeros(len(ground))][np.linalg.norm(ground, axis=1) > 0.4]
+    ball = sample_sphere(12_000, radius=0.4)
+    assert ball.normals is not None
+    upper = ball.points[:, 2] > 0
+    normals = np.concatenate([np.tile([0, 0, 1], (len(ground), 1)), ball.normals[upper]]).astype(np.float32)
+    return PointCloud(np.concatenate([ground, ball.points[upper]]), normals, source="ground")
+
+
 CLEAN = {
+    "ball on sparse ground": ball_on_sparse_ground,
     "sphere": lambda: sample_sphere(6000),
     "torus": lambda: sample_torus(8000),
     "thin box": thin_box,
