@@ -32,20 +32,6 @@ from .networks.siren import Siren
 from .networks.texture import ColorSiren, TextureField
 from .spacetime.field import SpaceTimeSDF
 
-__all__ = [
-    "SavedField",
-    "checksum_of",
-    "field_bytes",
-    "load_field",
-    "load_radiance",
-    "load_texture",
-    "radiance_bytes",
-    "save_field",
-    "save_radiance",
-    "save_texture",
-    "texture_bytes",
-]
-
 M = TypeVar("M", bound=nn.Module)
 
 # Types by name. Networks and closed forms are made again from their definition, combinations also from their parts.

@@ -13,16 +13,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from .fields.csg import Bounded, Difference, Intersection, Offset, Placed, Shell, Union
-from .fields.field import Field
-from .fields.function import FieldLike, as_field
+from .fields.field import Field, FieldLike, as_field
 from .fields.similarity import Similarity
-from .meshing._lattice import Bounds
+from .meshing._cells import Bounds
 from .meshing.extract import DEFAULT_BOUNDS, Mesh, extract_mesh
 from .tracing.projection import project_to_surface
 from .tracing.sphere import sphere_trace
 from .upward import upward
-
-__all__ = ["Closest", "WorldField", "WorldHits", "in_one_frame"]
 
 Points = TypeVar("Points", NDArray[np.floating], Tensor)
 

@@ -9,8 +9,6 @@ from __future__ import annotations
 import importlib
 from typing import Any
 
-__all__ = ["upward"]
-
 OFFERED = {
     "render": ("pipelines.render.draw", "render_shape"),
     "show": ("pipelines.web.window", "show"),

@@ -19,22 +19,6 @@ import numpy as np
 
 from .errors import InputError
 
-__all__ = [
-    "check_place",
-    "damage",
-    "files_in",
-    "json_bytes",
-    "natural",
-    "partial_of",
-    "remove",
-    "rename",
-    "sync",
-    "whole_file",
-    "write",
-    "write_json",
-    "write_whole",
-]
-
 
 def write(path: Path, content: bytes) -> None:
     """Write a file, and wait until the disk has it."""

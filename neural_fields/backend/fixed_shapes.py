@@ -16,8 +16,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-__all__ = ["FixedShapes", "Rows", "chosen", "current_shapes", "first_rows", "fixed_shapes", "one_evaluation"]
-
 
 class FixedShapes:
     """How much room bands have, and who found none.

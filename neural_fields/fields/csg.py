@@ -18,14 +18,11 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ..backend._checks import at_least, positive
 from ..backend.devices import few_numbers
+from ..backend.errors import at_least, positive
 from ..backend.fixed_shapes import current_shapes, one_evaluation
-from .field import Field, Jet
-from .function import FieldLike, as_field
+from .field import Field, FieldLike, Jet, as_field
 from .similarity import Similarity
-
-__all__ = ["Bounded", "Combined", "Difference", "Intersection", "Offset", "Placed", "Shell", "Union"]
 
 
 class Combined(Field):

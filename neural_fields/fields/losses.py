@@ -7,8 +7,6 @@ import math
 import torch
 from torch import Tensor
 
-__all__ = ["color_loss", "data_loss", "eikonal_loss", "normal_loss", "pseudo_huber", "tangential_loss"]
-
 
 def data_loss(value: Tensor, target: Tensor | float = 0.0) -> Tensor:
     """``(f(x) − d)²`` with the known distance d, 0 on the surface. ``(...,)`` → ``(...,)``, squared field units."""

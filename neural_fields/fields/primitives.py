@@ -8,12 +8,9 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from ..backend._checks import positive
 from ..backend.devices import few_numbers
+from ..backend.errors import positive
 from .field import Jet, OneLevelField
-
-__all__ = ["Box", "Capsule", "Plane", "Sphere", "Torus"]
-
 
 # A value, and the gradient for who asks for it.
 Evaluated = tuple[Tensor, Callable[[], Tensor]]
@@ -26,10 +23,12 @@ class ClosedForm(OneLevelField):
     def _evaluate(self, x: Tensor) -> Evaluated: ...
 
     def value(self, x: Tensor, *, level: int = -1) -> Tensor:
+        """See `Field.value`."""
         self.resolve_level(level)
         return self._evaluate(self.check_points(x))[0]
 
     def jet(self, x: Tensor, *, level: int = -1) -> Jet:
+        """See `Field.jet`."""
         self.resolve_level(level)
         value, gradient = self._evaluate(self.check_points(x))
         return Jet(value, gradient(), x.new_empty((*x.shape[:-1], 0)))

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-
-__all__ = ["Similarity"]
+from torch import Tensor
 
 Float64 = NDArray[np.float64]
 
@@ -56,3 +55,17 @@ class Similarity:
     def to_input(self, points: NDArray[np.floating]) -> Float64:
         """Map ``(..., 3)`` unit-sphere coordinates back to input coordinates, in float64."""
         return np.asarray(points, np.float64) * self.scale + np.asarray(self.center)
+
+
+def ball_chord(origins: Tensor, directions: Tensor, radius: Tensor | float) -> tuple[Tensor, Tensor]:
+    """Depth at which lines are nearest to 0, and half the length of their way through a ball around it, 0 if they miss.
+
+    Args:
+        origins: ``(R, 3)``.
+        directions: ``(R, 3)`` unit vectors.
+        radius: of the ball, one or ``(R,)``.
+    """
+    middle = -(origins * directions).sum(dim=-1)
+    # From the nearest point, and not from |o|² − middle², which cancels for far cameras.
+    squared = radius**2 - (origins + middle[:, None] * directions).square().sum(dim=-1)
+    return middle, squared.clamp(min=0).sqrt()

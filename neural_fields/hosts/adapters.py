@@ -11,14 +11,11 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ..backend._checks import positive
-from ..fields.function import FieldLike
+from ..backend.errors import positive
+from ..fields.field import FieldLike
 from ..volume.weights import neus_alpha
-from ._hosted import Box, Hosted, joined, mark
-from ._point_memo import PointMemo
+from ._hosted import Box, Hosted, PointMemo, joined, mark
 from .learning_rates import HOST_RATE, Pace
-
-__all__ = ["Deviation", "InstantNSRGeometry", "NerfstudioField", "NeuSGeometry"]
 
 
 class NeuSGeometry(Hosted):

@@ -15,12 +15,10 @@ from typing import Any
 
 from torch import nn
 
-from ..backend._checks import positive
+from ..backend.errors import positive
 from ..fields.field import Field
 from ..networks.multiscale import MultiscaleSDF
 from ..networks.siren import Siren
-
-__all__ = ["HOST_RATE", "Pace", "parameter_groups", "rescale_parameters"]
 
 # Shares of the rates below at which levels learn, the coarsest first; the last is for all that are finer, and one
 # number for all. Where colours do not need the geometry's own features, half of the rates leaves fewer waves.

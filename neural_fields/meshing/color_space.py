@@ -9,8 +9,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-__all__ = ["linear_to_srgb", "srgb_to_linear"]
-
 Floats = TypeVar("Floats", NDArray[np.float32], NDArray[np.float64])
 
 # Where the straight piece near black meets the power curve, on either side.

@@ -10,14 +10,22 @@ import torch
 from numpy.typing import NDArray
 from torch.nn.functional import normalize
 
-from ..backend._checks import positive
-from ..fields.function import FieldLike, as_field
-from ._blocks import ActiveCells, NoSurfaceError, active_cells, cull_blocks
-from ._cube import EDGE_AXIS, EDGE_ENDS, cube_tables
-from ._lattice import Bounds, Lattice, Progress, Sampler
+from ..backend.errors import positive
+from ..fields.field import FieldLike, as_field
+from ._cells import (
+    EDGE_AXIS,
+    EDGE_ENDS,
+    ActiveCells,
+    Bounds,
+    Lattice,
+    Progress,
+    Sampler,
+    active_cells,
+    cube_tables,
+    cull_blocks,
+)
+from ._cells import NoSurfaceError as NoSurfaceError
 from .mesh import Mesh, MeshStats
-
-__all__ = ["Mesh", "MeshStats", "NoSurfaceError", "extract_mesh", "map_normals"]
 
 # The unit sphere with a little room, so that a surface that touches it is still closed.
 DEFAULT_BOUNDS: Bounds = ((-1.02, -1.02, -1.02), (1.02, 1.02, 1.02))

@@ -11,8 +11,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["GENERATOR", "MATERIAL", "Motion", "write_glb"]
-
 GENERATOR = "mplicits"
 
 MATERIAL, ROUGHNESS = "baked", 0.8

@@ -24,18 +24,6 @@ from .color_space import srgb_to_linear
 from .glb import MATERIAL, Motion, write_glb
 from .placement import Placement
 
-__all__ = [
-    "Mesh",
-    "MeshStats",
-    "check_mesh_path",
-    "glb_attributes",
-    "glb_origin",
-    "needs_doubles",
-    "write_glb_mesh",
-    "write_obj",
-    "write_triangles",
-]
-
 Float64 = NDArray[np.float64]
 Origin = tuple[float, float, float]
 

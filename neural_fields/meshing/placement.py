@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 
 from ..fields.similarity import Similarity
 
-__all__ = ["FRAMES", "METRES", "UP_AXES", "FileTransform", "Frame", "Placement"]
-
 Float64 = NDArray[np.float64]
 
 METRES = {"um": 1e-6, "mm": 1e-3, "cm": 1e-2, "m": 1.0, "km": 1e3, "in": 0.0254, "ft": 0.3048}

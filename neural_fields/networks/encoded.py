@@ -5,12 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ..backend._checks import positive
-from ..fields.field import Field, Jet, SecondJet
-from ..fields.function import FieldLike, as_field
+from ..backend.errors import positive
+from ..fields.field import Field, FieldLike, Jet, SecondJet, as_field
 from .hash_encoding import HashEncoding
-
-__all__ = ["EncodedField"]
 
 
 class EncodedField(Field):

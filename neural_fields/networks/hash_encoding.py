@@ -12,9 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ..backend._checks import at_least, positive
-
-__all__ = ["HashEncoding", "check_table", "grid_resolutions", "spatial_hash", "tables_apart"]
+from ..backend.errors import at_least, positive
 
 INITIAL = 1e-4  # entries begin uniform in ±INITIAL (Sec. 4)
 

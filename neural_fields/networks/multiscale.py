@@ -13,17 +13,14 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor, nn
 
-from ..backend._transforms import under_vmap
+from ..backend.devices import under_vmap
 from ..backend.fixed_shapes import FixedShapes, Rows, current_shapes
 from ..backend.kernels.switch import Choice, choose
-from ..fields.field import Field, Jet, SecondJet
-from ..fields.function import FieldLike, as_field
+from ..fields.field import Field, FieldLike, Jet, SecondJet, as_field
 from .siren import Siren, needs_graph
 
 if TYPE_CHECKING:
     from ..backend.kernels.levels import Levels
-
-__all__ = ["MultiscaleSDF", "Parts", "as_levels", "choose_levels", "levels_of", "walk_levels"]
 
 # The tensors of a jet of any order, the value first; ``(N,)``, alone or with features, is a jet of order 0.
 Parts = tuple[Tensor, ...]

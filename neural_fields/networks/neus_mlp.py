@@ -13,11 +13,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils import parametrizations
 
-from ..backend._checks import at_least
+from ..backend.errors import at_least
 from ..fields.field import Jet, OneLevelField
 from .radiance import encode, encoded_size
-
-__all__ = ["NeusSDF"]
 
 BETA = 100.0  # of the softplus
 

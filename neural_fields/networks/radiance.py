@@ -9,11 +9,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from ..backend._checks import at_least
+from ..backend.errors import at_least
 from ..fields.field import Jet
 from .hash_encoding import HashEncoding
-
-__all__ = ["Outside", "Radiance", "ViewColor", "encode", "encoded_size"]
 
 
 def encode(x: Tensor, frequencies: int) -> Tensor:

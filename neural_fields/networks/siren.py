@@ -23,13 +23,10 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ..backend._checks import at_least, positive
-from ..backend._parallel import Step, over_blocks
-from ..backend._transforms import is_traced
+from ..backend.devices import Step, is_traced, over_blocks
+from ..backend.errors import at_least, positive
 from ..backend.kernels.switch import choose
 from ..fields.field import Jet, OneLevelField, SecondJet
-
-__all__ = ["Siren"]
 
 # Floats per activation matrix of one block: 1 MiB, so that the handful of matrices that a block needs at a time
 # fit the second- and third-level caches of current CPUs (`python -m benchmarks normals` shows the effect).
@@ -281,6 +278,7 @@ def fold(parameters: Sequence[Tensor], frequency: float, out: float) -> list[Ten
 
 
 def needs_graph(x: Tensor, parameters: Sequence[Tensor]) -> bool:
+    """Whether autograd records an evaluation at ``x`` with these parameters."""
     return torch.is_grad_enabled() and (x.requires_grad or any(p.requires_grad for p in parameters))
 
 

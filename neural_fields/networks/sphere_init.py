@@ -5,11 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from ..backend._checks import positive
+from ..backend.errors import positive
 from ..fields.losses import data_loss, eikonal_loss, normal_loss
 from .siren import Siren, forward
-
-__all__ = ["fit_sphere", "solve_sphere"]
 
 TRAINED_RADIUS = 1.05  # how far out it is trained: a little further than the unit sphere
 

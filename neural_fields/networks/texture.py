@@ -16,11 +16,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from ..backend._checks import positive
+from ..backend.errors import positive
 from ..fields.field import Field, Jet, OneLevelField
 from .siren import Siren, forward, needs_graph, plain_jet
-
-__all__ = ["ColorSiren", "TextureField"]
 
 
 class ColorSiren(nn.Module):

@@ -9,10 +9,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ..backend._checks import at_least, positive
+from ..backend.errors import at_least, positive
 from ..fields.field import Field
-
-__all__ = ["ValueGrid"]
 
 
 class ValueGrid:

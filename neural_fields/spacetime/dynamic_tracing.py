@@ -26,8 +26,6 @@ from ..tracing.cones import CONE_LIPSCHITZ, cone_ends, cone_starts
 from ..tracing.sphere import BOUNDING_RADIUS, Expected, Hits, Near, ball_points, trace_expected
 from .field import SpaceTimeSDF, TimeSlice, check_spacetime
 
-__all__ = ["DynamicTracer", "moment"]
-
 
 def moment(field: Field, t: float) -> Field:
     """The three-dimensional field at a time: `SpaceTimeSDF.at`, where a point costs least, or else a `TimeSlice`.

@@ -22,20 +22,6 @@ from torch import Tensor
 from ..fields.field import Field, Jet
 from .field import SpaceTimeJet, at_time
 
-__all__ = [
-    "Law",
-    "VectorField",
-    "curvature",
-    "key_loss",
-    "law_loss",
-    "mean_curvature",
-    "morph",
-    "near_surface",
-    "normal_speed",
-    "tangential_laplacian",
-    "transport",
-]
-
 # Positions (..., 3) and times (...,) to velocities (..., 3), in units of space per unit of time.
 VectorField = Callable[[Tensor, Tensor], Tensor]
 # Positions (..., 3) and times (...,) to speeds (...,) along the outward normal.

@@ -13,12 +13,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from ..backend._checks import at_least
+from ..backend.errors import at_least
 from ..fields.field import Field, Jet, SecondJet
 from ..networks.multiscale import MultiscaleSDF, levels_of
 from ..networks.siren import Siren
-
-__all__ = ["SpaceTimeJet", "SpaceTimeSDF", "TimeSlice", "at_time", "spacetime_jet"]
 
 
 class SpaceTimeJet(NamedTuple):

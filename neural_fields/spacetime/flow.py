@@ -15,23 +15,11 @@ from typing import Any, NamedTuple, Protocol
 import torch
 from torch import Tensor, nn
 
-from ..backend._checks import at_least, positive
+from ..backend.errors import at_least, positive
 from ..fields.field import Field
 from ..tracing.projection import project_to_surface
 from .evolution import VectorField
 from .field import TimeSlice, at_time
-
-__all__ = [
-    "IntegrationError",
-    "Solver",
-    "Tracks",
-    "flow",
-    "flow_jacobian",
-    "integrate_rows",
-    "track",
-    "trajectories",
-    "transport_error",
-]
 
 ADAPTIVE = ("dopri5", "dopri8", "bosh3", "fehlberg2", "adaptive_heun")
 FIXED = ("rk4", "heun3", "heun2", "midpoint", "euler")

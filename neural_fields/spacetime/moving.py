@@ -8,10 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ..fields.field import Field, Jet, OneLevelField
-from ..fields.function import FieldLike, as_field
-
-__all__ = ["Keyframes", "Moving", "RigidMotion", "ShrinkingSphere"]
+from ..fields.field import Field, FieldLike, Jet, OneLevelField, as_field
 
 Vector = tuple[float, float, float]
 

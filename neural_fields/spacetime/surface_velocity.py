@@ -14,14 +14,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ..backend._checks import at_least
+from ..backend.errors import at_least
 from ..fields.field import Field
 from ..tracing.projection import project_to_surface
 from ..tracing.sphere import BOUNDING_RADIUS, ball_points
 from .dynamic_tracing import moment
 from .field import at_time
-
-__all__ = ["CarriedVelocity"]
 
 
 class CarriedVelocity:

@@ -18,8 +18,6 @@ from .field import at_time
 from .flow import Solver, integrate_rows
 from .moving import Keyframes
 
-__all__ = ["CarriedKeyframes", "Velocity", "VelocityJet", "VelocitySiren"]
-
 
 class VelocityJet(NamedTuple):
     """A velocity and its first derivatives.

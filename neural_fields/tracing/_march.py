@@ -14,8 +14,6 @@ from torch import Tensor
 
 from ..fields.field import Field
 
-__all__ = ["PATIENCE", "Expected", "Found", "Near", "Rays", "Rule", "Stand", "look", "march", "march_budget"]
-
 # Steps at a gap of one `resolution`, before it doubles: few rays need as many, and none may need thousands.
 PATIENCE = 16
 # How far a step may reach into a band unseen, in δ: stepping to its edge and no further would never arrive.

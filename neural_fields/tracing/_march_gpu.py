@@ -16,8 +16,6 @@ from ..backend.fixed_shapes import first_rows, fixed_shapes
 from ..fields.field import Field
 from ._march import PATIENCE, Found, Rays, Rule, Stand, look
 
-__all__ = ["march_ahead"]
-
 # Passes before the first look, when many rays are about to leave, and between later ones.
 FIRST_PASSES, PASSES = 8, 16
 # Room in a band while nobody knows better: for all of a few rays, for a share of many.

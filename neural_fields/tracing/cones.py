@@ -10,14 +10,11 @@ from torch import Tensor
 
 from ..backend.devices import makes_wait
 from ..backend.fixed_shapes import first_rows
-from ..fields.field import Field
-from ..fields.function import FieldLike, as_field
+from ..fields.field import Field, FieldLike, as_field
 from ..networks.multiscale import choose_levels, levels_of
 from ..networks.siren import Siren
 from ._march_gpu import FIRST_PASSES, PASSES
 from .sphere import BOUNDING_RADIUS, ball_crossing, check_rays, unit_directions
-
-__all__ = ["CONE_LIPSCHITZ", "CONE_STEPS", "TILES", "cone_ends", "cone_starts"]
 
 # Networks are a little steeper than a distance here and there, and a cone that goes too far loses thin parts.
 CONE_LIPSCHITZ = 1.15

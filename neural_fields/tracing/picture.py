@@ -28,8 +28,6 @@ from ..backend.kernels.tracing import Marched, Queue, RayTensors
 from ..fields.field import Field
 from .cones import TILES
 
-__all__ = ["CAMERA", "Drawn", "Setting", "draw"]
-
 # Entries of the tensor of a view, float64: fx, fy, cx, cy; the pose's axes, a row for each world coordinate; the eye;
 # then tolerance, resolution and Lipschitz constant of the march, the reach of a Newton step, and two ones of the cones:
 # the radius of the ball that holds the surface, and how far the eye and that ball reach.

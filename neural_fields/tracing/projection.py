@@ -12,11 +12,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ..fields.field import Field
-from ..fields.function import FieldLike, as_field
+from ..fields.field import Field, FieldLike, as_field
 from ..networks.texture import TextureField
-
-__all__ = ["Mapped", "map_attribute", "map_colors", "project_to_surface"]
 
 
 class Mapped(NamedTuple):

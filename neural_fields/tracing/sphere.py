@@ -17,12 +17,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ..backend._checks import positive
 from ..backend.devices import makes_wait
-from ..fields.field import Field
-from ..fields.function import FieldLike, as_field
+from ..backend.errors import positive
+from ..fields.field import Field, FieldLike, as_field
+from ..fields.similarity import ball_chord
 from ..networks.multiscale import as_levels, choose_levels, levels_of
-from ..volume.weights import ball_chord
 from ._march import (
     BAND_ENTRY,
     BOLDNESS,
@@ -38,21 +37,6 @@ from ._march import (
     march_budget,
 )
 from ._march_gpu import march_ahead
-
-__all__ = [
-    "BOUNDING_RADIUS",
-    "MAX_STEPS",
-    "Expected",
-    "Hits",
-    "Near",
-    "ball_crossing",
-    "ball_points",
-    "check_rays",
-    "march_constants",
-    "sphere_trace",
-    "trace_expected",
-    "unit_directions",
-]
 
 # Fields live in the unit sphere; their surfaces may pass it by a little.
 BOUNDING_RADIUS = 1.05

@@ -17,11 +17,10 @@ from typing import Any, NamedTuple, Protocol, TypeVar, cast
 import torch
 from torch import Tensor
 
-from ..backend._checks import at_least, positive
 from ..backend.devices import precise, uniform
+from ..backend.errors import at_least, positive
 from ..backend.fixed_shapes import chosen
-from ..fields.field import Field, Jet
-from ..fields.function import FieldLike, as_field
+from ..fields.field import Field, FieldLike, Jet, as_field
 from .weights import (
     composite,
     importance_depths,
@@ -34,18 +33,6 @@ from .weights import (
     stratified_depths,
     transmittance_weights,
 )
-
-__all__ = [
-    "RayColor",
-    "RayOutside",
-    "Rendered",
-    "Samples",
-    "Sampling",
-    "render_samples",
-    "render_volume",
-    "sample_depths",
-    "sample_rays",
-]
 
 RayColor = Callable[[Tensor, Tensor, Jet], Tensor]
 """Colours ``(N, 3)`` of points ``(N, 3)`` seen along unit directions ``(N, 3)``, given the geometry's jet there."""

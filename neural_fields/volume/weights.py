@@ -15,21 +15,7 @@ from torch import Tensor
 from torch.nn.functional import softplus
 
 from ..backend.devices import uniform
-
-__all__ = [
-    "ball_chord",
-    "composite",
-    "importance_depths",
-    "invert_outside",
-    "neus_alpha",
-    "neus_optical_depth",
-    "outside_depths",
-    "ray_points",
-    "secant_weights",
-    "sphere_span",
-    "stratified_depths",
-    "transmittance_weights",
-]
+from ..fields.similarity import ball_chord
 
 
 class Weights(NamedTuple):
@@ -103,20 +89,6 @@ def composite(weights: Tensor, values: Tensor) -> Tensor:
 def ray_points(origins: Tensor, directions: Tensor, depths: Tensor) -> Tensor:
     """The points o + t v: ``(R, 3)``, ``(R, 3)`` and depths ``(R, S)`` → ``(R, S, 3)``."""
     return origins[:, None] + depths[..., None] * directions[:, None]
-
-
-def ball_chord(origins: Tensor, directions: Tensor, radius: Tensor | float) -> tuple[Tensor, Tensor]:
-    """Depth at which lines are nearest to 0, and half the length of their way through a ball around it, 0 if they miss.
-
-    Args:
-        origins: ``(R, 3)``.
-        directions: ``(R, 3)`` unit vectors.
-        radius: of the ball, one or ``(R,)``.
-    """
-    middle = -(origins * directions).sum(dim=-1)
-    # From the nearest point, and not from |o|² − middle², which cancels for far cameras.
-    squared = radius**2 - (origins + middle[:, None] * directions).square().sum(dim=-1)
-    return middle, squared.clamp(min=0).sqrt()
 
 
 def sphere_span(origins: Tensor, directions: Tensor, *, radius: float = 1.0) -> tuple[Tensor, Tensor]:

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from ...neural_fields import Field, Mesh, NoSurfaceError, TimeSlice, at_time, extract_mesh
-from ...neural_fields.fields.function import FieldLike
+from ...neural_fields.fields.field import FieldLike
 from ..surface.surface import components
 
 __all__ = ["CHANGES", "Change", "ChangeOptions", "Topology", "find_changes", "surface_of", "topology_of"]

@@ -16,8 +16,6 @@ from .packing import Packed
 from .siren import half_scratch
 from .tensor_tiles import keep, rows_of, value_of_tile
 
-__all__ = ["march_cones"]
-
 
 @triton.jit(do_not_specialize=["count", "max_steps"])
 def march(

@@ -13,8 +13,6 @@ from .launch import Network, on_device, program_count, scratch_for, tiling_of
 from .tensor_tiles import points_of, rows_of
 from .tiles import jet_of_tile, planes
 
-__all__ = ["jet"]
-
 
 @triton.jit(do_not_specialize=["count"])
 def evaluate(

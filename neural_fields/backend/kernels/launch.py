@@ -13,18 +13,6 @@ import torch
 import triton
 from torch import Tensor
 
-__all__ = [
-    "Network",
-    "Tiling",
-    "launch",
-    "multiprocessors",
-    "on_device",
-    "program_count",
-    "resident_programs",
-    "scratch_for",
-    "tiling_of",
-]
-
 # Of a multiprocessor, of compute capability 8.0 and later: registers; and of a warp, threads.
 REGISTERS, WARP = 1 << 16, 32
 # The interpreter runs one after the other; three show what several do.

@@ -31,8 +31,6 @@ from .packing import Packed, Shape
 from .siren import half_scratch
 from .tensor_tiles import jet_of_tile, points_of, rows_of, value_of_tile
 
-__all__ = ["Levels", "gate_of", "level_of_tile", "levels_jet", "levels_value", "walk_rows"]
-
 
 class Levels(NamedTuple):
     """A `MultiscaleSDF` as the kernels take it.

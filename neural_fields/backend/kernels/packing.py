@@ -20,8 +20,6 @@ from weakref import WeakKeyDictionary
 import torch
 from torch import Tensor
 
-__all__ = ["LARGEST_WEIGHT", "SINES", "Packed", "Shape", "Weights", "is_hopper", "pack", "packed", "state_of"]
-
 # Sines are multiplied by this before they are split: a power of two, so that their low halves are normal numbers.
 SINES = 1024.0
 # The largest entry of a scaled matrix lies in (LARGEST_WEIGHT / 2, LARGEST_WEIGHT].

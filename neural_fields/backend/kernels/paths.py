@@ -28,8 +28,6 @@ from .siren import half_scratch
 from .tensor_tiles import keep
 from .tracing import Marched, Queue, RayTensors
 
-__all__ = ["march_fused", "march_levels"]
-
 # Rays under way in a program: more of them fill the tiles, and fewer leave later rays for the end, when the last ones
 # are on their way. Twice as many above so many rays in all.
 SLOTS, MANY_RAYS = 256, 1 << 19

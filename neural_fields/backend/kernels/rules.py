@@ -8,8 +8,6 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-__all__ = ["first_band", "look_at", "turned_back"]
-
 
 @triton.jit
 def first_band(value, deltas, LEVELS: tl.constexpr):

@@ -14,8 +14,6 @@ from .launch import launch
 from .packing import Packed
 from .tensor_tiles import jet_of_tile, keep, points_of, rows_of, value_of_tile
 
-__all__ = ["half_scratch", "siren_jet", "siren_value"]
-
 
 @triton.jit(do_not_specialize=["count"])
 def evaluate(

@@ -22,8 +22,6 @@ from torch import Tensor
 
 from ..errors import InputError
 
-__all__ = ["MAX_DEPTH", "MAX_LEVELS", "MAX_WIDTH", "MODES", "VARIABLE", "Choice", "choose", "mode", "obstacle"]
-
 VARIABLE = "MPLICITS_KERNELS"
 MODES = ("auto", "off", "interpret")
 # What is tested; wider and deeper ones would run, and keep more in scratch than caches hold.

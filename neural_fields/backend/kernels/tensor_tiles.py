@@ -27,8 +27,6 @@ import triton.language as tl
 
 from .packing import SINES
 
-__all__ = ["jet_of_tile", "keep", "points_of", "rows_of", "sine", "sine_cosine", "value_of_tile"]
-
 # sin 2πq on [−¼, ¼] as the odd polynomial of degree 9 with the smallest largest error, 3.3e-9 (Remez exchange).
 C1 = tl.constexpr(6.283185005187988)
 C3 = tl.constexpr(-41.34165573120117)

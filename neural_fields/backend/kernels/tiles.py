@@ -23,15 +23,6 @@ import triton
 import triton.language as tl
 from triton.language.extra import libdevice
 
-__all__ = [
-    "cosine",
-    "first_phase",
-    "jet_of_tile",
-    "planes",
-    "product_from",
-    "sine",
-]
-
 # The interpreter runs kernels with numpy and has no libdevice; its sine is numpy's.
 INTERPRETED = tl.constexpr(bool(triton.knobs.runtime.interpret))
 

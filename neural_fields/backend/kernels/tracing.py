@@ -27,8 +27,6 @@ from .rules import look_at, turned_back
 from .siren import half_scratch
 from .tensor_tiles import keep, value_of_tile
 
-__all__ = ["IN_REGISTERS", "Marched", "Queue", "RayTensors", "march_rays"]
-
 # One network of so many units leaves registers enough to keep rays there too.
 IN_REGISTERS = 128
 

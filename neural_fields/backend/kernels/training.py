@@ -28,8 +28,6 @@ from .launch import Network, Tiling, on_device, program_count, scratch_for, tili
 from .tensor_tiles import points_of, rows_of
 from .tiles import add_first, cosine, first_phase, product_from, sine
 
-__all__ = ["jet_backward"]
-
 
 @triton.jit(do_not_specialize=["count"])
 def sweep(

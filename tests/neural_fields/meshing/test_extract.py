@@ -7,8 +7,7 @@ import torch
 from fields import Scaled
 from mplicits.neural_fields import Box, Capsule, Jet, MultiscaleSDF, Plane, Siren, Sphere, Torus, Union
 from mplicits.neural_fields.fields.field import OneLevelField
-from mplicits.neural_fields.meshing._cube import CORNERS, cube_tables
-from mplicits.neural_fields.meshing._lattice import Lattice
+from mplicits.neural_fields.meshing._cells import CORNERS, Lattice, cube_tables
 from mplicits.neural_fields.meshing.extract import Mesh, NoSurfaceError, extract_mesh, map_normals
 
 UNIT = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))

@@ -3,7 +3,7 @@
 import pytest
 import torch
 from mplicits.neural_fields import Sphere
-from mplicits.neural_fields.fields.function import as_field
+from mplicits.neural_fields.fields.field import as_field
 from mplicits.neural_fields.networks.value_grid import ValueGrid
 from torch import Tensor
 

@@ -1,22 +1,229 @@
-"""Finding the few cells that a surface crosses: culled blocks first, then signs at the corners of what is left.
-
-All indices are lattice points (see `Lattice`). The search ends at blocks of 2³ cells, whose centre is itself a
-lattice point, so that no value of it is thrown away.
-"""
+"""The cells of a lattice that a surface crosses, and the 256 cases of marching cubes (Lorensen and Cline 1987)."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
+from typing import NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
-from ._cube import CORNERS, cube_tables
-from ._lattice import Lattice, Sampler
+from ..fields.field import Field
 
-__all__ = ["ActiveCells", "NoSurfaceError", "active_cells", "cull_blocks"]
+Bounds = tuple[tuple[float, float, float], tuple[float, float, float]]
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """Cubic cells of edge ``step`` from ``low`` upwards; ``shape`` counts cells, so there are ``shape + 1`` points."""
+
+    low: tuple[float, float, float]
+    step: float
+    shape: tuple[int, int, int]
+
+    @classmethod
+    def over(cls, bounds: Bounds, resolution: int) -> Lattice:
+        """The lattice with ``resolution`` cells along the longest axis of a box; other axes round up to whole cells.
+
+        Raises:
+            ValueError: the box is empty or not finite, or there are fewer than two cells.
+        """
+        low, high = (np.asarray(corner, np.float64) for corner in bounds)
+        if low.shape != (3,) or high.shape != (3,) or not np.isfinite([low, high]).all() or not (low < high).all():
+            raise ValueError(
+                f"bounds={bounds}: expected two corners of three finite numbers, the first below the second"
+            )
+        if resolution < 2:
+            raise ValueError(f"resolution={resolution}: expected at least 2 cells along the longest axis")
+        step = float((high - low).max()) / resolution
+        # A millionth of a cell is rounding, not a reason for another layer.
+        x, y, z = (max(1, math.ceil(extent / step - 1e-6)) for extent in high - low)
+        return cls((float(low[0]), float(low[1]), float(low[2])), step, (x, y, z))
+
+    def positions(self, index: NDArray[np.integer] | NDArray[np.float64]) -> NDArray[np.float64]:
+        """Coordinates of points ``(N, 3)`` counted in cells, whole or not."""
+        return np.asarray(index, np.float64) * self.step + np.asarray(self.low)
+
+    def __str__(self) -> str:
+        """The box, for messages."""
+        high = self.positions(np.asarray(self.shape))
+        return " × ".join(f"[{a:.4g}, {b:.4g}]" for a, b in zip(self.low, high, strict=True))
+
+
+class Sampler:
+    """Evaluates a field in batches, checks what comes back, and counts.
+
+    Args:
+        field: what is sampled, on the device and in the dtype of its first parameter (or of ``deltas``).
+        lattice: where.
+        batch: rows per call of the field.
+        progress: told ``(stage, done, total)`` after every batch.
+
+    Attributes:
+        counts: points sent to each level so far.
+    """
+
+    def __init__(self, field: Field, lattice: Lattice, batch: int, progress: Progress | None = None) -> None:
+        self.field, self.lattice, self.batch, self.progress = field, lattice, batch, progress
+        self.counts = [0] * field.num_levels
+        self._like = field.like
+
+    def _points(self, positions: NDArray[np.float64]) -> torch.Tensor:
+        return torch.from_numpy(positions).to(self._like)
+
+    @torch.inference_mode()
+    def values(
+        self, count: int, points: Callable[[slice], NDArray[np.integer]], *, level: int, stage: str
+    ) -> NDArray[np.floating]:
+        """Values at ``count`` lattice points → ``(count,)``, in the field's dtype.
+
+        ``points`` gives a part of them, ``(n, 3)``, when it is needed, so that they never exist all at once.
+
+        Raises:
+            ValueError: the field gave NaN or an infinity.
+        """
+        parts = [np.empty(0, np.float32)]
+        for start in range(0, count, self.batch):
+            positions = self.lattice.positions(points(slice(start, start + self.batch)))
+            part = self.field.value(self._points(positions), level=level).cpu().numpy()
+            self._check(part, positions, level)
+            self._report(level, stage, start + len(part), count, len(part))
+            parts.append(part)
+        return np.concatenate(parts[1:] or parts)
+
+    @torch.inference_mode()
+    def jets(
+        self, positions: NDArray[np.float64], *, level: int, stage: str
+    ) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+        """Values ``(N,)`` and gradients ``(N, 3)`` at any positions ``(N, 3)``.
+
+        Raises:
+            ValueError: the field gave NaN or an infinity.
+        """
+        values = [np.empty(0, np.float32)]
+        gradients = [np.empty((0, 3), np.float32)]
+        for start in range(0, len(positions), self.batch):
+            batch = positions[start : start + self.batch]
+            jet = self.field.jet(self._points(batch), level=level)
+            values.append(jet.value.cpu().numpy())
+            gradients.append(jet.gradient.cpu().numpy())
+            self._check(values[-1] + gradients[-1].sum(axis=1), batch, level)
+            self._report(level, stage, start + len(batch), len(positions), len(batch))
+        return np.concatenate(values[1:] or values), np.concatenate(gradients[1:] or gradients)
+
+    def _check(self, values: NDArray[np.floating], positions: NDArray[np.float64], level: int) -> None:
+        bad = ~np.isfinite(values)
+        if bad.any():
+            where = ", ".join(f"{c:.4g}" for c in positions[bad.argmax()])
+            raise ValueError(
+                f"field: level {level} is not finite at {bad.sum()} of {len(values)} points, first at ({where}); "
+                "its parameters have probably diverged"
+            )
+
+    def _report(self, level: int, stage: str, done: int, total: int, count: int) -> None:
+        self.counts[level] += count
+        if self.progress is not None:
+            self.progress(stage, done, total)
+
+
+CORNERS: NDArray[np.int64] = np.array([[c & 1, c >> 1 & 1, c >> 2 & 1] for c in range(8)])  # (8, 3)
+_EDGES = [(c, c | 1 << axis, axis) for axis in range(3) for c in range(8) if not c >> axis & 1]
+EDGE_ENDS: NDArray[np.int64] = np.array([(a, b) for a, b, _ in _EDGES])  # (12, 2), the lower corner first
+EDGE_AXIS: NDArray[np.int64] = np.array([axis for _, _, axis in _EDGES])  # (12,)
+_EDGE_OF = {frozenset((a, b)): index for index, (a, b, _) in enumerate(_EDGES)}
+
+
+def _faces() -> list[tuple[int, int, int, int]]:
+    """Corners of the six faces, counter-clockwise as seen from outside the cube."""
+    faces = []
+    for axis in range(3):
+        u, v = 1 << (axis + 1) % 3, 1 << (axis + 2) % 3
+        low, high = 0, 1 << axis
+        faces += [(high, high | u, high | u | v, high | v), (low, low | v, low | u | v, low | u)]
+    return faces
+
+
+_FACES = _faces()
+_EDGE_FACES = [frozenset(i for i, face in enumerate(_FACES) if {a, b} <= set(face)) for a, b, _ in _EDGES]
+
+
+class CubeTables(NamedTuple):
+    """What a case byte means.
+
+    Attributes:
+        crossed: ``(256, 12)`` bool, the edges whose ends differ in sign.
+        ends: ``(256, 8)`` bool, the corners at the end of a crossed edge.
+        start: ``(257,)`` first row of each case in ``triangles``.
+        triangles: ``(T, 3)`` edge numbers, counter-clockwise as seen from the positive side.
+    """
+
+    crossed: NDArray[np.bool_]
+    ends: NDArray[np.bool_]
+    start: NDArray[np.int64]
+    triangles: NDArray[np.int64]
+
+
+def _loops(case: int) -> list[list[int]]:
+    """The closed polygons of a case, as edge numbers, counter-clockwise as seen from the positive side."""
+    follow: dict[int, int] = {}
+    for face in _FACES:
+        inside = [bool(case >> corner & 1) for corner in face]
+        for i in range(4):
+            if inside[i - 1] or not inside[i]:
+                continue
+            j = i
+            while inside[(j + 1) % 4]:
+                j += 1
+            enter = _EDGE_OF[frozenset((face[i - 1], face[i]))]
+            leave = _EDGE_OF[frozenset((face[j % 4], face[(j + 1) % 4]))]
+            follow[enter] = leave
+    loops = []
+    while follow:
+        loop = [next(iter(follow))]
+        while (edge := follow.pop(loop[-1])) != loop[0]:
+            loop.append(edge)
+        loops.append(loop)
+    return loops
+
+
+def _cut(loop: list[int]) -> list[tuple[int, int, int]]:
+    """Triangulate a polygon with as few diagonals inside a face of the cube as can be."""
+
+    @cache
+    def best(i: int, j: int) -> tuple[int, tuple[tuple[int, int, int], ...]]:
+        if j - i < 2:
+            return 0, ()
+        options = []
+        for k in range(i + 1, j):
+            left, right = best(i, k), best(k, j)
+            options.append((left[0] + right[0], (*left[1], (loop[i], loop[k], loop[j]), *right[1])))
+        closing = (i, j) == (0, len(loop) - 1)
+        flat = 0 if closing else bool(_EDGE_FACES[loop[i]] & _EDGE_FACES[loop[j]])
+        cost, triangles = min(options, key=lambda option: option[0])
+        return cost + flat, triangles
+
+    return list(best(0, len(loop) - 1)[1])
+
+
+@cache
+def cube_tables() -> CubeTables:
+    """Derive the tables; a few milliseconds, once."""
+    inside = (np.arange(256)[:, None] >> np.arange(8) & 1).astype(bool)
+    crossed = inside[:, EDGE_ENDS[:, 0]] != inside[:, EDGE_ENDS[:, 1]]
+    ends = np.zeros((256, 8), bool)
+    for edge, (a, b) in enumerate(EDGE_ENDS):
+        ends[:, a] |= crossed[:, edge]
+        ends[:, b] |= crossed[:, edge]
+    cases = [[triangle for loop in _loops(case) for triangle in _cut(loop)] for case in range(256)]
+    start = np.concatenate(([0], np.cumsum([len(case) for case in cases])))
+    triangles = np.array([triangle for case in cases for triangle in case])
+    return CubeTables(crossed, ends, start, triangles)
+
 
 Ints = NDArray[np.integer]
 Floats = NDArray[np.floating]
