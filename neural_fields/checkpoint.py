@@ -1,4 +1,4 @@
-"""Fields on disk: safetensors with a description in its header. No pickle, nothing executed on loading."""
+"""Fields on disk: safetensors with a description in the header. No pickle, nothing executed on loading."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from .spacetime.field import SpaceTimeSDF
 
 M = TypeVar("M", bound=nn.Module)
 
-# Types by name. Networks and closed forms are made again from their definition, combinations also from their parts.
+# Types by name: built from their definition, combinations also from their parts.
 NETWORKS: Mapping[str, Callable[..., Field]] = {cls.__name__: cls for cls in (Siren, NeusSDF)}
 CLOSED: Mapping[str, Callable[..., Field]] = {cls.__name__: cls for cls in (Box, Capsule, Plane, Sphere, Torus)}
 COMBINED: Mapping[str, Callable[..., Field]] = {
@@ -44,7 +44,7 @@ FILE_VERSION = 1
 
 
 class _Kind(NamedTuple):
-    """A kind of file: what is in it, the command that writes it, its usual name, and what to do if it is damaged."""
+    """A kind of file: its content, the command that writes it, its usual name, and the remedy if it is damaged."""
 
     thing: str
     command: str
@@ -53,7 +53,7 @@ class _Kind(NamedTuple):
 
     @property
     def key(self) -> str:
-        """Of the description in the file's metadata."""
+        """Key of the description in the file's metadata."""
         return f"mplicits-{self.thing.split()[-1]}"
 
 
@@ -70,12 +70,12 @@ OUTSIDE_SIZES = ("width", "depth", "point_frequencies", "view_frequencies")
 
 
 class SavedField(NamedTuple):
-    """What a checkpoint holds.
+    """Content of a checkpoint.
 
     Attributes:
-        field: the field, on the CPU (or the device asked for), in unit-sphere coordinates.
-        similarity: the way back to the input's coordinates.
-        metadata: whatever the writer added; JSON values.
+        field: on the device asked for, in unit-sphere coordinates.
+        similarity: from input to unit-sphere coordinates.
+        metadata: JSON values of the writer.
     """
 
     field: Field
@@ -90,10 +90,17 @@ def save_field(
     similarity: Similarity | None = None,
     metadata: Mapping[str, Any] | None = None,
 ) -> None:
-    """Write the `field_bytes` of ``field`` to a safetensors file, whole or not at all.
+    """Write ``field`` to a safetensors file, whole or not at all.
+
+    Args:
+        path: the file; replaced.
+        field: a `Siren`, a `MultiscaleSDF` of them, a `SpaceTimeSDF` of that, a closed form such as `Sphere`, or a
+            combination of these such as `Union`.
+        similarity: from input to unit-sphere coordinates; the identity by default.
+        metadata: JSON values to keep with the field.
 
     Raises:
-        TypeError: a field of this type has no description on disk.
+        TypeError: a field of this type cannot be described on disk.
     """
     write_whole(Path(path), field_bytes(field, similarity=similarity, metadata=metadata))
 
@@ -101,17 +108,7 @@ def save_field(
 def field_bytes(
     field: Field, *, similarity: Similarity | None = None, metadata: Mapping[str, Any] | None = None
 ) -> bytes:
-    """What a file of a field holds.
-
-    Args:
-        field: a `Siren`, a `MultiscaleSDF` of them, a `SpaceTimeSDF` of that, a closed form such as `Sphere`, or what
-            `Union`, `Difference`, `Offset` and the like make of all these.
-        similarity: the map from input to unit-sphere coordinates; the identity if there is none.
-        metadata: JSON values to keep with the field.
-
-    Raises:
-        TypeError: a field of this type has no description on disk.
-    """
+    """Content of a file of `save_field`, with the same arguments and errors."""
     similarity = similarity or Similarity.identity()
     header = {
         "field": _describe(field),
@@ -140,17 +137,12 @@ def load_field(path: str | os.PathLike[str], *, device: torch.device | str = "cp
 def save_texture(
     path: str | os.PathLike[str], texture: TextureField, *, metadata: Mapping[str, Any] | None = None
 ) -> None:
-    """Write a texture, without its geometry, to a safetensors file, whole or not at all; see `texture_bytes`."""
+    """Write a texture, without its geometry, to a safetensors file, whole or not at all."""
     write_whole(Path(path), texture_bytes(texture, metadata=metadata))
 
 
 def texture_bytes(texture: TextureField, *, metadata: Mapping[str, Any] | None = None) -> bytes:
-    """What a file of a texture holds.
-
-    Args:
-        texture: its geometry is not stored; a digest of it is, so that no other geometry gets these colours.
-        metadata: JSON values to keep with it.
-    """
+    """Content of a file of `save_texture`; a digest of the geometry binds the colours to it."""
     siren = texture.network.siren
     header = {
         "network": {"width": siren.width, "depth": siren.depth, "omega": siren.omega, "in_dim": siren.in_dim},
@@ -162,11 +154,7 @@ def texture_bytes(texture: TextureField, *, metadata: Mapping[str, Any] | None =
 
 
 def load_texture(path: str | os.PathLike[str], geometry: Field) -> TextureField:
-    """Read what `save_texture` wrote, and put it around its geometry.
-
-    Args:
-        path: a file written by `save_texture`.
-        geometry: the field that the texture was trained on; left as it is. The texture is put on its device.
+    """Read what `save_texture` wrote, around ``geometry``, the field that it was trained on, and on its device.
 
     Raises:
         InputError: there is no such file, it is damaged, no texture, or one of another geometry.
@@ -196,18 +184,12 @@ def load_texture(path: str | os.PathLike[str], geometry: Field) -> TextureField:
 def save_radiance(
     path: str | os.PathLike[str], radiance: Radiance, geometry: Field, *, metadata: Mapping[str, Any] | None = None
 ) -> None:
-    """Write what rays see of a geometry to a safetensors file, whole or not at all; see `radiance_bytes`."""
+    """Write the radiance of a geometry to a safetensors file, whole or not at all."""
     write_whole(Path(path), radiance_bytes(radiance, geometry, metadata=metadata))
 
 
 def radiance_bytes(radiance: Radiance, geometry: Field, *, metadata: Mapping[str, Any] | None = None) -> bytes:
-    """What a file of a radiance holds.
-
-    Args:
-        radiance: colours by direction, and what is behind.
-        geometry: of it; not stored but as a digest, so that no other geometry gets these colours.
-        metadata: JSON values to keep with it.
-    """
+    """Content of a file of `save_radiance`; a digest of the geometry binds the colours to it."""
     color, outside = radiance.color, radiance.outside
     header = {
         "color": _radiant_of(color, COLOR_SIZES),
@@ -223,11 +205,7 @@ def radiance_bytes(radiance: Radiance, geometry: Field, *, metadata: Mapping[str
 
 
 def load_radiance(path: str | os.PathLike[str], geometry: Field) -> tuple[Radiance, dict[str, Any]]:
-    """Read what `save_radiance` wrote, and its metadata.
-
-    Args:
-        path: a file written by `save_radiance`.
-        geometry: the field that was trained with it; left as it is. All of the radiance is put on its device.
+    """Read what `save_radiance` wrote, and its metadata, onto the device of ``geometry``, which was trained with it.
 
     Raises:
         InputError: there is no such file, it is damaged, no radiance, or one of another geometry.
@@ -249,13 +227,13 @@ def load_radiance(path: str | os.PathLike[str], geometry: Field) -> tuple[Radian
 
 
 def _radiant_of(network: ViewColor | Outside, sizes: Sequence[str]) -> dict[str, Any]:
-    """What `_radiant` needs to construct one again."""
+    """Arguments of the network, from which `_radiant` makes it again."""
     grid = None if network.grid is None else _grid_of(network.grid)
     return {name: getattr(network, name) for name in sizes} | {"grid": grid}
 
 
 def _grid_of(grid: HashEncoding) -> dict[str, Any]:
-    """What `_made_grid` needs to construct one again."""
+    """Arguments of the encoding, from which `_made_grid` makes it again."""
     return {
         "levels": len(grid.resolutions),
         "table_size": grid.table_size,
@@ -269,7 +247,7 @@ def _grid_of(grid: HashEncoding) -> dict[str, Any]:
 def _radiant(
     path: Path, kind: Callable[..., M], name: str, header: Mapping[str, Any], tensors: Mapping[str, Tensor]
 ) -> M:
-    """A network of a radiance, of its description and its tensors."""
+    """A network of a radiance, from its description and tensors."""
     own = {key.removeprefix(f"{name}."): held for key, held in tensors.items() if key.startswith(f"{name}.")}
     sizes = dict(header[name])
     grid = sizes.pop("grid")
@@ -280,7 +258,7 @@ def _radiant(
 
 
 def _made_grid(described: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> HashEncoding:
-    """An untrained one, unless it has more numbers than the file."""
+    """An untrained encoding; ValueError if it would have more numbers than the file."""
     _check_size({"levels": described["levels"], "features": described["features"]}, tensors)
     resolutions = grid_resolutions(described["levels"], described["coarsest"], described["finest"])
     entries = sum(min((cells + 1) ** 3, described["table_size"]) for cells in resolutions)
@@ -316,7 +294,7 @@ def _packed(state: Mapping[str, Tensor], kind: _Kind, header: Mapping[str, Any])
 
 @contextmanager
 def _reading(path: Path, kind: _Kind, device: torch.device | str) -> Iterator[tuple[dict[str, Any], dict[str, Tensor]]]:
-    """Header and tensors of a file; whatever goes wrong with them becomes an `InputError`."""
+    """Header and tensors of a file; any error in the block becomes an `InputError`."""
     thing, command = kind.thing, kind.command
     if not path.is_file():
         raise InputError(f"{path}: no such file; expected {thing} written by `{command}` ({kind.name})")
@@ -338,13 +316,13 @@ def _reading(path: Path, kind: _Kind, device: torch.device | str) -> Iterator[tu
         yield header, tensors
     except InputError:
         raise
-    except Exception as error:  # whatever a head that somebody else wrote can make of our constructors
+    except Exception as error:  # a foreign header may make constructors fail in any way
         reason = " ".join(str(error).split())[:160]
         raise InputError(f"{path}: damaged, or not {thing} written by `{command}` ({reason})") from error
 
 
 def _restore(path: Path, module: nn.Module, tensors: Mapping[str, Tensor], remedy: str) -> None:
-    """Load the tensors in their own precision, and refuse those that are not finite."""
+    """Load tensors in their own precision, and refuse those that are not finite."""
     for tensor in tensors.values():
         if tensor.is_floating_point():
             module.to(dtype=tensor.dtype)
@@ -355,7 +333,7 @@ def _restore(path: Path, module: nn.Module, tensors: Mapping[str, Tensor], remed
 
 
 def _describe(field: Field) -> dict[str, Any]:
-    """What `_build` needs to construct an untrained copy."""
+    """The arguments from which `_build` makes an untrained copy."""
     if isinstance(field, MultiscaleSDF):
         levels = [_describe(level) for level in field.levels]
         return {"type": "MultiscaleSDF", "taper": field.taper, "levels": levels}
@@ -387,11 +365,7 @@ def _similarity(described: Mapping[str, Any]) -> Similarity:
 
 
 def _check_size(arguments: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> None:
-    """Refuse a network that cannot have come from these tensors, before one is made.
-
-    Raises:
-        ValueError: a whole number of its description is larger than all that the file holds.
-    """
+    """Raise ValueError if a whole number of a description is larger than the file allows."""
     held = sum(tensor.numel() for tensor in tensors.values())
     for name, number in arguments.items():
         most = len(tensors) if name == "depth" else held

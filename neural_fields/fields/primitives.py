@@ -12,12 +12,12 @@ from ..backend.devices import few_numbers
 from ..backend.errors import positive
 from .field import Jet, OneLevelField
 
-# A value, and the gradient for who asks for it.
+# A value, and a function that returns the gradient.
 Evaluated = tuple[Tensor, Callable[[], Tensor]]
 
 
 class ClosedForm(OneLevelField):
-    """A closed-form field; a subclass gives value and gradient at points."""
+    """A closed-form field; a subclass returns value and gradient at points."""
 
     @abstractmethod
     def _evaluate(self, x: Tensor) -> Evaluated: ...
@@ -35,7 +35,7 @@ class ClosedForm(OneLevelField):
 
 
 def _direction(v: Tensor, length: Tensor) -> Tensor:
-    """``v`` over its length; zero vectors get direction zero instead of NaN."""
+    """``v`` over its length; 0 for zero vectors."""
     safe = torch.where(length > 0, length, torch.ones_like(length))
     return v / safe[..., None]
 

@@ -1,4 +1,4 @@
-"""What the shells for hosts have in common: scale, learning rates, bands that narrow, meshes in the host's units."""
+"""Shared by the adapters: scale, rates, narrowing bands, meshes in the host's units, and a memo of two results."""
 
 from __future__ import annotations
 
@@ -25,19 +25,15 @@ Box = Tensor | Sequence[Sequence[float]]
 
 
 class Hosted(nn.Module):
-    """A field f in a host's units: f(s x) / s, whose gradient is ∇f(s x).
+    """A field f in a host's units: f(s x) / s, whose gradient is ∇f(s x). ValueError if a number is not positive.
 
     Args:
         field: signed distance, negative inside.
-        scale: s; None for 1, or with ``bounds`` for what brings their farthest corner onto the field's unit sphere.
-        bounds: lowest and highest corner of what the host samples and meshes, in its own units ``(2, 3)``; None for
-            the box from −half to half on each axis.
-        half: of that box, in the host's units.
+        scale: s; by default 1, or with ``bounds`` what brings their farthest corner onto the field's unit sphere.
+        bounds: lowest and highest corner of what the host samples and meshes, in its units ``(2, 3)``.
+        half: half-edge of the box, in the host's units, where there are no ``bounds``.
         learning_rate: see `rescale_parameters`; None leaves the parameters in their own units.
         pace: share of the rates that suit the field; see `Pace`.
-
-    Raises:
-        ValueError: a number is not positive, or the bounds are none.
     """
 
     def __init__(
@@ -77,29 +73,28 @@ class Hosted(nn.Module):
 
         Raises:
             NoSurfaceError: there is no surface in the box.
-            ValueError: see `extract_mesh`.
         """
         box = self.bounds if bounds is None else as_bounds(bounds)
         return self.world.mesh(resolution, level=level, bounds=box, normals=normals)
 
     def parameter_groups(self, lr: float = HOST_RATE) -> list[dict[str, Any]]:
-        """Groups for the host's optimiser, with a rate for each layer of the field; see `rates.parameter_groups`."""
+        """Groups for the host's optimiser, with a rate for each layer; see `learning_rates.parameter_groups`."""
         return parameter_groups(self.field, lr, pace=self.pace)
 
     @torch.no_grad()
     def follow(self, inv_s: Tensor | float, *, band: float = 4.0, least: float = 0.02, most: float = 0.3) -> None:
-        """Let the bands be as wide as the surface is unsure; to be called after each step of the optimiser.
+        """Narrow the bands with the uncertainty of the surface; to be called after each step of the optimiser.
 
-        Every band gets the half-width ``band`` · s / inv_s, held between ``least`` and ``most``, s being the scale.
+        Every band gets the half-width ``band`` · s / inv_s, clamped to [``least``, ``most``], s being the scale.
 
         Args:
             inv_s: inverse standard deviation of NeuS's density, in the host's units; of several numbers the mean.
             band: half-width in standard deviations.
-            least: half-width that a band keeps, in the field's units.
-            most: half-width that it does not exceed.
+            least: smallest half-width, in the field's units.
+            most: largest half-width.
 
         Raises:
-            ValueError: the numbers do not grow from above 0 to ``most``.
+            ValueError: not 0 < least <= most.
         """
         if not 0 < least <= most:
             raise ValueError(f"least={least}, most={most}: expected 0 < least <= most")
@@ -124,7 +119,7 @@ class Hosted(nn.Module):
             return Jet(value / self.scale, gradient, features)
 
     def _second_jet(self, x: Tensor) -> tuple[Jet, Tensor]:
-        """The same, and the Laplacian ``(...,)``."""
+        """The jet, and the Laplacian ``(...,)``."""
         with _full_precision(x):
             value, gradient, features, hessian = self.field.second_jet(x * self.scale)
         laplacian = self.scale * hessian.diagonal(dim1=-2, dim2=-1).sum(dim=-1)
@@ -132,11 +127,7 @@ class Hosted(nn.Module):
 
 
 def as_bounds(box: Box) -> Bounds:
-    """Two corners as plain numbers.
-
-    Raises:
-        ValueError: it is no ``(2, 3)``, or the second corner is not above the first.
-    """
+    """Two corners as plain numbers; ValueError unless ``(2, 3)`` with the second above the first."""
     corners = torch.as_tensor(box).detach().double().cpu()
     if corners.shape != (2, 3) or not bool((corners[0] < corners[1]).all()):
         raise ValueError(f"bounds={corners.tolist()}: expected the lowest and the highest corner of a box, (2, 3)")
@@ -162,15 +153,15 @@ def mark(x: Tensor, gradient: Tensor) -> Tensor:
 
 
 def _full_precision(x: Tensor) -> torch.autocast:
-    """Hosts train in half precision, in which a distance near the surface has no digits left."""
+    """Autocast off: in half precision a distance near the surface has no digits left."""
     return torch.autocast(x.device.type, enabled=False)
 
 
 @contextmanager
 def _reaching(x: Tensor) -> Iterator[Tensor]:
-    """``x`` for an evaluation whose graph reaches it, with its own flag as it was afterwards.
+    """``x`` for an evaluation whose graph reaches it, with its own flag restored afterwards.
 
-    Hosts evaluate first and mark the points as requiring gradients later, inside ``gradient``.
+    Hosts evaluate first, and mark the points as requiring gradients later, inside ``gradient``.
     """
     if not torch.is_grad_enabled() or x.requires_grad:
         yield x
@@ -190,16 +181,16 @@ Evaluate = Callable[[], tuple[Tensor, Tensor]]
 
 @dataclass(frozen=True, eq=False)
 class _Waiting:
-    """The half of a pair that has not been asked for yet.
+    """The half of a pair (value, gradient) that was not requested yet.
 
     Attributes:
         half: which one it is.
-        result: the tensor; nobody outside has seen it.
+        result: the tensor.
         points: where it was evaluated.
         handed: the other half, which the caller has.
-        module: whose it is.
+        module: the module that was evaluated.
         tensors: the module's parameters and buffers.
-        state: what else it depends on, see `_state`.
+        state: what else the result depends on, see `_state`.
     """
 
     half: Half
@@ -211,7 +202,7 @@ class _Waiting:
     state: tuple[object, ...]
 
     def fits(self, half: Half, points: Tensor, module: nn.Module, tensors: Sequence[Tensor]) -> bool:
-        """Whether this is what is asked for, and nothing has changed since it was evaluated."""
+        """Whether this is the requested half, and nothing has changed since it was evaluated."""
         return (
             self.half == half
             and self.points() is points
@@ -226,21 +217,21 @@ class PointMemo:
     """Keeps one half of the last pair (value, gradient) until it is requested, at the very same points.
 
     Renderers like NeuS's call for the values and then, by another method, for the gradient at the same tensor. The
-    first call evaluates both and returns its half; the second call gets the other one, once. What is kept is dropped
+    first call evaluates both and returns its half; the second gets the other, once. The kept half is dropped
 
     - when it is returned, or anything else is requested;
     - when the points or the returned half die, so no graph lives longer than the caller's own tensors;
     - when a gradient flows back through the returned half: autograd may have freed the graph of both.
 
     It is used only for the same tensor object at the same version, with the same tensors of the module at the same
-    versions, and in the same grad mode. Writing through ``.data`` or NumPy between the two calls is not noticed.
+    versions, and in the same grad mode. Writes through ``.data`` or NumPy between the two calls are not noticed.
     """
 
     def __init__(self) -> None:
         self._waiting: _Waiting | None = None
 
     def __reduce__(self) -> tuple[type[PointMemo], tuple[()]]:
-        """Copies and pickles of a module start with nothing remembered: weak references cannot be copied."""
+        """Copies and pickles start empty: weak references cannot be copied."""
         return PointMemo, ()
 
     def ask(self, half: Half, points: Tensor, module: nn.Module, evaluate: Evaluate) -> Tensor:
@@ -275,7 +266,7 @@ class PointMemo:
 
 
 def _forgetter(memo: weakref.ref[PointMemo]) -> Callable[[object], None]:
-    """Called when one of the tensors of what waits dies."""
+    """Callback for the death of one of the memo's tensors."""
 
     def forget(dead: object) -> None:
         owner = memo()

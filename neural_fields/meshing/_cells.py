@@ -1,4 +1,8 @@
-"""The cells of a lattice that a surface crosses, and the 256 cases of marching cubes (Lorensen and Cline 1987)."""
+"""The cells of a lattice that a surface crosses, and the 256 cases of marching cubes (Lorensen and Cline 1987).
+
+All indices are lattice points (see `Lattice`). Blocks of cells are culled down to 2³ cells, whose centre is itself a
+lattice point; then signs at the corners of the remaining blocks are found.
+"""
 
 from __future__ import annotations
 
@@ -30,8 +34,7 @@ class Lattice:
     def over(cls, bounds: Bounds, resolution: int) -> Lattice:
         """The lattice with ``resolution`` cells along the longest axis of a box; other axes round up to whole cells.
 
-        Raises:
-            ValueError: the box is empty or not finite, or there are fewer than two cells.
+        ValueError if the box is empty or not finite, or for fewer than two cells.
         """
         low, high = (np.asarray(corner, np.float64) for corner in bounds)
         if low.shape != (3,) or high.shape != (3,) or not np.isfinite([low, high]).all() or not (low < high).all():
@@ -56,16 +59,9 @@ class Lattice:
 
 
 class Sampler:
-    """Evaluates a field in batches, checks what comes back, and counts.
+    """Evaluates a field at lattice points in batches of ``batch`` rows, checks that values are finite, and counts.
 
-    Args:
-        field: what is sampled, on the device and in the dtype of its first parameter (or of ``deltas``).
-        lattice: where.
-        batch: rows per call of the field.
-        progress: told ``(stage, done, total)`` after every batch.
-
-    Attributes:
-        counts: points sent to each level so far.
+    ``progress(stage, done, total)`` is called after every batch; ``counts`` holds the points sent to each level so far.
     """
 
     def __init__(self, field: Field, lattice: Lattice, batch: int, progress: Progress | None = None) -> None:
@@ -80,12 +76,9 @@ class Sampler:
     def values(
         self, count: int, points: Callable[[slice], NDArray[np.integer]], *, level: int, stage: str
     ) -> NDArray[np.floating]:
-        """Values at ``count`` lattice points → ``(count,)``, in the field's dtype.
+        """Values at ``count`` lattice points → ``(count,)``, in the field's dtype; ValueError if one is not finite.
 
-        ``points`` gives a part of them, ``(n, 3)``, when it is needed, so that they never exist all at once.
-
-        Raises:
-            ValueError: the field gave NaN or an infinity.
+        ``points`` returns a part of them, ``(n, 3)``, when it is needed, so that they never exist all at once.
         """
         parts = [np.empty(0, np.float32)]
         for start in range(0, count, self.batch):
@@ -100,11 +93,7 @@ class Sampler:
     def jets(
         self, positions: NDArray[np.float64], *, level: int, stage: str
     ) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
-        """Values ``(N,)`` and gradients ``(N, 3)`` at any positions ``(N, 3)``.
-
-        Raises:
-            ValueError: the field gave NaN or an infinity.
-        """
+        """Values ``(N,)`` and gradients ``(N, 3)`` at positions ``(N, 3)``; ValueError if one is not finite."""
         values = [np.empty(0, np.float32)]
         gradients = [np.empty((0, 3), np.float32)]
         for start in range(0, len(positions), self.batch):
@@ -153,7 +142,7 @@ _EDGE_FACES = [frozenset(i for i, face in enumerate(_FACES) if {a, b} <= set(fac
 
 
 class CubeTables(NamedTuple):
-    """What a case byte means.
+    """What a case byte means: bit c says that corner c is inside.
 
     Attributes:
         crossed: ``(256, 12)`` bool, the edges whose ends differ in sign.
@@ -192,7 +181,7 @@ def _loops(case: int) -> list[list[int]]:
 
 
 def _cut(loop: list[int]) -> list[tuple[int, int, int]]:
-    """Triangulate a polygon with as few diagonals inside a face of the cube as can be."""
+    """Triangulate a polygon with the fewest diagonals in a face, where the neighbour might place the same one."""
 
     @cache
     def best(i: int, j: int) -> tuple[int, tuple[tuple[int, int, int], ...]]:
@@ -212,7 +201,12 @@ def _cut(loop: list[int]) -> list[tuple[int, int, int]]:
 
 @cache
 def cube_tables() -> CubeTables:
-    """Derive the tables; a few milliseconds, once."""
+    """Derive the 256 cases from one rule per face instead of typing them in; a few milliseconds, once.
+
+    On each face, walked counter-clockwise from outside, every crossing from outside to inside is joined to the next one
+    back. Two cubes that share a face draw the same segments on it, so the surface has no cracks. Each crossed edge is
+    entered on one of its faces and left on the other, so segments close into loops, which are cut into triangles.
+    """
     inside = (np.arange(256)[:, None] >> np.arange(8) & 1).astype(bool)
     crossed = inside[:, EDGE_ENDS[:, 0]] != inside[:, EDGE_ENDS[:, 1]]
     ends = np.zeros((256, 8), bool)
@@ -244,7 +238,7 @@ class ActiveCells:
         cases: ``(C,)`` uint8 case of each cell (see `cube_tables`).
         corners: ``(8, C)`` rows of ``points``.
         points: ``(P, 3)`` lattice points.
-        values: ``(P,)`` their values; only those at the end of a crossed edge mean anything.
+        values: ``(P,)`` their values, valid at the ends of crossed edges.
     """
 
     cases: NDArray[np.uint8]
@@ -256,20 +250,16 @@ class ActiveCells:
 def cull_blocks(sampler: Sampler, *, level: int, lipschitz: float) -> tuple[Ints, Floats, NDArray[np.bool_]]:
     """Halve blocks from about 1/32 of the box down to 2³ cells, dropping those that cannot hold a zero.
 
-    A stage with blocks of half diagonal r asks level j only at the block centres c and keeps those with
+    A stage with blocks of half diagonal r evaluates level j at the block centres c and keeps those with
 
         |f_j(c)| ≤ L r + δ_j,
 
-    because a zero p of the target has |f_j(p)| < δ_j (it is in level j's band) and |f_j(c) − f_j(p)| ≤ L r. The
-    level is the first one with 4 δ_j ≤ L r: a finer one would cull little more; for the target δ is 0. Two
-    neighbouring centres with opposite signs are both kept whatever they say, since there the bound is violated.
+    because a zero p of the target has |f_j(p)| < δ_j and |f_j(c) − f_j(p)| ≤ L r. The level is the first with 4 δ_j ≤ L
+    r: a finer one would cull little more; for the target δ is 0. Neighbouring centres of opposite signs are both kept,
+    since there the bound is violated.
 
-    Returns:
-        Of the blocks of 2³ cells that were looked at: origins ``(B, 3)``, target values at the centres ``(B,)``, and
-        which survived ``(B,)``. The others still bound the field around them.
-
-    Raises:
-        NoSurfaceError: nothing survives.
+    Returns, of all blocks of 2³ cells evaluated: origins ``(B, 3)``, target values at the centres ``(B,)``, and which
+    survived ``(B,)``; the others still bound the field. Raises NoSurfaceError if none survives.
     """
     lattice = sampler.lattice
     deltas = [float(delta) for delta in sampler.field.deltas[:level]]
@@ -293,7 +283,7 @@ def cull_blocks(sampler: Sampler, *, level: int, lipschitz: float) -> tuple[Ints
 
 
 def _beside_other_sign(cells: Ints, inside: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Which of the ``cells`` (N, 3) have one of their six neighbours in the list with the other sign."""
+    """Which of the ``cells`` ``(N, 3)`` have one of their six neighbours in the list with the other sign."""
     size = cells.max(axis=0) + 2
     strides = np.array([size[1] * size[2], size[2], 1])
     keys = cells @ strides
@@ -322,15 +312,14 @@ def _where_signs_are(values: Floats, points: Ints, lattice: Lattice, sampler: Sa
 def active_cells(
     sampler: Sampler, blocks: Ints, centres: Floats, kept: NDArray[np.bool_], *, level: int, lipschitz: float
 ) -> ActiveCells:
-    """Find the crossed cells of 2³-cell blocks, and exact values at both ends of every crossed edge.
+    """The crossed cells of 2³-cell blocks, with exact values at both ends of every crossed edge.
 
-    The sign at a corner q follows from any known centre c of a block around it with |f(c)| > L |q − c|; only the other
-    corners are evaluated, then the ends of the edges that turn out to be crossed, until nothing is new. Where
-    the surface leaves the blocks through a face, the neighbour there is added and the search goes on, so that
-    the surface is closed inside the box also where the field is steeper than L.
+    The sign at a corner q follows from any known centre c of a block around it with |f(c)| > L |q − c|; only other
+    corners are evaluated, then the ends of crossed edges, until nothing is new. Where the surface leaves the blocks
+    through a face, the neighbour there is added: the surface is closed inside the box also where the field is steeper
+    than L.
 
-    Raises:
-        NoSurfaceError: the blocks hold no sign change.
+    Raises NoSurfaceError if the blocks hold no sign change.
     """
     known: tuple[Ints, Floats] = (np.empty(0, np.int64), centres[:0])
     while True:
@@ -355,8 +344,8 @@ class _Corners:
     """Signs and values at the corner points of a set of 2³-cell blocks.
 
     Every point belongs to the block at its lower end: point ``(2 b + o)`` with ``o`` in {0, 1}³ is number ``o`` of
-    block b. The points on the upper sides belong to the neighbours there, which are listed as owners whether
-    they are blocks of the set or not, so that shared points have one number and no sorting of points is needed.
+    block b. Points on the upper sides belong to the neighbours there, listed as owners whether in the set or not:
+    shared points have one number, and no sorting of points is needed.
     """
 
     def __init__(
@@ -424,7 +413,7 @@ class _Corners:
     def _find_signs(self, seen: Ints, centres: Floats, slope: float) -> None:
         """Bound the field at every point by ``centres ± slope · distance``, and evaluate where that leaves both signs.
 
-        ``seen`` are the keys of all blocks whose centre is known, those outside the set among them.
+        ``seen`` are the keys of all blocks whose centre is known, inside the set or not.
         """
         low, high = np.full_like(self.value, -np.inf), np.full_like(self.value, np.inf)
         for corner in CORNERS:
@@ -487,7 +476,7 @@ class _Corners:
         return self._places(np.unique(np.concatenate(found)), (0, 0, 0))
 
     def known_values(self) -> tuple[Ints, Floats]:
-        """What has been evaluated: keys of points, and their values."""
+        """Keys of all points evaluated, and their values."""
         rows = np.flatnonzero(self.known)
         return self.owners[rows // 8] * 8 + rows % 8, self.value[rows]
 

@@ -1,4 +1,4 @@
-"""How the coordinates of an input become those that other programs expect: which axis is up, how long a unit is."""
+"""From the coordinates of an input to those that other programs expect: up axis and unit."""
 
 from __future__ import annotations
 
@@ -20,12 +20,9 @@ Z_TO_Y = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 
 class Frame(NamedTuple):
-    """What programs take the coordinates of a format for.
+    """The coordinates that programs expect of a format: the ``up`` axis, the ``unit`` (a key of `METRES`).
 
-    Attributes:
-        up: the axis.
-        unit: a key of `METRES`.
-        always: whether that is so by the standard, so that files follow it unasked; else it is what importers assume.
+    ``always`` if the standard fixes them, so that files follow unasked; else they are what importers assume.
     """
 
     up: str
@@ -45,14 +42,14 @@ FRAMES = {
 
 @dataclass(frozen=True)
 class Placement:
-    """What is known of an input's coordinates, and whether its shape shall stand at the origin.
+    """Known properties of an input's coordinates, and whether the shape is centred at the origin.
 
-    A GLB is y-up and in metres by its standard; where nothing is said, the input is taken to be so as well. In PLY,
-    OBJ and STL the coordinates of the input stay as they are but for what is said here.
+    A GLB is y-up and in metres by its standard, and so is the input unless given here. In PLY, OBJ and STL coordinates
+    change only as given here.
 
     Attributes:
         up: the axis that points up in the input, "y" or "z".
-        unit: the length of one input unit, a key of `METRES`: "mm", "cm", "m", ….
+        unit: length of one input unit, a key of `METRES`: "mm", "cm", "m", ….
         center: whether the middle of the shape's bounding box goes to the origin.
 
     Raises:
@@ -70,12 +67,7 @@ class Placement:
             raise ValueError(f"unit={self.unit!r}: expected one of {', '.join(METRES)}")
 
     def into(self, suffix: str, vertices: Float64) -> FileTransform:
-        """The map from input coordinates to those of a file.
-
-        Args:
-            suffix: of the file, a key of `FRAMES`.
-            vertices: ``(V, 3)`` in input coordinates; their box is what is centred.
-        """
+        """The map from input coordinates to those of a file (``suffix`` a key of `FRAMES`); centres ``vertices``."""
         frame = FRAMES[suffix.lower()]
         turn = np.eye(3)
         if self.up is not None and self.up != frame.up:
@@ -85,11 +77,7 @@ class Placement:
         return FileTransform(turn, scale, middle)
 
     def describe(self, suffix: str) -> str | None:
-        """A line that says what a file's coordinates are, and what was taken for granted; None: they are the input's.
-
-        Args:
-            suffix: of the file, a key of `FRAMES`.
-        """
+        """A line about a file's coordinates and what was assumed; None if they are the input's."""
         frame = FRAMES[suffix.lower()]
         words = []
         if self.up is not None or frame.always:
@@ -112,10 +100,7 @@ class Placement:
 class FileTransform(NamedTuple):
     """The map ``x → scale · turn (x − middle)``, float64.
 
-    Attributes:
-        turn: ``(3, 3)``, a rotation by right angles.
-        scale: file units per input unit.
-        middle: ``(3,)`` in input coordinates, what goes to the origin.
+    ``turn`` ``(3, 3)`` rotates by right angles, ``scale`` is file units per input unit, ``middle`` ``(3,)`` goes to 0.
     """
 
     turn: Float64
@@ -132,16 +117,16 @@ class FileTransform(NamedTuple):
         return self.scale * (rows - self.middle) @ self.turn.T
 
     def directions(self, rows: NDArray[np.floating]) -> NDArray[np.floating]:
-        """Directions ``(..., 3)``, turned; their length and precision stay."""
+        """Directions ``(..., 3)``, turned; length and precision stay."""
         return rows @ self.turn.T.astype(rows.dtype)
 
     def home(self, similarity: Similarity) -> Similarity:
-        """Where the shape is in the file, and how large, if ``similarity`` says it of the input."""
+        """Place and size of the shape in the file, from those in the input."""
         x, y, z = self.points(np.asarray(similarity.center)).tolist()
         return Similarity((x, y, z), similarity.scale * self.scale)
 
     def node(self, origin: tuple[float, float, float]) -> dict[str, Any]:
-        """The same map as translation, rotation and scale of a glTF node, for positions relative to ``origin``."""
+        """The map as translation, rotation and scale of a glTF node, for positions relative to ``origin``."""
         translation = (self.points(np.asarray(origin)) + 0.0).tolist()  # no negative zero
         node: dict[str, Any] = {"translation": translation}
         if (self.turn != np.eye(3)).any():

@@ -1,4 +1,4 @@
-"""Geometry whose features are joined by learnt ones of the position: detail of colour that no surface has to carry."""
+"""Fields with a learnt encoding of the position among their features: colour detail that the surface need not carry."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from .hash_encoding import HashEncoding
 
 
 class EncodedField(Field):
-    """A field whose features are its own and, after them, ``gain · e(x)`` of a hash encoding e.
+    """A three-dimensional field whose features are its own, followed by ``gain · e(x)`` of a hash encoding e.
 
-    A colour network of a NeuS-style host gets the detail of the position from these features, so that the surface need
-    not bend for it: value, gradient, levels and bands stay those of the field. Hosts set one learning rate for all,
-    which is too low for a table; the gain makes up for that.
+    A colour network of a NeuS-style host gets positional detail from these features, so that the surface need not bend
+    for it: value, gradient, levels and bands stay those of the field.
 
     Args:
-        field: three-dimensional; a part of this module.
-        grid: the encoding e, a part of this module too; one of 24 features over the cube ±1 by default.
-        gain: factor on what it says. Tables learn at 0.01 in Instant-NGP (Müller et al. 2022, Sec. 4); entries that
-            count 64 times learn as if at 0.03 beside networks at 5e-4, as Adam's steps do not depend on their size.
+        field: a part of this module.
+        grid: the encoding e; one of 24 features over the cube ±1 by default.
+        gain: factor on e. Hosts have one rate for all, too low for a table: Instant-NGP (Müller et al. 2022, Sec. 4)
+            learns them at 0.01. With 64, entries learn as if at 0.03 beside networks at 5e-4, as Adam's steps have a
+            fixed size.
 
     Raises:
         ValueError: the field is not three-dimensional, or the gain not positive.

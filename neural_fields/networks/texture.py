@@ -1,12 +1,9 @@
 """Colour as a field over the band around a surface: the paper's texture network g (Sec. 3, "Texture mapping").
 
-With ω₀ folded in as in `siren`, the three outputs of a SIREN and their derivative along a direction v come from
-one pass of one tangent, two matrix products per layer and no automatic differentiation:
+With ω₀ folded in as in `siren`, colour and its derivative along a direction v come from one pass of one tangent:
 
     z_i = W_i h_{i-1} + b_i,   h_i = sin z_i,           h_0 = x,   g(x) = W_out h_d + b_out
                                u_i = (W_i u_{i-1}) ⊙ cos z_i,   u_0 = v,   ∇g(x) v = W_out u_d
-
-The whole Jacobian is three sweeps back, one per channel, made as a single product per layer.
 """
 
 from __future__ import annotations
@@ -29,7 +26,7 @@ class ColorSiren(nn.Module):
         depth: number of sine layers, at least 1.
         omega: the frequency ω₀ of Eq. 2; textures have finer detail than shapes.
         in_dim: dimension of the domain.
-        mean: RGB that the untrained network gives nearly everywhere.
+        mean: RGB of the untrained network nearly everywhere.
 
     Raises:
         ValueError: an argument is out of range.
@@ -44,13 +41,7 @@ class ColorSiren(nn.Module):
     """
 
     def __init__(
-        self,
-        width: int,
-        depth: int,
-        *,
-        omega: float = 60.0,
-        in_dim: int = 3,
-        mean: Sequence[float] = (0.5, 0.5, 0.5),
+        self, width: int, depth: int, *, omega: float = 60.0, in_dim: int = 3, mean: Sequence[float] = (0.5, 0.5, 0.5)
     ) -> None:
         super().__init__()
         self.siren = Siren(width, depth, omega=omega, in_dim=in_dim, num_features=2)
@@ -77,17 +68,10 @@ class ColorSiren(nn.Module):
         return torch.cat(values).reshape(shape), torch.cat(gradients).reshape(*shape, x.shape[-1])
 
     def derivative_along(self, x: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
-        """Colours, and their derivative ``∇g(x) v`` along ``v``, by one tangent forward.
+        """Colours and their derivative ``∇g(x) v``, both ``(..., 3)``, by one tangent forward.
 
-        Args:
-            x: ``(..., d)``.
-            direction: ``(..., d)``, the v of each point; need not be of unit length.
-
-        Returns:
-            Both ``(..., 3)``, differentiable with respect to parameters, ``x`` and ``direction``.
-
-        Raises:
-            ValueError: the shapes differ.
+        ``x`` and the directions v, of any length, are ``(..., d)``. Differentiable by parameters, ``x`` and
+        ``direction``.
         """
         if direction.shape != x.shape:
             raise ValueError(f"direction has shape {tuple(direction.shape)}; expected that of x, {tuple(x.shape)}")
@@ -113,15 +97,14 @@ class ColorSiren(nn.Module):
 class TextureField(OneLevelField):
     """RGB in the band ``|f| < δ`` around a surface, a constant colour elsewhere.
 
-    Colours are display numbers (sRGB-encoded) in [0, 1]: the network's output is clamped. Points outside the band
-    are gathered away before the network sees them. Whether a point is inside costs one value of the geometry;
-    who knows that it is (traced hits, samples) calls `colors`, which does not ask.
+    Colours are display numbers (sRGB-encoded) in [0, 1]: the network's output is clamped. Points outside the band are
+    gathered away before the network is evaluated, for one value of the geometry per point; `colors` skips that test.
 
     Args:
-        geometry: the field f whose surface has the colours; only evaluated, never trained here.
+        geometry: the field f whose surface has the colours; evaluated only, never trained here.
         network: g.
         delta: half-width δ of the band, in units of the field.
-        geometry_level: the level of the geometry that is meant.
+        geometry_level: the level of the geometry.
         outside: RGB outside the band.
 
     Raises:
@@ -160,7 +143,7 @@ class TextureField(OneLevelField):
         self.outside: Tensor
 
     def colors(self, x: Tensor) -> Tensor:
-        """Colours at ``x`` ``(..., d)`` → ``(..., 3)``, in the band or not: the geometry is not asked."""
+        """Colours at ``x`` ``(..., d)`` → ``(..., 3)``, in the band or not; the geometry is not evaluated."""
         return self.network.value(x).clamp(0, 1)
 
     def value(self, x: Tensor, *, level: int = -1) -> Tensor:
@@ -180,11 +163,7 @@ class TextureField(OneLevelField):
         return Jet(value.reshape(shape), gradient.reshape(*shape, self.in_dim), x.new_empty((*x.shape[:-1], 0)))
 
     def derivative_along(self, x: Tensor, direction: Tensor, *, level: int = -1) -> tuple[Tensor, Tensor]:
-        """Colours and their derivative along ``direction``, both ``(..., 3)``: see `ColorSiren.derivative_along`.
-
-        Raises:
-            ValueError: the shapes of ``x`` and ``direction`` differ.
-        """
+        """Colours and their derivative along ``direction``, both ``(..., 3)``: see `ColorSiren.derivative_along`."""
         rows, inside = self._inside(x, level)
         if direction.shape != x.shape:
             raise ValueError(f"direction has shape {tuple(direction.shape)}; expected that of x, {tuple(x.shape)}")

@@ -1,4 +1,4 @@
-"""Moving fields in closed form: ground truth for evolution, as `fields.primitives` is for shapes that stand still."""
+"""Moving fields in closed form, as `fields.primitives` has static ones."""
 
 from __future__ import annotations
 
@@ -17,13 +17,10 @@ class RigidMotion:
     """A rotation about an axis that itself travels: x(t) = c + v t + R(ω t)(x₀ − c).
 
     Args:
-        axis: direction of the axis; any length but zero.
+        axis: direction of the axis, of any length but zero; ValueError otherwise.
         angle: ω, radians per unit of time.
         center: c, a point on the axis at time 0.
         velocity: v, units per unit of time.
-
-    Raises:
-        ValueError: the axis has no length.
 
     Example:
         >>> import torch
@@ -77,11 +74,11 @@ class RigidMotion:
 
 
 class Moving(Field):
-    """A field carried by a rigid motion: f(x, t) = g(x at time 0), a distance at all times if g is one.
+    """A field g carried by a rigid motion: f(x, t) = g(x at time 0), a distance at all times if g is one.
 
     Args:
         field: g, three-dimensional, with any number of levels; or a function of points ``(..., 3)`` → ``(...,)``.
-        motion: how it moves.
+        motion: the rigid motion.
     """
 
     defined_by = ("motion",)
@@ -122,17 +119,11 @@ class Moving(Field):
 class ShrinkingSphere(OneLevelField):
     """The sphere that mean curvature shrinks, |x| = √(r₀² − 4αt), as a distance or as a solution.
 
-    The distance f = |x| − √(r₀² − 4αt) obeys ∂f/∂t = α|∇f|κ on its surface only: the law would have outer shells
-    shrink more slowly, and they would not stay at their distances. ``exact_law=True`` gives the field
+    The distance f = |x| − √(r₀² − 4αt) obeys ∂f/∂t = α|∇f|κ on its surface only. ``exact_law=True`` gives the field
     f = √(|x|² + 4αt) − r₀ with the same surface, which obeys it everywhere but is a distance at t = 0 only.
 
-    Args:
-        radius: r₀.
-        alpha: α; negative lets it grow.
-        exact_law: which of the two.
-
-    Raises:
-        ValueError: ``radius`` is not positive, or the sphere is gone before t = 1.
+    ``radius`` is r₀, ``alpha`` α (negative: it grows). ValueError if r₀ is not positive, or the sphere vanishes before
+    t = 1.
     """
 
     defined_by = ("radius", "alpha", "exact_law")
@@ -168,8 +159,8 @@ class ShrinkingSphere(OneLevelField):
 class Keyframes(OneLevelField):
     """Shapes at given times, blended in between: f(x, t) = Σ_k w_k(t) f_k(x) with hat functions w_k.
 
-    Before the first time and after the last the field stands still. The blend is exact at the key times; in between
-    it is a guide, not a distance: where ∇f_k and ∇f_{k+1} disagree, |∇f| < 1.
+    Before the first time and after the last the field stands still. In between it is a guide, not a distance: |∇f| < 1
+    where ∇f_k and ∇f_{k+1} disagree.
 
     Args:
         times: strictly increasing.

@@ -1,12 +1,10 @@
 """A velocity for the points of a moving surface: the best motion of the whole shape, and the rest along the normal.
 
-A level set defines only the normal speed v_n = −∂f/∂t / |∇f| of its points. By that alone (see `track`) the points of a
+A level set defines only the normal speed v_n = −∂f/∂t / |∇f| of its points; by that alone (see `track`) the points of a
 travelling ball slide to its rear. This takes the motion u(x) = a + b × x + c x (travel, turn and growth) that explains
 the normal speeds best,
 
     min over a, b, c of Σ (⟨n, u(x)⟩ − v_n(x))²  over points of the surface,   V = u + (v_n − ⟨n, u⟩) n.
-
-Rigid motions are carried exactly, as far as a surface shows them: a sphere that turns looks at rest.
 """
 
 from __future__ import annotations
@@ -23,18 +21,17 @@ from .field import at_time
 
 
 class CarriedVelocity:
-    """V(x, t) on a moving surface, for `flow`: the best motion as a whole, and the normal speed that it leaves.
+    """V(x, t) on a moving surface, for `flow`.
+
+    Rigid motions are exact as far as normals show them: a turning sphere stays at rest.
 
     Args:
         field: four-dimensional.
         level: whose surface.
-        nodes: times at which the motion as a whole is found; in between it is interpolated.
+        nodes: times at which the motion as a whole is found, at least 2; interpolated in between.
         samples: points of the surface for that, drawn near it at random.
-        least_slope: |∇f| is taken for at least this much, which bounds the velocity where a surface is torn.
+        least_slope: lower bound on |∇f|, which bounds the velocity where a surface is torn.
         seed: of the points.
-
-    Raises:
-        ValueError: the field is not four-dimensional, has no such level, or there are fewer than 2 nodes.
 
     Example:
         >>> import torch

@@ -1,7 +1,6 @@
-"""Neural attribute mapping of the paper (Sec. 3): what a field g says at points p of another surface S, near f = 0.
+"""Neural attribute mapping of the paper (Sec. 3): attributes g of a field f at points p of another surface near f = 0.
 
-The attributes of f live in its band, ``|f| < δ``. A point of S in the band is asked as it is, since g is constant
-along the normals of f. A point outside is first moved to the surface, down ∇f.
+g lives in the band ``|f| < δ`` and is constant along the normals of f. Points outside the band are first moved down ∇f.
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ def project_to_surface(
         field: f; or any function of points ``(..., 3)`` → ``(...,)``.
         points: ``(..., d)``, in the field's coordinates.
         level: whose surface.
-        steps: at most so many evaluations per point; points that have arrived are left alone.
+        steps: most evaluations per point; points that have arrived are left alone.
         tolerance: on ``|f|``, in field units.
 
     Returns:
@@ -85,7 +84,7 @@ def map_attribute(
     level: int = -1,
     batch: int = 1 << 18,
 ) -> Mapped:
-    """The mapping {S, f, g} of the paper at points of any surface S.
+    """The mapping {S, f, g} of the paper at points of any surface S; errors are those of `project_to_surface`.
 
     Args:
         field: f; or a function, as in `project_to_surface`.
@@ -94,9 +93,6 @@ def map_attribute(
         delta: half-width of the band, in field units.
         level: of f.
         batch: points at a time.
-
-    Raises:
-        ValueError: there is no such level, or the dimension is wrong.
 
     Example:
         >>> import torch
@@ -116,26 +112,12 @@ def map_attribute(
 
 
 def map_colors(texture: TextureField, points: Tensor, *, batch: int = 1 << 18) -> Mapped:
-    """Neural texture mapping: the colours of a texture at points of any surface near its geometry.
+    """Neural texture mapping: the colours of a texture at points ``(..., d)`` of any surface near its geometry.
 
-    Args:
-        texture: g, with its f and δ.
-        points: ``(..., d)``, in the field's coordinates.
-        batch: points at a time.
-
-    Returns:
-        Colours ``(..., 3)``, those not reached being ``texture.outside``, and which were reached.
-
-    Raises:
-        ValueError: the dimension is wrong.
+    Colours ``(..., 3)`` of points that were not reached are ``texture.outside``. ``batch`` is points at a time.
     """
     values, reached = map_attribute(
-        texture.geometry,
-        texture.colors,
-        points,
-        delta=float(texture.delta),
-        level=texture.geometry_level,
-        batch=batch,
+        texture.geometry, texture.colors, points, delta=float(texture.delta), level=texture.geometry_level, batch=batch
     )
     return Mapped(torch.where(reached[..., None], values, texture.outside.to(values)), reached)
 

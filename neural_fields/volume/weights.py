@@ -2,8 +2,8 @@
 
 A ray x(t) = o + t v is cut into intervals. With Φ_s(f) = 1 / (1 + e^{−s f}), an interval along which f falls from f_in
 to f_out stops the share α = max(0, 1 − Φ_s(f_out) / Φ_s(f_in)) = 1 − e^{−τ} of the light, with the optical depth τ =
-softplus(−s f_out) − softplus(−s f_in). Transmittances are T_i = exp(−Σ_{j<i} τ_j), the weights w_i = T_i α_i. So Σ w_i
-+ T_end = 1 holds by telescoping, without products that underflow.
+softplus(−s f_out) − softplus(−s f_in). Transmittances are T_i = exp(−Σ_{j<i} τ_j), the weights w_i = T_i α_i, so Σ w_i
++ T_end = 1 without products that underflow.
 """
 
 from __future__ import annotations
@@ -19,12 +19,7 @@ from ..fields.similarity import ball_chord
 
 
 class Weights(NamedTuple):
-    """How much each interval of a ray contributes.
-
-    Attributes:
-        weights: ``(R, S)``, w_i = T_i α_i.
-        remaining: ``(R,)``, the transmittance behind the last interval; Σ w_i + remaining = 1.
-    """
+    """``weights`` ``(R, S)``, w_i = T_i α_i, and ``remaining`` ``(R,)``, the transmittance behind the last interval."""
 
     weights: Tensor
     remaining: Tensor
@@ -35,8 +30,8 @@ def neus_optical_depth(
 ) -> Tensor:
     """Optical depth τ ≥ 0 of intervals, from the field at their middles (NeuS, Eq. 13, in logarithms).
 
-    The field is extended along the ray by its slope c: f_in, f_out = f ∓ c Δ / 2. Early in training a half-open
-    slope keeps gradients alive where the surface looks away: c′ = −((1 − a) relu(½ − ½c) + a relu(−c)).
+    The field is extended along the ray by its slope c: f_in, f_out = f ∓ c Δ / 2. Early in training a half-open slope
+    keeps gradients alive where the surface looks away: c′ = −((1 − a) relu(½ − ½c) + a relu(−c)).
 
     Args:
         value: ``(...,)`` f at the middle of each interval.
@@ -92,15 +87,9 @@ def ray_points(origins: Tensor, directions: Tensor, depths: Tensor) -> Tensor:
 
 
 def sphere_span(origins: Tensor, directions: Tensor, *, radius: float = 1.0) -> tuple[Tensor, Tensor]:
-    """Where rays enter and leave a sphere around the origin: depths ``(R,)`` and ``(R,)``.
+    """Depths ``(R,)`` at which rays with unit directions enter and leave a sphere around 0.
 
-    The span of a ray that misses the sphere, or leaves it behind itself, has no length. Rays that start inside begin
-    at depth 0.
-
-    Args:
-        origins: ``(R, 3)``.
-        directions: ``(R, 3)`` unit vectors.
-        radius: of the sphere.
+    The span of a ray that misses the sphere, or leaves it behind itself, has no length. Rays inside begin at depth 0.
     """
     middle, half = ball_chord(origins, directions, radius)
     far = (middle + half).clamp(min=0)
@@ -110,8 +99,7 @@ def sphere_span(origins: Tensor, directions: Tensor, *, radius: float = 1.0) -> 
 def stratified_depths(near: Tensor, far: Tensor, count: int, *, generator: torch.Generator | None = None) -> Tensor:
     """``count`` increasing depths ``(R, count)`` from near to far ``(R,)``: one in each of as many equal strata.
 
-    With a generator the depths of a ray are shifted together by a random part of a stratum; without, they are
-    the middles of the strata.
+    With a generator the depths of a ray are shifted together by a random part of a stratum; else they are the middles.
     """
     shift = uniform((len(near), 1), generator, near.device) if generator else 0.5
     strata = (torch.arange(count, device=near.device) + shift) / count
@@ -121,16 +109,10 @@ def stratified_depths(near: Tensor, far: Tensor, count: int, *, generator: torch
 def secant_weights(
     depths: Tensor, values: Tensor, inv_std: Tensor | float, *, cos_anneal: Tensor | float = 1.0
 ) -> Tensor:
-    """Weights ``(R, S − 1)`` of the intervals between depths, from the field's values at their ends alone.
+    """Weights ``(R, S − 1)`` of intervals from the values ``(R, S)`` at their ends, the increasing depths ``(R, S)``.
 
-    The slope is the lesser (steeper) one of the interval's own secant and the one before, so that an interval which the
-    surface enters through its end is found as well (NeuS, suppl. "hierarchical sampling").
-
-    Args:
-        depths: ``(R, S)`` increasing, S ≥ 2.
-        values: ``(R, S)`` the field there.
-        inv_std: s of the weights.
-        cos_anneal: see `neus_optical_depth`.
+    The slope is the steeper one of the interval's own secant and the one before, so that an interval which the surface
+    enters through its end is found as well (NeuS, suppl. "hierarchical sampling").
     """
     interval = depths.diff(dim=1)
     secant = values.diff(dim=1) / interval.clamp(min=1e-9)
@@ -144,16 +126,9 @@ def secant_weights(
 def importance_depths(
     depths: Tensor, values: Tensor, count: int, inv_std: Tensor | float, *, generator: torch.Generator | None = None
 ) -> Tensor:
-    """``count`` more depths on each ray, where the field's weights say that its surface is → ``(R, count)``, sorted.
+    """``count`` more depths on each ray near its surface, ``(R, count)``, sorted: quantiles of the `secant_weights`.
 
-    The new depths are quantiles of the piecewise constant density of `secant_weights`.
-
-    Args:
-        depths: ``(R, S)`` increasing, S ≥ 2.
-        values: ``(R, S)`` the field there.
-        count: how many.
-        inv_std: s of the weights; doubled from one round to the next.
-        generator: draws stratified quantiles; without, they are the middles of ``count`` equal parts.
+    A ``generator`` draws stratified quantiles; without, they are the middles of ``count`` equal parts.
     """
     interval = depths.diff(dim=1)
     weights = secant_weights(depths, values, inv_std)
@@ -182,8 +157,7 @@ def outside_depths(far: Tensor, count: int, *, generator: torch.Generator | None
 def invert_outside(points: Tensor) -> Tensor:
     """(x, y, z) outside the unit sphere → (x, y, z) / r and 1 / r, four numbers in [−1, 1] (NeRF++, Sec. 4).
 
-    Args:
-        points: ``(..., 3)``; inside the unit sphere they are taken as if they lay on it.
+    Points inside the unit sphere are taken as if on it.
     """
     radius = torch.linalg.vector_norm(points, dim=-1, keepdim=True).clamp(min=1)
     return torch.cat((points / radius, 1 / radius), dim=-1)

@@ -1,4 +1,4 @@
-"""Value and gradient of a SIREN in one launch, with products in IEEE float32: what training records on its graph."""
+"""Value and gradient of a SIREN in one launch, with products in IEEE float32, for training."""
 
 # pyright: reportGeneralTypeIssues=false, reportArgumentType=false, reportCallIssue=false
 # pyright: reportAttributeAccessIssue=false, reportMissingImports=false
@@ -16,23 +16,11 @@ from .tiles import jet_of_tile, planes
 
 @triton.jit(do_not_specialize=["count"])
 def evaluate(
-    x,
-    parameters,
-    value,
-    gradient,
-    scratch,
-    count,
-    omega,
-    gain,
-    PLANES: tl.constexpr,
-    ROWS: tl.constexpr,
-    IN: tl.constexpr,
-    WIDTH: tl.constexpr,
-    DEPTH: tl.constexpr,
-    COLUMNS: tl.constexpr,
-    PIECE: tl.constexpr,
-):
-    """Every program takes tiles from its own number on, in steps of how many programs there are."""
+    x, parameters, value, gradient, scratch, count, omega, gain,
+    PLANES: tl.constexpr, ROWS: tl.constexpr, IN: tl.constexpr, WIDTH: tl.constexpr, DEPTH: tl.constexpr,
+    COLUMNS: tl.constexpr, PIECE: tl.constexpr,
+):  # fmt: skip
+    """Every program takes tiles from its own number on, in steps of the number of programs."""
     STRIDE: tl.constexpr = (WIDTH + COLUMNS - 1) // COLUMNS * COLUMNS
     own = scratch + tl.program_id(0).to(tl.int64) * (PLANES * ROWS * STRIDE)
     for tile in range(tl.program_id(0), tl.cdiv(count, ROWS), tl.num_programs(0)):
@@ -46,12 +34,7 @@ def evaluate(
 
 
 def jet(x: Tensor, network: Network) -> tuple[Tensor, Tensor]:
-    """F and its gradient at points ``(N, d)`` → ``(N,)``, ``(N, d)``; N may be 0.
-
-    Args:
-        x: float32, on a CUDA device, or on the CPU under the interpreter.
-        network: on the same.
-    """
+    """F and its gradient at float32 points ``(N, d)`` → ``(N,)``, ``(N, d)``; N may be 0."""
     value, gradient = x.new_empty(len(x)), x.new_empty(x.shape)
     if len(x):
         tiling = tiling_of(network.width)

@@ -20,14 +20,12 @@ from weakref import WeakKeyDictionary
 import torch
 from torch import Tensor
 
-# Sines are multiplied by this before they are split: a power of two, so that their low halves are normal numbers.
-SINES = 1024.0
-# The largest entry of a scaled matrix lies in (LARGEST_WEIGHT / 2, LARGEST_WEIGHT].
-LARGEST_WEIGHT = 16.0
+SINES = 1024.0  # factor of sines before they are split, a power of two: their low halves are normal numbers
+LARGEST_WEIGHT = 16.0  # the largest entry of a scaled matrix lies in (LARGEST_WEIGHT / 2, LARGEST_WEIGHT]
 
 
 class Shape(NamedTuple):
-    """What a kernel is compiled for.
+    """Compile-time shape of a network.
 
     Attributes:
         width: units of a sine layer, padded with zeros to a multiple of an accumulator.
@@ -50,7 +48,7 @@ class Shape(NamedTuple):
         """One accumulator up to 128 units, or on Hopper 256; accumulators of 128 beyond.
 
         Only Hopper's products take their second operand from shared memory, and leave registers for 256 units. Above
-        128 units the weights of a level do not stay in shared memory; there twice as many points share them.
+        128 units the weights of a level do not stay in shared memory; twice as many points share them.
         """
         kept_width = 128  # two halves of such a matrix, 64 KiB, fit the shared memory of a program
         columns = max(16, 1 << (width - 1).bit_length())
@@ -67,7 +65,7 @@ class Shape(NamedTuple):
         return self.depth == 1 or (self.depth == 2 and self.width == self.columns)
 
     def scratch(self, rows: int, *, jet: bool) -> int:
-        """How many float16 numbers a program keeps in scratch for a tile of ``rows`` points."""
+        """Float16 numbers in a program's scratch for a tile of ``rows`` points."""
         if self.direct:
             return 0
         return 2 * rows * self.width * (2 + max(0, self.depth - 2) * jet)
@@ -79,8 +77,8 @@ class Packed(NamedTuple):
     Attributes:
         floats: float32, in rows of ``shape.width``: of the first layer one for each coordinate and one of biases; the
             biases of the other sine layers; the output's weights, and these scaled for the sweep back. Then numbers:
-            the output's bias, (2π)^depth, and of each hidden layer what its products are multiplied by, there and back.
-            Phases are in turns, and the output's gain is included.
+            the output's bias, (2π)^depth, and of each hidden layer the factors of its products, there and back. Phases
+            are in turns, and the output's gain is included.
         halves: float16 ``(depth − 1, 2, width, width)``: H and L of each hidden layer; rows are inner units.
         shape: see `Shape`.
     """
@@ -94,10 +92,7 @@ class Packed(NamedTuple):
 def pack(parameters: Sequence[Tensor], omega: float, gain: float) -> Packed:
     """Pack a SIREN by a few dozen small operations on its device, none of which waits.
 
-    Args:
-        parameters: (W₁, b₁, …, W_d, b_d, W_out, b_out); of the output the first row is used.
-        omega: factor of the phases, ω₀ times the unit of the sine layers' parameters.
-        gain: factor of the output.
+    ``omega`` is ω₀ times the unit of the sine layers' parameters, ``gain`` the factor of the output.
     """
     turns = omega / (2 * math.pi)
     width = len(parameters[0])
@@ -134,7 +129,7 @@ def pack(parameters: Sequence[Tensor], omega: float, gain: float) -> Packed:
 
 @functools.cache
 def is_hopper(device: torch.device) -> bool:
-    """Whether a device has compute capability 9; the interpreter is taken for one that has."""
+    """Whether a device has compute capability 9; true for the interpreter."""
     return device.type != "cuda" or torch.cuda.get_device_capability(device)[0] == 9
 
 
@@ -145,7 +140,7 @@ def power_of_two(target: float, like: Tensor) -> Tensor:
 
 
 class Weights(Protocol):
-    """What is asked of a `Siren`: its parameters, and what phases and outputs are multiplied by."""
+    """Interface of a `Siren`: its parameters and their units."""
 
     omega: float
     units: tuple[float, float]
@@ -169,8 +164,8 @@ def state_of(network: Weights) -> tuple[object, ...]:
 def packed(network: Weights) -> Packed:
     """A SIREN's weights for the kernels; packed again, into the same memory, when they have changed.
 
-    Changes are known by PyTorch's version counters, which changes through ``.data`` and CUDA graphs do not count: after
-    those, call ``torch.autograd.graph.increment_version(parameters)``.
+    Changes are known by PyTorch's version counters. After changes through ``.data`` or CUDA graphs, call
+    ``torch.autograd.graph.increment_version(parameters)``.
     """
     state, before = state_of(network), _kept.get(network)
     if before is not None and before[0] == state:

@@ -1,4 +1,4 @@
-"""What a value allows a ray, as `mplicits.neural_fields.tracing._march.look` has it, for kernels that march rays."""
+"""The rules of `tracing._march.look` for kernels that march rays."""
 
 # pyright: reportGeneralTypeIssues=false, reportArgumentType=false, reportCallIssue=false
 # pyright: reportAttributeAccessIssue=false, reportMissingImports=false, reportAssignmentType=false
@@ -25,10 +25,7 @@ def first_band(value, deltas, LEVELS: tl.constexpr):
 
 @triton.jit
 def turned_back(raw, depth, entry, low, low_value, sign):
-    """A start behind the surface: look again where the ray may begin, and if that is inside, for the way out.
-
-    Returns who has to, and by what values of the others are multiplied from now on.
-    """
+    """Which rays start behind the surface and go back to where they may begin, and the new sign of values."""
     fresh = (low_value == float("inf")) & (depth == low)
     back = fresh & (raw < 0) & (depth > entry)
     return back, tl.where(fresh & (raw < 0), tl.where(back, 1.0, -1.0), sign)
@@ -36,31 +33,15 @@ def turned_back(raw, depth, entry, low, low_value, sign):
 
 @triton.jit
 def look_at(
-    value,
-    delta,
-    depth,
-    far,
-    low,
-    low_value,
-    free,
-    gap,
-    high,
-    high_value,
-    boldness,
-    steps,
-    tolerance,
-    resolution,
+    value, delta, depth, far, low, low_value, free, gap, high, high_value, boldness, steps, tolerance, resolution,
     lipschitz,
-    PATIENCE: tl.constexpr,
-    BOLDNESS: tl.constexpr,
-    STEEPEST_RISE: tl.constexpr,
-    BAND_ENTRY: tl.constexpr,
+    PATIENCE: tl.constexpr, BOLDNESS: tl.constexpr, STEEPEST_RISE: tl.constexpr, BAND_ENTRY: tl.constexpr,
     FLOOR: tl.constexpr,
-):
-    """Take in values at ``depth``, the ``steps``-th that rays see, outside a band of half-width ``delta``, or 0.
+):  # fmt: skip
+    """Take in values at ``depth``, the ``steps``-th of each ray, outside a band of half-width ``delta``, or 0.
 
-    Returns the columns depth, low, low_value, free, gap, high, high_value and boldness of `mplicits`' ``Rays`` after
-    it; and hit, passed, where a hit is, and the slope.
+    Returns the columns depth, low, low_value, free, gap, high, high_value and boldness of ``Rays``; then hit, passed,
+    the depth of a hit, and the slope.
     """
     infinite = float("inf")
     wide = tl.maximum(BAND_ENTRY * delta, resolution * tl.exp2(((steps - 1) // PATIENCE).to(tl.float32)))

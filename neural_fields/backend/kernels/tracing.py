@@ -1,12 +1,11 @@
 """Rays that march through one network in one launch: each stays in registers until it meets the surface or leaves.
 
-`tracing._march` evaluates the field once a pass, and between passes has some seventy small operations; on a GPU each is
-a launch. Here a program marches ROWS rays at a time: a value of its tile, then the same rules (`rules.py`) in
-registers. A ray that ends writes what it found, and the next ray of a queue takes its place. All programs share the
-queue, so tiles stay full. What a ray finds does not depend on the program that marches it.
+`tracing._march` has some seventy small operations between evaluations; on a GPU each is a launch. Here a program
+marches ROWS rays at a time: a value of its tile, then the same rules (`rules.py`) in registers. A ray that ends writes
+its results, and the next ray of a queue, shared by all programs, takes its place.
 
-The rules are those of `sphere_trace` for a field without bands and without expectations. Decisions are the same;
-values differ by rounding, so depths do by about as much over the slope.
+The rules are those of `sphere_trace` for a field without bands and without expectations. Decisions are the same; values
+differ by rounding, and depths by about as much over the slope.
 """
 
 # pyright: reportGeneralTypeIssues=false, reportArgumentType=false, reportCallIssue=false
@@ -39,7 +38,7 @@ class RayTensors(NamedTuple):
         directions: ``(N, 3)`` of unit length.
         starts: ``(N,)`` depth at which each begins.
         entries: ``(N,)`` depth to which it may go back if that is behind the surface.
-        ends: ``(N,)`` depth at which it gives up.
+        ends: ``(N,)`` depth at which it stops.
     """
 
     origins: Tensor
@@ -50,11 +49,9 @@ class RayTensors(NamedTuple):
 
 
 class Queue(NamedTuple):
-    """Rays that wait to be marched.
+    """Rays to be marched.
 
-    Attributes:
-        rays: ``(N,)`` int32, numbers of rays.
-        state: ``(2,)`` int32: how many of them there are, and how many programs have taken; the second begins at 0.
+    ``rays`` ``(N,)`` int32 are their numbers; ``state`` ``(2,)`` int32 are their count, and how many were taken.
     """
 
     rays: Tensor
@@ -74,12 +71,12 @@ class Queue(NamedTuple):
 
 
 class Marched(NamedTuple):
-    """What rays found, ``(N,)`` each; the names are those of `mplicits.neural_fields.Hits`.
+    """Results of rays, ``(N,)`` each; the names are those of `Hits`.
 
     Attributes:
         mask: whether a ray meets the surface.
         depth: where, or where its search ended.
-        steps: how often the network was evaluated on it.
+        steps: evaluations of the network on it.
         slope: how fast the field fell along the ray at its last step.
         level: how many bands its last value lay in.
     """
@@ -92,45 +89,23 @@ class Marched(NamedTuple):
 
     @classmethod
     def nothing(cls, starts: Tensor) -> Marched:
-        """Memory for what kernels find, in the types that they write, filled in for rays that never begin."""
+        """Memory for results, in the types of kernels, filled in for rays that never begin."""
         small, number = (torch.zeros_like(starts, dtype=dtype) for dtype in (torch.int8, torch.int32))
         return cls(small, starts.clone(), number, torch.ones_like(starts), torch.zeros_like(number))
 
     def in_own_types(self) -> Marched:
-        """In those of `mplicits.neural_fields.Hits`."""
+        """The results in the types of `Hits`."""
         return self._replace(mask=self.mask.bool(), steps=self.steps.long(), level=self.level.long())
 
 
 @triton.jit(do_not_specialize=["max_steps"])
 def march(
-    origins,
-    directions,
-    starts,
-    entries,
-    ends,
-    listed,
-    queue,
-    floats,
-    halves,
-    found_mask,
-    found_depth,
-    found_steps,
-    found_slope,
-    scratch,
-    exchanged,
-    numbers,
-    max_steps,
-    PATIENCE: tl.constexpr,
-    BOLDNESS: tl.constexpr,
-    STEEPEST_RISE: tl.constexpr,
-    BAND_ENTRY: tl.constexpr,
-    FLOOR: tl.constexpr,
-    ORIGIN: tl.constexpr,
-    SHAPE: tl.constexpr,
-    SCRATCH: tl.constexpr,
-    ROWS: tl.constexpr,
+    origins, directions, starts, entries, ends, listed, queue, floats, halves, found_mask, found_depth, found_steps,
+    found_slope, scratch, exchanged, numbers, max_steps,
+    PATIENCE: tl.constexpr, BOLDNESS: tl.constexpr, STEEPEST_RISE: tl.constexpr, BAND_ENTRY: tl.constexpr,
+    FLOOR: tl.constexpr, ORIGIN: tl.constexpr, SHAPE: tl.constexpr, SCRATCH: tl.constexpr, ROWS: tl.constexpr,
     REFILL: tl.constexpr,
-):
+):  # fmt: skip
     """March all rays of a queue; ``numbers`` are the tolerance, the resolution and the Lipschitz constant."""
     infinite = float("inf")
     own = scratch + tl.cast(tl.program_id(0), tl.int64) * SCRATCH
@@ -215,17 +190,10 @@ def march_rays(
     max_steps: int,
     constants: dict[str, float],
 ) -> None:
-    """March the rays of a queue to the surface of one network, up to 128 units wide.
+    """March the rays of a queue to the surface of one three-dimensional network up to 128 units wide.
 
-    Args:
-        levels: one, on the rays' device, in three dimensions.
-        rays: contiguous.
-        queue: its state is changed.
-        found: written, for the rays of the queue.
-        numbers: ``(3,)`` on the device: tolerance, resolution and Lipschitz constant of `sphere_trace`.
-        max_steps: see there.
-        constants: PATIENCE, BOLDNESS, STEEPEST_RISE and BAND_ENTRY of `_march`, and FLOOR, the size below which a value
-            is zero.
+    ``numbers`` ``(3,)`` are tolerance, resolution and Lipschitz constant of `sphere_trace`, on the device;
+    ``constants`` are those of `march_constants`. Results go to ``found``; the state of the queue changes.
     """
     (network,) = levels.networks
     rows = network.shape.rows

@@ -11,8 +11,7 @@ The adjoint of the value adds what the tangent meets of the cosines' derivative:
     W̄_i = Σ s_iᵀ u_{i−1} + z̄_iᵀ h_{i−1},   b̄_i = Σ z̄_i,   w̄ = Σ u_d + f̄ h_d.
 
 Only the points are kept from the forward pass. Sweeps up and back are made again, tile by tile, into five planes for
-each layer (h, c, g, s, u; z̄ takes the place of g). A GPU's second-level cache can hold them. Sums over points
-are made by each program for itself and added up at the end, in the same order every time.
+each layer (h, c, g, s, u; z̄ takes the place of g). Each program sums over its points, and the sums are added in order.
 """
 
 # pyright: reportGeneralTypeIssues=false, reportArgumentType=false, reportCallIssue=false
@@ -31,24 +30,11 @@ from .tiles import add_first, cosine, first_phase, product_from, sine
 
 @triton.jit(do_not_specialize=["count"])
 def sweep(
-    x,
-    parameters,
-    value_bar,
-    gradient_bar,
-    x_bar,
-    sums,
-    scratch,
-    count,
-    omega,
-    gain,
-    ROWS: tl.constexpr,
-    IN: tl.constexpr,
-    WIDTH: tl.constexpr,
-    DEPTH: tl.constexpr,
-    COLUMNS: tl.constexpr,
+    x, parameters, value_bar, gradient_bar, x_bar, sums, scratch, count, omega, gain,
+    ROWS: tl.constexpr, IN: tl.constexpr, WIDTH: tl.constexpr, DEPTH: tl.constexpr, COLUMNS: tl.constexpr,
     PIECE: tl.constexpr,
-):
-    """Every program takes tiles in turn, and adds what they say of the weights to sums of its own."""
+):  # fmt: skip
+    """Every program takes tiles in turn, and adds their share of the weights' cotangents to sums of its own."""
     BLOCKS: tl.constexpr = (WIDTH + COLUMNS - 1) // COLUMNS
     STRIDE: tl.constexpr = BLOCKS * COLUMNS
     PLANE: tl.constexpr = ROWS * STRIDE
@@ -145,19 +131,10 @@ def sweep(
 
 @triton.jit
 def _add_ends(
-    own,
-    kept,
-    points,
-    cotangents,
-    f_bar,
-    gain,
-    ROWS: tl.constexpr,
-    IN: tl.constexpr,
-    WIDTH: tl.constexpr,
-    DEPTH: tl.constexpr,
-    COLUMNS: tl.constexpr,
-):
-    """Add what a tile says of the first layer and of the output."""
+    own, kept, points, cotangents, f_bar, gain,
+    ROWS: tl.constexpr, IN: tl.constexpr, WIDTH: tl.constexpr, DEPTH: tl.constexpr, COLUMNS: tl.constexpr,
+):  # fmt: skip
+    """Add a tile's share to the first layer and to the output."""
     BLOCKS: tl.constexpr = (WIDTH + COLUMNS - 1) // COLUMNS
     STRIDE: tl.constexpr = BLOCKS * COLUMNS
     PLANE: tl.constexpr = ROWS * STRIDE
@@ -181,15 +158,10 @@ def _add_ends(
 
 @triton.jit
 def _add_products(
-    target,
-    layer,
-    ROWS: tl.constexpr,
-    WIDTH: tl.constexpr,
-    DEPTH: tl.constexpr,
-    COLUMNS: tl.constexpr,
-    PIECE: tl.constexpr,
-):
-    """Add what a tile says of a square layer: sᵀ u + z̄ᵀ h, with u and h of the layer below, and the sum of z̄."""
+    target, layer,
+    ROWS: tl.constexpr, WIDTH: tl.constexpr, DEPTH: tl.constexpr, COLUMNS: tl.constexpr, PIECE: tl.constexpr,
+):  # fmt: skip
+    """Add a tile's share to a square layer: sᵀ u + z̄ᵀ h, with u and h of the layer below, and the sum of z̄."""
     BLOCKS: tl.constexpr = (WIDTH + COLUMNS - 1) // COLUMNS
     STRIDE: tl.constexpr = BLOCKS * COLUMNS
     PLANE: tl.constexpr = ROWS * STRIDE
@@ -223,13 +195,9 @@ def _add(target, found, inside):
 
 
 def jet_backward(x: Tensor, network: Network, value_bar: Tensor, gradient_bar: Tensor) -> tuple[Tensor, list[Tensor]]:
-    """Cotangents of the points ``(N, d)`` and of the network's parameters, in their order and shapes.
+    """Cotangents of the points ``(N, d)`` and of the parameters of a network of one output, in their order and shapes.
 
-    Args:
-        x: points ``(N, d)``; see `mplicits.neural_fields.backend.kernels.ieee.jet`.
-        network: with one output.
-        value_bar: cotangent of f, ``(N,)``.
-        gradient_bar: cotangent of ∇f, ``(N, d)``.
+    ``value_bar`` ``(N,)`` and ``gradient_bar`` ``(N, d)`` are the cotangents of f and ∇f.
     """
     x_bar = x.new_empty(x.shape)
     sizes = [parameter.numel() for parameter in network.parameters]
