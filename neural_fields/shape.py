@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from .fields.csg import Bounded, Difference, Intersection, Offset, Placed, Shell, Union
-from .fields.field import Field, FieldLike, as_field
+from .fields.field import Field, FieldLike, solid
 from .fields.similarity import Similarity
 from .meshing._cells import Bounds
 from .meshing.extract import DEFAULT_BOUNDS, Mesh, extract_mesh
@@ -77,9 +77,7 @@ class WorldField:
     """
 
     def __init__(self, field: FieldLike, similarity: Similarity | None = None) -> None:
-        field = as_field(field)
-        if field.in_dim != 3:
-            raise ValueError(f"field.in_dim={field.in_dim}: expected 3 (fix the time of a field in space-time first)")
+        field = solid(field)
         self.field, self.similarity = field, similarity or Similarity.identity()
 
     def __repr__(self) -> str:
@@ -291,15 +289,6 @@ def in_one_frame(shapes: Sequence[WorldField], *, margin: float = 0.0) -> tuple[
 
     What was learned is cut off at its own unit sphere (`Bounded`); a closed form holds everywhere. ``margin`` is room
     around the shapes, in input units. ValueError if there are no shapes, or the margin is negative or not finite.
-
-    Example:
-        >>> from mplicits.neural_fields import Similarity, Sphere, Union, WorldField
-        >>> from mplicits.neural_fields.shape import in_one_frame
-        >>> balls = [WorldField(Sphere(), Similarity((x, 0.0, 0.0), 1.0)) for x in (-1.0, 1.0)]
-        >>> fields, frame = in_one_frame(balls)
-        >>> frame
-        Similarity(center=(0.0, 0.0, 0.0), scale=2.0)
-        >>> both = WorldField(Union(*fields), frame)
     """
     if not shapes or not 0 <= margin < np.inf:
         raise ValueError(f"{len(shapes)} shapes, margin={margin}: expected at least one, and a finite number ≥ 0")

@@ -132,17 +132,6 @@ def fixed_shapes(
 
     Without a ``capacity`` every level is evaluated at every point, and used in its band. Results are equal but for
     rounding. With capacities, check ``lost``. The arguments are those of `FixedShapes`.
-
-    Example:
-        >>> import torch
-        >>> from mplicits.neural_fields import MultiscaleSDF
-        >>> from mplicits.neural_fields.backend.fixed_shapes import fixed_shapes
-        >>> sdf = MultiscaleSDF.from_widths([(16, 1), (16, 1)], omegas=[5, 10])
-        >>> x = torch.zeros(4, 3)
-        >>> with fixed_shapes():
-        ...     value = sdf.value(x)
-        >>> bool((value - sdf.value(x)).abs().max() < 1e-6)
-        True
     """
     shapes = FixedShapes(capacity, rooms=rooms)
     token = _shapes.set(shapes)

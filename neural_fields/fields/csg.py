@@ -21,7 +21,7 @@ from torch import Tensor
 from ..backend.devices import few_numbers
 from ..backend.errors import at_least, positive
 from ..backend.fixed_shapes import current_shapes, one_evaluation
-from .field import Field, FieldLike, Jet, as_field
+from .field import Field, FieldLike, Jet, as_field, solid
 from .similarity import Similarity
 
 
@@ -328,22 +328,13 @@ class Shell(_Pointwise):
 class Placed(Combined):
     """A field moved and scaled: ``scale · f((x − center) / scale)``, a distance if f is one.
 
-    Brings fields that were fitted in different unit spheres into one; see `in_one_frame`. The ``similarity`` maps from
-    the coordinates of this field to those of the three-dimensional ``part``.
-
-    Example:
-        >>> import torch
-        >>> from mplicits.neural_fields import Similarity, Sphere
-        >>> from mplicits.neural_fields.fields.csg import Placed
-        >>> Placed(Sphere(radius=0.5), Similarity((1.0, 0.0, 0.0), 2.0))(torch.tensor([[3.0, 0.0, 0.0]]))
-        tensor([1.])
+    The ``similarity`` maps from the coordinates of this field to those of the three-dimensional ``part``.
     """
 
     defined_by = ("similarity",)
 
     def __init__(self, part: FieldLike, similarity: Similarity) -> None:
-        super().__init__(part)
-        _check_space(self)
+        super().__init__(solid(part))
         self.similarity = similarity
 
     def _home(self, x: Tensor) -> Tensor:
@@ -362,23 +353,15 @@ class Placed(Combined):
 class Bounded(Combined):
     """A three-dimensional field that is known in a ball around 0 only, continued beyond as the solid in the ball.
 
-    Networks are arbitrary where they were not trained. Outside the ball f is evaluated at the nearest point p = r x /
-    |x| of the ball. With u = max(f(p), 0) and v = |x| − r, √(u² + v²) is at most the distance of x, with the slope of f
-    or 1. Inside it is max(f(x), |x| − r), which closes a surface that leaves the ball.
-
-    Example:
-        >>> import torch
-        >>> from mplicits.neural_fields import Plane
-        >>> from mplicits.neural_fields.fields.csg import Bounded
-        >>> Bounded(Plane(), radius=1.0)(torch.tensor([[0.0, 0.0, -0.5], [0.0, 0.0, -3.0], [0.0, 0.0, 3.0]]))
-        tensor([-0.5000,  2.0000,  2.2361])
+    Outside the ball f is evaluated at the nearest point p = r x / |x| of the ball. With u = max(f(p), 0) and v = |x| −
+    r, √(u² + v²) is at most the distance of x, with the slope of f or 1. Inside it is max(f(x), |x| − r), which closes
+    a surface that leaves the ball.
     """
 
     defined_by = ("radius",)
 
     def __init__(self, part: FieldLike, *, radius: float = 1.05) -> None:
-        super().__init__(part)
-        _check_space(self)
+        super().__init__(solid(part))
         positive(radius=radius)
         self.radius = float(radius)
 
@@ -410,8 +393,3 @@ class Bounded(Combined):
         outside = slope / self._outside(beyond, value)[..., None]
         joined = torch.where((beyond > 0)[..., None], outside, within)
         return Jet(self._join(x, [value]), joined, features)
-
-
-def _check_space(field: Field) -> None:
-    if field.in_dim != 3:
-        raise ValueError(f"field.in_dim={field.in_dim}: expected 3 (fix the time of a field in space-time first)")

@@ -254,6 +254,34 @@ class OneLevelField(Field):
         self.in_dim = in_dim
 
 
+class Wrapper(Field):
+    """A field evaluated through another one, ``field``, whose levels and bands it has; a subclass defines the jet."""
+
+    field: Field
+
+    @property
+    def same_rows(self) -> bool:
+        """Whether it holds for the field inside."""
+        return self.field.same_rows
+
+    @property
+    def deltas(self) -> Tensor:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Half-widths of the bands of the field inside."""
+        return self.field.deltas
+
+    def value(self, x: Tensor, *, level: int = -1) -> Tensor:
+        """See `Field.value`."""
+        return self.field.value(self._home(x), level=level)
+
+    def level_values(self, x: Tensor, *, level: int = -1) -> list[Tensor]:
+        """See `Field.level_values`."""
+        return self.field.level_values(self._home(x), level=level)
+
+    def _home(self, x: Tensor) -> Tensor:
+        """The points at which the field inside is evaluated."""
+        return x
+
+
 # Accepted where a field is expected: a field, or any function of points ``(..., 3)`` → ``(...,)``.
 FieldLike = Field | Callable[[Tensor], Tensor]
 
@@ -323,3 +351,11 @@ def as_field(field: FieldLike) -> Field:
     if not callable(field):
         raise TypeError(f"field: got a {type(field).__name__}; expected a Field, or a function of points (..., 3)")
     return FunctionField(field)
+
+
+def solid(field: FieldLike) -> Field:
+    """`as_field`; ValueError for a field that is not three-dimensional."""
+    field = as_field(field)
+    if field.in_dim != 3:
+        raise ValueError(f"field.in_dim={field.in_dim}: expected 3 (fix the time of a field in space-time first)")
+    return field

@@ -181,17 +181,7 @@ Evaluate = Callable[[], tuple[Tensor, Tensor]]
 
 @dataclass(frozen=True, eq=False)
 class _Waiting:
-    """The half of a pair (value, gradient) that was not requested yet.
-
-    Attributes:
-        half: which one it is.
-        result: the tensor.
-        points: where it was evaluated.
-        handed: the other half, which the caller has.
-        module: the module that was evaluated.
-        tensors: the module's parameters and buffers.
-        state: what else the result depends on, see `_state`.
-    """
+    """The half of a pair (value, gradient) that was not requested yet, with all that it depends on."""
 
     half: Half
     result: Tensor

@@ -12,8 +12,6 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from torch import nn
-
 from ..backend.errors import positive
 from ..fields.field import Field
 from ..networks.multiscale import MultiscaleSDF
@@ -48,7 +46,8 @@ def parameter_groups(field: Field, lr: float = HOST_RATE, *, pace: Pace = 1.0) -
     positive(lr=lr)
     groups, taken = [], set()
     for siren, rates in _wanted(field, pace):
-        for params, wanted, unit in zip(_parts(siren), rates, siren.units, strict=True):
+        parts = list(siren.layers.parameters()), list(siren.output.parameters())
+        for params, wanted, unit in zip(parts, rates, siren.units, strict=True):
             groups.append({"params": params, "lr": lr / HOST_RATE * wanted / unit})
             taken.update(map(id, params))
     rest = [parameter for parameter in field.parameters() if id(parameter) not in taken]
@@ -83,11 +82,6 @@ def rescale_parameters(field: Field, lr: float = HOST_RATE, *, pace: Pace = 1.0)
     for siren, rates in _wanted(field, pace):
         sines, output = (2.0 ** round(math.log2(wanted / lr)) for wanted in rates)
         siren.set_units(sines, output)
-
-
-def _parts(siren: Siren) -> tuple[Sequence[nn.Parameter], Sequence[nn.Parameter]]:
-    """Parameters of the sine layers, and those of the output."""
-    return list(siren.layers.parameters()), list(siren.output.parameters())
 
 
 def _wanted(field: Field, pace: Pace) -> Iterator[tuple[Siren, tuple[float, float]]]:

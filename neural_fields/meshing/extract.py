@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch.nn.functional import normalize
 
 from ..backend.errors import positive
-from ..fields.field import FieldLike, as_field
+from ..fields.field import FieldLike, as_field, solid
 from ._cells import (
     EDGE_AXIS,
     EDGE_ENDS,
@@ -80,9 +80,7 @@ def extract_mesh(
         >>> bool(abs((mesh.vertices**2).sum(axis=1) ** 0.5 - 0.5).max() < 1e-5)
         True
     """
-    field = as_field(field)
-    if field.in_dim != 3:
-        raise ValueError(f"field.in_dim={field.in_dim}: expected 3 (fix the time of a field in space-time first)")
+    field = solid(field)
     positive(lipschitz=lipschitz, batch=batch)
     if not 0 < clearance < 0.5:
         raise ValueError(f"clearance={clearance}: expected a fraction of a cell in (0, 0.5)")

@@ -6,11 +6,11 @@ import torch
 from torch import Tensor
 
 from ..backend.errors import positive
-from ..fields.field import Field, FieldLike, Jet, SecondJet, as_field
+from ..fields.field import FieldLike, Jet, SecondJet, Wrapper, solid
 from .hash_encoding import HashEncoding
 
 
-class EncodedField(Field):
+class EncodedField(Wrapper):
     """A three-dimensional field whose features are its own, followed by ``gain · e(x)`` of a hash encoding e.
 
     A colour network of a NeuS-style host gets positional detail from these features, so that the surface need not bend
@@ -40,29 +40,13 @@ class EncodedField(Field):
     def __init__(self, field: FieldLike, grid: HashEncoding | None = None, *, gain: float = 64.0) -> None:
         super().__init__()
         positive(gain=gain)
-        self.field = as_field(field)
-        if self.field.in_dim != 3:
-            raise ValueError(f"field.in_dim={self.field.in_dim}: expected 3, as positions are encoded")
+        self.field = solid(field)
         self.gain, self.num_levels = float(gain), self.field.num_levels
         if grid is None:
             grid = HashEncoding()
             with torch.no_grad():  # features begin as small as those of an encoding without a gain
                 grid.table.div_(gain)
         self.grid = grid
-
-    @property
-    def same_rows(self) -> bool:
-        """Whether it holds for the field that is encoded."""
-        return self.field.same_rows
-
-    @property
-    def deltas(self) -> Tensor:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Half-widths of the bands, the field's own."""
-        return self.field.deltas
-
-    def value(self, x: Tensor, *, level: int = -1) -> Tensor:
-        """See `Field.value`."""
-        return self.field.value(x, level=level)
 
     def value_features(self, x: Tensor, *, level: int = -1) -> tuple[Tensor, Tensor]:
         """See `Field.value_features`."""
@@ -78,10 +62,6 @@ class EncodedField(Field):
         """See `Field.second_jet`."""
         jet = self.field.second_jet(x, level=level, dims=dims)
         return jet._replace(features=self._joined(jet.features, x))
-
-    def level_values(self, x: Tensor, *, level: int = -1) -> list[Tensor]:
-        """See `Field.level_values`."""
-        return self.field.level_values(x, level=level)
 
     def _joined(self, features: Tensor, x: Tensor) -> Tensor:
         return torch.cat((features, self.gain * self.grid(x)), dim=-1)

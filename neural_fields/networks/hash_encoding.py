@@ -48,26 +48,9 @@ def tables_apart(*modules: nn.Module) -> tuple[list[nn.Parameter], list[nn.Param
 class HashEncoding(nn.Module):
     """Features of positions, piecewise trilinear, learnt with the network that reads them.
 
-    Each level is a grid whose vertices own table entries: one each where the grid fits into the table (Sec. 3), else a
-    shared one by a spatial hash (Eq. 4). Entries are interpolated and levels concatenated. Positions outside the cube
-    have the features of its nearest point.
-
-    Args:
-        levels: number of grids, L in the paper.
-        table_size: most entries of a level, T; a power of two.
-        features: numbers per entry, F.
-        coarsest: cells along a side of the first grid, N_min.
-        finest: cells along a side of the last grid, N_max.
-        extent: half-edge of the cube that the grids cover.
-
-    Raises:
-        ValueError: an argument is out of range.
-
-    Example:
-        >>> import torch
-        >>> from mplicits.neural_fields.networks.hash_encoding import HashEncoding
-        >>> HashEncoding(levels=4, finest=128)(torch.zeros(5, 3)).shape
-        torch.Size([5, 8])
+    ``levels`` grids (L) from ``coarsest`` (N_min) to ``finest`` (N_max) cells along a side cover the cube ±``extent``.
+    Their vertices own table entries of ``features`` (F) numbers: one each where the grid fits into ``table_size`` (T, a
+    power of two; Sec. 3), else a shared one by a spatial hash (Eq. 4). Outside the cube its nearest point counts.
     """
 
     def __init__(

@@ -280,10 +280,7 @@ def walk_levels(
         for level, delta in zip(levels[1:], deltas, strict=False):
             inside = inside & (parts[0].abs() < delta)
             joined = join(parts, evaluate(level, points), delta)
-            parts = tuple(
-                torch.where(inside.reshape(-1, *[1] * (new.ndim - 1)), new, part)
-                for part, new in zip(parts, joined, strict=True)
-            )
+            parts = _where(inside, joined, parts)
             yield shaped(parts)
         return
     rows = torch.arange(len(points), device=points.device)
@@ -312,10 +309,7 @@ def _walk_on(
         inside, rows = shapes.admit(index, inside & (parts[0].abs() < delta))
         if rows is None:
             joined = join(parts, evaluate(level, points), delta)
-            parts = tuple(
-                torch.where(inside.reshape(-1, *[1] * (new.ndim - 1)), new, part)
-                for part, new in zip(parts, joined, strict=True)
-            )
+            parts = _where(inside, joined, parts)
         else:
             some = Rows(rows, count, full=False)  # places that are left over get the last point, and
             joined = join(tuple(map(some.of, parts)), evaluate(level, some.of(points)), delta)
@@ -324,6 +318,12 @@ def _walk_on(
                 for part, new in zip(parts, joined, strict=True)
             )
         yield parts
+
+
+def _where(inside: Tensor, new: Parts, old: Parts) -> Parts:
+    """The new parts in rows that are ``inside`` ``(N,)``, the old ones elsewhere."""
+    pairs = zip(new, old, strict=True)
+    return tuple(torch.where(inside.reshape(-1, *[1] * (a.ndim - 1)), a, b) for a, b in pairs)
 
 
 def _wanted() -> Tensor | None:

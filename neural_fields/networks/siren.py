@@ -170,13 +170,10 @@ class Siren(OneLevelField):
         rows = self.check_points(x).reshape(-1, self.in_dim)
         if is_traced():
             output, gradients = plain_jet(rows, self.folded(), 1)
-            shape = x.shape[:-1]
-            features = output[:, 1:].reshape(*shape, self.num_features)
-            return Jet(output[:, 0].reshape(shape), gradients[:, 0].reshape(x.shape), features)
+            return _shaped(x, output, gradients[:, 0])
         if choose(rows, width=self.width, depth=self.depth, features=self.num_features).fused:
             value, gradient = self._fused_jet(rows)
-            shape = x.shape[:-1]
-            return Jet(value.reshape(shape), gradient.reshape(x.shape), x.new_empty(*shape, 0))
+            return _shaped(x, value[:, None], gradient)
         parameters = self.folded()
         if needs_graph(rows, parameters):
             size = GRAPH_BLOCK_FACTOR * self.block_rows(rows.device)
@@ -191,9 +188,7 @@ class Siren(OneLevelField):
                 return lambda part: _jet_into(output[part], gradient[part], rows[part], parameters, buffers)
 
             over_blocks(len(rows), self.block_rows(rows.device), prepare, like=rows)
-        shape = x.shape[:-1]
-        features = output[:, 1:].reshape(*shape, self.num_features)
-        return Jet(output[:, 0].reshape(shape), gradient.reshape(x.shape), features)
+        return _shaped(x, output, gradient)
 
     def _fused_jet(self, rows: Tensor) -> tuple[Tensor, Tensor]:
         """Value and gradient by the fused kernels, on the graph if one is recorded."""
@@ -218,13 +213,7 @@ class Siren(OneLevelField):
         size = self.block_rows(rows.device) * (GRAPH_BLOCK_FACTOR if needs_graph(rows, parameters) else 1)
         parts = [_plain_second_jet(part, parameters, dims) for part in rows.split(size)]
         output, gradient, hessian = (torch.cat(part) for part in zip(*parts, strict=True))
-        shape = x.shape[:-1]
-        return SecondJet(
-            output[:, 0].reshape(shape),
-            gradient.reshape(x.shape),
-            output[:, 1:].reshape(*shape, self.num_features),
-            hessian.reshape(*shape, dims, dims),
-        )
+        return SecondJet(*_shaped(x, output, gradient), hessian.reshape(*x.shape[:-1], dims, dims))
 
     def check_points(self, x: Tensor) -> Tensor:
         """See `Field.check_points`; ValueError too for another device, TypeError for another precision."""
@@ -252,6 +241,13 @@ class Siren(OneLevelField):
     def block_rows(self, device: torch.device) -> int:
         """Rows of one block on ``device``."""
         return _block_rows(self.width, device)
+
+
+def _shaped(x: Tensor, output: Tensor, gradient: Tensor) -> Jet:
+    """The jet at ``x`` ``(..., d)`` from outputs ``(N, 1 + F)`` and gradients ``(N, d)``."""
+    shape = x.shape[:-1]
+    features = output[:, 1:].reshape(*shape, output.shape[1] - 1)
+    return Jet(output[:, 0].reshape(shape), gradient.reshape(x.shape), features)
 
 
 def _block_rows(width: int, device: torch.device) -> int:
@@ -407,7 +403,10 @@ class _SirenJet(torch.autograd.Function):
         x, depth = saved[0], len(ctx.needs_input_grad) // 2 - 1
         parameters = saved[1 : 2 * depth + 3]
         if torch.is_grad_enabled():
-            return _differentiable_backward(ctx.needs_input_grad, x, parameters, cotangents)
+            output, jacobian = plain_jet(x, parameters, 1)
+            return _differentiable_backward(
+                ctx.needs_input_grad, (x, *parameters), (output, jacobian[:, 0]), cotangents
+            )
         kept = saved[2 * depth + 3 :]
         output_bar, gradient_bar = cotangents
         # Autograd materialises the cotangents nobody asked for.
@@ -482,8 +481,8 @@ class _FusedJet(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, omega: float, gain: float, *parameters: Tensor) -> tuple[Tensor, Tensor]:
-        from ..backend.kernels.ieee import jet
         from ..backend.kernels.launch import Network
+        from ..backend.kernels.training import jet
 
         ctx.numbers = omega, gain
         ctx.save_for_backward(x, *parameters)
@@ -499,26 +498,19 @@ class _FusedJet(torch.autograd.Function):
         assert value_bar is not None
         assert gradient_bar is not None
         if torch.is_grad_enabled():
-            # Who differentiates once more gets plain operations.
             needed = [ctx.needs_input_grad[0], *ctx.needs_input_grad[3:]]
-            wanted = [tensor for tensor, need in zip((x, *parameters), needed, strict=True) if need]
             output, jacobian = plain_jet(x, fold(parameters, omega, gain), 1)
-            outputs, bars = (output[:, 0], jacobian[:, 0]), (value_bar, gradient_bar)
-            found = iter(torch.autograd.grad(outputs, wanted, bars, create_graph=True, materialize_grads=True))
-            x_bar, *own = (next(found) if need else None for need in needed)
+            outputs = output[:, 0], jacobian[:, 0]
+            x_bar, *own = _differentiable_backward(needed, (x, *parameters), outputs, cotangents)
         else:
             x_bar, own = jet_backward(x, Network.of(parameters, omega, gain), value_bar, gradient_bar)
         return x_bar, None, None, *own
 
 
 def _differentiable_backward(
-    needed: Sequence[bool], x: Tensor, parameters: Sequence[Tensor], cotangents: Sequence[Tensor | None]
+    needed: Sequence[bool], inputs: Sequence[Tensor], outputs: Sequence[Tensor], cotangents: Sequence[Tensor | None]
 ) -> tuple[Tensor | None, ...]:
-    """The backward pass in plain operations, for a second derivative (``create_graph=True``)."""
-    inputs = [x, *parameters]
+    """Cotangents of the inputs that need one, by autograd, which can differentiate them again."""
     wanted = [tensor for tensor, need in zip(inputs, needed, strict=True) if need]
-    output, jacobian = plain_jet(x, parameters, 1)
-    found = iter(
-        torch.autograd.grad((output, jacobian[:, 0]), wanted, cotangents, create_graph=True, materialize_grads=True)
-    )
+    found = iter(torch.autograd.grad(outputs, wanted, cotangents, create_graph=True, materialize_grads=True))
     return tuple(next(found) if need else None for need in needed)

@@ -55,34 +55,14 @@ def solve_sphere(
 ) -> None:
     """Initialise as |x| − radius on the unit ball by one linear solve, instead of the training of `fit_sphere`.
 
-    The first layer is scaled to phases of at most ``phase`` per coordinate. The output's weights w and bias b minimise
+    The first layer is scaled to phases of at most ``phase`` per coordinate: higher ones fit the sphere worse, much
+    lower ones need large weights that cancel. The output's weights w and bias b minimise
 
         Σ (w·h(x) + b − |x| + r)² + slope_weight |Jᵀw − x / |x||² + ridge n |w|²
 
     over n points in the ball, h being the last sines and J their Jacobian. (128, 4) at ω₀ = 10 is then off by 0.01, and
     its slopes by 0.1 (root mean squares). No random numbers are drawn; features stay as they were. The output's weights
-    cancel and are seven times those of `fit_sphere`, so use it only for trainings that warm up slowly.
-
-    Args:
-        network: untrained; the coarse level.
-        radius: of the sphere.
-        phase: largest phase per coordinate in the first layer. Higher ones fit the sphere worse; much lower ones
-            better, but by large weights that cancel, which the first steps of a training break.
-        slope_weight: of squared slopes, beside squared distances.
-        ridge: in mean squares of a sine.
-
-    Raises:
-        ValueError: the radius is not positive.
-
-    Example:
-        >>> import torch
-        >>> from mplicits.neural_fields import Siren
-        >>> from mplicits.neural_fields.networks.sphere_init import solve_sphere
-        >>> _ = torch.manual_seed(0)
-        >>> siren = Siren(128, 4, omega=10.0)
-        >>> solve_sphere(siren, radius=0.4)
-        >>> bool((siren.value(0.4 * torch.eye(3)).abs() < 0.05).all())
-        True
+    are seven times those of `fit_sphere`, so use it only for trainings that warm up slowly.
     """
     positive(radius=radius)
     units = network.units

@@ -21,23 +21,7 @@ from .siren import Siren, forward, needs_graph, plain_jet
 class ColorSiren(nn.Module):
     """A SIREN with three outputs, defined everywhere and not limited to [0, 1].
 
-    Args:
-        width: neurons in each sine layer.
-        depth: number of sine layers, at least 1.
-        omega: the frequency ω₀ of Eq. 2; textures have finer detail than shapes.
-        in_dim: dimension of the domain.
-        mean: RGB of the untrained network nearly everywhere.
-
-    Raises:
-        ValueError: an argument is out of range.
-
-    Example:
-        >>> import torch
-        >>> from mplicits.neural_fields.networks.texture import ColorSiren
-        >>> network = ColorSiren(256, 3)
-        >>> value, along = network.derivative_along(torch.zeros(5, 3), torch.ones(5, 3))
-        >>> value.shape, along.shape
-        (torch.Size([5, 3]), torch.Size([5, 3]))
+    ``omega`` is ω₀ of Eq. 2, higher than for shapes; ``mean`` the RGB of the untrained network nearly everywhere.
     """
 
     def __init__(
@@ -52,11 +36,8 @@ class ColorSiren(nn.Module):
         """Colours at ``x`` ``(..., d)`` → ``(..., 3)``."""
         rows = self._rows(x)
         parameters = self.siren.folded()
-        if needs_graph(rows, parameters):
-            value = forward(rows, parameters)[0]
-        else:
-            value = torch.cat([_value_in_place(part, parameters) for part in self._blocks(rows)])
-        return value.reshape(*x.shape[:-1], 3)
+        blocks = [rows] if needs_graph(rows, parameters) else self._blocks(rows)
+        return torch.cat([forward(part, parameters)[0] for part in blocks]).reshape(*x.shape[:-1], 3)
 
     def jet(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Colours ``(..., 3)`` and their Jacobian ``(..., 3, d)`` at ``x`` ``(..., d)``, by sweeps back."""
@@ -77,12 +58,11 @@ class ColorSiren(nn.Module):
             raise ValueError(f"direction has shape {tuple(direction.shape)}; expected that of x, {tuple(x.shape)}")
         rows, tangents = self._rows(x), self._rows(direction)
         parameters = self.siren.folded()
-        if needs_graph(rows, [tangents, *parameters]):
-            value, derivative = _tangent(rows, tangents, parameters)
-        else:
+        pairs = [(rows, tangents)]
+        if not needs_graph(rows, [tangents, *parameters]):
             pairs = zip(self._blocks(rows), self._blocks(tangents), strict=True)
-            parts = [_tangent_in_place(part, along, parameters) for part, along in pairs]
-            value, derivative = (torch.cat(both) for both in zip(*parts, strict=True))
+        parts = [_tangent(part, along, parameters) for part, along in pairs]
+        value, derivative = (torch.cat(both) for both in zip(*parts, strict=True))
         shape = (*x.shape[:-1], 3)
         return value.reshape(shape), derivative.reshape(shape)
 
@@ -193,28 +173,10 @@ def _unclamped(raw: Tensor) -> Tensor:
     return ((raw >= 0) & (raw <= 1)).to(raw.dtype)
 
 
-def _value_in_place(x: Tensor, parameters: Sequence[Tensor]) -> Tensor:
-    """Outputs of one block, each sine over its phase."""
-    h = x
-    for weight, bias in zip(parameters[0:-2:2], parameters[1:-2:2], strict=True):
-        h = torch.addmm(bias, h, weight.t()).sin_()
-    return torch.addmm(parameters[-1], h, parameters[-2].t())
-
-
 def _tangent(x: Tensor, v: Tensor, parameters: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
     """Outputs and derivative along ``v``, both ``(N, 3)``, in operations that autograd can differentiate."""
     h, u = x, v
     for weight, bias in zip(parameters[0:-2:2], parameters[1:-2:2], strict=True):
         z = torch.addmm(bias, h, weight.t())
         h, u = z.sin(), (u @ weight.t()) * z.cos()
-    return torch.addmm(parameters[-1], h, parameters[-2].t()), u @ parameters[-2].t()
-
-
-def _tangent_in_place(x: Tensor, v: Tensor, parameters: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
-    """`_tangent` of one block that stays in cache."""
-    h, u = x, v
-    for weight, bias in zip(parameters[0:-2:2], parameters[1:-2:2], strict=True):
-        z = torch.addmm(bias, h, weight.t())
-        u = (u @ weight.t()).mul_(z.cos())
-        h = z.sin_()
     return torch.addmm(parameters[-1], h, parameters[-2].t()), u @ parameters[-2].t()

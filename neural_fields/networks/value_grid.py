@@ -12,32 +12,15 @@ from ..fields.field import Field
 class ValueGrid:
     """A level's values at (resolution + 1)³ vertices of the cube [−1, 1]³, trilinear in between.
 
-    Values from a few steps ago, interpolated, place a renderer's samples as well as the network does. For second
-    derivatives along lines of at most K the interpolation is off by 3/8 K h², h = 2 / resolution, plus the field's
-    change since `refresh`.
-
-    Args:
-        resolution: cells along an edge.
-        device: of the values.
-        reach: `refresh` of the near part evaluates vertices whose kept value is at most this far from 0; it may be
-            changed, and should not be below the diagonal of a cell.
+    For second derivatives along lines of at most K the interpolation is off by 3/8 K h², h = 2 / resolution, plus the
+    field's change since `refresh`.
 
     Attributes:
+        reach: a partial `refresh` evaluates vertices whose value is at most this far from 0; at least a cell's
+            diagonal.
         kept: ``(resolution + 1, resolution + 1, resolution + 1)`` values, by x, y and z; 1 where none was evaluated.
         moved: 0-d, root mean square change of the values within ``reach`` of 0 by the last `refresh`; ∞ if there were
             none.
-
-    Raises:
-        ValueError: a number is out of range.
-
-    Example:
-        >>> import torch
-        >>> from mplicits.neural_fields import Sphere
-        >>> from mplicits.neural_fields.networks.value_grid import ValueGrid
-        >>> grid = ValueGrid(32)
-        >>> grid.refresh(Sphere(radius=0.5))
-        >>> bool((grid(torch.tensor([[0.3, 0.4, 0.2]])) - (0.29**0.5 - 0.5)).abs() < 0.01)
-        True
     """
 
     def __init__(self, resolution: int = 64, device: torch.device | None = None, *, reach: float = 0.15) -> None:

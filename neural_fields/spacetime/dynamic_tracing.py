@@ -14,7 +14,7 @@ ray.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -109,8 +109,9 @@ class DynamicTracer:
             if number is not None and number < 0:
                 raise ValueError(f"{name}={number}: expected ≥ 0")
         self.field, self.origins, self.directions = field, origins, directions
-        self.level, self.radius = field.resolve_level(level), radius
-        self.tolerance, self.resolution, self.lipschitz = tolerance, resolution, lipschitz
+        self.level, self.lipschitz, self.radius = field.resolve_level(level), lipschitz, radius
+        self.settings: dict[str, Any] = {"level": self.level, "lipschitz": lipschitz, "radius": radius}
+        self.settings |= {"tolerance": tolerance, "resolution": resolution}
         self.reach, self.speed = 12.0 * resolution if reach is None else reach, speed
         self._frames: list[_Frame] = []
         self._key: _Key | None = None
@@ -141,20 +142,8 @@ class DynamicTracer:
     def _trace(
         self, field: Field, expected: Expected | None, near: Tensor | float, far: Tensor | float, reach: float | None
     ) -> tuple[Hits, Tensor, Near]:
-        return trace_expected(
-            field,
-            self.origins,
-            self.directions,
-            expected,
-            level=self.level,
-            near=near,
-            far=far,
-            radius=self.radius,
-            tolerance=self.tolerance,
-            resolution=self.resolution,
-            lipschitz=self.lipschitz,
-            reach=reach,
-        )
+        rays = self.origins, self.directions
+        return trace_expected(field, *rays, expected, near=near, far=far, reach=reach, **self.settings)
 
     def _measured_speed(self, t: float) -> float:
         """Largest |∂f/∂t| near the surface now, with a margin; for a distance, how fast the surface moves."""

@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from ..backend.errors import at_least
-from ..fields.field import Field, Jet, SecondJet
+from ..fields.field import Field, Jet, SecondJet, Wrapper, solid
 from ..networks.multiscale import MultiscaleSDF, levels_of
 from ..networks.siren import Siren
 
@@ -63,7 +63,7 @@ def at_time(x: Tensor, t: Tensor | float) -> Tensor:
     return torch.cat((x, time[..., None]), dim=-1)
 
 
-class SpaceTimeSDF(Field):
+class SpaceTimeSDF(Wrapper):
     """A multiscale signed distance field that moves: bands and residuals live in space-time.
 
     It wraps a four-dimensional `MultiscaleSDF`, whose bands |f_i(x, t)| < δ_i travel with the surface. ValueError for a
@@ -84,40 +84,19 @@ class SpaceTimeSDF(Field):
         self.in_dim, self.num_levels = 4, sdf.num_levels
 
     @property
-    def same_rows(self) -> bool:
-        """True: gating by bands keeps track of the rows."""
-        return True
-
-    @property
-    def deltas(self) -> Tensor:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Half-widths of the bands, in units of space."""
-        return self.sdf.deltas
+    def field(self) -> Field:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """The four-dimensional field."""
+        return self.sdf
 
     @classmethod
     def from_widths(
-        cls,
-        sizes: Sequence[tuple[int, int]],
-        *,
-        omegas: Sequence[float],
-        deltas: Sequence[float] | None = None,
-        taper: float = 0.0,
-        num_features: int = 0,
-        residual_gain: float = 0.1,
-        time_gain: float = 1.0,
+        cls, sizes: Sequence[tuple[int, int]], *, omegas: Sequence[float], time_gain: float = 1.0, **options: Any
     ) -> SpaceTimeSDF:
         """Untrained levels; the arguments are those of `MultiscaleSDF.from_widths`.
 
         ``time_gain`` is a factor on the initial weights of t; below 1 the field starts slower in time than in space.
         """
-        sdf = MultiscaleSDF.from_widths(
-            sizes,
-            omegas=omegas,
-            deltas=deltas,
-            taper=taper,
-            in_dim=4,
-            num_features=num_features,
-            residual_gain=residual_gain,
-        )
+        sdf = MultiscaleSDF.from_widths(sizes, omegas=omegas, in_dim=4, **options)
         with torch.no_grad():
             for level in sdf.levels:
                 assert isinstance(level, Siren)
@@ -139,8 +118,7 @@ class SpaceTimeSDF(Field):
         Raises:
             ValueError: a field of another kind, or ``extra_width`` is negative.
         """
-        if field.in_dim != 3:
-            raise ValueError(f"field.in_dim={field.in_dim}: expected a static field, three-dimensional")
+        field = solid(field)
         at_least(0, extra_width=extra_width)
         taper = field.taper if isinstance(field, MultiscaleSDF) else 0.0
         lifted: list[Field] = []
@@ -164,10 +142,6 @@ class SpaceTimeSDF(Field):
         levels = [_slice(level, t) for level in self.sdf.levels]
         return _assembled(levels, self.sdf.deltas, self.sdf.taper).requires_grad_(False)
 
-    def value(self, x: Tensor, *, level: int = -1) -> Tensor:
-        """See `Field.value`; ``x`` is ``(..., 4)``."""
-        return self.sdf.value(x, level=level)
-
     def jet(self, x: Tensor, *, level: int = -1) -> Jet:
         """See `Field.jet`; the last entry of the gradient is ∂f/∂t."""
         return self.sdf.jet(x, level=level)
@@ -176,12 +150,8 @@ class SpaceTimeSDF(Field):
         """See `Field.second_jet`."""
         return self.sdf.second_jet(x, level=level, dims=dims)
 
-    def level_values(self, x: Tensor, *, level: int = -1) -> list[Tensor]:
-        """See `Field.level_values`."""
-        return self.sdf.level_values(x, level=level)
 
-
-class TimeSlice(Field):
+class TimeSlice(Wrapper):
     """The three-dimensional field f(·, t) of a four-dimensional one, which is shared, not copied.
 
     It follows the field's training. Gradients reach the field, and a time that is a scalar tensor. ValueError if the
@@ -198,44 +168,26 @@ class TimeSlice(Field):
         self.field, self.t = field, t
         self.in_dim, self.num_levels = 3, field.num_levels
 
-    @property
-    def same_rows(self) -> bool:
-        """Whether it holds for the field in space-time."""
-        return self.field.same_rows
-
-    @property
-    def deltas(self) -> Tensor:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Half-widths of the bands, those of the whole field."""
-        return self.field.deltas
-
-    def value(self, x: Tensor, *, level: int = -1) -> Tensor:
-        """See `Field.value`."""
-        return self.field.value(self._lifted(x), level=level)
-
     def jet(self, x: Tensor, *, level: int = -1) -> Jet:
         """See `Field.jet`; the gradient is that by space (see `time_derivative`)."""
-        value, gradient, features = self.field.jet(self._lifted(x), level=level)
+        value, gradient, features = self.field.jet(self._home(x), level=level)
         return Jet(value, gradient[..., :3], features)
 
     def second_jet(self, x: Tensor, *, level: int = -1, dims: int | None = None) -> SecondJet:
         """See `Field.second_jet`."""
         dims = self.resolve_dims(dims)
-        value, gradient, features, hessian = self.field.second_jet(self._lifted(x), level=level, dims=dims)
+        value, gradient, features, hessian = self.field.second_jet(self._home(x), level=level, dims=dims)
         return SecondJet(value, gradient[..., :3], features, hessian)
-
-    def level_values(self, x: Tensor, *, level: int = -1) -> list[Tensor]:
-        """See `Field.level_values`."""
-        return self.field.level_values(self._lifted(x), level=level)
 
     def time_derivative(self, x: Tensor, *, level: int = -1) -> Tensor:
         """∂f/∂t at ``x`` ``(..., 3)`` → ``(...,)``."""
-        return self.field.jet(self._lifted(x), level=level).gradient[..., 3]
+        return self.field.jet(self._home(x), level=level).gradient[..., 3]
 
     def spacetime_jet(self, x: Tensor, *, level: int = -1, order: int = 1) -> SpaceTimeJet:
         """Value and all derivatives at ``x`` ``(..., 3)``; see `spacetime_jet`."""
-        return spacetime_jet(self.field, self._lifted(x), level=level, order=order)
+        return spacetime_jet(self.field, self._home(x), level=level, order=order)
 
-    def _lifted(self, x: Tensor) -> Tensor:
+    def _home(self, x: Tensor) -> Tensor:
         return at_time(self.check_points(x), self.t)
 
 

@@ -122,21 +122,38 @@ def flow(
     return integrate_rows(velocity, points, start, end, solver or Solver())
 
 
-class VelocityWithJacobian(Protocol):
-    """A vector field that knows its derivatives, as `mplicits.neural_fields.Velocity`."""
+class VelocityJet(NamedTuple):
+    """A velocity ``value`` ``(..., 3)`` with ``jacobian`` ∂v_i/∂x_j ``(..., 3, 3)`` and ``rate`` ∂v/∂t ``(..., 3)``."""
 
-    def jet(self, x: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """V ``(N, 3)``, ∂V/∂x ``(N, 3, 3)`` and ∂V/∂t ``(N, 3)``."""
+    value: Tensor
+    jacobian: Tensor
+    rate: Tensor
+
+    @property
+    def divergence(self) -> Tensor:
+        """``tr ∂v/∂x``, ``(...,)``: the growth rate of a small volume."""
+        return self.jacobian.diagonal(dim1=-2, dim2=-1).sum(dim=-1)
+
+    @property
+    def killing(self) -> Tensor:
+        """``‖J + Jᵀ‖²``, ``(...,)``: 0 for rigid motions only (Killing's equation)."""
+        return (self.jacobian + self.jacobian.transpose(-1, -2)).square().sum(dim=(-2, -1))
+
+
+class Velocity(Protocol):
+    """A velocity with its derivatives."""
+
+    def __call__(self, x: Tensor, t: Tensor) -> Tensor:
+        """Velocities ``(..., 3)`` at positions ``(..., 3)`` and times ``(...,)``."""
+        ...
+
+    def jet(self, x: Tensor, t: Tensor) -> VelocityJet:
+        """Velocities with their derivatives."""
         ...
 
 
 def flow_jacobian(
-    velocity: VelocityWithJacobian,
-    points: Tensor,
-    start: Tensor | float,
-    end: Tensor | float,
-    *,
-    solver: Solver | None = None,
+    velocity: Velocity, points: Tensor, start: Tensor | float, end: Tensor | float, *, solver: Solver | None = None
 ) -> tuple[Tensor, Tensor]:
     """`flow` with the Jacobian M = ∂φ/∂x of the map φ from ``start`` to ``end``: points ``(N, 3)`` and M ``(N, 3, 3)``.
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ..fields.field import Field, FieldLike, Jet, OneLevelField, as_field
+from ..fields.field import Field, FieldLike, Jet, OneLevelField, Wrapper, as_field, solid
 
 Vector = tuple[float, float, float]
 
@@ -73,7 +73,7 @@ class RigidMotion:
         return x.new_tensor(self.center), x.new_tensor(self.drift), time
 
 
-class Moving(Field):
+class Moving(Wrapper):
     """A field g carried by a rigid motion: f(x, t) = g(x at time 0), a distance at all times if g is one.
 
     Args:
@@ -85,24 +85,8 @@ class Moving(Field):
 
     def __init__(self, field: FieldLike, motion: RigidMotion) -> None:
         super().__init__()
-        field = as_field(field)
-        if field.in_dim != 3:
-            raise ValueError(f"field.in_dim={field.in_dim}: expected a static field, three-dimensional")
-        self.field, self.motion = field, motion
-        self.in_dim, self.num_levels = 4, field.num_levels
-
-    @property
-    def deltas(self) -> Tensor:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Half-widths of the bands, those of the field that moves."""
-        return self.field.deltas
-
-    def value(self, x: Tensor, *, level: int = -1) -> Tensor:
-        """See `Field.value`."""
-        return self.field.value(self._home(x), level=level)
-
-    def level_values(self, x: Tensor, *, level: int = -1) -> list[Tensor]:
-        """See `Field.level_values`."""
-        return self.field.level_values(self._home(x), level=level)
+        self.field, self.motion = solid(field), motion
+        self.in_dim, self.num_levels = 4, self.field.num_levels
 
     def jet(self, x: Tensor, *, level: int = -1) -> Jet:
         """See `Field.jet`; ∂f/∂t = −⟨∇f, V⟩."""

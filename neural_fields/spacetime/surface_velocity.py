@@ -21,26 +21,10 @@ from .field import at_time
 
 
 class CarriedVelocity:
-    """V(x, t) on a moving surface, for `flow`.
+    """V(x, t) on the moving surface of a four-dimensional field, for `flow`.
 
-    Rigid motions are exact as far as normals show them: a turning sphere stays at rest.
-
-    Args:
-        field: four-dimensional.
-        level: whose surface.
-        nodes: times at which the motion as a whole is found, at least 2; interpolated in between.
-        samples: points of the surface for that, drawn near it at random.
-        least_slope: lower bound on |∇f|, which bounds the velocity where a surface is torn.
-        seed: of the points.
-
-    Example:
-        >>> import torch
-        >>> from mplicits.neural_fields import Moving, RigidMotion, Sphere, flow
-        >>> from mplicits.neural_fields.spacetime.surface_velocity import CarriedVelocity
-        >>> ball = Moving(Sphere(radius=0.3), RigidMotion(velocity=(0.5, 0.0, 0.0)))
-        >>> there = flow(CarriedVelocity(ball), torch.tensor([[0.0, 0.3, 0.0]]), 0.0, 1.0)
-        >>> bool((there - torch.tensor([[0.5, 0.3, 0.0]])).abs().max() < 1e-3)
-        True
+    The motion as a whole is found at ``nodes`` ≥ 2 times from ``samples`` surface points, and interpolated; |∇f| counts
+    as at least ``least_slope``. Rigid motions are exact as far as normals show them: a turning sphere stays at rest.
     """
 
     def __init__(

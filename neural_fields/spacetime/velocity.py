@@ -6,46 +6,14 @@ A surface carried by v(x, t) is f(x, t) = f_k(φ_{t→t_k}(x)), φ following dx/
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
-
 import torch
 from torch import Tensor, nn
 
 from ..fields.field import Jet, OneLevelField
 from ..networks.siren import Siren, plain_jet
 from .field import at_time
-from .flow import Solver, integrate_rows
+from .flow import Solver, Velocity, VelocityJet, integrate_rows
 from .moving import Keyframes
-
-
-class VelocityJet(NamedTuple):
-    """A velocity ``value`` ``(..., 3)`` with ``jacobian`` ∂v_i/∂x_j ``(..., 3, 3)`` and ``rate`` ∂v/∂t ``(..., 3)``."""
-
-    value: Tensor
-    jacobian: Tensor
-    rate: Tensor
-
-    @property
-    def divergence(self) -> Tensor:
-        """``tr ∂v/∂x``, ``(...,)``: the growth rate of a small volume."""
-        return self.jacobian.diagonal(dim1=-2, dim2=-1).sum(dim=-1)
-
-    @property
-    def killing(self) -> Tensor:
-        """``‖J + Jᵀ‖²``, ``(...,)``: 0 for rigid motions only (Killing's equation)."""
-        return (self.jacobian + self.jacobian.transpose(-1, -2)).square().sum(dim=(-2, -1))
-
-
-class Velocity(Protocol):
-    """A velocity with its derivatives."""
-
-    def __call__(self, x: Tensor, t: Tensor) -> Tensor:
-        """Velocities ``(..., 3)`` at positions ``(..., 3)`` and times ``(...,)``."""
-        ...
-
-    def jet(self, x: Tensor, t: Tensor) -> VelocityJet:
-        """Velocities with their derivatives."""
-        ...
 
 
 class VelocitySiren(nn.Module):

@@ -62,12 +62,12 @@ class Found:
         unknown = torch.full_like(depth, torch.inf)
         self.near = Near(unknown, unknown.clone(), unknown.clone())
 
-    def record(self, index: Tensor, *, mask: Tensor, depth: Tensor, level: Tensor | int, steps: Tensor | int) -> None:
-        self.mask[index], self.depth[index], self.level[index], self.steps[index] = mask, depth, level, steps
-
-    def record_slope(self, index: Tensor, slope: Tensor) -> None:
-        """Record how fast the field fell along the rays at their last step."""
-        self.slope[index] = slope
+    def record(
+        self, at: Tensor, mask: Tensor, depth: Tensor, level: Tensor | int, steps: Tensor | int, slope: Tensor | float
+    ) -> None:
+        """Record results of the rays ``at`` these places of the call."""
+        self.mask[at], self.depth[at], self.level[at], self.steps[at] = mask, depth, level, steps
+        self.slope[at] = slope  # how fast the field fell along the ray at its last step
 
     def record_near(self, rays: Rays, close: Tensor, there: Tensor | None = None) -> None:
         """Record where rays come near the surface and leave it again; only of those ``there`` ``(K,)``, if given."""
@@ -229,10 +229,8 @@ def march(
         rays, stand = look(rays, value * rays.sign, rule, gap)
         ended = stand.hit | stand.passed if count < max_steps else torch.ones_like(stand.hit)
         rows = ended.nonzero()[:, 0]
-        found.record(
-            rays.ray[rows], mask=stand.hit[rows], depth=stand.depth[rows], level=stand.level[rows], steps=count
-        )
-        found.record_slope(rays.ray[rows], stand.slope[rows])
+        ends = Stand(*(column[rows] for column in stand))
+        found.record(rays.ray[rows], ends.hit, ends.depth, ends.level, count, ends.slope)
         rays = rays.only((~ended).nonzero()[:, 0])
 
 
@@ -339,12 +337,7 @@ def march_budget(
             moving = moving[(step.abs() > tolerance) & (rays.depth[moving] < rays.far[moving])]
         inside = (rays.depth < rays.far).nonzero()[:, 0]
         gone = (rays.depth >= rays.far).nonzero()[:, 0]
-        found.record(
-            rays.ray[gone],
-            mask=torch.zeros_like(gone, dtype=torch.bool),
-            depth=rays.depth[gone],
-            level=current,
-            steps=steps[gone],
-        )
+        missed = torch.zeros_like(gone, dtype=torch.bool)
+        found.record(rays.ray[gone], missed, rays.depth[gone], current, steps[gone], 1.0)
         rays, value, steps = rays.only(inside), value[inside], steps[inside]
-    found.record(rays.ray, mask=value.abs() < capture, depth=rays.depth, level=level, steps=steps)
+    found.record(rays.ray, value.abs() < capture, rays.depth, level, steps, 1.0)

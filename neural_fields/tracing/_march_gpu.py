@@ -68,9 +68,8 @@ class _Chunk:
         else:  # a field that is evaluated at other rows could not tell which rows overflow
             for _ in range(passes):
                 self._pass(self._values(), ~self.ended, found, reach)
-        ray, stand = self.rays.ray, self.stand
-        found.record(ray, mask=stand.hit, depth=stand.depth, level=stand.level, steps=self.count)
-        found.record_slope(ray, stand.slope)
+        stand = self.stand
+        found.record(self.rays.ray, stand.hit, stand.depth, stand.level, self.count, stand.slope)
         return demand
 
     def _values(self) -> Tensor:

@@ -36,28 +36,15 @@ def cone_starts(
     max_steps: int = CONE_STEPS,
     clearance: float = 0.0,
 ) -> Tensor:
-    """Depths up to which whole tiles of an image are empty, by marching one cone for each tile on level 0.
+    """Depths ``(H, W)`` up to which whole tiles of an image are empty, infinite where nothing can be visible.
 
-    A cone of spread σ (the largest distance between the directions of a tile and its middle one) holds every point of
-    the tile's rays at depth t within tσ of its axis, so with v = |f_0| on the axis the tile is empty up to t + ((v −
-    δ_0)/L − tσ) / (1 + σ). Tiles are marched from large to small, each starting where the larger one ended.
+    They are ``near`` of `sphere_trace` at ``level``, from one cone for each tile, marched on level 0. A cone of spread
+    σ (the largest distance between the directions of a tile and its middle one) holds the tile's rays at depth t within
+    tσ of its axis, so with v = |f_0| on the axis the tile is empty up to t + ((v − δ_0)/L − tσ) / (1 + σ). Tiles are
+    marched from large to small, each starting where the larger one ended, and keep a ``clearance`` from the surface.
 
-    Args:
-        field: three-dimensional; or any function of points.
-        origin: ``(3,)`` the common origin of all rays.
-        directions: ``(H, W, 3)`` of any length but 0.
-        level: the level that will be traced from there.
-        tiles: sides of the tiles in pixels, each a multiple of the next.
-        lipschitz: see `sphere_trace`.
-        radius: see `sphere_trace`.
-        max_steps: of each cone.
-        clearance: distance that the tiles keep from the surface.
-
-    Returns:
-        ``(H, W)`` depths for ``near`` of `sphere_trace`; infinite where nothing can be visible.
-
-    Raises:
-        ValueError: shapes do not fit, or the field is not three-dimensional.
+    ``origin`` is ``(3,)``, ``directions`` ``(H, W, 3)`` of any length but 0; ``tiles`` are sides in pixels, each a
+    multiple of the next. ValueError for other shapes, or a field that is not three-dimensional.
     """
     field = as_field(field)
     level = field.resolve_level(level)

@@ -84,25 +84,10 @@ def map_attribute(
     level: int = -1,
     batch: int = 1 << 18,
 ) -> Mapped:
-    """The mapping {S, f, g} of the paper at points of any surface S; errors are those of `project_to_surface`.
+    """The mapping {S, f, g} of the paper at points ``(..., d)`` of any surface S, in the field's coordinates.
 
-    Args:
-        field: f; or a function, as in `project_to_surface`.
-        attribute: g, points ``(N, d)`` of the band → attributes ``(N, C)``.
-        points: of S, ``(..., d)``, in the field's coordinates.
-        delta: half-width of the band, in field units.
-        level: of f.
-        batch: points at a time.
-
-    Example:
-        >>> import torch
-        >>> from mplicits.neural_fields import Torus
-        >>> from mplicits.neural_fields.tracing.projection import map_attribute
-        >>> fine = Torus(major=0.5, minor=0.2)
-        >>> mesh = torch.rand(100, 3)
-        >>> normals = map_attribute(fine, lambda x: fine.jet(x).gradient, mesh, delta=0.1)
-        >>> normals.values.shape
-        torch.Size([100, 3])
+    ``attribute`` is g, points ``(N, d)`` of the band → ``(N, C)``; ``delta`` the half-width of the band, in field
+    units; ``batch`` points at a time. Errors are those of `project_to_surface`.
     """
     field = as_field(field)
     rows = field.check_points(points).reshape(-1, field.in_dim)

@@ -118,19 +118,9 @@ def sphere_trace(
     field = as_field(field)
     if budget is None:
         hits, _, _ = trace_expected(
-            field,
-            origins,
-            directions,
-            None,
-            level=level,
-            near=near,
-            far=far,
-            tolerance=tolerance,
-            resolution=resolution,
-            lipschitz=lipschitz,
-            radius=radius,
-            max_steps=max_steps,
-        )
+            field, origins, directions, None, level=level, near=near, far=far, tolerance=tolerance,
+            resolution=resolution, lipschitz=lipschitz, radius=radius, max_steps=max_steps,
+        )  # fmt: skip
     else:
         check_rays(field, origins, directions, tolerance=tolerance, resolution=resolution, lipschitz=lipschitz)
         hits = _trace_budget(field, origins, directions, budget, level, near, far, tolerance, radius, capture)

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial, wraps
-from typing import Any, NamedTuple, Protocol, TypeVar, cast
+from typing import Any, NamedTuple, TypeVar, cast
 
 import torch
 from torch import Tensor
@@ -35,17 +35,10 @@ from .weights import (
 
 RayColor = Callable[[Tensor, Tensor, Jet], Tensor]
 """Colours ``(N, 3)`` of points ``(N, 3)`` seen along unit directions ``(N, 3)``, given the geometry's jet there."""
-
+RayOutside = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
+"""Density ``(N,)`` ≥ 0 and colour ``(N, 3)`` outside the unit sphere, at `invert_outside` points ``(N, 4)``."""
 
 F = TypeVar("F", bound=Callable[..., Any])
-
-
-class RayOutside(Protocol):
-    """A background field outside the unit sphere."""
-
-    def __call__(self, inverted: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
-        """Density ``(N,)`` ≥ 0 and colour ``(N, 3)`` at `invert_outside` points ``(N, 4)``."""
-        ...
 
 
 @dataclass(frozen=True)

@@ -8,21 +8,12 @@ softplus(−s f_out) − softplus(−s f_in). Transmittances are T_i = exp(−Σ
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import torch
 from torch import Tensor
 from torch.nn.functional import softplus
 
 from ..backend.devices import uniform
 from ..fields.similarity import ball_chord
-
-
-class Weights(NamedTuple):
-    """``weights`` ``(R, S)``, w_i = T_i α_i, and ``remaining`` ``(R,)``, the transmittance behind the last interval."""
-
-    weights: Tensor
-    remaining: Tensor
 
 
 def neus_optical_depth(
@@ -60,8 +51,8 @@ def neus_alpha(
     return -torch.expm1(-neus_optical_depth(value, slope, interval, inv_std, cos_anneal=cos_anneal))
 
 
-def transmittance_weights(optical_depth: Tensor) -> Weights:
-    """Weights of the intervals of each ray, from their optical depths ``(R, S)``, first to last.
+def transmittance_weights(optical_depth: Tensor) -> tuple[Tensor, Tensor]:
+    """Weights w_i ``(R, S)`` of intervals from their optical depths ``(R, S)``, and the light left behind all ``(R,)``.
 
     Example:
         >>> import torch
@@ -72,8 +63,8 @@ def transmittance_weights(optical_depth: Tensor) -> Weights:
     passed = optical_depth.cumsum(dim=-1)
     weights = (optical_depth - passed).exp() * -torch.expm1(-optical_depth)
     if optical_depth.shape[-1] == 0:
-        return Weights(weights, optical_depth.new_ones(optical_depth.shape[:-1]))
-    return Weights(weights, (-passed[..., -1]).exp())
+        return weights, optical_depth.new_ones(optical_depth.shape[:-1])
+    return weights, (-passed[..., -1]).exp()
 
 
 def composite(weights: Tensor, values: Tensor) -> Tensor:
@@ -120,7 +111,7 @@ def secant_weights(
     # Secants over tiny intervals are not bounded by the network's Lipschitz constant.
     slope = torch.minimum(secant, previous).clamp(-10.0, 0)
     middle = 0.5 * (values[:, 1:] + values[:, :-1])
-    return transmittance_weights(neus_optical_depth(middle, slope, interval, inv_std, cos_anneal=cos_anneal)).weights
+    return transmittance_weights(neus_optical_depth(middle, slope, interval, inv_std, cos_anneal=cos_anneal))[0]
 
 
 def importance_depths(

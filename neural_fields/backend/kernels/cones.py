@@ -11,9 +11,8 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from .launch import launch
+from .launch import half_scratch, launch
 from .packing import Packed
-from .siren import half_scratch
 from .tensor_tiles import keep, rows_of, value_of_tile
 
 

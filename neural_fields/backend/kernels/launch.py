@@ -92,6 +92,11 @@ def scratch_for(x: Tensor, programs: int, floats: int) -> Tensor:
     return torch.empty(programs * floats, dtype=torch.float32, device=x.device)
 
 
+def half_scratch(like: Tensor, numbers: int) -> Tensor:
+    """Uninitialised memory for ``numbers`` float16 numbers, at least one."""
+    return torch.empty(max(1, numbers), dtype=torch.float16, device=like.device)
+
+
 def on_device(x: Tensor) -> contextlib.AbstractContextManager[object]:
     """Make the device of ``x`` current, on which Triton launches."""
     return torch.cuda.device(x.device) if x.is_cuda else contextlib.nullcontext()

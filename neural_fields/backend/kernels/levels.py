@@ -25,9 +25,8 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from .launch import launch
+from .launch import half_scratch, launch
 from .packing import Packed, Shape
-from .siren import half_scratch
 from .tensor_tiles import jet_of_tile, points_of, rows_of, value_of_tile
 
 

@@ -2,7 +2,7 @@
 
 Each program has SLOTS places for rays, a ring of free ones, and for each level a ring of those that wait for its value.
 Free places take the next rays of a queue that all programs share. A program serves its longest ring, up to ROWS rays at
-a time: a value in the next band sends its ray to the ring of the next level; any other goes through `rules.py`, after
+a time: a value in the next band sends its ray to the ring of the next level; any other goes through `look_at`, after
 which the ray has ended or goes back to level 0. So tiles of every level stay full. The state of rays lies in a scratch
 of the program's own. The rules are those of `sphere_trace` without expectations; see `tracing.py`.
 """
@@ -19,12 +19,10 @@ import triton.language as tl
 from torch import Tensor
 
 from . import tracing
-from .launch import launch
+from .launch import half_scratch, launch
 from .levels import Levels, gate_of, level_of_tile
-from .rules import first_band, look_at, turned_back
-from .siren import half_scratch
 from .tensor_tiles import keep
-from .tracing import Marched, Queue, RayTensors
+from .tracing import Marched, Queue, RayTensors, first_band, look_at, turned_back
 
 # Rays under way in a program: more fill the tiles, fewer shorten the end. Twice as many above MANY_RAYS rays in all.
 SLOTS, MANY_RAYS = 256, 1 << 19

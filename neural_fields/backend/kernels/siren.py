@@ -5,12 +5,11 @@
 
 from __future__ import annotations
 
-import torch
 import triton
 import triton.language as tl
 from torch import Tensor
 
-from .launch import launch
+from .launch import half_scratch, launch
 from .packing import Packed
 from .tensor_tiles import jet_of_tile, keep, points_of, rows_of, value_of_tile
 
@@ -50,11 +49,6 @@ def siren_jet(x: Tensor, network: Packed) -> tuple[Tensor, Tensor]:
     value, gradient = x.new_empty(len(x)), x.new_empty(x.shape)
     _launch(x, network, value, gradient, jet=True)
     return value, gradient
-
-
-def half_scratch(like: Tensor, numbers: int) -> Tensor:
-    """Uninitialised memory for ``numbers`` float16 numbers, at least one."""
-    return torch.empty(max(1, numbers), dtype=torch.float16, device=like.device)
 
 
 def _launch(x: Tensor, network: Packed, value: Tensor, gradient: Tensor, *, jet: bool) -> None:

@@ -250,7 +250,7 @@ def test_nerfstudio_step_costs_one_jet_per_sample() -> None:
             "ALPHA": (6, 8, 1),
         }
         alpha = outputs[Heads.ALPHA]
-        weights = transmittance_weights(-torch.log1p(-alpha[..., 0])).weights
+        weights, _ = transmittance_weights(-torch.log1p(-alpha[..., 0]))
         eikonal = ((outputs[Heads.GRADIENT].norm(dim=-1) - 1) ** 2).mean()
         loss = ((weights[..., None] * outputs[Heads.RGB]).sum(dim=1) - 0.5).abs().mean() + 0.1 * eikonal
         optimizer.zero_grad()
