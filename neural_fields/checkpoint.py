@@ -44,12 +44,12 @@ FILE_VERSION = 1
 
 
 class _Kind(NamedTuple):
-    """A kind of file: its content, the command that writes it, its usual name, and the remedy if it is damaged."""
+    """A kind of file."""
 
-    thing: str
-    command: str
-    name: str
-    remedy: str
+    thing: str  # its content
+    command: str  # that writes it
+    name: str  # its usual name
+    remedy: str  # if it is damaged
 
     @property
     def key(self) -> str:
@@ -129,8 +129,6 @@ def load_field(path: str | os.PathLike[str], *, device: torch.device | str = "cp
         field = _build(header["field"], tensors)
         _restore(path, field, tensors, "fit the field again")
         similarity = _similarity(header["similarity"])
-        if not isinstance(header["metadata"], dict):
-            raise TypeError(f"metadata is a {type(header['metadata']).__name__}")
         return SavedField(field.to(device).requires_grad_(False), similarity, header["metadata"])
 
 
@@ -162,8 +160,7 @@ def load_texture(path: str | os.PathLike[str], geometry: Field) -> TextureField:
     path = Path(path)
     device = geometry.like.device
     with _reading(path, _TEXTURE, device) as (header, tensors):
-        if header["geometry"]["digest"] != _digest(geometry):
-            raise InputError(f"{path}: the texture of another field than this one; run `mplicits texture` again")
+        _check_geometry(path, header, geometry, _TEXTURE)
         sizes = dict(header["network"])
         _check_size(sizes, tensors)
         network = ColorSiren(sizes.pop("width"), sizes.pop("depth"), **sizes)
@@ -213,17 +210,13 @@ def load_radiance(path: str | os.PathLike[str], geometry: Field) -> tuple[Radian
     path = Path(path)
     device = geometry.like.device
     with _reading(path, _RADIANCE, device) as (header, tensors):
-        if header["geometry"]["digest"] != _digest(geometry):
-            raise InputError(f"{path}: the colours of another field than this one; run `mplicits reconstruct` again")
+        _check_geometry(path, header, geometry, _RADIANCE)
         inv_std = float(header["inv_std"])
         if not 0 < inv_std < math.inf or tensors["background"].shape != (3,):
             raise ValueError(f"inv_std {inv_std:g}, background of shape {tuple(tensors['background'].shape)}")
         color = _radiant(path, ViewColor, "color", header, tensors)
         outside = None if header["outside"] is None else _radiant(path, Outside, "outside", header, tensors)
-        metadata = header["metadata"]
-        if not isinstance(metadata, dict):
-            raise TypeError(f"metadata is a {type(metadata).__name__}")
-        return Radiance(color, outside, tensors["background"], inv_std), metadata
+        return Radiance(color, outside, tensors["background"], inv_std), header["metadata"]
 
 
 def _radiant_of(network: ViewColor | Outside, sizes: Sequence[str]) -> dict[str, Any]:
@@ -275,6 +268,11 @@ def _digest(field: Field) -> str:
     return digest.hexdigest()
 
 
+def _check_geometry(path: Path, header: Mapping[str, Any], geometry: Field, kind: _Kind) -> None:
+    if header["geometry"]["digest"] != _digest(geometry):
+        raise InputError(f"{path}: {kind.thing} of another field than this one; run `{kind.command}` again")
+
+
 def checksum_of(tensors: Mapping[str, Tensor]) -> str:
     """SHA-256 of tensors on the CPU, with their names, types and shapes."""
     digest = hashlib.sha256()
@@ -309,6 +307,8 @@ def _reading(path: Path, kind: _Kind, device: torch.device | str) -> Iterator[tu
                     f"{path}: {thing.split()[-1]} format version {header['version']}; this mplicits reads version "
                     f"{FILE_VERSION}, so write it again with `{command}` or install the version that wrote it"
                 )
+            if not isinstance(header["metadata"], dict):
+                raise TypeError(f"metadata is a {type(header['metadata']).__name__}")
             held = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
             if header.get("checksum") not in (None, checksum_of(held)):  # older files have none
                 raise InputError(f"{path}: damaged (its numbers are not those that were written); {kind.remedy}")

@@ -76,11 +76,11 @@ class FixedShapes:
 
 
 class Rows(NamedTuple):
-    """Some rows of tensors ``(N, …)``: ``places`` ``(K,)``, surplus ones N = ``total``; none is surplus if ``full``."""
+    """Some rows of tensors ``(N, …)``."""
 
-    places: Tensor
-    total: int
-    full: bool
+    places: Tensor  # (K,) their numbers, N for surplus places
+    total: int  # N
+    full: bool  # whether no place is surplus
 
     def of(self, tensor: Tensor) -> Tensor:
         """``(N, …)`` → ``(K, …)``; surplus places get the last row."""

@@ -142,19 +142,12 @@ _EDGE_FACES = [frozenset(i for i, face in enumerate(_FACES) if {a, b} <= set(fac
 
 
 class CubeTables(NamedTuple):
-    """What a case byte means: bit c says that corner c is inside.
+    """What a case byte means: bit c says that corner c is inside."""
 
-    Attributes:
-        crossed: ``(256, 12)`` bool, the edges whose ends differ in sign.
-        ends: ``(256, 8)`` bool, the corners at the end of a crossed edge.
-        start: ``(257,)`` first row of each case in ``triangles``.
-        triangles: ``(T, 3)`` edge numbers, counter-clockwise as seen from the positive side.
-    """
-
-    crossed: NDArray[np.bool_]
-    ends: NDArray[np.bool_]
-    start: NDArray[np.int64]
-    triangles: NDArray[np.int64]
+    crossed: NDArray[np.bool_]  # (256, 12), edges whose ends differ in sign
+    ends: NDArray[np.bool_]  # (256, 8), corners at the end of a crossed edge
+    start: NDArray[np.int64]  # (257,) first row of each case in `triangles`
+    triangles: NDArray[np.int64]  # (T, 3) edge numbers, counter-clockwise as seen from the positive side
 
 
 def _loops(case: int) -> list[list[int]]:
@@ -232,19 +225,12 @@ class NoSurfaceError(ValueError):
 
 @dataclass(frozen=True)
 class ActiveCells:
-    """The cells that the surface crosses.
+    """The cells that the surface crosses."""
 
-    Attributes:
-        cases: ``(C,)`` uint8 case of each cell (see `cube_tables`).
-        corners: ``(8, C)`` rows of ``points``.
-        points: ``(P, 3)`` lattice points.
-        values: ``(P,)`` their values, valid at the ends of crossed edges.
-    """
-
-    cases: NDArray[np.uint8]
-    corners: NDArray[np.int32]
-    points: Ints
-    values: Floats
+    cases: NDArray[np.uint8]  # (C,) case of each cell (see `cube_tables`)
+    corners: NDArray[np.int32]  # (8, C) rows of `points`
+    points: Ints  # (P, 3) lattice points
+    values: Floats  # (P,) their values, valid at the ends of crossed edges
 
 
 def cull_blocks(sampler: Sampler, *, level: int, lipschitz: float) -> tuple[Ints, Floats, NDArray[np.bool_]]:

@@ -30,19 +30,12 @@ FLOAT32_REACH = 128.0  # scales from the origin, up to which float32 rounds by l
 
 @dataclass(frozen=True)
 class MeshStats:
-    """Cost of an extraction.
+    """Cost of an extraction."""
 
-    Attributes:
-        points: points sent to each level (a level may answer some by a coarser one).
-        blocks: surviving blocks of 2³ cells.
-        cells: cells that the surface crosses.
-        seconds: wall time of each stage: "cull", "corners", "triangles", "normals".
-    """
-
-    points: tuple[int, ...]
-    blocks: int
-    cells: int
-    seconds: dict[str, float]
+    points: tuple[int, ...]  # sent to each level (a level may answer some by a coarser one)
+    blocks: int  # surviving blocks of 2³ cells
+    cells: int  # that the surface crosses
+    seconds: dict[str, float]  # wall time of each stage: "cull", "corners", "triangles", "normals"
 
 
 @dataclass(frozen=True)

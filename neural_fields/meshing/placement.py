@@ -20,14 +20,11 @@ Z_TO_Y = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 
 class Frame(NamedTuple):
-    """The coordinates that programs expect of a format: the ``up`` axis, the ``unit`` (a key of `METRES`).
+    """The coordinates that programs expect of a format."""
 
-    ``always`` if the standard fixes them, so that files follow unasked; else they are what importers assume.
-    """
-
-    up: str
-    unit: str
-    always: bool
+    up: str  # axis
+    unit: str  # a key of `METRES`
+    always: bool  # whether the standard fixes them, so that files follow unasked
 
 
 # glTF 2.0, Sec. 3.4: +y up, metres. Slicers take STL for millimetres on the xy-plane. Blender's importers take PLY and
@@ -98,14 +95,11 @@ class Placement:
 
 
 class FileTransform(NamedTuple):
-    """The map ``x → scale · turn (x − middle)``, float64.
+    """The map ``x → scale · turn (x − middle)``, float64."""
 
-    ``turn`` ``(3, 3)`` rotates by right angles, ``scale`` is file units per input unit, ``middle`` ``(3,)`` goes to 0.
-    """
-
-    turn: Float64
-    scale: float
-    middle: Float64
+    turn: Float64  # (3, 3), a rotation by right angles
+    scale: float  # file units per input unit
+    middle: Float64  # (3,) in input coordinates
 
     @property
     def changes(self) -> bool:

@@ -131,19 +131,12 @@ class Outside(nn.Module):
 
 @dataclass(frozen=True, eq=False)
 class Radiance:
-    """All that `render_volume` needs beside a geometry.
+    """All that `render_volume` needs beside a geometry."""
 
-    Attributes:
-        color: of the surface, by direction.
-        outside: the field outside the unit sphere, or None.
-        background: ``(3,)`` display RGB in [0, 1] behind everything.
-        inv_std: s of NeuS; 1/s is the uncertainty of the surface.
-    """
-
-    color: ViewColor
-    outside: Outside | None
-    background: Tensor
-    inv_std: float
+    color: ViewColor  # of the surface, by direction
+    outside: Outside | None  # field outside the unit sphere, or None
+    background: Tensor  # (3,) display RGB in [0, 1] behind everything
+    inv_std: float  # s of NeuS; 1/s is the uncertainty of the surface
 
 
 def _relu_layers(sizes: list[int]) -> list[nn.Linear]:

@@ -34,27 +34,20 @@ def moment(field: Field, t: float) -> Field:
 
 
 class _Frame(NamedTuple):
-    """A frame: ``time``, ``depth`` of hits, infinite elsewhere, and the fall of the field along rays (``slope``)."""
+    """A frame that was traced."""
 
     time: float
-    depth: Tensor
-    slope: Tensor
+    depth: Tensor  # of hits, infinite elsewhere
+    slope: Tensor  # how fast the field fell along the rays there
 
 
 class _Key(NamedTuple):
-    """A key frame.
-
-    Attributes:
-        time: of the frame.
-        lasts: time in which the surface moves by the reach.
-        near: where each ray came near the surface.
-        far: where to stop: where rays that missed had left it again.
-    """
+    """A key frame."""
 
     time: float
-    lasts: float
-    near: Near
-    far: Tensor
+    lasts: float  # time in which the surface moves by the reach
+    near: Near  # where each ray came near the surface
+    far: Tensor  # where to stop: where rays that missed had left it again
 
 
 class DynamicTracer:

@@ -22,32 +22,22 @@ FLOOR = 8  # rounding errors from zero that count as zero
 
 
 class Expected(NamedTuple):
-    """Expectations of rays, which only set where to look first.
+    """Expectations of rays ``(...,)``, which set where to look first.
 
-    Attributes:
-        depth: ``(...,)`` of their hits, infinite if unknown.
-        slope: ``(...,)`` how fast the field falls along the ray there, positive.
-        value: ``(...,)`` of the field where the ray begins, infinite if unknown. Where it is the fall of an even slope,
-            the ray is evaluated at its hit at once.
+    Where ``value`` is the fall of an even slope, the ray is evaluated at its hit at once.
     """
 
-    depth: Tensor
-    slope: Tensor
-    value: Tensor
+    depth: Tensor  # of their hits, infinite if unknown
+    slope: Tensor  # how fast the field falls along the ray there, positive
+    value: Tensor  # of the field where the ray begins, infinite if unknown
 
 
 class Near(NamedTuple):
-    """The part of each ray near the surface, ``(...,)`` each.
+    """The part of each ray near the surface, ``(...,)`` each."""
 
-    Attributes:
-        clear: the last depth evaluated before it; infinite for rays that never come near.
-        value: there, infinite where the ray begins near the surface.
-        leave: the first depth evaluated behind it, infinite if there is none.
-    """
-
-    clear: Tensor
-    value: Tensor
-    leave: Tensor
+    clear: Tensor  # the last depth evaluated before it; infinite for rays that never come near
+    value: Tensor  # there, infinite where the ray begins near the surface
+    leave: Tensor  # the first depth evaluated behind it, infinite if there is none
 
 
 class Found:
@@ -84,43 +74,24 @@ class Found:
 
 
 class Rays(NamedTuple):
-    """The rays still under way, one row ``(K,)`` or ``(K, 3)`` each.
+    """The rays still under way, one row ``(K,)`` or ``(K, 3)`` each."""
 
-    Attributes:
-        ray: row of the call.
-        origin: ``(K, 3)``.
-        direction: ``(K, 3)``.
-        depth: where to evaluate next.
-        entry: where the search may begin, at most ``depth``.
-        far: where to stop.
-        sign: −1 for a ray that began inside, else 1; values are multiplied by it.
-        low: the last depth known to be in front of the surface.
-        low_value: the value there, infinite before the first.
-        free: radius of the empty ball there.
-        gap: how much of the step from there may lie outside both its balls.
-        high: a depth known to be behind the surface, infinite if unknown.
-        high_value: the value there, negative.
-        boldness: share of the widest step that is taken.
-        expected: depth of the expected hit, infinite if unknown.
-        fall: how fast the field is expected to fall there.
-    """
-
-    ray: Tensor
+    ray: Tensor  # row of the call
     origin: Tensor
     direction: Tensor
-    depth: Tensor
-    entry: Tensor
-    far: Tensor
-    sign: Tensor
-    low: Tensor
-    low_value: Tensor
-    free: Tensor
-    gap: Tensor
-    high: Tensor
-    high_value: Tensor
-    boldness: Tensor
-    expected: Tensor
-    fall: Tensor
+    depth: Tensor  # where to evaluate next
+    entry: Tensor  # where the search may begin, at most `depth`
+    far: Tensor  # where to stop
+    sign: Tensor  # −1 for a ray that began inside, else 1; values are multiplied by it
+    low: Tensor  # last depth known to be in front of the surface
+    low_value: Tensor  # value there, infinite before the first
+    free: Tensor  # radius of the empty ball there
+    gap: Tensor  # how much of the step from there may lie outside both its balls
+    high: Tensor  # a depth known to be behind the surface, infinite if unknown
+    high_value: Tensor  # value there, negative
+    boldness: Tensor  # share of the widest step that is taken
+    expected: Tensor  # depth of the expected hit, infinite if unknown
+    fall: Tensor  # how fast the field is expected to fall there
 
     @classmethod
     def begin(cls, origins: Tensor, directions: Tensor, entries: Tensor, starts: Tensor, ends: Tensor) -> Rays:

@@ -183,17 +183,11 @@ def _until_all_stop(
 
 
 class _Cones(NamedTuple):
-    """The C tiles of an image.
+    """The C tiles of an image."""
 
-    Attributes:
-        axis: ``(C, 3)`` the direction of the middle pixel of each.
-        spread: ``(C,)`` the largest distance of the directions of its pixels from that.
-        of_pixel: ``(H, W)`` the tile of each pixel.
-    """
-
-    axis: Tensor
-    spread: Tensor
-    of_pixel: Tensor
+    axis: Tensor  # (C, 3) direction of the middle pixel of each
+    spread: Tensor  # (C,) largest distance of the directions of its pixels from that
+    of_pixel: Tensor  # (H, W) tile of each pixel
 
     @classmethod
     def of(cls, directions: Tensor, tile: int) -> _Cones:

@@ -215,27 +215,16 @@ def see_hits(
 
 
 class Setting(NamedTuple):
-    """Compile-time setting of a picture, beside the levels.
+    """Compile-time setting of a picture, beside the levels."""
 
-    Attributes:
-        width: of the image, in pixels.
-        height: likewise.
-        newton: whether hits take a last Newton step, which needs jets of the level that is traced.
-        max_steps: of each ray.
-        cone_steps: of each cone.
-        lipschitz: of the cones.
-        shallow: slope along the ray below which no Newton step is taken.
-        march: see `march_constants`.
-    """
-
-    width: int
+    width: int  # of the image, in pixels
     height: int
-    newton: bool
-    max_steps: int
-    cone_steps: int
-    lipschitz: float
-    shallow: float
-    march: tuple[tuple[str, float], ...]
+    newton: bool  # whether hits take a last Newton step, by jets of the level that is traced
+    max_steps: int  # of each ray
+    cone_steps: int  # of each cone
+    lipschitz: float  # of the cones
+    shallow: float  # slope along the ray below which no Newton step is taken
+    march: tuple[tuple[str, float], ...]  # see `march_constants`
 
 
 class Drawn(NamedTuple):

@@ -18,17 +18,11 @@ INTERPRETED_PROGRAMS = 3  # run in turn by the interpreter
 
 
 class Network(NamedTuple):
-    """A SIREN for the kernels.
+    """A SIREN for the kernels."""
 
-    Attributes:
-        parameters: (W₁, b₁, …, W_d, b_d, W_out, b_out), contiguous, float32; of the output the first row is read.
-        omega: ω₀ times the unit of the sine layers' parameters.
-        gain: the unit of the output's.
-    """
-
-    parameters: tuple[Tensor, ...]
-    omega: float
-    gain: float
+    parameters: tuple[Tensor, ...]  # (W₁, b₁, …, W_out, b_out), contiguous, float32; one output row is read
+    omega: float  # ω₀ times the unit of the sine layers' parameters
+    gain: float  # the unit of the output's
 
     @classmethod
     def of(cls, parameters: Sequence[Tensor], omega: float, gain: float) -> Network:
@@ -47,19 +41,12 @@ class Network(NamedTuple):
 
 
 class Tiling(NamedTuple):
-    """How a kernel cuts its work; the names are those of its arguments.
+    """How a kernel cuts its work; the names are those of its arguments."""
 
-    Attributes:
-        rows: points of a tile.
-        columns: units of an accumulator, a power of two.
-        piece: inner units of one product, a power of two ≥ 16.
-        warps: of a program.
-    """
-
-    rows: int
-    columns: int
-    piece: int
-    warps: int
+    rows: int  # points of a tile
+    columns: int  # units of an accumulator, a power of two
+    piece: int  # inner units of one product, a power of two ≥ 16
+    warps: int  # of a program
 
     def stride(self, width: int) -> int:
         """The width rounded up to whole accumulators."""

@@ -31,17 +31,11 @@ from .tensor_tiles import jet_of_tile, points_of, rows_of, value_of_tile
 
 
 class Levels(NamedTuple):
-    """A `MultiscaleSDF` for the kernels.
+    """A `MultiscaleSDF` for the kernels."""
 
-    Attributes:
-        networks: coarse to fine.
-        deltas: ``(len(networks) − 1,)`` half-widths of the bands, float32 on the networks' device.
-        taper: the share of a band over which its gate closes.
-    """
-
-    networks: tuple[Packed, ...]
-    deltas: Tensor
-    taper: float
+    networks: tuple[Packed, ...]  # coarse to fine
+    deltas: Tensor  # (len(networks) − 1,) half-widths of the bands, float32 on the networks' device
+    taper: float  # share of a band over which its gate closes
 
     @classmethod
     def of(cls, networks: Sequence[Packed], deltas: Tensor, taper: float) -> Levels:

@@ -25,23 +25,14 @@ LARGEST_WEIGHT = 16.0  # the largest entry of a scaled matrix lies in (LARGEST_W
 
 
 class Shape(NamedTuple):
-    """Compile-time shape of a network.
+    """Compile-time shape of a network."""
 
-    Attributes:
-        width: units of a sine layer, padded with zeros to a multiple of an accumulator.
-        depth: sine layers.
-        columns: units of an accumulator, a power of two in 16 to 256.
-        piece: inner units of one product, a power of two in 16 to 64.
-        rows: points of a tile.
-        kept: whether a program that evaluates values keeps the hidden weights in shared memory.
-    """
-
-    width: int
-    depth: int
-    columns: int
-    piece: int
-    rows: int
-    kept: bool
+    width: int  # units of a sine layer, padded with zeros to a multiple of an accumulator
+    depth: int  # sine layers
+    columns: int  # units of an accumulator, a power of two in 16 to 256
+    piece: int  # inner units of one product, a power of two in 16 to 64
+    rows: int  # points of a tile
+    kept: bool  # whether a program that evaluates values keeps the hidden weights in shared memory
 
     @classmethod
     def of(cls, width: int, depth: int, *, hopper: bool = True) -> Shape:
@@ -74,13 +65,11 @@ class Shape(NamedTuple):
 class Packed(NamedTuple):
     """A SIREN for the kernels.
 
-    Attributes:
-        floats: float32, in rows of ``shape.width``: of the first layer one for each coordinate and one of biases; the
-            biases of the other sine layers; the output's weights, and these scaled for the sweep back. Then numbers:
-            the output's bias, (2π)^depth, and of each hidden layer the factors of its products, there and back. Phases
-            are in turns, and the output's gain is included.
-        halves: float16 ``(depth − 1, 2, width, width)``: H and L of each hidden layer; rows are inner units.
-        shape: see `Shape`.
+    ``floats`` are float32, in rows of ``shape.width``: of the first layer one for each coordinate and one of biases;
+    the biases of the other sine layers; the output's weights, and these scaled for the sweep back. Then numbers: the
+    output's bias, (2π)^depth, and of each hidden layer the factors of its products, there and back. Phases are in
+    turns, the output's gain is included. ``halves``, float16 ``(depth − 1, 2, width, width)``, are H and L of each
+    hidden layer; rows are inner units.
     """
 
     floats: Tensor

@@ -29,31 +29,20 @@ IN_REGISTERS = 128
 
 
 class RayTensors(NamedTuple):
-    """Rays on a device.
+    """Rays on a device."""
 
-    Attributes:
-        origins: ``(N, 3)``, or ``(1, 3)`` for all of them.
-        directions: ``(N, 3)`` of unit length.
-        starts: ``(N,)`` depth at which each begins.
-        entries: ``(N,)`` depth to which it may go back if that is behind the surface.
-        ends: ``(N,)`` depth at which it stops.
-    """
-
-    origins: Tensor
-    directions: Tensor
-    starts: Tensor
-    entries: Tensor
-    ends: Tensor
+    origins: Tensor  # (N, 3), or (1, 3) for all of them
+    directions: Tensor  # (N, 3) of unit length
+    starts: Tensor  # (N,) depth at which each begins
+    entries: Tensor  # (N,) depth to which it may go back if that is behind the surface
+    ends: Tensor  # (N,) depth at which it stops
 
 
 class Queue(NamedTuple):
-    """Rays to be marched.
+    """Rays to be marched."""
 
-    ``rays`` ``(N,)`` int32 are their numbers; ``state`` ``(2,)`` int32 are their count, and how many were taken.
-    """
-
-    rays: Tensor
-    state: Tensor
+    rays: Tensor  # (N,) int32, their numbers
+    state: Tensor  # (2,) int32, how many there are, and how many were taken
 
     @classmethod
     def of(cls, starts: Tensor, ends: Tensor) -> Queue:
@@ -69,21 +58,13 @@ class Queue(NamedTuple):
 
 
 class Marched(NamedTuple):
-    """Results of rays, ``(N,)`` each; the names are those of `Hits`.
+    """Results of rays, ``(N,)`` each; the names are those of `Hits`."""
 
-    Attributes:
-        mask: whether a ray meets the surface.
-        depth: where, or where its search ended.
-        steps: evaluations of the network on it.
-        slope: how fast the field fell along the ray at its last step.
-        level: how many bands its last value lay in.
-    """
-
-    mask: Tensor
-    depth: Tensor
-    steps: Tensor
-    slope: Tensor
-    level: Tensor
+    mask: Tensor  # whether a ray meets the surface
+    depth: Tensor  # where, or where its search ended
+    steps: Tensor  # evaluations of the network on it
+    slope: Tensor  # how fast the field fell along the ray at its last step
+    level: Tensor  # how many bands its last value lay in
 
     @classmethod
     def nothing(cls, starts: Tensor) -> Marched:
