@@ -14,8 +14,6 @@ from mplicits.pipelines.training.config import closest, input_error
 from ..paper.names import METHODS, PRESETS, TABLES
 from .common import typed
 
-__all__ = ["PAPER"]
-
 Name = TypeVar("Name", bound=str)
 
 

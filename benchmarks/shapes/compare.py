@@ -8,12 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from mplicits.datasets.color_space import linear_to_srgb, srgb_to_linear
+from mplicits.neural_fields.meshing.color_space import linear_to_srgb, srgb_to_linear
 from mplicits.pipelines.render.trace import Seen
 from numpy.typing import NDArray
 from torch import Tensor
-
-__all__ = ["Drawing", "ImageError", "draw", "image_error", "psnr"]
 
 LEAST_MSE = 1e-12  # 120 dB: images that are the same have a finite PSNR
 

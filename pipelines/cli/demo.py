@@ -40,8 +40,6 @@ from ..training.report import Progress, Report, reported
 from ..training.settings import FitConfig
 from .common import tell_budget
 
-__all__ = ["demo", "distances_to_surface", "draw_levels", "spread_colors"]
-
 Float64 = NDArray[np.float64]
 
 TILE = (480, 640)

@@ -10,8 +10,6 @@ import time
 from ..training.config import given_flags
 from .common import Command, add_flags, positive, whole, write_json
 
-__all__ = ["EVALUATE", "MESH"]
-
 MESH_FILES = (".ply", ".obj", ".stl", ".glb")
 UNITS = ("um", "mm", "cm", "m", "km", "in", "ft")
 
@@ -94,7 +92,7 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     if arguments.photos is None:
         metrics = evaluate_files(arguments.mesh, arguments.reference, **options)
     else:
-        from ...datasets.views.formats.reading import read_cameras
+        from ...datasets.views.images import read_cameras
         from ..reconstruct.data.visibility import count_views
         from ..training.progress import counter_bar
 

@@ -13,8 +13,6 @@ from ..training.config import command_line, input_error
 from ..training.settings import ReconstructConfig
 from .common import Command, add_flags, check_output, positive, refuse, training, whole, write_json
 
-__all__ = ["CHECK_CAMERAS", "FIND_CAMERAS", "FIND_POINTS", "SCENE", "tell_found"]
-
 if TYPE_CHECKING:
     from ...datasets.views.poses.find_cameras import FoundCameras
     from ...datasets.views.poses.find_points import FoundPoints
@@ -118,7 +116,7 @@ def _check_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _check_cameras(arguments: argparse.Namespace) -> int:
     check_output(arguments.out, (".glb", ".ply"))
-    from ...datasets.views.formats.depth_maps import DepthSource
+    from ...datasets.views.formats.shots import DepthSource
     from ..reconstruct.checks.check import check_files
 
     depths = DepthSource(arguments.depth_maps, arguments.depth_kind, arguments.depth_scale)

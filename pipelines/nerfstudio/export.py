@@ -20,7 +20,7 @@ from ..mesh.bake import check_texture_size, textured_mesh
 from ..mesh.extract import normals_near
 from ..mesh.files import check_textured_path
 from ..reconstruct.data.visibility import seen_points
-from ..surface.trim import Support, seen_part
+from ..surface.surface import Support, seen_part
 
 __all__ = ["colored", "export_mesh", "host_cameras", "in_data_coordinates", "main", "part_seen"]
 

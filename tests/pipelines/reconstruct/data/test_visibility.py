@@ -9,7 +9,7 @@ from mplicits.datasets.cameras import look_at
 from mplicits.neural_fields import Sphere, Union, extract_mesh, save_field
 from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.reconstruct.data.visibility import SeenFrom, seen_points
-from mplicits.pipelines.surface.trim import Support, seen_part, thinned
+from mplicits.pipelines.surface.surface import Support, seen_part, thinned
 
 RADIUS, DISTANCE = 0.5, 2.0
 
