@@ -68,14 +68,6 @@ def test_projection_agrees_with_the_matrices_written_out():
     torch.testing.assert_close(z, image[:, 2])
 
 
-@pytest.mark.parametrize("shape", [(3,), (0, 3), (1, 3), (2, 4, 3)])
-def test_points_of_any_leading_shape_and_dtype(shape, dtype):
-    pixels, z = some_camera().project(torch.zeros(shape, dtype=dtype))
-    assert pixels.shape == (*shape[:-1], 2)
-    assert z.shape == shape[:-1]
-    assert pixels.dtype == z.dtype == torch.float64
-
-
 def test_rays_go_to_the_device_and_dtype_asked_for(device, dtype):
     camera = some_camera()
     eye, directions = camera.rays(dtype=dtype, device=device)
