@@ -8,7 +8,6 @@ import pytest
 import torch
 from bounds import unit_roundoff
 from mplicits.datasets import Camera, look_at, orbit, turntable
-from mplicits.datasets.cameras import pinhole_intrinsics
 from mplicits.neural_fields import Similarity
 
 
@@ -249,11 +248,6 @@ def test_views_that_cannot_be_say_why():
             look_at(*arguments[:2], up=arguments[2], width=4, height=4)
     with pytest.raises(ValueError, match="shape"):
         some_camera().project(torch.zeros(4, 2))
-
-
-def test_intrinsics_of_a_vertical_angle_of_view():
-    matrix = pinhole_intrinsics(90, 6, 4)
-    torch.testing.assert_close(matrix, torch.tensor([[2.0, 0, 2.5], [0, 2.0, 1.5], [0, 0, 1]]).double())
 
 
 def test_a_strip_sees_what_its_rows_see():
