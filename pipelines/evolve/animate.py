@@ -32,8 +32,6 @@ from ..training.motion import load_motion
 from .follow import follow_mesh
 from .shapes import Placement as ShapePlacement
 
-__all__ = ["SequenceOptions", "animate_run", "check_sequence_path", "film_frames", "last_colors", "there_and_back"]
-
 Tell = Callable[[int, int], None]
 
 SHEET = ".png"

@@ -18,8 +18,6 @@ from .problem import End
 from .samples import band_points
 from .topology import Change, Topology, find_changes, surface_of, topology_of
 
-__all__ = ["FrameFigures", "check_evolution", "end_figures", "frame_figures", "slope_figures", "warnings"]
-
 END_RESOLUTION = 192
 
 

@@ -39,16 +39,6 @@ from .landmarks import Landmarks, nearness, placed_landmarks
 from .samples import Bounds, Known, around, joined, known_at, uniform
 from .shapes import StaticShape
 
-__all__ = [
-    "MOTION",
-    "MotionObjective",
-    "MotionOptions",
-    "carried_samples",
-    "learn_motion",
-    "match",
-    "motion_figures",
-]
-
 
 @dataclass(frozen=True)
 class MotionOptions:

@@ -17,8 +17,6 @@ from ...neural_fields.spacetime.flow import IntegrationError, Solver
 from ...neural_fields.spacetime.surface_velocity import CarriedVelocity
 from .topology import surface_of, topology_of
 
-__all__ = ["TrackedMesh", "follow_mesh"]
-
 # So many cells on a side show how many pieces and holes a surface has; smaller ones than theirs do not count.
 TOPOLOGY_RESOLUTION = 64
 # A fixed step: near a change of topology adaptive ones would shrink to nothing before we can say when that was.

@@ -18,8 +18,6 @@ from ...datasets.landmarks import read_landmarks
 from ...neural_fields import InputError
 from .shapes import StaticShape
 
-__all__ = ["FAR_OUT", "Landmarks", "nearness", "placed_landmarks", "read_landmarks"]
-
 Float64 = NDArray[np.float64]
 FAR_OUT = 0.1  # how far from its surface a landmark may lie, in units of the field: fits and picks are not exact
 

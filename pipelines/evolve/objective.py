@@ -16,8 +16,6 @@ from ..training.trainer import Group, Objective, Report, Trainer, seeded, warm_c
 from .problem import Problem
 from .samples import Known, band_points, indices_in_band, uniform_spacetime
 
-__all__ = ["LONGEST_GRADIENT", "EvolveObjective", "learn_start"]
-
 # Norm of the gradient by the weights. Second derivatives have spikes, and a single one, at the peak of the learning
 # rate, would throw the field so far from any distance that it does not come back.
 LONGEST_GRADIENT = 1.0

@@ -23,8 +23,6 @@ from .deform import carried_samples, learn_motion, motion_figures
 from .samples import Bounds, Carried, Known, around, joined, known_at, no_bounds, signs, uniform, values_at
 from .shapes import Placement, StaticShape, aligned, into_unit_sphere
 
-__all__ = ["End", "Problem", "between", "build_problem", "morph_law", "velocity_field"]
-
 END_POINTS = 50_000  # on a surface that shall be met
 REACH_POINTS = 2000
 # Fitted fields are distances only about so far from their surfaces; a bound from them is taken for so much less.

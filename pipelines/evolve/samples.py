@@ -14,22 +14,6 @@ from ...neural_fields.spacetime.evolution import VectorField
 from ..fit.samples import DOMAIN, Rows
 from .shapes import StaticShape
 
-__all__ = [
-    "Bounds",
-    "Carried",
-    "Known",
-    "around",
-    "band_points",
-    "indices_in_band",
-    "joined",
-    "known_at",
-    "no_bounds",
-    "signs",
-    "uniform",
-    "uniform_spacetime",
-    "values_at",
-]
-
 
 @dataclass(frozen=True, eq=False)
 class Known(Rows):

@@ -25,8 +25,6 @@ from ..training.report import Report
 from ..training.settings import EvolveConfig, FitConfig
 from .landmarks import FAR_OUT
 
-__all__ = ["fits_beside", "fitted_scans", "scans_among"]
-
 
 def scans_among(shapes: Sequence[str]) -> dict[str, Mesh]:
     """Those of the shapes that are files of points or triangles, read.

@@ -34,8 +34,6 @@ from ...neural_fields.fields.csg import Bounded
 from ..surface.surface import sample_points
 from ..training.folder import find_field
 
-__all__ = ["Placed", "Placement", "StaticShape", "aligned", "into_unit_sphere", "read_shape"]
-
 Float64 = NDArray[np.float64]
 
 _SIZES: Mapping[str, int] = MappingProxyType({"sphere": 1, "torus": 2, "box": 3, "capsule": 2})

@@ -21,8 +21,6 @@ from ...neural_fields import Field, Mesh, NoSurfaceError, TimeSlice, at_time, ex
 from ...neural_fields.fields.function import FieldLike
 from ..surface.surface import components
 
-__all__ = ["CHANGES", "Change", "ChangeOptions", "Topology", "find_changes", "surface_of", "topology_of"]
-
 
 @dataclass(frozen=True)
 class ChangeOptions:

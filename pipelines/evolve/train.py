@@ -41,8 +41,6 @@ from .objective import LONGEST_GRADIENT, EvolveObjective, learn_start
 from .problem import Problem, build_problem
 from .shapes import StaticShape, read_shape
 
-__all__ = ["Evolution", "evolve", "train_evolution"]
-
 # Of a time budget, what the start and the checks may take.
 STARTING_SHARE, CHECKING_SHARE = 0.2, 0.25
 # Frames that are checked in any case; and how many frames the check of an end costs, by its finer mesh.

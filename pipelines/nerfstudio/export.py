@@ -22,8 +22,6 @@ from ..mesh.files import check_textured_path
 from ..reconstruct.data.visibility import seen_points
 from ..surface.trim import Support, seen_part
 
-__all__ = ["colored", "export_mesh", "host_cameras", "in_data_coordinates", "main", "part_seen"]
-
 Float64 = NDArray[np.float64]
 Move = tuple[Float64, float]  # (3, 4) and a scale: see `in_data_coordinates`
 

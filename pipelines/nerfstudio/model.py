@@ -27,16 +27,6 @@ from ...neural_fields.networks.hash_encoding import HashEncoding, tables_apart
 from ..training.settings import ReconstructConfig
 from .schedule import WarmCosine
 
-__all__ = [
-    "RATES",
-    "MultiscaleFactoModel",
-    "MultiscaleFactoModelConfig",
-    "MultiscaleFieldConfig",
-    "MultiscaleModel",
-    "MultiscaleModelConfig",
-    "build_field",
-]
-
 OURS = ReconstructConfig()  # colours are those of `mplicits reconstruct`
 COLOR_RATE = OURS.color_rate * OURS.learning_rate
 # Peak rates of Adam for the groups of parameters; the geometry is made to suit its own (`rescale_parameters`).

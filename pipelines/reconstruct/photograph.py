@@ -23,8 +23,6 @@ from ..training.machine import choose_device
 from .model.model import SceneModel
 from .views import render_camera
 
-__all__ = ["TrainedScene", "open_scene", "photograph"]
-
 
 class TrainedScene(NamedTuple):
     """What a reconstruction has left to be rendered.

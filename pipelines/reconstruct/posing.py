@@ -7,8 +7,6 @@ from ...datasets.views.poses.find_cameras import FoundCameras
 from ...datasets.views.poses.find_points import FoundPoints
 from ..training.report import Progress, Report, silent
 
-__all__ = ["colmap_report", "said_of"]
-
 
 def colmap_report(report: Report | None) -> ColmapReport:
     """A receiver of COLMAP's progress that passes it on to ``report``."""

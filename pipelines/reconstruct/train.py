@@ -41,16 +41,6 @@ from .model.model import RayPool, SceneModel, build_scene
 from .model.replayed import ReplayedTrainer, scene_trainer
 from .views import ViewImage, comparison_sheet, exposed_as, held_out, measure, reduced, render_image, spread
 
-__all__ = [
-    "HELD_OUT_FILE",
-    "MESH_FILE",
-    "PREVIEW_FILE",
-    "Reconstruction",
-    "reconstruct",
-    "scene_texture",
-    "surface_colors",
-]
-
 HELD_OUT_FILE = "held_out.png"
 PREVIEW_FILE = "preview.png"
 MESH_FILE = "mesh.ply"  # that the command makes of a finished run

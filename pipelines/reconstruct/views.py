@@ -23,19 +23,6 @@ from ..render.picture import Image, stacked
 from .data.silhouettes import OBJECT
 from .model.model import SceneModel, camera_rays
 
-__all__ = [
-    "ViewImage",
-    "comparison_sheet",
-    "exposed_as",
-    "held_out",
-    "measure",
-    "reduced",
-    "render_camera",
-    "render_image",
-    "spread",
-    "target_of",
-]
-
 Float32 = NDArray[np.float32]
 
 

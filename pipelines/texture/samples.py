@@ -16,8 +16,6 @@ from ...datasets.textured.reading import TEXTURED_READERS, read_textured, sample
 from ...neural_fields import Field, InputError, Similarity
 from ..fit.samples import DOMAIN
 
-__all__ = ["BandSamples", "ColorSamples", "band_directions", "has_colors", "match_colors", "read_colors"]
-
 
 class ColorSamples(NamedTuple):
     """Points of the band with known colours.

@@ -13,8 +13,6 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool3d, grid_sample, interpolate
 
-__all__ = ["CELL", "SpreadColors"]
-
 SPREAD_CELLS = 128  # cells on each side of the cube [-1, 1]³
 CELL = 2.0 / SPREAD_CELLS
 

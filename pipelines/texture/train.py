@@ -43,16 +43,6 @@ from ..training.settings import TextureConfig
 from ..training.trainer import Group, Objective, Trainer, parameter_count, seeded, stop_on_signals, warm_cosine
 from .samples import BandSamples, ColorSamples, band_directions, match_colors, read_colors
 
-__all__ = [
-    "FittedTexture",
-    "TextureObjective",
-    "default_delta",
-    "fit_texture",
-    "texture_of",
-    "texture_run",
-    "texture_step_seconds",
-]
-
 # A band at least this wide (in units of the field) holds decimated meshes, and the surfaces of small networks.
 LEAST_DELTA = 0.02
 FEWEST_COLORED = 2_000  # points that are left where time is short

@@ -32,20 +32,6 @@ from ..training.motion import load_motion
 from .spread import CELL, SpreadColors
 from .train import texture_of
 
-__all__ = [
-    "TRANSPORT",
-    "Backward",
-    "Colors",
-    "TransportOptions",
-    "TransportedColors",
-    "TransportedPoints",
-    "borrowed_texture",
-    "colors_of_run",
-    "pinned_texture",
-    "start_texture",
-    "texture_colors",
-]
-
 # Points (N, 3) to display colours (N, 3).
 Colors = Callable[[Tensor], Tensor]
 # Points (N, 3) of a moment to where they were at another time, (N, 3).

@@ -21,8 +21,6 @@ from ...neural_fields import InputError
 from ...neural_fields.backend import files as disk
 from .lock import lock_file, locked
 
-__all__ = ["is_scratch", "prune", "recover", "recovered", "replace_files"]
-
 JOURNAL = ".journal"
 PARTIAL = re.compile(r"\..*\.(\d+)\.partial(\.[^.]*)?")  # of `whole_file`
 

@@ -10,8 +10,6 @@ from typing import Any
 
 import torch
 
-__all__ = ["Budget", "BudgetOptions", "affordable", "least_share", "step_seconds"]
-
 
 @dataclass(frozen=True)
 class BudgetOptions:

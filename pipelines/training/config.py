@@ -15,19 +15,6 @@ from importlib import resources
 from pathlib import Path
 from typing import Any, ClassVar, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-__all__ = [
-    "Settings",
-    "add_config_flags",
-    "closest",
-    "command_line",
-    "given_flags",
-    "input_error",
-    "load_config",
-    "preset_names",
-    "setting",
-    "thing_of",
-]
-
 T = TypeVar("T")
 
 

@@ -7,8 +7,6 @@ from collections.abc import Mapping, MutableMapping
 import torch
 from torch import Tensor
 
-__all__ = ["Focus"]
-
 
 class Focus:
     """Pixels of a pool, drawn evenly or by the errors of their strips.

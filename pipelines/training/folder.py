@@ -32,36 +32,6 @@ from .atomic import is_scratch, prune, recovered, replace_files
 from .config import command_line, load_config
 from .lock import check_unlocked, locked
 
-__all__ = [
-    "CLOUD_FILE",
-    "FIELD_FILE",
-    "MAY_CHANGE",
-    "MERGED_FILE",
-    "RADIANCE_FILE",
-    "RECORD_FILE",
-    "STATE_FILE",
-    "SUPPORT_FILE",
-    "TEXTURE_FILE",
-    "RunFolder",
-    "check_new_run",
-    "chosen_level",
-    "digest_of",
-    "find_field",
-    "fitted_cloud",
-    "is_field",
-    "is_fitted",
-    "kept_cloud",
-    "load_state",
-    "load_still",
-    "named_cloud",
-    "read_record",
-    "resumes_with",
-    "save_state",
-    "state_bytes",
-    "texture_state_file",
-    "write_texture",
-]
-
 C = TypeVar("C")
 
 FIELD_FILE = "field.safetensors"

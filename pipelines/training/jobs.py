@@ -21,8 +21,6 @@ import torch
 from ...neural_fields import InputError
 from .trainer import Interrupted, shared_flag, stop_on_signals
 
-__all__ = ["Outcome", "check_jobs", "run_jobs", "run_streams"]
-
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 

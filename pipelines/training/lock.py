@@ -13,8 +13,6 @@ from filelock import FileLock, Timeout
 
 from ...neural_fields import InputError
 
-__all__ = ["check_unlocked", "lock_file", "locked"]
-
 
 def lock_file(target: Path) -> Path:
     """The lock of a run directory, which lies in it, or of a file, beside it."""

@@ -17,8 +17,6 @@ import torch
 
 from ...neural_fields import InputError
 
-__all__ = ["best_seconds", "environment", "format_table", "peak_memory", "sgemm_rate"]
-
 # Linux keeps the high-water mark of a process here. Not getrusage: its maximum survives exec, so that a child would
 # report what its parent held when it was born.
 STATUS = Path("/proc/self/status")

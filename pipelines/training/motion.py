@@ -8,8 +8,6 @@ from ...neural_fields import InputError
 from ...neural_fields.spacetime.velocity import VelocitySiren
 from .folder import load_state, read_record
 
-__all__ = ["VELOCITY_FILE", "load_motion"]
-
 VELOCITY_FILE = "velocity.safetensors"
 
 

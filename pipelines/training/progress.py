@@ -14,8 +14,6 @@ from rich.text import Text
 
 from .report import Progress, Report
 
-__all__ = ["Lines", "counter_bar", "progress_bars", "time_words"]
-
 
 @contextmanager
 def progress_bars(*, clock: Callable[[], float] = time.monotonic) -> Iterator[Report]:

@@ -18,8 +18,6 @@ from torch import Tensor
 
 from ...neural_fields.backend.devices import Supply
 
-__all__ = ["Again", "CudaGraphs", "Recorder", "Replays", "Results", "Work"]
-
 Results = Mapping[str, Tensor]
 Work = Callable[[], Results]
 

@@ -6,8 +6,6 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-__all__ = ["Progress", "Report", "reported", "silent"]
-
 
 @dataclass(frozen=True)
 class Progress:

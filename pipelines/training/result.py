@@ -9,8 +9,6 @@ from typing import Any, Generic, TypeVar
 from ...neural_fields import Field, Mesh, Similarity, WorldField, save_field
 from ...neural_fields.spacetime.dynamic_tracing import moment
 
-__all__ = ["Run"]
-
 F = TypeVar("F", bound=Field, covariant=True)
 
 

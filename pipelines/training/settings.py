@@ -13,8 +13,6 @@ from typing import ClassVar, Literal
 
 from .config import Settings, setting
 
-__all__ = ["SHADINGS", "EvolveConfig", "FitConfig", "ReconstructConfig", "ShadeOptions", "TextureConfig"]
-
 _per_level = functools.partial(setting, above=0, per_level=True)
 
 

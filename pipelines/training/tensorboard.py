@@ -10,8 +10,6 @@ from typing import Any
 from ...neural_fields import InputError
 from .report import Progress, Report
 
-__all__ = ["tensorboard_log"]
-
 
 @contextmanager
 def tensorboard_log(directory: str | Path) -> Iterator[Report]:

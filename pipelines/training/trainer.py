@@ -20,25 +20,6 @@ from torch import Tensor, nn
 from ...neural_fields.backend.devices import precise
 from .report import Progress, Report, silent
 
-__all__ = [
-    "Group",
-    "Interrupted",
-    "Objective",
-    "Progress",
-    "Report",
-    "StopFlag",
-    "Trainer",
-    "checkpoint_of",
-    "load_compiler",
-    "parameter_count",
-    "restore_frozen",
-    "seeded",
-    "shared_flag",
-    "stop_on_signals",
-    "warm_cosine",
-    "without_prefix",
-]
-
 Rate = Callable[[float], float]
 
 

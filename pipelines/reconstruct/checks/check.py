@@ -28,8 +28,6 @@ from ..data.silhouettes import Agreement, named
 from .depth_check import DepthCheck, check_depths
 from .frustums import camera_mesh
 
-__all__ = ["CameraCheck", "check_cameras", "check_files", "format_check"]
-
 Float64 = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 

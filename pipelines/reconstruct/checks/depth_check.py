@@ -14,8 +14,6 @@ from ....datasets.views.formats.depth_maps import DepthMap
 from ....datasets.views.images import PosedImage, PosedImages
 from ..data.measured import UNITS, said_outside
 
-__all__ = ["DepthCheck", "check_depths"]
-
 Float64 = NDArray[np.float64]
 
 

@@ -20,8 +20,6 @@ from ....datasets.views.images import PosedImages
 from ....neural_fields.meshing.extract import Mesh
 from ...render.shade import COLOR_MAPS, apply_color_map
 
-__all__ = ["camera_mesh", "frustum_size"]
-
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 Rgb = tuple[float, float, float]

@@ -24,8 +24,6 @@ from ....neural_fields.fields.function import FieldLike
 from ....neural_fields.volume.weights import sphere_span
 from .silhouettes import OBJECT
 
-__all__ = ["DepthRays", "MeasuredDepths", "depth_loss", "fit_scale_shift", "said_outside"]
-
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 

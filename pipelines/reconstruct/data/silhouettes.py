@@ -17,8 +17,6 @@ from ....datasets.cameras import Camera
 from ....datasets.views.images import PosedImage
 from ....neural_fields import Similarity
 
-__all__ = ["OBJECT", "Agreement", "Limits", "grid_in_ball", "named", "silhouettes"]
-
 OBJECT = 0.5  # a pixel with a larger share of object counts as one
 
 

@@ -17,8 +17,6 @@ from ...render.rasterise import mesh_view
 from ...render.studio import sees
 from .silhouettes import OBJECT
 
-__all__ = ["SeenFrom", "count_views", "seen_points"]
-
 SeenFrom = tuple[Camera, NDArray[np.float32] | None]
 """A camera in unit-sphere coordinates, and the mask ``(H, W)`` of its picture, which says what is object."""
 

@@ -8,8 +8,6 @@ from torch import Tensor
 from ....neural_fields.volume.weights import sphere_span
 from ..data.measured import MeasuredDepths
 
-__all__ = ["seen_through"]
-
 
 def seen_through(measured: MeasuredDepths, resolution: int, *, rays: int = 1 << 18, least: int = 2) -> Tensor:
     """Which vertices of a grid over [−1, 1]³ measured rays pass ``(resolution + 1,) * 3``, on the CPU.

@@ -22,8 +22,6 @@ from ..data.silhouettes import Agreement, grid_in_ball, silhouettes
 from ..model.model import SceneModel
 from .free_space import seen_through
 
-__all__ = ["begin", "carve", "fitting_resolution", "start_at_hull"]
-
 
 @dataclass(frozen=True)
 class HullOptions:

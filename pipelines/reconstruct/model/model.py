@@ -24,8 +24,6 @@ from ...training.focus import Focus
 from ...training.settings import ReconstructConfig
 from ...training.trainer import seeded
 
-__all__ = ["Exposures", "PoseCorrections", "RayPool", "Rays", "SceneModel", "build_scene", "camera_rays"]
-
 # Kinds of devices on which matrix products of colours are in bfloat16.
 HALF_PRECISION = ("cuda",)
 

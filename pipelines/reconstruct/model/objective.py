@@ -21,8 +21,6 @@ from ...training.trainer import Group, Objective, warm_cosine
 from ..data.measured import MeasuredDepths, depth_loss
 from .model import RayPool, SceneModel
 
-__all__ = ["Kind", "Outcome", "SceneObjective", "Schedule"]
-
 
 @dataclass(frozen=True)
 class Schedule:

@@ -19,8 +19,6 @@ from ..data.measured import MeasuredDepths
 from .model import RayPool, SceneModel
 from .objective import Kind, SceneObjective
 
-__all__ = ["ReplayedTrainer", "Rooms", "scene_trainer"]
-
 CHOICES = ("sections", "colors", "outside")
 
 
