@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from ..training.config import add_config_flags, given_flags, input_error, load_config, preset_names, thing_of
+from ..training.settings import add_config_flags, given_flags, input_error, load_config, preset_names, thing_of
 
 if TYPE_CHECKING:
-    from ..training.report import Progress, Report
+    from ..training.progress import Progress, Report
 
 __all__ = [
     "Command",
@@ -106,7 +106,7 @@ def training(
         stack.enter_context(stoppable(kept, at_any_time=at_any_time))
         listeners: list[Report] = []
         if board is not None:
-            from ..training.tensorboard import tensorboard_log
+            from ..training.progress import tensorboard_log
 
             listeners.append(stack.enter_context(tensorboard_log(board)))
         if not quiet:

@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NoReturn
 
-from ..training.config import closest
+from ..training.settings import closest
 from .commands import COMMANDS
 from .common import Command, Stopped, check_output
 

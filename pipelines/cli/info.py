@@ -10,8 +10,8 @@ import numpy as np
 from ...neural_fields import Mesh, Siren, load_field
 from ...neural_fields.networks.multiscale import levels_of
 from ..surface.surface import components, is_closed, read_described
-from ..training.config import command_line
 from ..training.folder import RECORD_FILE, find_field, is_field, read_record, resumes_with
+from ..training.settings import command_line
 from ..training.trainer import parameter_count
 
 __all__ = ["describe"]

@@ -7,7 +7,7 @@ import dataclasses
 import functools
 import time
 
-from ..training.config import given_flags
+from ..training.settings import given_flags
 from .common import Command, add_flags, positive, whole, write_json
 
 __all__ = ["EVALUATE", "MESH"]
@@ -95,7 +95,7 @@ def _evaluate(arguments: argparse.Namespace) -> int:
         metrics = evaluate_files(arguments.mesh, arguments.reference, **options)
     else:
         from ...datasets.views.formats.reading import read_cameras
-        from ..reconstruct.data.visibility import count_views
+        from ..reconstruct.views import count_views
         from ..training.progress import counter_bar
 
         cameras = [camera for _, camera in read_cameras(arguments.photos)]

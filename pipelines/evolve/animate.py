@@ -26,9 +26,8 @@ from ..render.shade import ShadeOptions, compose, downsample, shade
 from ..render.subject import Orbit, orbit_cameras, traced_part
 from ..render.trace import PRECISION, fine_strips, pixel_size, see_hits
 from ..texture.transport import Colors, TransportedColors, borrowed_texture, pinned_texture, start_texture
-from ..training.folder import FIELD_FILE, RECORD_FILE, chosen_level, find_field, read_record
+from ..training.folder import FIELD_FILE, RECORD_FILE, chosen_level, find_field, load_motion, read_record
 from ..training.machine import choose_device
-from ..training.motion import load_motion
 from .follow import follow_mesh
 from .shapes import Placement as ShapePlacement
 

@@ -31,13 +31,12 @@ from torch.nn.functional import huber_loss, normalize, pad
 
 from ...neural_fields import Field, at_time, flow
 from ...neural_fields.spacetime.velocity import CarriedKeyframes, VelocitySiren
-from ..training.budget import BUDGET, Budget
-from ..training.report import Report
+from ..training.progress import Report
+from ..training.scaffold import BUDGET, Budget
 from ..training.settings import EvolveConfig
 from ..training.trainer import Group, Objective, Trainer, seeded, warm_cosine
-from .landmarks import Landmarks, nearness, placed_landmarks
 from .samples import Bounds, Known, around, joined, known_at, uniform
-from .shapes import StaticShape
+from .shapes import Landmarks, StaticShape, nearness, placed_landmarks
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,8 @@ from ...neural_fields.backend.devices import upload
 from ...neural_fields.fields.losses import eikonal_loss
 from ...neural_fields.spacetime.evolution import key_loss, law_loss
 from ...neural_fields.spacetime.field import spacetime_jet
-from ..training.focus import Focus
 from ..training.settings import EvolveConfig
-from ..training.trainer import Group, Objective, Report, Trainer, seeded, warm_cosine
+from ..training.trainer import Focus, Group, Objective, Report, Trainer, seeded, warm_cosine
 from .problem import Problem
 from .samples import Known, band_points, indices_in_band, uniform_spacetime
 

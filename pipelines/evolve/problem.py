@@ -16,8 +16,8 @@ from ...neural_fields.spacetime.evolution import Law, VectorField, mean_curvatur
 from ...neural_fields.spacetime.flow import IntegrationError, trajectories
 from ...neural_fields.spacetime.moving import Keyframes
 from ...neural_fields.spacetime.velocity import CarriedKeyframes, VelocitySiren
-from ..training.budget import BUDGET, Budget, affordable
-from ..training.report import Report
+from ..training.progress import Report
+from ..training.scaffold import BUDGET, Budget, affordable
 from ..training.settings import EvolveConfig
 from .deform import carried_samples, learn_motion, motion_figures
 from .samples import Bounds, Carried, Known, around, joined, known_at, no_bounds, signs, uniform, values_at

@@ -19,11 +19,10 @@ from ...neural_fields import Mesh, load_field
 from ...neural_fields.backend.files import write_whole
 from ..fit.train import fit
 from ..surface.surface import read_surface
-from ..training.config import load_config
 from ..training.folder import FIELD_FILE, STATE_FILE, find_field, is_fitted, read_record
-from ..training.report import Report
-from ..training.settings import EvolveConfig, FitConfig
-from .landmarks import FAR_OUT
+from ..training.progress import Report
+from ..training.settings import EvolveConfig, FitConfig, load_config
+from .shapes import FAR_OUT
 
 
 def scans_among(shapes: Sequence[str]) -> dict[str, Mesh]:

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ...datasets.landmarks import read_landmarks
 from ...neural_fields import (
     Box,
     Capsule,
@@ -265,3 +266,52 @@ def _axes(surface: Mesh) -> Float64:
     _, axes = np.linalg.eigh(np.cov(points.T))
     axes[:, 0] *= np.sign(np.linalg.det(axes))
     return axes
+
+
+Float64 = NDArray[np.float64]
+FAR_OUT = 0.1  # how far from its surface a landmark may lie, in units of the field: fits and picks are not exact
+
+
+class Landmarks(NamedTuple):
+    """Pairs of points.
+
+    Attributes:
+        before: ``(P, 3)`` of a shape.
+        after: ``(P, 3)``, the same points of the next shape.
+    """
+
+    before: Tensor
+    after: Tensor
+
+
+def placed_landmarks(paths: Sequence[str], shapes: Sequence[StaticShape]) -> list[Landmarks]:
+    """The landmarks of each two shapes, in the frame that the shapes were put in; none where there are no files.
+
+    Raises:
+        InputError: a file cannot be read, or a landmark is not on its shape.
+    """
+    if not paths:
+        none = torch.empty(0, 3)
+        return [Landmarks(none, none)] * (len(shapes) - 1)
+    found = []
+    for index, path in enumerate(paths):
+        both = zip(read_landmarks(path), shapes[index : index + 2], strict=True)
+        found.append(Landmarks(*(_placed(path, points, shape) for points, shape in both)))
+    return found
+
+
+def nearness(points: Tensor, landmarks: Tensor) -> Tensor:
+    """exp(−|x − a|² / 2σ²) of points ``(N, 3)`` and landmarks ``(P, 3)``, ``(N, P)``: alike for points that match."""
+    # 0.3: the distance within which a landmark says something about its neighbours.
+    return torch.exp(-torch.cdist(points, landmarks).square() / (2 * 0.3**2))
+
+
+@torch.no_grad()
+def _placed(path: str, points: Float64, shape: StaticShape) -> Tensor:
+    placed = torch.from_numpy(shape.placement.apply(shape.similarity.to_unit(points))).float()
+    value = shape.field.value(placed).abs()
+    worst = int(value.argmax())
+    if not float(value[worst]) <= FAR_OUT:
+        where = " ".join(f"{number:g}" for number in points[worst])
+        raise InputError(f"{path}: landmark {where} is not on {shape.name}; give coordinates of that shape's own input")
+    return placed

@@ -17,12 +17,11 @@ from torch import Tensor
 from ...neural_fields import InputError, MultiscaleSDF, SpaceTimeSDF
 from ..fit.band import delta_of
 from ..fit.level import new_level
-from ..training.budget import BUDGET, Budget, step_seconds
-from ..training.folder import RunFolder, digest_of
+from ..training.folder import VELOCITY_FILE, RunFolder, digest_of, load_motion
 from ..training.machine import choose_device, environment
-from ..training.motion import VELOCITY_FILE, load_motion
-from ..training.report import Progress, Report, reported, silent
+from ..training.progress import Progress, Report, reported, silent
 from ..training.result import Run
+from ..training.scaffold import BUDGET, Budget, step_seconds
 from ..training.settings import EvolveConfig
 from ..training.trainer import (
     Interrupted,
@@ -36,10 +35,9 @@ from ..training.trainer import (
     without_prefix,
 )
 from .checks import check_evolution, frame_figures
-from .landmarks import read_landmarks
 from .objective import LONGEST_GRADIENT, EvolveObjective, learn_start
 from .problem import Problem, build_problem
-from .shapes import StaticShape, read_shape
+from .shapes import StaticShape, read_landmarks, read_shape
 
 # Of a time budget, what the start and the checks may take.
 STARTING_SHARE, CHECKING_SHARE = 0.2, 0.25

@@ -20,7 +20,7 @@ from ..render.draw import RenderOptions, render_run
 from ..render.picture import Image
 from ..training.folder import RADIANCE_FILE, find_field, load_still
 from ..training.machine import choose_device
-from .model.model import SceneModel
+from .model import SceneModel
 from .views import render_camera
 
 

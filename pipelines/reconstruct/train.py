@@ -26,20 +26,29 @@ from ..render.picture import Image, picture_bytes, write_picture
 from ..surface.surface import sample_points
 from ..surface.trim import in_region, thinned
 from ..texture.train import FittedTexture, fit_texture, texture_step_seconds
-from ..training.budget import BUDGET, Budget
 from ..training.folder import RADIANCE_FILE, SUPPORT_FILE, TEXTURE_FILE, RunFolder, digest_of
 from ..training.machine import choose_device, environment
-from ..training.report import Progress, Report, reported, silent
+from ..training.progress import Progress, Report, reported, silent
 from ..training.result import Run
+from ..training.scaffold import BUDGET, Budget
 from ..training.settings import ReconstructConfig, TextureConfig
 from ..training.trainer import Interrupted, load_compiler, parameter_count, stop_on_signals
-from .data.measured import MeasuredDepths
-from .data.silhouettes import Agreement
-from .data.visibility import seen_points
-from .initialisation.hull import begin
-from .model.model import RayPool, SceneModel, build_scene
-from .model.replayed import ReplayedTrainer, scene_trainer
-from .views import ViewImage, comparison_sheet, exposed_as, held_out, measure, reduced, render_image, spread
+from .hull import begin
+from .measured import MeasuredDepths
+from .model import RayPool, SceneModel, build_scene
+from .objective import ReplayedTrainer, scene_trainer
+from .silhouettes import Agreement
+from .views import (
+    ViewImage,
+    comparison_sheet,
+    exposed_as,
+    held_out,
+    measure,
+    reduced,
+    render_image,
+    seen_points,
+    spread,
+)
 
 HELD_OUT_FILE = "held_out.png"
 PREVIEW_FILE = "preview.png"

@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 import secrets
 import time
 from collections.abc import Iterable, Iterator, Mapping
@@ -19,18 +20,167 @@ from typing import Any, TypeVar
 
 import numpy as np
 import torch
+from filelock import FileLock, Timeout
 from numpy.typing import NDArray
 from safetensors import safe_open
+from safetensors.numpy import save as save_arrays
 from safetensors.torch import save
 from torch import Tensor
 
 from ...neural_fields import Field, InputError, Similarity, load_field
+from ...neural_fields.backend import files as disk
 from ...neural_fields.backend.files import check_place, damage, json_bytes, write_whole
 from ...neural_fields.checkpoint import SavedField, checksum_of, field_bytes
 from ...neural_fields.spacetime.dynamic_tracing import moment
-from .atomic import is_scratch, prune, recovered, replace_files
-from .config import command_line, load_config
-from .lock import check_unlocked, locked
+from ...neural_fields.spacetime.velocity import VelocitySiren
+from .settings import command_line, load_config
+
+
+def lock_file(target: Path) -> Path:
+    """The lock of a run directory, which lies in it, or of a file, beside it."""
+    return target / "run.lock" if target.is_dir() else target.with_suffix(".lock")
+
+
+@contextmanager
+def locked(target: Path) -> Iterator[None]:
+    """Be the only writer of a run directory, or of a file, until the block ends.
+
+    Raises:
+        InputError: another process writes there, or the lock cannot be made.
+    """
+    file = lock_file(target)
+    if not file.parent.is_dir():
+        raise InputError(f"{file}: cannot be written (no such folder); choose another place")
+    lock = FileLock(file, timeout=0)
+    try:
+        lock.acquire()
+    except Timeout as error:
+        raise InputError(
+            f"{target}: is being written by another process; wait until it ends, or choose another -o"
+        ) from error
+    except OSError as error:
+        raise InputError(f"{file}: cannot be written ({error.strerror or error}); choose another place") from error
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+def check_unlocked(target: Path) -> None:
+    """Refuse a run directory, or a file, that another process writes.
+
+    Raises:
+        InputError: see `locked`.
+    """
+    if lock_file(target).is_file():
+        with locked(target):
+            pass
+
+
+JOURNAL = ".journal"
+PARTIAL = re.compile(r"\..*\.(\d+)\.partial(\.[^.]*)?")  # of `whole_file`
+
+
+def replace_files(folder: Path, contents: Mapping[str, bytes], remove: Iterable[str] = ()) -> None:
+    """Write files of a folder and remove others, all at once. The caller holds the folder's lock.
+
+    Args:
+        folder: exists.
+        contents: by name of file.
+        remove: names of files, which may be absent.
+
+    Raises:
+        InputError: the folder cannot be written. It is then unchanged, or the next `recover` ends the change.
+    """
+    packed = {name: np.asarray(bytearray(content)) for name, content in contents.items()}
+    gone = sorted({*remove} - {*contents})
+    disk.write_whole(folder / JOURNAL, save_arrays(packed, {"remove": json.dumps(gone)}))
+    _carry_out(folder, contents, gone)
+
+
+def recover(folder: Path) -> None:
+    """End a change that was interrupted by a kill. The caller holds the folder's lock.
+
+    Raises:
+        InputError: the journal is damaged, or the folder cannot be written.
+    """
+    journal = folder / JOURNAL
+    if not journal.is_file():
+        return
+    with disk.damage(journal, "remove it"):
+        with safe_open(journal, framework="np") as file:
+            gone = json.loads(file.metadata()["remove"])
+            contents = {name: file.get_tensor(name).tobytes() for name in file.keys()}  # noqa: SIM118
+        if any(Path(name).name != name for name in [*contents, *gone]):
+            raise ValueError("names a file outside of its folder")
+    _carry_out(folder, contents, gone)
+
+
+def _carry_out(folder: Path, contents: Mapping[str, bytes], gone: Iterable[str]) -> None:
+    """Do what the journal says, and remove it."""
+    try:
+        disk.sync(folder)  # the journal lasts before anything else changes
+        for name, content in contents.items():
+            disk.write_whole(folder / name, content)
+        for name in gone:
+            disk.remove(folder / name)
+        disk.sync(folder)
+        disk.remove(folder / JOURNAL)
+    except OSError as error:
+        reason = error.strerror or error
+        raise InputError(f"{folder}: cannot be written ({reason}); make room, or choose another -o") from error
+
+
+def recovered(folder: Path) -> None:
+    """Wait for a change that is under way, and end one that was interrupted.
+
+    Raises:
+        InputError: it takes longer than ten seconds, or see `recover`.
+    """
+    if (folder / ".ready").is_dir():
+        raise InputError(
+            f"{folder}: an older version was killed while it wrote; move the files of {folder / '.ready'} into {folder}"
+        )
+    until = time.monotonic() + 10
+    while (folder / JOURNAL).is_file():
+        try:
+            with locked(folder):
+                recover(folder)
+        except InputError:  # the writer does it
+            if time.monotonic() > until:
+                raise
+            time.sleep(0.05)
+
+
+def prune(folder: Path) -> None:
+    """`recover`, and remove partial files of killed processes. The caller holds the folder's lock.
+
+    Raises:
+        InputError: see `recover`.
+    """
+    recover(folder)
+    for file in list(folder.iterdir()):
+        found = PARTIAL.fullmatch(file.name)
+        if found and _has_ended(int(found[1])):
+            disk.remove(file)
+
+
+def is_scratch(file: Path) -> bool:
+    """Whether a file may be lost: a lock, or a partial file."""
+    return file == lock_file(file.parent) or PARTIAL.fullmatch(file.name) is not None
+
+
+def _has_ended(number: int) -> bool:
+    """Whether there is no process of this number; False on Windows, which has no signal that only asks."""
+    try:
+        if os.name != "nt":
+            os.kill(number, 0)
+    except ProcessLookupError:
+        return True
+    except (PermissionError, OverflowError):
+        pass
+    return False
+
 
 C = TypeVar("C")
 
@@ -491,3 +641,31 @@ def load_state(
 
 def _checksum(tensors: Mapping[str, Tensor], progress: Mapping[str, Any]) -> str:
     return hashlib.sha256((checksum_of(tensors) + json.dumps(dict(progress))).encode()).hexdigest()
+
+
+VELOCITY_FILE = "velocity.safetensors"
+
+
+def load_motion(run: str | Path) -> VelocitySiren | None:
+    """The velocity of a run of ``evolve --kind deform``, on the CPU; None where the run has none.
+
+    Args:
+        run: its directory, or the file of its field there.
+
+    Raises:
+        InputError: the file is damaged, or not of this run.
+    """
+    folder = Path(run) if Path(run).is_dir() else Path(run).parent
+    if not (folder / VELOCITY_FILE).is_file():
+        return None
+    tensors, about = load_state(folder, name=VELOCITY_FILE)
+    record = read_record(folder)
+    if about.get("generation") != record.get("generation"):
+        raise InputError(f"{folder / VELOCITY_FILE}: not of the run in {folder}; evolve it again")
+    config = record["config"]
+    velocity = VelocitySiren(config["motion_width"], 2, omega=config["motion_omega"])
+    try:
+        velocity.load_state_dict(tensors)
+    except RuntimeError as error:
+        raise InputError(f"{folder / VELOCITY_FILE}: not a motion as run.json describes it; evolve it again") from error
+    return velocity.requires_grad_(False)

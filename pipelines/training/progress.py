@@ -4,15 +4,53 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 from rich.console import Console, RenderableType
 from rich.progress import BarColumn, ProgressColumn, Task, TaskID, TaskProgressColumn, TextColumn
 from rich.progress import Progress as Bars
 from rich.text import Text
 
-from .report import Progress, Report
+from ...neural_fields import InputError
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a stage of the work is.
+
+    Attributes:
+        stage: name of the stage.
+        step: steps done.
+        steps: steps planned; 0 for a stage that does not count steps.
+        fraction: of the stage, in [0, 1]; not step / steps when a time budget may end it earlier.
+        losses: unweighted loss terms of the last reported step.
+    """
+
+    stage: str
+    step: int
+    steps: int
+    fraction: float
+    losses: Mapping[str, float]
+
+
+Report = Callable[[Progress], None]
+
+
+def silent(_: Progress, /) -> None:
+    """A `Report` that ignores everything."""
+
+
+@contextmanager
+def reported(report: Report | None, stage: str) -> Iterator[None]:
+    """Report the beginning and the end of a stage that does not count steps."""
+    report = report or silent
+    report(Progress(stage, 0, 0, 0.0, {}))
+    yield
+    report(Progress(stage, 0, 0, 1.0, {}))
 
 
 @contextmanager
@@ -158,3 +196,43 @@ def _advance(bars: Bars, task: TaskID, fraction: float) -> None:
     left = seconds_left(shown.elapsed or 0.0, shown.fields.get("before", 0.0), fraction)
     shown.total = 1.0 if fraction else None  # `update` cannot take a total away
     bars.update(task, completed=fraction, left=left, at=bars.get_time())
+
+
+@contextmanager
+def tensorboard_log(directory: str | Path) -> Iterator[Report]:
+    """A receiver of progress that writes scalars for TensorBoard.
+
+    Each loss term of a stage is ``STAGE/TERM`` over the steps of that stage, as "level 0/surface.data".
+
+    Args:
+        directory: of the event files; made where it is absent. An older run's stay, under their own names.
+
+    Raises:
+        InputError: tensorboard is not installed, or the directory cannot be made.
+    """
+    writer = _writer(Path(directory))
+    try:
+        yield _Log(writer)
+    finally:
+        writer.close()
+
+
+class _Log:
+    def __init__(self, writer: Any) -> None:
+        self.writer = writer
+
+    def __call__(self, progress: Progress, /) -> None:
+        for name, value in progress.losses.items():
+            self.writer.add_scalar(f"{progress.stage}/{name}", value, progress.step)
+
+
+def _writer(directory: Path) -> Any:
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError as error:
+        raise InputError("--tensorboard: needs tensorboard; pip install mplicits[tensorboard]") from error
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        return SummaryWriter(str(directory))
+    except OSError as error:
+        raise InputError(f"--tensorboard {directory}: cannot be written ({error.strerror or error})") from error

@@ -35,9 +35,8 @@ from mplicits.datasets import (
 from mplicits.neural_fields import MultiscaleSDF, Siren, load_field, save_field
 from mplicits.neural_fields.backend.files import write_json
 from mplicits.neural_fields.meshing.glb import write_glb
-from mplicits.pipelines.training.config import load_config
 from mplicits.pipelines.training.folder import RECORD_FILE, load_state, read_record, save_state
-from mplicits.pipelines.training.settings import FitConfig
+from mplicits.pipelines.training.settings import FitConfig, load_config
 from mutate import damaged, damaged_json
 
 __all__ = ["Specimen", "specimens"]

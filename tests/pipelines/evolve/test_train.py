@@ -31,8 +31,7 @@ from mplicits.pipelines.evolve.checks import check_evolution, slope_figures
 from mplicits.pipelines.evolve.problem import End
 from mplicits.pipelines.evolve.samples import band_points
 from mplicits.pipelines.evolve.train import evolve
-from mplicits.pipelines.training.config import load_config, preset_names
-from mplicits.pipelines.training.settings import EvolveConfig
+from mplicits.pipelines.training.settings import EvolveConfig, load_config, preset_names
 from mplicits.pipelines.training.trainer import Interrupted, Progress
 from torch import Tensor
 

@@ -30,13 +30,12 @@ from mplicits.neural_fields import (
 )
 from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.mesh.extract import MeshOptions, mesh_run
-from mplicits.pipelines.reconstruct.data import silhouettes
-from mplicits.pipelines.reconstruct.model.model import SceneModel
+from mplicits.pipelines.reconstruct import silhouettes
+from mplicits.pipelines.reconstruct.model import SceneModel
 from mplicits.pipelines.reconstruct.train import Reconstruction, reconstruct, surface_colors
 from mplicits.pipelines.surface.measure import chamfer
-from mplicits.pipelines.training.config import load_config
 from mplicits.pipelines.training.folder import load_state, state_bytes
-from mplicits.pipelines.training.settings import ReconstructConfig
+from mplicits.pipelines.training.settings import ReconstructConfig, load_config
 from mplicits.pipelines.training.trainer import Interrupted, Progress
 from reconstructions import TINY_SCENE, small_reconstructions
 from torch import Tensor

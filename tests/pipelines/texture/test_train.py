@@ -26,12 +26,10 @@ from mplicits.neural_fields import (
 )
 from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.cli.train import TEXTURE as COMMAND
-from mplicits.pipelines.texture.samples import read_colors
-from mplicits.pipelines.texture.train import default_delta, fit_texture, texture_of, texture_run
-from mplicits.pipelines.training.config import load_config
+from mplicits.pipelines.texture.train import default_delta, fit_texture, read_colors, texture_of, texture_run
 from mplicits.pipelines.training.folder import TEXTURE_FILE, texture_state_file
 from mplicits.pipelines.training.progress import Lines
-from mplicits.pipelines.training.settings import TextureConfig
+from mplicits.pipelines.training.settings import TextureConfig, load_config
 from mplicits.pipelines.training.trainer import Progress, Trainer
 from numpy.typing import NDArray
 

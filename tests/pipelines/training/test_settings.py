@@ -8,9 +8,15 @@ from typing import Any, ClassVar, Literal
 
 import pytest
 from mplicits.neural_fields import InputError
-from mplicits.pipelines.training import config
-from mplicits.pipelines.training.config import add_config_flags, given_flags, load_config, preset_names, setting
-from mplicits.pipelines.training.settings import FitConfig
+from mplicits.pipelines.training import settings as config
+from mplicits.pipelines.training.settings import (
+    FitConfig,
+    add_config_flags,
+    given_flags,
+    load_config,
+    preset_names,
+    setting,
+)
 
 
 @dataclass(frozen=True)

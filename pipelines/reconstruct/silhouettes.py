@@ -13,9 +13,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ....datasets.cameras import Camera
-from ....datasets.views.images import PosedImage
-from ....neural_fields import Similarity
+from ...datasets.cameras import Camera
+from ...datasets.views.images import PosedImage
+from ...neural_fields import Similarity
 
 OBJECT = 0.5  # a pixel with a larger share of object counts as one
 

@@ -15,13 +15,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ....datasets.cameras import Camera
-from ....datasets.views.formats.depth_maps import DepthMap
-from ....datasets.views.images import PosedImage, PosedImages
-from ....neural_fields import Field, InputError, sphere_trace
-from ....neural_fields.backend.devices import handed, uniform
-from ....neural_fields.fields.function import FieldLike
-from ....neural_fields.volume.weights import sphere_span
+from ...datasets.cameras import Camera
+from ...datasets.views.formats.depth_maps import DepthMap
+from ...datasets.views.images import PosedImage, PosedImages
+from ...neural_fields import Field, InputError, sphere_trace
+from ...neural_fields.backend.devices import handed, uniform
+from ...neural_fields.fields.function import FieldLike
+from ...neural_fields.volume.weights import sphere_span
 from .silhouettes import OBJECT
 
 Float64 = NDArray[np.float64]

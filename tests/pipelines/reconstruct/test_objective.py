@@ -12,11 +12,10 @@ from mplicits.neural_fields import MultiscaleSDF, Similarity, Siren
 from mplicits.neural_fields.fields.losses import eikonal_loss
 from mplicits.neural_fields.networks.sphere_init import fit_sphere
 from mplicits.neural_fields.volume.weights import sphere_span
-from mplicits.pipelines.reconstruct.data.measured import MeasuredDepths
-from mplicits.pipelines.reconstruct.model import model as scene_model
-from mplicits.pipelines.reconstruct.model.model import RayPool, build_scene
-from mplicits.pipelines.reconstruct.model.objective import SceneObjective, Schedule
-from mplicits.pipelines.reconstruct.model.replayed import scene_trainer
+from mplicits.pipelines.reconstruct import model as scene_model
+from mplicits.pipelines.reconstruct.measured import MeasuredDepths
+from mplicits.pipelines.reconstruct.model import RayPool, build_scene
+from mplicits.pipelines.reconstruct.objective import SceneObjective, Schedule, scene_trainer
 from mplicits.pipelines.training.settings import ReconstructConfig
 from mplicits.pipelines.training.trainer import Progress, StopFlag, Trainer
 from reconstructions import QUICK, TINY_SCENE

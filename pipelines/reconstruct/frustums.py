@@ -15,10 +15,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ....datasets.cameras import Camera
-from ....datasets.views.images import PosedImages
-from ....neural_fields.meshing.extract import Mesh
-from ...render.shade import COLOR_MAPS, apply_color_map
+from ...datasets.cameras import Camera
+from ...datasets.views.images import PosedImages
+from ...neural_fields.meshing.extract import Mesh
+from ..render.shade import COLOR_MAPS, apply_color_map
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]

@@ -10,19 +10,18 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ....datasets.cameras import Camera
-from ....datasets.views.images import PosedImage
-from ....neural_fields import Field, InputError, Jet, MultiscaleSDF, Similarity, Siren
-from ....neural_fields.backend.devices import handed, precise
-from ....neural_fields.networks.hash_encoding import HashEncoding
-from ....neural_fields.networks.neus_mlp import NeusSDF
-from ....neural_fields.networks.radiance import Outside, Radiance, ViewColor
-from ....neural_fields.networks.sphere_init import fit_sphere
-from ....neural_fields.volume.render import Rendered, Sampling, render_volume
-from ....neural_fields.volume.weights import sphere_span
-from ...training.focus import Focus
-from ...training.settings import ReconstructConfig
-from ...training.trainer import seeded
+from ...datasets.cameras import Camera
+from ...datasets.views.images import PosedImage
+from ...neural_fields import Field, InputError, Jet, MultiscaleSDF, Similarity, Siren
+from ...neural_fields.backend.devices import handed, precise
+from ...neural_fields.networks.hash_encoding import HashEncoding
+from ...neural_fields.networks.neus_mlp import NeusSDF
+from ...neural_fields.networks.radiance import Outside, Radiance, ViewColor
+from ...neural_fields.networks.sphere_init import fit_sphere
+from ...neural_fields.volume.render import Rendered, Sampling, render_volume
+from ...neural_fields.volume.weights import sphere_span
+from ..training.settings import ReconstructConfig
+from ..training.trainer import Focus, seeded
 
 # Kinds of devices on which matrix products of colours are in bfloat16.
 HALF_PRECISION = ("cuda",)
