@@ -41,58 +41,31 @@ from .shapes import Landmarks, StaticShape, nearness, placed_landmarks
 
 @dataclass(frozen=True)
 class MotionOptions:
-    """Numbers of the motion's training; lengths are in units of the field.
+    """Numbers of the motion's training; lengths are in units of the field."""
 
-    Attributes:
-        pool: points of each shape.
-        matched: of them, which the guide has partners for.
-        steps: of the midpoint rule between two keys, while it is learnt.
-        guided: points with a partner, per end and step of the training.
-        loose: others, likewise.
-        regular: places at which the regularity is evaluated, per step.
-        around: how far these are from the paths.
-        fades: share of the steps after which the guide is gone.
-        far: residuals count linearly from here on: what has no partner does not pull at all others.
-        data: weight of the ends.
-        inside: radius that no path should leave.
-        normals: cost of a pair with opposite normals; the squared way is added to it.
-        surroundings: cost of a pair with other surroundings.
-        marked: weight of the squared differences of nearness to landmarks, added up.
-        depths: at which the surroundings are compared, inward and outward.
-        blur: first blur of the optimal transport, squared length.
-        least_blur: the last one.
-        cooling: factor of the blur, per round.
-        rounds: of Sinkhorn's iterations.
-        left: cost of mass without a partner. More than the longest way in the unit sphere, 2²: where it is less, the
-            rear of a shape that has travelled stays behind.
-        newton: steps to f = 0 of points that were carried.
-        share: of a time budget, for learning the motion.
-        rows: points per call.
-    """
-
-    pool: int = 20_000
-    matched: int = 1000
-    steps: int = 8
-    guided: int = 256
-    loose: int = 512
-    regular: int = 1024
-    around: float = 0.05
-    fades: float = 0.6
-    far: float = 0.1
-    data: float = 20.0
-    inside: float = 0.98
-    normals: float = 0.1
-    surroundings: float = 0.06
-    marked: float = 4.0
-    depths: tuple[float, ...] = (0.05, 0.1, 0.2, 0.3)
-    blur: float = 0.1
-    least_blur: float = 0.003
-    cooling: float = 0.93
-    rounds: int = 100
-    left: float = 5.0
-    newton: int = 2
-    share: float = 0.3
-    rows: int = 8192
+    pool: int = 20_000  # points of each shape
+    matched: int = 1000  # of them, which the guide has partners for
+    steps: int = 8  # of the midpoint rule between two keys, while it is learnt
+    guided: int = 256  # points with a partner, per end and step of the training
+    loose: int = 512  # others, likewise
+    regular: int = 1024  # places at which the regularity is evaluated, per step
+    around: float = 0.05  # how far these are from the paths
+    fades: float = 0.6  # share of the steps after which the guide is gone
+    far: float = 0.1  # residuals count linearly from here on, so that points without a partner do not dominate
+    data: float = 20.0  # weight of the ends
+    inside: float = 0.98  # radius that no path should leave
+    normals: float = 0.1  # cost of a pair with opposite normals, beside its squared distance
+    surroundings: float = 0.06  # cost of a pair with other surroundings
+    marked: float = 4.0  # weight of the squared differences of nearness to landmarks
+    depths: tuple[float, ...] = (0.05, 0.1, 0.2, 0.3)  # at which the surroundings are compared, inward and outward
+    blur: float = 0.1  # first blur of the optimal transport, squared length
+    least_blur: float = 0.003  # the last one
+    cooling: float = 0.93  # factor of the blur, per round
+    rounds: int = 100  # of Sinkhorn's iterations
+    left: float = 5.0  # cost of mass without a partner; above 2², or the rear of a shape that travelled stays behind
+    newton: int = 2  # steps to f = 0 of points that were carried
+    share: float = 0.3  # of a time budget, for learning the motion
+    rows: int = 8192  # points per call
 
 
 MOTION = MotionOptions()
@@ -133,15 +106,7 @@ def _surroundings(shape: StaticShape, seed: int) -> tuple[Tensor, Tensor, Tensor
 
 
 class MotionObjective(Objective):
-    """The loss of a velocity between key shapes, see the module.
-
-    Args:
-        velocity: trained.
-        shapes: in one frame.
-        keys: their times.
-        config: settings.
-        generator: CPU generator that draws the batches.
-    """
+    """The loss of a ``velocity`` between ``shapes`` in one frame, at the times ``keys``; see the module."""
 
     def __init__(
         self,

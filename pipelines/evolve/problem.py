@@ -31,49 +31,29 @@ CAUTION = 0.8
 
 @dataclass(frozen=True, eq=False)
 class End:
-    """A surface that shall be met.
+    """A surface that shall be met."""
 
-    Attributes:
-        name: of the shape.
-        time: when.
-        points: ``(N, 3)`` on it.
-        others: ``(N, 3)`` on it too, drawn independently.
-    """
-
-    name: str
+    name: str  # of the shape
     time: float
-    points: Tensor
-    others: Tensor
+    points: Tensor  # (N, 3) on it
+    others: Tensor  # (N, 3) on it too, drawn independently
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """An evolution to be learnt, in unit-sphere coordinates.
+    """An evolution to be learnt, in unit-sphere coordinates."""
 
-    Attributes:
-        similarity: from the first shape's input coordinates.
-        known: where the field is known; some of it at time 0.
-        bounds: where bounds are; may be empty.
-        law: what holds in between, or None where enough is known.
-        ends: the surfaces to be met.
-        placements: where each shape was put, from its own unit sphere.
-        motion: the velocity that carries the shapes, where one was learnt.
-        motion_figures: how well it does that, for each two shapes.
-        keys: moments between which the law moves a surface all the way from one shape to the next. The more of them,
-            the faster it moves: its error is taken per interval, not per unit of time, as what is known does not grow.
-        samples: known samples that were made, fewer than the settings' where a time budget left no time for all.
-    """
-
-    similarity: Similarity
-    known: Known
-    bounds: Bounds
-    law: Law | None
-    ends: tuple[End, ...]
-    placements: tuple[Placement, ...] = ()
-    motion: VelocitySiren | None = None
-    motion_figures: tuple[Mapping[str, float], ...] = ()
+    similarity: Similarity  # from the first shape's input coordinates
+    known: Known  # where the field is known; some of it at time 0
+    bounds: Bounds  # where bounds are; may be empty
+    law: Law | None  # what holds in between, or None where enough is known
+    ends: tuple[End, ...]  # the surfaces to be met
+    placements: tuple[Placement, ...] = ()  # where each shape was put, from its own unit sphere
+    motion: VelocitySiren | None = None  # the velocity that carries the shapes, where one was learnt
+    motion_figures: tuple[Mapping[str, float], ...] = ()  # how well it does that, for each two shapes
+    # moments between which the law moves one shape to the next; its error is taken per interval
     keys: tuple[float, ...] = (0.0, 1.0)
-    samples: int | None = None
+    samples: int | None = None  # known samples that were made; fewer than the settings' for want of time
 
 
 def build_problem(
@@ -84,14 +64,10 @@ def build_problem(
     progress: Report | None = None,
     budget: Budget | None = None,
 ) -> Problem:
-    """The problem that a configuration means.
+    """The problem that a configuration means, of shapes each in its own unit sphere.
 
-    Args:
-        shapes: each in its own unit sphere.
-        config: settings.
-        motion: of a deformation, if it is learnt already.
-        progress: of learning it.
-        budget: of time, of which the motion and the known samples get a share.
+    The ``motion`` of a deformation is learnt if it is not given. It and the known samples get a share of the
+    ``budget``.
 
     Raises:
         InputError: too few or too many shapes for this kind, or a motion that cannot be followed.
@@ -113,18 +89,11 @@ def build_problem(
 
 
 def between(times: Tensor, keys: Sequence[float], values: Tensor) -> tuple[Tensor, Tensor]:
-    """Bounds on a field whose surface stays between the shapes before and after it.
+    """Bounds ``(N,)``, below and above, on a field whose surface stays between two shapes; ±∞ for none.
 
-    What is outside both is at least as far from the surface as from the nearer of them, and inside both likewise:
-    ``f ≥ min(f_k, f_{k+1})`` where both are positive, ``f ≤ max(f_k, f_{k+1})`` where both are negative.
-
-    Args:
-        times: ``(N,)``.
-        keys: when each shape is reached, increasing.
-        values: ``(N, K)`` of the shapes' distances.
-
-    Returns:
-        Lower and upper bounds ``(N,)``, infinite where there are none.
+    What is outside both is at least as far from the surface as from the nearer of them, and inside both likewise: ``f ≥
+    min(f_k, f_{k+1})`` where both are positive, ``f ≤ max(f_k, f_{k+1})`` where both are negative. ``values`` ``(N,
+    K)`` are the shapes' distances, ``keys`` the increasing times of the shapes.
     """
     inner = torch.tensor(keys[1:-1], dtype=times.dtype, device=times.device)
     before = torch.bucketize(times, inner)[:, None]
@@ -199,11 +168,7 @@ def _morph(shapes: list[StaticShape], config: EvolveConfig, budget: Budget | Non
 
 
 def morph_law(guide: Field) -> Law:
-    """Level-set morphing that keeps distances: `morph` with the speed of the surface point below.
-
-    Args:
-        guide: g, four-dimensional; the surface moves outward with −∂g/∂t.
-    """
+    """Level-set morphing that keeps distances: normal speed −∂g/∂t of the ``guide`` g, at the surface point below."""
 
     @torch.no_grad()
     def speed(x: Tensor, t: Tensor) -> Tensor:

@@ -26,11 +26,7 @@ from .shapes import FAR_OUT
 
 
 def scans_among(shapes: Sequence[str]) -> dict[str, Mesh]:
-    """Those of the shapes that are files of points or triangles, read.
-
-    Raises:
-        InputError: one of them cannot be read.
-    """
+    """Those of the shapes that are files of points or triangles, read; InputError if one cannot be."""
     files = [text for text in dict.fromkeys(shapes) if Path(text).is_file() and Path(text).suffix != ".safetensors"]
     return {text: read_surface(text) for text in files}
 
@@ -48,17 +44,10 @@ def fitted_scans(
     *,
     progress: Report | None = None,
 ) -> EvolveConfig:
-    """The same evolution of fits: what is in the folder already is taken, or goes on.
+    """The same evolution with fits in place of ``scans``: what is in the ``folder`` already is taken, or goes on.
 
     Where all shapes of a deformation are meshes with the same faces, and no landmarks were given, up to 400 vertices
     become landmarks, files of which are written beside the fits.
-
-    Args:
-        config: whose shapes are files, among others.
-        scans: what `scans_among` has read.
-        folder: see `fits_beside`.
-        fits: settings of the fits.
-        progress: called now and then with how far a fit is.
 
     Raises:
         InputError: a cloud cannot be used.

@@ -124,20 +124,13 @@ class Placed(Field):
 
 @dataclass(frozen=True, eq=False)
 class StaticShape:
-    """A static shape.
+    """A static shape."""
 
-    Attributes:
-        name: what the user called it.
-        field: three-dimensional, on the CPU.
-        similarity: from input coordinates to the shape's own unit sphere.
-        surface: its surface, in the coordinates of ``field``.
-        placement: from its own unit sphere to the coordinates of ``field``.
-    """
-
-    name: str
-    field: Field
-    similarity: Similarity
-    surface: Mesh
+    name: str  # what the user called it
+    field: Field  # three-dimensional, on the CPU
+    similarity: Similarity  # from input coordinates to the shape's own unit sphere
+    surface: Mesh  # in the coordinates of ``field``
+    # from its own unit sphere to the coordinates of ``field``
     placement: Placement = dataclasses.field(default_factory=Placement)
 
     def points(self, count: int, seed: int) -> Tensor:
@@ -183,13 +176,11 @@ def read_shape(text: str) -> StaticShape:
 
 
 def aligned(shapes: list[StaticShape], how: Literal["none", "center", "pca"]) -> list[StaticShape]:
-    """All shapes in the frame of the first: its unit sphere.
+    """All shapes, each in its own unit sphere, in that of the first.
 
-    Args:
-        shapes: each in its own unit sphere.
-        how: "none" keeps the places and sizes that the shapes have in their input coordinates; "center" lays the
-            unit spheres on each other; "pca" turns each shape as well, so that its principal axes are those of the
-            first, the way round in which both have most volume in common.
+    "none" keeps the places and sizes of their input coordinates; "center" lays the unit spheres on each other; "pca"
+    turns each shape as well, to the principal axes of the first, the way round in which both have most volume in
+    common.
     """
     first = shapes[0]
     placed = [first]
@@ -207,12 +198,7 @@ def aligned(shapes: list[StaticShape], how: Literal["none", "center", "pca"]) ->
 
 
 def into_unit_sphere(shapes: list[StaticShape], reach: Float64) -> tuple[list[StaticShape], Similarity]:
-    """The shapes shrunk until all that they will ever reach lies in the unit sphere, and the similarity that did it.
-
-    Args:
-        shapes: in one frame.
-        reach: points ``(N, 3)`` of the surfaces at all times.
-    """
+    """The shapes shrunk until all points ``(N, 3)`` that they reach lie in the unit sphere, and the similarity."""
     # A mesh leaves its unit sphere by less than a thousandth.
     if np.linalg.norm(reach, axis=1).max() <= 1.001:
         return shapes, Similarity.identity()
@@ -273,12 +259,7 @@ FAR_OUT = 0.1  # how far from its surface a landmark may lie, in units of the fi
 
 
 class Landmarks(NamedTuple):
-    """Pairs of points.
-
-    Attributes:
-        before: ``(P, 3)`` of a shape.
-        after: ``(P, 3)``, the same points of the next shape.
-    """
+    """Pairs of points: ``(P, 3)`` of a shape, and the same points of the next shape."""
 
     before: Tensor
     after: Tensor

@@ -151,11 +151,7 @@ def host_cameras(cameras: Any) -> list[Camera]:
 
 
 def part_seen(mesh: Mesh, field: NerfstudioField, cameras: Sequence[Camera]) -> Mesh:
-    """What two cameras see at least of a mesh; all in nerfstudio's coordinates.
-
-    Raises:
-        NoSurfaceError: nothing of it.
-    """
+    """The part of a mesh in nerfstudio's coordinates that two cameras see at least; NoSurfaceError: nothing of it."""
     unit = Similarity((0.0, 0.0, 0.0), 1 / field.scale)
     points, within = seen_points(field.field, [(camera.moved(unit), None) for camera in cameras])
     part = None
@@ -168,13 +164,7 @@ def part_seen(mesh: Mesh, field: NerfstudioField, cameras: Sequence[Camera]) -> 
 
 
 def in_data_coordinates(mesh: Mesh, transform: ArrayLike, scale: float) -> Mesh:
-    """Undo x ↦ scale · (R x + t), by which nerfstudio has moved the data's cameras.
-
-    Args:
-        mesh: in nerfstudio's coordinates.
-        transform: ``(3, 4)``, R a rotation and t beside it.
-        scale: a number above 0.
-    """
+    """A mesh with nerfstudio's x ↦ scale · (R x + t) undone; ``transform`` ``(3, 4)`` is R and t."""
     matrix = np.asarray(transform, np.float64)
     rotation, shift = matrix[:, :3], matrix[:, 3]
     # Rows: R⁻¹ (x − t) is (x − t) R for a rotation.

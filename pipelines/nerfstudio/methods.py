@@ -16,7 +16,8 @@ from nerfstudio.engine.trainer import TrainerConfig  # pyright: ignore[reportMis
 from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig  # pyright: ignore[reportMissingImports]
 from nerfstudio.plugins.types import MethodSpecification  # pyright: ignore[reportMissingImports]
 
-from .model import RATES, STEPS, MultiscaleFactoModelConfig, MultiscaleModelConfig, WarmCosineConfig
+from .model import RATES, MultiscaleFactoModelConfig, MultiscaleModelConfig
+from .schedule import STEPS, WarmCosineConfig
 
 
 def _trainer(name: str, model: Any, groups: dict[str, float]) -> Any:

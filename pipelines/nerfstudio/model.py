@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any, Optional, Tuple, Type, cast  # noqa: UP035 - as nerfstudio writes what it makes flags of  # noqa: UP035 - as nerfstudio writes what it makes flags of
+from typing import Any, Tuple, Type, cast  # noqa: UP035 - as nerfstudio writes what it makes flags of
 from urllib.error import URLError
 
 import torch
@@ -16,63 +16,16 @@ from nerfstudio.engine.callbacks import (  # pyright: ignore[reportMissingImport
     TrainingCallback,
     TrainingCallbackLocation,
 )
-from nerfstudio.engine.schedulers import Scheduler, SchedulerConfig  # pyright: ignore[reportMissingImports]
 from nerfstudio.field_components.field_heads import FieldHeadNames  # pyright: ignore[reportMissingImports]
 from nerfstudio.models.neus import NeuSModel, NeuSModelConfig  # pyright: ignore[reportMissingImports]
 from nerfstudio.models.neus_facto import NeuSFactoModel, NeuSFactoModelConfig  # pyright: ignore[reportMissingImports]
 from torch import Tensor, nn
-from torch.optim import Optimizer
-from torch.optim.lr_scheduler import LambdaLR
 
 from ...neural_fields import MultiscaleSDF, NerfstudioField, Siren, ViewColor, fit_sphere
 from ...neural_fields.hosts.learning_rates import HOST_RATE
 from ...neural_fields.networks.hash_encoding import HashEncoding, tables_apart
 from ..training.settings import ReconstructConfig
-
-STEPS = 20_000
-
-
-@dataclass
-class WarmCosineConfig(SchedulerConfig):
-    """A linear warm-up, then a cosine down to a share of the rate.
-
-    nerfstudio's own computes with NumPy, whose numbers are then in the checkpoints, and PyTorch from 2.6 on does
-    not read them again.
-    """
-
-    _target: Type = field(default_factory=lambda: WarmCosine)  # noqa: UP006
-    warm_up_end: int = 500
-    """Steps of the warm-up; at most a tenth of the training."""
-    max_steps: Optional[int] = None  # noqa: UP045
-    """Steps until the rate is at its least; None: all of the training."""
-    least: float = 0.05
-    """Share of the rate that is left."""
-
-
-class WarmCosine(Scheduler):
-    """See `WarmCosineConfig`.
-
-    Attributes:
-        steps: of the training, which the model says when it knows.
-    """
-
-    config: WarmCosineConfig
-    steps: int = STEPS
-
-    def factor(self, step: int) -> float:
-        """The rate at a step, in units of the peak."""
-        config = self.config
-        end = self.steps if config.max_steps is None else config.max_steps
-        warm = min(config.warm_up_end, int(0.1 * end))
-        if step < warm:
-            return (step + 1) / (warm + 1)
-        done = min(1.0, (step - warm) / max(1, end - warm))
-        return config.least + (1 - config.least) * 0.5 * (1 + math.cos(math.pi * done))
-
-    def get_scheduler(self, optimizer: Optimizer, lr_init: float) -> LambdaLR:
-        """The schedule of one optimiser."""
-        return LambdaLR(optimizer, self.factor)
-
+from .schedule import WarmCosine
 
 OURS = ReconstructConfig()  # colours are those of `mplicits reconstruct`
 COLOR_RATE = OURS.color_rate * OURS.learning_rate
@@ -124,14 +77,9 @@ class MultiscaleFieldConfig(InstantiateConfig):
 
 
 def build_field(config: MultiscaleFieldConfig, *, aabb: Tensor, **_: object) -> NerfstudioField:
-    """The untrained field of a scene, a sphere of unknown colour.
+    """The untrained field of a scene, a sphere of unknown colour, in the scene box ``aabb`` ``(2, 3)``.
 
-    The hash encoding of its colours covers the cube around the scene box.
-
-    Args:
-        config: settings.
-        aabb: the scene box ``(2, 3)``, whose corners the field's unit sphere takes in.
-        _: what else nerfstudio hands to its own field: contraction, number of images, appearance.
+    The hash encoding of its colours covers the cube around the box. What else nerfstudio hands to its field is ignored.
     """
     sdf = MultiscaleSDF.from_widths(
         list(zip(config.widths, config.depths, strict=True)),
@@ -238,11 +186,7 @@ class MultiscaleFactoModel(_Multiscale, NeuSFactoModel):
 
 
 class LaterMetric(nn.Module):
-    """A metric that is built when it is first asked for, and says NaN where its weights cannot be downloaded.
-
-    Args:
-        build: makes the metric.
-    """
+    """A metric that ``build`` makes when it is first asked for; NaN where its weights cannot be downloaded."""
 
     def __init__(self, build: Any) -> None:
         super().__init__()

@@ -37,20 +37,13 @@ Float64 = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class DepthCheck:
-    """What is known of the depth maps of a data set.
+    """What is known of the depth maps of a data set."""
 
-    Attributes:
-        maps: how many views have one.
-        inside: share of the readings that end in the region of interest; None where their scale is not known.
-        seen_through: share of the readings of the median view in whose place another view sees something further away;
-            None where no two maps can be compared.
-        warnings: one line each.
-    """
-
-    maps: int
-    inside: float | None = None
+    maps: int  # how many views have one
+    inside: float | None = None  # share of the readings that end in the region; None where their scale is not known
+    # share, in the median view, in whose place another view sees further; None: no two maps can be compared
     seen_through: float | None = None
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()  # one line each
 
     def in_words(self, views: int) -> str:
         """One line, for a data set of so many views."""
@@ -156,25 +149,15 @@ LIMITS = CameraLimits()
 
 @dataclass(frozen=True, eq=False)
 class CameraCheck:
-    """Figures of cameras around a region of interest.
+    """Figures of cameras around a region of interest; None where there are no points, masks or depth maps."""
 
-    Attributes:
-        fields_of_view: ``(V, 2)`` full angles across and down, degrees.
-        distances: ``(V,)`` from the eyes to the middle of the region, in its radii.
-        in_view: ``(V,)`` share of the region's sphere that falls into the image.
-        points_inside: share of the sparse points that lie in the region; None without points.
-        mask_inside: share of the object's pixels whose rays meet the region, in the median view; None without masks.
-        depths: what is known of the depth maps; None without any.
-        warnings: one line each.
-    """
-
-    fields_of_view: Float64
-    distances: Float64
-    in_view: Float64
-    points_inside: float | None
-    mask_inside: float | None
+    fields_of_view: Float64  # (V, 2) full angles across and down, degrees
+    distances: Float64  # (V,) from the eyes to the middle of the region, in its radii
+    in_view: Float64  # (V,) share of the region's sphere that falls into the image
+    points_inside: float | None  # share of the sparse points that lie in the region
+    mask_inside: float | None  # share of the object's pixels whose rays meet the region, in the median view
     depths: DepthCheck | None
-    warnings: tuple[str, ...]
+    warnings: tuple[str, ...]  # one line each
 
     def record(self) -> dict[str, Any]:
         """As numbers and lists, for JSON."""
@@ -192,16 +175,9 @@ class CameraCheck:
 def check_files(
     path: str | Path, out: Path | None = None, depths: DepthSource | None = None, *, allow_missing: bool = False
 ) -> tuple[PosedImages, CameraCheck, str]:
-    """Check a data set, and write what it looks like.
+    """Check a data set → its images (made small), the figures, and both in words.
 
-    Args:
-        path: as for `read_posed_images`.
-        out: ``.glb`` or ``.ply`` file for `camera_mesh`, in world coordinates.
-        depths: as for `read_posed_images`.
-        allow_missing: as for `read_posed_images`.
-
-    Returns:
-        The images (made small), the figures, and both in words.
+    A file ``out`` gets `camera_mesh`, in world coordinates. The other arguments are those of `read_posed_images`.
 
     Raises:
         InputError: the data set cannot be read, or the file not be written.
@@ -277,13 +253,7 @@ def check_cameras(images: PosedImages) -> CameraCheck:
 
 
 def format_check(images: PosedImages, check: CameraCheck, sizes: Sequence[tuple[int, int]]) -> str:
-    """The figures in words, a line for each.
-
-    Args:
-        images: what was checked.
-        check: its figures.
-        sizes: widths and heights of the images as they are on disk.
-    """
+    """The figures in words, a line for each; ``sizes`` are widths and heights of the images as they are on disk."""
     distinct = list(dict.fromkeys(sizes))
     size = f"{distinct[0][0]} × {distinct[0][1]}" if len(distinct) == 1 else f"{len(distinct)} sizes"
     scale = images.similarity.scale

@@ -50,16 +50,10 @@ class _Part(NamedTuple):
 
 
 def camera_mesh(images: PosedImages) -> Mesh:
-    """Frustums, the unit sphere around the region of interest, the axes of the world and the sparse points.
+    """Frustums, the unit sphere around the region of interest, the axes of the world and sparse points, as one mesh.
 
     The lines of a frustum go from violet (the first view) to yellow (the last); its image plane shows the picture, and
     a triangle stands on the upper edge. The axes at the middle are those of the world: x red, y green, z blue.
-
-    Args:
-        images: what to show.
-
-    Returns:
-        A mesh with colours in unit-sphere coordinates.
     """
     cameras = [view.camera.moved(images.similarity) for view in images.views]
     size, reach = frustum_size(cameras)
@@ -79,11 +73,7 @@ def camera_mesh(images: PosedImages) -> Mesh:
 
 
 def frustum_size(cameras: Sequence[Camera]) -> tuple[float, float]:
-    """Longer side of the image planes and their greatest distance from the eyes, so that neighbours hardly meet.
-
-    Args:
-        cameras: in unit-sphere coordinates.
-    """
+    """Longer side of the image planes and their greatest distance from the eyes, so that neighbours hardly meet."""
     eyes = torch.stack([camera.eye for camera in cameras])
     distance = max(float(eyes.norm(dim=1).median()), 0.1)
     apart = torch.cdist(eyes, eyes).fill_diagonal_(torch.inf).amin(dim=1)

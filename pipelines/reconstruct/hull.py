@@ -26,15 +26,9 @@ from .silhouettes import Agreement, grid_in_ball, silhouettes
 def seen_through(measured: MeasuredDepths, resolution: int, *, rays: int = 1 << 18, least: int = 2) -> Tensor:
     """Which vertices of a grid over [−1, 1]³ measured rays pass ``(resolution + 1,) * 3``, on the CPU.
 
-    A vertex is passed where two rays at least go through the cell around it before they end in another one beyond it,
-    and no fewer than end there: a measurement that is wrong carves no hole into a surface that many see. Vertices that
-    lie deeper inside than half the diagonal of a cell are never passed, if measurements are right.
-
-    Args:
-        measured: the rays; those whose depth is not known yet are left out.
-        resolution: cells along an edge.
-        rays: that carve, at most.
-        least: rays that must pass through a place.
+    A vertex is passed where at least ``least`` of up to ``rays`` rays go through the cell around it before they end
+    beyond it, and no fewer than end there: one wrong measurement carves no hole. Right measurements pass no vertex that
+    lies deeper inside than half the diagonal of a cell. Rays whose depth is not known yet are left out.
     """
     count, edge = resolution + 1, 2 / resolution
     passed, ended = (torch.zeros(count**3, dtype=torch.int64, device=measured.device) for _ in range(2))
@@ -98,19 +92,10 @@ def begin(
     measured: MeasuredDepths | None = None,
     agreement: Agreement | None = None,
 ) -> str:
-    """Give an untrained scene the start that its settings ask for; it is a sphere already.
+    """Give an untrained scene, in place, the start that its settings ask for; it is a sphere already.
 
-    Args:
-        model: its geometry is trained in place.
-        views: those that are trained on.
-        images: of which these are a part; for the coordinates and the name.
-        config: ``start``, ``geometry`` and ``seed`` are used.
-        measured: depths of these views, if there are any.
-        agreement: of these views, if it is known.
-
-    Returns:
-        What it is now: "hull", "depths" (what no measured ray passes) or "sphere". A hull is carved by measured rays
-        too, unless it was asked for by name.
+    Returns "hull" (carved by measured rays too, unless it was asked for by name), "depths" (what no measured ray
+    passes) or "sphere". ``agreement`` is that of the ``views``, if it is known.
 
     Raises:
         InputError: a start was asked for that there is not.
@@ -147,18 +132,12 @@ def carve(
     """Signed distances to what is left of the unit ball at the vertices of a grid over [−1, 1]³, negative inside.
 
     A vertex of the unit ball is inside where `HullOptions.agree` of the views that see it find object within half a
-    cell. So the hull is up to a cell too large, and thin parts stay. Grids of half as many cells come first, which see
-    object from further around, so that most vertices are decided by a few.
-
-    Args:
-        views: pictures with masks; none leaves all that is not empty.
-        similarity: from world to unit-sphere coordinates.
-        resolution: cells along an edge; None takes `fitting_resolution`, or that of ``empty`` where there are no views.
-        empty: ``(E, E, E)`` vertices of a grid over the same cube that are known to be outside.
+    cell, so that thin parts stay; without views, where ``empty`` ``(E, E, E)``, a grid over the same cube, does not
+    exclude it. Grids of half as many cells come first, so that most vertices are decided by a few.
 
     Returns:
-        ``(resolution + 1,) * 3`` distances by x, y and z, exact to about a cell; or None where too little or too
-        much of the ball is left, as by empty and full masks.
+        ``(resolution + 1,) * 3`` distances by x, y and z, exact to about a cell; None where too little or too much of
+        the ball is left, as by empty and full masks.
     """
     if resolution is None:
         resolution = fitting_resolution(views, similarity) if views or empty is None else len(empty) - 1
@@ -231,14 +210,7 @@ def _all_around(empty: NDArray[np.bool_], resolution: int) -> NDArray[np.bool_]:
 
 
 def start_at_hull(network: Siren, distances: NDArray[np.float64], *, seed: int = 0, steps: int = HULL.steps) -> None:
-    """Train a SIREN in place to signed distances on a grid, smoothed as far as it cannot follow them.
-
-    Args:
-        network: the coarse level, on any device.
-        distances: as `carve` returns them.
-        seed: of the points.
-        steps: of Adam, its rate falling linearly.
-    """
+    """Train a SIREN in place to the distances of `carve`, smoothed as far as it cannot follow."""
     place = network.output.weight
     grid = ValueGrid(len(distances) - 1, place.device)
     grid.kept.copy_(torch.from_numpy(distances).to(place))

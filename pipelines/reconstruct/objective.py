@@ -45,44 +45,24 @@ class Schedule:
 
 
 class Kind(NamedTuple):
-    """Of which kind a step is: those of one kind do the same operations.
+    """Of which kind a step is: those of one kind do the same operations."""
 
-    Attributes:
-        rays: how many there are.
-        level: the finest that is switched on.
-        annealing: whether slopes are still annealed.
-        measured: whether measured depths count.
-    """
-
-    rays: int
-    level: int
-    annealing: bool
-    measured: bool
+    rays: int  # how many there are
+    level: int  # the finest that is switched on
+    annealing: bool  # whether slopes are still annealed
+    measured: bool  # whether measured depths count
 
 
 class Outcome(NamedTuple):
-    """What a step is descended by.
+    """What a step is descended by."""
 
-    Attributes:
-        terms: of the loss, unweighted.
-        total: their weighted sum.
-        sections: that are evaluated per ray, 0-d.
-    """
-
-    terms: dict[str, Tensor]
-    total: Tensor
-    sections: Tensor
+    terms: dict[str, Tensor]  # of the loss, unweighted
+    total: Tensor  # their weighted sum
+    sections: Tensor  # samples that are evaluated per ray, 0-d
 
 
 class SceneObjective(Objective):
-    """How far a scene is from the pixels of a pool.
-
-    Args:
-        model: what is trained, on the pool's device.
-        pool: the pixels.
-        config: settings.
-        measured: depths of the same pictures, if there are any.
-    """
+    """How far a scene is from the pixels of a pool, and from depths that were measured in the same pictures."""
 
     schedule = Schedule()
 
@@ -131,10 +111,7 @@ class SceneObjective(Objective):
         return min(started, self.model.geometry.num_levels) - 1
 
     def look(self, step: int, done: float) -> None:
-        """Bring the grid that rays march on up to date: its near part often, all of it now and then.
-
-        The less the surface moves, the longer the grid is left alone; see `Schedule`.
-        """
+        """Bring the SDF grid up to date: near the surface often, all of it now and then; see `Schedule`."""
         if self.grid is None:
             return
         plan = self.schedule
@@ -149,12 +126,7 @@ class SceneObjective(Objective):
             self.kept |= {"moved": self.grid.moved, "looks": torch.tensor([step, pause, looks + 1])}
 
     def remember(self, step: int, sections: Tensor) -> None:
-        """Fetch what the next steps depend on, all at once: a GPU is waited for.
-
-        Args:
-            step: number of the step.
-            sections: 0-d, evaluated per ray in it.
-        """
+        """Fetch what the next steps depend on, all at once: a GPU is waited for."""
         unsure = 1 / self.model.inv_std.detach()
         known = [sections, unsure.to(sections)]
         if self.grid is None:
@@ -295,16 +267,11 @@ Rooms = tuple[int, ...] | None
 
 
 class ReplayedTrainer(Trainer[SceneObjective]):
-    """A `Trainer` of a scene whose steps are replayed.
+    """A `Trainer` of a scene whose steps are replayed; ``recorder`` None is for CUDA's graphs.
 
-    How many sections of rays are evaluated, lie in bands, and get colours differs from step to step, and a recorded
-    step has room for given numbers. They follow, every sixteen steps, from the most that was asked for in the last
-    sixteen. A step in which a room was too small is not taken: its gradient would leave something out.
-
-    Args:
-        objective: of a scene.
-        recorder: how steps are recorded; None for CUDA's graphs.
-        others: of `Trainer`.
+    How many samples of rays are evaluated, lie in bands, and get colours differs from step to step, and a recorded step
+    has a capacity for each. It follows, every sixteen steps, from the most that was requested in the last sixteen. A
+    step whose request exceeds it is not taken: its gradient would leave something out.
     """
 
     capacity = Capacity()

@@ -47,14 +47,7 @@ def grid_in_ball(resolution: int) -> tuple[Tensor, Tensor]:
 def silhouettes(
     views: Sequence[PosedImage], similarity: Similarity, points: Tensor, edge: float
 ) -> Iterator[tuple[Tensor, Tensor]]:
-    """For each view, which points it sees and which of them are object ``(N,)``, each.
-
-    Args:
-        views: pictures with masks.
-        similarity: from world to unit-sphere coordinates.
-        points: ``(N, 3)`` float64 in the latter.
-        edge: a point is object where there is object within half of it.
-    """
+    """For each view, which points ``(N, 3)`` it sees, and which have object within half an ``edge``, ``(N,)`` each."""
     for view in views:
         camera, mask = view.camera.moved(similarity), _object_in(view)
         cut = bool(_border(mask).any())
@@ -87,20 +80,13 @@ class Agreement:
     """What silhouettes say of the same points, and which of them the others contradict.
 
     A view contradicts a point that it sees and takes for background.
-
-    Attributes:
-        views: pictures, all with masks.
-        similarity: from world to unit-sphere coordinates.
-        seen: which points of a grid in the unit ball each view sees ``(V, N)``.
-        against: which of them it contradicts ``(V, N)``.
-        limits: when a silhouette is wrong.
     """
 
-    views: Sequence[PosedImage]
-    similarity: Similarity
-    seen: Tensor
-    against: Tensor
-    limits: Limits = Limits()
+    views: Sequence[PosedImage]  # pictures, all with masks
+    similarity: Similarity  # from world to unit-sphere coordinates
+    seen: Tensor  # (V, N) which points of a grid in the unit ball each view sees
+    against: Tensor  # (V, N) which of them it contradicts
+    limits: Limits = Limits()  # when a silhouette is wrong
 
     @classmethod
     def of(cls, views: Sequence[PosedImage], similarity: Similarity, limits: Limits | None = None) -> Agreement:
@@ -149,11 +135,7 @@ class Agreement:
         return rest.without(rest._those(rest._cuts_alone)).views
 
     def holes(self) -> dict[int, NDArray[np.bool_]]:
-        """Holes in masks: background with object all around it, where all other views take for object what is behind.
-
-        Returns:
-            By the number of the view, for those that have any, pixels ``(H, W)``.
-        """
+        """Holes ``(H, W)`` in masks, by the view's number: enclosed background where all others see object."""
         alone = self.against & (self.against.sum(dim=0) == 1)
         points, found = grid_in_ball(self.limits.cells)[0], {}
         for index in self._cuts_alone.nonzero()[:, 0].tolist():

@@ -30,17 +30,11 @@ Float32 = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class ViewImage:
-    """A rendered view.
+    """A rendered view."""
 
-    Attributes:
-        color: ``(H, W, 3)`` display RGB in [0, 1].
-        normal: ``(H, W, 3)`` in unit-sphere coordinates; shorter than 1 where the view passes the object.
-        opacity: ``(H, W)``.
-    """
-
-    color: Float32
-    normal: Float32
-    opacity: Float32
+    color: Float32  # (H, W, 3) display RGB in [0, 1]
+    normal: Float32  # (H, W, 3) in unit-sphere coordinates; shorter than 1 where the view passes the object
+    opacity: Float32  # (H, W)
 
 
 def render_image(
@@ -50,15 +44,7 @@ def render_image(
     sampling: Sampling,
     **options: Any,
 ) -> ViewImage:
-    """Render a view with the model's volume renderer.
-
-    Args:
-        model: on any device.
-        view: whose camera it is.
-        similarity: from world to unit-sphere coordinates.
-        sampling: where to sample.
-        options: of `render_camera`.
-    """
+    """`render_camera` of a view whose camera is in world coordinates; ``options`` are its."""
     return render_camera(model, view.camera.moved(similarity), sampling, **options)
 
 
@@ -74,17 +60,10 @@ def render_camera(
     guide: Callable[[Tensor], Tensor] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> ViewImage:
-    """Render what a camera sees with the model's volume renderer, a ray through the middle of each pixel.
+    """What a camera in unit-sphere coordinates sees by volume rendering, a ray through the middle of each pixel.
 
-    Args:
-        model: on any device.
-        camera: in unit-sphere coordinates.
-        sampling: where to sample.
-        level: of the geometry.
-        least_weight: see `render_volume`.
-        skip: the same.
-        guide: the same.
-        progress: told (rays done, rays in all).
+    ``least_weight``, ``skip`` and ``guide`` are those of `SceneModel.render`; ``progress`` is told (rays done, rays in
+    all).
     """
     device = model.background.device
     origins, directions = (part.to(device) for part in camera_rays(camera))
@@ -117,10 +96,7 @@ def render_camera(
 
 
 def held_out(views: Sequence[PosedImage], every: int) -> tuple[list[PosedImage], list[PosedImage]]:
-    """Split views into those to train on and those held out: every n-th one, from the first; none for 0.
-
-    At least one view is trained on, so of a single view none is held out.
-    """
+    """The views to train on, and those held out: every n-th, from the first; none for 0, and none of a single view."""
     if every == 0 or len(views) == 1:
         return list(views), []
     chosen = set(range(0, len(views), max(2, every)))
@@ -215,17 +191,11 @@ SeenFrom = tuple[Camera, NDArray[np.float32] | None]
 
 @torch.no_grad()
 def seen_points(field: Field, views: Sequence[SeenFrom]) -> tuple[Tensor, float]:
-    """Points of the surface that two photographs see at least, and how far apart neighbours among them may be.
+    """Points ``(N, 3)`` of the surface that two photographs see at least, on the CPU, and the distance of neighbours.
 
     Every view is traced in up to 10,000 pixels of what its mask calls object, and all together in 300,000. Places are
     told apart that are 1/32 of a radius apart, or as far as neighbouring pixels on a surface that is seen obliquely.
-
-    Args:
-        field: in unit-sphere coordinates.
-        views: the photographs that it was trained on: cameras in the same coordinates, and masks if there are any.
-
-    Returns:
-        ``(N, 3)`` points in the unit sphere, on the CPU, and a length there.
+    ``views`` are cameras in the field's unit-sphere coordinates, and masks if there are any.
     """
     pixels = max(1, min(300_000 // len(views), 10_000))
     points: list[Tensor] = []
@@ -274,15 +244,8 @@ def count_views(
 ) -> NDArray[np.int64]:
     """How many cameras ``(N,)`` see points ``(N, 3)`` of a surface: in their picture, with nothing before them.
 
-    Masks do not count: a place that is in a picture is seen.
-
-    Args:
-        cameras: in the coordinates of the surface.
-        surface: what there is to see, and to hide.
-        points: of it.
-        finest: pixels of the longer side, in which it is decided what hides what. Ten of them wide is the strip beyond
-            a rim that may count as seen.
-        progress: called with ``(done, total)`` after every camera.
+    ``finest`` pixels of the longer side decide what hides what. Ten of them wide is the strip beyond a rim that may
+    count as seen. ``progress`` is called with ``(done, total)`` after every camera.
     """
     counts = np.zeros(len(points), dtype=np.int64)
     for index, camera in enumerate(cameras):

@@ -18,11 +18,7 @@ CELL = 2.0 / SPREAD_CELLS
 
 
 class SpreadColors:
-    """Colours in space, from samples of a surface.
-
-    Args:
-        points: ``(N, 3)`` of the surface, in the cube from −1 to 1; what lies outside counts in its outermost cells.
-        colors: ``(N, C)``, any values.
+    """Colours in space, from ``colors`` ``(N, C)`` at ``points`` ``(N, 3)`` of a surface in the cube from −1 to 1.
 
     Raises:
         ValueError: there are no samples.

@@ -1,8 +1,6 @@
 """Run directories: what an argument ``RUN|FILE`` means, and what a training writes and finds again.
 
-All files of a directory belong to one run, whose *generation*, a random name, is in each of them. A checkpoint replaces
-all of them at once (`replace_files`). An old run stays whole until the first checkpoint of a new one. The record has
-the SHA-256 of the field, and each file has one of its tensors.
+All files of a directory belong to one run, whose *generation*, a random name, is in each of them.
 """
 
 from __future__ import annotations
@@ -35,15 +33,39 @@ from ...neural_fields.spacetime.dynamic_tracing import moment
 from ...neural_fields.spacetime.velocity import VelocitySiren
 from .settings import command_line, load_config
 
+C = TypeVar("C")
+
+FIELD_FILE = "field.safetensors"
+RECORD_FILE = "run.json"
+STATE_FILE = "resume.safetensors"
+TEXTURE_FILE = "texture.safetensors"
+RADIANCE_FILE = "radiance.safetensors"
+SUPPORT_FILE = "support.safetensors"
+VELOCITY_FILE = "velocity.safetensors"
+CLOUD_FILE = "cloud.ply"  # what was made of depth maps
+MERGED_FILE = "merged_cloud.npz"  # of a large cloud, made again where it is missing
+JOURNAL = ".journal"
+PARTIAL = re.compile(r"\..*\.(\d+)\.partial(\.[^.]*)?")  # of `whole_file`
+# What a resumed run may do otherwise than it began; all else would make another run of it.
+MAY_CHANGE = ("device", "time_budget")
+# What is in the record alone: too long for the head of a field's file.
+LONG = ("checks", "held_out")
+
+
+# One writer at a time.
+
 
 def lock_file(target: Path) -> Path:
-    """The lock of a run directory, which lies in it, or of a file, beside it."""
+    """The lock of a run directory, which lies in it, or of a file, beside it.
+
+    It stays, empty: removing it would let two processes hold locks of two files of one name.
+    """
     return target / "run.lock" if target.is_dir() else target.with_suffix(".lock")
 
 
 @contextmanager
 def locked(target: Path) -> Iterator[None]:
-    """Be the only writer of a run directory, or of a file, until the block ends.
+    """Be the only writer of a run directory, or of a file, until the block or the process ends.
 
     Raises:
         InputError: another process writes there, or the lock cannot be made.
@@ -67,27 +89,20 @@ def locked(target: Path) -> Iterator[None]:
 
 
 def check_unlocked(target: Path) -> None:
-    """Refuse a run directory, or a file, that another process writes.
-
-    Raises:
-        InputError: see `locked`.
-    """
+    """Refuse a run directory, or a file, that another process writes; see `locked`."""
     if lock_file(target).is_file():
         with locked(target):
             pass
 
 
-JOURNAL = ".journal"
-PARTIAL = re.compile(r"\..*\.(\d+)\.partial(\.[^.]*)?")  # of `whole_file`
+# Several files replaced at once: their new contents are written into one file, the journal, and its renaming is the
+# moment of the change. The files are then written from it. After a kill the next reader or writer repeats that.
 
 
 def replace_files(folder: Path, contents: Mapping[str, bytes], remove: Iterable[str] = ()) -> None:
-    """Write files of a folder and remove others, all at once. The caller holds the folder's lock.
+    """Write files of a folder, by name, and remove others, which may be absent: after a kill all are old, or all new.
 
-    Args:
-        folder: exists.
-        contents: by name of file.
-        remove: names of files, which may be absent.
+    The caller holds the folder's lock.
 
     Raises:
         InputError: the folder cannot be written. It is then unchanged, or the next `recover` ends the change.
@@ -99,7 +114,7 @@ def replace_files(folder: Path, contents: Mapping[str, bytes], remove: Iterable[
 
 
 def recover(folder: Path) -> None:
-    """End a change that was interrupted by a kill. The caller holds the folder's lock.
+    """End a change that a kill has interrupted. The caller holds the folder's lock.
 
     Raises:
         InputError: the journal is damaged, or the folder cannot be written.
@@ -107,7 +122,7 @@ def recover(folder: Path) -> None:
     journal = folder / JOURNAL
     if not journal.is_file():
         return
-    with disk.damage(journal, "remove it"):
+    with damage(journal, "remove it"):
         with safe_open(journal, framework="np") as file:
             gone = json.loads(file.metadata()["remove"])
             contents = {name: file.get_tensor(name).tobytes() for name in file.keys()}  # noqa: SIM118
@@ -132,15 +147,7 @@ def _carry_out(folder: Path, contents: Mapping[str, bytes], gone: Iterable[str])
 
 
 def recovered(folder: Path) -> None:
-    """Wait for a change that is under way, and end one that was interrupted.
-
-    Raises:
-        InputError: it takes longer than ten seconds, or see `recover`.
-    """
-    if (folder / ".ready").is_dir():
-        raise InputError(
-            f"{folder}: an older version was killed while it wrote; move the files of {folder / '.ready'} into {folder}"
-        )
+    """Wait up to ten seconds for a change that is under way, and end one that was interrupted; see `recover`."""
     until = time.monotonic() + 10
     while (folder / JOURNAL).is_file():
         try:
@@ -153,21 +160,12 @@ def recovered(folder: Path) -> None:
 
 
 def prune(folder: Path) -> None:
-    """`recover`, and remove partial files of killed processes. The caller holds the folder's lock.
-
-    Raises:
-        InputError: see `recover`.
-    """
+    """`recover`, and remove partial files of killed processes. The caller holds the folder's lock."""
     recover(folder)
     for file in list(folder.iterdir()):
         found = PARTIAL.fullmatch(file.name)
         if found and _has_ended(int(found[1])):
             disk.remove(file)
-
-
-def is_scratch(file: Path) -> bool:
-    """Whether a file may be lost: a lock, or a partial file."""
-    return file == lock_file(file.parent) or PARTIAL.fullmatch(file.name) is not None
 
 
 def _has_ended(number: int) -> bool:
@@ -182,26 +180,11 @@ def _has_ended(number: int) -> bool:
     return False
 
 
-C = TypeVar("C")
-
-FIELD_FILE = "field.safetensors"
-RECORD_FILE = "run.json"
-STATE_FILE = "resume.safetensors"
-TEXTURE_FILE = "texture.safetensors"
-RADIANCE_FILE = "radiance.safetensors"
-SUPPORT_FILE = "support.safetensors"
-CLOUD_FILE = "cloud.ply"  # what was made of depth maps
-MERGED_FILE = "merged_cloud.npz"  # of a large cloud, made again where it is missing
-# What a resumed run may do otherwise than it began; all else would make another run of it.
-MAY_CHANGE = ("device", "time_budget")
-# What is in the record alone: too long for the head of a field's file.
-LONG = ("checks", "held_out")
+# What is in a run directory.
 
 
 def find_field(path: str | Path) -> Path:
-    """The checkpoint that ``RUN|FILE`` names.
-
-    A change of a run directory that a kill has interrupted is ended now.
+    """The checkpoint that ``RUN|FILE`` names; a change of the run directory that was interrupted is ended.
 
     Raises:
         InputError: there is nothing there, it is neither a run directory with a field nor a .safetensors file, or the
@@ -232,12 +215,7 @@ def is_field(path: str | Path) -> bool:
 
 
 def load_still(path: str | Path, time: float | None = None, *, device: torch.device | str = "cpu") -> SavedField:
-    """The field of a run as it is, or that of one moment if it moves.
-
-    Args:
-        path: run directory or .safetensors file.
-        time: the moment, in [0, 1]; None for a field that does not move.
-        device: where to put it.
+    """The field of a run as it is, or, if it moves, that of one moment in [0, 1].
 
     Raises:
         InputError: there is no such run; it moves and no time is given, or the other way round; or the time is not
@@ -269,6 +247,29 @@ def chosen_level(field: Field, file: Path, level: int | None, *, otherwise: int 
     return level
 
 
+def load_motion(run: str | Path) -> VelocitySiren | None:
+    """The velocity that a run of ``evolve --kind deform`` has learnt, on the CPU; None where the run has none.
+
+    Raises:
+        InputError: the file is damaged, or not of this run.
+    """
+    folder = Path(run) if Path(run).is_dir() else Path(run).parent
+    file = folder / VELOCITY_FILE
+    if not file.is_file():
+        return None
+    tensors, about = load_state(folder, name=VELOCITY_FILE)
+    record = read_record(folder)
+    if about.get("generation") != record.get("generation"):
+        raise InputError(f"{file}: not of the run in {folder}; evolve it again")
+    config = record["config"]
+    velocity = VelocitySiren(config["motion_width"], 2, omega=config["motion_omega"])
+    try:
+        velocity.load_state_dict(tensors)
+    except RuntimeError as error:
+        raise InputError(f"{file}: not a motion as {RECORD_FILE} describes it; evolve it again") from error
+    return velocity.requires_grad_(False)
+
+
 def is_fitted(run: Path) -> bool:
     """Whether the training in a directory went to its end."""
     recovered(run)
@@ -278,11 +279,7 @@ def is_fitted(run: Path) -> bool:
 
 
 def kept_cloud(run: Path) -> Path:
-    """The file of the cloud that was made of the depth maps of a run.
-
-    Raises:
-        InputError: the run was not fitted to depth maps.
-    """
+    """The file of the cloud that was made of the depth maps of a run; InputError without one."""
     kept = run / CLOUD_FILE
     if not kept.is_file():
         raise InputError(f"{run}: holds no {CLOUD_FILE}, so it was not fitted to depth maps; name its own cloud")
@@ -290,15 +287,10 @@ def kept_cloud(run: Path) -> Path:
 
 
 def named_cloud(source: str, run: Path | None) -> dict[str, str]:
-    """Where a cloud is, for a record: so that `fitted_cloud` finds it from any folder.
+    """Where the cloud of a run directory is, for a record, so that `fitted_cloud` finds it from any folder.
 
-    Args:
-        source: its file; what else it may be called stays as it is.
-        run: directory of the run, if there is one.
-
-    Returns:
-        ``cloud``, the absolute path, and ``cloud_from_run``, the path from the run's directory, which holds when both
-        are moved together.
+    ``cloud`` is the absolute path; a source that is no file stays as it is. ``cloud_from_run`` is the path from the
+    run's directory, which holds when both are moved together.
     """
     file = Path(source)
     if not file.is_file() and (run is None or file != run / CLOUD_FILE):  # that one comes with the first checkpoint
@@ -311,15 +303,10 @@ def named_cloud(source: str, run: Path | None) -> dict[str, str]:
 
 
 def fitted_cloud(file: Path, metadata: Mapping[str, Any], *, remedy: str) -> Path:
-    """The file of the cloud that a field was fitted to.
-
-    Args:
-        file: the field's checkpoint.
-        metadata: what is in it.
-        remedy: what to do where it is not found, for the message.
+    """The file of the cloud that the field in a ``file`` with this ``metadata`` was fitted to.
 
     Raises:
-        InputError: it is in neither of the places that `named_cloud` noted.
+        InputError: it is in neither of the places that `named_cloud` noted; the message ends with the ``remedy``.
     """
     record = metadata.get("run", {})
     source, from_run = record.get("cloud"), record.get("cloud_from_run")
@@ -358,10 +345,14 @@ def check_new_run(path: str | Path, *, resume: bool, force: bool) -> Path:
             reason = "is finished" if finished else "holds no interrupted run"
             raise InputError(f"{path}: {reason}, so there is nothing to resume; leave out --resume")
         return path
-    if path.is_dir() and not force and not all(is_scratch(file) or file.name == MERGED_FILE for file in path.iterdir()):
+    if path.is_dir() and not force and any(map(_could_be_lost, path.iterdir())):
         hint = " --resume continues it," if (path / STATE_FILE).is_file() else ""
         raise InputError(f"{path}: exists and is not empty;{hint} --force overwrites it, or choose another -o")
     return path
+
+
+def _could_be_lost(file: Path) -> bool:
+    return not (file == lock_file(file.parent) or file.name == MERGED_FILE or PARTIAL.fullmatch(file.name))
 
 
 def resumes_with(run: Path, record: Mapping[str, Any]) -> str | None:
@@ -378,12 +369,11 @@ def resumes_with(run: Path, record: Mapping[str, Any]) -> str | None:
 class RunFolder:
     """What a training writes: its record, a field that is usable at any time, and what it can be resumed from.
 
+    A checkpoint replaces all files at once. An old run stays whole until the first checkpoint of a new one.
+
     Args:
         path: the directory; None keeps nothing.
         resume: whether the interrupted run there is continued.
-
-    Attributes:
-        out: where to write, ``path``; None where nothing is kept, nothing.
 
     Raises:
         InputError: there is no directory to resume from.
@@ -424,19 +414,18 @@ class RunFolder:
         Raises:
             InputError: somebody else writes there, or has written since this was made.
         """
-        if self.out is None:
+        if self.path is None:
             yield
             return
-        self.out.mkdir(parents=True, exist_ok=True)
-        with locked(self.out):
-            prune(self.out)
-            if _generation_in(self.out) != self._found:
+        self.path.mkdir(parents=True, exist_ok=True)
+        with locked(self.path):
+            prune(self.path)
+            if _generation_in(self.path) != self._found:
                 raise InputError(
-                    f"{self.out}: another run was written there meanwhile; look at it, or choose another -o"
+                    f"{self.path}: another run was written there meanwhile; look at it, or choose another -o"
                 )
             if self.resume:
-                record = read_record(self.out)
-                self._generation = record.get("generation", self._generation)
+                self._generation = read_record(self.path).get("generation", self._generation)
             else:
                 self._gone = {SUPPORT_FILE, CLOUD_FILE, *also}
             yield
@@ -448,7 +437,7 @@ class RunFolder:
 
     def keep(self, name: str, content: bytes) -> None:
         """Have a file in the directory from the next checkpoint on."""
-        if self.out is not None:
+        if self.path is not None:
             self._kept[name] = content
 
     def keep_tensors(self, name: str, tensors: Mapping[str, Tensor]) -> None:
@@ -464,19 +453,19 @@ class RunFolder:
         progress: Mapping[str, Any],
     ) -> None:
         """Write a checkpoint: a usable field, and the ``tensors`` and ``progress`` (JSON) that `restore` returns."""
-        if self.out is not None:
+        if self.path is not None:
             about = {**progress, "config": record["config"], "generation": self._generation}
             self.keep(STATE_FILE, state_bytes(tensors, about))
-            self._replace(self.out, field, similarity, record)
+            self._replace(self.path, field, similarity, record)
 
     def finish(
         self, field: Field, similarity: Similarity, record: Mapping[str, Any], *, gone: Iterable[str] = ()
     ) -> dict[str, Any]:
         """Write field and record of a finished run → the record; what was to be resumed, and ``gone``, go."""
-        if self.out is None:
+        if self.path is None:
             return dict(record)
         self._gone |= {STATE_FILE, *gone}
-        return self._replace(self.out, field, similarity, record)
+        return self._replace(self.path, field, similarity, record)
 
     def _replace(self, out: Path, field: Field, similarity: Similarity, record: Mapping[str, Any]) -> dict[str, Any]:
         """Replace the files of the directory at once; the texture of an older field is removed."""
@@ -494,12 +483,9 @@ class RunFolder:
     def restore(self, fingerprint: str, mismatch: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """The tensors and the progress that `save` was given last.
 
-        Args:
-            fingerprint: of what the run learns from; it is in the progress.
-            mismatch: what to say if the run began with another.
-
         Raises:
-            InputError: there is nothing to resume, it is damaged, or the fingerprint is another.
+            InputError: there is nothing to resume, it is damaged, or the progress has another ``fingerprint`` of what
+                the run learns from; the message begins with ``mismatch``.
         """
         assert self.path is not None
         tensors, progress = load_state(self.path)
@@ -509,13 +495,9 @@ class RunFolder:
 
 
 def write_texture(run: Path, content: bytes, record: Mapping[str, Any], *, finished: bool) -> None:
-    """Write a texture, and what the record of its run says of it, at once; to be called by who has the run's lock.
+    """Write a texture, and what the record of its run, if there is one, holds as ``texture``, at once.
 
-    Args:
-        run: the directory; without a record, only the texture is written.
-        content: of the file.
-        record: kept as ``texture``.
-        finished: whether its training may be forgotten.
+    The caller holds the run's lock. The state of a ``finished`` training is removed.
 
     Raises:
         InputError: the directory cannot be written, or its record is damaged.
@@ -548,11 +530,7 @@ def _generation_in(run: Path) -> object:
 
 
 def _check_whole(run: Path) -> None:
-    """Refuse a run whose field is not that of its record; a writer who is at it is waited for.
-
-    Raises:
-        InputError: they do not belong together.
-    """
+    """Refuse a run whose field is not that of its record, by SHA-256; a writer who is at it is waited for."""
     for _ in range(20):
         recovered(run)
         try:
@@ -582,11 +560,7 @@ def digest_of(arrays: Iterable[NDArray[Any]]) -> str:
 
 
 def read_record(directory: Path) -> dict[str, Any]:
-    """Read ``run.json``.
-
-    Raises:
-        InputError: there is none, or it is damaged.
-    """
+    """What is in ``run.json``; InputError if there is none, or it is damaged."""
     path = directory / RECORD_FILE
     with damage(path, "fit again into a new directory"):
         try:
@@ -605,25 +579,18 @@ def state_bytes(tensors: Mapping[str, Tensor], progress: Mapping[str, Any]) -> b
     return save(plain, metadata={"progress": json.dumps(about)})
 
 
-def save_state(
-    directory: Path, tensors: Mapping[str, Tensor], progress: Mapping[str, Any], *, name: str = STATE_FILE
-) -> None:
-    """Write the resume file, whole or not at all; ``progress`` is JSON."""
-    write_whole(directory / name, state_bytes(tensors, progress))
+def save_state(file: Path, tensors: Mapping[str, Tensor], progress: Mapping[str, Any]) -> None:
+    """Write a file that `load_state` reads, whole or not at all; ``progress`` is JSON."""
+    write_whole(file, state_bytes(tensors, progress))
 
 
 def load_state(
     directory: Path, *, name: str = STATE_FILE, tensors: bool = True
 ) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Read what `save_state` wrote.
-
-    Args:
-        directory: holds it.
-        name: of the file.
-        tensors: whether to read them, too; there are none else.
+    """The tensors, unless they are not wanted, and the progress in a file of `state_bytes`.
 
     Raises:
-        InputError: there is no resume file, or it is damaged.
+        InputError: there is no such file, or it is damaged.
     """
     path = directory / name
     if not path.is_file():
@@ -641,31 +608,3 @@ def load_state(
 
 def _checksum(tensors: Mapping[str, Tensor], progress: Mapping[str, Any]) -> str:
     return hashlib.sha256((checksum_of(tensors) + json.dumps(dict(progress))).encode()).hexdigest()
-
-
-VELOCITY_FILE = "velocity.safetensors"
-
-
-def load_motion(run: str | Path) -> VelocitySiren | None:
-    """The velocity of a run of ``evolve --kind deform``, on the CPU; None where the run has none.
-
-    Args:
-        run: its directory, or the file of its field there.
-
-    Raises:
-        InputError: the file is damaged, or not of this run.
-    """
-    folder = Path(run) if Path(run).is_dir() else Path(run).parent
-    if not (folder / VELOCITY_FILE).is_file():
-        return None
-    tensors, about = load_state(folder, name=VELOCITY_FILE)
-    record = read_record(folder)
-    if about.get("generation") != record.get("generation"):
-        raise InputError(f"{folder / VELOCITY_FILE}: not of the run in {folder}; evolve it again")
-    config = record["config"]
-    velocity = VelocitySiren(config["motion_width"], 2, omega=config["motion_omega"])
-    try:
-        velocity.load_state_dict(tensors)
-    except RuntimeError as error:
-        raise InputError(f"{folder / VELOCITY_FILE}: not a motion as run.json describes it; evolve it again") from error
-    return velocity.requires_grad_(False)

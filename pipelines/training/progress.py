@@ -15,26 +15,18 @@ from rich.progress import BarColumn, ProgressColumn, Task, TaskID, TaskProgressC
 from rich.progress import Progress as Bars
 from rich.text import Text
 
-from ...neural_fields import InputError
+from .settings import input_error
 
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a stage of the work is.
-
-    Attributes:
-        stage: name of the stage.
-        step: steps done.
-        steps: steps planned; 0 for a stage that does not count steps.
-        fraction: of the stage, in [0, 1]; not step / steps when a time budget may end it earlier.
-        losses: unweighted loss terms of the last reported step.
-    """
+    """How far a stage of the work is."""
 
     stage: str
     step: int
-    steps: int
-    fraction: float
-    losses: Mapping[str, float]
+    steps: int  # planned; 0 for a stage that does not count steps
+    fraction: float  # of the stage, in [0, 1]; not step / steps where a time budget may end it earlier
+    losses: Mapping[str, float]  # unweighted terms of the last reported step
 
 
 Report = Callable[[Progress], None]
@@ -55,11 +47,7 @@ def reported(report: Report | None, stage: str) -> Iterator[None]:
 
 @contextmanager
 def progress_bars(*, clock: Callable[[], float] = time.monotonic) -> Iterator[Report]:
-    """Show a bar for each stage on stderr; where that is no terminal, print lines, see `Lines`.
-
-    Args:
-        clock: seconds, from any origin.
-    """
+    """Show a bar for each stage on stderr; where that is no terminal, print lines, see `Lines`."""
     console = Console(stderr=True)
     if not console.is_terminal:
         yield Lines(clock=clock)
@@ -89,9 +77,7 @@ def time_words(seconds: float) -> str:
 class Lines:
     """A line on stderr for each finished stage, and one in between when there was none for half a minute.
 
-    Args:
-        counting: whether stages count something, and are not worth a line when they are done.
-        clock: seconds, from any origin.
+    Stages that are ``counting`` something are not worth a line when they are done.
     """
 
     def __init__(self, *, counting: bool = False, clock: Callable[[], float] = time.monotonic) -> None:
@@ -118,12 +104,9 @@ class Lines:
 
 
 def seconds_left(elapsed: float, before: float, fraction: float) -> float | None:
-    """Seconds that a stage still takes, at the pace so far; None before there is any.
+    """Seconds that a stage still takes at the pace so far; None before there is any.
 
-    Args:
-        elapsed: seconds since it began.
-        before: fraction that was done by then; more than 0 for a resumed one.
-        fraction: that is done now.
+    ``before`` is the fraction that was done when it began ``elapsed`` seconds ago, more than 0 for a resumed one.
     """
     return elapsed * (1 - fraction) / (fraction - before) if fraction > before else None
 
@@ -200,12 +183,7 @@ def _advance(bars: Bars, task: TaskID, fraction: float) -> None:
 
 @contextmanager
 def tensorboard_log(directory: str | Path) -> Iterator[Report]:
-    """A receiver of progress that writes scalars for TensorBoard.
-
-    Each loss term of a stage is ``STAGE/TERM`` over the steps of that stage, as "level 0/surface.data".
-
-    Args:
-        directory: of the event files; made where it is absent. An older run's stay, under their own names.
+    """A receiver of progress that writes each loss term of a stage to a ``directory``, as "level 0/surface.data".
 
     Raises:
         InputError: tensorboard is not installed, or the directory cannot be made.
@@ -230,9 +208,9 @@ def _writer(directory: Path) -> Any:
     try:
         from torch.utils.tensorboard import SummaryWriter
     except ImportError as error:
-        raise InputError("--tensorboard: needs tensorboard; pip install mplicits[tensorboard]") from error
+        raise input_error("--tensorboard: needs tensorboard; pip install mplicits[tensorboard]") from error
     try:
         directory.mkdir(parents=True, exist_ok=True)
         return SummaryWriter(str(directory))
     except OSError as error:
-        raise InputError(f"--tensorboard {directory}: cannot be written ({error.strerror or error})") from error
+        raise input_error(f"--tensorboard {directory}: cannot be written ({error.strerror or error})") from error

@@ -41,15 +41,10 @@ def setting(
     at_most: float | None = None,
     per_level: bool = False,
 ) -> Any:
-    """A field of `Settings`, with its help text and its bounds as metadata.
+    """A field of `Settings`, with its help text and its bounds, which hold for every number of a list, as metadata.
 
-    Args:
-        default: its value where nothing else is said.
-        help: what it is, for the help of its flag.
-        above: the number, or every number of a list, must be larger; None, no number, is under no bound.
-        at_least: it must not be smaller.
-        at_most: it must not be larger.
-        per_level: a list with an entry for each level; the first such field of a class says how many there are.
+    With ``per_level`` it is a list with an entry for each level; the first such field of a class says how many there
+    are.
     """
     metadata = {"help": help, "above": above, "at_least": at_least, "at_most": at_most, "per_level": per_level}
     return dataclasses.field(default=default, metadata=metadata)
@@ -58,9 +53,6 @@ def setting(
 @dataclass(frozen=True)
 class Settings:
     """Base of all settings: their fields are made by `setting` and checked when an instance is made.
-
-    Attributes:
-        gone: settings of earlier versions, each with what a user does instead.
 
     Raises:
         ValueError: lists of different lengths, a word that is no choice, or a number out of range; the message names
@@ -160,16 +152,10 @@ def load_config(
 
 
 def add_config_flags(parser: argparse.ArgumentParser, cls: type, *, about: str = "each overrides the preset") -> None:
-    """Add one flag per field of ``cls`` (``learning_rates`` → ``--learning-rates 1e-3 5e-4``).
+    """Add one flag per field of ``cls`` (``learning_rates`` → ``--learning-rates 1e-3 5e-4``) to a parser.
 
-    A flag that is not given leaves no trace in the namespace, so that only given ones override. Values stay text:
-    `load_config` checks them with the same rules as a file's. Settings that are gone have hidden flags, which it
-    refuses.
-
-    Args:
-        parser: gets the flags.
-        cls: a dataclass of settings.
-        about: a few words above them in the help.
+    A flag that is not given leaves no trace in the namespace. Values stay text, which `load_config` checks like a
+    file's. Settings that are gone have hidden flags, which it refuses.
     """
     group = parser.add_argument_group("settings", about)
     for field in dataclasses.fields(cls):
@@ -191,8 +177,7 @@ def add_config_flags(parser: argparse.ArgumentParser, cls: type, *, about: str =
 def given_flags(arguments: argparse.Namespace, cls: type) -> dict[str, Any]:
     """The fields of ``cls`` that were given on the command line: neither left out nor None; lists as tuples.
 
-    Those of `add_config_flags` are ready for ``load_config``'s ``overrides``; those of flags of another kind for the
-    class itself, whose defaults then hold for the rest.
+    They are ready for ``load_config``'s ``overrides``, or for the class itself.
     """
     given = {name: getattr(arguments, name, None) for name in (*_names(cls), *getattr(cls, "gone", {}))}
     return {name: tuple(x) if isinstance(x, list) else x for name, x in given.items() if x is not None}
@@ -381,10 +366,8 @@ class FitConfig(TrainingSettings):
     def data_weight_after(self, mean_square: float, noise: float) -> float:
         """Weight of (f(x) − d)² at a level whose predecessor misses the points by this mean square.
 
-        Errors shrink from level to level, their squares twice as fast, and angles hardly: a fixed weight would leave
-        the finest level to its normals alone, and noise to the distances. In units of the error before, the balance
-        stays what it was. Smoothed noise leaves waves behind, which the level before follows all too closely: its
-        error is taken for no smaller than that ``noise``.
+        In units of that error the balance with the other terms stays what it was. It is taken for no smaller than the
+        square of the ``noise``, whose waves the level before follows all too closely.
         """
         return self.residual_data_weight / max(mean_square, noise**2, 1e-10)
 
