@@ -110,12 +110,7 @@ def slope_figures(field: Field, *, count: int = 20_000, width: float = 0.05) -> 
         return dict.fromkeys(("mean", "low", "high", "mean_error"))
     slope = field.jet(points).gradient[:, :3].norm(dim=1)
     low, high = slope.quantile(torch.tensor([0.05, 0.95])).tolist()
-    return {
-        "mean": float(slope.mean()),
-        "low": low,
-        "high": high,
-        "mean_error": float((slope - 1).abs().mean()),
-    }
+    return {"mean": float(slope.mean()), "low": low, "high": high, "mean_error": float((slope - 1).abs().mean())}
 
 
 def warnings(checks: dict[str, Any]) -> list[str]:

@@ -37,12 +37,7 @@ def fits_beside(run: Path) -> Path:
 
 
 def fitted_scans(
-    config: EvolveConfig,
-    scans: Mapping[str, Mesh],
-    folder: Path,
-    fits: FitConfig,
-    *,
-    progress: Report | None = None,
+    config: EvolveConfig, scans: Mapping[str, Mesh], folder: Path, fits: FitConfig, *, progress: Report | None = None
 ) -> EvolveConfig:
     """The same evolution with fits in place of ``scans``: what is in the ``folder`` already is taken, or goes on.
 

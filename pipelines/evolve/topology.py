@@ -78,12 +78,7 @@ def surface_of(field: FieldLike, *, resolution: int, level: int = -1) -> Mesh | 
 
 
 def find_changes(
-    field: Field,
-    times: Sequence[float],
-    found: Sequence[Topology],
-    *,
-    resolution: int = 96,
-    until: float = math.inf,
+    field: Field, times: Sequence[float], found: Sequence[Topology], *, resolution: int = 96, until: float = math.inf
 ) -> list[Change]:
     """The changes between growing ``times`` whose topology is ``found``, each by halving the interval that it lies in.
 

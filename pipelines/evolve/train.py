@@ -49,11 +49,7 @@ class Evolution(Run[SpaceTimeSDF]):
 
 
 def evolve(
-    config: EvolveConfig,
-    *,
-    out: str | Path | None = None,
-    resume: bool = False,
-    progress: Report | None = None,
+    config: EvolveConfig, *, out: str | Path | None = None, resume: bool = False, progress: Report | None = None
 ) -> Evolution:
     """Train a field of space-time.
 

@@ -98,12 +98,7 @@ def build_field(config: MultiscaleFieldConfig, *, aabb: Tensor, **_: object) -> 
         grid=HashEncoding.up_to(finest, extent=extent) if finest else None,
     )
     shell = NerfstudioField(
-        sdf,
-        color,
-        heads=FieldHeadNames,
-        bounds=aabb,
-        deviation=config.deviation,
-        learning_rate=config.learning_rate,
+        sdf, color, heads=FieldHeadNames, bounds=aabb, deviation=config.deviation, learning_rate=config.learning_rate
     )
     assert isinstance(sdf.base, Siren)
     with torch.enable_grad():

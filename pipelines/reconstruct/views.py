@@ -38,11 +38,7 @@ class ViewImage:
 
 
 def render_image(
-    model: SceneModel,
-    view: PosedImage,
-    similarity: Similarity,
-    sampling: Sampling,
-    **options: Any,
+    model: SceneModel, view: PosedImage, similarity: Similarity, sampling: Sampling, **options: Any
 ) -> ViewImage:
     """`render_camera` of a view whose camera is in world coordinates; ``options`` are its."""
     return render_camera(model, view.camera.moved(similarity), sampling, **options)
@@ -75,13 +71,7 @@ def render_camera(
     done = 0
     for rows in asked.split(4096):
         seen = model.render(
-            origins[rows],
-            directions[rows],
-            sampling,
-            level=level,
-            least_weight=least_weight,
-            skip=skip,
-            guide=guide,
+            origins[rows], directions[rows], sampling, level=level, least_weight=least_weight, skip=skip, guide=guide
         )
         color[rows], normal[rows], opacity[rows] = seen.color, seen.normal, seen.opacity
         done += len(rows)
@@ -158,10 +148,7 @@ def measure(image: ViewImage, view: PosedImage, background: Tensor) -> dict[str,
 
     target = target_of(view, background)
     ours, theirs = (torch.from_numpy(picture).permute(2, 0, 1)[None] for picture in (image.color, target))
-    figures = {
-        "psnr": float(psnr(ours, theirs, 1.0)),
-        "ssim": float(ssim(ours, theirs, 11).mean()),
-    }
+    figures = {"psnr": float(psnr(ours, theirs, 1.0)), "ssim": float(ssim(ours, theirs, 11).mean())}
     if view.mask is not None and bool((view.mask > OBJECT).any()):
         inside = torch.from_numpy(view.mask > OBJECT)
         figures["psnr_object"] = float(psnr(ours[0, :, inside], theirs[0, :, inside], 1.0))

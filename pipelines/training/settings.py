@@ -1,7 +1,6 @@
-"""Settings of ``fit``, ``texture``, ``reconstruct``, ``evolve`` and of shading; the shadings by name.
+"""Settings of ``fit``, ``texture``, ``reconstruct``, ``evolve`` and of shading; each is a key of presets and a flag.
 
-Every field is a key of the YAML presets and a flag of the command line. Nothing heavy is imported, so that ``--help``
-stays quick.
+Nothing heavy is imported, so that ``--help`` stays quick.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
-from typing import Any, ClassVar, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 T = TypeVar("T")
 
@@ -29,7 +28,6 @@ def command_line(*words: object) -> str:
 
 
 _KINDS = {bool: "true or false", int: "a whole number", float: "a finite number", str: "text"}
-_PLURALS = {bool: "true or false", int: "whole numbers", float: "finite numbers", str: "texts"}
 
 
 def setting(
@@ -58,8 +56,6 @@ class Settings:
         ValueError: lists of different lengths, a word that is no choice, or a number out of range; the message names
             the field, what came and what is allowed.
     """
-
-    gone: ClassVar[Mapping[str, str]] = {}
 
     def __post_init__(self) -> None:
         first, count = "", 1
@@ -94,7 +90,8 @@ def _described(kind: Any, limits: Mapping[str, Any] = types.MappingProxyType({})
     if get_origin(inner) is Literal:
         text = "one of " + ", ".join(map(str, args))
     elif get_origin(inner) is tuple:
-        text = f"a list of {'' if args[-1] is Ellipsis else f'{len(args)} '}{_PLURALS[args[0]]}"
+        plural = _KINDS[args[0]].removeprefix("a ") + "s"
+        text = f"a list of {'' if args[-1] is Ellipsis else f'{len(args)} '}{plural}"
     else:
         text = _KINDS[inner]
     bounds = " and ".join(f"{sign} {limits[name]:g}" for name, sign in signs.items() if limits.get(name) is not None)
@@ -110,8 +107,6 @@ def load_config(
     cls: type[T],
     preset: str | Path | None = None,
     overrides: Mapping[str, object] | None = None,
-    *,
-    thing: str | None = None,
 ) -> T:
     """Build a ``cls`` from its defaults, then a preset, then overrides.
 
@@ -120,20 +115,17 @@ def load_config(
         preset: the name of a preset in ``mplicits.configs`` (``"fast"`` is ``<thing>_fast.yaml``), or
             the path of a YAML file (a ``Path``, or a string that ends in .yaml or .yml).
         overrides: field name → value or its text; given by flags, and named as flags in messages.
-        thing: what is configured; the first half of a preset's file name. By default `thing_of` the class.
 
     Raises:
         InputError: no such preset or file, not YAML, an unknown key, or a value of the wrong kind. The
             message names the file or flag, the key, what came and what is allowed.
     """
     hints, names = _hints(cls), _names(cls)
-    source, pairs = _read_preset(preset, thing or thing_of(cls))
+    source, pairs = _read_preset(preset, thing_of(cls))
     values: dict[str, Any] = {}
     given = [(f"{source}: {key}", f"{source}: unknown key {str(key)!r}", key, value) for key, value in pairs.items()]
     given += [(_flag(key), f"unknown flag {_flag(key)}", key, value) for key, value in (overrides or {}).items()]
     for place, unknown, key, value in given:
-        if key in getattr(cls, "gone", {}):
-            raise input_error(f"{place}: is gone; {cls.gone[key]}")  # pyright: ignore[reportAttributeAccessIssue]
         if key not in names:
             near = closest(_flag(str(key)), map(_flag, names)) if place[0] == "-" else closest(str(key), names)
             raise input_error(unknown + near)
@@ -155,7 +147,7 @@ def add_config_flags(parser: argparse.ArgumentParser, cls: type, *, about: str =
     """Add one flag per field of ``cls`` (``learning_rates`` → ``--learning-rates 1e-3 5e-4``) to a parser.
 
     A flag that is not given leaves no trace in the namespace. Values stay text, which `load_config` checks like a
-    file's. Settings that are gone have hidden flags, which it refuses.
+    file's.
     """
     group = parser.add_argument_group("settings", about)
     for field in dataclasses.fields(cls):
@@ -170,8 +162,6 @@ def add_config_flags(parser: argparse.ArgumentParser, cls: type, *, about: str =
         else:
             options |= {"metavar": {int: "N", float: "X"}.get(item, "TEXT"), "nargs": None if item is kind else "+"}
         group.add_argument(_flag(field.name), **options)
-    for name in getattr(cls, "gone", {}):
-        group.add_argument(_flag(name), dest=name, nargs="*", default=argparse.SUPPRESS, help=argparse.SUPPRESS)
 
 
 def given_flags(arguments: argparse.Namespace, cls: type) -> dict[str, Any]:
@@ -179,7 +169,7 @@ def given_flags(arguments: argparse.Namespace, cls: type) -> dict[str, Any]:
 
     They are ready for ``load_config``'s ``overrides``, or for the class itself.
     """
-    given = {name: getattr(arguments, name, None) for name in (*_names(cls), *getattr(cls, "gone", {}))}
+    given = {name: getattr(arguments, name, None) for name in _names(cls)}
     return {name: tuple(x) if isinstance(x, list) else x for name, x in given.items() if x is not None}
 
 
@@ -216,18 +206,11 @@ def _read_preset(preset: str | Path | None, thing: str) -> tuple[str, Mapping[An
         raise input_error(f"no preset {preset!r} for {thing}{closest(preset, names)} (a file: --config FILE)")
     try:
         pairs = yaml.safe_load(file.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
-        raise input_error(f"{source}: cannot read the configuration ({reason})") from error
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        place = f", line {mark.line + 1}, column {mark.column + 1}" if mark else ""
-        raise input_error(f"{source}{place}: not YAML ({getattr(error, 'problem', None) or 'unreadable'})") from error
-    except (RecursionError, ValueError) as error:  # a year of 400 digits, a date of the 45th of May
-        reason = "nested too deeply" if isinstance(error, RecursionError) else " ".join(str(error).split())[:160]
-        raise input_error(f"{source}: not settings ({reason}); expected lines of 'key: value'") from error
-    if pairs is not None and not isinstance(pairs, dict):
-        raise input_error(f"{source}: expected lines of 'key: value', got a {type(pairs).__name__}")
+        if not isinstance(pairs, dict | None):
+            raise TypeError(f"it is a {type(pairs).__name__}")
+    except Exception as error:  # YAML raises errors of many kinds, as for a date of the 45th of May
+        reason = error.strerror if isinstance(error, OSError) else " ".join(str(error).split())[:160]
+        raise input_error(f"{source}: cannot be read as lines of 'key: value' ({reason})") from error
     return source, pairs or {}
 
 
@@ -394,8 +377,6 @@ class TextureConfig(TrainingSettings):
 @dataclass(frozen=True)
 class ReconstructConfig(TrainingSettings):
     """Settings of ``reconstruct``; the defaults are the ``default`` preset."""
-
-    gone: ClassVar = {"smooth_weight": "it had no gain on shapes that it was not made for; leave it out"}
 
     geometry: Literal["multiscale", "neus"] = setting(
         "multiscale", "a coarse SIREN and residuals in bands, or the 8 x 256 softplus network"

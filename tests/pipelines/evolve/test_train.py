@@ -264,11 +264,11 @@ def test_bad_arguments(tmp_path: Path, capsys: pytest.CaptureFixture[str], argum
 
 @pytest.mark.parametrize("name", preset_names("evolve"))
 def test_the_bundled_presets_are_valid(name: str) -> None:
-    load_config(EvolveConfig, name, thing="evolve")
+    load_config(EvolveConfig, name)
 
 
 def test_the_defaults_are_the_default_preset() -> None:
-    assert load_config(EvolveConfig, "default", thing="evolve") == EvolveConfig()
+    assert load_config(EvolveConfig, "default") == EvolveConfig()
 
 
 def test_stages_are_reported_in_order() -> None:

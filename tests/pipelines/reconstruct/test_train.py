@@ -142,7 +142,7 @@ def test_the_run_directory(finished: Path, data: Path) -> None:
     for name in ("psnr", "ssim", "psnr_object"):
         figures = [view[name] for view in record["held_out"]["views"].values()]
         assert record["held_out"][name] == pytest.approx(np.mean(figures))
-    config = load_config(ReconstructConfig, None, record["config"], thing="reconstruct")
+    config = load_config(ReconstructConfig, None, record["config"])
     assert config == TINY
 
 
@@ -469,7 +469,7 @@ def test_a_painted_sphere_is_recovered_from_its_pictures(tmp_path: Path) -> None
     write_transforms(tmp_path / "data", moved(render_scene(scene, views=24, size=64), WORLD))
     small = {"widths": (64, 96), "depths": (2, 3), "features": 16, "color_width": 96, "color_depth": 2}
     few = {"steps": 600, "rays": 128, "uniform": 24, "importance": 24, "texture_steps": 0}
-    config = load_config(ReconstructConfig, "fast", small | few, thing="reconstruct")
+    config = load_config(ReconstructConfig, "fast", small | few)
     run = reconstruct(tmp_path / "data", config)
     assert "masks" in run.images.region
     mesh = extract_mesh(run.model.geometry, resolution=128)
