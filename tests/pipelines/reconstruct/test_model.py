@@ -56,12 +56,6 @@ def test_bands_follow_the_uncertainty_down_to_their_floor() -> None:
         assert model.geometry.deltas.tolist() == pytest.approx([expected], rel=1e-4)
 
 
-def test_fields_of_one_level_have_no_bands_to_widen() -> None:
-    model = exact_scene()
-    model.widen(4.0, 0.02)
-    assert len(model.geometry.deltas) == 0
-
-
 @pytest.mark.parametrize("geometry", ["multiscale", "neus"])
 @pytest.mark.parametrize("radius", [0.4, 0.6])
 def test_every_geometry_begins_as_a_sphere(geometry: str, radius: float) -> None:
@@ -220,14 +214,6 @@ def test_pixels_that_are_left_out_are_never_drawn(whole: bool) -> None:
     assert len(set(rest)) < len(set(everything))
 
 
-def test_all_pixels_are_drawn_where_the_outside_is_learnt() -> None:
-    pictures = views()
-    pool = RayPool(pictures, WORLD, CPU, whole=True)
-    every = {(index, y, x) for index, picture in enumerate(pictures) for y, x in np.ndindex(*picture.color.shape[:2])}
-    assert len(pool) == len(every)
-    assert set(places(pool)[0]) == every
-
-
 def test_all_pixels_are_equally_likely() -> None:
     pool = RayPool(views(), WORLD, CPU)
     where, _, _ = places(pool, 100 * len(pool))
@@ -237,27 +223,12 @@ def test_all_pixels_are_equally_likely() -> None:
     assert abs(excess) < 5 * (2 * len(pool)) ** 0.5
 
 
-def test_drawing_repeats_with_the_same_generator_only() -> None:
-    pool = RayPool(views(), WORLD, CPU)
-    first, again, other = (pool.draw(50, torch.Generator().manual_seed(seed)) for seed in (3, 3, 4))
-    assert torch.equal(first.color, again.color)
-    assert not torch.equal(first.color, other.color)
-
-
 def test_without_masks_everything_counts_as_object() -> None:
     pool = RayPool(views(masked=False), WORLD, CPU)
     assert not pool.has_masks
     assert pool.draw(30, torch.Generator()).mask.tolist() == [1.0] * 30
     # One view without a mask: nobody knows what is object there.
     assert not RayPool([*views(), view(0, 14, 9, masked=False)], WORLD, CPU).has_masks
-
-
-def test_a_pixel_costs_ten_bytes_with_its_mask() -> None:
-    pool = RayPool(views(), WORLD, CPU)
-    assert pool.masks is not None
-    tensors = (pool.colors, pool.masks, pool.pixels, pool.owners)
-    assert pool.colors.dtype == pool.masks.dtype == torch.uint8
-    assert sum(tensor.nbytes for tensor in tensors) == 10 * len(pool)  # 3 colour, 1 mask, 4 pixel, 2 view
 
 
 def test_cameras_that_all_look_away_are_refused() -> None:

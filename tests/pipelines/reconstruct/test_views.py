@@ -10,7 +10,6 @@ import pytest
 import torch
 import trimesh
 from mplicits.datasets import look_at
-from mplicits.datasets.cameras import Camera
 from mplicits.datasets.synthetic.scenes import SCENES, render_scene, render_view, scene_cameras
 from mplicits.datasets.views.images import PosedImage
 from mplicits.datasets.views.writing import write_transforms
@@ -197,16 +196,6 @@ def test_a_grid_of_values_finds_the_same_picture() -> None:
     assert abs(asked.color - guided.color).max() < 0.02
 
 
-def test_samples_of_little_weight_can_be_left_out() -> None:
-    scene, model = SCENES["painted-sphere"](), exact_model("painted-sphere", inv_std=60.0)
-    (view,) = render_scene(scene, views=1, size=12).views
-    whole, light = (
-        render_image(model, view, Similarity.identity(), Sampling(16, 16), least_weight=least) for least in (0.0, 1e-4)
-    )
-    assert abs(whole.color - light.color).max() < 33 * 1e-4
-    assert np.array_equal(whole.opacity, light.opacity)
-
-
 # --- sheets ------------------------------------------------------------------------------------------
 
 
@@ -224,11 +213,6 @@ def test_a_sheet_shows_photograph_rendering_and_normals() -> None:
     assert np.allclose(small[:8, 20:30], 0.5, atol=0.003)  # normals of no length
     assert np.allclose(small[12:20, :6], second, atol=0.003)
     assert np.allclose(small[12:20, 18:], 1)
-
-
-def test_large_pictures_keep_their_size() -> None:
-    color = noise(4, 700)
-    assert comparison_sheet([(picture(color), rendered(color))], WHITE).shape == (8, 2100, 3)
 
 
 def test_a_reduced_view_sees_the_same_in_fewer_pixels() -> None:
@@ -401,9 +385,3 @@ def test_the_command_says_how_near_the_mesh_is_where_photographs_see(
     np.savetxt(cloud, np.random.default_rng(0).normal(size=(50, 3)))
     assert main(["evaluate", str(truth), str(cloud), *some]) == 2
     assert f"{cloud}: points hide nothing" in capsys.readouterr().err
-
-
-def test_cameras_keep_their_shape() -> None:
-    camera: Camera = look_at(torch.tensor([0.0, 0.0, 3.0]), (0, 0, 0), up=(0, 1, 0), fov=50, width=3, height=2)
-    counts = count_views([camera], balls(), np.array([[0.0, 0.0, 1.8], [0.0, 0.0, -0.5]]), finest=256)
-    assert counts.tolist() == [1, 0]

@@ -257,17 +257,6 @@ def test_a_lock_lasts_as_long_as_its_block(tmp_path: Path) -> None:
     assert check_new_run(tmp_path, resume=False, force=False) == tmp_path  # a lock is nothing that could be lost
 
 
-def broken(target: Path) -> None:
-    with locked(target):
-        raise RuntimeError
-
-
-def test_an_error_releases_the_lock(tmp_path: Path) -> None:
-    with pytest.raises(RuntimeError):
-        broken(tmp_path)
-    check_unlocked(tmp_path)
-
-
 @pytest.mark.parametrize("command", ["fit CLOUD -o RUN", "fit CLOUD -o RUN --force", "evolve -o RUN --resume"])
 def test_a_second_writer_is_told_in_one_line_and_ends_with_2(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str

@@ -44,12 +44,7 @@ def test_defaults_file_and_overrides_apply_in_this_order(tmp_path):
     path = write(tmp_path, "widths: [64, 64, 64]\nrates: [1e-3, 5.0e-4, 1]\nbudget: 60\nverbose: true\nbatch: 1e4\n")
     loaded = load_config(Settings, path, {"batch": "512", "origin": ["0", "-1e-3", "2"]})
     assert loaded == Settings(
-        widths=(64, 64, 64),
-        rates=(1e-3, 5e-4, 1.0),
-        budget=60.0,
-        verbose=True,
-        batch=512,
-        origin=(0.0, -1e-3, 2.0),
+        widths=(64, 64, 64), rates=(1e-3, 5e-4, 1.0), budget=60.0, verbose=True, batch=512, origin=(0.0, -1e-3, 2.0)
     )
     assert isinstance(loaded.budget, float)
     assert isinstance(loaded.rates[2], float)
