@@ -29,6 +29,7 @@ demo: $(VENV)/.installed
 # Two processes of one thread each: most tests are too small to share. Each has whole files at first, whose fixtures are
 # made once for that, and takes from the other when it has none left.
 test: lint
+	@command -v chromedriver >/dev/null || echo "the tests of pages are skipped: no Chromium; on Debian: apt-get install chromium chromium-driver"
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal
 
 test-all: lint

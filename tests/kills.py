@@ -29,7 +29,7 @@ import numpy as np
 import torch
 from mplicits.neural_fields import InputError, load_field, load_texture
 from mplicits.pipelines.cli.entry import main as mplicits
-from mplicits.pipelines.cli.info import describe
+from mplicits.pipelines.cli.fit import describe
 from mplicits.pipelines.training.folder import RunFolder, find_field, is_fitted, load_state, read_record
 from mplicits.pipelines.training.trainer import Trainer
 from safetensors.torch import load_file

@@ -15,7 +15,7 @@ from mplicits.datasets.cameras import turntable
 from mplicits.neural_fields import extract_mesh
 from mplicits.pipelines.training.folder import load_still
 from mplicits.pipelines.web.export import BITS, WebOptions, web_run
-from mplicits.pipelines.web.networks import rounded_field
+from mplicits.pipelines.web.payload import rounded_field
 from pages import differences, rendered, until
 
 TOLERANCE, RESOLUTION = 2e-5, 1e-4

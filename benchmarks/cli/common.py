@@ -17,8 +17,6 @@ from mplicits.pipelines.training.settings import input_error
 if TYPE_CHECKING:
     from ..harness.benchmark import Benchmark
 
-__all__ = ["folder_flag", "measured_flags", "noise_of", "noisy_flags", "number", "run_benches", "typed", "view_flags"]
-
 
 def typed(arguments: argparse.Namespace) -> str:
     """The command as it could be typed again beside its files: pages are for others, who have other folders."""

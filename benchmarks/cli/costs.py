@@ -13,8 +13,6 @@ from mplicits.pipelines.training.settings import FitConfig
 
 from .common import folder_flag, measured_flags, number, run_benches
 
-__all__ = ["COSTS"]
-
 
 def _normals_arguments(parser: argparse.ArgumentParser) -> None:
     number(parser, "--points", whole(1), 262_144, "how many")

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from mplicits.pipelines.cli.common import Program
 
-from mplicits.pipelines.cli.entry import Program
-
-from .commands import COMMANDS
-
-__all__ = ["BENCHMARKS", "main"]
+from .costs import COSTS
+from .paper import PAPER
+from .scenes import SCENES
+from .shapes import SHAPES
 
 OVERVIEW = """usage: python -m benchmarks NAME [arguments]
 
@@ -23,9 +22,6 @@ examples:
 
 `python -m benchmarks NAME --help` says more about each."""
 
-BENCHMARKS = Program("python -m benchmarks", COMMANDS, OVERVIEW)
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run one benchmark; see `Program.main`."""
-    return BENCHMARKS.main(argv)
+# Nothing above loads torch, so that ``--help`` is quick.
+BENCHMARKS = Program("python -m benchmarks", {**COSTS, **SHAPES, **SCENES, "paper": PAPER}, OVERVIEW)
+main = BENCHMARKS.main

@@ -14,8 +14,6 @@ from mplicits.pipelines.training.settings import closest, input_error
 from ..paper.names import METHODS, PRESETS, TABLES
 from .common import typed
 
-__all__ = ["PAPER"]
-
 Name = TypeVar("Name", bound=str)
 
 

@@ -16,8 +16,6 @@ from .common import folder_flag, measured_flags, number, run_benches
 if TYPE_CHECKING:
     from ..harness.benchmark import Benchmark
 
-__all__ = ["SCENES"]
-
 GEOMETRIES = ("multiscale", "neus", "single")  # those of `bench.geometries`
 
 

@@ -21,8 +21,6 @@ from mplicits.pipelines.training.settings import (
 
 from .common import folder_flag, measured_flags, noise_of, noisy_flags, number, run_benches, view_flags
 
-__all__ = ["SHAPES"]
-
 
 def _fit_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("shapes", nargs="+", metavar="SHAPE", help="mesh files")

@@ -17,8 +17,6 @@ from .kernels import JET, MANY, POINT, evaluated_by, staged_bytes
 from .rounding import gated_bound, rounding_bound
 from .traffic import traffic_of
 
-__all__ = ["LevelsBench", "LevelsRow"]
-
 SIZES = (((16, 1), (24, 2)), ((64, 2), (128, 2)), ((128, 2), (256, 2), (400, 2)))
 TAPERS = (0.0, 0.5)
 # Of points that come to a band, the share that lies in it.

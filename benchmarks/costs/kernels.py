@@ -23,8 +23,6 @@ from ..harness.tables import Column, Figure, Table, tabulated
 from .rounding import rounding_bound
 from .traffic import traffic_of
 
-__all__ = ["JET", "MANY", "POINT", "KernelRow", "KernelsBench", "evaluated_by", "staged_bytes"]
-
 POINT, JET = 12, 16  # bytes of a point, and of a value with its gradient
 # Bytes are counted of so many times the points, so that those of weights do not count.
 MANY = 64

@@ -21,8 +21,6 @@ from ..harness.benchmark import Benchmark, Part
 from ..harness.cells import Workplace
 from ..harness.tables import Column, Figure, Table, tabulated
 
-__all__ = ["PictureRow", "PicturesBench", "SampleRow", "SamplesBench"]
-
 EYE, FOV = (1.6, 0.9, 2.0), 40.0
 WARM = 3  # pictures before those that are timed: the first ones compile
 # What a picture is allowed to be off by: of a pixel, and in degrees.

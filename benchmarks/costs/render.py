@@ -26,8 +26,6 @@ from ..shapes.fits import fit_home, kept_fit
 from .render_truth import Agreement, Truth
 from .speed import counted
 
-__all__ = ["NETWORKS", "RenderBench", "RenderRow", "naive_view"]
-
 Networks = Mapping[str, Sequence[tuple[int, int, float, int, float]]]
 
 # The networks of Tab. 4 with our frequencies; level by level (width, depth, ω₀, steps, learning rate).

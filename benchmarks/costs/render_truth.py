@@ -17,8 +17,6 @@ from mplicits.pipelines.render.trace import Seen
 from numpy.typing import NDArray
 from torch import Tensor
 
-__all__ = ["Agreement", "Truth"]
-
 OUTLINE_RESOLUTION = 64
 # A mesh and a trace that disagree about a pixel are settled by this search of the field itself along the ray.
 WINDOW, SPACING = 0.01, 1e-4

@@ -22,8 +22,6 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-__all__ = ["gated_bound", "rounding_bound"]
-
 SINE_ERROR = 4.0  # in u
 # Likewise of a cosine, which is the sine of a difference that is rounded once more.
 COSINE_ERROR = 5.0

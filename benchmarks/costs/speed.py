@@ -34,19 +34,6 @@ from ..harness.benchmark import Benchmark, Part
 from ..harness.cells import Workplace
 from ..harness.tables import Column, Figure, Table, tabulated
 
-__all__ = [
-    "Counted",
-    "MeshBench",
-    "MeshRow",
-    "NormalsBench",
-    "NormalsRow",
-    "counted",
-    "evaluate_slabs",
-    "peer_mesher",
-    "printed_jet",
-    "tangent_jet",
-]
-
 SIZES = ((128, 2), (256, 2), (400, 2), (256, 3))
 
 

@@ -12,8 +12,6 @@ from mplicits.neural_fields.networks import siren
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
-__all__ = ["Traffic", "traffic_of"]
-
 _aten = torch.ops.aten
 _WAITS = (_aten.nonzero, _aten._local_scalar_dense)
 _FREE = (_aten.empty, _aten.empty_like, _aten.new_empty, _aten.empty_strided, _aten.new_empty_strided)

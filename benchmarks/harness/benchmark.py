@@ -26,17 +26,6 @@ from .report import Section, as_csv, as_dict, as_page
 from .run import kept_records, run_cell
 from .tables import Table
 
-__all__ = [
-    "Benchmark",
-    "Part",
-    "from_figures",
-    "machine_words",
-    "network_name",
-    "one_of_each",
-    "plain",
-    "write_results",
-]
-
 R = TypeVar("R")
 
 

@@ -20,20 +20,6 @@ from mplicits.neural_fields.backend.files import write_json
 from mplicits.pipelines.training.settings import closest
 from mplicits.pipelines.training.trainer import Progress, Report
 
-__all__ = [
-    "Catalogue",
-    "Cell",
-    "Findings",
-    "Method",
-    "Record",
-    "Workplace",
-    "key_of",
-    "make_folder",
-    "read_record",
-    "record_file",
-    "write_record",
-]
-
 # What a cell found, as it stands in its JSON file; see `benchmarks.harness.run.run_cell`.
 Record = Mapping[str, Any]
 

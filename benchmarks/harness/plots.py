@@ -9,8 +9,6 @@ from importlib.util import find_spec
 
 from mplicits.neural_fields import InputError
 
-__all__ = ["Plot", "Series", "check_matplotlib", "to_svg"]
-
 SIZE = (9.0, 5.0)  # inches
 TILTED = 80  # characters of all labels, from which on they are tilted
 COLUMNS = 4  # of the legend

@@ -12,19 +12,6 @@ from mplicits.pipelines.training.machine import format_table
 
 from .tables import Column, Row, Table, Value
 
-__all__ = [
-    "Section",
-    "as_csv",
-    "as_dict",
-    "as_markdown",
-    "as_page",
-    "as_text",
-    "from_dict",
-    "section_as_dict",
-    "section_from_dict",
-    "with_missing",
-]
-
 NONE = "–"
 
 

@@ -17,8 +17,6 @@ from mplicits.pipelines.training.trainer import Interrupted, Report
 
 from .cells import Catalogue, Cell, Record, Workplace, read_record, write_record
 
-__all__ = ["Ran", "Say", "kept_records", "run_cell", "run_cells"]
-
 Say = Callable[[str], None]
 C = TypeVar("C", bound=Cell)
 

@@ -7,8 +7,6 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal, TypeVar
 
-__all__ = ["Column", "Figure", "Row", "Table", "Value", "mean", "median", "ratio", "tabulated"]
-
 T = TypeVar("T")
 Value = float | int | str | None
 

@@ -22,8 +22,6 @@ from ..harness.cells import Workplace
 from ..harness.tables import Column, Figure, Table, tabulated
 from .evolve import MorphBench
 
-__all__ = ["DynamicBench", "DynamicRow", "dynamic_rows"]
-
 FIRST = 2  # frames that the dynamic tracer needs to know a motion; they are left out of all figures
 FRAMES_OF_MOTION = 96  # from t = 0 to t = 1: four seconds of a film
 START = 0.25

@@ -39,16 +39,6 @@ from ..harness.cells import Workplace
 from ..harness.tables import Column, Figure, Table, tabulated
 from ..shapes.fits import fit_home, kept_fit
 
-__all__ = [
-    "CASES",
-    "ExactBench",
-    "ExactCase",
-    "ExactRow",
-    "MorphBench",
-    "MorphRow",
-    "measure_exact",
-]
-
 TIMES = 20
 RESOLUTION = 64
 TARGET = 2e-3  # mean surface error, in units of the field

@@ -22,18 +22,6 @@ from mplicits.datasets.synthetic import solids
 from mplicits.neural_fields import Field, FunctionField, Jet
 from torch import Tensor
 
-__all__ = [
-    "Bending",
-    "DeformingField",
-    "Motion",
-    "Twisting",
-    "arc",
-    "arc_slopes",
-    "bending_arm",
-    "straightened",
-    "twisting_bar",
-]
-
 # Where a beam is so little bent (times the length of the arc: radians) its curvature is taken for this one; that shifts
 # points by 1e-6, at t = 0, where all are to rest, as at any other time, so that forward and inverse still agree.
 _STRAIGHT = 1e-6

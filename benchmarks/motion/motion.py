@@ -49,19 +49,6 @@ from ..shapes.fits import fit_home, kept_fit
 from .figures import DeformingField, bending_arm, twisting_bar
 from .walking import walker
 
-__all__ = [
-    "BLEND",
-    "FIGURES",
-    "SCAN_FITS",
-    "STRETCHED",
-    "MotionBench",
-    "MotionRow",
-    "blended",
-    "carried_points",
-    "measure_motion",
-    "triangle_stretch",
-]
-
 Float64 = NDArray[np.float64]
 
 FIGURES: Mapping[str, Callable[[], DeformingField]] = MappingProxyType(

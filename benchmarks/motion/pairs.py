@@ -25,9 +25,9 @@ from mplicits.pipelines.evolve.problem import build_problem
 from mplicits.pipelines.evolve.shapes import read_shape
 from mplicits.pipelines.evolve.topology import surface_of, topology_of
 from mplicits.pipelines.evolve.train import train_evolution
+from mplicits.pipelines.render.draw import Orbit, orbit_cameras
 from mplicits.pipelines.render.picture import contact_sheet, in_rows, write_picture
 from mplicits.pipelines.render.rasterise import mesh_view, picture_of
-from mplicits.pipelines.render.subject import Orbit, orbit_cameras
 from mplicits.pipelines.surface.surface import face_normals, read_reference
 from mplicits.pipelines.texture.transport import Colors, TransportedColors
 from mplicits.pipelines.training.settings import EvolveConfig, FitConfig
@@ -39,8 +39,6 @@ from ..harness.cells import Workplace
 from ..harness.tables import Column, Figure, Table, mean, tabulated
 from ..shapes.fits import fit_home, kept_fit
 from .motion import BLEND, STRETCHED, blended, carried_points, triangle_stretch
-
-__all__ = ["PAIR_FITS", "PairBench", "PairRow", "color_jumps", "measure_pair", "paint"]
 
 Float64 = NDArray[np.float64]
 

@@ -22,8 +22,6 @@ from torch import Tensor
 
 from .figures import DeformingField, arc, arc_slopes, straightened
 
-__all__ = ["Walking", "walker"]
-
 _WAIST = 0.06  # above it the chest turns, below it legs bend
 _TURNS = (0.1, 0.4)  # heights between which the turn of the chest grows
 _HIP, _KNEE = (-0.05, 0.08), (-0.38, 0.08)  # height of the middle of a joint's arc, and half its length

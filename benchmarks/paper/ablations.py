@@ -32,16 +32,6 @@ from .published import ABL_DELTA, ABL_GRAD, ABL_NORMAL, ABL_SDF
 if TYPE_CHECKING:
     from .cells import Preset
 
-__all__ = [
-    "DELTA_FACTOR",
-    "LOSS_WEIGHTS",
-    "DeltaFactor",
-    "LossWeights",
-    "delta_factor_tables",
-    "error_plots",
-    "loss_weight_tables",
-]
-
 
 class Constraint(NamedTuple):
     """One term of the loss: its name in the paper and in `Weights`, and the paper's table."""

@@ -29,20 +29,6 @@ from .cells import PaperCell
 from .judge import damaged_cloud
 from .ours import Ours, our_config
 
-__all__ = [
-    "Base",
-    "base_cell",
-    "base_of",
-    "delta_after",
-    "domain_sources",
-    "generator_for",
-    "on_its_own",
-    "reviewed",
-    "train_level",
-    "up_to",
-    "without_bands",
-]
-
 
 @dataclass(frozen=True)
 class Base:

@@ -31,8 +31,6 @@ from .robustness import DELTAS_TABLE, OUTLIERS_TABLE, UNDERTRAINED_TABLE
 from .sheets import write_sheets
 from .speed import MARCHING_CUBES, NORMALS
 
-__all__ = ["SPECS", "Bench", "bench_paper", "find_shapes"]
-
 # In the order of `names.TABLES`; a test holds the two together.
 SPECS: tuple[TableSpec, ...] = (
     COMPARISON_TABLE,

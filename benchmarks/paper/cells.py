@@ -21,21 +21,6 @@ from ..harness.cells import Record
 from ..harness.plots import Plot
 from ..harness.tables import Table
 
-__all__ = [
-    "Input",
-    "PaperCell",
-    "Preset",
-    "TableSpec",
-    "by_shape",
-    "cells_of",
-    "figure",
-    "of_output",
-    "outputs_of",
-    "printed_name",
-    "select",
-    "shapes_of",
-]
-
 # smoke: seconds, for tests; cpu: 15 to 30 s of training on two cores, each method; paper: as published.
 Preset = Literal["smoke", "cpu", "paper"]
 

@@ -17,8 +17,6 @@ from .published import BANF, COMPARISON, NOISE, POISSON
 if TYPE_CHECKING:
     from .cells import Preset
 
-__all__ = ["BANF_TABLE", "COMPARISON_TABLE", "NOISE_TABLE", "POISSON_TABLE"]
-
 NOISE_LEVEL = 0.01  # of the bounding box's diagonal (paper, Tab. 3)
 CURVE = (0.005, 0.02)  # and what the noise curves have beside it, for these:
 CURVE_METHODS = ("ours", "poisson")

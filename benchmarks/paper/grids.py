@@ -19,8 +19,6 @@ from ..peers import BandLimited, BanfSDF, HashGridSDF
 from .cells import Preset
 from .recipe import Output, Recipe, SignedPools, cosine, descend, differences, finished, mape_loss, stencil
 
-__all__ = ["BanfRecipe", "BanfSettings", "GridSettings", "InstantNgpRecipe", "NgpSettings"]
-
 # Rows per call where a field is asked about a whole pool.
 CHUNK = 1 << 16
 

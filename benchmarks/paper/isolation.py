@@ -42,8 +42,6 @@ from .published import CD_WITHOUT_CULLING, COMPONENTS, TAB_ISOLATION
 if TYPE_CHECKING:
     from .cells import Preset
 
-__all__ = ["ISOLATION", "IndependentLevels", "Isolation", "isolation_tables", "steepness"]
-
 NOISE = 0.01
 VARIANTS: Mapping[str, str] = MappingProxyType(
     {

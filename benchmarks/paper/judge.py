@@ -19,24 +19,11 @@ from mplicits.pipelines.mesh.files import write_mesh
 from mplicits.pipelines.render.picture import write_picture
 from mplicits.pipelines.render.rasterise import picture_of
 from mplicits.pipelines.surface.measure import evaluate_surfaces
-from mplicits.pipelines.surface.surface import read_reference
-from mplicits.pipelines.surface.trim import Support, drop_unsupported
+from mplicits.pipelines.surface.surface import Support, drop_unsupported, read_reference
 from mplicits.pipelines.training.settings import FitConfig, load_config
 
 from ..harness.cells import Workplace
 from .cells import PaperCell, Preset
-
-__all__ = [
-    "STEEP",
-    "Judge",
-    "Protocol",
-    "damaged_cloud",
-    "fit_config",
-    "flip_normals",
-    "oriented_cloud",
-    "protocol_of",
-    "reference_of",
-]
 
 # Bound on |∇f| for extracting fields whose slope nobody keeps near 1: what is culled by it is safely empty.
 STEEP = 2.0

@@ -12,8 +12,6 @@ from .networks import BaconRecipe, IdfRecipe, SirenRecipe
 from .ours import FromRecipe, Ours, Poisson
 from .speed import MarchingCubes, Normals
 
-__all__ = ["CATALOGUE", "METHODS"]
-
 # The first ones are those of `names.METHODS`; a test holds the two together.
 METHODS: tuple[Method[PaperCell], ...] = (
     Ours(),

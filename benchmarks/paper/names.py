@@ -7,8 +7,6 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from .cells import Preset
 
-__all__ = ["METHODS", "PRESETS", "TABLES"]
-
 PRESETS: tuple[Preset, ...] = ("smoke", "cpu", "paper")
 
 TABLES = (

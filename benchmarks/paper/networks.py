@@ -17,21 +17,6 @@ from ..peers.idf import attenuation
 from .cells import Preset
 from .recipe import Output, Recipe, cosine, descend, finished
 
-__all__ = [
-    "BaconRecipe",
-    "BaconSettings",
-    "IdfRecipe",
-    "IdfSettings",
-    "SirenRecipe",
-    "SirenSettings",
-    "SirenWeights",
-    "begin_as_sphere",
-    "displaced",
-    "hand_over",
-    "laplacian_samples",
-    "siren_loss",
-]
-
 # What a network begins as, and the rate at which it gets there: at 3e-3 nothing is left of a sphere at ω₀ = 30, and
 # the training that follows finds no surface.
 SPHERE_RADIUS, SPHERE_RATE = 0.4, 5e-4

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 from mplicits.neural_fields.meshing.extract import Mesh
-from mplicits.pipelines.surface.trim import read_support
+from mplicits.pipelines.surface.surface import read_support
 from mplicits.pipelines.training.folder import FIELD_FILE
 from mplicits.pipelines.training.settings import FitConfig
 
@@ -20,8 +20,6 @@ from ..shapes.fits import has_poisson, kept_fit, screened_poisson
 from .cells import PaperCell
 from .judge import Judge, damaged_cloud, fit_config, oriented_cloud, protocol_of
 from .recipe import Recipe
-
-__all__ = ["FromRecipe", "Ours", "Poisson", "level_names", "our_config"]
 
 LIPSCHITZ = 1.25  # the eikonal term keeps |∇f| near 1
 

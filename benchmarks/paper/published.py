@@ -11,28 +11,6 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import NamedTuple
 
-__all__ = [
-    "ABL_DELTA",
-    "ABL_GRAD",
-    "ABL_NORMAL",
-    "ABL_SDF",
-    "BANF",
-    "CD_WITHOUT_CULLING",
-    "COMPARISON",
-    "COMPONENTS",
-    "DELTAS",
-    "NOISE",
-    "OUTLIERS",
-    "PAPER_MODELS",
-    "POISSON",
-    "TAB_ISOLATION",
-    "TIME_AUTO",
-    "TIME_MC",
-    "UNDERTRAINED",
-    "ComparisonRow",
-    "NoiseRow",
-]
-
 
 class NoiseRow(NamedTuple):
     """Chamfer distances and IoUs over all shapes."""

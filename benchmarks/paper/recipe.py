@@ -18,19 +18,6 @@ from torch import Tensor, nn
 
 from .cells import Preset
 
-__all__ = [
-    "Output",
-    "Recipe",
-    "SignedPools",
-    "Trained",
-    "cosine",
-    "descend",
-    "differences",
-    "finished",
-    "mape_loss",
-    "stencil",
-]
-
 F = TypeVar("F", bound=Field)
 S = TypeVar("S")
 

@@ -17,8 +17,6 @@ from .published import DELTAS, OUTLIERS, UNDERTRAINED
 if TYPE_CHECKING:
     from .cells import Preset
 
-__all__ = ["DELTAS_TABLE", "OUTLIERS_TABLE", "UNDERTRAINED_TABLE"]
-
 CONTAMINATION = (0.001, 0.01, 0.05)  # the paper has the first two
 FLIPPED = 0.1
 OUTLIER_METHODS = ("ours", "poisson", "poisson-trim")

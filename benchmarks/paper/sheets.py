@@ -17,8 +17,6 @@ from ..harness.cells import Record, Workplace
 from .cells import PaperCell
 from .judge import damaged_cloud, protocol_of, reference_of
 
-__all__ = ["write_sheets"]
-
 COLUMNS = 4
 LEAST_METHODS = 2  # a sheet of one method compares nothing
 

@@ -24,16 +24,6 @@ from .published import PAPER_MODELS, TIME_AUTO, TIME_MC
 if TYPE_CHECKING:
     from .cells import Preset
 
-__all__ = [
-    "MARCHING_CUBES",
-    "NORMALS",
-    "MarchingCubes",
-    "Normals",
-    "grid_seconds",
-    "marching_cubes_tables",
-    "normals_tables",
-]
-
 Overrides = tuple[tuple[str, Any], ...]
 SIZES: Mapping[Preset, Overrides] = MappingProxyType(
     {

@@ -23,8 +23,6 @@ from mplicits.neural_fields.backend._checks import at_least, positive
 from mplicits.neural_fields.fields.field import Field, Jet
 from torch import Tensor, nn
 
-__all__ = ["BaconSDF"]
-
 # The shapes experiments of the paper: 384 samples per period, their Nyquist harmonic 192 shared out as
 # 1/24, 1/24, 1/24, 1/16, 1/16, 1/8, 1/8, 1/4, 1/4.
 BANDS = (8, 8, 8, 12, 12, 24, 24, 48, 48)

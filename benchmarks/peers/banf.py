@@ -16,8 +16,6 @@ from torch import Tensor, nn
 
 from .trilinear import Place, interpolate, interpolate_jet, locate, vertices
 
-__all__ = ["BandLimited", "BanfSDF"]
-
 
 class BandLimited(OneLevelField):
     """A field's trilinear interpolant on a cubic grid; outside its cube, the value at the cube's nearest point.

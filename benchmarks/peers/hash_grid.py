@@ -16,8 +16,6 @@ from torch import Tensor, nn
 
 from .trilinear import Place, interpolate, interpolate_jet, locate, vertices
 
-__all__ = ["HashGridSDF"]
-
 
 class HashGridSDF(OneLevelField):
     """A signed distance read by a ReLU network from interpolated grids.

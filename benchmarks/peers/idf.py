@@ -20,8 +20,6 @@ from mplicits.neural_fields.fields.field import Field, Jet
 from mplicits.neural_fields.networks.siren import Siren
 from torch import Tensor
 
-__all__ = ["IdfSDF", "attenuation"]
-
 # Below this the base has no normal to speak of, and nothing is moved.
 LEAST_SLOPE = 1e-6
 

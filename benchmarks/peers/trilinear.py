@@ -11,8 +11,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-__all__ = ["Place", "interpolate", "interpolate_jet", "locate", "vertices"]
-
 
 class Place(NamedTuple):
     """Where points lie in a grid.

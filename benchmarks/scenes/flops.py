@@ -37,18 +37,6 @@ from torch.utils.flop_counter import FlopCounterMode
 from ..costs.speed import Counted, counted
 from .reconstruct_rows import StepParts
 
-__all__ = [
-    "LateRows",
-    "Tallied",
-    "Watched",
-    "color_flops",
-    "jet_flops",
-    "outside_flops",
-    "product_counter",
-    "train_watched",
-    "value_flops",
-]
-
 PROBE = 64  # rows on which the FLOPs of one are counted
 ENDLESS = 10**9  # steps that no training comes to the end of
 REPORT_EVERY = 20  # steps; a GPU is looked at no more often

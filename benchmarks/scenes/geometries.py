@@ -21,8 +21,6 @@ from ..harness.tables import Column, Figure, Table, tabulated
 from .reconstruct import ALIKE, UNUSED, BenchScene, ReconstructBench
 from .reconstruct_rows import MULTISCALE, NEUS, ReconstructRow
 
-__all__ = ["GEOMETRIES", "SINGLE", "GeometryBench", "GeometryRow", "Interval", "interval", "single_siren"]
-
 SINGLE = "single"
 GEOMETRIES = (MULTISCALE, NEUS, SINGLE)
 FACTORS = ("color_rate", "sharpening")  # rates in units of the geometry's

@@ -22,7 +22,7 @@ from mplicits.pipelines.reconstruct.model import RayPool, SceneModel, build_scen
 from mplicits.pipelines.reconstruct.views import ViewImage, comparison_sheet, held_out, measure, render_image
 from mplicits.pipelines.render.picture import Image, contact_sheet, write_picture
 from mplicits.pipelines.surface.measure import Metrics, evaluate_surfaces
-from mplicits.pipelines.surface.trim import in_region, keep_largest
+from mplicits.pipelines.surface.surface import in_region, keep_largest
 from mplicits.pipelines.training.folder import digest_of
 from mplicits.pipelines.training.machine import choose_device, environment
 from mplicits.pipelines.training.settings import ReconstructConfig, closest
@@ -41,8 +41,6 @@ from .reconstruct_rows import (
     SurfaceFigures,
     reconstruct_tables,
 )
-
-__all__ = ["BenchScene", "ReconstructBench", "common_sheet", "read_scene", "row_of", "surface_figures"]
 
 SHEET_VIEWS = 4  # rows of a sheet of held-out views
 COMMON_VIEWS = 2  # on the sheet of all rows

@@ -9,19 +9,6 @@ from dataclasses import dataclass
 
 from ..harness.tables import Column, Figure, Row, Table, tabulated
 
-__all__ = [
-    "EQUAL_TIME",
-    "MULTISCALE",
-    "NEUS",
-    "Comparison",
-    "LateRates",
-    "ReconstructRow",
-    "StepParts",
-    "SurfaceFigures",
-    "comparisons",
-    "reconstruct_tables",
-]
-
 NEUS = "neus"
 MULTISCALE = "multiscale"
 EQUAL_TIME = "equal-time"

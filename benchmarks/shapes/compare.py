@@ -13,8 +13,6 @@ from mplicits.pipelines.render.trace import Seen
 from numpy.typing import NDArray
 from torch import Tensor
 
-__all__ = ["Drawing", "ImageError", "draw", "image_error", "psnr"]
-
 LEAST_MSE = 1e-12  # 120 dB: images that are the same have a finite PSNR
 
 

@@ -27,8 +27,15 @@ from mplicits.pipelines.fit.train import Run, fit, prepare
 from mplicits.pipelines.render.picture import contact_sheet, write_picture
 from mplicits.pipelines.render.rasterise import picture_of
 from mplicits.pipelines.surface.measure import Metrics, evaluate_surfaces
-from mplicits.pipelines.surface.surface import face_normals, from_cloud, read_reference, read_surface, sample_points
-from mplicits.pipelines.surface.trim import drop_unsupported, read_support
+from mplicits.pipelines.surface.surface import (
+    drop_unsupported,
+    face_normals,
+    from_cloud,
+    read_reference,
+    read_support,
+    read_surface,
+    sample_points,
+)
 from mplicits.pipelines.training.folder import STATE_FILE, find_field, is_fitted, read_record
 from mplicits.pipelines.training.machine import peak_memory
 from mplicits.pipelines.training.settings import FitConfig
@@ -38,20 +45,6 @@ from ..harness.benchmark import Benchmark, Part, plain
 from ..harness.cells import Workplace, key_of
 from ..harness.tables import Column, Figure, Table, tabulated
 from .roughness import Roughness, surface_roughness
-
-__all__ = [
-    "FitBench",
-    "FitRow",
-    "ScaleBench",
-    "ScaleRow",
-    "clouds_of",
-    "fit_home",
-    "has_poisson",
-    "kept_fit",
-    "screened_poisson",
-    "write_noisy_cloud",
-]
-
 
 SIDES = 8  # steps of a coordinate of a normal from 0 to 1: about 7° are one side
 STEEPEST = 85.0  # degrees above or below the horizon, so that the picture has an upright

@@ -30,8 +30,6 @@ from ..harness.cells import Workplace
 from ..harness.tables import Column, Figure, Table, tabulated
 from .compare import ImageError, draw, image_error, psnr
 
-__all__ = ["NormalMapBench", "NormalMapRow"]
-
 # A reference whose vertices are mostly further than this from the coarse surface is another shape (unit sphere).
 ELSEWHERE = 0.1
 PROBED = 10_000

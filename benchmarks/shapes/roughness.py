@@ -17,8 +17,6 @@ from mplicits.pipelines.surface.surface import face_normals, sample_points
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-__all__ = ["Roughness", "feet_among", "roughness", "sharp_edge_points", "surface_roughness"]
-
 Float64 = NDArray[np.float64]
 
 # Samples looked at in a disc of the low-pass: the mean of as many adds a hundredth to what it is taken from.

@@ -8,8 +8,6 @@ from mplicits.neural_fields import Field, Mesh
 from mplicits.pipelines.surface.surface import sample_points
 from numpy.typing import NDArray
 
-__all__ = ["approximation_error", "near_surface"]
-
 Float64 = NDArray[np.float64]
 
 

@@ -26,8 +26,6 @@ from ..harness.cells import Workplace
 from ..harness.tables import Column, Figure, Table, tabulated
 from .fits import clouds_of
 
-__all__ = ["SignsBench", "SignsRow"]
-
 NEAREST = 64  # of the noisy points, among which a smoothed one is looked for
 
 

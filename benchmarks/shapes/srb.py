@@ -32,8 +32,6 @@ from ..harness.tables import Column, Figure, Row, Table, tabulated
 from .fits import fit_home, has_poisson, kept_fit, screened_poisson, timed_mesh
 from .sampled_error import approximation_error, near_surface
 
-__all__ = ["PUBLISHED", "Distances", "Scan", "SrbBench", "SrbRow", "distances", "find_scans"]
-
 Float64 = NDArray[np.float64]
 
 READABLE = (".ply", ".obj", ".stl", ".off", ".xyz", ".npz", ".npy")

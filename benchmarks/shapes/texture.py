@@ -37,8 +37,6 @@ from ..harness.tables import Column, Figure, Table, tabulated
 from .compare import Drawing, ImageError, draw, image_error, psnr
 from .fits import fit_home, kept_fit
 
-__all__ = ["PAPER_MSE", "Fitted", "TextureBench", "TextureRow"]
-
 FIT_POINTS = 100_000
 # "Textures" in the supplement; over which pixels, of what images, it does not say.
 PAPER_MSE: Mapping[str, float] = MappingProxyType(

@@ -39,8 +39,6 @@ from ..training.progress import Progress, Report, progress_bars, reported
 from ..training.settings import FitConfig
 from .common import tell_budget
 
-__all__ = ["demo", "distances_to_surface", "draw_levels", "spread_colors"]
-
 Float64 = NDArray[np.float64]
 
 TILE = (480, 640)

@@ -21,8 +21,6 @@ from ...neural_fields import InputError
 from ...neural_fields.backend.kernels.switch import choose
 from ..training.machine import sgemm_rate
 
-__all__ = ["Finding", "examine", "format_findings"]
-
 PACKAGE = "mplicits"
 OWN_CV2 = "opencv-contrib-python-headless"
 OTHER_CV2 = ("opencv-python", "opencv-python-headless", "opencv-contrib-python")

@@ -14,8 +14,6 @@ from typing import Any
 from ..training.settings import SHADINGS, ShadeOptions, add_config_flags, given_flags, input_error, load_config
 from .common import Command, add_flags, between, check_output, finite, refuse, whole
 
-__all__ = ["ANIMATE", "RENDER", "SLICE", "VIEW"]
-
 PICTURES = (".png", ".jpg", ".jpeg")
 FILMS = (".mp4", ".gif")
 BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), "gray": (0.5, 0.5, 0.5), "transparent": None}
@@ -93,8 +91,7 @@ def _render(arguments: argparse.Namespace) -> int:
     lit = not arguments.fast
     shade = load_config(ShadeOptions, overrides={"shadows": lit, "occlusion": lit, **given})
 
-    from ..render.draw import RenderOptions, render_run
-    from ..render.subject import Orbit
+    from ..render.draw import Orbit, RenderOptions, render_run
 
     chosen: dict[str, Any] = given_flags(arguments, RenderOptions) | {"background": arguments.background}
     draw = render_run
@@ -265,7 +262,7 @@ def _animate(arguments: argparse.Namespace) -> int:
         refuse(arguments, ("colors", "last_colors"), "--no-colors leaves them out; leave one of the two out")
 
     from ..evolve.animate import SequenceOptions, animate_run
-    from ..render.subject import Orbit
+    from ..render.draw import Orbit
 
     given = given_flags(arguments, SequenceOptions)
     options = SequenceOptions(orbit=Orbit(**given_flags(arguments, Orbit)), **given)

@@ -1,29 +1,25 @@
-"""The command line: ``mplicits COMMAND …``.
+"""``mplicits COMMAND …``: the table of all commands, and those of a few lines: info, doctor, sample, demo.
 
-Bad input is one line on stderr and exit code 2; Ctrl-C is 130. torch is loaded by the command that needs
-it, never for help or for a mistake in the arguments.
+Commands load what they need, torch above all, when they run; never for help or for a mistake in the arguments.
 """
 
 from __future__ import annotations
 
 import argparse
-import os
-import re
-import sys
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import NoReturn
+from collections.abc import Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
 
-from ..training.settings import closest
-from .commands import COMMANDS
-from .common import Command, Stopped, check_output
-
-__all__ = ["MPLICITS", "Program", "main"]
-
-# How often an idle thread of GNU's OpenMP, which PyTorch uses on Linux, looks for its next share of work before it
-# sleeps: 0.2 ms rather than several. Meanwhile it holds a core that another process, or a thread with blocks of its
-# own, could use. Read when torch is loaded.
-SPINS = ("GOMP_SPINCOUNT", "20000")
+from ..training.settings import FitConfig, command_line, given_flags, input_error
+from .common import Command, Program, add_flags, add_settings, between, check_output, read_settings, refuse
+from .draw import ANIMATE, RENDER, SLICE, VIEW
+from .fit import FIT, describe
+from .mesh import EVALUATE, MESH
+from .solids import BOOLEAN, OFFSET
+from .train import EVOLVE, RECONSTRUCT, TEXTURE
+from .views import CHECK_CAMERAS, FIND_CAMERAS, FIND_POINTS, SCENE
+from .web import WEB
 
 OVERVIEW = """usage: mplicits COMMAND [arguments]
 
@@ -41,146 +37,157 @@ examples:
 
 `mplicits COMMAND --help` says more about each; `mplicits --version` prints the version."""
 
-HELP = ("-h", "--help")
 MOVED = {"bench": "benchmarks are not in the package; run `python -m benchmarks NAME` in a checkout of mplicits"}
 
-
-class _UsageError(Exception):
-    """A mistake in the arguments."""
-
-
-class _Parser(argparse.ArgumentParser):
-    """An argument parser that raises instead of exiting, and knows what a mistyped flag should have been."""
-
-    def __init__(self, name: str, command: Command, *, program: str) -> None:
-        super().__init__(
-            prog=f"{program} {name}",
-            description=command.description or command.summary,
-            epilog=f"examples:\n{command.examples}",
-            formatter_class=argparse.RawDescriptionHelpFormatter,
-            allow_abbrev=False,
-        )
-        # argparse takes -1e-3 for a flag; coordinates and tolerances are written so, and lengths as -2mm.
-        self._negative_number_matcher = re.compile(r"^-(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?[a-z]*$")
-        command.add_arguments(self)
-
-    def error(self, message: str) -> NoReturn:
-        raise _UsageError(f"{message} (see `{self.prog} --help`)")
-
-    def check_flags(self, arguments: Sequence[str]) -> None:
-        """Name the nearest flag of a mistyped one, before argparse complains of what is then missing."""
-        known = {flag: action.help for flag, action in self._option_string_actions.items() if flag.startswith("--")}
-        for argument in arguments:
-            if argument == "--":
-                return
-            flag = argument.split("=", 1)[0]
-            if flag.startswith("--") and flag not in known:
-                shown = (name for name, text in known.items() if text != argparse.SUPPRESS)
-                self.error(f"unknown flag {flag}{closest(flag, shown)}")
+SOLIDS = ("box", "cylinder", "gear")
+SAMPLES = ("statue", *SOLIDS)
+LENGTHS = {  # faults of a scan that are lengths, and what each is
+    "noise": "standard deviation of the ranges, along the rays (0.096)",
+    "isotropic_noise": "standard deviation of each coordinate of each point (0)",
+    "quantise": "ranges are rounded to multiples of this (0)",
+    "misalign": "registration error: how far each scan is shifted along each axis, and turned as well (0)",
+}
+DEMO_PRESET = "fast"  # with all that the demo does beside the fit, about two minutes on two cores
 
 
-@dataclass(frozen=True)
-class Program:
-    """A table of commands with its own name on the command line.
+def _info_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("path", metavar="RUN|FILE", help="a run, a .safetensors file, a mesh or a cloud")
 
-    Attributes:
-        name: what is typed before a command.
-        commands: by name.
-        overview: what ``--help`` prints; ``{commands}`` is replaced by the list of commands.
-        moved: commands of earlier versions, each with what to run instead.
-    """
 
-    name: str
-    commands: Mapping[str, Command]
-    overview: str
-    moved: Mapping[str, str] = field(default_factory=dict)
+def _info(arguments: argparse.Namespace) -> int:
+    print(describe(arguments.path))
+    return 0
 
-    def main(self, argv: Sequence[str] | None = None) -> int:
-        """Run one command.
 
-        Args:
-            argv: arguments without the program's name; those of the process by default.
+def _doctor(_arguments: argparse.Namespace) -> int:
+    from .doctor import examine, format_findings
 
-        Returns:
-            Exit code: 0, 1 (a check failed), 2 (bad input or arguments) or 130 (interrupted).
-        """
-        os.environ.setdefault(*SPINS)
-        try:
-            return self._run(list(sys.argv[1:] if argv is None else argv))
-        except SystemExit as stop:  # argparse's --help
-            return int(stop.code or 0)
-        except _UsageError as error:
-            return self._fail(str(error))
-        except Stopped as stop:
-            print(stop, file=sys.stderr)
-            return 130
-        except KeyboardInterrupt:
-            print(f"{self._short}: interrupted", file=sys.stderr)
-            return 130
-        except BrokenPipeError:
-            # Whoever read our output has left, `head` say. Python would complain again when it flushes at exit.
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            return 141
-        except OSError as error:
-            if error.filename is None:
-                raise
-            reason = error.strerror or type(error).__name__
-            return self._fail(f"{os.fsdecode(error.filename)}: {reason}; check the path and its permissions")
-        except ValueError as error:
-            from ...neural_fields import InputError
+    findings = examine()
+    print(format_findings(findings))
+    return int(any(finding.level == "error" for finding in findings))
 
-            if not isinstance(error, InputError):
-                raise
-            return self._fail(str(error))
 
-    def parser(self, name: str) -> _Parser:
-        """The parser of a command's arguments."""
-        return _Parser(name, self.commands[name], program=self.name)
+def _sample_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("name", nargs="?", choices=SAMPLES, default=SAMPLES[0], help="which one (default: statue)")
+    add_flags(parser, "--out", help="a .ply file to write")
+    add_flags(parser, "--seed", help="of the scanners' noise (0)")
+    faults = parser.add_argument_group("faults of the statue's scan; lengths in mm, or with a unit: 0.2mm, 20um")
+    for name, about in LENGTHS.items():
+        faults.add_argument(f"--{name.replace('_', '-')}", metavar="LENGTH", help=about)
+    what = "share of the readings beside a jump in depth that lie in the air between its two sides, from 0 to 1 (0)"
+    faults.add_argument("--smear", type=between(0, 1), metavar="SHARE", help=what)
+    what = "how many times as dense the points are on one side as on the other (1)"
+    faults.add_argument("--uneven", type=between(1, 1e6), metavar="FACTOR", help=what)
 
-    @property
-    def _short(self) -> str:
-        """The name that messages begin with."""
-        return self.name.split()[-1]
 
-    def _run(self, arguments: list[str]) -> int:
-        if arguments[:1] == ["help"]:
-            arguments = [*arguments[1:], "--help"]
-        if not arguments or arguments[0] in HELP:
-            print(self.overview.format(commands=self._listed()))
-            return 0 if arguments else 2
-        if arguments[0] == "--version":
-            from importlib.metadata import version  # late, as all that --help can do without
+def _sample(arguments: argparse.Namespace) -> int:
+    check_output(arguments.out, (".ply",))
+    flags = (*LENGTHS, "smear", "uneven")
+    if arguments.name in SOLIDS:
+        refuse(arguments, flags, f"is of scans, and {arguments.name} is an exact mesh; leave it out")
+        return _solid(arguments)
+    options = _faults(arguments) if any(getattr(arguments, name) is not None for name in flags) else {}
+    from ...datasets import statue_scan, write_cloud_ply
+    from ..training.progress import counter_bar
 
-            print(f"mplicits {version('mplicits')}")
-            return 0
-        name, *rest = arguments
-        if name in self.moved:
-            raise _UsageError(f"{name}: {self.moved[name]}")
-        if name not in self.commands:
-            raise _UsageError(f"unknown command {name!r}{closest(name, self.commands)}")
-        parser = self.parser(name)
-        if not {*HELP} & set(rest):
-            parser.check_flags(rest)
-        given = parser.parse_args(rest)
-        check_output(getattr(given, "json", None), (".json",))
-        given.words = [*self.name.split(), *arguments]  # as they were typed, for pages of results
-        code = self.commands[name].run(given)
-        sys.stdout.flush()
-        return code
+    with counter_bar("scan") as progress:
+        cloud = statue_scan(seed=arguments.seed, progress=progress, **options)
+    write_cloud_ply(arguments.out, cloud)
+    print(f"{arguments.out}: {len(cloud):,} points; fit it with: {command_line('fit', arguments.out, '-o', 'RUN')}")
+    return 0
 
-    def _listed(self) -> str:
-        """A line for each command, with what it does."""
-        width = max(map(len, self.commands))
-        return "\n".join(f"  {name:<{width}}  {command.summary}" for name, command in self.commands.items())
 
-    def _fail(self, message: str) -> int:
-        print(f"{self._short}: error: {' '.join(message.split())}", file=sys.stderr)
-        return 2
+def _faults(arguments: argparse.Namespace) -> dict[str, Any]:
+    """What `statue_scan` is told of the faults that were asked for, in units of the statue."""
+    from ...datasets import STATUE_PLACEMENT, ScanFaults
+    from ..mesh.solids import length_in
 
+    given: dict[str, float] = {}
+    for name in LENGTHS:
+        text, flag = getattr(arguments, name), f"--{name.replace('_', '-')}"
+        if text is not None:
+            length = length_in(text, "mm", flag)
+            if length < 0:
+                raise input_error(f"{flag} {text}: expected a length ≥ 0")
+            given[name.removesuffix("_noise")] = length / STATUE_PLACEMENT.scale
+    noise = {"noise": given.pop("noise")} if "noise" in given else {}
+    return {**noise, "faults": ScanFaults(**{**given_flags(arguments, ScanFaults), **given})}
+
+
+def _solid(arguments: argparse.Namespace) -> int:
+    from ...datasets.synthetic.prisms import PRISMS
+    from ...neural_fields import Mesh
+    from ..mesh.files import write_mesh
+
+    write_mesh(arguments.out, Mesh(*PRISMS[arguments.name]()))
+    command = f"python -m benchmarks fit {arguments.out} --points 12000"
+    print(f"{arguments.out}: an exact mesh; in a checkout of mplicits, `{command}` fits points drawn on it")
+    return 0
+
+
+def _demo_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("cloud", nargs="?", metavar="CLOUD", help="any cloud (default: the bundled statue scan)")
+    add_flags(parser, "--out", required=False, default=Path("demo"), metavar="DIR", help="directory (demo)")
+    add_flags(parser, "--resolution", default=320, help="of the meshes (320)")
+    add_flags(parser, "--up", help="the axis that points up in the picture")
+    add_settings(parser, FitConfig, default=DEMO_PRESET)
+
+
+def _demo(arguments: argparse.Namespace) -> int:
+    config = read_settings(arguments, FitConfig, default=DEMO_PRESET)
+    from .demo import demo
+
+    return demo(arguments.cloud, arguments.out, config=config, up=arguments.up, resolution=arguments.resolution)
+
+
+COMMANDS: Mapping[str, Command] = MappingProxyType(
+    {
+        "fit": FIT,
+        "mesh": MESH,
+        "boolean": BOOLEAN,
+        "offset": OFFSET,
+        "texture": TEXTURE,
+        "reconstruct": RECONSTRUCT,
+        "evolve": EVOLVE,
+        "animate": ANIMATE,
+        "render": RENDER,
+        "slice": SLICE,
+        "view": VIEW,
+        "web": WEB,
+        "find-cameras": FIND_CAMERAS,
+        "find-points": FIND_POINTS,
+        "check-cameras": CHECK_CAMERAS,
+        "evaluate": EVALUATE,
+        "info": Command(
+            "say what a run, a checkpoint, a mesh or a cloud is",
+            "  mplicits info runs/scan\n  mplicits info scan.ply",
+            _info_arguments,
+            _info,
+        ),
+        "doctor": Command(
+            "check this installation and measure this machine",
+            "  mplicits doctor",
+            lambda _parser: None,
+            _doctor,
+        ),
+        "sample": Command(
+            "write the bundled scan of a statue, or the mesh of a solid with sharp edges",
+            "  mplicits sample -o scan.ply\n  mplicits sample -o worse.ply --noise 0.5mm --misalign 1mm --smear 0.3\n"
+            "  mplicits sample gear -o gear.ply",
+            _sample_arguments,
+            _sample,
+        ),
+        "scene": SCENE,
+        "demo": Command(
+            "fit, mesh and draw the bundled scan, or any cloud",
+            "  mplicits demo\n  mplicits demo scan.ply -o demo-scan --up z",
+            _demo_arguments,
+            _demo,
+            "Fit a cloud, write mesh.ply, mesh.glb and picture.png, and say how near the result is.",
+        ),
+    }
+)
 
 MPLICITS = Program("mplicits", COMMANDS, OVERVIEW, MOVED)
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command of ``mplicits``; see `Program.main`."""
-    return MPLICITS.main(argv)
+main = MPLICITS.main
+"""Run one command of ``mplicits``; see `Program.main`."""

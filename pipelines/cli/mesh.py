@@ -10,8 +10,6 @@ import time
 from ..training.settings import given_flags
 from .common import Command, add_flags, positive, whole, write_json
 
-__all__ = ["EVALUATE", "MESH"]
-
 MESH_FILES = (".ply", ".obj", ".stl", ".glb")
 UNITS = ("um", "mm", "cm", "m", "km", "in", "ft")
 

@@ -13,8 +13,6 @@ from .mesh import MESH_FILES, UNITS
 if TYPE_CHECKING:
     from ..mesh.solids import Made
 
-__all__ = ["BOOLEAN", "OFFSET"]
-
 PART = "run directory, .safetensors file or closed mesh"
 
 

@@ -33,8 +33,6 @@ from .common import (
 )
 from .views import tell_found
 
-__all__ = ["EVOLVE", "RECONSTRUCT", "TEXTURE", "tell_texture"]
-
 if TYPE_CHECKING:
     from ..texture.train import FittedTexture
 

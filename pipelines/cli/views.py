@@ -12,8 +12,6 @@ from typing import TYPE_CHECKING, get_args, get_type_hints
 from ..training.settings import ReconstructConfig, command_line, input_error
 from .common import Command, add_flags, check_output, positive, refuse, training, whole, write_json
 
-__all__ = ["CHECK_CAMERAS", "FIND_CAMERAS", "FIND_POINTS", "SCENE", "tell_found"]
-
 if TYPE_CHECKING:
     from ...datasets.views.poses.find_cameras import FoundCameras
     from ...datasets.views.poses.find_points import FoundPoints

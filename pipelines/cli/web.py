@@ -9,8 +9,6 @@ from pathlib import Path
 from ..training.settings import given_flags, input_error
 from .common import Command, add_flags, check_output, refuse, stoppable, whole
 
-__all__ = ["WEB"]
-
 PAGES = (".html", ".htm")
 # At the beginning of each page that was written here, so that no other page of a user's is overwritten.
 MARK = 'id="header">{"format":"mplicits-web"'

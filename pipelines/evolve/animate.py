@@ -20,10 +20,10 @@ from ...neural_fields.meshing.extract import NoSurfaceError, extract_mesh
 from ...neural_fields.meshing.placement import Placement
 from ...neural_fields.spacetime.dynamic_tracing import DynamicTracer, moment
 from ..mesh.files import write_mesh, write_moving
+from ..render.draw import Orbit, orbit_cameras, traced_part
 from ..render.film import ANIMATIONS, write_animation
 from ..render.picture import Image, contact_sheet, in_rows, write_picture
 from ..render.shade import ShadeOptions, compose, downsample, shade
-from ..render.subject import Orbit, orbit_cameras, traced_part
 from ..render.trace import PRECISION, fine_strips, pixel_size, see_hits
 from ..texture.transport import Colors, TransportedColors, borrowed_texture, pinned_texture, start_texture
 from ..training.folder import FIELD_FILE, RECORD_FILE, chosen_level, find_field, load_motion, read_record

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from ...datasets import OrientedCloud, PointCloud, prepare_cloud, spacing_of
 from ...datasets.clouds.large import Merging
 from ...neural_fields import InputError, MultiscaleSDF, Similarity, Siren
-from ..surface.trim import thinned
+from ..surface.surface import thinned
 from ..training.folder import SUPPORT_FILE, RunFolder, digest_of, named_cloud
 from ..training.machine import choose_device, environment, peak_memory
 from ..training.progress import reported, silent

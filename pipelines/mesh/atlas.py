@@ -15,8 +15,6 @@ from ...datasets.clouds.point_cloud import unit_rows
 from ...datasets.clouds.readers.meshes import vertex_normals
 from ...neural_fields import InputError, Mesh
 
-__all__ = ["check_unwrap_tools", "decimate", "from_frame", "to_frame", "unwrap", "vertex_tangents"]
-
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 

@@ -18,8 +18,6 @@ from ..surface.raster import cover
 from .atlas import decimate, to_frame, unwrap
 from .files import check_textured_path, write_textured
 
-__all__ = ["Baked", "bake", "check_texture_size", "textured_mesh"]
-
 Float64 = NDArray[np.float64]
 Image = NDArray[np.uint8]
 Attribute = Callable[[Float64], NDArray[np.floating]]

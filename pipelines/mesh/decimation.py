@@ -14,8 +14,6 @@ from ..surface.distance import MeshDistance
 from ..surface.surface import is_closed
 from .atlas import decimate
 
-__all__ = ["Decimated", "Decimation", "check_decimation_tool", "decimated", "deviation"]
-
 Float64 = NDArray[np.float64]
 
 

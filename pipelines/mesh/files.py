@@ -22,23 +22,12 @@ from ...neural_fields.meshing.mesh import (
     check_mesh_path,
     glb_attributes,
     glb_origin,
-    needs_doubles,
     write_glb_mesh,
     write_obj,
     write_triangles,
 )
 from ...neural_fields.meshing.placement import Placement
 from .atlas import check_unwrap_tools
-
-__all__ = [
-    "check_mesh_path",
-    "check_textured_path",
-    "needs_doubles",
-    "placement_of",
-    "write_mesh",
-    "write_moving",
-    "write_textured",
-]
 
 Image = NDArray[np.uint8]
 

@@ -20,8 +20,6 @@ from ..training.settings import TextureConfig
 from .extract import MeshOptions, mesh_run
 from .files import check_mesh_path
 
-__all__ = ["FitMesh", "plan_mesh"]
-
 COLORLESS = ".stl"
 
 

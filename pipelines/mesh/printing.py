@@ -15,8 +15,6 @@ from ...neural_fields import Field, Mesh, Similarity, project_to_surface
 from ...neural_fields.meshing.placement import FRAMES, Placement
 from ..surface.surface import components, sample_points
 
-__all__ = ["PrintReport", "Thickness", "format_report", "print_report", "thickness"]
-
 Float64 = NDArray[np.float64]
 
 

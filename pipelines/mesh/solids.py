@@ -31,12 +31,9 @@ from ...neural_fields.meshing.extract import NoSurfaceError, extract_mesh
 from ...neural_fields.meshing.placement import METRES
 from ...neural_fields.shape import in_one_frame
 from ..surface.solid import MeshField
-from ..surface.surface import is_closed, read_surface, volume
-from ..surface.trim import Support, read_support, without_blobs
+from ..surface.surface import Support, is_closed, read_support, read_surface, volume, without_blobs
 from ..training.folder import chosen_level, find_field, is_field, load_still
 from .files import check_mesh_path, placement_of, write_mesh
-
-__all__ = ["OPERATIONS", "Made", "SolidOptions", "boolean", "length_in", "offset"]
 
 FIELD_SUFFIX = ".safetensors"
 OPERATIONS: dict[str, type[Union | Intersection | Difference]] = {

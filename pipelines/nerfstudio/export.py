@@ -20,7 +20,9 @@ from ..mesh.bake import check_texture_size, textured_mesh
 from ..mesh.extract import normals_near
 from ..mesh.files import check_textured_path
 from ..reconstruct.views import seen_points
-from ..surface.trim import Support, seen_part
+from ..surface.surface import Support, seen_part
+
+__all__ = ["colored", "export_mesh", "host_cameras", "in_data_coordinates", "main", "part_seen"]
 
 Float64 = NDArray[np.float64]
 Move = tuple[Float64, float]  # (3, 4) and a scale: see `in_data_coordinates`
@@ -151,7 +153,11 @@ def host_cameras(cameras: Any) -> list[Camera]:
 
 
 def part_seen(mesh: Mesh, field: NerfstudioField, cameras: Sequence[Camera]) -> Mesh:
-    """The part of a mesh in nerfstudio's coordinates that two cameras see at least; NoSurfaceError: nothing of it."""
+    """What two cameras see at least of a mesh; all in nerfstudio's coordinates.
+
+    Raises:
+        NoSurfaceError: nothing of it.
+    """
     unit = Similarity((0.0, 0.0, 0.0), 1 / field.scale)
     points, within = seen_points(field.field, [(camera.moved(unit), None) for camera in cameras])
     part = None
@@ -164,7 +170,13 @@ def part_seen(mesh: Mesh, field: NerfstudioField, cameras: Sequence[Camera]) -> 
 
 
 def in_data_coordinates(mesh: Mesh, transform: ArrayLike, scale: float) -> Mesh:
-    """A mesh with nerfstudio's x ↦ scale · (R x + t) undone; ``transform`` ``(3, 4)`` is R and t."""
+    """Undo x ↦ scale · (R x + t), by which nerfstudio has moved the data's cameras.
+
+    Args:
+        mesh: in nerfstudio's coordinates.
+        transform: ``(3, 4)``, R a rotation and t beside it.
+        scale: a number above 0.
+    """
     matrix = np.asarray(transform, np.float64)
     rotation, shift = matrix[:, :3], matrix[:, 3]
     # Rows: R⁻¹ (x − t) is (x − t) R for a rotation.

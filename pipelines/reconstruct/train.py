@@ -24,8 +24,7 @@ from ...datasets.views.images import PosedImage, PosedImages, read_posed_images
 from ...neural_fields import Field, InputError, Jet, NoSurfaceError, TextureField, extract_mesh
 from ...neural_fields.checkpoint import radiance_bytes, texture_bytes
 from ..render.picture import Image, picture_bytes, write_picture
-from ..surface.surface import sample_points
-from ..surface.trim import in_region, thinned
+from ..surface.surface import in_region, sample_points, thinned
 from ..texture.train import FittedTexture, fit_texture, texture_step_seconds
 from ..training.folder import RADIANCE_FILE, SUPPORT_FILE, TEXTURE_FILE, RunFolder, digest_of
 from ..training.machine import choose_device

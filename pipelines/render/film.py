@@ -17,8 +17,6 @@ from ...neural_fields import InputError
 from ...neural_fields.backend.files import whole_file
 from .picture import Image
 
-__all__ = ["ANIMATIONS", "write_animation"]
-
 ANIMATIONS = (".mp4", ".gif")
 # Without these, players guess the matrix from the frame's size, and colours shift a little.
 BT709 = ["-colorspace", "bt709", "-color_primaries", "bt709", "-color_trc", "bt709", "-color_range", "tv"]

@@ -16,17 +16,6 @@ from numpy.typing import NDArray
 from ...neural_fields import InputError
 from ...neural_fields.backend.files import check_place, write_whole
 
-__all__ = [
-    "Image",
-    "as_bytes",
-    "check_picture_path",
-    "contact_sheet",
-    "in_rows",
-    "picture_bytes",
-    "stacked",
-    "write_picture",
-]
-
 Image = NDArray[np.uint8]
 Titled = tuple[str, Image]
 

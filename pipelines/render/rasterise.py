@@ -22,8 +22,6 @@ from .picture import Image
 from .shade import ShadeOptions, compose, default_shading, downsample, shade
 from .trace import Seen
 
-__all__ = ["Painted", "cloud_view", "mesh_view", "picture_of", "read_painted"]
-
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 Painted = Mesh | TexturedMesh

@@ -18,17 +18,6 @@ from torch import Tensor
 from ...neural_fields import Field
 from .picture import Image, as_bytes
 
-__all__ = [
-    "Slice",
-    "draw_slice",
-    "level_color",
-    "plane_axes",
-    "round_step",
-    "slice_field",
-    "slice_points",
-    "take_slice",
-]
-
 Array = NDArray[np.floating]
 Floats = NDArray[np.float32]
 Color = tuple[float, float, float]

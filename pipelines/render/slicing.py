@@ -19,8 +19,6 @@ from .legend import with_legend
 from .picture import Image, write_picture
 from .slice import draw_slice, plane_axes, round_step, take_slice
 
-__all__ = ["SliceOptions", "slice_run"]
-
 Float64 = NDArray[np.float64]
 Triple = tuple[float, float, float]
 

@@ -23,8 +23,6 @@ from ..surface.surface import read_reference, sample_points
 from .rasterise import Painted, mesh_view, read_painted
 from .trace import Seen, fine_strips
 
-__all__ = ["photograph_mesh", "sees", "true_mesh"]
-
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 

@@ -20,16 +20,6 @@ from ...neural_fields.networks.multiscale import as_levels, choose_levels, level
 from ...neural_fields.tracing.cones import CONE_LIPSCHITZ, CONE_STEPS, cone_starts
 from ...neural_fields.tracing.sphere import BOUNDING_RADIUS, MAX_STEPS, Hits, march_constants
 
-__all__ = [
-    "Seen",
-    "fine_strips",
-    "pixel_size",
-    "see_hits",
-    "strips",
-    "trace_hits",
-    "trace_view",
-]
-
 STRIP = 1 << 19  # pixels that are worked on at a time: about a third of a gigabyte
 
 

@@ -9,8 +9,6 @@ from scipy.spatial import KDTree
 from ...neural_fields import Mesh
 from .surface import face_normals
 
-__all__ = ["MeshDistance", "barycentric_of_nearest"]
-
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 

@@ -23,17 +23,6 @@ from ...neural_fields.backend.files import write_json
 from .raster import cover
 from .surface import components, is_closed, read_surface, sample_points
 
-__all__ = [
-    "Metrics",
-    "Overlap",
-    "chamfer",
-    "evaluate_files",
-    "evaluate_surfaces",
-    "format_metrics",
-    "overlap",
-    "write_metrics",
-]
-
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 

@@ -11,8 +11,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Clipped", "Coverage", "clip", "cover"]
-
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 Faces = NDArray[np.integer]

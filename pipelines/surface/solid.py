@@ -10,8 +10,6 @@ from ...neural_fields.fields.field import OneLevelField
 from .distance import MeshDistance
 from .surface import is_closed, volume
 
-__all__ = ["MeshField"]
-
 
 class MeshField(OneLevelField):
     """The signed distance to a closed mesh, exact to rounding; see `MeshDistance`.

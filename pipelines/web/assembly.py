@@ -15,8 +15,6 @@ from typing import Any
 from ...neural_fields.backend.files import write_whole
 from .payload import deflated, text_of
 
-__all__ = ["field_file", "fill_page", "write_folder"]
-
 SCRIPTS = (
     "decode.js",
     "network.js",

@@ -17,17 +17,13 @@ from ...neural_fields.backend.files import write_whole
 from ...neural_fields.meshing.extract import NoSurfaceError
 from ...neural_fields.spacetime.field import SpaceTimeSDF
 from ...neural_fields.tracing.sphere import BOUNDING_RADIUS
-from ..render.subject import FRAME_RESOLUTION, traced_part
+from ..render.draw import FRAME_RESOLUTION, traced_part
 from ..texture.train import texture_of
 from ..training.folder import chosen_level, find_field, fitted_cloud, is_field, load_still
 from .assembly import fill_page, write_folder
-from .film import MOMENTS, band_reach, swept_shell
-from .networks import Rounding, network_layers, rounding_error, shader_levels, taper_of
-from .payload import Payload
+from .payload import Payload, Rounding, network_layers, rounding_error, shader_levels, taper_of
 from .shapes import Shape, add_shape, distance_cloud, field_shapes, read_shape
-from .shell import GRID, shell_mesh, surface_reach
-
-__all__ = ["BITS", "PAGES", "Packed", "WebOptions", "WebPage", "pack", "pack_field", "pack_shapes", "web_run"]
+from .shell import GRID, MOMENTS, band_reach, shell_mesh, surface_reach, swept_shell
 
 PAGES = (".html", ".htm")
 BITS = 13

@@ -15,8 +15,6 @@ from http.cookies import CookieError, SimpleCookie
 from typing import NamedTuple
 from urllib.parse import parse_qs, urlsplit
 
-__all__ = ["Gate", "Verdict"]
-
 # Nobody frames a page of ours, caches it or learns its address.
 HEADERS: Mapping[str, str] = {
     "Referrer-Policy": "no-referrer",

@@ -16,8 +16,6 @@ from ..training.folder import find_field, load_still
 from .export import Packed, WebOptions, pack_shapes
 from .shapes import field_shapes
 
-__all__ = ["Pairs"]
-
 
 class Pairs:
     """Landmarks of two runs, kept in a file while there are any.

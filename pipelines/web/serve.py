@@ -21,8 +21,6 @@ from .assembly import field_file, fill_page
 from .export import Packed
 from .gate import Gate
 
-__all__ = ["PageServer"]
-
 PORTS = range(8080, 8180)  # of which the first free one is taken
 
 

@@ -13,12 +13,10 @@ from numpy.typing import NDArray
 from ...datasets.textured.mesh import TexturedMesh, colors_at
 from ...neural_fields import Field, InputError, Similarity, TextureField, map_colors
 from ...neural_fields.meshing.extract import NoSurfaceError, extract_mesh
+from ..render.draw import disc_size
 from ..render.rasterise import read_painted
 from ..render.shade import COLOR_MAPS, apply_color_map
-from ..render.subject import disc_size
 from .payload import Payload
-
-__all__ = ["Shape", "add_shape", "distance_cloud", "field_shapes", "read_shape"]
 
 Float64 = NDArray[np.float64]
 

@@ -12,11 +12,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...neural_fields import Field, extract_mesh
+from ...neural_fields import Field, Jet, extract_mesh
 from ...neural_fields.meshing.mesh import Mesh
+from ...neural_fields.spacetime.field import SpaceTimeSDF, at_time
 from ...neural_fields.tracing.sphere import BOUNDING_RADIUS
-
-__all__ = ["CELLS", "GRID", "shell_mesh", "surface_reach"]
 
 # Between the corners of those meshes a coarser level may be this much further from zero.
 MARGIN = 1.25
@@ -79,3 +78,87 @@ def surface_reach(field: Field) -> list[list[float]]:
         deltas = [float(delta) for delta in field.deltas[:level]]
         found.append([min(delta, max(pair)) for delta, *pair in zip(deltas, before, reaches, strict=True)])
     return found
+
+
+MOMENTS = np.linspace(0.0, 1.0, 5)  # at which surfaces are looked at: the first view, what rounding changes
+LATTICE, TIMES = 24, 9  # along the box and in time: where changes are measured
+CELL = 2 * BOUNDING_RADIUS / CELLS
+
+
+class Swept(Field):
+    """The least value of all moments of a field that moves, less what lies between them.
+
+    With moments t_k,
+
+        f(x) = min_k f(x, t_k) − ½ Δt s,  Δt = t_(k+1) − t_k,
+
+    which is no more than f(x, t) at any t, if no value changes faster than s. So its offset surfaces hold those of
+    every moment. There are so many moments that ½ Δt s is at most half a cell of the mesh, and at most 65.
+
+    Args:
+        field: that moves.
+        speed: s, in units of the field for all the time from 0 to 1; see `fastest_change`.
+    """
+
+    def __init__(self, field: SpaceTimeSDF, speed: float) -> None:
+        super().__init__()
+        count = min(65, 2 + math.floor(speed / CELL))
+        self.in_dim, self.num_levels = 3, field.num_levels
+        self.stills = torch.nn.ModuleList(field.at(float(t)) for t in np.linspace(0, 1, count))
+        self.margin = 0.5 * speed / (count - 1)
+
+    @property
+    def deltas(self) -> Tensor:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Half-widths of the bands, those of every moment."""
+        return self._stills()[0].deltas
+
+    def _stills(self) -> list[Field]:
+        return [still for still in self.stills if isinstance(still, Field)]
+
+    def value(self, x: Tensor, *, level: int = -1) -> Tensor:
+        """See `Field.value`."""
+        values = [still.value(x, level=level) for still in self._stills()]
+        return torch.stack(values).amin(dim=0) - self.margin
+
+    def jet(self, x: Tensor, *, level: int = -1) -> Jet:
+        """See `Field.jet`; the gradient is that of the moment with the least value."""
+        jets = [still.jet(x, level=level) for still in self._stills()]
+        value, first = torch.stack([jet.value for jet in jets]).min(dim=0)
+        gradients = torch.stack([jet.gradient for jet in jets])
+        places = first[None, ..., None].expand(1, *gradients.shape[1:])
+        return Jet(value - self.margin, gradients.gather(0, places)[0], jets[0].features)
+
+
+@torch.no_grad()
+def fastest_change(field: SpaceTimeSDF) -> float:
+    """The greatest |∂f_0/∂t| near level 0's band, at `LATTICE`³ places and `TIMES` times.
+
+    It is a measurement and no bound of the field: what moves faster between the places of the lattice is not seen.
+    """
+    line = torch.linspace(-BOUNDING_RADIUS, BOUNDING_RADIUS, LATTICE, dtype=field.like.dtype, device=field.like.device)
+    places = torch.cartesian_prod(line, line, line)
+    places = places[places.norm(dim=-1) <= BOUNDING_RADIUS]
+    # Changes are of interest up to 0.2 from the band.
+    near = 0.2 + (float(field.deltas[0]) if field.num_levels > 1 else 0.0)
+    fastest = 0.0
+    for t in np.linspace(0, 1, TIMES):
+        jet = field.jet(at_time(places, float(t)), level=0)
+        rates = jet.gradient[:, 3][jet.value.abs() <= near].abs()
+        if len(rates):
+            fastest = max(fastest, float(rates.max()))
+    return fastest
+
+
+def band_reach(field: Field) -> list[list[float]]:
+    """The δ of the levels before each level: what `surface_reach` is at most, at any moment."""
+    deltas = [float(delta) for delta in field.deltas]
+    return [deltas[:level] for level in range(field.num_levels)]
+
+
+def swept_shell(field: SpaceTimeSDF) -> Mesh:
+    """A mesh around the bands of all moments; see `shell_mesh` and `Swept`.
+
+    Raises:
+        NoSurfaceError: there is no moment with a surface.
+    """
+    return shell_mesh(Swept(field, fastest_change(field)).requires_grad_(False))

@@ -11,8 +11,6 @@ from ..training.folder import FIELD_FILE
 from .export import WebOptions, pack
 from .serve import PageServer
 
-__all__ = ["Watcher"]
-
 
 class Watcher:
     """Shows what a training writes into its run directory; use it as a context manager around the training.

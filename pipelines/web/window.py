@@ -14,8 +14,6 @@ from .assembly import fill_page
 from .export import WebOptions, pack_field
 from .serve import PageServer
 
-__all__ = ["Frame", "in_notebook", "show", "until_closed"]
-
 
 class Frame(NamedTuple):
     """A page in a notebook's cell.

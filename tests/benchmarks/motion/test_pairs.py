@@ -12,7 +12,7 @@ from mplicits.neural_fields.spacetime.moving import Keyframes
 from mplicits.pipelines.evolve import deform
 from mplicits.pipelines.evolve.shapes import read_shape
 from mplicits.pipelines.mesh.files import write_mesh
-from mplicits.pipelines.render.subject import Orbit, orbit_cameras
+from mplicits.pipelines.render.draw import Orbit, orbit_cameras
 from mplicits.pipelines.texture import transport
 from torch import Tensor
 

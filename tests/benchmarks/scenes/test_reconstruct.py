@@ -13,7 +13,7 @@ from mplicits.neural_fields.networks.neus_mlp import NeusSDF
 from mplicits.neural_fields.networks.radiance import Outside, ViewColor
 from mplicits.pipelines.reconstruct.model import RayPool, SceneModel, build_scene
 from mplicits.pipelines.reconstruct.objective import ReplayedTrainer, SceneObjective, scene_trainer
-from mplicits.pipelines.surface.trim import in_region
+from mplicits.pipelines.surface.surface import in_region
 from mplicits.pipelines.training.replay import Again
 from mplicits.pipelines.training.settings import ReconstructConfig
 from mplicits.pipelines.training.trainer import StopFlag

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 from mplicits.datasets.synthetic.prisms import PRISMS, TURN, box, cylinder, gear, prism
-from mplicits.pipelines.cli.commands import SOLIDS
+from mplicits.pipelines.cli.entry import SOLIDS
 
 
 def volume(solid: tuple[np.ndarray, np.ndarray]) -> float:

@@ -18,8 +18,7 @@ import trimesh
 from mplicits.datasets import sample_sphere
 from mplicits.neural_fields import MultiscaleSDF, Similarity, save_field
 from mplicits.pipelines.cli import doctor
-from mplicits.pipelines.cli.commands import COMMANDS
-from mplicits.pipelines.cli.entry import main
+from mplicits.pipelines.cli.entry import COMMANDS, main
 from mplicits.pipelines.surface.surface import read_surface
 
 SMALL = ["--widths", "16", "16", "--depths", "1", "1", "--omegas", "5", "8", "--steps", "300", "100"]
@@ -376,7 +375,7 @@ def test_ctrl_c_and_a_closed_pipe_end_quietly(monkeypatch, capsys):
     def interrupt(_path: object) -> str:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("mplicits.pipelines.cli.info.describe", interrupt)
+    monkeypatch.setattr("mplicits.pipelines.cli.entry.describe", interrupt)
     assert main(["info", "x"]) == 130
     assert capsys.readouterr().err == "mplicits: interrupted\n"
 

@@ -45,8 +45,7 @@ from mplicits.pipelines.evolve.animate import (
 )
 from mplicits.pipelines.evolve.follow import follow_mesh
 from mplicits.pipelines.mesh.extract import MeshOptions, mesh_run
-from mplicits.pipelines.render.draw import RenderOptions, render_run
-from mplicits.pipelines.render.subject import Orbit
+from mplicits.pipelines.render.draw import Orbit, RenderOptions, render_run
 from mplicits.pipelines.surface.surface import read_surface
 from mplicits.pipelines.texture.spread import CELL
 from mplicits.pipelines.texture.transport import TransportedColors, borrowed_texture

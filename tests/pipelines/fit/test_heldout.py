@@ -9,7 +9,7 @@ import torch
 from mplicits.datasets import PointCloud
 from mplicits.datasets.synthetic.samples import sample_sphere
 from mplicits.neural_fields import Siren, Sphere
-from mplicits.pipelines.cli.info import describe
+from mplicits.pipelines.cli.fit import describe
 from mplicits.pipelines.fit.band import Band
 from mplicits.pipelines.fit.heldout import (
     JUDGE,

@@ -13,7 +13,7 @@ from mplicits.neural_fields.meshing.extract import Mesh, extract_mesh
 from mplicits.pipelines.fit.review import review_points
 from mplicits.pipelines.fit.train import fit, prepare
 from mplicits.pipelines.mesh.extract import MeshOptions, mesh_run
-from mplicits.pipelines.surface.trim import read_support
+from mplicits.pipelines.surface.surface import read_support
 from mplicits.pipelines.training.folder import SUPPORT_FILE
 from mplicits.pipelines.training.settings import FitConfig
 

@@ -13,7 +13,7 @@ import torch
 from mplicits.datasets import PointCloud
 from mplicits.neural_fields import InputError, load_field
 from mplicits.neural_fields.meshing.extract import extract_mesh
-from mplicits.pipelines.cli.info import describe
+from mplicits.pipelines.cli.fit import describe
 from mplicits.pipelines.fit.heldout import JUDGE
 from mplicits.pipelines.fit.level import LEVEL, calm_omega
 from mplicits.pipelines.fit.train import fit

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from mplicits.neural_fields import Box, Similarity, Sphere, Union, save_field
 from mplicits.pipelines.mesh import MeshOptions, export_run, extract
-from mplicits.pipelines.mesh.fineness import RESOLUTIONS, fineness, thin_depth, thin_share
-from mplicits.pipelines.surface.trim import Support
+from mplicits.pipelines.mesh.extract import RESOLUTIONS, fineness, thin_depth, thin_share
+from mplicits.pipelines.surface.surface import Support
 
 DEPTHS = {resolution: thin_depth(resolution) for resolution in RESOLUTIONS}
 

@@ -187,7 +187,7 @@ def test_blobs_are_not_joined(tmp_path: Path) -> None:
     from mplicits.neural_fields import WorldField
     from mplicits.neural_fields.shape import in_one_frame
     from mplicits.pipelines.mesh import solids
-    from mplicits.pipelines.surface.trim import Support
+    from mplicits.pipelines.surface.surface import Support
 
     scan = WorldField(Union(Sphere(radius=0.4), Sphere(radius=0.15, center=(0.0, 0.0, 0.75))))
     other = WorldField(Sphere(radius=0.2, center=(0.7, 0.0, 0.0)))

@@ -31,7 +31,7 @@ from mplicits.pipelines.reconstruct.views import (
     spread,
     target_of,
 )
-from mplicits.pipelines.surface.trim import Support, seen_part, thinned
+from mplicits.pipelines.surface.surface import Support, seen_part, thinned
 from torch import Tensor, nn
 
 WHITE = torch.ones(3)

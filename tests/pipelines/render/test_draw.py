@@ -18,11 +18,10 @@ from mplicits.neural_fields.meshing.extract import extract_mesh
 from mplicits.pipelines.cli.entry import main
 from mplicits.pipelines.mesh.files import write_mesh
 from mplicits.pipelines.render import trace
-from mplicits.pipelines.render.draw import RenderOptions, render_run
+from mplicits.pipelines.render.draw import RenderOptions, choose_frame, open_subject, reference_distance, render_run
 from mplicits.pipelines.render.legend import with_color_bar
 from mplicits.pipelines.render.rasterise import mesh_view
 from mplicits.pipelines.render.shade import SHADINGS
-from mplicits.pipelines.render.subject import choose_frame, open_subject, reference_distance
 from mplicits.pipelines.render.trace import pixel_size, trace_view
 from torch.nn.functional import normalize
 

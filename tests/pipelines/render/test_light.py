@@ -3,7 +3,7 @@
 import pytest
 import torch
 from mplicits.neural_fields import Box, Field, MultiscaleSDF, Plane, Siren, Sphere, Torus, Union
-from mplicits.pipelines.render.light import ambient_occlusion, level_set_curvature, soft_shadow
+from mplicits.pipelines.render.shade import ambient_occlusion, level_set_curvature, soft_shadow
 
 UP = torch.tensor([0.0, 0.0, 1.0])
 HEIGHT, RADIUS = 0.6, 0.2

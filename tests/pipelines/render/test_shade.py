@@ -11,15 +11,17 @@ import torch
 from fields import FIELDS
 from mplicits.datasets.cameras import Camera, look_at
 from mplicits.neural_fields import Field, InputError, Plane, Siren, Sphere, Union
-from mplicits.pipelines.render.light import MATCAPS, load_matcap, sample_matcap
 from mplicits.pipelines.render.shade import (
     COLOR_MAPS,
+    MATCAPS,
     SHADINGS,
     ShadeOptions,
     apply_color_map,
     compose,
     downsample,
+    load_matcap,
     measure,
+    sample_matcap,
     shade,
     value_limits,
 )

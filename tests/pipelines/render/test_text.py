@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 import pytest
-from mplicits.pipelines.render.text import plain, text_mask, text_width
+from mplicits.pipelines.render.legend import plain, text_mask, text_width
 
 WORDS = "|f₁| < δ₁ = 0.5"
 

@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 from mplicits.neural_fields import InputError, Sphere, Union
 from mplicits.neural_fields.meshing.extract import Mesh, extract_mesh
-from mplicits.pipelines.surface.surface import face_normals
-from mplicits.pipelines.surface.trim import (
+from mplicits.pipelines.surface.surface import (
     drop_unsupported,
+    face_normals,
     in_region,
     keep_faces,
     keep_largest,

@@ -15,7 +15,7 @@ from evolutions import BRIEF, few_points
 from faults import KINDS, Faults, Killed
 from mplicits.datasets import PointCloud
 from mplicits.neural_fields import InputError, Similarity, Siren, load_field
-from mplicits.pipelines.cli.info import describe
+from mplicits.pipelines.cli.fit import describe
 from mplicits.pipelines.evolve.train import evolve
 from mplicits.pipelines.fit import fit
 from mplicits.pipelines.texture.train import texture_run

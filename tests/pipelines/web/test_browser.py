@@ -13,7 +13,7 @@ from mplicits.datasets.cameras import look_at, turntable
 from mplicits.neural_fields import MultiscaleSDF, Siren, extract_mesh, map_colors, save_field
 from mplicits.neural_fields.networks.sphere_init import solve_sphere
 from mplicits.pipelines.web.export import BITS, WebOptions, web_run
-from mplicits.pipelines.web.networks import rounded_field
+from mplicits.pipelines.web.payload import rounded_field
 from pages import TITLE, bumpy, differences, painted, until
 
 pytest.importorskip("selenium")
@@ -274,7 +274,7 @@ DAMAGES = {
     "header": (lambda text: text[: text.index('"deltas"')], "not complete"),
     "flipped": (lambda text: text.replace('id="data">', 'id="data">AAAA'), "damaged or cut off"),
     "foreign": (lambda text: text.replace('"mplicits-web"', '"something"'), "no field of mplicits"),
-    "newer": (lambda text: text.replace('"version":1', '"version":7'), "version 7"),
+    "newer": (lambda text: text.replace('"version":2', '"version":7'), "version 7"),
     "no base64": (lambda text: text.replace('id="data">', 'id="data">!'), "damaged"),
 }
 

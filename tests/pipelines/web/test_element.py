@@ -14,7 +14,7 @@ import torch
 from mplicits.neural_fields import Similarity, save_field
 from mplicits.pipelines.cli import main
 from mplicits.pipelines.web.export import BITS
-from mplicits.pipelines.web.networks import rounded_field
+from mplicits.pipelines.web.payload import rounded_field
 from pages import bumpy, until
 
 POLICY = "default-src 'none'; script-src 'self'; connect-src 'self'; style-src 'none'"

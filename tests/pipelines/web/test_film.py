@@ -12,8 +12,8 @@ from mplicits.neural_fields.networks.sphere_init import solve_sphere
 from mplicits.neural_fields.spacetime.field import SpaceTimeSDF
 from mplicits.pipelines.cli import main
 from mplicits.pipelines.web.export import WebOptions, web_run
-from mplicits.pipelines.web.film import Swept, fastest_change, swept_shell
-from mplicits.pipelines.web.networks import network_layers
+from mplicits.pipelines.web.payload import network_layers
+from mplicits.pipelines.web.shell import Swept, fastest_change, swept_shell
 from pages import differences, rendered, until
 
 VELOCITY = np.array([0.4, 0.2, -0.1])

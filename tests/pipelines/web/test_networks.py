@@ -8,8 +8,14 @@ import pytest
 import torch
 from fields import small_multiscale
 from mplicits.neural_fields import MultiscaleSDF, Siren, Sphere
-from mplicits.pipelines.web.networks import network_layers, rounded_field, rounding_error, shader_levels
-from mplicits.pipelines.web.payload import Payload, pack_codes
+from mplicits.pipelines.web.payload import (
+    Payload,
+    network_layers,
+    pack_codes,
+    rounded_field,
+    rounding_error,
+    shader_levels,
+)
 
 
 def evaluate(layers, points):

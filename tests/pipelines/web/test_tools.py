@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from mplicits.pipelines.web.export import BITS
-from mplicits.pipelines.web.networks import rounded_field
+from mplicits.pipelines.web.payload import rounded_field
 from pages import bumpy, until
 
 pytest.importorskip("selenium")
