@@ -1,21 +1,15 @@
-"""A morph by a velocity: a motion is learnt that takes each key shape to the next, and carries what lies in between.
+"""A morph by a velocity that takes each key shape to the next, and carries what lies in between.
 
-A level set knows no correspondence, so the morph of `problem` melts a leg here and lets another one condense there.
-Here a velocity v(x, t) is learnt first. Its characteristics φ take points of one shape to where they shall lie on the
-next one,
+A level set knows no correspondence. Here a velocity v(x, t) is learnt first, whose characteristics φ minimise
 
     L = Σ_k |f_{k+1}(φ_{k→k+1}(x))|² over x on S_k, and |f_k(φ_{k+1→k}(x))|² over x on S_{k+1}      both ends are met
       + w(step) Σ |φ(x) − T(x)|²                                                  a guide, which fades
       + l Σ |φ(a) − b|²                                                           landmarks, where there are any
       + α ‖J + Jᵀ‖² / 2 + β (tr J)²                                         as rigid, as even in volume as can be
 
-along all paths. The guide T matches points by entropic optimal transport, of places, normals and what the two fields
-say at steps along the normals (how thick the shape is there, how far the next part); it only has to be about right.
-`CarriedKeyframes` then is the shape at any time, and what the field of space-time learns.
-
-After the velocities of Sang et al. 2025 ("Implicit Neural Surface Deformation with Explicit Velocity Fields", and
-"4Deform"), who learn both together; here the characteristics are taken first, so that both ends are met by construction
-and no loss has to hold in between.
+along all paths. The guide T matches points by entropic optimal transport of places, normals and values nearby.
+`CarriedKeyframes` then is the shape at any time, and what the field of space-time learns. After Sang et al. 2025
+("Implicit Neural Surface Deformation with Explicit Velocity Fields", and "4Deform"), who learn both together.
 """
 
 from __future__ import annotations

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -131,12 +130,10 @@ def _deform(
     motion = motion or learn_motion(placed, keys, config, progress, budget=budget)
     frames = Keyframes(keys, [shape.field for shape in placed])
     carried = CarriedKeyframes(frames, motion)
-    made = _sampled(lambda count: carried_samples(carried, placed, count, config.seed), config, budget)
+    known, bounds, number = _sampled(lambda count: carried_samples(carried, placed, count, config.seed), config, budget)
     ends = tuple(_end(shape, time, config.seed) for shape, time in zip(placed, keys, strict=True))
     similarity, figures = _composed(shapes[0].similarity, region), tuple(motion_figures(motion, placed, keys))
-    return Problem(
-        similarity, made.known, made.bounds, None, ends, _placements(placed), motion, figures, samples=made.number
-    )
+    return Problem(similarity, known, bounds, None, ends, _placements(placed), motion, figures, samples=number)
 
 
 def _together(shapes: list[StaticShape], config: EvolveConfig) -> tuple[list[StaticShape], Similarity]:
@@ -159,12 +156,12 @@ def _morph(shapes: list[StaticShape], config: EvolveConfig, budget: Budget | Non
         bounded = torch.isfinite(low) | torch.isfinite(high)
         return joined(known), Bounds(at_time(x, t)[bounded], CAUTION * low[bounded], CAUTION * high[bounded])
 
-    made = _sampled(samples, config, budget)
+    known, bounds, number = _sampled(samples, config, budget)
     guide = Keyframes(keys, [shape.field for shape in placed]).requires_grad_(False)
     ends = tuple(_end(shape, time, config.seed) for shape, time in pairs)
     similarity = _composed(shapes[0].similarity, region)
     law, places = morph_law(guide), _placements(placed)
-    return Problem(similarity, made.known, made.bounds, law, ends, places, keys=keys, samples=made.number)
+    return Problem(similarity, known, bounds, law, ends, places, keys=keys, samples=number)
 
 
 def morph_law(guide: Field) -> Law:
@@ -192,17 +189,17 @@ def _smooth(shapes: list[StaticShape], config: EvolveConfig, budget: Budget | No
         low = CAUTION * beyond[outside]
         return known, Bounds(at_time(x, t)[outside], low, torch.full_like(low, math.inf))
 
-    made = _sampled(samples, config, budget)
+    known, bounds, number = _sampled(samples, config, budget)
     end = _end(shape, 0.0, config.seed)
     law = mean_curvature(alpha, extend=True)
     similarity, places = _composed(shape.similarity, region), _placements(placed)
-    return Problem(similarity, made.known, made.bounds, law, (end,), places, samples=made.number)
+    return Problem(similarity, known, bounds, law, (end,), places, samples=number)
 
 
 def _transport(shapes: list[StaticShape], config: EvolveConfig, budget: Budget | None) -> Problem:
-    shapes = aligned(shapes, "none")
+    shapes, times = aligned(shapes, "none"), [index / 8 for index in range(9)]
     reach = [
-        trajectories(_velocity(config, index, Similarity.identity()), shape.points(REACH_POINTS, 0), _reach_times())
+        trajectories(_velocity(config, index, Similarity.identity()), shape.points(REACH_POINTS, 0), times)
         for index, shape in enumerate(shapes)
     ]
     placed, region = into_unit_sphere(shapes, torch.cat(reach).reshape(-1, 3).double().numpy())
@@ -221,32 +218,26 @@ def _transport(shapes: list[StaticShape], config: EvolveConfig, budget: Budget |
         known = carried.samples(torch.cat(points))
         return (known, no_bounds()) if rigid else signs(known)
 
-    made = _sampled(samples, config, budget)
+    known, bounds, number = _sampled(samples, config, budget)
     law = transport(velocities[0], extend=not rigid) if len(placed) == 1 else None
     name = " + ".join(shape.name for shape in shapes)
     ends = tuple(
         End(name, time, *(carried.surface(placed, time, END_POINTS, seed) for seed in (0, 1))) for time in (0.0, 1.0)
     )
     similarity, places = _composed(shapes[0].similarity, region), _placements(placed)
-    return Problem(similarity, made.known, made.bounds, law, ends, places, samples=made.number)
+    return Problem(similarity, known, bounds, law, ends, places, samples=number)
 
 
-class _Sampled(NamedTuple):
-    """Known samples and bounds, and how many samples were asked for."""
-
-    known: Known
-    bounds: Bounds
-    number: int
-
-
-def _sampled(samples: Callable[[int], tuple[Known, Bounds]], config: EvolveConfig, budget: Budget | None) -> _Sampled:
-    """As many samples as the settings want, or as a time budget leaves time for."""
+def _sampled(
+    samples: Callable[[int], tuple[Known, Bounds]], config: EvolveConfig, budget: Budget | None
+) -> tuple[Known, Bounds, int]:
+    """Known samples and bounds, and their number: the settings', or what a time budget leaves time for."""
     count, left = config.samples, None if budget is None else budget.left()
     if budget is not None and left is not None:
         count = affordable(samples, config.samples, BUDGET.sampling_share * left)
         if count < config.samples:
             budget.notes.append(f"{count:,} known samples instead of {config.samples:,}")
-    return _Sampled(*samples(count), count)
+    return *samples(count), count
 
 
 def _velocity(config: EvolveConfig, index: int, region: Similarity) -> VectorField:
@@ -264,10 +255,6 @@ def _velocity(config: EvolveConfig, index: int, region: Similarity) -> VectorFie
 
 def _end(shape: StaticShape, time: float, seed: int) -> End:
     return End(shape.name, time, *(shape.points(END_POINTS, seed + 101 + index) for index in range(2)))
-
-
-def _reach_times() -> list[float]:
-    return [index / 8 for index in range(9)]
 
 
 def _placements(shapes: Sequence[StaticShape]) -> tuple[Placement, ...]:

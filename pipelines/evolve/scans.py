@@ -1,8 +1,4 @@
-"""Scans and meshes as shapes of an evolution: each file is fitted once, beside the run, and the fits are evolved.
-
-Meshes with the same faces are one mesh in several poses: their vertices are known to be the same, and some of them
-become the landmarks of a deformation.
-"""
+"""Scans and meshes as shapes of an evolution: each is fitted once, beside the run; poses of one mesh give landmarks."""
 
 from __future__ import annotations
 

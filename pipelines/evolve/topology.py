@@ -1,8 +1,7 @@
-"""Where and when a surface that moves changes its topology: pieces and holes, and the moments at which they change.
+"""Changes of topology of a surface that moves. Of c pieces with h holes the Euler number is χ = V − E + F = 2 (c − h).
 
-A closed surface of c pieces with h holes through them (the sum of their genera) has the Euler number
-χ = V − E + F = 2 (c − h). A smooth f(x, t) changes neither but where ∇f = 0 on the surface, at single points of
-space-time, so that two moments before and after a change differ near one place and nowhere else.
+f(x, t) changes it only where ∇f = 0 on the surface, at single points of space-time, so that two moments before and
+after a change differ near one place and nowhere else.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""Whether posed photographs can be right: figures of their cameras, and warnings about what is usually wrong.
-
-All lengths are in radii of the region of interest, because cameras are moved into its unit sphere first.
-"""
+"""Whether posed photographs can be right: figures of cameras, in radii of the region of interest, and warnings."""
 
 from __future__ import annotations
 

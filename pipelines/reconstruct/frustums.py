@@ -1,8 +1,4 @@
-"""Cameras as things to look at: frustums that carry their pictures, a wire sphere, axes and points, in one mesh.
-
-Everything is made of triangles with colours at their corners, because that is what every viewer shows: lines are tubes,
-points are octahedra. Coordinates are those of the unit sphere.
-"""
+"""Cameras as triangles with colours, in unit-sphere coordinates: frustums with pictures, a sphere, axes, points."""
 
 from __future__ import annotations
 

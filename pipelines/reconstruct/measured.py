@@ -1,7 +1,4 @@
-"""Depths that were measured along rays of the photographs: of depth maps and sparse points, for start and training.
-
-A measurement says two things: where the ray meets the surface, and that nothing is on the way there.
-"""
+"""Measured depths, of depth maps and sparse points: rays that meet the surface, and nothing before it."""
 
 from __future__ import annotations
 

@@ -51,21 +51,13 @@ def silhouettes(
     for view in views:
         camera, mask = view.camera.moved(similarity), _object_in(view)
         cut = bool(_border(mask).any())
-        mask = torch.from_numpy(_widened(mask, camera, 0.5 * edge, edge))
-        row, column, depth, inside = _pixels(camera, points)
+        mask = _widened(mask, camera, 0.5 * edge, edge)
+        pixels, depth, inside = camera.in_view(points.numpy())
+        column, row = np.rint(pixels[inside]).astype(np.int64).T
+        objects = inside.copy()
+        objects[inside] = mask[row, column]
         # What a picture does not show is no object, unless its rim cuts the object.
-        yield (
-            inside if cut else depth > 0,
-            inside & mask[row.clamp(0, camera.height - 1), column.clamp(0, camera.width - 1)],
-        )
-
-
-def _pixels(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Rows, columns and depths of points ``(N, 3)``, and which of them are in the picture ``(N,)``, each."""
-    pixels, depth = camera.project(points)
-    column, row = pixels.round().long().unbind(dim=1)
-    inside = (depth > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-    return row, column, depth, inside
+        yield torch.from_numpy(inside if cut else depth > 0), torch.from_numpy(objects)
 
 
 def _widened(mask: NDArray[np.bool_], camera: Camera, length: float, nearest: float) -> NDArray[np.bool_]:
@@ -180,9 +172,10 @@ class Agreement:
     def _shadow(self, view: PosedImage, points: Tensor) -> NDArray[np.bool_]:
         """Where a view sees points ``(N, 3)``, and all within a cell of them ``(H, W)``."""
         camera, edge = view.camera.moved(self.similarity), 2 / self.limits.cells
-        row, column, _, inside = _pixels(camera, points)
+        pixels, _, inside = camera.in_view(points.numpy())
+        column, row = np.rint(pixels[inside]).astype(np.int64).T
         there = np.zeros((camera.height, camera.width), dtype=bool)
-        there[row[inside].numpy(), column[inside].numpy()] = True
+        there[row, column] = True
         return _widened(there, camera, edge, edge)
 
 

@@ -1,8 +1,4 @@
-"""``reconstruct``: from posed photographs to a surface with colours, by volume rendering (NeuS) of a multiscale SDF.
-
-Colours are learnt by direction; at the end a texture learns those that most cameras see, which every other command can
-use.
-"""
+"""``reconstruct``: from posed photographs to a surface with colours, by volume rendering (NeuS) of a multiscale SDF."""
 
 from __future__ import annotations
 

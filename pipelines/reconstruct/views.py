@@ -103,11 +103,9 @@ def spread(views: Sequence[PosedImage]) -> list[PosedImage]:
 
 def reduced(view: PosedImage, pixels: int) -> PosedImage:
     """A view in about so many pixels, in linear light; as it is, if it has no more."""
-    camera = view.camera
-    share = math.sqrt(pixels / (camera.width * camera.height))
-    if share >= 1:
+    small = _coarse(view.camera, pixels)
+    if small is view.camera:
         return view
-    small = camera.resized(max(1, round(share * camera.width)), max(1, round(share * camera.height)))
     step = partial(shrink, width=small.width, height=small.height)
     mask = None if view.mask is None else step(view.mask)
     return PosedImage(view.name, small, resample(view.color, None, step)[0], mask)
@@ -217,7 +215,11 @@ def seen_points(field: Field, views: Sequence[SeenFrom]) -> tuple[Tensor, float]
 
 def _coarse(camera: Camera, pixels: int) -> Camera:
     """A camera in about so many pixels; as it is, if it has no more."""
-    share = min(1.0, math.sqrt(pixels / (camera.width * camera.height)))
+    share = math.sqrt(pixels / (camera.width * camera.height))
+    return camera if share >= 1 else _scaled(camera, share)
+
+
+def _scaled(camera: Camera, share: float) -> Camera:
     return camera.resized(max(1, round(share * camera.width)), max(1, round(share * camera.height)))
 
 
@@ -236,8 +238,7 @@ def count_views(
     """
     counts = np.zeros(len(points), dtype=np.int64)
     for index, camera in enumerate(cameras):
-        share = finest / max(camera.width, camera.height)
-        large = camera.resized(max(1, round(share * camera.width)), max(1, round(share * camera.height)))
+        large = _scaled(camera, finest / max(camera.width, camera.height))
         counts += sees(large, mesh_view(surface, large), points)
         if progress is not None:
             progress(index + 1, len(cameras))

@@ -1,10 +1,8 @@
 """Texture transport: the colours of a surface that moves are those that its points had at the start.
 
-Where it was is integrated back in time along the velocity that was learnt, or else for the vertices of a coarse mesh of
-the moment; what lies between them then moves by the affine map that fits the nearest ones best: displacements are
-smooth, colours need not be. Where surface is made anew, points come from places that are on no surface. Their nearest
-point would jump, so colours are averaged there, the wider the further away (`SpreadColors`). With the colours of the
-end too, both are carried and fade into each other with time.
+Where they were is integrated back in time along the velocity that was learnt, or else for the vertices of a coarse
+mesh; between these, points move by the affine map that fits the nearest ones best. Places that were on no surface have
+averaged colours (`SpreadColors`). Colours of the end, where there are any, fade in with time.
 """
 
 from __future__ import annotations

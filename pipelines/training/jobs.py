@@ -1,8 +1,4 @@
-"""Many independent pieces of work: one after the other, in streams of one GPU, or side by side in the workers of Ray.
-
-Ray (https://ray.io) is the extra ``ray``. It starts on this machine alone, joins no cluster, serves no dashboard and
-reports to nobody.
-"""
+"""Many independent pieces of work: one after the other, in streams of one GPU, or in local workers of Ray."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
-"""Steps of a training as CUDA graphs: all their operations in one launch, with nothing for the host to do in between.
+"""Steps of a training as CUDA graphs: the host takes longer to ask for a thousand small operations than a GPU to do.
 
-A training step of small networks is a thousand operations of microseconds, and the host takes longer to ask for them
-than a GPU to do them. Steps of one kind ask for the same ones: the first is done as usual, in fixed shapes, the second
-is recorded, and from then on it is replayed. What the host knows, random numbers, rates, comes through a `Supply`.
+The first step of a kind is done as usual, in fixed shapes, the second is recorded, and others are replayed. What the
+host knows, random numbers and rates, comes through a `Supply`.
 """
 
 from __future__ import annotations

@@ -259,6 +259,7 @@ def input_error(message: str) -> Exception:
 
 
 _per_level = functools.partial(setting, above=0, per_level=True)
+_share = functools.partial(setting, at_least=0, at_most=1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -282,15 +283,9 @@ class FitConfig(TrainingSettings):
     batch: int = setting(8192, "samples per training step", above=0)
     levels: int | None = setting(None, "train only this many levels, coarse to fine")
     data_weight: float = setting(1e4, "level 0: weight of (f(x) - d)^2, the distance d known (Eq. 4)", at_least=0)
-    residual_data_weight: float = setting(
-        1.0,
-        "the same of other levels, over the larger of the mean square error of the level before and the noise's",
-        at_least=0,
-    )
+    residual_data_weight: float = setting(1.0, "the same of other levels, over the mean square before", at_least=0)
     normal_weight: float = setting(300.0, "weight of 1 - cos(grad f, N), the normal N known (Eq. 4)", at_least=0)
-    robust_normals: bool = setting(
-        True, "residual levels of sparse clouds: large errors count linearly, so that sharp edges do not outweigh faces"
-    )
+    robust_normals: bool = setting(True, "residual levels of sparse clouds: large errors of normals count linearly")
     eikonal_weight: float = setting(50.0, "weight of (|grad f| - 1)^2 (Eq. 4)", at_least=0)
     domain_weight: float = setting(0.1, "factor on data_weight for level 0's distances away from the cloud", at_least=0)
     epsilon: float = setting(0.3, "margin of the bands (Eq. 5)", above=0)
@@ -308,27 +303,15 @@ class FitConfig(TrainingSettings):
     normals: Literal["auto", "file", "estimate", "none"] = setting(
         "auto", "where normals come from; none: level 0 learns from points alone, and orients their normals"
     )
-    sensor_origin: tuple[float, float, float] | None = setting(
-        None, "x y z of the sensor, in input units: estimated normals face it"
-    )
+    sensor_origin: tuple[float, float, float] | None = setting(None, "x y z of the sensor, which normals face")
     isolation: float | None = setting(
         30.0, "drop points whose 8th neighbour is this many times further away than usual; none keeps them", above=1
     )
-    merge_above: int | None = setting(
-        1_000_000,
-        "clouds of more points are merged, as they are read, to at most so many voxel means; none: never",
-        above=0,
-    )
-    drop_outliers: bool = setting(
-        True, "drop points that belong to no surface, by their neighbours and their distance to level 0"
-    )
+    merge_above: int | None = setting(1_000_000, "merge larger clouds to so many voxel means; none: never", above=0)
+    drop_outliers: bool = setting(True, "drop points that belong to no surface, by neighbours and distance to level 0")
     turn_normals: bool = setting(True, "turn single normals that oppose their neighbours' (not with --normals file)")
-    smooth_noise: bool = setting(
-        True, "move points along their normals to where their neighbours agree, if noise exceeds spacing"
-    )
-    between: bool = setting(
-        True, "learn between the points too, where neighbours and their normals agree on the surface"
-    )
+    smooth_noise: bool = setting(True, "move points along their normals to where neighbours agree, if noise is large")
+    between: bool = setting(True, "learn between the points too, where neighbours and normals agree on the surface")
     hold_out: float = setting(
         0.01,
         "share of the points held out to choose the best step of a level, and whether to keep it; 0: none",
@@ -369,26 +352,20 @@ class TextureConfig(TrainingSettings):
     band_batch: int = setting(2048, "points of the band per training step", above=0)
     tangential_weight: float = setting(0.3, "weight of the change of colour along the normals", at_least=0)
     samples: int = setting(400_000, "points on a mesh, and half as many in the band, to draw from", above=0)
-    delta: float | None = setting(
-        None, "half-width of the band in units of the field; none: the coarsest level's, at least 0.02", above=0
-    )
+    delta: float | None = setting(None, "half-width of the band; none: the coarsest level's, at least 0.02", above=0)
 
 
 @dataclass(frozen=True)
 class ReconstructConfig(TrainingSettings):
     """Settings of ``reconstruct``; the defaults are the ``default`` preset."""
 
-    geometry: Literal["multiscale", "neus"] = setting(
-        "multiscale", "a coarse SIREN and residuals in bands, or the 8 x 256 softplus network"
-    )
+    geometry: Literal["multiscale", "neus"] = setting("multiscale", "SIRENs in bands, or 8 x 256 softplus layers")
     widths: tuple[int, ...] = _per_level((128, 256), "neurons per layer, one number per level")
     depths: tuple[int, ...] = _per_level((4, 3), "sine layers, one number per level")
     omegas: tuple[float, ...] = _per_level((10.0, 30.0), "SIREN frequency of each level (Eq. 2)")
-    starts: tuple[float, ...] = setting(
-        (0.0, 0.25), "when each level is switched on, as shares of the training", per_level=True
-    )
+    starts: tuple[float, ...] = setting((0.0, 0.25), "share of the training before each level starts", per_level=True)
     features: int = setting(32, "appearance features of every level of the multiscale geometry", at_least=0)
-    taper: float = setting(0.3, "share of a band over which the next level fades out", at_least=0, at_most=1)
+    taper: float = _share(0.3, "share of a band over which the next level fades out")
     band: float = setting(4.0, "half-width of the bands in units of the surface's uncertainty 1/s", above=0)
     least_delta: float = setting(0.02, "half-width that a band keeps, in units of the region's radius", above=0)
     start: Literal["auto", "hull", "depths", "sphere"] = setting(
@@ -399,38 +376,24 @@ class ReconstructConfig(TrainingSettings):
     color_width: int = setting(128, "neurons per layer of the colour network", above=0)
     color_depth: int = setting(2, "layers of the colour network", above=0)
     color_frequencies: int = setting(4, "octaves of the colour network's position; NeuS has 0", at_least=0)
-    color_grid: int = setting(
-        512, "cells along the finest grid of the colour network's hash encoding; 0: none", at_least=0
-    )
+    color_grid: int = setting(512, "cells along the finest grid of the colours' hash encoding; 0: none", at_least=0)
     background: Literal["auto", "black", "white", "outside"] = setting(
         "auto", "what is behind the object; outside is learnt; auto: white with masks, else outside"
     )
-    allow_missing: bool = setting(
-        False, "go on where fewer than half of the photographs have a camera, and without those that are missing"
-    )
-    depth_maps: str | None = setting(
-        None, "folder with a depth map for each photograph; by default those that the data set names"
-    )
+    allow_missing: bool = setting(False, "go on without photographs that are missing, or have no camera")
+    depth_maps: str | None = setting(None, "folder with a depth map for each photograph; none: the data set's")
     depth_kind: Literal["metric", "relative", "disparity"] = setting(
         "metric", "depths in the units of the cameras; of unknown scale and shift; or inverse ones of that kind"
     )
     depth_scale: float | None = setting(
         None, "numbers of the depth maps per unit of the cameras; by default 1000 for integers, else 1", above=0
     )
-    exposure: Literal["off", "affine"] = setting(
-        "off", "affine: learn a gain and an offset of each photograph and colour"
-    )
+    exposure: Literal["off", "affine"] = setting("off", "affine: learn gain and offset of each photograph and colour")
     cameras: Literal["given", "refined"] = setting("given", "refined: learn a small rotation and shift of each camera")
     steps: int = setting(5000, "training steps", above=0)
     rays: int = setting(256, "rays per training step", above=0)
-    jets: int = setting(
-        3072,
-        "samples that a step evaluates, about: fewer rays, down to a quarter, while the surface is unsure; 0: no limit",
-        at_least=0,
-    )
-    focus: float = setting(
-        0.5, "share of the rays drawn by the error of their pixels; 0: all evenly", at_least=0, at_most=1
-    )
+    jets: int = setting(3072, "samples per step, about, by fewer rays while the surface is unsure; 0: any", at_least=0)
+    focus: float = _share(0.5, "share of the rays drawn by the error of their pixels; 0: all evenly")
     uniform: int = setting(48, "evenly spaced samples per ray", at_least=2)
     importance: int = setting(8, "samples per ray near the surface", at_least=0)
     texture_steps: int = setting(500, "training steps of the surface's texture; 0: uncoloured", at_least=0)
@@ -441,17 +404,11 @@ class ReconstructConfig(TrainingSettings):
     eikonal_weight: float = setting(0.05, "weight of (|grad f| - 1)^2", at_least=0)
     mask_weight: float = setting(0.1, "weight of the masks' cross-entropy, where there are masks", at_least=0)
     depth_weight: float = setting(0.5, "weight of measured depths (depth maps, COLMAP's points); 0: unused", at_least=0)
-    anneal: float = setting(0.2, "share of the training with annealed slopes", at_least=0, at_most=1)
+    anneal: float = _share(0.2, "share of the training with annealed slopes")
     least_weight: float = setting(1e-4, "samples that contribute less to their pixel get no colour", at_least=0)
-    skip: float = setting(
-        1e-3, "samples of smaller estimated weight are not evaluated; 0: all are", at_least=0, at_most=1
-    )
-    skip_share: float = setting(
-        0.03, "share of the skipped samples evaluated for the eikonal term", at_least=0, at_most=1
-    )
-    march_grid: int = setting(
-        64, "cells along the grid of coarse values that places samples; 0: the network", at_least=0
-    )
+    skip: float = _share(1e-3, "samples of smaller estimated weight are not evaluated; 0: all are")
+    skip_share: float = _share(0.03, "share of the skipped samples evaluated for the eikonal term")
+    march_grid: int = setting(64, "cells along the SDF grid that places samples; 0: the network does", at_least=0)
     graphs: bool = setting(True, "on a GPU, record each kind of step once, and replay it as one CUDA graph")
     width: int | None = setting(None, "shrink the pictures to this many pixels across before training", above=0)
     test_every: int = setting(8, "every n-th picture is held out and measured; 0 trains on all", at_least=0)
@@ -574,19 +531,13 @@ class ShadeOptions(Settings):
     light_level: int | None = setting(0, "level in which shadows and occlusion are traced; none: the one shown")
     softness: float = setting(0.15, "how fast shadows blur with the distance they fall; 0.001 is sharp", above=0)
     reach: float = setting(0.12, "how far around a point occlusion looks, in units of the field", above=0)
-    clay: tuple[float, float, float] = setting(
-        (0.80, 0.78, 0.74), "r g b of a surface without colours, in [0, 1]", at_least=0, at_most=1
-    )
+    clay: tuple[float, float, float] = _share((0.80, 0.78, 0.74), "r g b of a surface without colours, in [0, 1]")
     back_faces: bool = setting(False, "tint what is seen from behind, so that holes and wrong normals show")
     detail: float = setting(4e-3, "curvature: how wide a patch it is measured on, in units of the field", above=0)
     matcap: str = setting("clay", "clay, chrome, or a PNG or JPEG of a sphere that fills it")
-    limits: tuple[float, float] | None = setting(
-        None, "values at the ends of the colour map (depth, curvature, error); none: fitted"
-    )
+    limits: tuple[float, float] | None = setting(None, "values at the ends of the colour map; none: fitted")
     quantile: float = setting(0.95, "share of pixels within fitted limits (curvature, error)", above=0, at_most=1)
-    relief: float = setting(
-        0.35, "shading of the colours of curvature and error by a headlight, in [0, 1]", at_least=0, at_most=1
-    )
+    relief: float = _share(0.35, "shading of the colours of curvature and error by a headlight")
 
     def __post_init__(self) -> None:
         super().__post_init__()
