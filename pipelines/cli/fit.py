@@ -185,7 +185,7 @@ def _depth_input(arguments: argparse.Namespace, cloud: str) -> DepthInput | None
         InputError: there are flags of depth maps, but CLOUD is none.
     """
     from ...datasets import DepthSettings, is_depth_file
-    from ...datasets.depth.images import DEPTH_SUFFIXES
+    from ...datasets.files import DEPTH_SUFFIXES
     from ..fit.depth import DepthInput
 
     given = [

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ...datasets import read_cameras, srgb_to_linear
 from ...datasets.cameras import Camera
 from ...datasets.clouds.cleaning.orientation import fibonacci_directions
-from ...datasets.views.formats.depth_maps import DepthMap, DepthSource
+from ...datasets.views.formats.shots import DepthMap, DepthSource
 from ...datasets.views.images import PosedImage, PosedImages, read_posed_images
 from ...datasets.views.poses.colmap_process import Report as ColmapReport
 from ...datasets.views.poses.find_cameras import FoundCameras

@@ -153,6 +153,9 @@ class Trainer(Generic[O]):
         seconds: end the schedule after this long even if steps remain; None for no limit.
         clip: largest norm of the whole gradient; None for any.
         network_name: what the network is called in `state`.
+        betas: of Adam.
+        eps: of Adam.
+        amsgrad: second moments never fall.
     """
 
     def __init__(
@@ -164,11 +167,16 @@ class Trainer(Generic[O]):
         seconds: float | None = None,
         clip: float | None = None,
         network_name: str = "network",
+        betas: tuple[float, float] = (0.9, 0.99),
+        eps: float = 1e-8,
+        amsgrad: bool = False,
     ) -> None:
         self.objective, self.stage, self.steps, self.seconds, self.clip = objective, stage, steps, seconds, clip
         groups = [list(group.parameters) for group in objective.groups]
         self.trained = [parameter for group in groups for parameter in group]
-        self.adam = torch.optim.Adam([{"params": group} for group in groups], betas=(0.9, 0.99), fused=True)
+        self.adam = torch.optim.Adam(
+            [{"params": group} for group in groups], betas=betas, eps=eps, amsgrad=amsgrad, fused=True
+        )
         self.step, self.elapsed = 0, 0.0
         self.losses: dict[str, float] = {}
         self._name = f"{network_name}."
