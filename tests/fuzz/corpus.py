@@ -39,8 +39,6 @@ from mplicits.pipelines.training.folder import RECORD_FILE, STATE_FILE, load_sta
 from mplicits.pipelines.training.settings import FitConfig, load_config
 from mutate import damaged, damaged_json
 
-__all__ = ["Specimen", "specimens"]
-
 Damage = Callable[[bytes, random.Random], bytes]
 
 # And two points more, for there must be ten at least to be a cloud.
