@@ -28,11 +28,6 @@ class Run(Generic[F]):
     directory: Path | None
     record: dict[str, Any]
 
-    @property
-    def folder(self) -> Path | None:
-        """Where it was written, or None."""
-        return self.directory
-
     def shape(self, time: float | None = None) -> WorldField:
         """The field in input coordinates and units: distances, normals, closest points, rays, meshes.
 
