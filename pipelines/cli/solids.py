@@ -6,7 +6,7 @@ import argparse
 import time
 from typing import TYPE_CHECKING
 
-from ..training.config import given_flags
+from ..training.settings import given_flags
 from .common import Command, add_flags
 from .mesh import MESH_FILES, UNITS
 

@@ -1,0 +1,238 @@
+"""A start of the geometry, carved out of a grid: what all masks take for object, and no measured ray passes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation, distance_transform_edt
+from torch import Tensor, nn
+
+from ...datasets.views.images import PosedImage, PosedImages
+from ...neural_fields import InputError, MultiscaleSDF, Similarity, Siren
+from ...neural_fields.fields.losses import data_loss, eikonal_loss
+from ...neural_fields.networks.value_grid import ValueGrid
+from ...neural_fields.volume.weights import sphere_span
+from ..training.settings import ReconstructConfig
+from ..training.trainer import seeded
+from .measured import MeasuredDepths
+from .model import SceneModel
+from .silhouettes import Agreement, grid_in_ball, silhouettes
+
+
+def seen_through(measured: MeasuredDepths, resolution: int, *, rays: int = 1 << 18, least: int = 2) -> Tensor:
+    """Which vertices of a grid over [−1, 1]³ measured rays pass ``(resolution + 1,) * 3``, on the CPU.
+
+    A vertex is passed where at least ``least`` of up to ``rays`` rays go through the cell around it before they end
+    beyond it, and no fewer than end there: one wrong measurement carves no hole. Right measurements pass no vertex that
+    lies deeper inside than half the diagonal of a cell. Rays whose depth is not known yet are left out.
+    """
+    count, edge = resolution + 1, 2 / resolution
+    passed, ended = (torch.zeros(count**3, dtype=torch.int64, device=measured.device) for _ in range(2))
+    rows = torch.arange(len(measured), device=measured.device)[:: max(1, len(measured) // rays)]
+    steps = torch.arange(round(2 / edge) * 2, device=measured.device) * (edge / 2)
+    for part in rows.split(1 << 14):
+        origins, directions, reach = measured.at(part)[:3]
+        near, far = sphere_span(origins, directions)
+        depths = near[:, None] + steps
+        # Not the last cell and a half: that is where the surface is, as well as it was measured.
+        kept = depths < torch.minimum(reach - 1.5 * edge, far)[:, None]
+        places = origins[:, None] + depths[..., None] * directions[:, None]
+        cells = _cell(places, resolution)
+        # Half-cell steps meet a cell more than once; a ray counts once.
+        first = torch.ones_like(kept)
+        first[:, 1:] = cells[:, 1:] != cells[:, :-1]
+        passed += torch.bincount(cells[kept & first], minlength=count**3)
+        inside = (reach > near) & (reach < far)
+        ends = _cell(origins + reach[:, None] * directions, resolution)
+        ended += torch.bincount(ends[inside], minlength=count**3)
+    return ((passed >= least) & (passed >= ended)).reshape(count, count, count).cpu()
+
+
+def _cell(points: Tensor, resolution: int) -> Tensor:
+    """Number of the vertex that is next to each point ``(...,)``."""
+    x, y, z = ((points.clamp(-1, 1) + 1) * (0.5 * resolution)).round().long().unbind(dim=-1)
+    return (x * (resolution + 1) + y) * (resolution + 1) + z
+
+
+@dataclass(frozen=True)
+class HullOptions:
+    """How a start is carved and learnt. The values are this project's own."""
+
+    resolution: int = 48  # cells along the grid that measured rays carve
+    coarsest: int = 32  # cells along the coarsest grid that silhouettes carve; doubled until they suit the pixels
+    finest: int = 128  # the same at most: the coarse level could not follow a finer one
+    pixels: float = 1.5  # largest cells, in pixels
+    # share of the views that must take a point for object: through a gap often one camera looks alone
+    agree: float = 0.99
+    seeing: float = 0.25  # share of all views that must see it
+    room: float = 3.0  # edges of a cell within which a coarse vertex must see object, to have finer ones tried
+    least: float = 1e-3  # share of the unit ball that a hull fills at least
+    most: float = 0.5  # the same at most, of silhouettes
+    # the same of what no measured ray passes: of a scene that is seen from one side, much is not seen
+    most_unseen: float = 0.9
+    steps: int = 250  # of Adam, in which the network learns the distances
+    batch: int = 1024  # points per step
+    rate: float = 2e-3  # of Adam, at first
+    data_weight: float = 100.0  # weight of the squared error of the distance
+    eikonal_weight: float = 0.1  # weight of (|∇f| − 1)²
+
+
+HULL = HullOptions()
+
+
+def begin(
+    model: SceneModel,
+    views: Sequence[PosedImage],
+    images: PosedImages,
+    config: ReconstructConfig,
+    measured: MeasuredDepths | None = None,
+    agreement: Agreement | None = None,
+) -> str:
+    """Give an untrained scene, in place, the start that its settings ask for; it is a sphere already.
+
+    Returns "hull" (carved by measured rays too, unless it was asked for by name), "depths" (what no measured ray
+    passes) or "sphere". ``agreement`` is that of the ``views``, if it is known.
+
+    Raises:
+        InputError: a start was asked for that there is not.
+    """
+    base = model.geometry.base if isinstance(model.geometry, MultiscaleSDF) else None
+    masked = all(view.mask is not None for view in views) and config.start != "depths"
+    carving = None if config.start == "hull" else measured
+    if config.start != "sphere" and isinstance(base, Siren) and (masked or carving is not None):
+        empty = None if carving is None else seen_through(carving, HULL.resolution).numpy()
+        carved = (agreement or Agreement.of(views, images.similarity)).trusted() if masked else ()
+        distances = carve(carved, images.similarity, empty=empty)
+        if distances is not None:
+            start_at_hull(base, distances, seed=config.seed)
+            return "hull" if masked else "depths"
+    if config.start in ("hull", "depths"):
+        wants = {
+            "hull": "visual hull to begin with, which wants masks on all pictures that leave a part of the region",
+            "depths": "start by measured depths, which wants depth maps in the cameras' units or COLMAP's points",
+        }
+        raise InputError(
+            f"{images.source}: no {wants[config.start]}, and --geometry multiscale; see `mplicits check-cameras`, or "
+            "take --start sphere"
+        )
+    return "sphere"
+
+
+def carve(
+    views: Sequence[PosedImage],
+    similarity: Similarity,
+    *,
+    resolution: int | None = None,
+    empty: NDArray[np.bool_] | None = None,
+) -> NDArray[np.float64] | None:
+    """Signed distances to what is left of the unit ball at the vertices of a grid over [−1, 1]³, negative inside.
+
+    A vertex of the unit ball is inside where `HullOptions.agree` of the views that see it find object within half a
+    cell, so that thin parts stay; without views, where ``empty`` ``(E, E, E)``, a grid over the same cube, does not
+    exclude it. Grids of half as many cells come first, so that most vertices are decided by a few.
+
+    Returns:
+        ``(resolution + 1,) * 3`` distances by x, y and z, exact to about a cell; None where too little or too much of
+        the ball is left, as by empty and full masks.
+    """
+    if resolution is None:
+        resolution = fitting_resolution(views, similarity) if views or empty is None else len(empty) - 1
+    solid, ball = _object_vertices(views, similarity, resolution)
+    if empty is not None:
+        solid &= ~_all_around(empty, resolution)
+    if not HULL.least < solid.sum() / ball < (HULL.most if views else HULL.most_unseen):
+        return None
+    # The surface lies half a cell from the outermost vertices inside.
+    outer, inner = (np.asarray(distance_transform_edt(part), dtype=np.float64) for part in (~solid, solid))
+    return 2 / resolution * np.where(solid, 0.5 - inner, outer - 0.5)
+
+
+def fitting_resolution(views: Sequence[PosedImage], similarity: Similarity) -> int:
+    """Cells along an edge of [−1, 1]³ that are hardly larger than what a pixel sees in its middle."""
+    cameras = [view.camera.moved(similarity) for view in views]
+    pixel = float(np.median([float(camera.eye.norm() / camera.intrinsics[0, 0]) for camera in cameras] or [1.0]))
+    resolution = HULL.coarsest
+    while resolution < HULL.finest and 2 / resolution > HULL.pixels * pixel:
+        resolution *= 2
+    return resolution
+
+
+def _object_vertices(
+    views: Sequence[PosedImage], similarity: Similarity, resolution: int
+) -> tuple[NDArray[np.bool_], int]:
+    """Vertices that enough views take for object ``(resolution + 1,) * 3``, and how many are asked.
+
+    Those in the unit ball are; without views all of them are object.
+    """
+    ball, sizes = 0, [resolution]
+    while views and sizes[0] > HULL.coarsest and sizes[0] % 2 == 0:
+        sizes.insert(0, sizes[0] // 2)
+    solid = np.ones(3 * (sizes[0] + 1,), dtype=bool)
+    for size in sizes:
+        count = size + 1
+        points, places = grid_in_ball(size)
+        ball = len(places)
+        if count > len(solid):
+            # Beside a vertex that is object there is one of the coarser grid that is, with room to spare.
+            near = binary_dilation(solid, np.ones((3, 3, 3)))
+            for axis in range(3):
+                near = near.repeat(2, axis=axis)
+            among = torch.from_numpy(near[:count, :count, :count].reshape(-1))[places]
+            points, places = points[among], places[among]
+        if views:
+            places = places[_agreed(views, similarity, points, 2 / size * (1 if size == resolution else HULL.room))]
+        solid = np.zeros(count**3, dtype=bool)
+        solid[places.numpy()] = True
+        solid = solid.reshape(count, count, count)
+    return solid, ball
+
+
+def _agreed(views: Sequence[PosedImage], similarity: Similarity, points: Tensor, edge: float) -> Tensor:
+    """Which points ``(N, 3)`` are object for enough of the views that see them, if enough do ``(N,)``."""
+    seen, object_in = torch.zeros(len(points)), torch.zeros(len(points))
+    for sees, objects in silhouettes([view for view in views if view.mask is not None], similarity, points, edge):
+        seen += sees
+        object_in += objects
+    return (object_in >= HULL.agree * seen) & (seen >= max(1.0, HULL.seeing * len(views)))
+
+
+def _all_around(empty: NDArray[np.bool_], resolution: int) -> NDArray[np.bool_]:
+    """Vertices of another grid over the same cube whose neighbours in this one are all empty."""
+    for axis in range(3):
+        place = np.linspace(0, empty.shape[axis] - 1, resolution + 1)
+        below, above = (np.take(empty, end(place).astype(int), axis=axis) for end in (np.floor, np.ceil))
+        empty = below & above
+    return empty
+
+
+def start_at_hull(network: Siren, distances: NDArray[np.float64], *, seed: int = 0, steps: int = HULL.steps) -> None:
+    """Train a SIREN in place to the distances of `carve`, smoothed as far as it cannot follow."""
+    place = network.output.weight
+    grid = ValueGrid(len(distances) - 1, place.device)
+    grid.kept.copy_(torch.from_numpy(distances).to(place))
+    units = network.units
+    network.set_units()
+    adam = torch.optim.Adam(network.parameters(), lr=HULL.rate, betas=(0.9, 0.99))
+    with seeded(seed):
+        for step in range(steps):
+            points = _in_ball(HULL.batch).to(place)
+            jet = network.jet(points)
+            loss = HULL.data_weight * data_loss(jet.value, grid(points)) + HULL.eikonal_weight * eikonal_loss(
+                jet.gradient
+            )
+            for group in adam.param_groups:
+                group["lr"] = HULL.rate * (1 - step / steps)
+            adam.zero_grad(set_to_none=True)
+            loss.mean().backward()
+            adam.step()
+    network.set_units(*units)
+
+
+def _in_ball(count: int) -> Tensor:
+    """Points ``(count, 3)``, evenly spread in the unit ball."""
+    directions = nn.functional.normalize(torch.randn(count, 3), dim=1)
+    return torch.rand(count, 1) ** (1 / 3) * directions

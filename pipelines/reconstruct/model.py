@@ -1,0 +1,300 @@
+"""What ``reconstruct`` learns, and from what: a scene of geometry, colours and uncertainty, and rays of pictures."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from ...datasets.cameras import Camera
+from ...datasets.views.images import PosedImage
+from ...neural_fields import Field, InputError, Jet, MultiscaleSDF, Similarity, Siren
+from ...neural_fields.backend.devices import handed, precise
+from ...neural_fields.networks.hash_encoding import HashEncoding
+from ...neural_fields.networks.neus_mlp import NeusSDF
+from ...neural_fields.networks.radiance import Outside, Radiance, ViewColor
+from ...neural_fields.networks.sphere_init import fit_sphere
+from ...neural_fields.volume.render import Rendered, Sampling, render_volume
+from ...neural_fields.volume.weights import sphere_span
+from ..training.settings import ReconstructConfig
+from ..training.trainer import Focus, seeded
+
+# Kinds of devices on which matrix products of colours are in bfloat16.
+HALF_PRECISION = ("cuda",)
+
+
+class Exposures(nn.Module):
+    """Brightness and white balance of each photograph: p = g_v c + o_v for each channel, g_v > 0.
+
+    The geometric mean of all gains is 1 and the mean of all offsets 0, so that colours stay those of the usual
+    photograph.
+    """
+
+    def __init__(self, views: int) -> None:
+        super().__init__()
+        self.logs, self.shifts = nn.Parameter(torch.zeros(views, 3)), nn.Parameter(torch.zeros(views, 3))
+
+    def forward(self) -> tuple[Tensor, Tensor]:
+        """Gains and offsets, ``(V, 3)`` each."""
+        return (self.logs - self.logs.mean(dim=0)).exp(), self.shifts - self.shifts.mean(dim=0)
+
+
+class PoseCorrections(nn.Module):
+    """Small rotations and shifts of the cameras: v → exp([ω_v]×) v for directions, o → o + t_v for eyes.
+
+    The means of all ω and of all t are 0, so that the scene as a whole stays where it is (to the first order).
+    """
+
+    def __init__(self, views: int) -> None:
+        super().__init__()
+        self.turns, self.shifts = nn.Parameter(torch.zeros(views, 3)), nn.Parameter(torch.zeros(views, 3))
+
+    def forward(self) -> tuple[Tensor, Tensor]:
+        """Rotation vectors ω in radians, and shifts in radii of the region, ``(V, 3)`` each."""
+        return self.turns - self.turns.mean(dim=0), self.shifts - self.shifts.mean(dim=0)
+
+    def moved(self, origins: Tensor, directions: Tensor, view: Tensor) -> tuple[Tensor, Tensor]:
+        """Origins and directions ``(R, 3)`` of rays of the cameras with the numbers ``view`` ``(R,)``, corrected."""
+        turns, shifts = self()
+        # Rodrigues: v cos θ + (ω × v) sin θ / θ + ω ⟨ω, v⟩ (1 − cos θ) / θ², the last factor as half a sinc squared.
+        # (PyTorch's exponential of matrices would make a GPU wait.) The root has a slope at 0, too.
+        angle = (turns.square().sum(dim=1, keepdim=True) + 1e-20).sqrt()
+        first, second = torch.sinc(angle / math.pi), 0.5 * torch.sinc(0.5 * angle / math.pi).square()
+        turn, cosine, first, second, shift = (
+            part.index_select(0, view) for part in (turns, angle.cos(), first, second, shifts)
+        )
+        along = (turn * directions).sum(dim=1, keepdim=True)
+        turned = cosine * directions + first * torch.linalg.cross(turn, directions) + second * along * turn
+        return origins + shift, turned
+
+
+class SceneModel(nn.Module):
+    """Everything that a pixel's colour depends on, in unit-sphere coordinates.
+
+    ``outside`` is the background field, None without one; ``background`` ``(3,)`` is the colour behind everything.
+    """
+
+    def __init__(
+        self,
+        geometry: Field,
+        color: ViewColor,
+        outside: Outside | None,
+        background: Tensor,
+        exposures: Exposures | None = None,
+        poses: PoseCorrections | None = None,
+    ) -> None:
+        super().__init__()
+        self.geometry, self.color, self.outside = geometry, color, outside
+        self.exposures, self.poses = exposures, poses
+        self.variance = nn.Parameter(torch.tensor(0.3))  # NeuS's, so that s begins at 20
+        self.register_buffer("background", background)
+        self.background: Tensor
+
+    @classmethod
+    def of(cls, geometry: Field, radiance: Radiance) -> SceneModel:
+        """A scene that was trained, of its geometry and its `Radiance`."""
+        model = cls(geometry, radiance.color, radiance.outside, radiance.background).to(radiance.background.device)
+        with torch.no_grad():
+            model.variance.fill_(math.log(radiance.inv_std) / 10)
+        return model.requires_grad_(False)
+
+    def radiance(self) -> Radiance:
+        """What rays see of the geometry; without exposures and poses, which are the photographs'."""
+        return Radiance(self.color, self.outside, self.background, float(self.inv_std.detach()))
+
+    @property
+    def inv_std(self) -> Tensor:
+        """The s of NeuS, exp(10 v), 0-d: one learning rate serves v and the networks."""
+        return (10 * self.variance).exp().clamp(max=1e6)
+
+    def widen(self, band: float, least: float) -> None:
+        """Make all bands ``band`` / s wide, but at least ``least``: as wide as the surface is unsure."""
+        if len(self.geometry.deltas):
+            inv_std = self.inv_std.detach()
+            width = (band / inv_std.to(precise(inv_std.device))).clamp(min=least)
+            self.geometry.deltas.copy_(width.expand_as(self.geometry.deltas))
+
+    def photographed(self, seen: Rendered, view: Tensor) -> Tensor:
+        """Colours ``(R, 3)`` of rendered rays as photographs with the numbers ``view`` ``(R,)`` show them.
+
+        A background that is known has the same colour in all of them; one that is learnt is a part of the photograph.
+        """
+        if self.exposures is None:
+            return seen.color
+        gain, offset = (part.index_select(0, view) for part in self.exposures())
+        if self.outside is not None:
+            return gain * seen.color + offset
+        behind = (1 - seen.opacity)[:, None] * self.background
+        return gain * (seen.color - behind) + seen.opacity[:, None] * offset + behind
+
+    def render(
+        self,
+        origins: Tensor,
+        directions: Tensor,
+        sampling: Sampling,
+        *,
+        cos_anneal: Tensor | float = 1.0,
+        level: int = -1,
+        least_weight: float = 0.0,
+        skip: float = 0.0,
+        skip_share: float = 0.0,
+        guide: Callable[[Tensor], Tensor] | None = None,
+        generator: torch.Generator | None = None,
+    ) -> Rendered:
+        """`render_volume` of this scene, with colours in half precision on a GPU."""
+
+        def color(x: Tensor, direction: Tensor, jet: Jet) -> Tensor:
+            with torch.autocast(x.device.type, torch.bfloat16, enabled=x.device.type in HALF_PRECISION):
+                return self.color(x, direction, jet).float()
+
+        return render_volume(
+            self.geometry,
+            color,
+            origins,
+            directions,
+            inv_std=self.inv_std,
+            sampling=sampling,
+            cos_anneal=cos_anneal,
+            level=level,
+            background=self.background,
+            outside=self.outside,
+            early_stop_eps=least_weight,
+            alpha_threshold=skip,
+            skip_share=skip_share,
+            sdf_grid=guide,
+            generator=generator,
+        )
+
+
+def build_scene(config: ReconstructConfig, *, has_masks: bool, views: int = 0) -> SceneModel:
+    """An untrained scene: a sphere of unknown colour, and so many photographs to learn exposures or poses of."""
+    background = config.background
+    if background == "auto":
+        background = "white" if has_masks else "outside"
+    with seeded(config.seed):
+        if config.geometry == "neus":
+            geometry: Field = NeusSDF(radius=config.radius)
+            features = 256
+        else:
+            features = config.features
+            geometry = MultiscaleSDF.from_widths(
+                list(zip(config.widths, config.depths, strict=True)),
+                omegas=config.omegas,
+                deltas=[config.radius] * (len(config.widths) - 1),
+                taper=config.taper,
+                num_features=features,
+                residual_gain=0.01,
+            )
+            base = geometry.base
+            assert isinstance(base, Siren)
+            fit_sphere(base, config.radius)
+        finest = config.color_grid
+        color = ViewColor(
+            features,
+            width=config.color_width,
+            depth=config.color_depth,
+            point_frequencies=config.color_frequencies,
+            grid=HashEncoding.up_to(finest) if finest else None,
+        )
+        outside = None
+        if background == "outside" and finest:
+            around = HashEncoding.up_to(finest, extent=2.0)
+            outside = Outside(width=64, depth=2, point_frequencies=4, grid=around)
+        elif background == "outside":
+            outside = Outside()
+    exposures = Exposures(views) if config.exposure == "affine" else None
+    poses = PoseCorrections(views) if config.cameras == "refined" else None
+    return SceneModel(geometry, color, outside, torch.full((3,), float(background == "white")), exposures, poses)
+
+
+class Rays(NamedTuple):
+    """Rays in unit-sphere coordinates, and what the pictures say about them."""
+
+    origins: Tensor  # (R, 3)
+    directions: Tensor  # (R, 3) unit vectors
+    color: Tensor  # (R, 3) display RGB in [0, 1]
+    mask: Tensor  # (R,) how much of the pixel is object; 1 everywhere without masks
+    view: Tensor  # (R,) number of the picture
+    row: Tensor  # (R,) number of the pixel in the pool
+
+
+def camera_rays(camera: Camera) -> tuple[Tensor, Tensor]:
+    """Origins and unit directions, both ``(H · W, 3)`` float32, of a camera's pixels."""
+    eye, directions = camera.rays()
+    return eye.expand(directions.shape[:2].numel(), 3), directions.reshape(-1, 3)
+
+
+class RayPool:
+    """The pixels whose rays meet the unit sphere; ``whole``: all of them, where what lies outside is learnt too.
+
+    Of a view, by its number, pixels ``(H, W)`` are ``left_out``. Of all pixels only the colours are kept; directions
+    follow from the pixel's number when rays are drawn.
+
+    Raises:
+        InputError: no ray of any picture meets the region of interest.
+    """
+
+    def __init__(
+        self,
+        views: Sequence[PosedImage],
+        similarity: Similarity,
+        device: torch.device,
+        *,
+        whole: bool = False,
+        left_out: Mapping[int, np.ndarray] | None = None,
+    ) -> None:
+        self.device, self.has_masks = device, all(view.mask is not None for view in views)
+        cameras = [view.camera.moved(similarity) for view in views]
+        self.eyes = torch.stack([camera.eye for camera in cameras]).float().to(device)
+        self.axes = torch.stack([camera.world_from_camera[:3, :3] for camera in cameras]).float().to(device)
+        lens = [camera.intrinsics[[0, 1, 0, 1], [0, 1, 2, 2]] for camera in cameras]
+        self.lens = torch.stack(lens).float().to(device)  # (V, 4): fx, fy, cx, cy
+        self.widths = torch.tensor([camera.width for camera in cameras], device=device)
+        colors, masks, pixels, owners, hits = [], [], [], [], 0
+        for index, (view, camera) in enumerate(zip(views, cameras, strict=True)):
+            near, far = sphere_span(*camera_rays(camera))
+            hit = far > near
+            hits += int(hit.sum())
+            wanted = torch.ones_like(hit) if whole else hit
+            if left_out and index in left_out:
+                wanted = wanted & ~torch.from_numpy(left_out[index].reshape(-1))
+            kept = wanted.nonzero()[:, 0]
+            pixels.append(kept.int())
+            owners.append(torch.full_like(kept, index, dtype=torch.int16))
+            # Eight bits hold what pictures hold; a pool of float32 would be four times as large.
+            colors.append(_bytes(view.color.reshape(-1, 3))[kept])
+            if self.has_masks and view.mask is not None:
+                masks.append(_bytes(view.mask.reshape(-1))[kept])
+        self.colors, self.pixels = torch.cat(colors).to(device), torch.cat(pixels).to(device)
+        self.owners = torch.cat(owners).to(device)
+        self.masks = torch.cat(masks).to(device) if masks else None
+        if not hits:
+            raise InputError("no pixel of any picture sees the region of interest; see `mplicits check-cameras`")
+
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+    def draw(self, count: int, generator: torch.Generator, focus: Focus | None = None) -> Rays:
+        """``count`` rays at random, with replacement; ``focus`` says where."""
+
+        def draw() -> Tensor:
+            if focus is None:
+                return torch.randint(len(self), (count,), generator=generator)
+            return focus.rows(count, generator)
+
+        rows = handed(draw, self.device)
+        view, pixel = self.owners[rows].long(), self.pixels[rows].long()
+        fx, fy, cx, cy = self.lens[view].unbind(dim=1)
+        x, y = pixel % self.widths[view], pixel // self.widths[view]
+        seen = torch.stack(((x - cx) / fx, (y - cy) / fy, torch.ones_like(fx)), dim=1)
+        directions = torch.nn.functional.normalize(torch.einsum("rij,rj->ri", self.axes[view], seen), dim=1)
+        mask = torch.ones(len(rows), device=self.device) if self.masks is None else self.masks[rows] / 255
+        return Rays(self.eyes[view], directions, self.colors[rows] / 255, mask, view, rows)
+
+
+def _bytes(numbers: np.ndarray) -> Tensor:
+    return torch.from_numpy(np.rint(np.clip(numbers, 0, 1) * 255).astype(np.uint8))
