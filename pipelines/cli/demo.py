@@ -53,17 +53,10 @@ def demo(
     up: str | None = None,
     resolution: int = 320,
 ) -> int:
-    """Fit a cloud, write its meshes and a picture into ``out``, print figures.
+    """Fit a cloud, write its meshes and a picture into ``out``, and print figures.
 
-    Args:
-        cloud: a point-cloud file; None takes the bundled scan, whose exact distance is known.
-        out: directory for scan.ply (the bundled scan), run/, mesh.ply, mesh.glb and picture.png.
-        config: of the fit.
-        up: axis that points up in the picture, "y" or "z".
-        resolution: of the meshes.
-
-    Raises:
-        InputError: the cloud cannot be used, or ``out`` cannot be made.
+    Without a cloud, the bundled scan is fitted and compared with its exact surface. ``up`` is "y" or "z". Raises an
+    InputError if the cloud cannot be used or ``out`` cannot be made.
     """
     started = time.monotonic()
     out = Path(out)
@@ -127,13 +120,9 @@ def _extract(field: Field, level: int, resolution: int) -> Mesh:
 
 
 def spread_colors(mesh: Mesh, cloud: PointCloud, similarity: Similarity, *, neighbors: int = 4) -> Mesh:
-    """The mesh with each vertex coloured by the nearest points; as it is, where the cloud has no colours.
+    """The mesh with colours at its vertices: means of the nearest points, weighted by 1 / distance².
 
-    Args:
-        mesh: in unit-sphere coordinates.
-        cloud: in input coordinates.
-        similarity: from one to the other.
-        neighbors: how many points share in a vertex (2 or more), by the inverse of their squared distances.
+    The mesh is in unit-sphere coordinates, the cloud in input coordinates. Without colours the mesh stays as it is.
     """
     points = from_cloud(cloud).moved(similarity)
     if points.colors is None:
@@ -154,15 +143,9 @@ def draw_levels(
     up: str,
     drawn: list[Image] | None = None,
 ) -> Image:
-    """The cloud and each level side by side, all from one camera; with the mesh, where that has colours.
+    """The cloud and each level side by side from one camera, and the mesh of the finest if it has colours.
 
-    Args:
-        cloud: in input coordinates.
-        field: whose levels are traced.
-        mesh: of the finest, in unit-sphere coordinates; None leaves it out.
-        similarity: from input to unit-sphere coordinates.
-        up: "y" or "z".
-        drawn: pictures of the first levels from an earlier call, which are not drawn again; new ones are added.
+    ``drawn`` holds the pictures of levels from an earlier call; new ones are appended to it.
     """
     drawn = [] if drawn is None else drawn
     points = from_cloud(cloud).moved(similarity)

@@ -1,6 +1,6 @@
-"""``mplicits COMMAND …``: the table of all commands, and those of a few lines: info, doctor, sample, demo.
+"""``mplicits COMMAND …``: the table of all commands, and the short ones: info, doctor, sample, demo.
 
-Commands load what they need, torch above all, when they run; never for help or for a mistake in the arguments.
+Commands import torch and the like when they run, never for help or a mistake in the arguments.
 """
 
 from __future__ import annotations

@@ -45,9 +45,9 @@ def photograph_mesh(
     depths: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> PosedImages:
-    """Posed images of a mesh, as `render_scene` makes them of exact scenes, in the coordinates of its file.
+    """Posed images of a mesh in its file's coordinates, as `render_scene` makes them of exact scenes.
 
-    What has no colours is grey clay, and always lit: bare, it would be a silhouette.
+    A mesh without colours is grey clay, and always lit.
 
     Args:
         path: a file that `read_painted` knows.
@@ -56,7 +56,7 @@ def photograph_mesh(
         seed: of the cameras and the sparse points.
         samples: rays per pixel and direction.
         up: "y" or "z", the axis that points up.
-        shaded: whether a fixed lamp lights the mesh; without, the images show its colours themselves.
+        shaded: whether a fixed lamp lights the mesh.
         glossy: whether the lamp is reflected, in a highlight that moves with the eye.
         depths: whether each image has the depths of its pixels' centres.
         progress: called with ``(done, total)`` after every image.
@@ -94,26 +94,13 @@ def photograph_mesh(
 
 
 def true_mesh(path: str | Path) -> Mesh:
-    """What was photographed, with the colours of its vertices, as a mesh to hold reconstructions against.
-
-    Args:
-        path: a mesh file.
-
-    Raises:
-        InputError: it cannot be read, or has no faces.
-    """
+    """The photographed mesh with colours at its vertices, to compare reconstructions with; raises InputError."""
     surface = read_reference(path)
     return dataclasses.replace(surface, normals=vertex_normals(surface.vertices, surface.faces))
 
 
 def sees(camera: Camera, seen: Seen, points: Float64) -> NDArray[np.bool_]:
-    """Which of the points ``(P, 3)`` a camera sees: those in its picture that are where the surface in their pixel is.
-
-    Args:
-        camera: in the coordinates of the points.
-        seen: what its pixels see.
-        points: of the surface.
-    """
+    """Which surface points ``(P, 3)`` a camera sees: those in its picture at the place that ``seen`` has there."""
     pixels, depths, found = camera.in_view(points)
     if not len(seen.pixel):
         return np.zeros_like(found)

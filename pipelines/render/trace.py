@@ -1,8 +1,4 @@
-"""From a field and a camera to what every pixel sees: the coarse-to-fine trace, then one jet for each pixel.
-
-`Seen` is the same whether a surface was traced in a field or rasterised from a mesh. Images that are too large to be
-worked on at once are cut into strips.
-"""
+"""What every pixel sees of a field: the coarse-to-fine trace, then one jet per pixel; large images in strips."""
 
 from __future__ import annotations
 
@@ -28,10 +24,10 @@ class Precision:
     """How exactly pictures are traced.
 
     Attributes:
-        tolerance: of depths, in pixels; the jet's Newton step, which costs nothing, leaves about its square.
-        resolution: of the march, in pixels: two crossings nearer to each other may be overlooked.
-        newton: the longest Newton step, in pixels; a hit on the jump at a gate's edge is right where it is.
-        shallow: slope along the ray below which no Newton step is made: the surface may turn away before it arrives.
+        tolerance: of depths, in pixels; the Newton step leaves about its square.
+        resolution: of the march, in pixels; nearer crossings may be missed.
+        newton: longest Newton step, in pixels; a hit on the jump at a gate's edge is right where it is.
+        shallow: slope along the ray below which no Newton step is made.
         nearest: least distance of what a camera in the shape looks at, in the field's units.
     """
 
@@ -47,7 +43,7 @@ PRECISION = Precision()
 
 @dataclass(frozen=True)
 class Seen:
-    """One row for each pixel that sees the surface; nothing is kept, or shaded, for the others.
+    """One row for each pixel that sees the surface, traced in a field or rasterised from a mesh.
 
     Attributes:
         size: width and height of the image.
@@ -56,7 +52,7 @@ class Seen:
         position: ``(P, 3)`` the point seen.
         normal: ``(P, 3)`` unit outward normal there.
         direction: ``(P, 3)`` unit direction of the ray, away from the eye.
-        color: ``(P, 3)`` the surface's own colour in [0, 1], where it has one.
+        color: ``(P, 3)`` the surface's own colour in [0, 1], if it has one.
     """
 
     size: tuple[int, int]
@@ -77,9 +73,7 @@ class Seen:
 def strips(camera: Camera, pixels: Callable[[], int]) -> Iterator[tuple[int, Camera]]:
     """Cut a camera into strips of whole rows: the first row and the camera of each.
 
-    Args:
-        camera: of the whole image.
-        pixels: asked before each strip for about how many pixels it is to have.
+    ``pixels`` is called before each strip and returns about how many pixels it is to have.
     """
     first = 0
     while first < camera.height:
@@ -109,16 +103,15 @@ def trace_view(
     """What the pixels of a camera see of a level of a field.
 
     The jet that gives the normal also gives the value at the hit, so the position takes one more Newton step along the
-    ray. With a finer ``normal_level`` the gradient is that level's instead (neural normal mapping, paper Sec. 3):
-    details of the fine level for the price of one evaluation, on the silhouette of the coarse one.
+    ray. With a finer ``normal_level`` the normal is that level's gradient (neural normal mapping, paper Sec. 3).
 
     Args:
         field: three-dimensional, on ``device``.
         camera: in the field's coordinates.
         level: whose surface is seen.
         normal_level: whose gradient is the normal; by default ``level``.
-        texture: the colours of the surface, mapped onto whichever level is seen (paper Sec. 3, neural texture mapping).
-        colors: they may also come from any function of points ``(P, 3)``.
+        texture: colours, mapped onto the level that is seen (paper Sec. 3, neural texture mapping).
+        colors: a function from points ``(P, 3)`` to colours, instead.
         budget: steps on each level, for the paper's fixed mode; by default the adaptive one (see `sphere_trace`).
         device: where to work, and where the result is.
 
