@@ -289,7 +289,7 @@ class Program:
     moved: Mapping[str, str] = field(default_factory=dict)
 
     def main(self, argv: Sequence[str] | None = None) -> int:
-        """Run one command → 0, 1 (a check failed), 2 (bad input or arguments), 130 (interrupted) or 141 (output was closed).
+        """Run one command → 0, 1 (a check failed), 2 (bad input or arguments), 130 (interrupted), 141 (output closed).
 
         ``argv`` has no program name; None takes the arguments of the process.
         """

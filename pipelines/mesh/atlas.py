@@ -1,9 +1,6 @@
-"""Texture coordinates for a mesh that has none, made by xatlas, and the axes in which its normal map is written.
+"""Texture coordinates for a mesh that has none, by xatlas, and the axes in which its normal map is written.
 
-The tangent of a vertex is what MikkTSpace makes it (M. Mikkelsen, "Simulation of Wrinkled Surfaces Revisited", 2008,
-Sec. 3.3; Blender and glTF ask for it): the direction of growing u on each face around the vertex, laid into the plane
-of the vertex's normal, weighted by the angle of the face there. Faces on the other side of a seam have their own
-vertices and are not mixed in.
+Tangents are MikkTSpace's (M. Mikkelsen, "Simulation of Wrinkled Surfaces Revisited", 2008, Sec. 3.3), as in glTF.
 """
 
 from __future__ import annotations
@@ -20,11 +17,7 @@ Int64 = NDArray[np.int64]
 
 
 def check_unwrap_tools() -> None:
-    """Ask, before any long work, whether the extra ``mplicits[texture]`` is installed.
-
-    Raises:
-        InputError: it is not.
-    """
+    """Raise an InputError before any long work if the extra ``mplicits[texture]`` is not installed."""
     try:
         import fast_simplification  # noqa: F401
         import xatlas  # noqa: F401
@@ -33,16 +26,7 @@ def check_unwrap_tools() -> None:
 
 
 def decimate(vertices: Float64, faces: NDArray[np.integer], count: int) -> tuple[Float64, Int64]:
-    """Collapse edges by their quadric error until about ``count`` triangles are left.
-
-    Args:
-        vertices: ``(V, 3)``.
-        faces: ``(F, 3)``.
-        count: triangles to keep; a mesh of no more is returned as it is.
-
-    Returns:
-        Vertices and faces.
-    """
+    """Collapse edges by their quadric error until about ``count`` triangles are left, if there are more."""
     if len(faces) <= count:
         return vertices, faces.astype(np.int64)
     import fast_simplification
@@ -62,18 +46,9 @@ def decimate(vertices: Float64, faces: NDArray[np.integer], count: int) -> tuple
 def unwrap(vertices: Float64, faces: NDArray[np.integer], *, size: int = 2048, padding: int | None = None) -> Mesh:
     """Cut a mesh into charts that lie flat, and pack them into the unit square.
 
-    Args:
-        vertices: ``(V, 3)``, in any units.
-        faces: ``(F, 3)``.
-        size: of the texture to be, in texels.
-        padding: texels between charts, about; by default a 256th of ``size``.
-
-    Returns:
-        The same triangles in the same order, with normals (those of the faces around averaged by area, across seams
-        too), texture coordinates and tangents; vertices on seams are repeated, once per chart.
-
-    Raises:
-        ValueError: there is no triangle with an area.
+    Returns the same triangles in the same order, with normals (means by area, across seams too), texture coordinates
+    and tangents; vertices on seams are repeated, once per chart. ``size`` is the side of the texture, ``padding`` the
+    space between charts (by default a 256th of it), in texels. Raises a ValueError if no triangle has an area.
     """
     import xatlas
 
@@ -110,11 +85,8 @@ def _box(vertices: Float64) -> tuple[Float64, float]:
 def vertex_tangents(vertices: Float64, faces: Int64, uv: Float64, normals: Float64) -> Float64:
     """Tangents ``(V, 4)``: a unit vector square to the normal, and w = ±1; the bitangent is ``w · normal × tangent``.
 
-    Args:
-        vertices: ``(V, 3)``, repeated at seams.
-        faces: ``(F, 3)``.
-        uv: ``(V, 2)``, v upwards: the bitangent points to where v grows.
-        normals: ``(V, 3)`` of unit length.
+    The direction of growing u on each face around the vertex, laid into the plane of the normal, weighted by the angle
+    of the face there. Vertices are repeated at seams; v of ``uv`` ``(V, 2)`` grows upwards.
     """
     sums = np.zeros((len(vertices), 3))
     turning = np.zeros(len(vertices))
@@ -137,12 +109,9 @@ def vertex_tangents(vertices: Float64, faces: Int64, uv: Float64, normals: Float
 
 
 def to_frame(directions: Float64, normals: Float64, tangents: Float64) -> Float64:
-    """Directions ``(N, 3)`` → their coordinates along tangent, bitangent and normal.
+    """Coordinates of directions ``(N, 3)`` along tangent, bitangent and normal.
 
-    Args:
-        directions: in the mesh's coordinates.
-        normals: ``(N, 3)``, interpolated between vertices; of any length.
-        tangents: ``(N, 4)``, interpolated likewise.
+    ``normals`` ``(N, 3)`` and ``tangents`` ``(N, 4)`` are interpolated between vertices, of any length.
     """
     return np.asarray(np.linalg.solve(_axes(normals, tangents), directions[..., None])[..., 0], np.float64)
 

@@ -19,18 +19,10 @@ Float64 = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Decimation:
-    """What a decimation has cost, in the units of the mesh.
+    """What a decimation has cost; ``largest`` and ``mean`` distance are in the units of the mesh, both ways.
 
-    The distance from each mesh to the other is measured exactly: at the vertices of the full one, and at the vertices,
-    edge midpoints and face centres of the other, evenly thinned to 50,000 points each way.
-
-    Attributes:
-        faces_before: triangles of the full mesh.
-        faces: triangles that are left.
-        largest: greatest distance found, either way.
-        mean: of all distances, the mean of both ways.
-        closed_before: whether the full mesh was watertight.
-        closed: whether what is left is.
+    Distances from each mesh to the other are exact, at the vertices of the full mesh and at the vertices, edge
+    midpoints and face centres of the other, evenly thinned to 50,000 points each way.
     """
 
     faces_before: int
@@ -61,11 +53,7 @@ class Decimated(NamedTuple):
 
 
 def check_decimation_tool() -> None:
-    """Ask, before any long work, whether there is something to decimate with.
-
-    Raises:
-        InputError: the extra ``mplicits[texture]`` is not installed.
-    """
+    """Raise an InputError before any long work if the extra ``mplicits[texture]`` is not installed."""
     try:
         import fast_simplification  # noqa: F401
     except ImportError as error:
@@ -73,12 +61,7 @@ def check_decimation_tool() -> None:
 
 
 def decimated(mesh: Mesh, faces: int) -> Decimated:
-    """Collapse edges by their quadric error, and measure how far that has led.
-
-    Args:
-        mesh: in any coordinates; a mesh of no more triangles stays as it is.
-        faces: about how many triangles to keep.
-    """
+    """Collapse edges until about ``faces`` triangles are left, and measure how far that has led."""
     full = Mesh(mesh.vertices, mesh.faces.astype(np.int64))
     closed = is_closed(full)
     if len(mesh.faces) <= faces:

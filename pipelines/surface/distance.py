@@ -16,16 +16,11 @@ Int64 = NDArray[np.int64]
 class MeshDistance:
     """Signed distance to a mesh, negative inside, exact to rounding.
 
-    Faces are found through a k-d tree of their centres, long faces cut into pieces for it; the search widens until no
-    face left out can be nearer. The sign is that of the angle-weighted pseudo-normal of the nearest face, edge or
-    vertex (Bærentzen and Aanæs, IEEE TVCG 2005), which is exact for a closed, consistently oriented mesh; near
-    a hole it is the side of the nearest face.
+    The search in a k-d tree of face centres (long faces in pieces) widens until no face left out can be nearer. The
+    sign is that of the angle-weighted pseudo-normal of the nearest face, edge or vertex (Bærentzen and Aanæs, IEEE TVCG
+    2005), exact for closed, consistently oriented meshes.
 
-    Args:
-        mesh: equal vertices are made one.
-
-    Raises:
-        ValueError: the mesh has no faces of any area.
+    Raises a ValueError for a mesh without a face of any area; equal vertices are made one.
     """
 
     pairs_at_once = 1 << 19  # rows times candidates looked at together: about 100 MiB of temporaries
@@ -48,15 +43,10 @@ class MeshDistance:
         return self.with_slope(points)[0]
 
     def with_slope(self, points: Float64, *, certain: bool = True) -> tuple[Float64, Float64]:
-        """Distances ``(M,)`` of points ``(M, 3)``, and their gradients ``(M, 3)``: away from the nearest point.
+        """Distances ``(M,)`` of points ``(M, 3)`` and their gradients ``(M, 3)``: on the surface, the pseudo-normals.
 
-        On the surface that is the pseudo-normal.
-
-        Args:
-            points: ``(M, 3)``.
-            certain: whether the search widens until no other face can be nearer, which costs much far from the surface.
-                Otherwise it ends after the eight pieces of faces whose centres are nearest: a distance may be too long
-                by the radius of a piece, and is right wherever the nearest face is among theirs.
+        Unless ``certain``, the search ends after the eight pieces whose centres are nearest: a distance may be too long
+        by the radius of a piece, far from the surface above all, where certainty costs much.
         """
         if not certain:
             nearest = np.reshape(self.tree.query(points, k=min(8, len(self.owner)), workers=-1)[1], (len(points), -1))
@@ -97,7 +87,7 @@ class MeshDistance:
 def barycentric_of_nearest(points: Float64, corners: Float64) -> Float64:
     """Weights ``(..., 3)`` of the corners ``(..., 3, 3)`` for the point of each triangle nearest to ``(..., 3)``.
 
-    A weight is exactly 0 where that point is on an edge, two are where it is a corner.
+    A weight is exactly 0 where that point is on an edge; two are at a corner.
     """
     a, b, c = (corners[..., k, :] for k in range(3))
     ab, ac, ap = b - a, c - a, points - a
@@ -151,9 +141,9 @@ def _angle(corners: Float64, k: int) -> Float64:
 
 
 def _pieces(corners: Float64, area: float) -> tuple[Float64, Int64, float]:
-    """Centres ``(P, 3)`` of small pieces of the faces, the faces they belong to ``(P,)``, and their largest radius.
+    """Centres ``(P, 3)`` of pieces of the faces, their faces ``(P,)``, and their largest radius.
 
-    Faces much longer than is usual are halved across their longest edge until none is.
+    Faces much longer than the median are halved across their longest edge until none is.
     """
     lengths = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2)  # (F, 3): edges ab, bc, ca
     limit = max(float(np.median(lengths.max(axis=1))), (area / 200_000) ** 0.5)  # at most some 200,000 pieces

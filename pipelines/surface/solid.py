@@ -12,15 +12,9 @@ from .surface import is_closed, volume
 
 
 class MeshField(OneLevelField):
-    """The signed distance to a closed mesh, exact to rounding; see `MeshDistance`.
+    """The signed distance to a closed mesh, exact to rounding, in float64 on the CPU, without a graph.
 
-    Evaluated in float64 on the CPU, without a graph. A mesh that is turned inside out is turned back.
-
-    Args:
-        mesh: in the coordinates of the field.
-
-    Raises:
-        ValueError: the mesh is not closed, or encloses nothing.
+    A mesh that is turned inside out is turned back. Raises a ValueError if it is not closed or encloses nothing.
     """
 
     def __init__(self, mesh: Mesh) -> None:

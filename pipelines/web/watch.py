@@ -13,11 +13,10 @@ from .serve import PageServer
 
 
 class Watcher:
-    """Shows what a training writes into its run directory; use it as a context manager around the training.
+    """Shows the checkpoints that a training writes, as a context manager around it.
 
-    A thread of its own looks for a new checkpoint once a second, and makes a page of it if a browser is connected:
-    nothing is evaluated while nobody looks. The page begins with the first checkpoint. Whatever goes wrong in it is
-    said once, and leaves the training alone.
+    A thread looks for a new checkpoint every ``look_every`` seconds, and packs it if a browser is connected. The page
+    begins with the first one. An error in it is reported once by ``say``, and leaves the training alone.
 
     Args:
         run: directory of the run, or its .safetensors file.
@@ -25,7 +24,7 @@ class Watcher:
         server: that shows the run already; it is closed at the end.
         resume: whether a field that is there already is of this run, and to be shown.
         port: the server's, or None for the first free one.
-        say: told where to look, and what went wrong.
+        say: called with the address, and with errors.
         look_every: seconds between two looks.
     """
 
