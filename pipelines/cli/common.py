@@ -9,7 +9,7 @@ import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
@@ -278,7 +278,7 @@ class _Parser(argparse.ArgumentParser):
 
 @dataclass(frozen=True)
 class Program:
-    """A table of commands with a name, an overview that ``--help`` prints, and advice for commands that have moved.
+    """A table of commands with a name, and an overview that ``--help`` prints.
 
     ``{commands}`` in the overview is replaced by the list of commands.
     """
@@ -286,7 +286,6 @@ class Program:
     name: str
     commands: Mapping[str, Command]
     overview: str
-    moved: Mapping[str, str] = field(default_factory=dict)
 
     def main(self, argv: Sequence[str] | None = None) -> int:
         """Run one command → 0, 1 (a check failed), 2 (bad input or arguments), 130 (interrupted), 141 (output closed).
@@ -343,8 +342,6 @@ class Program:
             print(f"mplicits {version('mplicits')}")
             return 0
         name, *rest = arguments
-        if name in self.moved:
-            raise _UsageError(f"{name}: {self.moved[name]}")
         if name not in self.commands:
             raise _UsageError(f"unknown command {name!r}{closest(name, self.commands)}")
         parser = self.parser(name)

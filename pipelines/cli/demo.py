@@ -119,7 +119,7 @@ def _extract(field: Field, level: int, resolution: int) -> Mesh:
         raise InputError(f"level {level} has no surface ({error}); is the cloud a surface, are its normals?") from error
 
 
-def spread_colors(mesh: Mesh, cloud: PointCloud, similarity: Similarity, *, neighbors: int = 4) -> Mesh:
+def spread_colors(mesh: Mesh, cloud: PointCloud, similarity: Similarity) -> Mesh:
     """The mesh with colours at its vertices: means of the nearest points, weighted by 1 / distance².
 
     The mesh is in unit-sphere coordinates, the cloud in input coordinates. Without colours the mesh stays as it is.
@@ -127,7 +127,7 @@ def spread_colors(mesh: Mesh, cloud: PointCloud, similarity: Similarity, *, neig
     points = from_cloud(cloud).moved(similarity)
     if points.colors is None:
         return mesh
-    distance, index = KDTree(points.vertices).query(mesh.vertices, k=neighbors, workers=-1)
+    distance, index = KDTree(points.vertices).query(mesh.vertices, k=4, workers=-1)
     weights = 1 / np.maximum(distance, 1e-9) ** 2
     weights /= weights.sum(axis=1, keepdims=True)
     colors = np.einsum("vk,vkc->vc", weights, points.colors[index])
@@ -166,10 +166,10 @@ def _traced(field: Field, camera: Camera, level: int) -> Image:
 
 
 @torch.inference_mode()
-def distances_to_surface(field: Field, points: Float64, *, level: int, batch: int = 1 << 18) -> Float64:
+def distances_to_surface(field: Field, points: Float64, *, level: int) -> Float64:
     """First-order distances |f| / |∇f| of ``points`` ``(N, 3)`` to the zero set of a level, in the field's units."""
     parts = []
-    for part in torch.from_numpy(points.astype(np.float32)).split(batch):
+    for part in torch.from_numpy(points.astype(np.float32)).split(1 << 18):
         jet = field.jet(part, level=level)
         parts.append(jet.value.abs() / jet.gradient.norm(dim=-1).clamp(min=1e-6))
     return torch.cat(parts).double().numpy()

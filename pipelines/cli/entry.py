@@ -16,8 +16,7 @@ from ..training.settings import FitConfig
 from .common import Command, Program, add_flags, add_settings, between, check_output, read_settings, refuse
 from .draw import ANIMATE, RENDER, SLICE, VIEW
 from .fit import FIT, describe
-from .mesh import EVALUATE, MESH
-from .solids import BOOLEAN, OFFSET
+from .mesh import BOOLEAN, EVALUATE, MESH, OFFSET
 from .train import EVOLVE, RECONSTRUCT, TEXTURE
 from .views import CHECK_CAMERAS, FIND_CAMERAS, FIND_POINTS, SCENE
 from .web import WEB
@@ -38,7 +37,6 @@ examples:
 
 `mplicits COMMAND --help` says more about each; `mplicits --version` prints the version."""
 
-MOVED = {"bench": "benchmarks are not in the package; run `python -m benchmarks NAME` in a checkout of mplicits"}
 
 SOLIDS = ("box", "cylinder", "gear")
 SAMPLES = ("statue", *SOLIDS)
@@ -189,6 +187,6 @@ COMMANDS: Mapping[str, Command] = MappingProxyType(
     }
 )
 
-MPLICITS = Program("mplicits", COMMANDS, OVERVIEW, MOVED)
+MPLICITS = Program("mplicits", COMMANDS, OVERVIEW)
 main = MPLICITS.main
 """Run one command of ``mplicits``; see `Program.main`."""

@@ -108,24 +108,12 @@ def textured_mesh(
     placement: Placement | None = None,
     progress: Progress | None = None,
 ) -> Mesh:
-    """Decimate, unwrap, bake, and write a textured GLB, or an OBJ with its MTL and PNG files.
+    """Decimate, unwrap, bake, and write a textured GLB, or an OBJ with its MTL and PNG files → the mesh as written.
 
-    Args:
-        path: the .glb or .obj file.
-        mesh: in unit-sphere coordinates.
-        similarity: from there to input coordinates.
-        colors_at: see `bake`; points are on the decimated mesh, near the surface.
-        normals_at: likewise.
-        size: texels along each side.
-        faces: triangles to keep.
-        placement: see `write_mesh`.
-        progress: called with the stage ("unwrap", "bake"), how much of it is done, and of how much.
-
-    Returns:
-        The mesh as written, in unit-sphere coordinates.
-
-    Raises:
-        InputError: the file cannot be written, the size is out of range, or ``mplicits[texture]`` is not installed.
+    Mesh and points are in unit-sphere coordinates. ``colors_at`` and ``normals_at`` (see `bake`) get points of the
+    decimated mesh, near the surface. ``size`` is the side of the textures in texels, ``faces`` the triangles to keep.
+    ``progress`` is called with the stage ("unwrap", "bake"), how much of it is done, and of how much. Raises
+    InputError.
     """
     path = check_textured_path(path, similarity)
     check_texture_size(size)

@@ -23,8 +23,8 @@ from ...neural_fields.tracing.projection import map_attribute
 from ..surface.surface import Support, in_region, keep_largest, read_support, seen_part, trim_distance, without_blobs
 from ..texture.transport import Colors, colors_of_run
 from ..training.folder import TEXTURE_FILE, chosen_level, find_field, fitted_cloud, load_still
+from .atlas import Decimation, check_tools, decimated
 from .bake import check_texture_size, textured_mesh
-from .decimation import Decimation, check_decimation_tool, decimated
 from .files import check_mesh_path, check_textured_path, placement_of, write_mesh
 from .printing import PrintReport, print_report
 
@@ -167,7 +167,7 @@ def export_run(
             given = "--faces" if options.faces is not None else "--report"
             raise InputError(f"{given}: goes with a mesh without --texture; --texture-faces says how many it keeps")
     if options.faces is not None:
-        check_decimation_tool()
+        check_tools("--faces", "fast_simplification")
     file = find_field(run)
     field, similarity, metadata = load_still(file, options.time)
     check(out, similarity, centered=placement.center)  # again: not every format can hold every place

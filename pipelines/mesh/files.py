@@ -23,7 +23,7 @@ from ...neural_fields.meshing.mesh import (
     write_triangles,
 )
 from ...neural_fields.meshing.placement import Placement
-from .atlas import check_unwrap_tools
+from .atlas import check_tools
 
 Image = NDArray[np.uint8]
 
@@ -41,7 +41,7 @@ def check_textured_path(path: str | Path, similarity: Similarity | None = None, 
     path = Path(path)
     if path.suffix.lower() not in (".glb", ".obj"):
         raise InputError(f"{path}: textures are written as .glb or .obj; choose one of them, or leave --texture out")
-    check_unwrap_tools()
+    check_tools("--texture", "fast_simplification", "xatlas")
     return check_mesh_path(path, similarity, centered=centered)
 
 

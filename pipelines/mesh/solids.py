@@ -30,7 +30,7 @@ from ...neural_fields.fields.csg import Bounded
 from ...neural_fields.meshing.extract import NoSurfaceError, extract_mesh
 from ...neural_fields.meshing.placement import METRES
 from ...neural_fields.shape import in_one_frame
-from ..surface.solid import MeshField
+from ..surface.distance import MeshField
 from ..surface.surface import Support, is_closed, read_support, read_surface, volume, without_blobs
 from ..training.folder import chosen_level, find_field, is_field, load_still
 from .files import check_mesh_path, placement_of, write_mesh
@@ -120,16 +120,10 @@ def boolean(
 ) -> Made:
     """Join two or more runs, checkpoints and closed meshes that lie in the same input coordinates.
 
-    Args:
-        parts: the operands; a difference takes the others from the first.
-        operation: a key of `OPERATIONS`.
-        out: a mesh file; or a .safetensors file for the field itself, where no part is a mesh.
-        options: how.
-        smooth: width of the blend, see `length_in` and `Union`.
-        say: called with a line about what was removed, if anything was.
-
-    Raises:
-        InputError: a part cannot be read or is not closed, nothing is left, or the file cannot be written.
+    ``operation`` is a key of `OPERATIONS`; a difference takes the others from the first. ``out`` is a mesh, or a
+    .safetensors file for the field itself, where no part is a mesh. ``smooth`` is the width of the blend (`length_in`,
+    `Union`). ``say`` is called with a line about what was removed. Raises an InputError if a part cannot be read or is
+    not closed, nothing is left, or the file cannot be written.
     """
     options = options or SolidOptions()
     width = length_in(smooth, options.unit, "--smooth")
@@ -167,22 +161,11 @@ def offset(
     shell: bool = False,
     say: Callable[[str], None] | None = None,
 ) -> Made:
-    """Grow or shrink a run or a closed mesh by a length, or keep the wall between it and that.
+    """Grow or shrink a run or a closed mesh by a length (`length_in`), or keep the wall in between, if ``shell``.
 
     The distance is that to the mesh of the finest level: away from its surface, a `MultiscaleSDF` is its coarsest
-    level.
-
-    Args:
-        part: a run, a checkpoint or a closed mesh.
-        by: how far, outwards; negative is inwards. See `length_in`.
-        out: the mesh file.
-        options: how.
-        shell: whether to keep only what lies between the surface and where it went.
-        say: called with a line about what was removed, if anything was.
-
-    Raises:
-        InputError: the part cannot be read or is not closed, nothing is left, a wall is thinner than two cells, or the
-            file cannot be written.
+    level. ``say`` is called with a line about what was removed. Raises an InputError if the part cannot be read or is
+    not closed, nothing is left, a wall is thinner than two cells, or the file cannot be written.
     """
     options = options or SolidOptions()
     length = length_in(by, options.unit, "--by")

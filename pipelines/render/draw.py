@@ -354,18 +354,9 @@ def render_run(
 ) -> str:
     """Draw a run, a mesh or a cloud; a film goes once around the shape, or through the posed cameras in order.
 
-    Args:
-        source: run directory, .safetensors file, mesh or cloud.
-        out: a .png or .jpg picture, or an .mp4 or .gif film.
-        options: see `RenderOptions`.
-        painter: draws in place of the shadings, background included.
-        progress: called with the number of parts drawn, and their total.
-
-    Returns:
-        What was drawn, in a few words.
-
-    Raises:
-        InputError: something cannot be read or does not go together, or ``out`` cannot be written.
+    ``painter`` draws in place of the shadings, background included; ``progress`` is called with the number of parts
+    drawn, and their total. Returns what was drawn, in a few words. Raises an InputError if something cannot be read or
+    does not go together, or ``out`` cannot be written.
     """
     options, out = options or RenderOptions(), Path(out)
     film = out.suffix.lower() in ANIMATIONS

@@ -25,20 +25,12 @@ BT709 = ["-colorspace", "bt709", "-color_primaries", "bt709", "-color_trc", "bt7
 def write_animation(
     path: str | Path, frames: Iterable[Image], *, fps: float = 30, progress: Callable[[int], None] | None = None
 ) -> None:
-    """Write an H.264 MP4, or a GIF that loops with one palette for all frames.
+    """Write RGB frames ``(H, W, 3)``, uint8, to an H.264 MP4, or a GIF that loops with one palette for all frames.
 
     Frames are taken one by one, and the file appears when it is complete. An odd width or height of an MP4 is padded by
-    repeating the last column or row, since colour is stored at half resolution.
-
-    Args:
-        path: an .mp4 or .gif file.
-        frames: ``(H, W, 3)`` uint8 RGB, all of one size.
-        fps: frames per second; a GIF shows at most 50.
-        progress: called with the number of frames so far.
-
-    Raises:
-        InputError: another extension, or the file cannot be written.
-        ValueError: no frames, a frame is no RGB image of the first one's size, or ``fps`` is not > 0.
+    repeating the last column or row, since colour is stored at half resolution. A GIF shows at most 50 frames per
+    second. ``progress`` is called with the number of frames so far. Raises an InputError if the file cannot be written,
+    and a ValueError for no frames, frames of several sizes, or ``fps`` ≤ 0.
     """
     path = Path(path)
     suffix = path.suffix.lower()

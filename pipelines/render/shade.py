@@ -14,7 +14,6 @@ import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 from torch import Tensor
 from torch.nn.functional import grid_sample, normalize
 
@@ -303,7 +302,6 @@ def shade(
     level: int = -1,
     options: ShadeOptions | None = None,
     matcap: Tensor | None = None,
-    reference: KDTree | None = None,
     values: Tensor | None = None,
 ) -> Tensor:
     """Colours ``(P, 3)``, display RGB in [0, 1], of the pixels that see something.
@@ -331,7 +329,7 @@ def shade(
     if shading == "matcap":
         return sample_matcap(load_matcap(options.matcap) if matcap is None else matcap, _view_normals(seen, camera))
     if values is None:
-        values = measure(seen, shading, field=field, level=level, reference=reference, detail=options.detail)
+        values = measure(seen, shading, field=field, level=level, detail=options.detail)
     low, high = value_limits(values, shading, options)
     # What is near is light, what is far from the reference dark: of those two maps the light end is the high one.
     colors = apply_color_map(values, (low, high) if shading == "curvature" else (high, low), COLOR_MAPS[_MAPS[shading]])
@@ -346,12 +344,11 @@ def measure(
     *,
     field: Field | None = None,
     level: int = -1,
-    reference: KDTree | None = None,
     detail: float = 4e-3,
 ) -> Tensor:
-    """The numbers ``(P,)`` that "depth", "curvature" and "error" show, in the units of ``seen``.
+    """The numbers ``(P,)`` that "depth" and "curvature" show, in the units of ``seen``.
 
-    ``detail`` is the step of `level_set_curvature`. Raises a ValueError if a field or reference is missing.
+    ``detail`` is the step of `level_set_curvature`. Raises a ValueError if a field is missing.
     """
     if shading == "depth":
         return seen.depth
@@ -359,12 +356,7 @@ def measure(
         if field is None:
             raise ValueError("shading='curvature': needs a field; a mesh has none")
         return level_set_curvature(field, seen.position, level=level, step=detail)
-    if shading == "error":
-        if reference is None:
-            raise ValueError("shading='error': needs a reference cloud to measure from")
-        distances = reference.query(seen.position.detach().cpu().double().numpy())[0]
-        return torch.as_tensor(np.asarray(distances)).to(seen.position)
-    raise ValueError(f"shading={shading!r}: expected one of {', '.join(_MAPS)}")
+    raise ValueError(f"shading={shading!r}: expected depth, curvature, or values that were measured before")
 
 
 def value_limits(values: Tensor, shading: str, options: ShadeOptions) -> tuple[float, float]:

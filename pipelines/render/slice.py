@@ -83,29 +83,6 @@ def slice_points(*, origin: Vector, u: Vector, v: Vector, half_size: float, size
     return torch.from_numpy(points)
 
 
-def slice_field(
-    field: Field,
-    *,
-    origin: Vector,
-    u: Vector,
-    v: Vector,
-    half_size: float,
-    size: tuple[int, int],
-    level: int = -1,
-) -> Tensor:
-    """Values ``(H, W)`` of one level at the centres of a picture's pixels, in one inference; see `slice_points`.
-
-    Example:
-        >>> from mplicits.neural_fields import Sphere
-        >>> from mplicits.pipelines.render.slice import slice_field
-        >>> slice_field(Sphere(radius=1), origin=(0, 0, 0), u=(1, 0, 0), v=(0, 1, 0), half_size=2, size=(4, 1))
-        tensor([[5., 1., 1., 5.]])
-    """
-    points = slice_points(origin=origin, u=u, v=v, half_size=half_size, size=size)
-    with torch.inference_mode():
-        return field.value(points.to(field.like), level=level)
-
-
 @dataclass(frozen=True)
 class Slice:
     """The values of all levels on a plane.

@@ -63,18 +63,11 @@ def slice_run(
     *,
     progress: Callable[[int], None] | None = None,
 ) -> str:
-    """Draw a plane through the field of a run → what was drawn, in a few words.
+    """Draw a plane through the field of a run to a picture or film → what was drawn, in a few words.
 
     The plane of a film goes from the middle of the shape to both its ends and back, so that it can be repeated.
-
-    Args:
-        run: run directory or .safetensors file.
-        out: a .png or .jpg picture, or an .mp4 or .gif film.
-        options: which plane, and how.
-        progress: called with the number of frames of a film so far.
-
-    Raises:
-        InputError: there is no such run or level, the plane misses the unit sphere, or the file cannot be written.
+    ``progress`` is called with the number of frames so far. Raises an InputError if there is no such run or level, the
+    plane misses the unit sphere, or the file cannot be written.
     """
     options, out = options or SliceOptions(), Path(out)
     file = find_field(run)

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from ...datasets.cameras import Camera
-from ...neural_fields import Field, Siren, TextureField, map_colors, sphere_trace
+from ...neural_fields import Field, Siren, sphere_trace
 from ...neural_fields.networks.multiscale import as_levels, choose_levels, levels_of
 from ...neural_fields.tracing.cones import CONE_LIPSCHITZ, CONE_STEPS, cone_starts
 from ...neural_fields.tracing.sphere import BOUNDING_RADIUS, MAX_STEPS, Hits, march_constants
@@ -95,7 +95,6 @@ def trace_view(
     *,
     level: int = -1,
     normal_level: int | None = None,
-    texture: TextureField | None = None,
     colors: Callable[[Tensor], Tensor] | None = None,
     budget: Sequence[int] | None = None,
     device: torch.device | str = "cpu",
@@ -110,8 +109,7 @@ def trace_view(
         camera: in the field's coordinates.
         level: whose surface is seen.
         normal_level: whose gradient is the normal; by default ``level``.
-        texture: colours, mapped onto the level that is seen (paper Sec. 3, neural texture mapping).
-        colors: a function from points ``(P, 3)`` to colours, instead.
+        colors: of points ``(P, 3)``, mapped onto the level that is seen (paper Sec. 3, neural texture mapping).
         budget: steps on each level, for the paper's fixed mode; by default the adaptive one (see `sphere_trace`).
         device: where to work, and where the result is.
 
@@ -120,8 +118,6 @@ def trace_view(
     """
     level = field.resolve_level(level)
     normal_level = level if normal_level is None else field.resolve_level(normal_level)
-    if texture is not None:
-        colors = lambda points: map_colors(texture, points).values  # noqa: E731  either way it is a function
     if budget is None and not camera.distortion and _draws_at_once(field, max(level, normal_level), device):
         return _draw(field, camera, level, normal_level, colors)
     eye, directions = camera.rays(device=device)

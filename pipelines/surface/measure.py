@@ -5,7 +5,6 @@ Lengths are in units of the REFERENCE's bounding sphere (paper, Sec. 5), between
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +15,6 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from ...neural_fields import InputError, Mesh, Similarity
-from ...neural_fields.backend.files import write_json
 from .raster import cover
 from .surface import components, is_closed, read_surface, sample_points
 
@@ -271,11 +269,6 @@ def format_metrics(metrics: Metrics) -> str:
     ]
     rows = [f"{name:<32} {value:>10}  {remark}".rstrip() for name, value, remark in lines]
     return "\n".join([*rows, f"{m.samples:,} samples on each surface, seed {m.seed}", *(f"note: {n}" for n in m.notes)])
-
-
-def write_metrics(path: str | Path, metrics: Metrics) -> None:
-    """Write the figures as JSON, through a temporary file beside the target."""
-    write_json(path, dataclasses.asdict(metrics))
 
 
 class Overlap(NamedTuple):

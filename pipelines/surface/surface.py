@@ -37,11 +37,7 @@ def read_surface(path: str | Path) -> Mesh:
 def read_described(path: str | Path) -> tuple[Mesh, str]:
     """`read_surface`, and of a cloud one line about what was read; see `PointCloud`."""
     path = Path(path)
-    mesh = None
-    if path.suffix.lower() in (".glb", ".gltf"):
-        mesh = _load_gltf(path)
-    elif path.suffix.lower() in MESH_SUFFIXES:
-        mesh = _load_mesh(path)
+    mesh = _load_mesh(path) if path.suffix.lower() in MESH_SUFFIXES else None
     if mesh is not None:
         return mesh, ""
     cloud = read_cloud(path)
@@ -72,31 +68,21 @@ def _load_mesh(path: Path) -> Mesh | None:
     """The triangles of a file; None where it has no faces."""
     if not path.is_file():
         raise InputError(f"{path}: no such file")
-    cloud, faces = read_mesh(path)
-    if not len(faces):
-        return None
-    colors = None if cloud.colors is None else cloud.colors.astype(np.float64)
-    return _checked(path, Mesh(cloud.points, faces, None, colors))
-
-
-def _load_gltf(path: Path) -> Mesh:
-    if not path.is_file():
-        raise InputError(f"{path}: no such file")
-    mesh = read_gltf(path, textures=False)
-    colors = None if mesh.vertex_colors is None else mesh.vertex_colors.astype(np.float64)
-    return _checked(path, Mesh(mesh.vertices, mesh.faces, None, colors))
-
-
-def _checked(path: Path, surface: Mesh) -> Mesh:
-    """The surface; an InputError if a face names no vertex, a coordinate is not finite, or all vertices coincide."""
-    vertices, faces = surface.vertices, surface.faces
+    if path.suffix.lower() in (".glb", ".gltf"):
+        mesh = read_gltf(path, textures=False)
+        vertices, faces, colors = mesh.vertices, mesh.faces, mesh.vertex_colors
+    else:
+        cloud, faces = read_mesh(path)
+        vertices, colors = cloud.points, cloud.colors
+        if not len(faces):
+            return None
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise InputError(f"{path}: a face names vertex {faces.max()}, but there are only {len(vertices)}")
     if not np.isfinite(vertices[np.unique(faces)]).all():
         raise InputError(f"{path}: a vertex has a coordinate that is not a finite number")
     if not np.ptp(vertices[np.unique(faces)], axis=0).any():
         raise InputError(f"{path}: all vertices coincide")
-    return surface
+    return Mesh(vertices, faces, None, None if colors is None else colors.astype(np.float64))
 
 
 def face_normals(mesh: Mesh) -> tuple[Float64, Float64]:

@@ -155,17 +155,9 @@ def pack_field(
 ) -> Packed:
     """Pack a field: levels of SIRENs as networks that the page traces, any other as meshes of its levels.
 
-    Args:
-        field: three-dimensional, or levels of SIRENs in space and time.
-        similarity: from input coordinates to the field's.
-        options: what to show.
-        name: the title, if ``options`` has none.
-        texture: colours of the surface.
-        cloud: a file of points to show beside it.
-
-    Raises:
-        NoSurfaceError: there is no surface.
-        InputError: it moves and no shader traces it, or the cloud cannot be read.
+    It is three-dimensional, or levels of SIRENs in space and time. ``texture`` has its colours, ``cloud`` is a file of
+    points to show beside it. Raises a NoSurfaceError, or an InputError if it moves and no shader traces it, or the
+    cloud cannot be read.
     """
     options = options or WebOptions()
     shapes = [] if cloud is None else [distance_cloud(cloud, field, similarity)]

@@ -19,11 +19,10 @@ from benchmarks.harness.report import (
     section_from_dict,
     with_missing,
 )
-from benchmarks.harness.tables import Column, Row, Table, mean, median, ratio
-from benchmarks.paper.cells import printed_name, select
+from benchmarks.harness.tables import Column, Row, Table
 from benchmarks.paper.comparison import banf_tables, comparison_tables, noise_plots, noise_tables, poisson_tables
 from benchmarks.paper.published import BANF, COMPARISON, NOISE
-from benchmarks.paper.robustness import delta_tables, outlier_plots, outlier_tables, shortened, undertrained_tables
+from benchmarks.paper.robustness import outlier_plots, outlier_tables
 
 
 def record(shape, method, chamfers, *, iou=0.9, deltas=(), **cell):
@@ -180,46 +179,6 @@ def test_outliers() -> None:
     }
     (plot,) = outlier_plots(records)
     assert plot.series == (Series("lucy", (None, 1e-5, None)), Series("spot", (None, 2e-5, 4e-5)))
-
-
-def test_undertrained() -> None:
-    assert shortened((100, 40, 40), 1.0) == ()
-    records = [
-        record("armadillo", "ours", {"Ours fine": 4e-5}, deltas=[0.4], overrides={"steps": [25, 40, 40]}),
-        record("armadillo", "ours", {"Ours fine": 3e-5}, deltas=[0.3], overrides={"steps": [50, 40, 40]}),
-        record("armadillo", "ours", {"Ours fine": 2e-5}, deltas=[0.2]),
-    ]
-    (table,) = undertrained_tables(records)
-    (row,) = table.rows
-    assert row.values == (0.4, 0.3, 0.2, 4e-5, 3e-5, 2e-5, pytest.approx(2))
-    assert row.published == (6.2e-2, 2e-2, 1.71e-2, 1.11e-5, 1.06e-4, 9.81e-5, pytest.approx(1.11e-5 / 9.81e-5))
-    assert table.notes[0] == "A coarse stage of 25 % costs at most a factor of 2.00 in Chamfer distance."
-    (partial,) = undertrained_tables(records[:2])
-    assert partial.rows[0].values[2] is None
-
-
-def test_deltas() -> None:
-    records = [
-        record("thai", "ours", {"Ours fine": 4e-5}, deltas=[0.02, 0.01]),
-        record("thai", "ours", {"Ours fine": 4e-5}, deltas=[0.04, 0.03], noise=0.01),
-    ]
-    (table,) = delta_tables(records)
-    assert [column.name for column in table.columns] == ["δ₁", "δ₂"]
-    assert [(row.name, row.values, row.published) for row in table.rows] == [
-        ("thai", (0.02, 0.01), (2.71e-2, 1.57e-2)),
-        ("thai + 1 % noise", (0.04, 0.03), (6.9e-2, 5.2e-2)),
-    ]
-    assert table.notes[0] == "The widest band is 4.00 % of the unit sphere's radius."
-
-
-def test_helpers() -> None:
-    assert mean([1.0, None, 3.0]) == 2.0
-    assert mean([None]) is median([]) is None
-    assert median([1.0, None, 9.0, 2.0]) == 2.0
-    assert ratio(1.0, 0.0) is ratio(None, 1.0) is None
-    assert printed_name("xyzrgb_Dragon", BANF) == "dragon"
-    assert printed_name("cow", BANF) is None
-    assert select([record("a", "x", {}), record("b", "x", {})], shape="b", method="x", overrides={})[0]["outputs"] == []
 
 
 TABLE = Table(

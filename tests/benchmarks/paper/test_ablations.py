@@ -10,9 +10,9 @@ import pytest
 import torch
 from imageio.v3 import imread
 from mplicits.datasets import read_cloud
-from mplicits.neural_fields import Box, InputError, Mesh, MultiscaleSDF, Similarity, Siren, Sphere, extract_mesh
+from mplicits.neural_fields import Box, Mesh, MultiscaleSDF, Similarity, Siren, Sphere, extract_mesh
 from mplicits.pipelines.fit.cloud import CloudDistance
-from mplicits.pipelines.fit.samples import Weights, banded_sources
+from mplicits.pipelines.fit.samples import banded_sources
 from mplicits.pipelines.fit.train import fit, prepare
 from mplicits.pipelines.mesh.files import write_mesh
 from mplicits.pipelines.surface.distance import MeshDistance, barycentric_of_nearest
@@ -22,10 +22,7 @@ from benchmarks.harness.run import run_cell
 from benchmarks.paper.ablations import (
     DELTA_FACTOR,
     LOSS_WEIGHTS,
-    delta_factor_tables,
-    error_plots,
     loss_weight_tables,
-    short,
 )
 from benchmarks.paper.base import (
     Base,
@@ -38,12 +35,11 @@ from benchmarks.paper.base import (
     up_to,
     without_bands,
 )
-from benchmarks.paper.cells import PaperCell
 from benchmarks.paper.isolation import ISOLATION, IndependentLevels, isolation_tables, residuals_everywhere, steepness
 from benchmarks.paper.judge import fit_config
 from benchmarks.paper.methods import CATALOGUE
 from benchmarks.paper.sheets import write_sheets
-from benchmarks.paper.speed import MARCHING_CUBES, NORMALS, grid_seconds, marching_cubes_tables, normals_tables
+from benchmarks.paper.speed import MARCHING_CUBES, NORMALS, grid_seconds
 from benchmarks.shapes.sampled_error import approximation_error, near_surface
 
 HALF = np.array([0.5, 0.3, 0.4])
@@ -240,14 +236,6 @@ def test_residual_levels_see_the_cloud_that_level_0_has_judged(base: Base) -> No
     np.testing.assert_array_equal(reviewed(flipped, up_to(base.field, 0), trusting).normals, normals)
 
 
-def test_weights_stand_where_they_are_given(base: Base) -> None:
-    errors, cloud = torch.full((4,), 0.01), base.index()
-    assert cloud.noise == 0
-    usual = Weights().resolved(base.config, errors, cloud)
-    assert usual == pytest.approx((1e4, base.config.normal_weight, base.config.eikonal_weight))
-    assert Weights(data=0.0, eikonal=7.0).resolved(base.config, errors, cloud) == (0.0, base.config.normal_weight, 7.0)
-
-
 def test_sources_of_the_variants(base: Base) -> None:
     index, previous = base.index(), up_to(base.field, 0)
     delta = delta_after(index, previous, base.config)
@@ -274,13 +262,6 @@ def test_a_residual_without_bands_learns_the_whole_domain(base: Base) -> None:
     x = 1.6 * torch.rand(2000, 3, generator=torch.Generator().manual_seed(5)) - 0.8
     exact = index.signed(x)
     assert float((field.value(x) - exact).abs().mean()) < float((base.field.base.value(x) - exact).abs().mean())  # type: ignore[operator]
-
-
-def test_short_schedules_are_for_cpus_only() -> None:
-    config = fit_config("smoke")
-    assert short(config, "smoke") is config
-    assert short(config, "paper") is config
-    assert max(short(fit_config("cpu"), "cpu").steps) == 120
 
 
 def test_grid_seconds_count_what_was_left_out() -> None:
@@ -343,19 +324,6 @@ def test_loss_weight_rows() -> None:
     assert plot.series[1].values == (0.0073, 0.0081)
 
 
-def test_delta_factor_rows() -> None:
-    def at(epsilon: float, medium: float, fine: float) -> dict[str, Any]:
-        outputs = [{"name": "medium", "error": medium}, {"name": "fine", "error": fine}]
-        return record("delta-factor", outputs, cell={"overrides": {"epsilon": epsilon}}, deltas=[0.02, 0.01])
-
-    (table,) = delta_factor_tables([at(4.0, 0.3, 0.2), at(0.01, 0.03, 0.02), at(0.3, 0.05, 0.04)])
-    assert [row.name for row in table.rows] == ["1.01", "1.3", "5"]
-    assert table.rows[1].values == pytest.approx((0.02, 0.01, 0.05, 0.04))
-    assert table.rows[1].published == (None, None, 0.0103, 0.0050)
-    (plot,) = error_plots([table])
-    assert [series.values for series in plot.series[:2]] == [(0.03, 0.05, 0.3), (0.0098, 0.0103, 0.0139)]
-
-
 def test_isolation_rows() -> None:
     def figures(name: str, chamfer: float | None, components: int) -> dict[str, Any]:
         found = {"hausdorff": 2 * (chamfer or 0), "shell_iou": 0.5, "iou": 0.9, "components": components}
@@ -387,28 +355,6 @@ def test_isolation_rows() -> None:
         (50.0, "1,234"),
     ]
     assert culling.rows[3].published == (2.8e-1, "365 to 4,109")
-
-
-def test_marching_cubes_rows() -> None:
-    seconds = {"baseline": 8.0, "without culling": 6.0, "with culling": 2.0, "ours": 0.5}
-    outputs = [{"name": name, "seconds": spent} for name, spent in seconds.items()]
-    (table,) = marching_cubes_tables([record("ours", []), record("marching-cubes", outputs, shape="armadillo")])
-    assert table.rows[0].values == (8.0, 6.0, 2.0, 4.0, 0.5, 16.0)
-    assert table.rows[0].published == pytest.approx((4.87, 4.10, 0.99, 4.87 / 0.99, None, None))
-    assert [row.name for row in table.rows[1:]] == [f"{name} (paper only)" for name in ("Lucy", "Dragon", "Thai")]
-
-
-def test_normals_rows() -> None:
-    seconds = {"autograd": 4.0, "algorithm 1": 2.0, "ours": 1.0}
-    outputs = [{"name": name, "seconds": spent} for name, spent in seconds.items()]
-    cell = {"overrides": {"depth": 2, "side": 512}}
-    (table,) = normals_tables([record("normals", outputs, cell=cell, details={"largest_difference": 3e-6})])
-    assert table.rows[0].name == "256x2, 512x512"
-    assert table.rows[0].values == (4.0, 2.0, 1.0, 2.0, 4.0)
-    published = table.rows[0].published
-    assert published is not None
-    assert published[:2] == pytest.approx((0.022 / 3, 0.004))
-    assert "3.0e-06" in table.notes[1]
 
 
 def test_tables_of_nothing() -> None:
@@ -451,13 +397,3 @@ def test_smoke(spec: Any, ball: Path, out: Path) -> None:
         assert noisy[0] > clean[0]  # a row more: what culling hides
     again = [run_cell(cell, out, CATALOGUE) for cell in cells]
     assert again == records
-
-
-def test_a_cloud_without_faces_has_no_exact_distances(tmp_path: Path, out: Path) -> None:
-    rng = np.random.default_rng(0)
-    normals = rng.normal(size=(400, 3))
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    np.savetxt(tmp_path / "cloud.xyz", np.concatenate((normals, normals), axis=1))
-    cell = PaperCell(tmp_path / "cloud.xyz", "delta-factor", "smoke", overrides=(("epsilon", 0.3),))
-    with pytest.raises(InputError, match="has no faces"):
-        run_cell(cell, out, CATALOGUE)

@@ -14,7 +14,6 @@ from mplicits.neural_fields.networks.radiance import Outside, ViewColor
 from mplicits.pipelines.reconstruct.model.model import RayPool, SceneModel, build_scene
 from mplicits.pipelines.reconstruct.model.objective import SceneObjective
 from mplicits.pipelines.reconstruct.model.replayed import ReplayedTrainer, scene_trainer
-from mplicits.pipelines.surface.surface import in_region
 from mplicits.pipelines.training.replay import Again
 from mplicits.pipelines.training.settings import ReconstructConfig
 from mplicits.pipelines.training.trainer import StopFlag
@@ -237,17 +236,6 @@ def test_surfaces_are_held_against_the_exact_one(bench):
         assert least < row.surface.chamfer < 1.5 * ball.chamfer
 
 
-def test_what_lies_outside_the_region_of_interest_is_left_out():
-    ball = extract_mesh(Sphere(radius=0.5), resolution=32)
-    whole = in_region(ball)
-    assert whole is not None
-    assert len(whole.faces) == len(ball.faces)
-    corner = Sphere(radius=0.1, center=(0.8, 0.8, 0.8))
-    both = in_region(extract_mesh(Union(Sphere(radius=0.5), corner), resolution=32))
-    assert len(both.faces) == len(ball.faces)
-    assert in_region(extract_mesh(corner, resolution=32)) is None
-
-
 def files_of(bench, folder: str, suffix: str) -> dict[str, Path]:
     """What is kept of each row."""
     out, ours, *_ = bench
@@ -388,16 +376,11 @@ def test_the_command_goes_on_after_an_interruption(tmp_path, capsys, monkeypatch
         (["painted-shpere"], "painted-shpere: no such data set, and no scene of that name; did you mean"),
         (["figure", "--geometry", "neus"], "--geometry: the benchmark trains both; leave it out"),
         (["figure", "--jets", "9"], "--jets: rows see the same rays, as many in every step; leave it out"),
-        (["figure", "--focus", "1"], "--focus: rows see the same rays"),
         (
             ["figure", "--geometry-only", "--neus-learning-rate", "1e-3"],
             "--neus-learning-rate: --geometry-only tries the same rates for all; give --rates",
         ),
-        (["figure", "--time-budget", "9"], "--time-budget: rows are compared after as many steps"),
         (["figure", "--views", "2", "--size", "8", "--test-every", "0"], "figure: no picture is held out"),
-        (["figure", "--json", "rows.txt"], "rows.txt: unknown extension '.txt'"),
-        (["figure", "--equaltime"], "unknown flag --equaltime; did you mean '--equal-time'?"),
-        (["figure", "--steps", "0"], "steps: 0; expected a whole number > 0"),
     ],
 )
 def test_mistakes_are_one_line(arguments, message, capsys, tmp_path, monkeypatch):

@@ -8,7 +8,6 @@ import pytest
 import trimesh
 from mplicits.neural_fields import (
     Box,
-    InputError,
     Mesh,
     Similarity,
     Sphere,
@@ -19,7 +18,7 @@ from mplicits.neural_fields import (
 )
 from mplicits.pipelines.cli import entry as cli
 from mplicits.pipelines.mesh.solids import length_in
-from mplicits.pipelines.surface.solid import MeshField
+from mplicits.pipelines.surface.distance import MeshField
 from mplicits.pipelines.training.trainer import parameter_count
 
 RADIUS, OTHER, APART = 30.0, 25.0, 35.0  # millimetres
@@ -203,8 +202,3 @@ def test_blobs_are_not_joined(tmp_path: Path) -> None:
     assert "removed 1 component " in heard[0]
     assert left.vertices[:, 2].max() < 0.41
     assert left.vertices[:, 0].max() > 0.89
-
-
-def test_a_length_is_no_word() -> None:
-    with pytest.raises(InputError, match="--by two"):
-        length_in("two", "mm", "--by")
